@@ -63,6 +63,6 @@ def spoilt(frame: dict[str, Any]) -> list[dict[str, Any]]:
     return without + [frame | {name: NO_VALUE} for name in frame]
 
 
-def taken(frame: dict[str, Any]) -> bool:
+def is_described_frame(frame: dict[str, Any]) -> bool:
     """Return whether the frame matches the document's description of frames."""
     return bool(_FRAME.is_valid(frame))

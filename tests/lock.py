@@ -44,7 +44,7 @@ HEAD = """\
 """
 
 
-def wanted() -> list[str]:
+def declared_requirements() -> list[str]:
     """Return the requirements in `pyproject.toml`, both to build acsard and to run it."""
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
     project = pyproject["project"]
@@ -67,7 +67,7 @@ def resolved(python: str, machine: str, versions: dict[str, str]) -> dict[str, t
         words += ["--implementation", "cp", "--python-version", python]
         words += [word for item in platforms for word in ("--platform", item)]
         done = subprocess.run(
-            [*words, "--constraint", str(constraints), *wanted()],
+            [*words, "--constraint", str(constraints), *declared_requirements()],
             stdout=subprocess.PIPE, text=True, check=True,
         )  # fmt: skip
     packages: list[Any] = json.loads(done.stdout)["install"]

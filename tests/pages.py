@@ -110,13 +110,13 @@ class Collected(NamedTuple):
     """A call of pytest. tests/system/test_pages.py checks that the call finds tests."""
 
 
-class Shown(NamedTuple):
+class UntestedCommand(NamedTuple):
     """A command that no test runs, and the reason."""
 
     why: str
 
 
-How = Run | Elsewhere | InCi | Collected | Shown
+How = Run | Elsewhere | InCi | Collected | UntestedCommand
 
 HERE = "tests/system/test_pages.py"
 FLEET, UNIT = "tests/system/test_fleet.py", "tests/systemd/test_unit.py"
@@ -131,15 +131,15 @@ CLIENTS = "tests/system/test_languages.py"
 GUIDED = "tests/system/test_calibrate.py"
 BRIDGED = "tests/system/test_ros_dds.py"
 
-NO_ROS = Shown("needs ROS 2; the page says what was tried with it")
-TWO_MACHINES = Shown("needs a second machine")
+NO_ROS = UntestedCommand("needs ROS 2; the page says what was tried with it")
+TWO_MACHINES = UntestedCommand("needs a second machine")
 PLACES = Elsewhere(
     "tests/systemd/test_fleet.py",
     "test_a_router_runs_as_its_own_user_in_the_directories_that_the_page_creates",
 )
 PYTEST = Collected()
 FIRST = Elsewhere(HERE, "test_the_first_command_of_the_readme_installs_it_and_the_robot_is_up")
-DOWNLOADED = Shown("downloads 44 MB; typed by hand, the venv then runs acsard")
+DOWNLOADED = UntestedCommand("downloads 44 MB; typed by hand, the venv then runs acsard")
 VENV = Elsewhere(HERE, "test_the_service_s_venv_has_all_that_lan_and_service_need")
 AUTHORITY = Elsewhere(
     HERE, "test_the_install_line_of_the_fleet_page_suffices_to_make_its_authority"
@@ -248,19 +248,21 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/pytest -m 'nightly and not soak'": PYTEST,
     ".venv/bin/pytest -m languages": PYTEST,
     ".venv/bin/pytest -m bridge": PYTEST,
-    ".venv/bin/pip install -e '.[test,dds]'": Shown("downloads what only the tests of DDS need"),
-    "sudo apt install cmake g++ libclang-dev": Shown(
+    ".venv/bin/pip install -e '.[test,dds]'": UntestedCommand(
+        "downloads what only the tests of DDS need"
+    ),
+    "sudo apt install cmake g++ libclang-dev": UntestedCommand(
         "installs what builds the bridge of the tests"
     ),
     ".venv/bin/pytest -m soak -s": PYTEST,
-    "bash .ci/run": Shown("it is what runs everything here"),
+    "bash .ci/run": UntestedCommand("it is what runs everything here"),
     ".venv/bin/python -m tests.screens": Elsewhere(
         "tests/test_screens.py", "test_each_screen_fits_its_width_and_shows_the_whole_reason"
     ),
-    ".venv/bin/python -m tests.pythons python3.12 python3.13": Shown(
+    ".venv/bin/python -m tests.pythons python3.12 python3.13": UntestedCommand(
         "installs into venvs of other Pythons, for who has them"
     ),
-    ".venv/bin/python -m tests.simulate --seed 1 --hours 24": Shown("takes half an hour"),
+    ".venv/bin/python -m tests.simulate --seed 1 --hours 24": UntestedCommand("takes half an hour"),
     ".venv/bin/python -m tests.simulate --replay 17": Elsewhere(
         "tests/simulate/test_simulate.py", "test_a_seed_of_a_replay_is_played_and_reported"
     ),
@@ -271,17 +273,17 @@ COMMANDS: dict[str, How] = {
         "tests/simulate/test_simulate.py",
         "test_a_paired_run_finds_no_difference_to_the_same_code_and_names_the_first_one_else",
     ),
-    "git worktree add --detach ../other HEAD~1": Shown("needs the history"),
+    "git worktree add --detach ../other HEAD~1": UntestedCommand("needs the history"),
     ".venv/bin/coverage run": InCi(".venv/bin/coverage run"),
     ".venv/bin/coverage report": InCi(".venv/bin/coverage report"),
-    ".venv/bin/python -m tests.simulate.planted": Shown("takes hours"),
+    ".venv/bin/python -m tests.simulate.planted": UntestedCommand("takes hours"),
     ".venv/bin/python -m tests.simulate.planted --again": Elsewhere(
         "tests/simulate/test_planted.py",
         "test_a_row_whose_seed_finds_nothing_any_more_is_listed",
     ),
-    ".venv/bin/python -m tests.firmware.unchanged HEAD~1": Shown("needs the history"),
-    ".venv/bin/python -m tests.mutation": Shown("takes long, for changes of the core"),
-    ".venv/bin/python -m tests.mutation --safety": Shown("takes long, for the same"),
+    ".venv/bin/python -m tests.firmware.unchanged HEAD~1": UntestedCommand("needs the history"),
+    ".venv/bin/python -m tests.mutation": UntestedCommand("takes long, for changes of the core"),
+    ".venv/bin/python -m tests.mutation --safety": UntestedCommand("takes long, for the same"),
     ".venv/bin/python -m tests.pictures pictures": Elsewhere(
         "tests/system/test_page.py",
         "test_every_view_is_drawn_on_a_phone_in_both_orientations_and_on_a_desktop",
@@ -319,7 +321,9 @@ COMMANDS: dict[str, How] = {
     "datamodel-codegen --input schemas --input-file-type jsonschema "
     "--output-model-type pydantic_v2.BaseModel --output acsard_types": TYPED,
     # deploy/foxglove
-    ".venv/bin/pip install '.[foxglove]'": Shown("an install with extras is made by other tests"),
+    ".venv/bin/pip install '.[foxglove]'": UntestedCommand(
+        "an install with extras is made by other tests"
+    ),
     ".venv/bin/acsard foxglove --drive": Elsewhere(
         FOXGLOVE, "test_a_held_button_drives_and_its_release_stops_the_robot"
     ),
@@ -338,7 +342,7 @@ COMMANDS: dict[str, How] = {
         "test_the_flash_of_the_firmware_page_calls_avrdude_with_its_port",
         "make only says what it would do",
     ),
-    "stty -F /dev/ttyACM0 115200 raw -echo && cat /dev/ttyACM0": Shown("needs a board"),
+    "stty -F /dev/ttyACM0 115200 raw -echo && cat /dev/ttyACM0": UntestedCommand("needs a board"),
     "sudo systemctl stop acsard": Elsewhere(
         UNIT, "test_stop_ramps_down_ends_with_stop_and_exits_0"
     ),
@@ -367,11 +371,11 @@ COMMANDS: dict[str, How] = {
     "acsard calibrate --log drive --config acsard.toml": BAG,
     "acsard calibrate --log drive --config acsard.toml --write": BAG,
     "ros2 bag record -s mcap -o drive /joint_states /imu/data": NO_ROS,
-    "rosbags-convert --src drive.bag --dst drive --dst-storage mcap": Shown(
+    "rosbags-convert --src drive.bag --dst drive --dst-storage mcap": UntestedCommand(
         "of the library rosbags; the tests write their bags by it"
     ),
     "ros2 bag convert -i drive -o mcap.yaml": NO_ROS,
-    "zstd -d drive_0.mcap.zstd": Shown("of the package zstd"),
+    "zstd -d drive_0.mcap.zstd": UntestedCommand("of the package zstd"),
     "acsard calibrate --log drive.csv --distance 4.03 --write": Elsewhere(
         CALIBRATE, "test_in_two_joined_logs_the_distance_belongs_to_the_straight_drive"
     ),
@@ -457,7 +461,7 @@ COMMANDS: dict[str, How] = {
     "sudo /opt/acsard/venv/bin/pip install -r deploy/systemd/requirements.lock": VENV,
     "sudo /opt/acsard/venv/bin/pip install --no-deps --no-build-isolation .": VENV,
     "sudo /opt/acsard/venv/bin/acsard service install": INSTALLED,
-    "git pull && .venv/bin/pip install '.[web]'": Shown("needs a newer commit"),
+    "git pull && .venv/bin/pip install '.[web]'": UntestedCommand("needs a newer commit"),
     "python3 -m pip download -r deploy/systemd/requirements.lock -d wheels": DOWNLOADED,
     "sudo /opt/acsard/venv/bin/pip install --no-index --find-links wheels -r "
     "deploy/systemd/requirements.lock": DOWNLOADED,

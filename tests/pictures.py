@@ -106,7 +106,7 @@ class _States:
     def __init__(self, there: Path, browser: Browser, seen: Callable[[Browser, str], None]) -> None:
         self.there, self.browser, self.seen = there, browser, seen
 
-    def look(self, state: str, mode: str, hint: str = "") -> None:
+    def capture(self, state: str, mode: str, hint: str = "") -> None:
         """Wait until the page shows this mode and hint, then call `seen` for the named state."""
         until(lambda: self.browser.text("mode") == mode, 10.0, mode)
         until(lambda: hint in self.browser.text("hint"), 10.0, hint)
@@ -116,7 +116,7 @@ class _States:
 
     def look_at_a_board(self) -> None:
         """Show the states of a robot whose board works, reports wrong speeds, or is unplugged."""
-        browser, look = self.browser, self.look
+        browser, look = self.browser, self.capture
         with (
             Peer(self.there / "mcu") as board,
             Daemon(self.there, board.path) as daemon,
@@ -175,7 +175,7 @@ class _States:
 
     def look_as_others(self) -> None:
         """Show a camera, a viewer's page, a robot without a daemon, and a daemon that ends."""
-        browser, look, tls = self.browser, self.look, self.there / "tls"
+        browser, look, tls = self.browser, self.capture, self.there / "tls"
         Authority.make(tls, "test", 1, [NAME]).issue(tls, "robot", [NAME], 1)
         with closing(Stream()) as stream:
             config = {"web": {"camera": f"http://127.0.0.1:{stream.port}/stream"}}
@@ -222,7 +222,7 @@ class _States:
             Page(daemon, self.there) as page,
         ):
             self.browser.open(page.here)
-            self.look("no-board", "NO BOARD")
+            self.capture("no-board", "NO BOARD")
 
 
 def states(on_state: Callable[[Browser, str], None]) -> None:

@@ -44,7 +44,7 @@ def urdf() -> ET.Element:
     return ET.parse(FILES / "acsar.urdf").getroot()
 
 
-def one(element: ET.Element, path: str) -> ET.Element:
+def find_only(element: ET.Element, path: str) -> ET.Element:
     elements = element.findall(path)
     assert len(elements) == 1, path
     return elements[0]
@@ -55,16 +55,16 @@ def numbers(text: str | None) -> list[float]:
 
 
 def joint(name: str) -> ET.Element:
-    return one(urdf(), f"joint[@name='{name}']")
+    return find_only(urdf(), f"joint[@name='{name}']")
 
 
 def joint_to(link: str) -> ET.Element:
-    return next(j for j in urdf().findall("joint") if one(j, "child").get("link") == link)
+    return next(j for j in urdf().findall("joint") if find_only(j, "child").get("link") == link)
 
 
 def wheel_links() -> list[ET.Element]:
-    names = [one(joint(name), "child").get("link") for name in CONFIG.joints.as_tuple()]
-    return [one(urdf(), f"link[@name='{name}']") for name in names]
+    names = [find_only(joint(name), "child").get("link") for name in CONFIG.joints.as_tuple()]
+    return [find_only(urdf(), f"link[@name='{name}']") for name in names]
 
 
 def yaml(name: str) -> Any:
@@ -100,12 +100,12 @@ def test_the_continuous_joints_are_the_wheels() -> None:
 @each("name", CONFIG.joints.as_tuple())
 def test_each_wheel_touches_the_floor_at_half_the_wheel_separation(name: str) -> None:
     radius, half = CONFIG.drive.wheel_radius, CONFIG.drive.wheel_separation / 2
-    assert one(joint(name), "parent").get("link") == CONFIG.odometry.base_frame
-    x, y, z = numbers(one(joint(name), "origin").get("xyz"))
+    assert find_only(joint(name), "parent").get("link") == CONFIG.odometry.base_frame
+    x, y, z = numbers(find_only(joint(name), "origin").get("xyz"))
     assert (y, z) == pytest.approx((WHEEL_SIGNS[name][1] * half, radius))
     assert math.copysign(1, x) == WHEEL_SIGNS[name][0]
-    assert numbers(one(joint(name), "axis").get("xyz")) == [0, 1, 0]
-    limit = one(joint(name), "limit").get("velocity")
+    assert numbers(find_only(joint(name), "axis").get("xyz")) == [0, 1, 0]
+    limit = find_only(joint(name), "limit").get("velocity")
     assert numbers(limit) == [CONFIG.limits.wheel_speed]
 
 
@@ -113,8 +113,8 @@ def test_every_wheel_has_the_radius_and_lies_on_its_side() -> None:
     radius = CONFIG.drive.wheel_radius
     for link in wheel_links():
         for part in ("visual", "collision"):
-            assert numbers(one(link, f"{part}/geometry/cylinder").get("radius")) == [radius]
-            turn = numbers(one(link, f"{part}/origin").get("rpy"))
+            assert numbers(find_only(link, f"{part}/geometry/cylinder").get("radius")) == [radius]
+            turn = numbers(find_only(link, f"{part}/origin").get("rpy"))
             assert turn == pytest.approx([math.pi / 2, 0, 0])
 
 
@@ -129,15 +129,15 @@ def test_lidar_and_footprint_frames_agree_with_the_configuration() -> None:
         (footprint.footprint_frame, [0, 0, footprint.footprint_z_offset], [0, 0, 0]),
     ):
         fixed_joint = joint_to(link)
-        assert one(fixed_joint, "parent").get("link") == CONFIG.odometry.base_frame
-        assert numbers(one(fixed_joint, "origin").get("xyz")) == xyz
-        assert numbers(one(fixed_joint, "origin").get("rpy")) == rpy
+        assert find_only(fixed_joint, "parent").get("link") == CONFIG.odometry.base_frame
+        assert numbers(find_only(fixed_joint, "origin").get("xyz")) == xyz
+        assert numbers(find_only(fixed_joint, "origin").get("rpy")) == rpy
 
 
 def test_only_the_base_frame_has_no_parent() -> None:
     links = {link.get("name") for link in urdf().findall("link")}
-    children = [one(j, "child").get("link") for j in urdf().findall("joint")]
-    parents = {one(j, "parent").get("link") for j in urdf().findall("joint")}
+    children = [find_only(j, "child").get("link") for j in urdf().findall("joint")]
+    parents = {find_only(j, "parent").get("link") for j in urdf().findall("joint")}
     assert links - set(children) == {CONFIG.odometry.base_frame}
     assert len(children) == len(set(children))
     assert parents <= links
@@ -154,9 +154,9 @@ def test_inertias_are_physically_possible() -> None:
 
 
 def test_ros2_control_has_what_the_topic_hardware_needs() -> None:
-    control = one(urdf(), "ros2_control")
+    control = find_only(urdf(), "ros2_control")
     assert control.get("type") == "system"
-    plugin = one(control, "hardware/plugin").text
+    plugin = find_only(control, "hardware/plugin").text
     assert plugin == "joint_state_topic_hardware_interface/JointStateTopicSystem"
     parameters = {p.get("name"): p.text for p in control.findall("hardware/param")}
     assert parameters["joint_commands_topic"] == "/joint_commands"
@@ -283,8 +283,8 @@ def test_nav2s_footprint_has_the_wheels_inside() -> None:
     for text in footprints:
         corners = json.loads(text)
         for name, link in zip(CONFIG.joints.as_tuple(), wheel_links(), strict=True):
-            x, y, _ = numbers(one(joint(name), "origin").get("xyz"))
-            wheel = one(link, "visual/geometry/cylinder")
+            x, y, _ = numbers(find_only(joint(name), "origin").get("xyz"))
+            wheel = find_only(link, "visual/geometry/cylinder")
             (radius,), (width,) = numbers(wheel.get("radius")), numbers(wheel.get("length"))
             assert abs(x) + radius <= max(abs(corner[0]) for corner in corners) + 1e-9
             assert abs(y) + width / 2 <= max(abs(corner[1]) for corner in corners) + 1e-9

@@ -6,7 +6,7 @@ import re
 
 from packaging.requirements import Requirement
 
-from tests.lock import LOCK, wanted
+from tests.lock import LOCK, declared_requirements
 from tests.lowest import lowest
 
 PIN = re.compile(r"^([a-z0-9-]+)==(\S+) \\\n((?: {4}--hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", re.M)
@@ -21,7 +21,7 @@ def test_every_line_of_the_lock_is_a_version_with_its_hashes() -> None:
 
 def test_the_lock_has_all_that_the_service_needs_in_versions_that_are_allowed() -> None:
     pins = {name: version for name, version, _ in PIN.findall(LOCK.read_text())}
-    for text in wanted():
+    for text in declared_requirements():
         need = Requirement(text)
         assert need.specifier.contains(pins[need.name]), text
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 from msgspec.structs import replace
 
-from acsard.bench.matching import Seen, staircase
+from acsard.bench.matching import RecordedTraffic, staircase
 from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
@@ -63,7 +63,7 @@ class FarEnd:
     """A simulated board at one end of a pty. The daemon opens the other end, at `path`."""
 
     def __init__(self, mcu: FakeMcu) -> None:
-        self.seen = Seen()
+        self.seen = RecordedTraffic()
         self._mcu = mcu
         self._pty = PtyEnd()
         self.path = self._pty.path
@@ -79,14 +79,14 @@ class FarEnd:
             ready = [fd for fd, _ in poll.poll()]
             now_ns = clock.mono_ns()
             if self._pty.fileno() in ready:
-                self._hear(now_ns)
+                self._receive(now_ns)
             if self._timer.fileno() in ready:
                 self._timer.expirations()
             self._advance()
             if until_fd in ready:
                 return
 
-    def _hear(self, now_ns: int) -> None:
+    def _receive(self, now_ns: int) -> None:
         data = self._pty.read()
         if data:
             self.seen.from_daemon.append((now_ns, data))
@@ -106,7 +106,8 @@ class FarEnd:
 def main(part: Part) -> None:
     """Simulate the board until standard input ends.
 
-    Then write a `Seen` to standard output, with all data that the board received and sent.
+    Then write a `RecordedTraffic` to standard output, with all data that the board received and
+    sent.
     """
     try:
         # Other processes must not delay the simulated board: a real one has its own processor.

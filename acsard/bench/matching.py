@@ -151,7 +151,7 @@ def summary(durations_ns: Sequence[int]) -> Summary | None:
     return Summary(len(us), round(float(p50), 1), round(float(p99), 1), round(float(us.max()), 1))
 
 
-class Seen(Struct, frozen=True):
+class RecordedTraffic(Struct, frozen=True):
     """All data that the simulated board received and sent, with monotonic times in ns."""
 
     from_daemon: list[Chunk] = []
@@ -160,7 +160,7 @@ class Seen(Struct, frozen=True):
     """Bytes to the daemon. Each chunk has the time just before the board wrote it."""
 
 
-class Sent(Struct, frozen=True):
+class SentCommand(Struct, frozen=True):
     """A command: the monotonic time of its publication, ns, and the line that must carry it."""
 
     at_ns: int
@@ -182,9 +182,9 @@ class Record(Struct, frozen=True):
     """Monotonic time just before the daemon was started, ns."""
     window_ns: tuple[int, int]
     """Start and end of the evaluated time, ns. Start-up and shutdown of the daemon are excluded."""
-    seen: Seen | None
+    seen: RecordedTraffic | None
     """Data on the wire; None on a real port, whose wire cannot be observed."""
-    sent: list[Sent]
+    sent: list[SentCommand]
     samples: list[Sample]
 
     @property

@@ -26,7 +26,7 @@ import msgspec
 import zenoh
 
 from acsard.bench.far_end import Part
-from acsard.bench.matching import Record, Sample, Seen, Sent
+from acsard.bench.matching import Record, RecordedTraffic, Sample, SentCommand
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.link.codec import Codec
@@ -144,7 +144,7 @@ class Rig:
         self._far_end: subprocess.Popen[bytes] | None = None
         self._session: zenoh.Session | None = None
         self._arrived: list[tuple[Instant, bytes]] = []
-        self._sent: list[Sent] = []
+        self._sent: list[SentCommand] = []
         self._began_ns = self._settled_ns = 0
 
     def __enter__(self) -> Self:
@@ -275,23 +275,23 @@ class Rig:
         while clock.mono_ns() - began_ns < seconds * NS_PER_S:
             time.sleep(phases.uniform(*SPACING_S))
             self._alive()
-            self._sent.append(self._put(wheel_speed(number)))
+            self._sent.append(self._publish(wheel_speed(number)))
             number += 1
         # Wait for the line of the last command.
         time.sleep(0.1)
-        self._put(0.0)
+        self._publish(0.0)
         return self._share(began_ns, used_ns)
 
     def _neutral(self, phases: random.Random) -> None:
         """Send zeros until the daemon accepts one. At first it ignores a new sender."""
         before = self._counted()
 
-        def look() -> bool | None:
-            self._put(0.0)
+        def send_zero() -> bool | None:
+            self._publish(0.0)
             time.sleep(phases.uniform(*SPACING_S))
             return before is None or self._counted() != before or None
 
-        self._wait(look, "zero-speed command accepted by the daemon")
+        self._wait(send_zero, "zero-speed command accepted by the daemon")
         time.sleep(0.2)
 
     def _counted(self) -> int | None:
@@ -305,14 +305,14 @@ class Rig:
         used_ns = processor_ns(self.process.pid) - used_ns
         return used_ns / (clock.mono_ns() - began_ns)
 
-    def _put(self, wheel_speed: float) -> Sent:
+    def _publish(self, wheel_speed: float) -> SentCommand:
         speeds = WheelSpeeds(wheel_speed, wheel_speed, wheel_speed, wheel_speed)
         twist = self._kinematics.twist(speeds)
         message = Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))
         payload, line = encode(message, "msgpack"), self._codec.encode(speeds).rstrip(b",\r\n")
         at_ns = clock.mono_ns()
         self._publisher.put(payload, attachment=self._attachment)
-        return Sent(at_ns, line)
+        return SentCommand(at_ns, line)
 
     def unsubscribe(self) -> None:
         """Unsubscribe from the odometry, so that no more samples are recorded."""
@@ -348,11 +348,11 @@ class Rig:
         return Record(self._began_ns, window_ns, wire_data, self._sent, samples)
 
 
-def _recorded_data(far_end: subprocess.Popen[bytes]) -> Seen:
+def _recorded_data(far_end: subprocess.Popen[bytes]) -> RecordedTraffic:
     assert far_end.stdin is not None
     assert far_end.stdout is not None
     far_end.stdin.close()
     output = far_end.stdout.read()
     if far_end.wait(END_TIMEOUT_S):
         raise ended(SIMULATOR_PROCESS, far_end.returncode)
-    return msgspec.msgpack.decode(output, type=Seen)
+    return msgspec.msgpack.decode(output, type=RecordedTraffic)

@@ -352,7 +352,7 @@ def fit(
     parameters, size = start.copy(), np.inf
     for at in range(MAX_STEPS):
         normal, score = _sum([source(parameters) for source in sources])
-        known, prior = _known(parameters, held, usual)
+        known, prior = _prior_terms(parameters, held, usual)
         step = np.zeros(PARAMETER_COUNT)
         step[list(active)] = _solved(normal.sum(axis=0) + known, score.sum(axis=0) + prior, active)
         # Far from the solution, take only a part of the step, because the linearization holds only
@@ -364,7 +364,7 @@ def fit(
         if size < SMALL:
             break
     normal, score = _sum([source(parameters) for source in sources])
-    known, _ = _known(parameters, held, usual)
+    known, _ = _prior_terms(parameters, held, usual)
     return Fit(parameters, normal, score, known, active, size < SETTLED, usual)
 
 
@@ -392,7 +392,7 @@ def _weight(part: Evidence) -> float:
     return 1.0 / max(noise / max(1, rank), white, 1e-18)
 
 
-def _known(
+def _prior_terms(
     parameters: Floats, targets: Sequence[Held], usual: Mapping[Parameter, float]
 ) -> tuple[Floats, Floats]:
     """Return the terms that constraints and prior information add to the normal equations.

@@ -27,7 +27,7 @@ from acsard.calibration.fit import (
     huber,
 )
 from acsard.calibration.log_table import Floats, LogError
-from acsard.calibration.runs import Block, Run, cumulative, gaps, inside, rests
+from acsard.calibration.runs import Block, Run, cumulative, gaps, inside, rest_intervals
 
 REST_S, EDGE_S = 0.6, 0.3
 """Limits for a standstill of the robot from which the gyro's bias is measured, s.
@@ -228,7 +228,7 @@ Rests = tuple[Floats, Floats, Floats]
 
 def _biases(run: Run) -> Rests:
     means = []
-    for begin, end in rests(run, REST_S, EDGE_S):
+    for begin, end in rest_intervals(run, REST_S, EDGE_S):
         a, b = np.searchsorted(run.gyro_t, (begin, end))
         if b - a >= MIN_SAMPLES:
             means.append(((begin + end) / 2, *_mean(run.gyro[a:b])))

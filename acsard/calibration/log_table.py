@@ -303,7 +303,7 @@ def _columns(header: list[str], number: int) -> list[str]:
         raise LogError(f"{where}: there are no commas between the names: write {EXAMPLE}")
     if missing := [name for name in wanted if name not in header]:
         raise LogError(
-            f"{where}: no column {', '.join(missing)}{_near(missing, header)}; the header "
+            f"{where}: no column {', '.join(missing)}{_column_hint(missing, header)}; the header "
             f"must name t, and either fr, fl, rl and rr, or left and right, for example {EXAMPLE}"
         )
     sensors: list[str] = [name for name in ("yaw_rate", "yaw") if name in header]
@@ -312,14 +312,15 @@ def _columns(header: list[str], number: int) -> list[str]:
     if not sensors:
         raise LogError(
             f"{where}: no column with which to compare the wheels: the header must name yaw_rate "
-            f"(a gyro, rad/s), or x and y (positions, m){_near(['yaw_rate', 'x', 'y'], header)}"
+            "(a gyro, rad/s), or x and y (positions, m)"
+            f"{_column_hint(['yaw_rate', 'x', 'y'], header)}"
         )
     commands = APPLIED if set(APPLIED) <= set(header) else ()
     used = {*wanted, *sensors, *commands, "run"}
     return [name if name in used else "" for name in header]
 
 
-def _near(names: Sequence[str], header: Sequence[str]) -> str:
+def _column_hint(names: Sequence[str], header: Sequence[str]) -> str:
     others = [name for name in header if name and name not in COLUMNS]
     if "t" in names and (times := [name for name in others if "time" in name or "stamp" in name]):
         return f" (if column {times[0][:40]} is the time, rename it to t and convert it to seconds)"

@@ -305,17 +305,19 @@ class _Log:
                     f"{self._no_wheels([topic])}. To use the wheels of another topic, leave out "
                     f"--topic {printable(topic.name)}"
                 )
-        wheels = self._one("the wheels", [topic for topic in of[JointState] if topic.wheels])
+        wheels = self._choose_topic(
+            "the wheels", [topic for topic in of[JointState] if topic.wheels]
+        )
         if wheels is None:
             raise LogError(self._no_wheels(of[JointState]))
         free = not any(known[name].kind is not JointState for name in names)
-        gyro = self._one("the turn rates", of[Imu], free=free)
-        places = self._one("the positions", of[PoseStamped] if free else
+        gyro = self._choose_topic("the turn rates", of[Imu], free=free)
+        places = self._choose_topic("the positions", of[PoseStamped] if free else
                            [*of[PoseStamped], *of[Odometry]], free=free)  # fmt: skip
         if free and places is None:
             odometry = [topic for topic in of[Odometry] if len(topic) >= MIN_MESSAGES]
             if gyro is None:
-                places = self._one("the positions", odometry)
+                places = self._choose_topic("the positions", odometry)
             elif odometry:
                 name = printable(odometry[0].name)
                 self._notes.append(
@@ -331,7 +333,9 @@ class _Log:
             )
         return wheels, gyro, places
 
-    def _one(self, what: str, fit: Sequence[_Topic], *, free: bool = True) -> _Topic | None:
+    def _choose_topic(
+        self, what: str, fit: Sequence[_Topic], *, free: bool = True
+    ) -> _Topic | None:
         """Return the one topic of `fit` to use as the source of `what`, or None.
 
         If the user has named a topic, only this topic is used. If `free` is false, only a topic

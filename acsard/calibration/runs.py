@@ -506,7 +506,7 @@ def cumulative(steps: Floats) -> Floats:
     return np.concatenate((np.zeros(1), np.cumsum(steps)))
 
 
-def rests(run: Run, least_s: float, edge_s: float) -> Floats:
+def rest_intervals(run: Run, least_s: float, edge_s: float) -> Floats:
     """Return the intervals in which all wheels stand still, s: one row (begin, end) for each.
 
     Each interval is shortened by `edge_s` s at each end. It is left out if it is then shorter than

@@ -330,7 +330,7 @@ def _calibrated(
             best, result=configured(base), stays_configured={TRACK: np.inf, RATIO: np.inf},
             improvement=UNMEASURED,
         )  # fmt: skip
-    known = _known(best, odometry)
+    known = _used_deviations(best, odometry)
     log_noise = _noise(best, known, odometry, present=bool(worse))
     # With a tape, the calibration gives the size of the wheels even if the log improves nothing.
     if worse and tape is None and (log_noise is None or not log_noise.better):
@@ -338,7 +338,7 @@ def _calibrated(
     return _calibration(log, tape, best, odometry, log_noise)
 
 
-def _known(best: Candidate, odometry: OdometryConfig) -> Deviations:
+def _used_deviations(best: Candidate, odometry: OdometryConfig) -> Deviations:
     base, new = best.made.base, best.result.relative_deviations()
     now = Deviations.of(odometry, base)
     return Deviations(
@@ -382,7 +382,7 @@ def _candidates(made: Prepared) -> list[Candidate]:
     headings = made.headings
     gyro = headings is not None and headings.source == "yaw_rate"
     bias_std = headings.bias_std if headings is not None else 0.0
-    for fixed, constraints in _held(made.base).items():
+    for fixed, constraints in _constraints(made.base).items():
         if candidates and not candidates[0].stays_configured:
             break
         fitted = fit(
@@ -414,7 +414,7 @@ def _candidates(made: Prepared) -> list[Candidate]:
     return candidates
 
 
-def _held(base: Base) -> dict[str, list[Held]]:
+def _constraints(base: Base) -> dict[str, list[Held]]:
     ratio, track, growth = np.zeros((3, PARAMETER_COUNT))
     ratio[[Parameter.LEFT, Parameter.RIGHT]] = base.right, -base.left
     track[Parameter.INVERSE_TRACK] = growth[Parameter.TRACK_GROWTH] = 1.0
@@ -464,7 +464,7 @@ def _calibration(
         scale.append("distance")
         notes.append(f"the distance of {tape.metres:g} m by tape was compared with run {name}")
     plausibility.in_range(result.values)
-    known = _known(best, odometry)
+    known = _used_deviations(best, odometry)
     if tape is not None:
         known = replace(known, scale=result.relative_deviations().scale)
     totals = Drives.of(log.runs, rows, by_wheels, base, result, rate)

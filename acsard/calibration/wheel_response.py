@@ -222,7 +222,7 @@ def _evidence(
                     witness.forget()
                     continue
                 expected.follow(command, speed, speed, step, response_time)
-                witness.look(speed, expected, step, most, 0.0, still)
+                witness.check_speed(speed, expected, step, most, 0.0, still)
                 longest = max(longest, *witness.evidence.values())
     return longest
 

@@ -270,8 +270,8 @@ class Board:
         self.sent_lines += 1
         self.sent_s = self.now_s
         if turned:
-            self.lateness.look(self.sent_s - self._listened_s, self.sent_s)
-        self.restarts.sent(motors, self.sent_s)
+            self.lateness.record(self.sent_s - self._listened_s, self.sent_s)
+        self.restarts.record_speeds(motors, self.sent_s)
 
     def zeros(self) -> None:
         """Send zero speeds in two lines: one ends with a comma, and the other does not.
@@ -283,7 +283,7 @@ class Board:
         self._commanded = ZERO
         plain = self._codecs[True].stop + self._codecs[False].stop
         self.wire.send(b"\r\n" + plain + (self.line(ZERO) if self.sealed else b""))
-        self.restarts.sent(ZERO, self.now_s)
+        self.restarts.record_speeds(ZERO, self.now_s)
 
     def answers_within(self, seconds: float) -> bool:
         """Send zero speeds until the board answers, for `seconds` s at most.
@@ -298,7 +298,7 @@ class Board:
             self.listen(self.period_s)
         return True
 
-    def ask(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
+    def send_zero(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
         """Send one line of zero speeds, then listen for `wait_s` s, but at least for `period_s`.
 
         The line ends with a comma if `comma` is true. None means the value of `self.comma`.
@@ -323,7 +323,7 @@ class Board:
         self.listen(max(motion.SHORT_MEASUREMENT_S / 4, wait_s))
         pairs: list[tuple[float, Reply]] = []
         for _ in range(lines):
-            self.ask(max(wait_s, 1.5 * self.period_s), comma)
+            self.send_zero(max(wait_s, 1.5 * self.period_s), comma)
             first = motion.since(self.replies, self.sent_s)[:1]
             pairs += [(reply.at_s - self.sent_s, reply) for reply in first]
         return pairs
@@ -388,16 +388,16 @@ class Board:
         self.abort_check()
         while True:
             until_ns = min(end_ns, self.wire.now_ns() + BEAT_NS)
-            replies += self._hear(until_ns)
+            replies += self._receive(until_ns)
             now_ns = self.wire.now_ns()
             self._listened_s = now_ns / NS_PER_S
             late_ns = max(now_ns - until_ns, self.wire.late_ns())
-            self.lateness.look(late_ns / NS_PER_S, self._listened_s)
+            self.lateness.record(late_ns / NS_PER_S, self._listened_s)
             self.abort_check()
             if now_ns >= end_ns:
                 return replies
 
-    def _hear(self, until_ns: int) -> list[Reply]:
+    def _receive(self, until_ns: int) -> list[Reply]:
         new_replies = []
         for at_ns, data in self.wire.listen(until_ns):
             self.heard.take(data)
@@ -409,7 +409,7 @@ class Board:
                 at_s = (at_ns - wire_ns(following, self.baud_rate)) / NS_PER_S
                 reply = self._reply(line, at_s)
                 self.heard.line(line, reply is not None)
-                if restart := self.restarts.look(line, at_s, reply):
+                if restart := self.restarts.check_line(line, at_s, reply):
                     raise RestartedError(restart)
                 if reply is not None:
                     new_replies.append(reply)
@@ -476,7 +476,7 @@ class Board:
         last = self.replies[-1].motors if self.replies else ZERO
         return motion.moving(last, motion.STANDING_SPEED)
 
-    def rest(self) -> None:
+    def stop_motors(self) -> None:
         """Send zero speeds until all motors stand still.
 
         Raises `StoppedError` if a motor keeps turning, or if the board falls silent.
@@ -527,7 +527,7 @@ class Board:
             patience_s = motion.SLOWING_TIMEOUT_S if self._slows() else motion.MOTOR_TIMEOUT_S
             if self.now_s - began_s >= patience_s:
                 return False
-            self.ask(comma=comma)
+            self.send_zero(comma=comma)
 
     def _slows(self) -> bool:
         return min(motion.trend(self.replies, self.now_s, self.gap_s)) < motion.SLOWING_RATIO

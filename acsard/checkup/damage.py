@@ -80,5 +80,5 @@ def _moves(board: Board, line: bytes) -> bool:
         board.wire.send(line)
         board.listen(max(SHORT_MEASUREMENT_S / 6, len(line) * 12 / board.baud_rate))
     replies = board.drive(ZERO, SHORT_MEASUREMENT_S + 2 * board.gap_s)
-    board.rest()
+    board.stop_motors()
     return any(moving(reply.motors) for reply in replies)

@@ -68,7 +68,7 @@ def identity(board: Board) -> Finding:
     board.unrecognized_lines.clear()
     # Ask up to three times, because the question or its answer may be lost.
     for _ in range(3):
-        board.restarts.asked(board.now_s)
+        board.restarts.record_request(board.now_s)
         board.wire.send(b"\r\n?\r\n")
         board.listen(1.5 * SHORT_MEASUREMENT_S)
         if any(line.startswith(IDENTITY) or line == b"?" for line in board.unrecognized_lines):

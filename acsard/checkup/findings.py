@@ -58,14 +58,14 @@ def wheel_of(mcu: McuConfig, motor: int) -> tuple[str, int]:
     raise ValueError(f"the configuration has no wheel with motor {LETTERS[motor]}")
 
 
-def words(wheel: str) -> str:
+def with_spaces(wheel: str) -> str:
     """Return a wheel's name with spaces: "front right" for "front_right"."""
     return wheel.replace("_", " ")
 
 
 def motor_name(mcu: McuConfig, motor: int) -> str:
     """Return a text such as "motor d (rear right)" for motor 3 and its configured wheel."""
-    return f"motor {LETTERS[motor]} ({words(wheel_of(mcu, motor)[0])})"
+    return f"motor {LETTERS[motor]} ({with_spaces(wheel_of(mcu, motor)[0])})"
 
 
 def motor_names(mcu: McuConfig, motors: Sequence[int], joint: str = " and ") -> str:

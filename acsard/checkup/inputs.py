@@ -36,7 +36,7 @@ def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
     board reports. A bumper is named by its configured place on the robot, or by its number if the
     configuration contains no places. The inputs are not tested if no operator is ready.
     """
-    board.ask(REPORT_TIMEOUT_S)
+    board.send_zero(REPORT_TIMEOUT_S)
     estop = safety.estop == "required" or (safety.estop == "auto" and 0 in board.inputs)
     places = () if safety.bumper == "off" else safety.bumpers
     counted = 0 if safety.bumper == "off" else sum(number > 0 for number in board.inputs)
@@ -71,7 +71,7 @@ def _pressed(board: Board, operator: Operator, asked: Input, inputs: list[Input]
     operator.doing(f"press the {asked.name} and release it, within {PRESS_TIMEOUT_S:g} s")
     end_s, numbers = board.now_s + PRESS_TIMEOUT_S, set[int]()
     while board.now_s < end_s:
-        board.ask()
+        board.send_zero()
         now = {number for number, pressed in board.inputs.items() if pressed}
         numbers |= now
         if numbers and not now:

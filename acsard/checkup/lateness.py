@@ -38,7 +38,7 @@ class Lateness:
     def __init__(self) -> None:
         self._delays: list[tuple[float, float]] = []
 
-    def look(self, late_s: float, now_s: float) -> None:
+    def record(self, late_s: float, now_s: float) -> None:
         """Record a delay of `late_s` s that ended at the monotonic time `now_s`, s.
 
         A delay that is shorter than `MIN_DELAY_S` is ignored.

@@ -234,7 +234,7 @@ def pulsed(board: Board, motors: Sequence[int]) -> PulseCounts | None:
         since_s, coasting = board.now_s, board.replies[-1].motors
         answered = bool(board.drive(on, PULSE_S, PULSE_S))
         board.drive(ZERO, 2 * board.gap_s + (4 + STRIDE * count % SPREAD) * board.period_s)
-        if not _stand(board):
+        if not _wait_until_still(board):
             return None
         count += 1
         if board.own_clock and not _whole(board, since_s):
@@ -267,11 +267,11 @@ def _grain(board: Board, motors: Sequence[int]) -> float:
     return min((angle for angle in angles if angle), default=0.0)
 
 
-def _stand(board: Board) -> bool:
+def _wait_until_still(board: Board) -> bool:
     began_s = board.now_s
     while board.turning():
         if board.now_s - began_s > motion.MOTOR_TIMEOUT_S / 2:
-            board.rest()
+            board.stop_motors()
             return False
-        board.ask()
+        board.send_zero()
     return True

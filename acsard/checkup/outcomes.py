@@ -393,7 +393,7 @@ class Outcome(Struct, frozen=True):
     mend: str
 
 
-def _read(manual: str) -> dict[str, Outcome]:
+def _parse_manual(manual: str) -> dict[str, Outcome]:
     outcomes = {}
     for entry in re.split(r"\n+(?! )", manual.strip()):
         head, *rest = entry.splitlines()
@@ -405,7 +405,7 @@ def _read(manual: str) -> dict[str, Outcome]:
     return outcomes
 
 
-OUTCOMES_BY_NAME = _read(OUTCOMES)
+OUTCOMES_BY_NAME = _parse_manual(OUTCOMES)
 """Maps the name of each outcome, such as "baud rate: right", to the outcome."""
 
 

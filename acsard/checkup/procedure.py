@@ -144,7 +144,7 @@ def run(
             if operator.ask(CONFIRMATION, (LIFTED,)) != LIFTED:
                 raise StoppedError(outcomes.find("wheels: not lifted"))
             watched = _Watched(operator, board, asleep_ns)
-            board.abort_check = watched.look
+            board.abort_check = watched.check_operator
             _Steps(board, watched, once, all_restarts).all(config.safety)
     except StoppedError as end:
         once(end.finding)
@@ -173,7 +173,7 @@ class _Watched:
         self.doing, self.keys = operator.doing, operator.keys
         self._operator, self._board, self._asleep_ns = operator, board, asleep_ns
         self._ran_s = self._now_s()
-        """Time of the last call of `look` or of the operator's last answer, s."""
+        """Time of the last call of `check_operator` or of the operator's last answer, s."""
 
     def _now_s(self) -> float:
         """Return a monotonic time, s, that advances even while the computer is suspended."""
@@ -185,7 +185,7 @@ class _Watched:
         self._ran_s = self._now_s()
         return answer
 
-    def look(self) -> None:
+    def check_operator(self) -> None:
         now_s = self._now_s()
         stalled_s, self._ran_s = now_s - self._ran_s, now_s
         if stalled_s > (STALL_S if self._board.armed else ZEROS_STALL_S):
@@ -193,7 +193,7 @@ class _Watched:
         if stalled_s > STALL_S:
             # `Board` measures neither the time for which the computer was suspended, nor the time
             # for which the terminal did not accept the tool's output.
-            self._board.lateness.look(stalled_s, self._board.now_s)
+            self._board.lateness.record(stalled_s, self._board.now_s)
         if QUITS in self.keys(0.0).lower():
             raise KeyboardInterrupt
 
@@ -218,7 +218,7 @@ class _Steps:
         board, operator = self._board, self._operator
         for doing, step in SILENT_STEPS:
             self._measure(doing, partial(step, board))
-        self._take("", self._stand)
+        self._take("", self._stop_and_arm)
         for motor in range(4):
             self._take("", partial(self._turn, motor))
         channels = self._channels
@@ -233,8 +233,8 @@ class _Steps:
         self._measure(broken, lambda: damage.finding(board, right))
         self._take("", lambda: inputs.finding(board, operator, safety))
 
-    def _stand(self) -> None:
-        self._board.rest()
+    def _stop_and_arm(self) -> None:
+        self._board.stop_motors()
         self._board.armed = True
 
     def _turn(self, motor: int) -> Finding:
@@ -245,11 +245,11 @@ class _Steps:
         board, operator, channels = self._board, self._operator, self._channels
         operator.doing(f"{motor_name(board.mcu, motor)} turns: briefly, then forward and back")
 
-        def looked() -> Finding:
+        def measure_motor() -> Finding:
             channels[motor:] = [wheels.channel(board, motor)]
             return encoder_finding(board.mcu, channels[motor])
 
-        finding = self._in_time(looked)
+        finding = self._in_time(measure_motor)
         if finding is not None and not lateness.judged(finding):
             channels[motor] = structs.replace(channels[motor], judged=False)
             return finding
@@ -272,7 +272,7 @@ class _Steps:
                 self._operator.doing("this computer ran the check too late; this part runs again")
                 board.saved_results = saved
                 if board.armed:
-                    board.rest()
+                    board.stop_motors()
             began_s = board.now_s
             finding, ends = _ended(step)
             # A finding that is not `TimingFinding` is right even if this computer ran the check too
@@ -348,7 +348,7 @@ class _Steps:
         if cause := restarts.cause(board.unrecognized_lines):
             self._all_restarts[-1] = structs.replace(self._all_restarts[-1], cause=cause)
         if board.armed:
-            board.rest()
+            board.stop_motors()
 
 
 def _ended(step: Step) -> tuple[Finding | None, bool]:

@@ -87,7 +87,7 @@ class Restarts:
 
     def __init__(self) -> None:
         self.watched = True
-        """Whether `look` reports restarts. If false, it always returns None."""
+        """Whether `check_line` reports restarts. If false, it always returns None."""
         self._asked_s = self._turned_s = float("-inf")
         self._turned: Motors = ZERO
         """The last commanded speeds, rad/s, that were not all zero."""
@@ -105,18 +105,18 @@ class Restarts:
         """Pair from the last reply that contained the board's clock: this clock, ms, and the time
         of that reply, s. None if no reply has contained the clock."""
 
-    def asked(self, at_s: float) -> None:
+    def record_request(self, at_s: float) -> None:
         """Record that the check requested the board's identification at the time `at_s`, s."""
         self._asked_s = at_s
 
-    def sent(self, motors: Motors, at_s: float) -> None:
+    def record_speeds(self, motors: Motors, at_s: float) -> None:
         """Record that the check sent the speeds `motors`, rad/s, at the time `at_s`, s."""
         self._unanswered += 1
         self._silent_s, self._sent_s = self._silence_s(at_s), at_s
         if any(motors):
             self._turned, self._turned_s = motors, at_s
 
-    def look(self, line: bytes, at_s: float, reply: Reply | None) -> Restart | None:
+    def check_line(self, line: bytes, at_s: float, reply: Reply | None) -> Restart | None:
         """Process a received line. Return a `Restart` if it shows that the board restarted.
 
         Otherwise return None. `at_s` is the time at which `line` arrived, s. `reply` is the decoded
@@ -175,7 +175,7 @@ def finding(mcu: McuConfig, restarts: Sequence[Restart], back: bool = True) -> F
     `restarts` contains at least one restart. `back` is false if the board did not answer after the
     last restart.
     """
-    each = Counter(_told(mcu, restart) for restart in restarts)
+    each = Counter(_restart_texts(mcu, restart) for restart in restarts)
     values: dict[str, object] = {
         "times": ", ".join(filter(None, ("restarted", _times(len(restarts))))),
         "told": "; ".join(
@@ -202,7 +202,7 @@ def _silent(restarts: Sequence[Restart]) -> bool:
     return len(restarts) > 1 and all(restart.silent_s >= MIN_SILENCE_S for restart in restarts)
 
 
-def _told(mcu: McuConfig, restart: Restart) -> tuple[str, str]:
+def _restart_texts(mcu: McuConfig, restart: Restart) -> tuple[str, str]:
     turned = [motor for motor in range(4) if restart.turned[motor]]
     when = f"{motor_names(mcu, turned, ', ')} turned" if turned else "no motor turned"
     return when, restart.sign + (f" (reset={restart.cause})" if restart.cause else "")

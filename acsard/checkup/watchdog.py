@@ -142,14 +142,14 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Bounds:
         return motion.STANDSTILL_TIMEOUT_S, NOT_MEASURED
     by_counts = _per_turn(board, motors) > 0
     if not (board.own_clock or by_counts or trial.first >= STOPPED):
-        return _asked(board, motors, stop, (least_s, trial.silent_s))
+        return _bisect_timeout(board, motors, stop, (least_s, trial.silent_s))
     # Each of the two distances may be wrong by one jump of the reported speeds, and a motor that
     # slows down may add half a jump.
     about_s = max(2.5 * stop.grain_s, 0.0 if by_counts else board.gap_s / 2)
     return max(0.0, ran_on_s - about_s), max(0.0, ran_on_s + about_s)
 
 
-def _asked(board: Board, motors: Sequence[int], stop: Run, bounds: Bounds) -> Bounds:
+def _bisect_timeout(board: Board, motors: Sequence[int], stop: Run, bounds: Bounds) -> Bounds:
     """Measure by bisection for how long motors run on after the last line.
 
     Return a lower and an upper bound of this time, s. The search begins with `bounds`. `stop` is
@@ -182,7 +182,7 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
     began_s = board.now_s
     full = run_up(board, command(motors))
     if max(abs(full[motor]) for motor in motors) < motion.SPEED / 2:
-        board.rest()
+        board.stop_motors()
         letters = ", ".join(LETTERS[motor] for motor in motors)
         raise StoppedError(outcomes.find("watchdog: weak", letters=letters))
     # The ramp is over in the second half of the time since `began_s`.
@@ -193,9 +193,9 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
             board.wire.send(line)
         board.listen(min(left_s, board.period_s) if line else left_s)
     silent_s, before = board.now_s - told_s, len(board.replies)
-    board.ask()
+    board.send_zero()
     told_s = told_s if length_s else board.sent_s
-    board.rest()
+    board.stop_motors()
     first, second = (_share(reply, motors) for reply in board.replies[before : before + 2])
     course = motion.since(board.replies, told_s)
     slow_s = next(

@@ -15,7 +15,7 @@ from msgspec import Struct, structs
 
 from acsard.checkup import motion, outcomes
 from acsard.checkup.board import Board, Operator
-from acsard.checkup.findings import Finding, motor_name, wheel_of, words
+from acsard.checkup.findings import Finding, motor_name, wheel_of, with_spaces
 from acsard.checkup.motion import PROBE_MOVING_SPEED, SHORT_MEASUREMENT_S, SPEED, ZERO, moving
 from acsard.core.config.settings import McuConfig
 from acsard.core.link.codec import LETTERS, Motors
@@ -125,14 +125,14 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
     )
     loose = channel.kind in FOLLOWING_KINDS and channel.wheel == ""
     return outcomes.find(
-        "motor: loose" if loose else f"motor: {channel.kind}{_whose(mcu, channel)}",
+        "motor: loose" if loose else f"motor: {channel.kind}{_fault_suffix(mcu, channel)}",
         name=motor_name(mcu, motor),
         figure=f"{forth:+.2f} {'rad/s, probed' if channel.probed else f'{back:+.2f} rad/s'}",
         shown=", ".join(f"encoder {LETTERS[m]} {channel.forth[m]:+.2f}" for m in moved),
         here=LETTERS[motor],
         there=LETTERS[there],
         reversed=", and one motor or encoder is reversed" if channel.forth[there] < 0 else "",
-        wheel=words(wheel_of(mcu, motor)[0]),
+        wheel=with_spaces(wheel_of(mcu, motor)[0]),
         error=channel.error,
         which="slower" if forth - back < 2 * SPEED else "faster",
         tolerance=FAIL_TOLERANCE,
@@ -141,7 +141,7 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
     )
 
 
-def _whose(mcu: McuConfig, channel: Channel) -> str:
+def _fault_suffix(mcu: McuConfig, channel: Channel) -> str:
     """Return the end of the outcome's name that says which part is at fault, such as ", motor".
 
     Only the wheel and the direction that the operator saw can distinguish a wrong motor from a
@@ -179,14 +179,14 @@ def wheel_map(mcu: McuConfig, channels: Sequence[Channel]) -> Finding:
         if channel.kind in FOLLOWING_KINDS and channel.wheel:
             wheel, sign = channel.wheel, 1 if channel.forward else -1
         if wheel in entries:
-            return outcomes.find("wheel map: twice", wheel=words(wheel))
+            return outcomes.find("wheel map: twice", wheel=with_spaces(wheel))
         entries[wheel] = f"{'+' if sign > 0 else '-'}{LETTERS[channel.motor]}"
     wrong = [wheel for wheel in WHEELS if entries[wheel] != getattr(mcu.wheels, wheel)]
     return outcomes.find(
         "wheel map: other" if wrong else "wheel map: right",
         {f"mcu.wheels.{wheel}": entries[wheel] for wheel in WHEELS},
         map=" ".join(entries[wheel] for wheel in WHEELS),
-        wheels=", ".join(map(words, wrong)),
+        wheels=", ".join(map(with_spaces, wrong)),
     )
 
 
@@ -298,12 +298,12 @@ def _both_ways(board: Board, motor: int) -> Channel:
         return Channel(motor, speeds, ZERO, probed=True)
     (forth, unsure), back = turn(board, motor, motion.SPEED), ZERO
     if motor in moving(forth):
-        board.rest()
+        board.stop_motors()
         back, other = turn(board, motor, -motion.SPEED)
         unsure = max(unsure, other)
     if motor not in moving(back):
         board.stop_and_be_silent(motion.WATCHDOG_SILENCE_S)
-    board.rest()
+    board.stop_motors()
     return Channel(motor, forth, back, unsure=unsure)
 
 
@@ -335,7 +335,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     coasting = board.replies[-1].motors if board.replies else ZERO
     began_s = board.now_s
 
-    def shown() -> Motors:
+    def mean_speeds() -> Motors:
         """Return each encoder's mean speed in the probe, rad/s.
 
         The movement of a motor that still coasted when the probe began is subtracted.
@@ -350,16 +350,16 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
         board.now_s < began_s + motion.SHORT_MEASUREMENT_S and own > -4 * motion.PROBE_MOVING_SPEED
     ):
         board.drive(only_motor(motor, speed), board.period_s)
-        own = shown()[motor]
+        own = mean_speeds()[motor]
     if own >= motion.PROBE_MOVING_SPEED:
         return None
     # Without a correct encoder, the firmware may drive the motor to full speed although it receives
     # zeros. Only its watchdog stops the motor. So a motor that has moved must stand still before
     # the next zeros are sent.
-    moved = moving(shown(), motion.PROBE_MOVING_SPEED)
+    moved = moving(mean_speeds(), motion.PROBE_MOVING_SPEED)
     board.stop_and_be_silent(motion.STANDSTILL_TIMEOUT_S if moved else motion.WATCHDOG_SILENCE_S)
-    board.rest()
-    speeds = shown()
+    board.stop_motors()
+    speeds = mean_speeds()
     return None if speeds[motor] >= motion.PROBE_MOVING_SPEED else speeds
 
 
@@ -372,7 +372,7 @@ def _with_other_comma(board: Board, dead: Channel) -> Channel:
         return dead
     turn(board, dead.motor, motion.SPEED)
     board.latched = not board.settles(configured)
-    board.rest()
+    board.stop_motors()
     return channel
 
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import get_args, get_type_hints
 
 from acsard.cli import parser
-from acsard.core.config.live import flat, live
+from acsard.core.config.live import find_live_setting, flat
 from acsard.core.config.named_faults import ARGUMENTS, FAULTS
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config, LogConfig
@@ -64,7 +64,7 @@ def main(args: argparse.Namespace) -> int:
         raise missing("shtab", "shell") from None
     whole = parser()
     kinds = {"FILE": shtab.FILE, "DIR": shtab.DIRECTORY, "DIRECTORY": shtab.DIRECTORY}
-    known = _words()
+    known = _candidates()
     for verb, action in _actions(whole):
         kind = kinds.get(str(action.metavar))
         if verb == "recording" and action.dest == "file":
@@ -84,14 +84,14 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _words() -> Mapping[tuple[str, str], list[str]]:
+def _candidates() -> Mapping[tuple[str, str], list[str]]:
     config = Config()
     sources = [source.name for source in config.commands.sources]
     published = [topic.key for topic in PUBLISHED]
     incoming = [*source_keys(sources), "imu"]
     followed = [*published, *map(json_key, published), *incoming]
     asked = [t.key for t in TOPICS if t.direction == "query" and "<" not in t.key]
-    settings = [key for key, _ in flat(effective(config)) if live(key)]
+    settings = [key for key, _ in flat(effective(config)) if find_live_setting(key)]
     levels = [str(level) for level in get_args(get_type_hints(LogConfig)["level"])]
     return {
         ("get", "key"): [*published, *asked, *(f"schema/{name}" for name in SCHEMAS)],

@@ -174,14 +174,14 @@ def explained(
     come, end, looked = Event(), Event(), Event()
     began_s = time.monotonic()
 
-    def say(reason: str) -> bool:
+    def print_reason(reason: str) -> bool:
         if reason and not come.is_set():
             print(f"acsard: {printable(reason)}", file=sys.stderr, flush=True)
         return bool(reason)
 
-    def tell() -> None:
+    def print_reasons() -> None:
         try:
-            reported = not come.wait(min(after_s, timeout_s)) and say(look())
+            reported = not come.wait(min(after_s, timeout_s)) and print_reason(look())
         finally:
             looked.set()
         while ceased is not None and not end.wait(after_s):
@@ -189,9 +189,9 @@ def explained(
                 come.clear()
                 reported = False
             elif not reported:
-                reported = say(ceased())
+                reported = print_reason(ceased())
 
-    Thread(target=tell, name="waiting", daemon=True).start()
+    Thread(target=print_reasons, name="waiting", daemon=True).start()
     try:
         yield come.set
         if time.monotonic() - began_s >= timeout_s:

@@ -49,7 +49,7 @@ def main(args: argparse.Namespace) -> int:
         )
     with connected(args, args.source) as robot:
         if robot.where.tls and not has((us := robot.whoami()).role, COMMAND_ROLE):
-            raise (NotPermittedError if us.role else NoAnswerError)(us.words())
+            raise (NotPermittedError if us.role else NoAnswerError)(us.describe())
         ride = KeyboardDrive(robot, Keyboard(args.linear, args.angular))
         try:
             terminal.drive(ride)

@@ -146,7 +146,7 @@ def _print(
             on_message()
             whose = robot_of(str(sample.key_expr)) if of_many else ""
             if quota.take(whose):
-                print(_shown(decoder, *encoded(sample), whose), flush=True)
+                print(_message_text(decoder, *encoded(sample), whose), flush=True)
                 printed_s = time.monotonic()
             elif timeout is not None and time.monotonic() - printed_s > timeout:
                 return 1
@@ -166,7 +166,7 @@ def _shortened(key: str) -> Decoder[Any]:
     return Decoder(MESSAGES[topic.type])
 
 
-def _shown(decoder: Decoder[Any] | None, encoding: str, payload: bytes, whose: str) -> str:
+def _message_text(decoder: Decoder[Any] | None, encoding: str, payload: bytes, whose: str) -> str:
     if decoder is not None:
         try:
             text = short(decoder.decode(encoding, payload))

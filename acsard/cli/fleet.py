@@ -54,6 +54,6 @@ def main(args: argparse.Namespace) -> int:
         width = output_size().columns
         # Flush now, so that a session that closes slowly does not hold back the table.
         print("\n".join(table(rows, width)), flush=True)
-    for text in filter(None, (fleet.seen, fleet.left_out_text)):
+    for text in filter(None, (fleet.presence_text, fleet.left_out_text)):
         print(f"acsard: {text}", file=sys.stderr)
     return int(Exit.OK)

@@ -43,7 +43,7 @@ def main(args: argparse.Namespace) -> int:
         raise missing("foxglove-sdk", "foxglove") from None
     address = loopback(args.address)
     with connected(args) as robot:
-        bridge = Bridge(robot, address, _tell, acts=args.drive)
+        bridge = Bridge(robot, address, _print_message, acts=args.drive)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda *_: bridge.end())
         try:
@@ -80,5 +80,5 @@ def loopback(text: str) -> tuple[str, int]:
     return str(address), port
 
 
-def _tell(text: str) -> None:
+def _print_message(text: str) -> None:
     print(f"acsard: {lines(text)}", file=sys.stderr, flush=True)

@@ -95,9 +95,9 @@ def _checked(
     port, simulated = config.mcu.port, config.mcu.simulated
     findings: list[Finding] = []
 
-    def tell(finding: Finding) -> None:
+    def report_finding(finding: Finding) -> None:
         findings.append(finding)
-        prompt.found(finding)
+        prompt.show_finding(finding)
 
     words = " (the built-in SIMULATOR, in simulated time)" if simulated else ""
     prompt.begin(f"port {port}{words}, configuration {where}", simulated=simulated)
@@ -109,7 +109,7 @@ def _checked(
             ),
             single_key_mode() if isinstance(prompt, TerminalPrompt) else nullcontext(),
         ):
-            procedure.run(_wire(config), prompt, config, tell, clock.asleep_ns)
+            procedure.run(_wire(config), prompt, config, report_finding, clock.asleep_ns)
     except MendableError as error:
         if not args.json:
             raise

@@ -323,11 +323,11 @@ def _show(recording: Recording, part: Span, as_json: bool) -> bool:
         if part.begin <= seconds <= part.end or (over and has_steps):
             has_steps = True
             for entry in entries:
-                _tell(entry, as_json)
+                _print_entry(entry, as_json)
     if over or (part.begin > 0.0 and not has_steps):
         return has_steps
     for entry in story.end("" if _is_being_recorded(recording) else recording.ending):
-        _tell(entry, as_json)
+        _print_entry(entry, as_json)
     return has_steps
 
 
@@ -343,7 +343,7 @@ def _note(recording: Recording, note: str) -> None:
         print(f"{recording.path}: {note.strip()}", file=sys.stderr)
 
 
-def _tell(entry: TimelineEntry, as_json: bool) -> None:
+def _print_entry(entry: TimelineEntry, as_json: bool) -> None:
     if as_json:
         print(json_line(msgspec.json.encode(entry).decode()))
     else:
@@ -574,12 +574,12 @@ def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
     began_ns, last = recording.about.wall_ns, read_end(recording.paths[-1])
     whole = f" of {(last.last_ns - began_ns) / 1e9:.0f}" if last else ""
 
-    def tell(wall_ns: int) -> None:
+    def print_progress(wall_ns: int) -> None:
         text = f"\r{(wall_ns - began_ns) / 1e9:.0f}{whole} s of the recording"
         print(text, end="", file=sys.stderr, flush=True)
 
     try:
-        yield tell
+        yield print_progress
     finally:
         print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
@@ -603,11 +603,11 @@ def _percent(recording: Recording) -> Callable[[int], None]:
     end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime
     told = 0
 
-    def tell(at_ns: int) -> None:
+    def print_percent(at_ns: int) -> None:
         nonlocal told
         percent = int(100 * (at_ns / 1e9 - began) / max(1.0, end - began))
         if told < percent < 100:
             told = percent
             print(percent, file=sys.stderr, flush=True)
 
-    return tell
+    return print_percent

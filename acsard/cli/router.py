@@ -34,7 +34,7 @@ def main(args: argparse.Namespace) -> int:
     router, log = Router(args.file), Log(LogConfig())
     try:
         if not args.supervised:
-            return asyncio.run(_kept(str(args.file), log))
+            return asyncio.run(_keep_router(str(args.file), log))
         log_from_environment()
         manager = Systemd({}, os.getpid())
         return int(ListenerProcess(router, log, manager, sys.stdin.fileno()).run())
@@ -42,7 +42,7 @@ def main(args: argparse.Namespace) -> int:
         log.close()
 
 
-async def _kept(file: str, log: Log) -> int:
+async def _keep_router(file: str, log: Log) -> int:
     """Run a router process, and restart it whenever it ends. Return 0 after a signal.
 
     If the router cannot use its configuration or its certificates, return its exit code.

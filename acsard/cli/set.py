@@ -24,7 +24,7 @@ import msgspec
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
 from acsard.cli.replies import of_each, print_each
 from acsard.client import Client
-from acsard.core.config.live import flat, live
+from acsard.core.config.live import find_live_setting, flat
 from acsard.core.config.lowered import LIMITS_PREFIX, lowered, survives_restart
 from acsard.core.config.settings import LimitsConfig
 from acsard.core.config.validation import finite, show
@@ -79,7 +79,7 @@ def main(args: argparse.Namespace) -> int:
         require_changeable(file, settings)
     with connected_to_many(args) as (robot, many):
         if not settings:
-            _tell(robot.get("config"), args.json)
+            _print_settings(robot.get("config"), args.json)
             return int(Exit.OK)
         if many:
             return _set_all(robot, many, settings, keep=args.keep, as_json=args.json)
@@ -196,8 +196,8 @@ def _file(path: str | None, settings: dict[str, Plain]) -> Path:
     return writable(path)
 
 
-def _tell(config: object, as_json: bool) -> None:
-    now = {key: value for key, value in flat(config) if live(key)}
+def _print_settings(config: object, as_json: bool) -> None:
+    now = {key: value for key, value in flat(config) if find_live_setting(key)}
     if as_json:
         print(msgspec.json.encode(now).decode())
         return

@@ -23,5 +23,5 @@ def main(args: argparse.Namespace) -> int:
         if args.once or not has_screen():
             print(terminal.one_screen(feed))
         else:
-            terminal.live(feed)
+            terminal.show_live(feed)
     return 0

@@ -25,7 +25,7 @@ def main(args: argparse.Namespace) -> int:
     if args.json:
         print(msgspec.json.encode(us).decode())
     else:
-        print(f"{us.words()}\nsender {us.sender}")
+        print(f"{us.describe()}\nsender {us.sender}")
     if us.role:
         return int(Exit.OK)
     return int(Exit.NO_PERMISSION if us.certificate else Exit.UNREACHABLE)

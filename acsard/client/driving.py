@@ -123,7 +123,7 @@ def _opening(checks: _Drive) -> Iterator[float]:
         checks.send(0.0, 0.0)
         yield OPENING_PERIOD_S
         checks.require_no_pause()
-        checks.look()
+        checks.process_states()
         if passed >= OPEN_TIMEOUT_S or (passed >= SETTLED_S and checks.refuses_for_good):
             checks.require(0.0)
 
@@ -140,7 +140,7 @@ def _stopping(checks: _Drive) -> Iterator[float]:
     while since + SLOWS_S > (now := clock.steady_s()) or watch.age(now) > MAX_STATE_AGE_S:
         checks.send(0.0, 0.0)
         yield SEND_PERIOD_S
-        checks.look()
+        checks.process_states()
         if checks.refuses_for_good:
             checks.require(0.0)
         if watch.state is None or watch.last_seen < begun + SETTLED_S:
@@ -192,10 +192,10 @@ class _Drive:
                 "program from running, or did the network to the daemon fail?"
             )
 
-    def look(self) -> None:
+    def process_states(self) -> None:
         now, watch = clock.steady_s(), self.watch
         try:
-            states = watch.look(now)
+            states = watch.poll(now)
         except zenoh.ZError:
             raise NoAnswerError(CONNECTION_CLOSED) from None
         for state in states:
@@ -218,7 +218,7 @@ class _Drive:
         Raise it immediately if the daemon will keep refusing the commands. If the daemon receives
         no commands of this client's source, the error is an `UnheardError`.
         """
-        self.look()
+        self.process_states()
         if not self.objection:
             return
         if self.refuses_for_good or clock.steady_s() - self._followed_s >= grace:

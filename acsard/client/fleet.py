@@ -2,7 +2,8 @@
 
 A daemon is present while Zenoh shows its liveliness token. Zenoh's threads store the newest states
 undecoded, and the thread that calls `Fleet.rows()` decodes them. This thread also calls
-`Fleet.due()` and `Fleet.ask()`. Of these three methods, only `Fleet.ask()` may wait for the bus.
+`Fleet.due()` and `Fleet.send_queries()`. Of these three methods, only `Fleet.send_queries()` may
+wait for the bus.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class Row(Struct, frozen=True):
     """Whether the robot counts as silent, because no new state has arrived (see `Follower`)."""
 
 
-class _Known:
+class _TrackedRobot:
     def __init__(self) -> None:
         self.here: bool | None = None
         self.version = ""
@@ -83,7 +84,7 @@ class Fleet:
         self._lock = Lock()
         self.left_out = False
         """Whether a robot was left out because there were already `most` robots."""
-        self._known = {robot_id: _Known() for robot_id in ids if robot_id != ALL_ROBOTS}
+        self._known = {robot_id: _TrackedRobot() for robot_id in ids if robot_id != ALL_ROBOTS}
         self._states, self._infos = Decoder(RobotState), Decoder(Info)
         self._declared: list[Any] = []
         session, liveliness = robot.session, robot.session.liveliness()
@@ -113,9 +114,10 @@ class Fleet:
             return [self._row(name, robot, now) for name, robot in self._known.items()]
 
     def due(self) -> list[tuple[str, str]]:
-        """Return the queries that are due now, as pairs of robot id and key. Pass them to `ask()`.
+        """Return the queries that are due now, as pairs of robot id and key.
 
-        The method also sets the times of the next queries, so a query is returned only once.
+        Pass them to `send_queries()`. The method also sets the times of the next queries, so a
+        query is returned only once.
         """
         now, due = clock.steady_s(), []
         with self._lock:
@@ -128,10 +130,12 @@ class Fleet:
                     due.append((name, "info"))
         return due
 
-    def ask(self, due: Sequence[tuple[str, str]]) -> None:
+    def send_queries(self, due: Sequence[tuple[str, str]]) -> None:
         """Send the queries that `due()` returned. This may wait for the bus. Raises `ZError`."""
         for name, key in due:
-            self._robot.sibling(name).ask(key, self._answer if key == "state" else self._info)
+            self._robot.sibling(name).start_query(
+                key, self._answer if key == "state" else self._info
+            )
 
     def is_present(self, robot_id: str) -> bool:
         """Return whether the liveliness token of this robot's daemon is present."""
@@ -143,7 +147,7 @@ class Fleet:
         for subscriber in self._declared:
             subscriber.undeclare()
 
-    def _row(self, name: str, robot: _Known, now: float) -> Row:
+    def _row(self, name: str, robot: _TrackedRobot, now: float) -> Row:
         follower, state = robot.follower, robot.follower.state
         silent = follower.silent(now)
         if robot.here and not follower.is_confirmed and not silent:
@@ -152,7 +156,7 @@ class Fleet:
         age = follower.age(now) if follower.is_confirmed else math.inf
         return Row(name, robot.here, state, age, robot.version, silent)
 
-    def _take(self, robot: _Known) -> None:
+    def _take(self, robot: _TrackedRobot) -> None:
         for sample, at in robot.newest.take():
             try:
                 robot.follower.published(self._states.decode(*encoded(sample)), at)
@@ -161,14 +165,14 @@ class Fleet:
 
     # Zenoh's threads call the methods below.
 
-    def _of(self, sample: zenoh.Sample) -> _Known | None:
+    def _of(self, sample: zenoh.Sample) -> _TrackedRobot | None:
         name = robot_of(str(sample.key_expr))
         with self._lock:
             if name not in self._known and name:
                 if len(self._known) >= self._most:
                     self._forget_one()
                 if len(self._known) < self._most:
-                    self._known[name] = _Known()
+                    self._known[name] = _TrackedRobot()
                 else:
                     self.left_out = True
             return self._known.get(name)

@@ -151,7 +151,7 @@ class Followed(Protocol):
     def subscribe(self, name: str) -> Subscription:
         """Subscribe to a key."""
 
-    def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
+    def start_query(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
         """Query a key. Call `take` with each reply that arrives."""
 
 
@@ -173,7 +173,7 @@ class Watch(Follower):
         self._answers = Mailbox[zenoh.Sample](MAX_WAITING_ANSWERS)
         """Replies to queries, which a thread of Zenoh adds."""
 
-    def look(self, now: float) -> list[RobotState]:
+    def poll(self, now: float) -> list[RobotState]:
         """Process the states that have arrived, and return the new states.
 
         If no state has arrived for some time, also send a query. A later call processes its reply.
@@ -184,21 +184,21 @@ class Watch(Follower):
             sample = self._states.try_recv()
             if sample is None:
                 break
-            state = self._read(sample)
+            state = self._decode(sample)
             if state is not None:
                 self.published(state, now)
                 states.append(state)
         # Process the replies last, so that `answered` compares their stamps with the published
         # states. `published` compares no stamps.
         for sample in self._answers.take():
-            state = self._read(sample)
+            state = self._decode(sample)
             if state is not None and self.answered(state, now):
                 states.append(state)
         if self.query_is_due(now):
-            self._robot.ask(STATE_KEY, self._answers.put)
+            self._robot.start_query(STATE_KEY, self._answers.put)
         return states
 
-    def _read(self, sample: zenoh.Sample) -> RobotState | None:
+    def _decode(self, sample: zenoh.Sample) -> RobotState | None:
         try:
             return self._decoder.decode(*encoded(sample))
         except DecodeError:

@@ -33,7 +33,7 @@ class Outbox:
         self.dead: Future[Never] = Future()
         """Future that gets the exception that ended the thread. No command is sent after that. The
         future stays pending while the thread runs, and also if `end` ends the thread."""
-        self._thread = Thread(target=self._live, name="outbox", daemon=True)
+        self._thread = Thread(target=self._run, name="outbox", daemon=True)
         self._thread.start()
 
     def take(self, commander: Commander, put: Put, wish: Wish) -> int | None:
@@ -74,7 +74,7 @@ class Outbox:
             self._news.notify_all()
         self._thread.join(seconds)
 
-    def _live(self) -> None:
+    def _run(self) -> None:
         try:
             while self._round():
                 pass

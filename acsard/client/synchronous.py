@@ -311,7 +311,7 @@ class Client:
         Unlike `call`, this does not add the field `latch`.
         """
         payload = msgspec.json.encode(fields) if fields else None
-        return Decoder(schema.ServiceReply).decode(*self._ask(service_key(service), payload))
+        return Decoder(schema.ServiceReply).decode(*self._query(service_key(service), payload))
 
     def get(self, name: str) -> Any:
         """Return the last message on a key such as `odom` or `state`, decoded to its type."""
@@ -319,13 +319,15 @@ class Client:
 
     def reply(self, name: str) -> tuple[str, bytes]:
         """Return the last message on a key, not decoded, as a pair of encoding and payload."""
-        return self._ask(name)
+        return self._query(name)
 
     def whoami(self) -> Identity:
         """Return this client's role and name at the robot. The role is "" if it is unknown."""
         where = self.where
         try:
-            return identity(self.ask, where.tls, self.sender, where.robot_id, where.endpoint)
+            return identity(
+                self.start_query, where.tls, self.sender, where.robot_id, where.endpoint
+            )
         except zenoh.ZError:
             raise self._refused("whoami") from None
 
@@ -369,7 +371,7 @@ class Client:
         """
         return Subscription(self._queue(name), self.key(name))
 
-    def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
+    def start_query(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
         """Query a key, and return immediately. A thread of Zenoh calls `take` with each reply.
 
         Error replies are ignored.
@@ -429,7 +431,7 @@ class Client:
         else:
             self._spacing.moving.pop(self, None)
 
-    def _ask(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
+    def _query(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
         # Ignore later replies, because any client on the bus may send any number of replies.
         end_s = time.monotonic() + REPLY_TIMEOUT_S
         while True:
@@ -512,10 +514,10 @@ class Client:
         if isinstance(error, NoAnswerError):
             return error
         if us.role and not has(us.role, COMMAND_ROLE):
-            return NotPermittedError(us.words())
+            return NotPermittedError(us.describe())
         # The role may explain why no command arrives, but not a fault or a stop.
         unexplained = str(error) == no_command(self.source)
-        return NotDrivenError(f"{error}; {us.words()}" if unexplained else str(error))
+        return NotDrivenError(f"{error}; {us.describe()}" if unexplained else str(error))
 
 
 class _PartialImu(schema.Imu, frozen=True, kw_only=True):

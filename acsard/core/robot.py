@@ -317,7 +317,9 @@ class Robot:
             inputs.now, inputs.port_open, inputs.opened, inputs.received, unsent, inputs.late_ns
         )
         link = session.link
-        warning = self._answered.look(self.counters["lines_sent"], session.good_lines, link == "up")
+        warning = self._answered.check(
+            self.counters["lines_sent"], session.good_lines, link == "up"
+        )
         if warning is not None:
             events.append(warning)
         if before == "up" != link:
@@ -336,7 +338,7 @@ class Robot:
             for part in (self._estop, self._bumpers, self._battery):
                 part.reopen()
         known = self._estop.state or self._bumpers.state or self._battery.status
-        is_blocked = self._unreported or self._battery.held
+        is_blocked = self._unreported or self._battery.refuses_clear
         if session.statuses or known or is_blocked or session.forgot:
             self._watch_inputs(inputs.now, events)
         if link != "up":
@@ -373,11 +375,11 @@ class Robot:
         ended between two steps.
         """
         estop, bumpers, statuses = self._estop, self._bumpers, self.session.statuses
-        events += estop.look(statuses, now.mono_ns)
+        events += estop.process_reports(statuses, now.mono_ns)
         if estop.pressed_now:
             self.counters["emergency_stops"] += 1
             self._life.press(estop.pressed_now, now)
-        events += bumpers.look(statuses, now.mono_ns)
+        events += bumpers.process_reports(statuses, now.mono_ns)
         if bumpers.pressed_now:
             self.counters["bumper_presses"] += 1
             if bumpers.latching:
@@ -393,7 +395,7 @@ class Robot:
             self._fault(DRIVER_FAULT_REASON, now, events)
             self._life.caused_again(now.mono_ns)
         battery = self._battery
-        events += battery.look(statuses, now.mono_ns)
+        events += battery.process_reports(statuses, now.mono_ns)
         if battery.stopped_now:
             self._life.press(battery.why, now)
         if self.session.forgot:
@@ -403,13 +405,13 @@ class Robot:
         refusal = self._awaited_report() if self._unreported else ("", "")
         if estop.why:
             refusal = estop.why, estop.mend
-        elif bumpers.held:
-            refusal = bumpers.held, bumpers.mend
+        elif bumpers.clear_refusal:
+            refusal = bumpers.clear_refusal, bumpers.mend
         elif self.session.status.driver_fault:
             refusal = DRIVER_FAULT_REASON, DRIVER_FAULT_ADVICE
-        elif battery.held:
+        elif battery.refuses_clear:
             refusal = battery.why, battery.mend
-        self._life.hold(*refusal, now.mono_ns)
+        self._life.refuse_clear(*refusal, now.mono_ns)
 
     def _awaited_report(self) -> tuple[str, str]:
         """Return the cause of a latch from an earlier run of the daemon, and advice about it.
@@ -668,7 +670,7 @@ class Robot:
                     return (
                         MISSING_REASON if self._estop.missing else missing_text(self.config.safety)
                     )
-                return self.session.words(self._port_trouble)
+                return self.session.describe_link(self._port_trouble)
             case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
                 return self._life.why
             case Mode.SHUTDOWN:

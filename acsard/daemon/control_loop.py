@@ -503,7 +503,7 @@ class ControlLoop:
 
     def _publish(self, outputs: Outputs) -> None:
         bus, queued_ns = self._bus, None
-        for key, message in self.report.due(outputs, bus.wanted, self._look):
+        for key, message in self.report.due(outputs, bus.wanted_keys, self._snapshot):
             bus.publish(key, message)
             if key in FEEDBACK_TOPICS:
                 queued_ns = self._mono_ns()
@@ -525,7 +525,7 @@ class ControlLoop:
         Unless `last` is true, an answer waits until the latches are stored, but at most for
         `MAX_ANSWER_DELAY_NS`.
         """
-        is_stored, before_ns = self._handover.held, now.mono_ns - MAX_ANSWER_DELAY_NS
+        is_stored, before_ns = self._handover.is_stored, now.mono_ns - MAX_ANSWER_DELAY_NS
         trouble = "" if is_stored else self._handover.trouble or NOT_STORED
         while self._answers and (is_stored or last or self._answers[0][0] < before_ns):
             _, answer = self._answers.popleft()
@@ -537,10 +537,10 @@ class ControlLoop:
                 self._bus.retire(reply.ticket)
 
     def _current(self, key: str) -> Message | None:
-        message = self.report.current(key, self._look)
+        message = self.report.current(key, self._snapshot)
         return self._beside(key) if message is None and self._beside else message
 
-    def _look(self) -> Snapshot:
+    def _snapshot(self) -> Snapshot:
         outputs = self.outputs
         if self._settings_file is not None:
             self.report.settings_differ = self._settings_file.differ

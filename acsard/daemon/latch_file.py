@@ -161,7 +161,7 @@ class LatchFile:
         time of that stop. Raises `InUseError` if another daemon uses this file.
         """
         try:
-            latches = await in_thread(lambda: self._look(now), HANG_TIMEOUT_S)
+            latches = await in_thread(lambda: self._load(now), HANG_TIMEOUT_S)
         except TimeoutError as error:
             self._abandoned = True
             why = str(error) if isinstance(error, NoThreadError) else DISK_HANGS
@@ -191,7 +191,7 @@ class LatchFile:
         self._threads = threads
         return latches
 
-    def _look(self, now: Instant) -> Latches:
+    def _load(self, now: Instant) -> Latches:
         with self._disk:
             if self._abandoned:
                 return Latches()

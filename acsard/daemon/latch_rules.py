@@ -249,7 +249,7 @@ class Handover:
         self.take(latches)
 
     @property
-    def held(self) -> bool:
+    def is_stored(self) -> bool:
         """Whether the latches are stored, so that they survive a kill of the process.
 
         Without a keeper this is always True, because no latches need to be stored.

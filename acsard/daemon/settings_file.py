@@ -158,7 +158,7 @@ class SettingsFile:
                 set with the Zenoh key `speed_limit`.
         """
         self._in_force = config
-        self._look()
+        self._wake_thread()
 
     def keep(self, request: Request, now_ns: int) -> None:
         """Queue a `set` request with the field `keep`, so that the thread checks it.
@@ -184,7 +184,7 @@ class SettingsFile:
         if not why:
             self._box.put(request)
 
-    def _look(self) -> None:
+    def _wake_thread(self) -> None:
         # If requests wait, the thread is awake. In a full queue, "look" would displace a request.
         if not self._box.waiting:
             self._box.put("look")
@@ -207,7 +207,7 @@ class SettingsFile:
             return False
         pending.answer = answer
         self._changes.append((pending.edit, answer))
-        self._look()
+        self._wake_thread()
         return True
 
     def results(self, now_ns: int, events: list[Event]) -> list[Request | Answer]:
@@ -356,7 +356,7 @@ class SettingsFile:
         # Comparing all settings takes 1 ms, and they are usually the same objects as last time.
         if self._compared[0] is not in_force or self._compared[1] is not written:
             changes = differences(in_force, written)
-            texts = [change.words(key) for key, change in changes.items()]
+            texts = [change.describe(key) for key, change in changes.items()]
             self._compared = in_force, written, listed(texts, MAX_NAMED)
         return self._compared[2]
 

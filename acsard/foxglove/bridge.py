@@ -26,7 +26,7 @@ from acsard.foxglove.server import (
     Listener,
     Refusals,
     Settings,
-    Shown,
+    ShownTopics,
     as_parameters,
     services,
     start,
@@ -78,7 +78,7 @@ class Bridge:
         self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
         facts = learn(robot)
         ros = facts.config.ros
-        self._shown_topics = Shown(self._wake.set)
+        self._shown_topics = ShownTopics(self._wake.set)
         self._settings = Settings(robot, self._notices, facts.tables, self._wake.set)
         topic = full_name(ros.namespace, "cmd_vel")
         self._drives = Drives(self._viewer, topic, self._notices, facts.forbidden)
@@ -147,7 +147,7 @@ class Bridge:
         topics, fresh = self._shown_topics.take()
         self._relay.follow(topics, fresh)
         if self._commands_hidden_reason and not topics.isdisjoint(self._relay.commanders):
-            self._notices.say(
+            self._notices.enqueue(
                 "warning", "commands", self._commands_hidden_reason, status_id="commands"
             )
             self._commands_hidden_reason = ""
@@ -160,7 +160,7 @@ class Bridge:
 
     def _went(self) -> None:
         words = f"the daemon of robot {self._id} is gone; `acsard foxglove` waits for it"
-        self._notices.say("error", "daemon", words, status_id=DAEMON_GONE_ID)
+        self._notices.enqueue("error", "daemon", words, status_id=DAEMON_GONE_ID)
 
     def _came_back(self) -> None:
         # The daemon may restart during the query, which makes the reply outdated.
@@ -169,11 +169,11 @@ class Bridge:
             facts = learn(self._robot)
         except AcsardError as error:
             self._outdated, self._retry_s = True, clock.steady_s() + LEARN_RETRY_S
-            self._notices.say("error", "daemon", str(error), status_id=DAEMON_GONE_ID)
+            self._notices.enqueue("error", "daemon", str(error), status_id=DAEMON_GONE_ID)
             return
         self._learn(facts)
         self._notices.remove(DAEMON_GONE_ID)
-        self._notices.say("info", "daemon", f"the daemon of robot {self._id} is back")
+        self._notices.enqueue("info", "daemon", f"the daemon of robot {self._id} is back")
 
     def _learn(self, facts: Facts) -> None:
         self._relay.offer(facts)
@@ -197,7 +197,7 @@ class Bridge:
             self._watch = Watch(self._robot, now, self._wake.set)
         if self._watch is not None:
             with suppress(zenoh.ZError):  # the session is closed: the program is ending
-                self._watch.look(now)
+                self._watch.poll(now)
 
     def _object(self, driving: dict[int, Client]) -> None:
         """Tell all viewers why the robot does not follow the commands of a viewer.
@@ -212,13 +212,13 @@ class Bridge:
             robot, why = driving.get(client), ""
             if robot is not None and self._watch is not None:
                 why = self._watch.objection(robot.source, robot.sender, now_ns / NS_PER_S)
-            if objections.look(why, now_ns):
+            if objections.update(why, now_ns):
                 status_id = f"drive {client}"
                 if objections.reported:
                     zero_first = "must send a zero" in objections.reported
                     mend = f" ({RELEASE_ADVICE})" if zero_first else ""
                     words = f"your commands do not drive the robot: {objections.reported}{mend}"
-                    self._notices.say("warning", "drive", words, status_id=status_id)
+                    self._notices.enqueue("warning", "drive", words, status_id=status_id)
                 else:
                     self._notices.remove(status_id)
             if robot is None:

@@ -164,15 +164,15 @@ class Drives:
             return
         encoding, problem = viewer.channels.get(channel, ("", TOO_MANY_CHANNELS))
         if not encoding:
-            self._notices.say("warning", "drive", problem)
+            self._notices.enqueue("warning", "drive", problem)
             return
         if self.forbidden:
-            self._notices.say("error", "drive", self.forbidden)
+            self._notices.enqueue("error", "drive", self.forbidden)
             return
         try:
             wished = wish(encoding, data)
         except DecodeError as error:
-            self._notices.say("warning", "drive", f"{self.topic}: refused: {error}")
+            self._notices.enqueue("warning", "drive", f"{self.topic}: refused: {error}")
             return
         robot = viewer.robot
         with self._lock:
@@ -182,7 +182,7 @@ class Drives:
                 viewer.commander, lambda due: self._send(robot, due), wished
             )
         if viewer.is_slow(silence_ns):
-            self._notices.say(
+            self._notices.enqueue(
                 "warning",
                 "drive",
                 "the panel publishes so rarely that the robot stops between its messages: set the "
@@ -231,4 +231,4 @@ class Drives:
         except zenoh.ZError as error:
             words = "the bus accepts no commands, so the commands of all panels are lost"
             mend = "run `acsard doctor` on the robot"
-            self._notices.say("error", "drive", f"{words} ({error}): {mend}")
+            self._notices.enqueue("error", "drive", f"{words} ({error}): {mend}")

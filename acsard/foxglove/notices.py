@@ -53,7 +53,7 @@ class Notices:
         self._texts = Buckets(REPEAT_RATE)
         self._staying: dict[str, Notice] = {}
 
-    def say(self, level: Level, name: str, text: str, status_id: str = "") -> None:
+    def enqueue(self, level: Level, name: str, text: str, status_id: str = "") -> None:
         """Queue a message to all viewers.
 
         Args:
@@ -112,7 +112,7 @@ class Objections:
         """Reason why the robot does not follow the viewer, as it was last reported, in words. It is
         "" if no reason is reported."""
 
-    def look(self, objection: str, now_ns: int) -> bool:
+    def update(self, objection: str, now_ns: int) -> bool:
         """Update the reported reason `reported`, and return whether it has changed.
 
         A reason is reported if the robot has not followed the viewer for `GRACE_S`.

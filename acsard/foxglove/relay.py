@@ -138,7 +138,7 @@ class Commanders:
         self._robot, self._wake = robot, wake
         self._reader, self._commands_hidden = Reader(Config()), False
         self._forms: dict[str, dict[str, CommandForm]] = {}
-        self._subscriptions: dict[str, _Heard] = {}
+        self._subscriptions: dict[str, _SourceSubscriptions] = {}
 
     def use(self, facts: Facts) -> None:
         """Use the command sources, keys and permissions in `facts` from now on.
@@ -167,7 +167,9 @@ class Commanders:
         for topic in self._subscriptions.keys() - wanted:
             self._subscriptions.pop(topic).undeclare()
         for topic in wanted - self._subscriptions.keys():
-            self._subscriptions[topic] = _Heard(self._robot.session, self._forms[topic], self._wake)
+            self._subscriptions[topic] = _SourceSubscriptions(
+                self._robot.session, self._forms[topic], self._wake
+            )
 
     def take(self) -> Iterator[tuple[str, TwistStamped]]:
         """Yield a pair (topic, command) for each valid command since the last call."""
@@ -179,7 +181,7 @@ class Commanders:
                     pass  # the daemon refuses it too, and counts the reason
 
 
-class _Heard:
+class _SourceSubscriptions:
     """The subscriptions to the commands of one source, and the queue of these commands."""
 
     def __init__(
@@ -285,7 +287,7 @@ class Relay:
             if out is None or out.key not in self._followed:
                 continue
             if out.key == EVENTS_KEY:
-                self._robot.ask(EVENTS_KEY, self._followed[EVENTS_KEY].add)
+                self._robot.start_query(EVENTS_KEY, self._followed[EVENTS_KEY].add)
             elif out.key in ("tf_static", "diagnostics", "state") and out.last:
                 # These keys are published rarely, so a new viewer receives the last message.
                 out.channel.log(out.last)
@@ -298,7 +300,7 @@ class Relay:
         arrivals = queue_on(self._robot.session, self._robot.key(key), latched=topic.latched)
         arrivals.wakes(self._wake)
         if not topic.latched:
-            self._robot.ask(key, arrivals.put)  # the next message may be seconds away
+            self._robot.start_query(key, arrivals.put)  # the next message may be seconds away
         return Subscription(arrivals, self._robot.key(key))
 
     def forward(self) -> None:

@@ -73,7 +73,7 @@ def learn(robot: Client) -> Facts:
         )
         us = robot.whoami()
         role = us.role
-        forbidden = "" if has(role, COMMAND_ROLE) else us.words()
+        forbidden = "" if has(role, COMMAND_ROLE) else us.describe()
     try:
         sources = tuple(source.name for source in robot.get("state").sources)
         tables = robot.get("config") if has(role, least_role("config")) else None

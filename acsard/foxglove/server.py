@@ -18,7 +18,7 @@ import msgspec
 from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, WebSocketServer
 
 from acsard.client import Client as Robot
-from acsard.core.config.live import flat, live
+from acsard.core.config.live import find_live_setting, flat
 from acsard.core.config.settings import RosConfig
 from acsard.core.messages.encodings import DecodeError, Decoder, encode
 from acsard.core.messages.json_schema import SCHEMAS
@@ -40,7 +40,7 @@ POLL_PERIOD_NS = 5 * NS_PER_S
 needed because other clients may change the settings."""
 
 
-class Shown:
+class ShownTopics:
     """The topics that viewers show, with the viewers that are subscribed to each topic."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
@@ -113,7 +113,7 @@ class Settings:
         """
         with self._lock:
             self._asked = True
-            return asked(self._known, names)
+            return select_settings(self._known, names)
 
     def follow(self, names: Collection[str]) -> None:
         with self._lock:
@@ -139,9 +139,9 @@ class Settings:
                 self._wishes.put(wishes)
         if full:
             text = f"not set: {MAX_WAITING_CHANGES} earlier changes wait for the daemon; try again"
-            self._notices.say("error", "set", text)
+            self._notices.enqueue("error", "set", text)
         with self._lock:
-            return asked(self._known, wishes.keys()) if wishes else {}
+            return select_settings(self._known, wishes.keys()) if wishes else {}
 
     def _change(self, wishes: dict[str, Any]) -> dict[str, Any]:
         """Change all settings in `wishes`, or none.
@@ -160,9 +160,11 @@ class Settings:
                 news = self.learn(self._robot.get("config"))
         except AcsardError as error:
             text, done = str(error), False
-        self._notices.say("info" if done else "error", "set", text if done else f"not set: {text}")
+        self._notices.enqueue(
+            "info" if done else "error", "set", text if done else f"not set: {text}"
+        )
         with self._lock:
-            return news | (asked(self._known, wishes.keys()) if wishes else {})
+            return news | (select_settings(self._known, wishes.keys()) if wishes else {})
 
     def refresh(self, here: bool) -> dict[str, Any]:
         """Make one queued change. If no change waits, query the settings if a viewer needs them.
@@ -195,11 +197,11 @@ def live_settings(config: object) -> dict[str, Any]:
 
     `config` is the configuration as nested dicts. Tuples become lists.
     """
-    items = ((key, value) for key, value in flat(config) if live(key))
+    items = ((key, value) for key, value in flat(config) if find_live_setting(key))
     return {key: list(value) if isinstance(value, tuple) else value for key, value in items}
 
 
-def asked(known: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+def select_settings(known: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
     """Return those settings in `known` whose names are in `names`, or all if `names` is empty."""
     return {key: value for key, value in known.items() if key in names or not names}
 
@@ -211,7 +213,7 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]
 class Listener:
     """The callbacks for requests of viewers. The server runs them on its own threads."""
 
-    def __init__(self, shown: Shown, drives: Drives, settings: Settings) -> None:
+    def __init__(self, shown: ShownTopics, drives: Drives, settings: Settings) -> None:
         self._shown_topics, self._drives, self._settings = shown, drives, settings
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
@@ -314,7 +316,7 @@ class Refusals(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         if "handshake failed" in record.getMessage():
-            self._notices.say(
+            self._notices.enqueue(
                 "warning",
                 "refused",
                 "a client was refused: either it is not a Foxglove viewer, or it is too old for "

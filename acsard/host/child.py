@@ -269,7 +269,7 @@ class Parent:
             with suppress(OSError):
                 os.write(self.fd, b".")  # fails if the buffer is full or the parent has gone
 
-    def gone(self) -> bool:
+    def is_gone(self) -> bool:
         """Return whether the parent has closed the socket. Call this only if `fd` is readable."""
         try:
             return not os.read(self.fd, 64)

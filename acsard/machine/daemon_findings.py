@@ -16,7 +16,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.client import Client, connect
-from acsard.core.config.live import Difference, differences, live
+from acsard.core.config.live import Difference, differences, find_live_setting
 from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import SIMULATOR, BatteryConfig, Config
 from acsard.core.config.validation import write
@@ -33,7 +33,7 @@ from acsard.core.messages.schema import (
 from acsard.core.motion import bumpers
 from acsard.core.motion.battery import MISSING_REASON as NO_BATTERY
 from acsard.core.motion.battery import Battery
-from acsard.core.motion.battery import words as battery_words
+from acsard.core.motion.battery import status_text as battery_words
 from acsard.core.motion.emergency_stop import (
     CHECK,
     MISSING_REASON,
@@ -76,7 +76,7 @@ DIFFERENCE_REASONS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = 
         "to keep {which} after a restart, write these lines into the configuration file: {lines}",
     ),
     (
-        lambda key: key not in OPTION_KEYS and live(key) is None,
+        lambda key: key not in OPTION_KEYS and find_live_setting(key) is None,
         "warning",
         "these values come from another file or from the daemon's environment, or the file has "
         "changed since the daemon started",
@@ -85,7 +85,7 @@ DIFFERENCE_REASONS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = 
         "findings below are about the running daemon",
     ),
     (
-        lambda key: live(key) is not None,
+        lambda key: find_live_setting(key) is not None,
         "warning",
         "these values were set while the daemon ran, or come from another file, or the file has "
         "changed since the daemon started",
@@ -177,7 +177,7 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
         differing = {key: difference for key, difference in others.items() if belongs(key)}
         if not differing:
             continue
-        texts = [difference.words(key) for key, difference in differing.items()]
+        texts = [difference.describe(key) for key, difference in differing.items()]
         text = f"the running daemon ({daemon_name}) has other values than the file ({reason}): "
         text += listed(texts, MAX_KEYS, "; ")
         mend = mend.format(

@@ -146,7 +146,7 @@ class File(Struct, frozen=True):
     """True for a file that users are expected to change, such as the configuration. An installation
     never replaces such a file. If a user has changed the file, only a purge removes it."""
 
-    def found(self) -> bytes | None:
+    def current_content(self) -> bytes | None:
         """Return the present content of the file, or None if it does not exist.
 
         Raises `MendableError` if the file cannot be read.
@@ -176,7 +176,7 @@ class File(Struct, frozen=True):
         The result is "missing", "as installed", "changed", "wrong mode or owner" or "unreadable".
         """
         try:
-            content = self.found()
+            content = self.current_content()
         except MendableError:
             return "unreadable"
         if content is None:
@@ -376,7 +376,7 @@ def admitting(directory: Path) -> Write | Keep | None:
     if os.geteuid() != 0 or not (UNIT_DIRECTORY / GATEWAY).exists():
         return None
     file = lan_drop_in(GATEWAY)
-    return admitted(file, file.found(), directory)
+    return admitted(file, file.current_content(), directory)
 
 
 def admitted(file: File, content: bytes | None, directory: Path) -> Write | Keep:
@@ -406,7 +406,7 @@ def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
 
     The content is None if the file does not exist. Raises `MendableError` if a file cannot be read.
     """
-    return {file.path: file.found() for file in wanted}
+    return {file.path: file.current_content() for file in wanted}
 
 
 def wrong_modes(wanted: Iterable[File]) -> set[Path]:

@@ -55,11 +55,11 @@ def replacing(
         FileExistsError: `new` exists, and must not be replaced.
     """
     _require_free(new, force, may_replace)
-    part = _near(new, "part")
+    part = _hidden_sibling(new, "part")
     try:
         yield part
         _require_free(new, force, may_replace)
-        _put(part, new)
+        _replace(part, new)
     except BaseException:
         _remove(part)
         raise
@@ -71,13 +71,13 @@ def synced(stream: BinaryIO) -> None:
     os.fsync(stream.fileno())
 
 
-def _put(part: Path, new: Path) -> None:
+def _replace(part: Path, new: Path) -> None:
     # No system call replaces a directory that contains files. Therefore an existing directory `new`
     # first gets another name. It is removed after `part` has been renamed.
     if not new.is_dir():
         os.replace(part, new)
         return
-    old = _near(new, "old")
+    old = _hidden_sibling(new, "old")
     os.rename(new, old)
     try:
         os.rename(part, new)
@@ -87,7 +87,7 @@ def _put(part: Path, new: Path) -> None:
     _remove(old)
 
 
-def _near(new: Path, ending: str) -> Path:
+def _hidden_sibling(new: Path, ending: str) -> Path:
     return new.with_name(f".{new.name}.{os.getpid()}.{ending}")
 
 

@@ -125,14 +125,14 @@ def end_in(data: bytes) -> EndRecord | None:
     Return None if these bytes contain no valid end record.
     """
     try:
-        metadata = _last(data[-TAIL_BYTES:])
+        metadata = _metadata_in(data[-TAIL_BYTES:])
         return msgspec.convert(metadata, EndRecord, strict=False) if metadata else None
     except DAMAGE_ERRORS:
         # A caller that reads the whole file reports the damage.
         return None
 
 
-def _last(tail: bytes) -> dict[str, str] | None:
+def _metadata_in(tail: bytes) -> dict[str, str] | None:
     """Return the metadata of the end record, or None if the file is not finished.
 
     `tail` contains the last bytes of the file.

@@ -310,13 +310,13 @@ class RecordingWriter:
         Raises `FileNotFoundError` if the file was deleted.
         """
         if self._chunk is not None and self._chunk.has_unwritten:
-            self._put(self._chunk.take())
+            self._append(self._chunk.take())
         self._sync()
         # The disk also accepts data for a deleted file, but this data is lost.
         if not os.fstat(self._file.fileno()).st_nlink:
             raise FileNotFoundError(errno.ENOENT, f"{self.path.name} has been removed")
 
-    def _put(self, data: bytes) -> None:
+    def _append(self, data: bytes) -> None:
         if self._chunk_at is None:
             self._chunk_at = self._file.tell()
             self._file.write(GROWING_HEAD)
@@ -331,7 +331,7 @@ class RecordingWriter:
         if self._chunk is None:
             return
         last, head = self._chunk.end()
-        self._put(last)
+        self._append(last)
         end = self._file.tell()
         assert self._chunk_at is not None
         self._file.seek(self._chunk_at)

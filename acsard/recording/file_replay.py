@@ -560,8 +560,8 @@ class EventCopies:
             if event != copy:
                 if copy is not None or not missing:
                     self._differs(
-                        f"the file has two versions of an event: {_words(event)} in a step, but "
-                        f"{_words(copy)} in the channel `events`"
+                        f"the file has two versions of an event: {_entry_text(event)} in a step, "
+                        f"but {_entry_text(copy)} in the channel `events`"
                     )
                 return
 
@@ -569,7 +569,7 @@ class EventCopies:
         self.difference = self.difference or printable(sentence)
 
 
-def _words(entry: TimelineEntry | None) -> str:
+def _entry_text(entry: TimelineEntry | None) -> str:
     if entry is None:
         return "nothing"
     by = f" (by {entry.by})" if entry.by else ""

@@ -157,7 +157,7 @@ class GrowingChunk:
     def take(self) -> bytes:
         """Return the compressed bytes of the messages that were added since the last call."""
         self._out.append(self._compressor.flush(COMPRESSOBJ_FLUSH_BLOCK))
-        return self._taken()
+        return self._take_output()
 
     def end(self) -> tuple[bytes, bytes]:
         """End the chunk, and return a pair: the last bytes of the chunk, and its true header.
@@ -166,10 +166,10 @@ class GrowingChunk:
         the chunk with the true header.
         """
         self._out.append(self._compressor.flush())
-        last = self._taken()
+        last = self._take_output()
         return last, _head(self.first_ns, self._last_ns, self.size, self._crc, self._length)
 
-    def _taken(self) -> bytes:
+    def _take_output(self) -> bytes:
         out = b"".join(self._out)
         self._out.clear()
         self._length += len(out)
@@ -372,7 +372,7 @@ def walk(data: bytes) -> Iterator[FileItem]:
         opcode, length = RECORD_HEAD.unpack_from(data, at)
         claimed = at + RECORD_HEAD.size + length
         chunk = chunks.read(at)
-        item = _read(stream, at, opcode, claimed, len(data)) if chunk is None else None
+        item = _decode_record(stream, at, opcode, claimed, len(data)) if chunk is None else None
         if chunk is not None and chunk.complete:
             item = FileItem(None, chunk, chunk.end)
         elif item is None and opcode in SKIPPED_RECORDS and claimed <= len(data):
@@ -394,7 +394,9 @@ def walk(data: bytes) -> Iterator[FileItem]:
         at = item.end
 
 
-def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> FileItem | None:
+def _decode_record(
+    stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int
+) -> FileItem | None:
     """Decode the record at the offset `at`, or return None if it is damaged or cut off.
 
     `claimed` is the offset at which the record ends according to its length field. `size` is the

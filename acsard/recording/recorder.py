@@ -127,10 +127,10 @@ class Recorder:
         self._number += 1
         if self._events:
             self._report(self._events.popleft())
-        self._put(FinishedStep(inputs, outputs, sent), robot, guard)
+        self._enqueue(FinishedStep(inputs, outputs, sent), robot, guard)
         self._watch_disk(inputs.now.mono_ns)
 
-    def _put(self, step: FinishedStep, robot: Robot, guard: Guard) -> None:
+    def _enqueue(self, step: FinishedStep, robot: Robot, guard: Guard) -> None:
         queue = self._queue
         if self._full:
             self._lost += 1
@@ -239,11 +239,11 @@ class Recorder:
         while not over:
             over = self._over.wait(SYNC_PAUSE_S)
             try:
-                self._writer.write(self._taken(), over)
+                self._writer.write(self._take_queue(), over)
             except Exception:
                 self._events.append(Event("recording", ENDED, "error"))
                 raise
 
-    def _taken(self) -> list[FinishedStep | StateBeforeStep]:
+    def _take_queue(self) -> list[FinishedStep | StateBeforeStep]:
         queue = self._queue
         return [queue.popleft() for _ in range(len(queue))]

@@ -142,12 +142,12 @@ def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
     with part.open("r+b", buffering=0) as stream:
         try:
             for at, data in writes:
-                _put(stream, at, data)
+                _write_at(stream, at, data)
         except OSError as error:
             with suppress(OSError):
                 stream.truncate(len(before))
                 for at, data in writes:
-                    _put(stream, at, before[at : at + len(data)])
+                    _write_at(stream, at, before[at : at + len(data)])
             if error.errno not in DISK_FULL:
                 raise
             return False
@@ -192,7 +192,7 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
     return [(chunk.end, end), *heads], chunk.end + len(end)
 
 
-def _put(stream: FileIO, at: int, data: bytes) -> None:
+def _write_at(stream: FileIO, at: int, data: bytes) -> None:
     """Write `data` at the offset `at`, and sync it. An `OSError` may leave a part of it written."""
     stream.seek(at)
     while data:

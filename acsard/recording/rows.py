@@ -309,7 +309,7 @@ def _steps(batch: Batch) -> Iterator[Step]:
         )
         recorded = RecordedOutputs(
             line=row.line,
-            sent=_sent(row),
+            sent=_sent_line(row),
             status=status,
             poses=tuple(poses),
             events=rare.events_out,
@@ -321,7 +321,7 @@ def _steps(batch: Batch) -> Iterator[Step]:
         yield Step(batch.first + index, inputs, recorded, begins=index == 0)
 
 
-def _sent(row: Row) -> bytes | None:
+def _sent_line(row: Row) -> bytes | None:
     if row.sent is True:
         return row.line
     return None if row.sent is False else row.sent

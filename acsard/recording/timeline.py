@@ -258,7 +258,7 @@ class WaitingSenders:
             yield from self._command(command, source, step.inputs.now)
 
     def _command(self, command: Command, source: str, now: Instant) -> Iterator[TimelineEntry]:
-        key, known = (command.source, command.sender), self._known(source)
+        key, known = (command.source, command.sender), self._sender_is_known(source)
         shared = command.source == source
         speed = command.twist.linear or command.twist.angular
         why = self._why(command.source, source)
@@ -288,7 +288,7 @@ class WaitingSenders:
             self._waiting = recent
         return len(self._waiting) < MAX_WAITING
 
-    def _known(self, source: str) -> bool:
+    def _sender_is_known(self, source: str) -> bool:
         """Return whether it is known which sender of the source `source` the robot follows.
 
         It is known if `_commander` contains a single sender, and this sender uses `source`.

@@ -317,7 +317,7 @@ class _Machine:
         entry = _Entry(None)
         entry.holds([arguments])
         self._copies(arguments)
-        entry.value = _made(kind.value, arguments.value)
+        entry.value = _construct(kind.value, arguments.value)
         self._stack.append(entry)
 
     def make_bare(self) -> None:
@@ -413,7 +413,7 @@ def _is_part(kind: Any) -> bool:
     return plain and kind.__module__ != "builtins" and not hasattr(kind, "__setstate__")
 
 
-def _made(kind: type, arguments: tuple[Any, ...]) -> object:
+def _construct(kind: type, arguments: tuple[Any, ...]) -> object:
     """Return an object of the class `kind`, constructed with the arguments `arguments`.
 
     Raises `ValueError` if the class is not allowed. Raises `TypeError` or a msgspec error if the

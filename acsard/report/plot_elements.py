@@ -118,7 +118,7 @@ def sentence(mark: Mark) -> str:
     """Return the text that the page shows when the user points at an event. It is escaped."""
     head = f"<b>{label(mark.name.replace('_', ' '))}</b>"
     by = [label(f"by {mark.by}")] if mark.by else []
-    return "<br>".join([head, label(mark.words), *by])
+    return "<br>".join([head, label(mark.text_with_count), *by])
 
 
 def layout() -> dict[str, Any]:

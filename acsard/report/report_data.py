@@ -68,7 +68,7 @@ class Mark(Struct, frozen=True):
     """Wall-clock time of the event, s since 1970. Later changes of the clock do not change it."""
 
     @property
-    def words(self) -> str:
+    def text_with_count(self) -> str:
         """The text of the event, and the number of equal events that the log combined, if any."""
         return f"{self.text}{how_often(self.text, self.count)}"
 

@@ -76,7 +76,7 @@ def differences(config: Config) -> list[Setting]:
     """
     here, default = (dict(flat(effective(each))) for each in (config, Config()))
     return [
-        Setting(key, _shown(here, key), _shown(default, key))
+        Setting(key, _cell_text(here, key), _cell_text(default, key))
         for key in {**default, **here}
         if key not in here or key not in default or _plain(here[key]) != _plain(default[key])
     ]
@@ -86,7 +86,7 @@ def _plain(value: object) -> object:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _shown(table: dict[str, object], key: str) -> str:
+def _cell_text(table: dict[str, object], key: str) -> str:
     return show(table[key]) if key in table else "-"
 
 

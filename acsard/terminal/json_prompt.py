@@ -28,7 +28,7 @@ from msgspec import Struct
 from acsard.checkup.findings import Finding
 from acsard.host.config_file import change, require_changeable, writable
 from acsard.host.errors import MendableError
-from acsard.terminal.prompt import Ask
+from acsard.terminal.prompt import NumberQuestion
 
 T = TypeVar("T")
 
@@ -114,7 +114,7 @@ class Question(Struct, frozen=True, omit_defaults=True, kw_only=True):
     """Explanation why the previous answer to this question was rejected, or an empty text."""
 
 
-class Found(Struct, frozen=True):
+class FindingMessage(Struct, frozen=True):
     """One finding of a check. It is sent as soon as it is known."""
 
     finding: Finding
@@ -157,20 +157,20 @@ class JsonPrompt:
     # Output
 
     def begin(self, subject: str, *, simulated: bool) -> None:
-        self._tell(Subject(subject, simulated))
+        self._send(Subject(subject, simulated))
 
-    def say(self, text: str) -> None:
-        self._tell(JobMessage(text))
+    def show_text(self, text: str) -> None:
+        self._send(JobMessage(text))
 
     def doing(self, text: str) -> None:
-        self._tell(Doing(text))
+        self._send(Doing(text))
 
     def progress(self, share: float) -> None:
-        self._tell(Progress(round(share, 3)))
+        self._send(Progress(round(share, 3)))
 
-    def found(self, finding: Finding) -> None:
+    def show_finding(self, finding: Finding) -> None:
         self._found += 1
-        self._tell(Found(finding))
+        self._send(FindingMessage(finding))
         # A complete check has about 16 findings.
         self.progress(min(0.99, self._found / 16))
 
@@ -181,7 +181,7 @@ class JsonPrompt:
         """
         self._moves = False
         self.progress(1.0)
-        self._tell(Result(text.strip("\n")))
+        self._send(Result(text.strip("\n")))
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
         return self._choose(question, answers)
@@ -189,11 +189,11 @@ class JsonPrompt:
     def start(self, text: str, by_key: bool = False) -> None:
         self._choose(text, ("start",), leg=True, by_key=by_key)
 
-    def number(self, ask: Ask) -> float:
+    def number(self, ask: NumberQuestion) -> float:
         def read(value: str | float | None) -> float:
             return ask.number("" if value is None else str(value))
 
-        return self._ask(
+        return self._ask_until_valid(
             read, words=ask.words, unit=ask.unit, least=ask.least, most=ask.most, usual=ask.usual
         )
 
@@ -222,7 +222,7 @@ class JsonPrompt:
             file = writable(config)
             require_changeable(file, keys)
         except MendableError as error:
-            self.say(f"acsard cannot write the configuration file: {error}")
+            self.show_text(f"acsard cannot write the configuration file: {error}")
             return False
         wanted = self.ask(
             f"Write these lines into {file}? The comments in the file stay.", ("write", "leave")
@@ -230,7 +230,7 @@ class JsonPrompt:
         self._moves = False
         if wanted == "write":
             change(file, keys)
-            self.say(f"{file}: written")
+            self.show_text(f"{file}: written")
         return wanted == "write"
 
     def _choose(self, words: str, answers: Sequence[str], **more: bool) -> str:
@@ -239,12 +239,12 @@ class JsonPrompt:
                 raise ValueError(f"answer with one of: {', '.join(answers)}")
             return str(value)
 
-        return self._ask(chosen, words=words, answers=answers, **more)
+        return self._ask_until_valid(chosen, words=words, answers=answers, **more)
 
-    def _tell(self, message: Struct) -> None:
+    def _send(self, message: Struct) -> None:
         print(msgspec.json.encode(message).decode(), flush=True)
 
-    def _ask(self, read: Callable[[str | float | None], T], **about: object) -> T:
+    def _ask_until_valid(self, read: Callable[[str | float | None], T], **about: object) -> T:
         """Ask until `read` accepts the answer.
 
         To reject it, `read` raises `ValueError` with a description of valid answers.
@@ -257,7 +257,7 @@ class JsonPrompt:
             self._open = question.question
             # Do not take the lock here: a program that does not read its output must still be able
             # to send.
-            self._tell(question)
+            self._send(question)
             with self._news:
                 while self._open:
                     # Wait with a time limit, because a signal that arrives just before the wait

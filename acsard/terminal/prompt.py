@@ -24,7 +24,7 @@ class NobodyError(AcsardError):
     """A question needs an answer, but no person can be asked."""
 
 
-class Ask(Struct, frozen=True):
+class NumberQuestion(Struct, frozen=True):
     """A question whose answer is a number, such as a distance that a person measures by tape.
 
     `words` is the text of the question, and `unit` is the unit of the answer. The number must be
@@ -67,7 +67,7 @@ class Prompt(Protocol):
         `simulated` says whether it is simulated.
         """
 
-    def say(self, text: str) -> None:
+    def show_text(self, text: str) -> None:
         """Show a text that stays on the screen."""
 
     def doing(self, text: str) -> None:
@@ -76,7 +76,7 @@ class Prompt(Protocol):
     def progress(self, share: float) -> None:
         """Show the completed share of the present drive or check, from 0 to 1."""
 
-    def found(self, finding: Finding) -> None:
+    def show_finding(self, finding: Finding) -> None:
         """Show one finding of a check. Call this as soon as the finding is known."""
 
     def result(self, text: str) -> None:
@@ -99,7 +99,7 @@ class Prompt(Protocol):
         to end the drive this way. Otherwise the drive ends by itself, and a key press aborts it.
         """
 
-    def number(self, ask: Ask) -> float:
+    def number(self, ask: NumberQuestion) -> float:
         """Ask for a number, and return it. Return the default of `ask` if no person can be asked.
 
         Raises `NobodyError` if there is neither a person nor a default.

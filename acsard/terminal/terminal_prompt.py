@@ -20,7 +20,7 @@ from rich.text import Text
 
 from acsard.checkup.findings import Finding
 from acsard.terminal.output import MAX_TEXT_WIDTH, show, table
-from acsard.terminal.prompt import Ask, NobodyError
+from acsard.terminal.prompt import NobodyError, NumberQuestion
 
 T = TypeVar("T")
 
@@ -55,7 +55,7 @@ class Screen:
         if not self._as_json:
             print(subject, flush=True)
 
-    def say(self, text: str) -> None:
+    def show_text(self, text: str) -> None:
         self._print(f"\n{_wrapped(text)}\n")
 
     def doing(self, text: str) -> None:
@@ -64,7 +64,7 @@ class Screen:
             self._print(f"\r\033[K{f'   ... {text}'[: _columns() - 1]}")
             self._visible = True
 
-    def found(self, finding: Finding) -> None:
+    def show_finding(self, finding: Finding) -> None:
         if not self._as_json:
             self._clear()
             show(row(finding), most=MAX_TEXT_WIDTH)
@@ -97,9 +97,9 @@ class NoPrompt(Screen):
         return answers[0] if len(answers) == 1 else None
 
     def start(self, text: str, by_key: bool = False) -> None:
-        self.say(text)
+        self.show_text(text)
 
-    def number(self, ask: Ask) -> float:
+    def number(self, ask: NumberQuestion) -> float:
         if ask.usual is None:
             raise NobodyError(
                 "this calibration method needs a person who measures: run it without --yes"
@@ -142,10 +142,10 @@ class TerminalPrompt(Screen):
                 self._print(f"   please type {' or '.join(answers)}; {QUIT_KEY} quits\n")
 
     def start(self, text: str, by_key: bool = False) -> None:
-        self.say(text)
+        self.show_text(text)
         # Keys that were pressed before the text appeared must not start anything.
         _forget_input()
-        self.say("Enter starts this drive, then any key stops it; q quits.")
+        self.show_text("Enter starts this drive, then any key stops it; q quits.")
         while True:
             pressed = _read()
             if not pressed.strip("\r\n"):
@@ -153,7 +153,7 @@ class TerminalPrompt(Screen):
             if QUIT_KEY in pressed:
                 raise KeyboardInterrupt
 
-    def number(self, ask: Ask) -> float:
+    def number(self, ask: NumberQuestion) -> float:
         with _lines():
             _forget_input()
             while True:
@@ -164,7 +164,7 @@ class TerminalPrompt(Screen):
                 try:
                     return ask.number(line)
                 except ValueError as error:
-                    self.say(f"{error} (q quits)")
+                    self.show_text(f"{error} (q quits)")
 
     def keys(self, wait_s: float) -> str:
         return _read() if select.select([sys.stdin], [], [], wait_s)[0] else ""

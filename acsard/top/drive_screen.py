@@ -66,7 +66,7 @@ def lines(teleop: Teleop, width: int, height: int | None = None) -> list[Text]:
         if teleop.objection:
             rows += _wrapped(refused(teleop.objection), width, "bold red")
         rows += flow(measured(state), width)
-    rows.append(Text(f"keys ask for {asked(teleop)}"))
+    rows.append(Text(f"keys ask for {selected_speeds(teleop)}"))
     below = [Text(line, "dim") for line in HELP]
     if height is not None and len(rows) + len(below) >= height:
         rows = [*rows[: max(1, height - len(below))], *below][:height]
@@ -83,13 +83,13 @@ def report_lines(teleop: Teleop, width: int) -> list[str]:
     The report has the content of the screen, but not the help about the keys. A line has at most
     `width` characters. A `width` below 20 counts as 20.
     """
-    parts = [f"keys ask for {asked(teleop)}"]
+    parts = [f"keys ask for {selected_speeds(teleop)}"]
     if teleop.state is None or teleop.silent:
-        return _words([silence(teleop), *parts], width)
+        return _wrap_parts([silence(teleop), *parts], width)
     if teleop.objection:
         parts.insert(0, refused(teleop.objection))
     why = f"{printable(teleop.state.mode)}: {reason(teleop.state)}"
-    return _words([why, *parts], width, measured(teleop.state))
+    return _wrap_parts([why, *parts], width, measured(teleop.state))
 
 
 def last_report_lines(teleop: Teleop, width: int) -> list[str]:
@@ -99,12 +99,12 @@ def last_report_lines(teleop: Teleop, width: int) -> list[str]:
     and its speeds. A line has at most `width` characters.
     """
     if teleop.state is None or teleop.silent:
-        return _words([f"drive ended: {silence(teleop)}"], width)
+        return _wrap_parts([f"drive ended: {silence(teleop)}"], width)
     what = "still moves" if moves(teleop.state) else "stands still"
     if teleop.state.linear is None:
         what = "reports no speed"
     why = f"{printable(teleop.state.mode)}: {reason(teleop.state)}"
-    return _words([f"drive ended: the robot {what}", why], width, measured(teleop.state))
+    return _wrap_parts([f"drive ended: the robot {what}", why], width, measured(teleop.state))
 
 
 def released(teleop: Teleop) -> bool:
@@ -144,7 +144,7 @@ def refused(objection: str) -> str:
     return f"your keys do not drive the robot: {printable(objection)}{mend}"
 
 
-def asked(teleop: Teleop) -> str:
+def selected_speeds(teleop: Teleop) -> str:
     return f"{teleop.linear:.2f} m/s, {teleop.angular:.2f} rad/s"
 
 
@@ -154,7 +154,7 @@ def measured(state: RobotState) -> list[Text]:
     return [Text(text) for text in texts]
 
 
-def _words(parts: Sequence[str], width: int, figures: Sequence[Text] = ()) -> list[str]:
+def _wrap_parts(parts: Sequence[str], width: int, figures: Sequence[Text] = ()) -> list[str]:
     width = max(20, width)
     lines = wrap("; ".join(parts), width, subsequent_indent="  ", break_on_hyphens=False)
     return [*lines, *(f"  {line}" for line in flow(figures, width - 2))]

@@ -23,7 +23,7 @@ class Feed:
         self._watch = Watch(robot, clock.steady_s())
         self._past: deque[tuple[float, RobotState]] = deque()
 
-    def ask(self) -> None:
+    def query_state(self) -> None:
         """Query the robot's present state, without waiting for the next published state.
 
         Raises `ReplyError` if the reply cannot be decoded, and the errors of `Client.get`.
@@ -46,7 +46,7 @@ class Feed:
     def poll(self) -> None:
         """Store the newest of the states that have arrived since the last call, if any."""
         now = clock.steady_s()
-        for state in self._watch.look(now)[-1:]:
+        for state in self._watch.poll(now)[-1:]:
             self._take(state, now)
 
     def _take(self, state: RobotState, now: float) -> None:
@@ -58,7 +58,7 @@ class Feed:
         while len(self._past) > 2 and now - self._past[1][0] >= 1.0:
             self._past.popleft()
 
-    def seen(self, hint: str = "") -> ScreenData:
+    def screen_data(self, hint: str = "") -> ScreenData:
         """Return the data for the screen of `acsard top`.
 
         `hint` is a text for the header of the screen, such as the key that quits.

@@ -150,7 +150,7 @@ class Roster(Fleet):
 
         Unlike in the rows of `Fleet`, `here` is False for a robot that was never present, not None.
         """
-        self.ask(self.due())
+        self.send_queries(self.due())
         return [replace(row, here=bool(row.here)) for row in super().rows()]
 
     def gather(self) -> list[Row]:
@@ -180,7 +180,7 @@ class Roster(Fleet):
         )
 
     @property
-    def seen(self) -> str:
+    def presence_text(self) -> str:
         """A sentence with the number of robots that are present; "" if the user named them."""
         with self._lock:
             here = sum(bool(robot.here) for robot in self._known.values())

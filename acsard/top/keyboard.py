@@ -127,7 +127,7 @@ class Keyboard:
             repeated = self._move == _MOVES[key] and now - self._pressed < REPEAT_S
             self._repeats = self._repeats + 1 if repeated else 0
             hold = REPEAT_S if self._repeats >= REPEATS else KEY_HOLD_S
-            if not self._held(now):
+            if not self._key_is_down(now):
                 self._begun, self._over = now, False
             self._pressed = now
             if not self._over:
@@ -148,7 +148,7 @@ class Keyboard:
         - No key seems to be held. Then the network may be delaying the repeats of a held key. If
           more than `MAX_BURST_KEYS` repeats arrive together later, ignore this key too.
         """
-        key_down = self._held(now)
+        key_down = self._key_is_down(now)
         if self._over or (key_down and now - self._begun <= SETTLED_S):
             return
         self._over = True
@@ -160,9 +160,9 @@ class Keyboard:
 
         `now` is the present time on the monotonic clock, s.
         """
-        return self._over and self._held(now)
+        return self._over and self._key_is_down(now)
 
-    def _held(self, now: float) -> bool:
+    def _key_is_down(self, now: float) -> bool:
         return now - self._pressed <= RELEASE_TIMEOUT_NS / NS_PER_S
 
     def _stop(self, now: float) -> None:
@@ -217,7 +217,7 @@ class KeyboardDrive:
     def take(self) -> None:
         """Process the states that have arrived. If no state has arrived for some time, query it."""
         now, before = clock.steady_s(), self._watch.state
-        for state in self._watch.look(now):
+        for state in self._watch.poll(now):
             if must_release_key(state, self._robot.source) or restarted(before, state):
                 self._keyboard.end_hold(now)
             before = state
@@ -227,7 +227,7 @@ class KeyboardDrive:
         for _ in range(ZEROS):
             self._robot.send(0.0, 0.0)
 
-    def seen(self) -> Teleop:
+    def screen_data(self) -> Teleop:
         now, robot, watch = clock.steady_s(), self._robot, self._watch
         why = ""
         if watch.state is not None and now - self._fine > GRACE_S:

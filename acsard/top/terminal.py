@@ -59,26 +59,26 @@ SCREEN_END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQU
 
 
 def one_screen(feed: Feed) -> str:
-    feed.ask()
+    feed.query_state()
     time.sleep(0.5)  # rates are averaged over this time
-    feed.ask()
+    feed.query_state()
     _be_lenient()
     width = Console().width
-    return plain(screen(feed.seen(), width), width=width)
+    return plain(screen(feed.screen_data(), width), width=width)
 
 
-def live(feed: Feed) -> None:
+def show_live(feed: Feed) -> None:
     """Show the screen of `acsard top` until `q` is typed, the input ends or a signal arrives."""
     # A failed query does not matter, because the screen says that it waits for a state.
     with suppress(AcsardError):
-        feed.ask()
+        feed.query_state()
     console = Console()
 
     def draw() -> RenderableType:
         feed.poll()
-        return screen(feed.seen("q quits"), *console.size)
+        return screen(feed.screen_data("q quits"), *console.size)
 
-    _hold(lambda suspend: _watch(draw, console, suspend))
+    _run_suspendable(lambda suspend: _watch(draw, console, suspend))
 
 
 def drive(ride: KeyboardDrive) -> None:
@@ -88,7 +88,7 @@ def drive(ride: KeyboardDrive) -> None:
     """
     if has_screen():
         console = Console()
-        _hold(lambda suspend: _steer(ride, console, suspend))
+        _run_suspendable(lambda suspend: _steer(ride, console, suspend))
     else:
         _drive_in_lines(ride)
 
@@ -103,7 +103,7 @@ def print_last_report(ride: KeyboardDrive) -> None:
     left = clock.steady_s()
     while os.isatty(0) and os.isatty(1):
         ride.take()
-        teleop, took = ride.seen(), clock.steady_s() - left
+        teleop, took = ride.screen_data(), clock.steady_s() - left
         rests = teleop.age < took and released(teleop)
         # A robot usually stops within 2 s, by its own deceleration ramp.
         if rests or took > 2.0:
@@ -126,11 +126,11 @@ def roster(fleet: Roster) -> None:
                 line.stylize("bold red")
             elif WARNING in line.plain:
                 line.stylize("bold yellow")
-        below = f"q quits   {fleet.left_out_text or fleet.seen}" if rows else fleet.hint()
+        below = f"q quits   {fleet.left_out_text or fleet.presence_text}" if rows else fleet.hint()
         last = Text(below.rstrip(), "dim", no_wrap=bool(rows), overflow="ellipsis")
         return Group(*texts, Text(), last)
 
-    _hold(lambda suspend: _watch(draw, console, suspend))
+    _run_suspendable(lambda suspend: _watch(draw, console, suspend))
 
 
 def _watch(draw: Callable[[], RenderableType], console: Console, suspend: list[bool]) -> bool:
@@ -153,7 +153,7 @@ def _screen(console: Console) -> Live:
     )
 
 
-def _hold(shows: Callable[[list[bool]], bool]) -> None:
+def _run_suspendable(shows: Callable[[list[bool]], bool]) -> None:
     """Call `shows` repeatedly until it returns False or a signal arrives.
 
     The argument of `shows` is an empty list. When the user presses Ctrl-Z, an element is added to
@@ -183,7 +183,7 @@ def _steer(ride: KeyboardDrive, console: Console, suspend: list[bool]) -> bool:
             ride.step(typed)
             if typed or time.monotonic() >= due:
                 due = time.monotonic() + DRAW_PERIOD_S
-                display.update(Group(*lines(ride.seen(), *console.size)), refresh=True)
+                display.update(Group(*lines(ride.screen_data(), *console.size)), refresh=True)
     for letter in ("k", "", ""):
         ride.step(letter)  # stop the robot, because a suspended program sends no commands
     return True
@@ -258,8 +258,8 @@ def _drive_in_lines(ride: KeyboardDrive) -> None:
     with until_signal(), keys() as read:
         while (typed := read(KEY_POLL_S)) is not None:
             ride.step(typed)
-            teleop = ride.seen()
-            if due.tell(teleop, time.monotonic()):
+            teleop = ride.screen_data()
+            if due.should_print(teleop, time.monotonic()):
                 width, height = output_size()
                 print("\n".join(page.with_help(report_lines(teleop, width), height)), flush=True)
 
@@ -280,7 +280,7 @@ class ReportThrottle:
         self._shown: tuple[object, ...] = ()
         self._at = -RESTING_REPORT_S
 
-    def tell(self, teleop: Teleop, now: float) -> bool:
+    def should_print(self, teleop: Teleop, now: float) -> bool:
         """Return whether the caller must print a report now.
 
         If the result is True, the report counts as printed. `teleop` is the content of the report,

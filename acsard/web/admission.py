@@ -226,7 +226,7 @@ class Admission:
             # path that needs a token. If such a request already contains a valid token, record the
             # client's identity, so that other clients cannot displace this connection.
             tokens = [] if here else tokens_shown(request, self._robot)
-            if identity := next(filter(None, map(self._vault.known, tokens)), None):
+            if identity := next(filter(None, map(self._vault.find_owner, tokens)), None):
                 self._acceptor.admitted(request.transport, identity)
             elif not here:
                 await self._pace_stranger(request)

@@ -75,7 +75,7 @@ def problem(status: int, text: str) -> web.Response:
     return reply(Problem(text), status)
 
 
-def sent(request: web.Request, file: File) -> web.Response:
+def file_answer(request: web.Request, file: File) -> web.Response:
     """Return the answer that contains a file of the page, compressed if the client accepts gzip.
 
     If the client already has this version of the file, return an answer with the status 304.
@@ -106,7 +106,7 @@ async def sent_in_pieces(
     pieces = (
         memoryview(body)[begin : begin + PIECE_BYTES] for begin in range(0, len(body), PIECE_BYTES)
     )
-    return await _sent(request, answer, pieces, within)
+    return await _send_pieces(request, answer, pieces, within)
 
 
 async def sent_unpacked(
@@ -120,7 +120,9 @@ async def sent_unpacked(
     """
     if request.method == "HEAD":
         return web.Response(headers=headers)
-    return await _sent(request, web.StreamResponse(headers=headers), _unpacked(packed), within)
+    return await _send_pieces(
+        request, web.StreamResponse(headers=headers), _unpacked(packed), within
+    )
 
 
 def _unpacked(packed: bytes) -> Iterator[bytes]:
@@ -133,7 +135,7 @@ def _unpacked(packed: bytes) -> Iterator[bytes]:
     yield unpack.flush()
 
 
-async def _sent(
+async def _send_pieces(
     request: web.Request,
     answer: web.StreamResponse,
     pieces: Iterable[bytes | memoryview],
@@ -255,13 +257,13 @@ class Files:
             stamp = tuple((entry.st_mtime_ns, entry.st_size) for entry in stats)
             known = self._files.get(name)
             if known is None or known.stamp != stamp:
-                known = self._files[name] = _read(paths, kind, stamp)
+                known = self._files[name] = _load_file(paths, kind, stamp)
         except (OSError, ValueError):
             return None
         return known
 
 
-def _read(paths: Sequence[Path], kind: str, stamp: tuple[tuple[int, int], ...]) -> File:
+def _load_file(paths: Sequence[Path], kind: str, stamp: tuple[tuple[int, int], ...]) -> File:
     """Read a file of the page, and insert the files that `INLINED` lists for it.
 
     The first path belongs to the file itself, and the other paths to the inserted files.

@@ -18,7 +18,7 @@ from aiohttp import web
 from msgspec import UNSET, Meta, Struct, UnsetType, inspect
 
 from acsard import __version__
-from acsard.core.config.live import WHEN_TEXTS, flat, live
+from acsard.core.config.live import WHEN_TEXTS, find_live_setting, flat
 from acsard.core.config.settings import WebConfig
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.permissions import least_role
@@ -35,8 +35,8 @@ from acsard.web.answers import (
     File,
     Files,
     TroubleError,
+    file_answer,
     reply,
-    sent,
     sent_in_pieces,
     sent_unpacked,
     takes_gzip,
@@ -183,7 +183,7 @@ class Page:
                 self._sent.pop(name, None)
                 raise web.HTTPNotFound
             self._sent[name] = file, now
-        return sent(request, file)
+        return file_answer(request, file)
 
     async def token(self, request: web.Request) -> web.StreamResponse:
         """Check the token in the request's body, and return it in a cookie that no script can read.
@@ -197,7 +197,7 @@ class Page:
         identity = await self._admission.owner(peer_of(request), [form.token])
         cookie = cookie_name(self._robots.id, own_port(request))
         old_token = "" if form.replace else request.cookies.get(cookie, "")
-        present = self._vault.known(old_token)
+        present = self._vault.find_owner(old_token)
         if present is not None and not identity.may(present.role):
             raise TroubleError(
                 409,
@@ -325,14 +325,14 @@ class Page:
         return reply(await self._box.rows())
 
     async def recording(self, request: web.Request) -> web.StreamResponse:
-        path, _ = await self._box.found(request.match_info["name"])
+        path, _ = await self._box.find(request.match_info["name"])
         disposition = {"Content-Disposition": f'attachment; filename="{path.name}"'}
         return web.FileResponse(
             path, headers=disposition | {"Content-Type": "application/octet-stream"}
         )
 
     async def draw(self, request: web.Request) -> web.StreamResponse:
-        progress = self._reports.ask(*await self._box.found(request.match_info["name"]))
+        progress = self._reports.request(*await self._box.find(request.match_info["name"]))
         return reply(progress, DRAWING_STATUS[progress.report])
 
     async def report(self, request: web.Request) -> web.StreamResponse:
@@ -370,7 +370,7 @@ def settings_in(config: Mapping[str, Any]) -> list[Setting]:
     return [
         Setting(key, value, setting.what, WHEN_TEXTS[setting.when], **_allowed(key))
         for key, value in flat(config)
-        if (setting := live(key)) is not None
+        if (setting := find_live_setting(key)) is not None
     ]
 
 

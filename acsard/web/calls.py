@@ -127,15 +127,15 @@ class Calls:
         async def stop() -> ServiceReply:
             if other:
                 return await self._stop(other, client, identity, request)
-            return await self._stops.ask(request)
+            return await self._stops.send_stop(request)
 
         if verb == "stop" and other and other not in self._answered and not self._is_known(other):
             self._require_few(identity)
         try:
             if verb == "stop":
-                reply = await self._merged.ask((identity.token, other), stop)
+                reply = await self._merged.send_stop((identity.token, other), stop)
             else:
-                reply = await self._ask(request)
+                reply = await self._run_call(request)
         except (MendableError, DecodeError, TimeoutError) as error:
             return ServiceReply(False, str(error) or "the robot did not answer in time: try again")
         if verb == "set" and reply.success:
@@ -152,7 +152,7 @@ class Calls:
         client = self._robots.client
         if client is None:
             raise MendableError(self._robots.gone)
-        return await self._ask(lambda: client.sibling(robot).reply(f"{name}?fmt=json"))
+        return await self._run_call(lambda: client.sibling(robot).reply(f"{name}?fmt=json"))
 
     async def _stop(
         self, robot: str, client: Client, identity: Identity, request: Callable[[], ServiceReply]
@@ -191,7 +191,7 @@ class Calls:
                 "again",
             )
 
-    async def _ask(self, call: Callable[[], T]) -> T:
+    async def _run_call(self, call: Callable[[], T]) -> T:
         with self._asks.place() as free:
             if not free:
                 raise MendableError(BUSY)
@@ -213,7 +213,7 @@ class StopMerger:
         """Maps (client, robot) to the task that waits for the event in `_rests` and then sends a
         stop."""
 
-    async def ask(self, name: Hashable, stop: Stop) -> ServiceReply:
+    async def send_stop(self, name: Hashable, stop: Stop) -> ServiceReply:
         """Send a stop by calling `stop`, and return the reply.
 
         If another stop with the same `name` still waits to be sent, return the reply to that stop
@@ -223,13 +223,13 @@ class StopMerger:
             return await asyncio.shield(self._next[name])
         rest = self._rests.get(name)
         if rest is None:
-            self._rest(name)
+            self._begin_pause(name)
             return await stop()
         task = self._next[name] = asyncio.create_task(self._later(name, rest, stop))
         task.add_done_callback(lambda done: done.cancelled() or done.exception())
         return await asyncio.shield(task)
 
-    def _rest(self, name: Hashable) -> None:
+    def _begin_pause(self, name: Hashable) -> None:
         self._rests[name] = asyncio.Event()
         asyncio.get_running_loop().call_later(
             MIN_STOP_INTERVAL_S, lambda: self._rests.pop(name).set()
@@ -239,7 +239,7 @@ class StopMerger:
         # If the event loop is late, `rest` may be set and gone from `_rests` before this starts.
         await rest.wait()
         del self._next[name]  # later callers share the next stop
-        self._rest(name)
+        self._begin_pause(name)
         return await stop()
 
 
@@ -253,7 +253,7 @@ class Stops:
         self._room = asyncio.Semaphore(MAX_STOPS)
         self._next: asyncio.Task[ServiceReply] | None = None
 
-    async def ask(self, call: Callable[[], ServiceReply]) -> ServiceReply:
+    async def send_stop(self, call: Callable[[], ServiceReply]) -> ServiceReply:
         """Send a stop by calling `call`, and return the reply.
 
         If `MAX_STOPS` stops are running, wait for the next stop, and return the reply to it.

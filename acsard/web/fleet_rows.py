@@ -48,7 +48,7 @@ class Fleet:
 
     def join(self, viewer: object) -> None:
         self._joined.add(viewer)
-        self._look()
+        self._start_due_work()
 
     def leave(self, viewer: object) -> None:
         self._joined.discard(viewer)
@@ -60,7 +60,7 @@ class Fleet:
         The queries run in the background. The result is [] until the subscription to the robots has
         been made.
         """
-        self._look()
+        self._start_due_work()
         rows = [] if self._tracked is None else self._tracked.rows()
         return [_row(row) for row in sorted(rows, key=lambda row: row.robot_id)]
 
@@ -74,14 +74,14 @@ class Fleet:
         here = self._tracked is not None and self._tracked.is_present(robot)
         return here or bool(states and states.number)
 
-    def _look(self) -> None:
+    def _start_due_work(self) -> None:
         tracked, client = self._tracked, self._robots.client
         if not self._joined or client is None or self._busy:
             return
         if tracked is None:
             self._start(self._declare(client))
         elif due := tracked.due():
-            self._start(_within_time(lambda: tracked.ask(due)))
+            self._start(_within_time(lambda: tracked.send_queries(due)))
 
     async def _declare(self, client: Client) -> None:
         def declare() -> fleet.Fleet:
@@ -102,7 +102,7 @@ class Fleet:
         try:
             self._tracked = await in_thread(declare, DECLARE_TIMEOUT_S, lambda late: late.end())
         except NOT_READY_ERRORS:
-            return  # the next call of `_look` retries
+            return  # the next call of `_start_due_work` retries
         self._tidy()
 
     def _tidy(self) -> None:

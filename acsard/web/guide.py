@@ -90,7 +90,7 @@ class Choices(Struct, frozen=True):
     """Advice with the commands to type if this server sees no serial port; otherwise ""."""
 
 
-class _Said(Struct, frozen=True):
+class _ChildLine(Struct, frozen=True):
     """The fields that this server reads in an output line of the child."""
 
     question: int = 0
@@ -153,7 +153,7 @@ class Guide:
             )
         self._job = _Job(viewer, by, asked.begin, self._viewers[viewer])
         self._tell_all()
-        self._task = asyncio.get_running_loop().create_task(self._live(self._job, asked))
+        self._task = asyncio.get_running_loop().create_task(self._run_job(self._job, asked))
         return ""
 
     def reply(self, viewer: object, reply: Reply) -> str:
@@ -222,7 +222,7 @@ class Guide:
         job = self._job
         return job if job is not None and job.viewer is viewer else None
 
-    async def _live(self, job: _Job, asked: Begin) -> None:
+    async def _run_job(self, job: _Job, asked: Begin) -> None:
         try:
             code, text = await job.run(arguments(asked, self._reach, await self._ports(asked)))
         # Python raises `RuntimeError` if it cannot start a thread for the child process.
@@ -346,7 +346,7 @@ class _Job:
                 self._interrupt()
             await asyncio.gather(self._read_output(process), self._read_errors(process))
             code = await process.wait()
-        return code if code >= 0 else 128 - code, self._words()
+        return code if code >= 0 else 128 - code, self._error_text()
 
     def answer(self, reply: Reply) -> bool:
         if not self._question or reply.reply != self._question:
@@ -406,7 +406,7 @@ class _Job:
 
     def _take(self, line: bytes) -> None:
         try:
-            message = msgspec.json.decode(line, type=_Said)
+            message = msgspec.json.decode(line, type=_ChildLine)
         except (msgspec.MsgspecError, ValueError):
             return  # not a protocol line: a library printed it
         if message.question:
@@ -420,7 +420,7 @@ class _Job:
         while chunk := await process.stderr.read(4096):
             self._last = last_part(self._last + chunk)
 
-    def _words(self) -> str:
+    def _error_text(self) -> str:
         lines = self._last.decode(errors="replace").splitlines()
         if self.left and lines[-1:] == ["KeyboardInterrupt"]:
             return ""  # interrupted while the interpreter was starting

@@ -36,13 +36,13 @@ GUIDED_PREFIX = "Guided"
 SENT_MESSAGES = (
     socket_messages.Hello, socket_messages.DrivenPath, socket_messages.LastMinute,
     socket_messages.Answer, socket_messages.Rows, socket_messages.Pong, socket_messages.Refused,
-    socket_messages.Gone,
+    socket_messages.DaemonUnreachable,
 )  # fmt: skip
 
 GUIDE_MESSAGES = (
     socket_messages.Running, socket_messages.Ended, json_prompt.Subject,
     json_prompt.JobMessage, json_prompt.Doing, json_prompt.Progress, json_prompt.Question,
-    json_prompt.Found, json_prompt.Result,
+    json_prompt.FindingMessage, json_prompt.Result,
 )  # fmt: skip
 """Types of the field `guide` of a WebSocket message, which reports on a check or calibration."""
 

@@ -114,7 +114,7 @@ class BlackBox:
         except (OSError, TimeoutError) as error:
             raise _unread(place, error) from None
 
-    async def found(self, name: str) -> tuple[Path, tuple[int, int]]:
+    async def find(self, name: str) -> tuple[Path, tuple[int, int]]:
         """Return the path of the recording `name`, and the version of its file.
 
         The version is the pair (modification time in ns, size in bytes). Raises `RefusedError` if
@@ -122,7 +122,7 @@ class BlackBox:
         """
         place = self._place()
 
-        def look() -> tuple[Path, tuple[int, int]] | None:
+        def find_file() -> tuple[Path, tuple[int, int]] | None:
             path = next((path for path in _files(place) if path.name == name), None)
             try:
                 status = path.stat() if path is not None else None
@@ -135,7 +135,7 @@ class BlackBox:
             )
 
         try:
-            entry = await in_thread(look, READ_TIMEOUT_S)
+            entry = await in_thread(find_file, READ_TIMEOUT_S)
         except (OSError, TimeoutError) as error:
             raise _unread(place, error) from None
         if entry is None:
@@ -268,13 +268,13 @@ class Reports:
         self._drawing: _Drawing | None = None
         self._work: asyncio.Task[None] | None = None
 
-    def ask(self, path: Path, stamp: tuple[int, int]) -> ReportState:
+    def request(self, path: Path, stamp: tuple[int, int]) -> ReportState:
         """Return the progress of the report of a recording. Start drawing the report if needed.
 
         While the report of another recording is being drawn, return the state "busy". When a
         drawing has ended, the next call returns its result, even if the drawing failed. A later
         call draws the report again if the drawing failed, or if the recording has changed since.
-        `path` and `stamp` are the results of `BlackBox.found()`.
+        `path` and `stamp` are the results of `BlackBox.find()`.
         """
         drawing, now_ns = self._drawing, clock.mono_ns()
         if drawing is not None and not drawing.ended and drawing.path != path:

@@ -69,20 +69,20 @@ def _path() -> Track:
     return Track(PATH_POINTS, PATH_STEP_M, PATH_S, 1.0)
 
 
-class _Asking:
+class _TaskQueries:
     """Bus client for a `Watch`. Its queries run in threads, so the event loop never waits."""
 
     def __init__(self, client: Client) -> None:
         self.subscribe, self._client = client.subscribe, client
         self._asked: asyncio.Task[None] | None = None
 
-    def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
+    def start_query(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
         if self._asked is None or self._asked.done():
-            self._asked = asyncio.create_task(self._ask(name, take))
+            self._asked = asyncio.create_task(self._query(name, take))
 
-    async def _ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
+    async def _query(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
         with suppress(*NOT_READY_ERRORS):
-            await in_thread(lambda: self._client.ask(name, take), None)
+            await in_thread(lambda: self._client.start_query(name, take), None)
 
 
 class Robots:
@@ -123,7 +123,7 @@ class Robots:
         asking = asyncio.create_task(self._ask_again_and_again())
 
         def watch() -> Watch:
-            return Watch(_Asking(client), clock.steady_s())
+            return Watch(_TaskQueries(client), clock.steady_s())
 
         try:
             await self._follow(
@@ -180,7 +180,7 @@ class Robots:
             now_ns = clock.steady_ns()
             before, unreadable, now = watch.state, watch.unreadable, now_ns / NS_PER_S
             with suppress(zenoh.ZError):  # the session is closed, so the robot is silent
-                for state in watch.look(now):
+                for state in watch.poll(now):
                     self._take(before, state, now_ns)
                     before = state
             if watch.unreadable > unreadable:
@@ -245,14 +245,14 @@ class Robots:
     async def _ask_again_and_again(self) -> None:
         while True:
             self._refresh_requested.clear()
-            answered = await self._ask()
+            answered = await self._query_robot()
             try:
                 async with asyncio.timeout(ABOUT_PERIOD_S if answered else ABOUT_RETRY_S):
                     await self._refresh_requested.wait()
             except TimeoutError:
                 pass
 
-    async def _ask(self) -> bool:
+    async def _query_robot(self) -> bool:
         client = self.client
         assert client is not None
         try:

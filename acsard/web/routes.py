@@ -99,7 +99,7 @@ class Route(Struct, frozen=True):
         return _PARAMETER.sub(lambda match: f"{{{match[1]}:{patterns[match[1]]}}}", self.path)
 
 
-def asked(topic: Topic) -> bool:
+def is_queryable(topic: Topic) -> bool:
     """Return whether a program can query the last message of `topic` over HTTP."""
     own = topic.direction in ("out", "query") and "<key>" not in topic.key
     return own and topic.query in ROLES
@@ -110,7 +110,7 @@ def values(handler: Handler) -> Iterator[Route]:
 
     `handler` is the handler of all these routes.
     """
-    for topic in filter(asked, TOPICS):
+    for topic in filter(is_queryable, TOPICS):
         path = f"/api/{topic.key.replace('<Type>', '{type}')}"
         gives = {200: Body("The last value.", topic.type if topic.type in SCHEMAS else "")}
         yield Route("GET", path, least_role(topic.key), handler, topic.note, gives=gives)

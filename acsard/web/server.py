@@ -156,11 +156,11 @@ async def _watch_parent(leaving: asyncio.Event) -> None:
     """
     parent, loop = Parent(sys.stdin.fileno()), asyncio.get_running_loop()
 
-    def look() -> None:
-        if parent.gone():
+    def leave_if_parent_is_gone() -> None:
+        if parent.is_gone():
             leaving.set()
 
-    loop.add_reader(parent.fd, look)
+    loop.add_reader(parent.fd, leave_if_parent_is_gone)
     try:
         while True:
             parent.beat()

@@ -301,7 +301,7 @@ class Refused(Struct, frozen=True):
     reason: str
 
 
-class Gone(Struct, frozen=True):
+class DaemonUnreachable(Struct, frozen=True):
     """Report that the daemon is not reachable. `gone` is the reason."""
 
     gone: str

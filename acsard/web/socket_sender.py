@@ -70,7 +70,7 @@ class Outgoing:
         self._reports = Buckets(REPORT_RATE)
         self._closing = False
 
-    def say(self, message: object) -> None:
+    def enqueue(self, message: object) -> None:
         """Queue a message. If more than 200 messages wait, the oldest message is dropped."""
         self._out.append(msgspec.json.encode(message))
         self._news.set()
@@ -87,7 +87,7 @@ class Outgoing:
         """
         self._counts.refuse(reason, self._origin)
         if self._reports.take(f"{what} {reason}", clock.mono_ns()):
-            self.say(Refused(what, text))
+            self.enqueue(Refused(what, text))
 
     async def pump(self, look_around: Callable[[float], float]) -> None:
         """Send messages until the task is cancelled or the connection closes.
@@ -280,7 +280,7 @@ class Keys:
     async def _join(self, subscription: Following) -> None:
         stream = None
         while stream is None and self._is_followed(subscription):
-            stream = await self._found(subscription)
+            stream = await self._follow(subscription)
         if stream is None:
             return
         if not self._is_followed(subscription):  # the viewer unsubscribed during the wait
@@ -289,7 +289,7 @@ class Keys:
         subscription.stream = stream
         self._out.wake()
 
-    async def _found(self, subscription: Following) -> Stream | None:
+    async def _follow(self, subscription: Following) -> Stream | None:
         client = self._robots.client
         if client is None:
             await asyncio.sleep(0.2)

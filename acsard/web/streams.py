@@ -167,7 +167,7 @@ class Streams:
                 return subscription
             try:
                 # The query gives a first value soon, even if the key is published rarely.
-                client.ask(key, of_it(stream.answered))
+                client.start_query(key, of_it(stream.answered))
             except zenoh.ZError:
                 subscription.undeclare()
                 raise

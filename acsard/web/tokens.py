@@ -59,7 +59,7 @@ class Vault:
         last read, and all tokens in the file. They are in one tuple, because several threads
         replace them."""
 
-    def known(self, text: str) -> Identity | None:
+    def find_owner(self, text: str) -> Identity | None:
         """Return the owner of the token `text`, or None if the token is not valid.
 
         This method does not read the token file. It uses the tokens that the last call of `all()`,
@@ -173,7 +173,7 @@ class Vault:
             handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX)
-                tokens = self._kept()
+                tokens = self._load_tokens()
                 yield tokens
                 self._write(tokens)
             finally:
@@ -185,7 +185,7 @@ class Vault:
         except OSError as error:
             raise MendableError(f"cannot write {self.path}: {error.strerror}") from None
 
-    def _kept(self) -> list[Token]:
+    def _load_tokens(self) -> list[Token]:
         try:
             return msgspec.json.decode(self.path.read_bytes(), type=list[Token])
         except FileNotFoundError:

@@ -103,12 +103,12 @@ class ViewerCommands:
         if not self._rates.take(owner, clock.mono_ns()) and not ends:
             return False
         replaced = commander.replaced
-        self.outbox.take(commander, partial(self._put, source, sender), wish)
+        self.outbox.take(commander, partial(self._publish, source, sender), wish)
         if commander.replaced > replaced:
             self._counts.add("commands_superseded")
         return True
 
-    def _put(self, source: str, sender: Sender, wish: Wish) -> None:
+    def _publish(self, source: str, sender: Sender, wish: Wish) -> None:
         try:
             client = self._client()
             if client is not None:
@@ -169,9 +169,9 @@ class Viewer:
 
     async def run(self) -> None:
         self._greet()
-        self._out.say(socket_messages.DrivenPath(**self._robots.paths()))
-        self._out.say(socket_messages.LastMinute(self._robots.minute()))
-        self._guide.join(self, self._out.say)
+        self._out.enqueue(socket_messages.DrivenPath(**self._robots.paths()))
+        self._out.enqueue(socket_messages.LastMinute(self._robots.minute()))
+        self._guide.join(self, self._out.enqueue)
         pump = asyncio.create_task(self._out.pump(self._look_around))
         try:
             async for message in self._socket:
@@ -258,7 +258,7 @@ class Viewer:
                 self._call(frame)
             case Ping():
                 now = clock.now().wall_ns / 1e6
-                self._out.say(socket_messages.Pong(frame.ping, now))
+                self._out.enqueue(socket_messages.Pong(frame.ping, now))
             case Subscribe():
                 self._subscribe(frame)
             case Unsubscribe():
@@ -324,7 +324,7 @@ class Viewer:
         """
         if isinstance(frame, Call):
             self._counts.refuse("too_fast", self.who.origin)
-            self._out.say(socket_messages.Answer(frame.id, False, text))
+            self._out.enqueue(socket_messages.Answer(frame.id, False, text))
         else:
             self._out.refuse(frame.kind, "too_fast", text)
 
@@ -338,7 +338,7 @@ class Viewer:
         finally:
             if frame.call != "stop":
                 self._calling -= 1
-        self._out.say(socket_messages.Answer(frame.id, ok, text))
+        self._out.enqueue(socket_messages.Answer(frame.id, ok, text))
 
     def _subscribe(self, frame: Subscribe) -> None:
         if frame.subscribe == FLEET:
@@ -373,7 +373,7 @@ class Viewer:
             },
             self._camera,
         )
-        self._out.say(socket_messages.Hello(greeting))
+        self._out.enqueue(socket_messages.Hello(greeting))
 
     def _look_around(self, now: float) -> float:
         """Report changes to the client, and return the time of the next call.
@@ -383,12 +383,12 @@ class Viewer:
         if self._robots.gone != self._unreachable_reason:
             self._unreachable_reason = self._robots.gone
             if self._unreachable_reason:
-                self._out.say(socket_messages.Gone(self._unreachable_reason))
+                self._out.enqueue(socket_messages.DaemonUnreachable(self._unreachable_reason))
         if self._robots.about is not self._about:
             self._greet()
         if self._fleet_due is not None and now >= self._fleet_due:
             self._fleet_due = now + FLEET_S
-            self._out.say(socket_messages.Rows(self._fleet.rows(), self._fleet.note))
+            self._out.enqueue(socket_messages.Rows(self._fleet.rows(), self._fleet.note))
         return now + 0.25
 
     def _start(

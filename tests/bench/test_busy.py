@@ -26,7 +26,7 @@ from msgspec.structs import replace
 from acsard.bench.matching import staircase
 from acsard.core.config.settings import Config
 from tests.bench.rigs import all_cores_busy, config, delays_us, rig, schedule, share, waits_us
-from tests.system.strangers import FLOOD, words
+from tests.system.strangers import FLOOD, command_line
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(300)]
 
@@ -60,7 +60,7 @@ def flooded(settings: Config, wanted: bool) -> Iterator[None]:
         return
     text = FLOOD.replace("acsard/acsar/cmd/app", f"acsard/{settings.robot.id}/cmd/nav")
     flood = subprocess.Popen(
-        words(text, settings.bus.listen[0], 0.0, 2 * SECONDS), stdout=subprocess.PIPE
+        command_line(text, settings.bus.listen[0], 0.0, 2 * SECONDS), stdout=subprocess.PIPE
     )
     try:
         yield

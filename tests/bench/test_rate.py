@@ -34,7 +34,7 @@ PRIORITY = 50
 """SCHED_FIFO priority of the daemon, below that of the simulated wire."""
 
 
-def taken(running: Rig) -> tuple[float, int, int]:
+def sample_state(running: Rig) -> tuple[float, int, int]:
     """Return the time of a `state` in s, and its counts of missed periods and feedback lines."""
     state = running.state()
     counters = state.counters
@@ -58,9 +58,9 @@ def missed_share(rate: float, realtime: bool) -> float:
     words = (sys.executable, "-m", "tests.bench.unlimited", "--rate", str(rate))
     with rig(config(), words, wire_baud_rate=BAUD_RATE) as running:
         scheduled(running, realtime)
-        before = taken(running)
+        before = sample_state(running)
         used = running.follow(SECONDS)
-        seconds, missed, lines = (b - a for a, b in zip(before, taken(running), strict=True))
+        seconds, missed, lines = (b - a for a, b in zip(before, sample_state(running), strict=True))
         running.end_program()
     share = missed / max(1.0, seconds * rate)
     print(

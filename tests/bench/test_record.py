@@ -98,7 +98,7 @@ def pair(where: Path, first: bool) -> tuple[float, float]:
         return 100 * used[False] / span, 100 * used[True] / span
 
 
-def told(name: str, costs: list[Cost]) -> str:
+def cost_text(name: str, costs: list[Cost]) -> str:
     middle = [median(column) for column in zip(*costs, strict=True)]
     return (
         f"{name}: {middle[0]:.2f} % of a core, late p50 {middle[1]:.0f} us, p99 {middle[2]:.0f} us "
@@ -113,7 +113,7 @@ def test_recording_makes_no_period_late(tmp_path: Path) -> None:
         for records in (False, True) if number % 2 else (True, False):
             costs[records].append(cost(tmp_path / f"{number}-{records}", records))
     off, on = costs[False], costs[True]
-    print(f"\n{told('without', off)}\n{told('recording', on)}")
+    print(f"\n{cost_text('without', off)}\n{cost_text('recording', on)}")
     # The bound is the difference between two equal daemons on this machine now.
     noise = max(run.p99 for run in off) - min(run.p99 for run in off)
     assert median(run.p99 for run in on) <= median(run.p99 for run in off) + noise

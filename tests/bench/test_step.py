@@ -119,7 +119,7 @@ class Run:
         self.reports.enter_context(made.mcu.free_running(0.01))
         made.run(1.5)
         made.drive(0.0, 0.0, 0.2)
-        made.bus.wanted = {"odom"}
+        made.bus.wanted_keys = {"odom"}
         setattr(made.bus, "publish", lambda key, message: encode(message, "msgpack"))  # noqa: B010
         feed, step = made.port.feed, made.loop.step
         robot, self.heard = made.loop.robot, list[Received]()

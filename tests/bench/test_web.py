@@ -166,7 +166,7 @@ async def measured(peer: Peer, send: Callable[[float], object]) -> list[float]:
     return delays_ms
 
 
-def told(what: str, times: list[float]) -> float:
+def print_spread(what: str, times: list[float]) -> float:
     """Print the spread, and return the median."""
     times.sort()
     p50, p99 = statistics.median(times), times[int(len(times) * 0.99)]
@@ -184,7 +184,7 @@ def test_a_command_by_the_page_is_soon_on_the_port(tmp_path: Path, peer: Peer) -
             async with hands(page) as ours:
                 reading = asyncio.create_task(_read(ours))
                 await ours.hold(0.0, 0.8)
-                medians["page"] = told("page", await measured(peer, ours.drive))
+                medians["page"] = print_spread("page", await measured(peer, ours.drive))
                 reading.cancel()
 
         run(by_page, 120.0)
@@ -192,7 +192,7 @@ def test_a_command_by_the_page_is_soon_on_the_port(tmp_path: Path, peer: Peer) -
             for _ in range(80):
                 robot.send(0.0)
                 time.sleep(0.02)
-            medians["client"] = told("client", asyncio.run(measured(peer, robot.send)))
+            medians["client"] = print_spread("client", asyncio.run(measured(peer, robot.send)))
     assert medians["page"] < 10 * max(medians["client"], 0.5)
 
 
@@ -267,9 +267,9 @@ def test_a_finger_on_the_stick_is_soon_on_the_port(tmp_path: Path) -> None:
             lifted.append(finger.waited(lambda: browser.touch("End"), lambda speed: speed == 0))
             time.sleep(0.1)
             pressed.append(finger.waited(finger.press, lambda speed: speed > 3.5))
-    told("finger down -> first byte of a line that drives", pressed)
-    moves = told("finger moved -> first byte of its line", moved)
-    lifts = told("finger lifted -> first byte of the zero", lifted)
+    print_spread("finger down -> first byte of a line that drives", pressed)
+    moves = print_spread("finger moved -> first byte of its line", moved)
+    lifts = print_spread("finger lifted -> first byte of the zero", lifted)
     done = finish(acsard("bench", "--json"), tmp_path, 60.0)
     by_bench = json.loads(done.out)["outside"]["command_to_wire"]
     print(

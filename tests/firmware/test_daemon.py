@@ -95,7 +95,7 @@ def drives(board: Board, linear: float = 0.5, within: float = 5.0) -> Status:
     return until(lambda: turns(board, linear / RADIUS), within, f"it drives at {linear} m/s")
 
 
-def stands(board: Board) -> Status:
+def wait_until_still(board: Board) -> Status:
     """Wait until no wheel turns or has voltage. Return the board's state."""
 
     def look() -> Status | None:
@@ -246,7 +246,7 @@ def test_every_line_is_executed_and_odometry_agrees_with_the_wheels(
             began = board.status()
             with bus.commanding(0.0) as commander:
                 drive_about(board, commander, length_s)
-                status = stands(board)
+                status = wait_until_still(board)
             off_by = errors(odom, wheels, status)
         state = bus.at_rest()
         daemon.signal(signal.SIGTERM)
@@ -351,10 +351,10 @@ def resets(rig: Rig, how: Callable[[Board], None], unseen: float) -> None:
             assert (state["link"], state["mode"]) == ("up", "ready")
             (waiting,) = [source for source in state["sources"] if source["name"] == "app"]
             assert waiting["waits_for"].startswith("send a zero first")
-            coasted = truly(stands(board))
+            coasted = truly(wait_until_still(board))
             gives_way(bus, commander)
             drives(board)
-        true = truly(stands(board))
+        true = truly(wait_until_still(board))
         bus.at_rest()
         now = time.monotonic()
         odom.find(lambda message: True, 3.0, "odometry at rest", after=now)
@@ -449,7 +449,7 @@ def test_a_press_at_the_robot_stops_it_and_clear_is_refused_until_the_release(
         state = until(lambda: s if (s := bus.state())["mode"] == "stopped" else None, 3.0, "a stop")
         assert state["emergency_stop"] == "pressed"
         assert "emergency stop pressed at the robot" in state["reason"]
-        off = stands(board)
+        off = wait_until_still(board)
         assert "p00.00,bp00.00,cp00.00,dp00.00" in off.to_board.last
         refused = bus.get("srv/clear")
         assert not refused["success"], refused
@@ -572,7 +572,7 @@ def test_a_lost_link_is_restored_and_the_commander_must_be_neutral_first(
             at = time.monotonic()
             board.command("mute")
             stale = link("stale", at)
-            off = stands(board)
+            off = wait_until_still(board)
             stopped = (off.wanted_ns + off.base_ns) / MS - at * 1000
             # After less than a second it would ramp up again by itself.
             passes(board, 1200)
@@ -625,7 +625,7 @@ def test_with_counts_the_loss_of_a_fifth_of_the_lines_loses_no_distance(
             board.command("lose from 20")
             with bus.commanding(0.0) as commander:
                 drive_about(board, commander, length_s)
-                status = stands(board)
+                status = wait_until_still(board)
                 off_by = errors(odom, wheels, status)
             board.command("lose from 0")
         stale = len(daemon.events("link_stale"))

@@ -67,16 +67,16 @@ class SupervisorC(ctypes.Structure):
 @pytest.fixture(scope="session")
 def logic(library: ctypes.CDLL) -> ctypes.CDLL:
     """The firmware's library, with the argument types of its C functions declared."""
-    return told(library)
+    return declare_types(library)
 
 
 @pytest.fixture(scope="session")
 def coarse(coarse_library: ctypes.CDLL) -> ctypes.CDLL:
     """The same library for an encoder with few counts per turn."""
-    return told(coarse_library)
+    return declare_types(coarse_library)
 
 
-def told(library: ctypes.CDLL) -> ctypes.CDLL:
+def declare_types(library: ctypes.CDLL) -> ctypes.CDLL:
     u16, u32, single = ctypes.c_uint16, ctypes.c_uint32, ctypes.c_float
     types: list[tuple[str, list[Any], Any]] = [
         ("watchdog_start", [], None),

@@ -159,7 +159,7 @@ def parser(library: ctypes.CDLL) -> Parser:
 FIGURE = re.compile(rb"[pn]\d\d\.\d\d(?!\d)")
 
 
-def said(line: bytes) -> tuple[int, ...] | None:
+def parsed_speeds(line: bytes) -> tuple[int, ...] | None:
     """Return the speeds that the daemon's parser reads from a plain line, hundredths of a rad/s.
 
     Returns None unless each number has the daemon's format, because the board accepts no other.
@@ -219,7 +219,7 @@ def test_mutated_lines_give_the_same_result_as_in_the_host_s_parser(parser: Pars
         if b"#" in line or b"*" in line:
             continue
         command = parser.parse(line)
-        assert (command and command.hundredths) == said(line), line
+        assert (command and command.hundredths) == parsed_speeds(line), line
         valid_count += command is not None
     assert 5_000 < valid_count < 45_000, "both kinds"
 
@@ -233,7 +233,7 @@ def test_every_line_the_host_writes_is_accepted_with_the_same_value(
 ) -> None:
     line = Codec(WheelMap(), trailing_comma=comma).encode(speeds)
     (command,) = parser.stream(line)
-    assert command == Command(said(line.rstrip(b"\r\n")) or ())
+    assert command == Command(parsed_speeds(line.rstrip(b"\r\n")) or ())
 
 
 @given(wheels, st.booleans(), st.integers(0, 255), st.sampled_from(["", "S", "GS", "Z", "SS"]))
@@ -241,7 +241,7 @@ def test_a_checked_line_is_accepted_with_its_sequence_and_request(
     parser: Parser, speeds: WheelSpeeds, comma: bool, sequence: int, letters: str
 ) -> None:
     line = Codec(WheelMap(), trailing_comma=comma).encode(speeds).rstrip(b"\r\n")
-    command = Command(said(line) or (), True, "S" in letters, sequence)
+    command = Command(parsed_speeds(line) or (), True, "S" in letters, sequence)
     assert parser.parse(checked(line, sequence, letters)) == command
 
 
@@ -442,4 +442,4 @@ def test_a_reply_has_the_values_it_was_given(
     if check and sample:
         assert reply.milliseconds == milliseconds
         assert list(reply.counts) == counts
-    assert said(line[:31]) == tuple(hundredths)
+    assert parsed_speeds(line[:31]) == tuple(hundredths)

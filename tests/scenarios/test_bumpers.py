@@ -33,7 +33,7 @@ class Lines:
         self.world = world
         self.pressed_ns, self._before, self._lines, self._first = 0, False, 0, 0
         self.applied: list[tuple[float, float]] = []
-        world.watch = self.look
+        world.watch = self.note_press
 
     def begin(self) -> None:
         """Forget all earlier lines and speeds."""
@@ -41,7 +41,7 @@ class Lines:
         self.applied.clear()
         self._lines = 0
 
-    def look(self, outputs: Outputs) -> None:
+    def note_press(self, outputs: Outputs) -> None:
         """Remember the time of the step in which the daemon reads the press."""
         pressed = any(self.world.loop.robot.snapshot(outputs.now.mono_ns).bumpers or ())
         if pressed > self._before:

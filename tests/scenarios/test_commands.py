@@ -305,7 +305,7 @@ def test_a_query_on_the_wildcard_calls_no_service(world: World) -> None:
 
 
 def test_state_is_published_ten_times_a_second_and_immediately_on_change(world: World) -> None:
-    world.bus.wanted.add("state")
+    world.bus.wanted_keys.add("state")
     world.run(0.5)
     published = world.bus.published["state"]
     before = len(published)

@@ -58,7 +58,7 @@ def record(where: Path, seconds: int) -> list[Path]:
                 assert world.call("set", settings).success
             speed = 0.0 if second % 30 < 5 else dice.uniform(-0.8, 0.8)
             world.hold(speed, dice.uniform(-1.0, 1.0), seconds=1.0)
-            recorder._writer.write(recorder._taken(), False)
+            recorder._writer.write(recorder._take_queue(), False)
         recorder.close()
     return listed(where)
 

@@ -71,7 +71,7 @@ def test_one_line_goes_out_every_period(world: World) -> None:
 
 
 def test_every_message_of_a_sample_has_its_stamp(world: World) -> None:
-    world.bus.wanted |= {"odom", "tf", "wheel_states"}
+    world.bus.wanted_keys |= {"odom", "tf", "wheel_states"}
     world.drive(0.5, seconds=0.5)
     published = world.bus.published
     for odom, tf, wheels in zip(
@@ -84,7 +84,7 @@ def test_every_message_of_a_sample_has_its_stamp(world: World) -> None:
 
 
 def test_the_applied_speed_ramps_by_the_acceleration(world: World) -> None:
-    world.bus.wanted.add("cmd_vel_out")
+    world.bus.wanted_keys.add("cmd_vel_out")
     world.drive(0.5, seconds=1.0)
     twists = world.bus.published["cmd_vel_out"]
     lines = [

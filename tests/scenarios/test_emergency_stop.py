@@ -34,14 +34,14 @@ class Watch:
         self.world = world
         self.stopped_ns = 0
         self._before, self._lines, self._first = "", 0, 0
-        world.watch = self.look
+        world.watch = self.note_stop
 
     def begin(self) -> None:
         """Forget all earlier lines."""
         self.world.port.sent.clear()
         self._lines = 0
 
-    def look(self, outputs: Outputs) -> None:
+    def note_stop(self, outputs: Outputs) -> None:
         """Remember the step that stops the robot. `waited_ns` and `moved` use later lines."""
         if outputs.mode == "stopped" != self._before:
             self.stopped_ns, self._first = outputs.now.mono_ns, self._lines

@@ -234,7 +234,7 @@ def replay_file(world: World, tape: Tape) -> Said:
     """Return the messages that a client received or sent, by ROS topic, except those of the log."""
     messages: Said = defaultdict(list)
     for key in BY_KEY:
-        messages[BY_KEY[key].topic("")] = [_as_told(item) for item in world.bus.published[key]]
+        messages[BY_KEY[key].topic("")] = [_exportable(item) for item in world.bus.published[key]]
     for inputs, _, _ in tape.taken:
         for item in inputs.commands:
             arrived = item.arrived_ns + inputs.now.wall_ns - inputs.now.mono_ns
@@ -244,7 +244,7 @@ def replay_file(world: World, tape: Tape) -> Said:
     return messages
 
 
-def _as_told(message: Message) -> Any:
+def _exportable(message: Message) -> Any:
     """Return the message without those values that an export cannot contain.
 
     These are the daemon's measurements of its own process, for example its latencies.

@@ -106,7 +106,7 @@ def test_with_a_gyro_the_position_follows_the_true_one_too() -> None:
 def test_the_diagnostics_show_bias_delay_and_the_track_it_implies() -> None:
     made = world(SimConfig(track_multiplier=1.6, gyro_bias=0.01, gyro_delay=0.04))
     wandering(made, 4)
-    message = made.loop.report.current("diagnostics", made.loop._look)
+    message = made.loop.report.current("diagnostics", made.loop._snapshot)
     assert isinstance(message, DiagnosticArray)
     (row,) = [status for status in message.status if status.name == "acsard: gyro"]
     values = {pair.key: float(pair.value) for pair in row.values}
@@ -182,7 +182,7 @@ def test_without_the_setting_the_gyro_is_off_and_has_no_diagnostics() -> None:
     made = World()
     made.run(1.0)
     assert made.state.gyro == "off"
-    message = made.loop.report.current("diagnostics", made.loop._look)
+    message = made.loop.report.current("diagnostics", made.loop._snapshot)
     assert isinstance(message, DiagnosticArray)
     assert not [status for status in message.status if "gyro" in status.name]
 

@@ -25,7 +25,7 @@ SHORT, SLOW, LONG = 2, 10, 60
 """Minutes. The hour is for the soak runs, since it takes half a minute of real time."""
 
 
-def live(minutes: int) -> dict[str, object]:
+def drive_with_troubles(minutes: int) -> dict[str, object]:
     """Drive for `minutes`, each minute with another kind of trouble, and return the trace.
 
     All random numbers come from a fixed seed.
@@ -97,7 +97,7 @@ def _trouble(world: World, kind: int) -> None:
 
 def ends_as_it_always_did(minutes: int) -> None:
     began = time.perf_counter()
-    ended = live(minutes)
+    ended = drive_with_troubles(minutes)
     print(f"\n{minutes} minutes in virtual time: {time.perf_counter() - began:.1f} s; {ended}")
     assert ended == json.loads(GOLDEN.read_text())[f"{minutes} minutes"]
 
@@ -119,6 +119,6 @@ def test_a_drive_of_an_hour_ends_in_the_recorded_state() -> None:
 
 
 if __name__ == "__main__":
-    golden = {f"{minutes} minutes": live(minutes) for minutes in (SHORT, SLOW, LONG)}
+    golden = {f"{minutes} minutes": drive_with_troubles(minutes) for minutes in (SHORT, SLOW, LONG)}
     GOLDEN.write_text(json.dumps(golden, indent=2) + "\n")
     print(GOLDEN.read_text())

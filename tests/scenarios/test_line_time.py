@@ -26,7 +26,7 @@ class Drive:
 
     def __init__(self, made: World, reports: bool, batched: bool = False) -> None:
         self.world, self.faults = made, ExitStack()
-        made.bus.wanted.add("wheel_states")
+        made.bus.wanted_keys.add("wheel_states")
         if batched:
             self.faults.enter_context(made.mcu.ftdi())
         if reports:

@@ -37,7 +37,7 @@ T = TypeVar("T", bound=Message)
 
 def current(world: World, key: str, kind: type[T]) -> T:
     """Return the present value of this key, as a query would receive it."""
-    message = world.loop.report.current(key, world.loop._look)
+    message = world.loop.report.current(key, world.loop._snapshot)
     assert isinstance(message, kind)
     return message
 

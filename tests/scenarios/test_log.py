@@ -30,7 +30,7 @@ def world() -> World:
     return world
 
 
-def told(world: World, name: EventName) -> list[Event]:
+def events_named(world: World, name: EventName) -> list[Event]:
     return [event for event in world.events if event.name == name]
 
 
@@ -39,7 +39,7 @@ def signed(name: str) -> bytes:
     return msgspec.json.encode({"sender": f"{name}/s3cret"})
 
 
-def shown(name: str) -> str:
+def logged_name(name: str) -> str:
     """Return the text by which the log names the client of `signed(name)`."""
     return f"{public_name(f'{name}/s3cret')} (native)"
 
@@ -71,7 +71,7 @@ def test_every_service_call_is_reported_once_with_its_caller(world: World, servi
         call(world, "stop", signed("ann@desk"))
     call(world, service, signed("joe@laptop patrol"))
     (event,) = (event for event in world.events if event.name == service)
-    assert event.by == shown("joe@laptop patrol")
+    assert event.by == logged_name("joe@laptop patrol")
     assert event.count == 1
 
 
@@ -81,17 +81,20 @@ def test_stops_and_clears_are_reported_in_order_with_their_clients(world: World)
         call(world, "clear", signed(name + "@desk"))
     asked = [(event.name, event.by) for event in world.events if event.by]
     assert asked == [
-        ("stop", shown("joe")),
-        ("clear", shown("joe@desk")),
-        ("stop", shown("ann")),
-        ("clear", shown("ann@desk")),
+        ("stop", logged_name("joe")),
+        ("clear", logged_name("joe@desk")),
+        ("stop", logged_name("ann")),
+        ("clear", logged_name("ann@desk")),
     ]
 
 
 def test_the_stop_of_a_second_client_is_reported_without_delay(world: World) -> None:
     call(world, "stop", signed("joe"))
     call(world, "stop", signed("ann"))
-    assert [event.by for event in told(world, "stop")] == [shown("joe"), shown("ann")]
+    assert [event.by for event in events_named(world, "stop")] == [
+        logged_name("joe"),
+        logged_name("ann"),
+    ]
 
 
 def test_no_stop_is_reported_after_the_clear_that_released_it(world: World) -> None:
@@ -100,7 +103,7 @@ def test_no_stop_is_reported_after_the_clear_that_released_it(world: World) -> N
         world.run(0.05)
     call(world, "clear", signed("ann"))
     world.run(3.0)
-    assert counted(told(world, "stop")) == 2 * BURST
+    assert counted(events_named(world, "stop")) == 2 * BURST
     assert [event.name for event in world.events if event.name in ("stop", "clear")] == [
         *["stop"] * (BURST + 1),
         "clear",
@@ -117,7 +120,7 @@ def test_no_clear_is_reported_after_the_stop_that_followed_it(world: World) -> N
     call(world, "stop", signed("joe"))
     world.run(5.0)
     names = [event.name for event in world.events if event.name in ("stop", "clear")]
-    assert (names[-1], counted(told(world, "stop"))) == ("stop", BURST + 1)
+    assert (names[-1], counted(events_named(world, "stop"))) == ("stop", BURST + 1)
 
 
 def test_a_client_that_repeats_a_stop_pushes_no_other_row_out_of_the_events(world: World) -> None:
@@ -125,7 +128,7 @@ def test_a_client_that_repeats_a_stop_pushes_no_other_row_out_of_the_events(worl
     for _ in range(25):
         call(world, "stop", signed("joe"))
         world.run(1.0)
-    events = world.loop.report.current("events", world.loop._look)
+    events = world.loop.report.current("events", world.loop._snapshot)
     assert isinstance(events, Events)
     assert "deactivate" in {row.name for row in events.events}
 
@@ -134,8 +137,8 @@ def test_the_log_says_that_a_caller_over_ros_is_unnamed(world: World) -> None:
     call(world, "stop", bytes(16) + b"\x10" + bytes(range(16)), "rmw")
     world.run(2.0)
     call(world, "clear", b"", "bridge")
-    assert told(world, "stop")[0].by == f"unnamed (rmw {bytes(range(16)).hex()})"
-    assert told(world, "clear")[0].by == "unnamed (bridge)"
+    assert events_named(world, "stop")[0].by == f"unnamed (rmw {bytes(range(16)).hex()})"
+    assert events_named(world, "clear")[0].by == "unnamed (bridge)"
 
 
 def test_a_put_on_stop_is_reported_with_its_name_or_the_session_that_stamped_it(
@@ -147,9 +150,9 @@ def test_a_put_on_stop_is_reported_with_its_name_or_the_session_that_stamped_it(
         Arrival("stop", True, b"", "", world.now_ns, None, "", attachment=signed("ann"))
     )
     world.run(0.1)
-    assert [event.by for event in told(world, "stop")] == [
+    assert [event.by for event in events_named(world, "stop")] == [
         f"unnamed (native, session {public_name('peer')})",
-        shown("ann"),
+        logged_name("ann"),
     ]
 
 
@@ -159,11 +162,11 @@ def test_a_put_on_stop_is_reported_with_its_name_or_the_session_that_stamped_it(
 def test_a_drive_is_reported_as_changes_of_mode_and_commander(world: World) -> None:
     world.drive(0.5, seconds=0.5)
     world.run(1.0)
-    assert [event.text for event in told(world, "mode")] == [
+    assert [event.text for event in events_named(world, "mode")] == [
         "ready -> driving: commanded by app",
         "driving -> ready: waiting for a command: no source has sent one within its timeout",
     ]
-    assert [event.text for event in told(world, "commander")] == [
+    assert [event.text for event in events_named(world, "commander")] == [
         f"no sender -> app ({public_name('somebody')})"
     ]
 
@@ -174,7 +177,7 @@ def test_each_change_of_the_commander_by_priority_is_reported(world: World) -> N
     world.send(0.0, source="app")
     world.run(1.0)
     world.drive(0.5, seconds=0.3)
-    assert [event.by.partition(" ")[0] for event in told(world, "commander")] == [
+    assert [event.by.partition(" ")[0] for event in events_named(world, "commander")] == [
         "app",
         "teleop",
         "app",
@@ -206,7 +209,7 @@ def test_refused_commands_are_one_log_line_a_second_that_counts_them_by_reason(
         world.send(0.1, source="stranger")
         world.run(0.01)
     world.run(1.1)
-    lines = told(world, "command_refused")
+    lines = events_named(world, "command_refused")
     assert len(lines) <= 7
     assert counted(lines) == 1000
     assert "100 x unknown_source" in lines[2].text
@@ -218,7 +221,7 @@ def test_missed_periods_are_one_log_line_a_second_that_counts_all(world: World) 
         world.stall(0.05)
         world.run(0.05)
     world.run(1.1)
-    lines = told(world, "missed_periods")
+    lines = events_named(world, "missed_periods")
     assert len(lines) <= 4
     assert counted(lines) == world.state.counters["missed_periods"] > 60
 
@@ -229,7 +232,7 @@ def test_the_cause_of_a_late_period_is_in_the_line_that_follows() -> None:
     world.events.clear()
     world.stall(0.05)
     world.run(1.1)
-    number, cause = told(world, "missed_periods")
+    number, cause = events_named(world, "missed_periods")
     assert number.text == "4 x missed: no control step ran in 4 successive control periods"
     assert cause.text.startswith("late: by 0.04 s, because other programs used the processor for")
 
@@ -238,7 +241,7 @@ def test_noise_on_the_wire_is_one_log_line_a_second_that_counts_all(world: World
     with world.mcu.noise():
         world.run(5.0)
     world.run(1.1)
-    lines = told(world, "lines_rejected")
+    lines = events_named(world, "lines_rejected")
     assert len(lines) <= 7
     assert counted(lines) == world.state.counters["line_malformed"] > 20
     assert lines[1].text.startswith(f"{lines[1].count} x malformed; the last: ")
@@ -283,10 +286,10 @@ def test_commanders_that_alternate_cause_a_bounded_number_of_log_lines(world: Wo
     for turn in range(200):
         world.send(0.0, source=("teleop", "app")[turn % 2])
         world.run(0.3)
-    assert told(world, "commander")
+    assert events_named(world, "commander")
     # The commanders take turns every 0.3 s for 60 s.
-    assert len(told(world, "commander")) <= 60 + LINES_A_SECOND
-    assert counted(told(world, "commander")) == 200
+    assert len(events_named(world, "commander")) <= 60 + LINES_A_SECOND
+    assert counted(events_named(world, "commander")) == 200
 
 
 def test_stops_by_a_thousand_names_are_few_and_short_log_lines(world: World) -> None:
@@ -297,8 +300,8 @@ def test_stops_by_a_thousand_names_are_few_and_short_log_lines(world: World) -> 
         )
         world.run(0.001)
     world.run(2.0)
-    assert len(told(world, "stop")) <= BURST + 3
-    assert max(len(event.by) + len(event.text) for event in told(world, "stop")) < 700
+    assert len(events_named(world, "stop")) <= BURST + 3
+    assert max(len(event.by) + len(event.text) for event in events_named(world, "stop")) < 700
 
 
 @pytest.mark.slow

@@ -54,13 +54,13 @@ def off(made: World) -> tuple[float, float]:
 
 
 def row(made: World) -> DiagnosticStatus:
-    message = made.loop.report.current("diagnostics", made.loop._look)
+    message = made.loop.report.current("diagnostics", made.loop._snapshot)
     assert isinstance(message, DiagnosticArray)
     (row_status,) = [status for status in message.status if status.name == "acsard: wheels"]
     return row_status
 
 
-def lies(made: World, kind: str, wheel: int) -> Fault:
+def encoder_fault(made: World, kind: str, wheel: int) -> Fault:
     return {
         "dead": made.mcu.stuck_encoder(wheel),
         "reversed": made.mcu.bias(wheel, -1.0),
@@ -84,7 +84,7 @@ def test_with_one_wheel_fault_the_pose_stays_right_and_state_names_the_wheel(
 ) -> None:
     made = world()
     made.drive(0.3, seconds=1.0)
-    with lies(made, kind, wheel):
+    with encoder_fault(made, kind, wheel):
         made.hold(0.6, -0.8, seconds=1.0)
         made.send(0.0)
         made.run(1.0)
@@ -160,7 +160,7 @@ def reversed_encoder(seed: int) -> tuple[float, float, str]:
 
     setattr(odometry, "fold", both)  # noqa: B010
     made.drive(scale * dice.uniform(-0.6, 1), scale * dice.uniform(-2, 2), dice.uniform(0.5, 1.5))
-    with lies(made, "reversed", wheel):
+    with encoder_fault(made, "reversed", wheel):
         for _ in range(6):
             twist = scale * dice.uniform(-0.6, 1.0), scale * dice.uniform(-2, 2)
             made.hold(*twist, dice.uniform(0.5, 2.0))

@@ -68,7 +68,7 @@ def stop_and_clear(world: World, meanwhile: Callable[[], None]) -> None:
     assert world.call("clear").success
 
 
-def stands(world: World, act: Callable[[], None]) -> None:
+def check_stays_at_rest(world: World, act: Callable[[], None]) -> None:
     """Call `act`. Check that the robot stays at rest meanwhile and reports that it needs a zero."""
     since_ns = world.now_ns
     act()
@@ -137,7 +137,7 @@ def test_keyboard_drives_after_k_was_held_for_a_second(world: World, road: Road)
     keyboard.press(0.0, 1.1)
     drives(world, lambda: keyboard.press(FAST, 1.5))
     stop_and_clear(world, lambda: keyboard.press(FAST, 2.0))
-    stands(world, lambda: keyboard.press(FAST, 2.0))
+    check_stays_at_rest(world, lambda: keyboard.press(FAST, 2.0))
     keyboard.press(0.0, 1.1)
     drives(world, lambda: keyboard.press(FAST, 1.5))
     world.run(10.0)
@@ -159,7 +159,7 @@ def test_one_zero_of_a_new_publisher_by_rmw_is_enough_once_its_delays_are_known(
     keyboard = Keyboard(world, "rmw")
     keyboard.send(0.0)
     world.run(3.0)
-    stands(world, lambda: keyboard.press(FAST, 1.5))
+    check_stays_at_rest(world, lambda: keyboard.press(FAST, 1.5))
     keyboard.send(0.0)
     drives(world, lambda: keyboard.press(FAST, 1.0))
 
@@ -168,7 +168,7 @@ def test_keyboard_by_the_bridge_waits_for_a_second_after_k(world: World) -> None
     keyboard = Keyboard(world, "bridge")
     keyboard.send(0.0)
     world.run(0.9)
-    stands(world, lambda: keyboard.press(FAST, 1.0))
+    check_stays_at_rest(world, lambda: keyboard.press(FAST, 1.0))
     keyboard.send(0.0)
     world.run(1.1)
     drives(world, lambda: keyboard.hold(FAST, 0.2, 30.0))
@@ -209,11 +209,11 @@ def test_joystick_drives_after_the_button_was_held_for_a_second_with_the_stick_a
     world: World, kind: type[Joystick], road: Road
 ) -> None:
     joystick = kind(world, road)
-    stands(world, lambda: joystick.joy(True, FAST, 1.0))
+    check_stays_at_rest(world, lambda: joystick.joy(True, FAST, 1.0))
     joystick.joy(True, 0.0, 1.1)
     drives(world, lambda: joystick.joy(True, FAST, 1.0))
     stop_and_clear(world, lambda: joystick.joy(True, FAST, CLEAR_S))
-    stands(world, lambda: joystick.joy(True, FAST, 2.0))
+    check_stays_at_rest(world, lambda: joystick.joy(True, FAST, 2.0))
     joystick.joy(True, 0.0, 1.1)
     drives(world, lambda: joystick.joy(True, FAST, 0.5))
     joystick.joy(False, 0.0, 10.0)
@@ -242,7 +242,7 @@ def test_joy_teleop_is_not_armed_by_releasing_its_button(world: World, road: Roa
     joystick.joy(True, FAST, 1.0)
     stop_and_clear(world, lambda: joystick.joy(True, FAST, CLEAR_S))
     joystick.joy(False, 0.0, 10.0)
-    stands(world, lambda: joystick.joy(True, FAST, 2.0))
+    check_stays_at_rest(world, lambda: joystick.joy(True, FAST, 2.0))
 
 
 # rqt_robot_steering
@@ -289,7 +289,7 @@ def test_rqt_robot_steering_drives_after_stop_was_clicked(
     steering.wait(pause)
     drives(world, lambda: slide(steering, FAST, 1.0))
     stop_and_clear(world, lambda: steering.wait(CLEAR_S))
-    stands(world, lambda: steering.wait(2.0))
+    check_stays_at_rest(world, lambda: steering.wait(2.0))
     steering.stop()
     steering.wait(pause)
     drives(world, lambda: slide(steering, FAST, 0.5))
@@ -310,13 +310,13 @@ def test_topic_pub_of_a_speed_never_drives_however_often_it_is_started(
 ) -> None:
     for pause in (0.5, 2.0, 10.0):
         name = f"before a pause of {pause} s"
-        stands(world, partial(topic_pub, world, road, name, FAST, 3.0))
+        check_stays_at_rest(world, partial(topic_pub, world, road, name, FAST, 3.0))
         world.run(pause)
 
 
 def test_topic_pub_of_a_zero_by_rmw_arms_no_other_sender(world: World) -> None:
     topic_pub(world, "rmw", "zero", 0.0, 2.0)
-    stands(world, lambda: topic_pub(world, "rmw", "speed", FAST, 3.0))
+    check_stays_at_rest(world, lambda: topic_pub(world, "rmw", "speed", FAST, 3.0))
 
 
 def test_topic_pub_once_of_a_zero_by_the_bridge_arms_after_a_second(world: World) -> None:
@@ -445,12 +445,12 @@ def test_nav2_drives_a_goal_that_was_cancelled_and_sent_again_a_good_second_late
     world: World, road: Road, smoother: bool, cancelled_at: float
 ) -> None:
     nav2 = Nav2(world, road, smoother=smoother)
-    stands(world, lambda: nav2.goal(FAST, 3.0))
+    check_stays_at_rest(world, lambda: nav2.goal(FAST, 3.0))
     nav2.cancel()
     nav2.idle(2.0)
     drives(world, lambda: nav2.goal(FAST, 1.0))
     stop_and_clear(world, lambda: nav2.goal(FAST, CLEAR_S))
-    stands(world, lambda: nav2.goal(cancelled_at, 3.0))
+    check_stays_at_rest(world, lambda: nav2.goal(cancelled_at, 3.0))
     nav2.cancel()
     nav2.idle(cancelled_at + 1.1)
     drives(world, lambda: nav2.goal(FAST, 0.5))
@@ -488,7 +488,7 @@ def test_nav2_between_two_goals_must_be_given_a_goal_that_is_cancelled(
     nav2.idle(3.0)
     stop_and_clear(world, lambda: nav2.idle(CLEAR_S))
     nav2.idle(10.0)
-    stands(world, lambda: nav2.goal(FAST, 3.0))
+    check_stays_at_rest(world, lambda: nav2.goal(FAST, 3.0))
 
 
 @pytest.mark.slow
@@ -519,7 +519,7 @@ def test_after_a_start_the_second_goal_of_nav2_is_the_first_to_move_the_robot(
     """
     nav2 = Nav2(world, road, smoother=False, stamps="kept")
     nav2.idle(5.0)
-    stands(world, lambda: nav2.goal(FAST, 30.0))
+    check_stays_at_rest(world, lambda: nav2.goal(FAST, 30.0))
     nav2.cancel()
     nav2.idle(0.0 if road == "rmw" else 1.0)
     drives(world, lambda: nav2.goal(FAST, 0.5))
@@ -541,7 +541,7 @@ def test_a_nav2_that_was_started_again_must_send_a_zero_by_rmw_and_not_by_the_br
     before.cancel()
     before.idle(10.0)
     again = Nav2(world, road, "again", smoother=False, stamps="kept")
-    (drives if moves else stands)(world, lambda: again.goal(FAST, 2.0))
+    (drives if moves else check_stays_at_rest)(world, lambda: again.goal(FAST, 2.0))
 
 
 @pytest.mark.slow
@@ -575,7 +575,7 @@ def test_zeros_that_pass_through_nav2_do_nothing_after_a_clear(world: World) -> 
     nav2.idle(5.0)
     stop_and_clear(world, lambda: nav2.idle(CLEAR_S))
     nav2.receive_zeros(1.0)
-    stands(world, lambda: nav2.goal(FAST, 2.0))
+    check_stays_at_rest(world, lambda: nav2.goal(FAST, 2.0))
 
 
 @pytest.mark.slow
@@ -629,7 +629,7 @@ def test_after_one_cancelled_docking_later_ones_drive_through_the_zeros_of_nav2(
     """
     monitor, docking = Speaker(world, road, "monitor"), Docking(world, road)
     monitor.key = "cmd/nav"
-    stands(world, lambda: docking.dock(0.15, 3.0))
+    check_stays_at_rest(world, lambda: docking.dock(0.15, 3.0))
     docking.end()
     world.run(1.1)
     since_ns = world.now_ns
@@ -655,7 +655,7 @@ def test_nav2_with_stamps_moves_again_only_if_its_last_zero_is_stamped_right(
     nav2.goal(FAST, 3.0)
     nav2.cancel()
     nav2.idle(2.0)
-    (drives if moves else stands)(world, lambda: nav2.goal(FAST, 1.0))
+    (drives if moves else check_stays_at_rest)(world, lambda: nav2.goal(FAST, 1.0))
     assert "enable_stamped_cmd_vel: true" not in (ROS2 / "nav2_params.yaml").read_text()
 
 
@@ -709,7 +709,7 @@ def test_ros2_control_drives_after_a_while_without_cmd_vel(
     control.cycle(2.0)
     drives(world, lambda: control.cycle(1.0, FAST))
     stop_and_clear(world, lambda: control.cycle(CLEAR_S, FAST))
-    stands(world, lambda: control.cycle(2.0, FAST))
+    check_stays_at_rest(world, lambda: control.cycle(2.0, FAST))
     control.cycle(silence)
     drives(world, lambda: control.cycle(0.5, FAST))
 
@@ -774,7 +774,7 @@ def test_the_foxglove_panel_drives_when_its_button_is_released_and_pressed_again
     panel = Panel(world)
     drives(world, lambda: panel.button(FAST, 1.0))
     stop_and_clear(world, lambda: panel.button(FAST, CLEAR_S))
-    stands(world, lambda: panel.button(FAST, 2.0))
+    check_stays_at_rest(world, lambda: panel.button(FAST, 2.0))
     assert must_release_key(world.state, "app")
     panel.release(2.0)
     drives(world, lambda: panel.button(FAST, 0.5))
@@ -786,7 +786,7 @@ def test_a_new_connection_does_not_arm_a_panel_whose_button_is_held(world: World
     drives(world, lambda: panel.button(FAST, 1.0))
     stop_and_clear(world, lambda: panel.button(FAST, CLEAR_S))
     panel.connect()
-    stands(world, lambda: panel.button(FAST, 4.0))
+    check_stays_at_rest(world, lambda: panel.button(FAST, 4.0))
     panel.release(2.0)
     drives(world, lambda: panel.button(FAST, 0.5))
 

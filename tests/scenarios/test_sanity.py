@@ -121,7 +121,7 @@ def test_one_count_is_no_impossible_speed_although_it_looks_faster_than_the_boun
     world.run(1.0)
     for speed in (0.2, -0.2, 0.2):
         world.drive(speed, seconds=2.0)
-        assert (world.state.mode, told(world, "fault")) == ("driving", [])
+        assert (world.state.mode, event_texts(world, "fault")) == ("driving", [])
         world.send(0.0)
         world.run(0.5)
     assert world.state.counters.get("line_implausible", 0) <= 10
@@ -194,7 +194,7 @@ def test_a_bit_flipped_in_the_first_line_after_a_silence_costs_no_more_than_the_
             if drives:
                 world.send(0.5, 0.8)
             world.run(0.1)
-        assert told(world, "fault") == []
+        assert event_texts(world, "fault") == []
         ends.append(off_by(world))
     metres, turned = zip(*ends, strict=True)
     assert max(metres) < metres[0] + 0.03
@@ -211,7 +211,7 @@ def test_a_bit_flipped_while_the_link_returns_is_no_fault(number: int) -> None:
         world.run(1.5)
     damage(world, 0.3, number, TENS[0], 8)
     world.run(2.0)
-    assert (world.state.mode, told(world, "fault")) == ("ready", [])
+    assert (world.state.mode, event_texts(world, "fault")) == ("ready", [])
 
 
 @pytest.mark.slow
@@ -227,14 +227,14 @@ def test_a_bit_error_in_the_first_line_after_clear_is_no_fault_and_turns_no_pose
     damage(world, 0.0, 1, TENS[0], 8)
     assert world.call("clear").success
     world.run(1.0)
-    assert (world.state.mode, told(world, "fault")) == ("ready", [])
+    assert (world.state.mode, event_texts(world, "fault")) == ("ready", [])
     assert world.state.yaw == pytest.approx(yaw, abs=0.01)
 
 
 # hands
 
 
-def told(world: World, name: str) -> list[str]:
+def event_texts(world: World, name: str) -> list[str]:
     return [event.text for event in world.events if event.name == name]
 
 
@@ -300,7 +300,7 @@ def test_no_hand_latches_a_fault_whatever_the_mode(count: int, world: World) -> 
         world.events.clear()
         reason = world.state.reason
         shove(world, mode, dice)
-        latched = told(world, "fault")
+        latched = event_texts(world, "fault")
         assert (world.state.mode, latched) == (mode, []), f"push {trial} in {mode}: {latched}"
         resisting = mode == "driving" and world.state.reason.startswith("driving: app keeps")
         assert mode == "ready" or resisting or world.state.reason == reason
@@ -321,8 +321,10 @@ def test_wheels_turned_by_hand_are_reported_at_most_once_a_second_and_counted(
     with world.mcu.pushed(0.12):
         world.run(4.0)
     assert world.state.mode == mode
-    assert 3 <= len(told(world, "uncommanded_motion")) <= 4
-    assert world.state.counters["uncommanded_motion"] == len(told(world, "uncommanded_motion"))
+    assert 3 <= len(event_texts(world, "uncommanded_motion")) <= 4
+    assert world.state.counters["uncommanded_motion"] == len(
+        event_texts(world, "uncommanded_motion")
+    )
     leave(world, mode)
     world.drive(0.5, seconds=1.0)
     assert world.state.mode == "driving"
@@ -352,7 +354,7 @@ def test_motors_that_are_slow_to_stop_are_no_runaway_and_no_hand(lag: float, way
         world.run(3.0)
         if way == "stop":
             assert world.call("clear").success
-    assert told(world, "fault") == told(world, "uncommanded_motion") == []
+    assert event_texts(world, "fault") == event_texts(world, "uncommanded_motion") == []
 
 
 INTERRUPTIONS = (
@@ -389,7 +391,7 @@ def test_motors_that_lag_are_no_runaway_when_the_daemon_has_forgotten_their_spee
             world.run(seconds)
             world.port.plug(world.mcu)
         world.run(2.0)
-        assert told(world, "fault") == []
+        assert event_texts(world, "fault") == []
 
 
 @pytest.mark.variations(3)
@@ -464,7 +466,7 @@ def test_the_sparsest_allowed_feedback_raises_no_false_alarm_even_with_lost_line
             assert world.state.mode == "driving"
             world.send(0.0)
             world.run(dice.uniform(0.3, 1.5))
-    assert told(world, "fault") == told(world, "uncommanded_motion") == []
+    assert event_texts(world, "fault") == event_texts(world, "uncommanded_motion") == []
 
 
 def test_a_robot_that_may_not_turn_drives_straight_on() -> None:

@@ -234,7 +234,7 @@ def test_rates_and_covariances_are_in_force_from_the_next_message_on(world: Worl
         odometry__covariance="constant",
         odometry__pose_covariance_diagonal=diagonal,
     ).success
-    world.bus.wanted.add("odom")
+    world.bus.wanted_keys.add("odom")
     world.run(2.0)
     messages = world.bus.published["odom"]
     assert 19 <= len(messages) <= 21

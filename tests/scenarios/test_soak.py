@@ -295,19 +295,19 @@ def trouble(world: World, kind: str, dice: random.Random) -> str:
     if kind == "mute":
         with world.mcu.mute():
             world.hold(linear, seconds=seconds)
-            return _word(world, "fallen silent")
+            return _missing_text(world, "fallen silent")
     if kind in ("noise", "partial_line"):
         with getattr(world.mcu, kind)():
             world.hold(linear, seconds=seconds)
-            return _word(world, "fallen silent")
+            return _missing_text(world, "fallen silent")
     if kind == "reset":
         world.mcu.reset(world.now_ns)
         world.hold(linear, seconds=1.0)
-        return _word(world, "fallen silent")
+        return _missing_text(world, "fallen silent")
     if kind == "unplug":
         world.port.unplug()
         world.hold(linear, seconds=seconds)
-        word = _word(world, "reopened")
+        word = _missing_text(world, "reopened")
         world.mcu = FakeMcu(world.config, world.now_ns)
         world.port.plug(world.mcu)
         return word
@@ -315,7 +315,7 @@ def trouble(world: World, kind: str, dice: random.Random) -> str:
         world.port.blocked = True
         world.hold(linear, seconds=seconds)
         world.port.blocked = False
-        return _word(world, "the serial port sends nothing")
+        return _missing_text(world, "the serial port sends nothing")
     if kind == "stall":
         world.send(linear)
         world.stall(seconds / 4)
@@ -324,24 +324,24 @@ def trouble(world: World, kind: str, dice: random.Random) -> str:
         gain = dice.choice((-1.0, 3.0, 9.0))
         with world.mcu.stuck_encoder(wheel) if kind == "stuck" else world.mcu.bias(wheel, gain):
             world.hold(linear, seconds=2.5)
-            return _word(world, "wheel" if kind == "stuck" or gain < 9 else "rad/s is over")
+            return _missing_text(world, "wheel" if kind == "stuck" or gain < 9 else "rad/s is over")
     if kind == "bad commands":
         world.put("cmd/app", b"{")
         world.put("cmd/*", b"{}")
         world.put("wheel_cmd/app", b"\x80")
         world.send(1e300, -1e300, source="stranger")
         world.run(seconds)
-        return _word(world, "waiting for a command")
+        return _missing_text(world, "waiting for a command")
     if kind == "clock":
         world.wall_offset_ns += dice.choice((-1, 1)) * dice.randrange(DAY_NS)
         world.hold(linear, seconds=seconds)
-        return _word(world, "commanded by app")
+        return _missing_text(world, "commanded by app")
     world.put("stop", b"")
     world.hold(linear, seconds=seconds)
-    return _word(world, "stopped by unnamed (native) at")
+    return _missing_text(world, "stopped by unnamed (native) at")
 
 
-def _word(world: World, word: str) -> str:
+def _missing_text(world: World, word: str) -> str:
     state = world.state
     return "" if word in state.reason else f"{word!r} is not in {state.mode}: {state.reason!r}"
 

@@ -95,7 +95,7 @@ class Host:
 
     def write(self) -> None:
         """Write the recorded steps to the file, as the recorder's thread does each second."""
-        self.recorder._writer.write(self.recorder._taken(), False)
+        self.recorder._writer.write(self.recorder._take_queue(), False)
 
     def run(self, seconds: float) -> None:
         self.world.run(seconds)
@@ -398,7 +398,7 @@ def seconds_of(text: str, date: str = "") -> float:
     return time.mktime(time.strptime(whole, "%Y-%m-%d %H:%M:%S")) + float(f"0.{fraction}")
 
 
-def shown(*words: str) -> list[Line]:
+def shown_lines(*words: str) -> list[Line]:
     """Return the lines of `acsard recording show`."""
     with redirect_stdout(io.StringIO()) as printed:
         assert main(["recording", "show", *words]) == 0
@@ -463,7 +463,7 @@ def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
         for run in (first_run, second_run, third_run):
             run(host)
         outputs = {
-            "show": shown("all", "--directory", str(where)),
+            "show": shown_lines("all", "--directory", str(where)),
             "report": reported(where, here),
             "export": exported(where, here),
         }
@@ -509,7 +509,7 @@ def test_show_and_export_of_a_part_have_the_same_lines(
     first, new = str(listed(story.where)[0]), tmp_path / "new.mcap"
     times = ["--from", str(begin), "--to", str(end)]
     assert main(["recording", "export", first, str(new), *times]) == 0
-    show = shown(first, *times)
+    show = shown_lines(first, *times)
     assert show[-1].text.startswith("drive: was driving, ")
     assert [line.text for line in log_of(new)] == [line.text for line in show]
 
@@ -524,7 +524,7 @@ def test_show_and_export_of_a_damaged_recording_have_the_same_lines(
     data[(begin + end) // 2] ^= 0xFF
     bad.write_bytes(data)
     assert main(["recording", "export", str(bad), str(new)]) == Exit.INCOMPLETE
-    show = shown(str(bad))
+    show = shown_lines(str(bad))
     (gap,) = [number for number, line in enumerate(show) if line.text.startswith("gap: ")]
     assert len(show) - gap > 20
     assert [line.text for line in log_of(new)] == [line.text for line in show]

@@ -110,7 +110,7 @@ class MemoryBus:
     """
 
     def __init__(self, wanted: Collection[str]) -> None:
-        self.wanted = set(wanted)
+        self.wanted_keys = set(wanted)
         self.published: dict[str, deque[Message]] = {}
         self.replies: dict[int, list[Reply]] = {}
         self.finished: set[int] = set()
@@ -400,13 +400,13 @@ class World:
 
     @property
     def state(self) -> RobotState:
-        message = self.loop.report.current("state", self.loop._look)
+        message = self.loop.report.current("state", self.loop._snapshot)
         assert isinstance(message, RobotState)
         return message
 
     @property
     def odom(self) -> Odometry:
-        message = self.loop.report.current("odom", self.loop._look)
+        message = self.loop.report.current("odom", self.loop._snapshot)
         assert isinstance(message, Odometry)
         return message
 

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from tests.simulate import pairs, shrink
 from tests.simulate.actors import Result, collect_seldom, played
-from tests.simulate.plan import Plan, made
+from tests.simulate.plan import Plan, make_plan
 
 HERE = Path(__file__).parent
 
@@ -48,7 +48,7 @@ def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterato
     with ProcessPoolExecutor(workers, initializer=collect_seldom) as pool:
         # A worker that is not forked, as in Python 3.14, does not import a package's `__main__`, so
         # the function must be in another module.
-        running = {pool.submit(played, made(seed + n)) for n in range(workers)}
+        running = {pool.submit(played, make_plan(seed + n)) for n in range(workers)}
         following, total = seed + workers, 0.0
         while running:
             done, running = wait(running, return_when=FIRST_COMPLETED)
@@ -57,7 +57,7 @@ def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterato
                 total += result.simulated_s
                 yield result
                 if total < seconds and time.monotonic() < end:
-                    running.add(pool.submit(played, made(following)))
+                    running.add(pool.submit(played, make_plan(following)))
                     following += 1
 
 
@@ -117,15 +117,15 @@ def keep_plans(broken: list[Result], where: Path) -> None:
     found_by = commit()
     for result in broken:
         path = where / f"{result.seed}.json"
-        print(shrink.kept(made(result.seed), result, found_by, path), flush=True)
+        print(shrink.write_corpus_file(make_plan(result.seed), result, found_by, path), flush=True)
     for result in broken[:MOST_SHRUNK]:
-        small = shrink.shrunk(made(result.seed), result)
-        shrink.kept(small, result, found_by, where / f"{result.seed}.json")
+        small = shrink.shrunk(make_plan(result.seed), result)
+        shrink.write_corpus_file(small, result, found_by, where / f"{result.seed}.json")
 
 
 def replay(what: str) -> int:
     """Play the plan of a seed, or the plan in a JSON file."""
-    result = played(shrink.load(Path(what)) if what.endswith(".json") else made(int(what)))
+    result = played(shrink.load(Path(what)) if what.endswith(".json") else make_plan(int(what)))
     if result.finding:
         show(result)
     print(f"{result.simulated_s:.1f} s simulated in {result.cpu_s:.1f} s")
@@ -134,7 +134,7 @@ def replay(what: str) -> int:
 
 def reduce(seed: int, keep: str) -> int:
     """Shrink the plan of a seed that breaks a promise. Print the result, or store it."""
-    plan = made(seed)
+    plan = make_plan(seed)
     result = played(plan)
     if not result.finding:
         print(f"seed {seed} breaks no promise")
@@ -143,7 +143,7 @@ def reduce(seed: int, keep: str) -> int:
     small: Plan = shrink.shrunk(plan, result, print)
     show(played(small))
     if keep:
-        print(shrink.kept(small, result, commit(), HERE / "corpus" / f"{keep}.json"))
+        print(shrink.write_corpus_file(small, result, commit(), HERE / "corpus" / f"{keep}.json"))
     else:
         print(shrink.written(small, result, commit()))
     return 0

@@ -28,7 +28,7 @@ from tests.simulate.log_lines import LogLines
 from tests.simulate.plan import Plan
 from tests.simulate.plugging import Plugging
 from tests.simulate.pose import LIARS, PoseWitness
-from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
+from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, StepResult
 from tests.simulate.promises import DIALECTS, INPUTS, BrokenError, Witness
 from tests.simulate.reasons import Reasons
 from tests.simulate.reports import Echo, HalfDuplex, Reports, judge_pose, judge_state
@@ -284,7 +284,7 @@ class Run:
             if due_ns + extra_ns < end_ns or self.epilogue:
                 self.at(
                     due_ns + extra_ns,
-                    lambda due=due_ns + extra_ns: self._ask(event, due, latch, read_ns),  # type: ignore[misc]
+                    lambda due=due_ns + extra_ns: self._call_service(event, due, latch, read_ns),  # type: ignore[misc]
                 )
 
     def _typed(self, latch: int, place: int) -> tuple[int, int]:
@@ -295,7 +295,7 @@ class Run:
         older = [known for known in self._numbers.items() if known[0] != latch]
         return older[-place] if 0 < place <= len(older) else (2**53, -1)
 
-    def _ask(
+    def _call_service(
         self,
         event: dict[str, Any],
         due_ns: int,
@@ -333,7 +333,7 @@ class Run:
             witness.stops.append(true_ns)
             if event.get("put"):
                 put_by = event["by"] if via == "native" else ""
-                self.inputs.asked(true_ns, named(put_by, "native"))
+                self.inputs.note_stop(true_ns, named(put_by, "native"))
                 product.deliver(at_ns, "stop", b"", via="native", attachment=attachment)
                 self._puts_ns.append(true_ns)
                 return
@@ -349,7 +349,7 @@ class Run:
                 return
             match verb:
                 case "stop":
-                    self.inputs.asked(true_ns, named(event["by"], via))
+                    self.inputs.note_stop(true_ns, named(event["by"], via))
                 case "clear":
                     self.inputs.cleared(true_ns)
                     witness.cleared(true_ns, read_ns, text, event["by"])
@@ -366,7 +366,7 @@ class Run:
                     self.pose.placed((x, y, yaw) if at_once else None)
 
         self._calls[ticket] = event, true_ns, answered
-        product.ask(at_ns, service, ticket, payload, via, attachment)
+        product.call_service(at_ns, service, ticket, payload, via, attachment)
 
     # the board and the host
 
@@ -395,7 +395,7 @@ class Run:
                 elif name == "half_duplex":
                     self.half_duplex.begin()
                 elif name == "mute":
-                    self.at(self.true_ns + NS // 2 + 2 * self.witness.period_ns, self._look)
+                    self.at(self.true_ns + NS // 2 + 2 * self.witness.period_ns, self._check_state)
                 self.at(after_ns, lambda: self._mended(fault))
             case "reset":
                 product.reset(int(event["deaf"] * NS))
@@ -411,7 +411,7 @@ class Run:
                 self.inputs.lost()
                 product.unplug()
                 self.pose.doubt()
-                self.at(self.true_ns + NS // 2, self._look)
+                self.at(self.true_ns + NS // 2, self._check_state)
                 self.at(after_ns, lambda: self.plug(event["new"], event.get("without", ())))
             case "block":
                 self._block(True)
@@ -468,7 +468,7 @@ class Run:
 
         self.at(until_ns, works)
 
-    def _look(self) -> None:
+    def _check_state(self) -> None:
         """Check the speeds and the pose in `state`.
 
         The check is left out shortly after the host stalled or slept.
@@ -662,7 +662,7 @@ class Run:
         if self._linked:
             self.witness.arming(true_ns)
 
-    def _see(self, snapshot: Seen) -> None:
+    def _see(self, snapshot: StepResult) -> None:
         if self.failure is not None:
             return
         try:
@@ -693,7 +693,7 @@ class Run:
         """Return the number of good lines that the daemon has counted."""
         return int(self.product.state()["counters"]["lines"])
 
-    def _judge(self, snapshot: Seen) -> None:
+    def _judge(self, snapshot: StepResult) -> None:
         witness, offset = self.witness, self.slept_ns - START_NS
         true_ns = snapshot.at_ns + offset
         if snapshot.at_ns - snapshot.decided_ns > NS // 1000:
@@ -762,10 +762,10 @@ class Run:
         driven = self.followed.wish if driving else None
         whole = sum(line.endswith(b"\n") for _, line in snapshot.lines)
         self.course.step(true_ns, driven, witness.last, whole)
-        self.liveness.look(true_ns)
-        self.reasons.look(true_ns, self._stalled_ns)
+        self.liveness.judge(true_ns)
+        self.reasons.judge(true_ns, self._stalled_ns)
         if self._plain and not self.echo.on:
-            self.damage.look(true_ns, self._lines, self._stalled_ns == true_ns)
+            self.damage.judge(true_ns, self._lines, self._stalled_ns == true_ns)
         if snapshot.estimates:
             lies, truth = self._names, self.product.truth()
             self.pose.gyro(true_ns, self.product.gyro)

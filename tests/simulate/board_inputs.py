@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from tests.simulate.ages import MARGIN_NS
-from tests.simulate.product import Seen
+from tests.simulate.product import StepResult
 from tests.simulate.promises import DRIVER, INPUTS, LINE, ZERO, BrokenError, Witness
 from tests.simulate.roads import NS
 
@@ -268,7 +268,7 @@ class _Input:
         """`maybe` or `surely` if the board is silent about it."""
 
     @property
-    def known(self) -> bool:
+    def is_known(self) -> bool:
         """Whether the daemon certainly knows which of these inputs are pressed."""
         return self.sure and not self.silent and self.reported_ns is not None
 
@@ -382,7 +382,7 @@ class Inputs:
         self._powered, self._cut_ns = False, None
         self._doubt()
 
-    def asked(self, asked_ns: int, name: str) -> None:
+    def note_stop(self, asked_ns: int, name: str) -> None:
         """Note that the daemon has executed a stop of the client with this name."""
         self._names.append((asked_ns, name))
 
@@ -407,7 +407,7 @@ class Inputs:
     @property
     def limiting(self) -> bool:
         """Whether a bumper may be pressed from which the robot may only drive away."""
-        free = self.bumpers.known and b"X" not in self.bumpers.marks
+        free = self.bumpers.is_known and b"X" not in self.bumpers.marks
         return self._away and (self._fresh or not free)
 
     def take(self, decided_ns: int, offset: int, calm_ns: int) -> None:
@@ -501,7 +501,7 @@ class Inputs:
         elif driver.pressed_ns is None:
             driver.pressed_ns = true_ns
         self._witness.driver_fault |= faulty and not (estop.sure and estop.marks == b"X")
-        free = not estop.marks or (estop.known and estop.marks == b".")
+        free = not estop.marks or (estop.is_known and estop.marks == b".")
         self._driver_faulted |= faulty and certain and free and self._powered
 
     def _silence(self, known: _Input, decided_ns: int, offset: int, calm_ns: int) -> None:
@@ -550,7 +550,7 @@ class Inputs:
     def step(
         self,
         true_ns: int,
-        snapshot: Seen,
+        snapshot: StepResult,
         offset: int,
         calm: bool,
         state: Callable[[], dict[str, Any]],
@@ -562,7 +562,7 @@ class Inputs:
         if not self._reports:
             return
         witness, moving = self._witness, self._moving(snapshot.lines)
-        if self._away and self.bumpers.known and b"X" in self.bumpers.marks:
+        if self._away and self.bumpers.is_known and b"X" in self.bumpers.marks:
             self._drives_away(true_ns, moving)
             self._pushes(snapshot.decided_ns + offset)
         for name, pressed_ns in self._stopping():
@@ -607,7 +607,7 @@ class Inputs:
             self._looked_ns = snapshot.decided_ns
             self._state(true_ns, state(), snapshot.decided_ns)
 
-    def _keeps_names(self, true_ns: int, snapshot: Seen) -> None:
+    def _keeps_names(self, true_ns: int, snapshot: StepResult) -> None:
         """Check that the reason names a client that has stopped the robot, until a clear.
 
         The judge learns a client's name from the answer to its stop, and forgets all names when the
@@ -623,7 +623,7 @@ class Inputs:
                 text = f"{[name for _, name in self._names]} asked, and it is {snapshot.reason!r}"
                 raise BrokenError("a stop keeps the name of its client", true_ns, text)
 
-    def _drivers(self, true_ns: int, snapshot: Seen) -> None:
+    def _drivers(self, true_ns: int, snapshot: StepResult) -> None:
         """Check that a fault of a motor driver stops the robot.
 
         A pressed emergency stop removes the drivers' power, and the fault that they then report
@@ -631,7 +631,7 @@ class Inputs:
         """
         estop = self.estop
         free = not estop.marks and not self._fresh
-        free |= estop.known and estop.marks == b"." and not self._fresh
+        free |= estop.is_known and estop.marks == b"." and not self._fresh
         pressed = estop.pressed_ns is not None and estop.pressed_ns < self._stepped_ns
         pressed |= not self._witness.driver_fault
         began = (
@@ -668,7 +668,7 @@ class Inputs:
             speeds.append(tuple(motors[place] * sign for place, sign in self._witness.motors))
         return [wheels for wheels in speeds if any(wheels)]
 
-    def _answers(self, true_ns: int, snapshot: Seen, calm: bool) -> None:
+    def _answers(self, true_ns: int, snapshot: StepResult, calm: bool) -> None:
         """Check that the daemon sends a line within a period after a press."""
         if self._due_ns is None:
             return
@@ -715,7 +715,7 @@ class Inputs:
                 witness.counts["pushes against a bumper"] += 1
             latest.add(sender)
 
-    def _empty(self, true_ns: int, snapshot: Seen) -> None:
+    def _empty(self, true_ns: int, snapshot: StepResult) -> None:
         """Check the stop of an empty battery. The judge allows a small error of the mean."""
         battery, witness = self.battery, self._witness
         if not battery.bounds:
@@ -760,10 +760,10 @@ class Inputs:
 
     def _state(self, true_ns: int, state: dict[str, Any], decided_ns: int) -> None:
         """Compare the inputs in `state` with the lines of the board."""
-        if self.estop.known:
+        if self.estop.is_known:
             expected = "pressed" if self.estop.marks == b"X" else "released"
             self._same(true_ns, "the emergency stop", state["emergency_stop"], {expected})
-        if self.bumpers.known:
+        if self.bumpers.is_known:
             pressed = str([mark == ord("X") for mark in self.bumpers.marks])
             self._same(true_ns, "the bumpers", str(state["bumpers"]), {pressed})
         battery = self.battery

@@ -53,7 +53,7 @@ class Damage:
                 self._whole, self._counted, self._short_ns = 0, None, None
         self._held = rest[-MAX_LINE:]
 
-    def look(self, at_ns: int, lines: Callable[[], int], stalled: bool = False) -> None:
+    def judge(self, at_ns: int, lines: Callable[[], int], stalled: bool = False) -> None:
         """Judge a step.
 
         `lines` returns the number of valid lines that the daemon has counted. If the step

@@ -191,11 +191,11 @@ class Liveness:
             and all(priority[r["source"]] < priority[sender["source"]] for r in rivals)
         )
 
-    def look(self, now_ns: int) -> None:
+    def judge(self, now_ns: int) -> None:
         """Check that the robot drives if a lawful sender has sent speeds for long enough."""
         run = self.run
         self._stays_armed(now_ns)
-        if not self._since or run.active != run.lasting or run.witness.held is not None:
+        if not self._since or run.active != run.lasting or run.witness.must_rest is not None:
             return
         # A `deactivate` that waits for the disk is in force before its answer.
         if not run.product.plugged or run.witness.perhaps_latched or run.witness.pending:

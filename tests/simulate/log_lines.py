@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from tests.simulate.product import Seen
+from tests.simulate.product import StepResult
 from tests.simulate.promises import BrokenError
 from tests.simulate.roads import NS
 
@@ -29,7 +29,7 @@ class LogLines:
         self._since_ns = 0
         """Since when it lacks them."""
 
-    def see(self, true_ns: int, snapshot: Seen) -> None:
+    def see(self, true_ns: int, snapshot: StepResult) -> None:
         """Judge the lines of one step."""
         now_ns = snapshot.decided_ns
         if snapshot.mode != self._mode:

@@ -25,7 +25,7 @@ import msgspec
 
 from tests.simulate import bad_moments, board_inputs
 from tests.simulate.differences import DIFFERENCES, LEFT_OUT
-from tests.simulate.plan import Plan, made
+from tests.simulate.plan import Plan, make_plan
 
 OURS = Path(__file__).parents[2]
 
@@ -206,7 +206,7 @@ def compare(
     try:
         with ThreadPoolExecutor(len(pairs)) as pool:
             while total < seconds:
-                plans = [comparable(made(seed + runs + n)) for n in range(len(pairs))]
+                plans = [comparable(make_plan(seed + runs + n)) for n in range(len(pairs))]
                 results = pool.map(lambda pair, plan: pair.differs(plan), pairs, plans)
                 for plan, (difference, simulated_s) in zip(plans, results, strict=True):
                     runs += 1

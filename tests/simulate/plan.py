@@ -58,7 +58,7 @@ DIALECTS = (
 """Other forms of the protocol, to which a board may change while it runs."""
 
 
-def made(seed: int, seconds: float | None = None) -> Plan:
+def make_plan(seed: int, seconds: float | None = None) -> Plan:
     """Return the plan of this seed."""
     dice = random.Random(f"plan {seed}")
     share = dice.choice((0.2, 0.5, 0.7))

@@ -28,7 +28,7 @@ from threading import Lock
 from typing import NamedTuple
 
 from tests.simulate.actors import played
-from tests.simulate.plan import made
+from tests.simulate.plan import make_plan
 from tests.simulate.planted_cases import CASES
 from tests.simulate.planted_faults import FAULTS, Fault
 
@@ -159,7 +159,7 @@ def broken_again(fault: Fault, row: Row) -> str:
 @cache
 def sound_finding(seed: int) -> str:
     """Return the promise that this seed breaks in the product without a fault, or ""."""
-    return played(made(seed)).finding
+    return played(make_plan(seed)).finding
 
 
 class Play(NamedTuple):

@@ -182,8 +182,8 @@ FAULTS = (
         "arbiter arming",
         "a sender drives without having sent a zero",
         ARBITER,
-        "        if not (armed and sender.live(now_ns)):\n",
-        "        if not sender.live(now_ns):\n",
+        "        if not (armed and sender.is_live(now_ns)):\n",
+        "        if not sender.is_live(now_ns):\n",
     ),
     fault(
         "arbiter stale",
@@ -483,7 +483,7 @@ FAULTS = (
         "lifecycle off",
         "deactivate answers, but does nothing",
         LIFECYCLE,
-        "self._latch(inactive=self._made(now, by, f\"switched off by {by or 'request'}\"))",
+        "self._latch(inactive=self._new_latch(now, by, f\"switched off by {by or 'request'}\"))",
         "self._off_ns = now.mono_ns",
     ),
     fault(
@@ -728,8 +728,8 @@ FAULTS = (
         "odometry gap",
         "a gap while the robot moves does not make the pose less certain",
         ODOMETRY,
-        "        if rolled.unknown > 0.0:\n            self._stand",
-        "        if rolled.unknown > 1e9:\n            self._stand",
+        "        if rolled.unknown > 0.0:\n            self._add_unseen_motion",
+        "        if rolled.unknown > 1e9:\n            self._add_unseen_motion",
         Edit(
             ODOMETRY,
             "            self._uncertainty.doubt(along + by_counts, yaw + turn_by_counts)\n",
@@ -809,7 +809,7 @@ FAULTS = (
         "wheel press",
         "a wheel that rested during a press and is then turned by hand is a runaway",
         WITNESS,
-        "self.driven = self.driven and not self._rests(raw_speed, dt, count)",
+        "self.driven = self.driven and not self._is_surely_slow(raw_speed, dt, count)",
         "self.driven = self.driven",
     ),
     fault(
@@ -963,7 +963,7 @@ FAULTS = (
         "battery clear",
         "a clear works while the battery is empty",
         ROBOT,
-        "        elif battery.held:\n",
+        "        elif battery.refuses_clear:\n",
         "        elif False:\n",
     ),
     fault(

@@ -5,7 +5,7 @@ Times are in ns of the robot's monotonic clock, which stops while the host sleep
 
 from __future__ import annotations
 
-from tests.simulate.product import Product, Seen
+from tests.simulate.product import Product, StepResult
 from tests.simulate.promises import LINE, BrokenError
 from tests.simulate.roads import NS
 
@@ -30,7 +30,7 @@ class Plugging:
         self._line_ns = -1
         """When the step ended that made the last line, or in which the link was not up."""
 
-    def see(self, true_ns: int, snapshot: Seen, product: Product, calm_ns: int) -> None:
+    def see(self, true_ns: int, snapshot: StepResult, product: Product, calm_ns: int) -> None:
         """Judge a step. The last stall of the host, or block of the output, ended at `calm_ns`."""
         if not product.plugged:
             late_ns = snapshot.decided_ns - product.unplugged_ns

@@ -252,7 +252,7 @@ class PoseWitness:
             # A sum is finite only if each of its numbers is.
             if not math.isfinite(ex + ey + eyaw + sum(covariance)):
                 raise BrokenError("the pose is finite", now_ns, f"{ex} {ey} {eyaw} {covariance}")
-            self._one(now_ns, sampled_ns + offset_ns, (ex, ey, eyaw), covariance, lies)
+            self._judge_pose(now_ns, sampled_ns + offset_ns, (ex, ey, eyaw), covariance, lies)
         sampled_ns, ex, ey, eyaw, covariance, _ = estimates[-1]
         self.latest = ex, ey, eyaw
         if silent_only:
@@ -273,7 +273,7 @@ class PoseWitness:
                 self._expected, self._asked_ns = (true, asked), last[0]
         return placed
 
-    def _one(
+    def _judge_pose(
         self, now_ns: int, at_ns: int, pose: Pose, covariance: tuple[float, ...], lies: bool
     ) -> None:
         last, self._last = self._last, (at_ns, pose)

@@ -55,7 +55,7 @@ Estimate = tuple[int, float, float, float, tuple[float, ...], tuple[float, ...]]
 NONE: Sequence[Estimate] = ()
 
 
-class Seen(msgspec.Struct, frozen=True, gc=False):
+class StepResult(msgspec.Struct, frozen=True, gc=False):
     """The externally visible results of one control step."""
 
     at_ns: int
@@ -170,7 +170,7 @@ class Disk:
 class Product:
     """One robot with its computer and its board. Its daemon may end and start several times."""
 
-    def __init__(self, config: dict[str, Any], see: Callable[[Seen], None]) -> None:
+    def __init__(self, config: dict[str, Any], see: Callable[[StepResult], None]) -> None:
         self._config, self._see = parse(b"", config), see
         self._faults: list[tuple[str, tuple[Any, ...]]] = []
         self._lasting = ExitStack()
@@ -190,7 +190,7 @@ class Product:
 
     def _began(self) -> None:
         world = self._world
-        world.bus.wanted = set()
+        world.bus.wanted_keys = set()
         world.watch = self._watch
         if isinstance(world.mcu, WatchedMcu):
             world.mcu._see = self._sight
@@ -223,7 +223,7 @@ class Product:
             [_plain(estimate) for estimate in outputs.estimates] if outputs.estimates else NONE
         )
         self._see(
-            Seen(
+            StepResult(
                 world.now_ns,
                 outputs.now.mono_ns,
                 outputs.mode,
@@ -299,7 +299,7 @@ class Product:
         arrival = Arrival("stop", True, b"", "", self.now_ns, None, "", "native", b"", self.wall_ns)
         self._world.bus.arrivals.insert(0, arrival)
 
-    def ask(
+    def call_service(
         self, at_ns: int, service: str, ticket: int, payload: bytes, via: Any, attachment: bytes
     ) -> None:
         """Deliver a service call. As on the real bus, a sample on the key `stop` precedes a stop.
@@ -328,7 +328,7 @@ class Product:
     def shows_state(self) -> bool:
         """Whether the daemon runs and has made its first step, before which it has no `state`."""
         loop = self._world.loop
-        return self.alive and loop.report.current("state", loop._look) is not None
+        return self.alive and loop.report.current("state", loop._snapshot) is not None
 
     def state(self) -> dict[str, Any]:
         """Return the present `state`, as a client reads it."""

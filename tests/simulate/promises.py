@@ -477,7 +477,7 @@ class Witness:
         self.mode, self.reason = mode, reason
 
     @property
-    def held(self) -> tuple[int, str] | None:
+    def must_rest(self) -> tuple[int, str] | None:
         """The time since which the robot must not move, and the cause, or None."""
         causes = []
         if self.stops:
@@ -493,13 +493,13 @@ class Witness:
         return min(causes, default=None)
 
     @property
-    def _surely_held(self) -> tuple[int, str] | None:
-        """Like `held`, but without latches that a pending call may have released.
+    def _must_surely_rest(self) -> tuple[int, str] | None:
+        """Like `must_rest`, but without latches that a pending call may have released.
 
         A call is pending while the daemon waits for the disk.
         """
         if not self.pending:
-            return self.held
+            return self.must_rest
         cleared_ns, active_ns = self.pending.get("clear", -1), self.pending.get("activate", -1)
         causes = [(at_ns, "a stop") for at_ns in self.stops if at_ns > cleared_ns]
         if self.fault_ns is not None and self.fault_ns > cleared_ns:
@@ -569,11 +569,11 @@ class Witness:
         )
         if "set" not in self.pending:
             self._limits(at_ns, wheels, before, made_ns - last_ns, grows)
-        hold = self._surely_held
+        hold = self._must_surely_rest
         if hold is None:
             self.braking = None
         else:
-            self._held(at_ns, hold, grows, line, wheels)
+            self._check_rest(at_ns, hold, grows, line, wheels)
         self._wished(at_ns, wheels, before, grows, line)
         self.obeyed(at_ns, wheels)
         self.last, self.last_ns, self.cut, self.rested = wheels, made_ns, False, False
@@ -743,7 +743,7 @@ class Witness:
         word = "stop_deceleration" if stop else "deceleration"
         return int(max(linear / low[f"linear_{word}"], angular / low[f"angular_{word}"]) * NS)
 
-    def _held(
+    def _check_rest(
         self,
         at_ns: int,
         hold: tuple[int, str],
@@ -773,7 +773,7 @@ class Witness:
         self.rested |= at_ns - self._turns_ns > NS
         if fastest < 0.5:
             return
-        hold = self._surely_held
+        hold = self._must_surely_rest
         if hold is None:
             return
         since_ns, why = hold

@@ -79,7 +79,7 @@ class _Clock:
     def steady(self) -> bool:
         return not self.odd and self.most_ns - self.least_ns <= STEADY_NS
 
-    def known(self, at_ns: int, timeout_ns: int) -> bool:
+    def is_proved(self, at_ns: int, timeout_ns: int) -> bool:
         """Return whether the daemon certainly had proved this clock's delays at this time."""
         lasted = at_ns - self.first_ns
         return self.steady and lasted > 5 * min(timeout_ns, 2 * NS) + NS and self.count >= PROOF
@@ -91,7 +91,7 @@ class _Clock:
         )
 
 
-class _Heard:
+class _LastMessage:
     """The last message of one sender on one source."""
 
     def __init__(self) -> None:
@@ -132,7 +132,7 @@ class Reasons:
         else:
             self._known_before.clear()
         self._clocks.clear()
-        self._heard: dict[str, dict[str, _Heard]] = {}
+        self._heard: dict[str, dict[str, _LastMessage]] = {}
         self._dropped_ns: dict[str, int] = {}
         """When a message of a source was last dropped unread. It may have been a speed, so a shared
         identity must send a zero again."""
@@ -148,7 +148,7 @@ class Reasons:
             return
         wish = self.run.witness.wishes[-1][1]
         at_ns, delay_ns = wish.arrived_ns, wish.arrived_ns - message.sent_ns
-        record = self._heard.setdefault(source, {}).setdefault(sample.identity, _Heard())
+        record = self._heard.setdefault(source, {}).setdefault(sample.identity, _LastMessage())
         record.arrived_ns, record.armed_ns = at_ns, wish.armed_ns
         record.shared = sample.shared
         record.stamped |= bool(sample.clock)
@@ -162,7 +162,7 @@ class Reasons:
         wild = (sender.get(name) for name in ("clock", "twice", "swap", "bad_stamps"))
         clock.odd |= any(wild) or sender.get("stamps_speeds", False)
         clock.odd |= sample.clock in self.run.witness.shared_clocks
-        clock.proved |= clock.known(at_ns, self.run.witness.timeout[source])
+        clock.proved |= clock.is_proved(at_ns, self.run.witness.timeout[source])
         clock.believed |= clock.may_be_known(at_ns, self.run.witness.timeout[source])
         record.clock = clock
 
@@ -186,7 +186,7 @@ class Reasons:
         clock.most_ns = max(clock.most_ns, delay_ns)
         return clock
 
-    def look(self, now_ns: int, stalled_ns: int) -> None:
+    def judge(self, now_ns: int, stalled_ns: int) -> None:
         """Judge `state` if the robot has been ready for a while although a sender sends speeds."""
         run, witness = self.run, self.run.witness
         if witness.mode != "ready":
@@ -211,7 +211,7 @@ class Reasons:
         if wishing:
             self._judge(now_ns, wishing, run.product.state())
 
-    def _waits(self, source: str, record: _Heard, now_ns: int, tick_ns: int) -> bool:
+    def _waits(self, source: str, record: _LastMessage, now_ns: int, tick_ns: int) -> bool:
         """Return whether the daemon certainly has a fresh speed of this sender."""
         age_ns = now_ns - record.speed_ns
         return (
@@ -241,17 +241,17 @@ class Reasons:
         """Return the kinds of causes for which this source may wait now."""
         witness, causes = self.run.witness, set[str]()
         timeout_ns = witness.timeout[source]
-        for sender in self._live(source, now_ns):
+        for sender in self._fresh_senders(source, now_ns):
             clock, certain = sender.clock, not (sender.shared and source in self._junk)
             if clock is None:
                 certain &= not sender.stamped
             else:
-                certain &= clock.known(sender.armed_ns, timeout_ns)
+                certain &= clock.is_proved(sender.armed_ns, timeout_ns)
                 may_be_known = not sender.foreign or clock.may_be_known(now_ns, timeout_ns)
                 if may_be_known and (not clock.steady or self._stood):
                     causes.add("late")
                 # A foreign clock that was known is not new again, however late it becomes.
-                if not (clock.known(now_ns, timeout_ns) or (sender.foreign and clock.proved)):
+                if not (clock.is_proved(now_ns, timeout_ns) or (sender.foreign and clock.proved)):
                     causes.add("proof")
             since_ns = max(self._calm_ns, self._dropped_ns.get(source, -1) if sender.shared else -1)
             armed = sender.armed_ns > since_ns and certain
@@ -264,11 +264,11 @@ class Reasons:
             causes.add("stalled")
         mine = witness.priority[source]
         for other, priority in witness.priority.items():
-            if other != source and priority >= mine and self._live(other, now_ns):
+            if other != source and priority >= mine and self._fresh_senders(other, now_ns):
                 causes.add("priority")
         return causes
 
-    def _live(self, source: str, now_ns: int) -> list[_Heard]:
+    def _fresh_senders(self, source: str, now_ns: int) -> list[_LastMessage]:
         """Return the senders of this source whose last command may still be fresh."""
         longest_ns = self.run.witness.timeout[source] + MARGIN_NS
         senders = self._heard.get(source, {}).values()

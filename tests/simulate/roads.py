@@ -82,7 +82,11 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
         repeats = place >= 0 and phases[place][0] in ends and place == ended
         if wish[0] is not None and not repeats:
             number += 1
-            late = sender["delay"] + _jitter(sender["jitter"], chance[0]) + _held(sender, t)
+            late = (
+                sender["delay"]
+                + _jitter(sender["jitter"], chance[0])
+                + _congestion_delay(sender, t)
+            )
             arrives_ns = int((t + late) * NS)
             lost = chance[1] < sender["loss"] or _is_in_hole(sender, t)
             junk = kinds[int(chance[2] * 1e6) % len(kinds)] if chance[3] < sender["junk"] else ""
@@ -137,7 +141,7 @@ def _jitter(scale: float, chance: float) -> float:
     return min(0.1, -scale * math.log(1.0 - chance)) if scale else 0.0
 
 
-def _held(sender: dict[str, Any], t: float) -> float:
+def _congestion_delay(sender: dict[str, Any], t: float) -> float:
     """Return the additional network delay of a message that is sent at `t`, in s."""
     for begin, end, shape, size in sender["congestion"]:
         if shape == "drain":

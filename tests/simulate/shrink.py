@@ -134,7 +134,7 @@ def written(plan: Plan, result: Result, commit: str) -> str:
     return json.dumps(record, indent=1) + "\n"
 
 
-def kept(plan: Plan, result: Result, commit: str, path: Path) -> str:
+def write_corpus_file(plan: Plan, result: Result, commit: str, path: Path) -> str:
     """Write a corpus file, which `test_corpus.py` then plays. Return a message with its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(written(plan, result, commit), encoding="utf-8")

@@ -37,10 +37,10 @@ from tests.simulate.gyro_faults import GyroFaults
 from tests.simulate.jerk import Slope
 from tests.simulate.log_lines import LogLines
 from tests.simulate.pairs import OURS, Pair, Trace
-from tests.simulate.plan import KINDS, LATER_KINDS, Plan, _rare_events, made
+from tests.simulate.plan import KINDS, LATER_KINDS, Plan, _rare_events, make_plan
 from tests.simulate.plugging import Plugging
 from tests.simulate.pose import PoseWitness
-from tests.simulate.product import HELD, Disk, Product, Seen, problems
+from tests.simulate.product import HELD, Disk, Product, StepResult, problems
 from tests.simulate.promises import ZERO, BrokenError, Witness
 from tests.simulate.reasons import Reasons, kind_of
 from tests.simulate.reports import Echo, HalfDuplex, Reports, judge_pose
@@ -49,7 +49,7 @@ from tests.simulate.spread import Spread
 from tests.simulate.unjudged import Unjudged
 
 ODD = {"odd configuration", "extreme timing", "other vehicle", "other dialect"}
-PLAIN = next(p for p in map(made, range(99)) if ODD.isdisjoint(p["kinds"]))
+PLAIN = next(p for p in map(make_plan, range(99)) if ODD.isdisjoint(p["kinds"]))
 EMPTY: Plan = {
     "seed": 0, "seconds": 2.0, "kinds": [], "board": [], "senders": [], "events": [],
     "lawful": "a new client",
@@ -64,9 +64,9 @@ def quiet() -> Plan:
 @pytest.mark.slow
 def test_a_seed_gives_the_same_bytes_again_also_when_its_plan_was_written_to_a_file() -> None:
     first, again = Trace(), Trace()
-    plan = made(4, 15.0)
+    plan = make_plan(4, 15.0)
     text = json.dumps(plan)
-    assert text == json.dumps(made(4, 15.0))
+    assert text == json.dumps(make_plan(4, 15.0))
     results = [played(plan, first.step), played(json.loads(text), again.step)]
     assert first.hashes == again.hashes
     assert len(first.hashes) > 15
@@ -75,13 +75,13 @@ def test_a_seed_gives_the_same_bytes_again_also_when_its_plan_was_written_to_a_f
 
 @pytest.mark.slow
 def test_every_configuration_of_a_plan_is_legal_and_every_kind_of_trouble_is_drawn() -> None:
-    plans = [made(seed) for seed in range(30)]
+    plans = [make_plan(seed) for seed in range(30)]
     assert [problems(plan["config"]) for plan in plans] == [[]] * 30
     assert {kind for plan in plans for kind in plan["kinds"]} == {*KINDS, *LATER_KINDS}
 
 
 def test_a_sender_sends_the_same_without_the_other_senders() -> None:
-    plan = next(p for p in map(made, range(20)) if len(p["senders"]) > 2)
+    plan = next(p for p in map(make_plan, range(20)) if len(p["senders"]) > 2)
     alone = shrink.without(plan, [("senders", 0)])
     both = [
         messages(plan_["senders"][place], plan_["seed"], plan["seconds"], 0)
@@ -95,7 +95,7 @@ def test_some_plans_have_a_bound_of_the_feedback_below_one_encoder_count() -> No
     """The bound is just above the limit of the wheels, and all these plans are legal."""
     below = 0
     for seed in range(500):
-        config = made(seed, 20.0)["config"]
+        config = make_plan(seed, 20.0)["config"]
         bound = config.get("feedback", {}).get("wheel_speed", 80.0)
         if bound < 1.31 * config["limits"]["wheel_speed"]:
             assert problems(config) == []
@@ -113,7 +113,7 @@ def test_a_quiet_plan_breaks_no_promise() -> None:
 def test_a_seed_of_a_replay_is_played_and_reported(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(main, "made", lambda seed: made(seed, 3.0))
+    monkeypatch.setattr(main, "make_plan", lambda seed: make_plan(seed, 3.0))
     assert main.replay("17") == 0
     assert " s simulated in " in capsys.readouterr().out
     broken = Result(17, "a promise at 2.000 s: so", "a promise", 2 * NS, 2.0, 0.1, Counter())
@@ -126,7 +126,7 @@ def test_a_seed_of_a_replay_is_played_and_reported(
 def test_seeds_are_played_until_the_time_is_simulated_and_what_they_covered_is_printed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(main, "made", lambda seed: made(seed, 3.0))
+    monkeypatch.setattr(main, "make_plan", lambda seed: make_plan(seed, 3.0))
     assert main.explore(1, 0.012, 2) == 0
     out = capsys.readouterr().out
     assert re.search(r": \d runs from seed 1, 0\.0\d h simulated in .* 0 findings\n", out)
@@ -145,7 +145,7 @@ def test_the_plan_of_each_finding_is_kept_and_the_first_ones_are_shrunk(
     main.keep_plans([broken({"seed": seed}) for seed in seeds], tmp_path / "findings")
     plans = [shrink.load(tmp_path / "findings" / f"{seed}.json") for seed in seeds]
     assert [plan["senders"] for plan in plans[:-1]] == [[]] * main.MOST_SHRUNK
-    assert plans[-1] == json.loads(json.dumps(made(main.MOST_SHRUNK)))
+    assert plans[-1] == json.loads(json.dumps(make_plan(main.MOST_SHRUNK)))
 
 
 # the witness
@@ -232,7 +232,7 @@ class Bench:
         if data:
             self.inputs.fed(at_ns, data)
         self.inputs.take(at_ns, 0, -NS)
-        snapshot = Seen(at_ns, at_ns, mode, self.reason, None, "up", [*lines], ())
+        snapshot = StepResult(at_ns, at_ns, mode, self.reason, None, "up", [*lines], ())
         self.inputs.step(at_ns, snapshot, 0, True, lambda: self.state)
 
 
@@ -340,7 +340,7 @@ def test_a_late_answer_to_a_clear_does_not_end_the_doubt_about_a_silence(silent:
     bench.inputs.fed(at_ns, b"" if silent else OK)
     bench.inputs.take(at_ns, 0, -NS)
     bench.witness.cleared(12 * NS // 10, 11 * NS // 10, CLEARED, "ann")
-    snapshot = Seen(at_ns, at_ns, "stopped", "a reason", None, "up", [], ())
+    snapshot = StepResult(at_ns, at_ns, "stopped", "a reason", None, "up", [], ())
     expected = nullcontext() if silent else pytest.raises(BrokenError, match="without a cause")
     with expected:
         bench.inputs.step(at_ns, snapshot, 0, True, dict)
@@ -539,7 +539,7 @@ def test_a_battery_stops_the_robot_by_its_mean_and_not_by_a_motor_start() -> Non
 
 @pytest.mark.slow
 def test_some_plans_have_inputs_and_are_legal_and_an_older_product_gets_none() -> None:
-    plans = list(map(made, range(200)))
+    plans = list(map(make_plan, range(200)))
     with_inputs = [plan for plan in plans if kinds(plan)]
     for kind in ("estop", "stop", "away", "battery", "driver_fault"):
         assert 4 <= sum(kind in kinds(plan) for plan in plans) <= 30
@@ -556,7 +556,7 @@ def test_some_plans_have_inputs_and_are_legal_and_an_older_product_gets_none() -
 
 @pytest.mark.slow
 def test_a_plan_with_bumpers_breaks_no_promise_and_a_robot_that_ignores_them_does() -> None:
-    plans = [item for item in map(made, range(100)) if kinds(item) == {"stop"}]
+    plans = [item for item in map(make_plan, range(100)) if kinds(item) == {"stop"}]
     plan = min(plans, key=lambda item: item["seconds"])
     result = played(plan)
     assert result.finding == ""
@@ -583,7 +583,7 @@ def driven(**changes: Any) -> Plan:
 
 @pytest.mark.slow
 def test_in_a_quarter_of_the_plans_nobody_outranks_a_sender_that_keeps_all_rules() -> None:
-    plans = [plan for plan in map(made, range(100)) if "moment" not in plan]
+    plans = [plan for plan in map(make_plan, range(100)) if "moment" not in plan]
     lawful = sum(bool(Run(plan).liveness.lawful) for plan in plans)
     assert 0.15 <= lawful / len(plans) <= 0.4
 
@@ -934,7 +934,7 @@ def test_a_clear_that_its_sender_sent_before_the_stop_must_not_release_it() -> N
     with pytest.raises(BrokenError, match="releases no later stop"):
         witness.cleared(9 * NS, 4 * NS, CLEARED, "ann")
     witness.cleared(9 * NS, 6 * NS, CLEARED, "ann")
-    assert witness.held is None
+    assert witness.must_rest is None
 
 
 @pytest.mark.parametrize(("at_s", "finding"), [(6.9, True), (7.0, False)])
@@ -967,7 +967,7 @@ def test_a_clear_releases_no_cause_of_a_fault_that_its_sender_has_not_seen(
     with pytest.raises(BrokenError, match=promise) if finding else nullcontext():
         read_ns = None if read_s is None else int(read_s * NS)
         witness.cleared(int(at_s * NS), read_ns, CLEARED, "ann")
-        assert witness.held is None
+        assert witness.must_rest is None
         assert not witness.faults
 
 
@@ -976,7 +976,7 @@ def test_a_zero_before_what_may_be_a_speed_of_the_same_identity_arms_nobody(
     junk: str, armed: bool
 ) -> None:
     witness = witnessed()
-    sender = made(1)["senders"][0] | {"way": "plain", "source": "app", "churn": False}
+    sender = make_plan(1)["senders"][0] | {"way": "plain", "source": "app", "churn": False}
     for at_s, v, kind in ((1.0, 0.0, ""), (1.5, 0.0, junk), (2.5, 0.3, "")):
         message = Message(int(at_s * NS), int(at_s * NS), v, 0.0, 0, 0, kind)
         witness.command(
@@ -990,7 +990,7 @@ def test_a_speed_of_another_shared_identity_of_the_source_undoes_a_zero(
     way: str, armed: bool
 ) -> None:
     witness = witnessed()
-    plain = made(1)["senders"][0] | {"way": "plain", "source": "app", "churn": False}
+    plain = make_plan(1)["senders"][0] | {"way": "plain", "source": "app", "churn": False}
     other = plain | {"way": way, "routers": [[0.0, "session of router 1"]]}
     for at_s, sender, v in ((1.0, plain, 0.0), (1.5, other, 0.3), (2.5, plain, 0.3)):
         message = Message(int(at_s * NS), int(at_s * NS), v, 0.0, NS, 0, "")
@@ -1002,7 +1002,7 @@ def test_a_speed_of_another_shared_identity_of_the_source_undoes_a_zero(
 
 def test_a_sender_behind_routers_has_the_identity_of_the_session_that_stamps() -> None:
     routers = [[0.0, "session of router 1"], [2.0, ""], [3.0, "session of router 2"]]
-    sender = made(1)["senders"][0] | {"way": "routed", "source": "app", "churn": False}
+    sender = make_plan(1)["senders"][0] | {"way": "routed", "source": "app", "churn": False}
     sender["routers"] = routers
     identities = []
     for at_s in (1, 2, 4):
@@ -1021,7 +1021,7 @@ def test_a_sender_behind_routers_has_the_identity_of_the_session_that_stamps() -
 def test_some_plans_have_several_senders_behind_routers_on_one_source() -> None:
     together = 0
     for seed in range(200):
-        senders = [sender for sender in made(seed)["senders"] if sender["way"] == "routed"]
+        senders = [sender for sender in make_plan(seed)["senders"] if sender["way"] == "routed"]
         assert all(sender["routers"][0][0] == 0.0 for sender in senders)
         together += len(senders) > 1 and len({sender["source"] for sender in senders}) == 1
     assert together > 3
@@ -1099,7 +1099,7 @@ def test_a_robot_does_not_learn_the_delay_of_a_command_that_the_inbox_dropped(
     dropped: bool,
 ) -> None:
     witness = witnessed()
-    sender = made(1)["senders"][0] | {
+    sender = make_plan(1)["senders"][0] | {
         "way": "client", "source": "app", "id": "ann", "churn": False, "delay": 0.001, "clock": []
     }  # fmt: skip
 
@@ -1287,11 +1287,11 @@ def test_the_judge_of_the_log_counts_its_lines_and_wants_each_mode_there(
     times_ms: tuple[int, ...], name: str, promise: str
 ) -> None:
     log = LogLines()
-    log.see(0, Seen(0, 0, "ready", "a reason", None, "up", [], []))
+    log.see(0, StepResult(0, 0, "ready", "a reason", None, "up", [], []))
     with pytest.raises(BrokenError, match=promise) if promise else nullcontext():
         for at_ms in times_ms:
             at_ns, line = at_ms * NS // 1000, (name, "info", "ready -> driving: so")
-            log.see(at_ns, Seen(at_ns, at_ns, "driving", "", None, "up", [], [], [line]))
+            log.see(at_ns, StepResult(at_ns, at_ns, "driving", "", None, "up", [], [], [line]))
 
 
 @pytest.mark.parametrize(
@@ -1381,7 +1381,7 @@ def test_a_port_that_is_opened_again_has_no_rest_of_a_line() -> None:
 def test_rare_events_come_at_the_time_of_a_drive() -> None:
     counts = {"echo": 0, "block": 0}
     for seed in range(200, 400):
-        plan = made(seed)
+        plan = make_plan(seed)
         before = {key: plan[key] for key in ("board", "config")} | {"seconds": plan["seconds"]}
         drives = [[1.0, 0.0, 0.0], [5.0, 0.5, 0.0], [9.0, -0.5, 0.0]]
         sender = {"phases": drives}
@@ -1406,7 +1406,7 @@ def state_of(counters: dict[str, int]) -> dict[str, Any]:
 
 
 def test_junk_that_is_counted_by_another_reason_is_a_finding() -> None:
-    reports, sender = Reports(), made(1)["senders"][0] | {"way": "plain", "wheels": False}
+    reports, sender = Reports(), make_plan(1)["senders"][0] | {"way": "plain", "wheels": False}
     for n, junk in enumerate(("huge", "delete", "fields")):
         message = Message(n, n, 0.1, 0.0, 0, n, junk)
         reports.command(sender, message, sample(sender, message, PLAIN["config"], 0), n, False)
@@ -1471,7 +1471,7 @@ def test_a_board_that_cannot_be_read_loses_the_link_and_comes_back(fault: list[A
     run = Run(quiet_with({"at": 2.0, "for": 2.0, "do": "board", "fault": fault}))
     see = run.product._see
 
-    def look(snapshot: Seen) -> None:
+    def look(snapshot: StepResult) -> None:
         links[snapshot.link] += 2 < snapshot.at_ns / NS - START.mono_ns / NS < 4
         see(snapshot)
 
@@ -1491,7 +1491,12 @@ def test_a_request_of_ros_has_the_settings_that_the_operator_sets() -> None:
 def test_a_command_with_a_bad_stamp_is_one_of_its_key_or_of_a_clock_that_is_not_judged(
     way: str, stamp_ns: int
 ) -> None:
-    sender = made(1)["senders"][0] | {"way": way, "source": "app", "churn": False, "wheels": False}
+    sender = make_plan(1)["senders"][0] | {
+        "way": way,
+        "source": "app",
+        "churn": False,
+        "wheels": False,
+    }
     message = Message(NS, NS, 0.3, 0.0, stamp_ns, 1, "")
     command = sample(sender, message, PLAIN["config"], START.wall_ns)
     options = {name: value for name, value in command.options.items() if name != "put"}
@@ -1605,7 +1610,7 @@ def test_the_judge_sees_a_board_that_comes_and_goes(
 ) -> None:
     at_ns = after_ms * NS // 1000
     lines = [(at_ns, line)] if line else []
-    snapshot = Seen(at_ns, at_ns, "waiting", "no board", None, link, lines, [])
+    snapshot = StepResult(at_ns, at_ns, "waiting", "no board", None, link, lines, [])
     board: Any = Board(line is not None)
     judged = pytest.raises(BrokenError, match=promise) if promise else nullcontext()
     with judged:
@@ -1622,23 +1627,23 @@ def test_whole_lines_that_are_not_heard_behind_a_damaged_one_are_a_finding(
         for n in range(1, 9):
             damage.fed(whole[:7])
             damage.fed(whole[7:])
-            damage.look(n * NS, lambda n=n: max(0, n - lost))  # type: ignore[misc]
+            damage.judge(n * NS, lambda n=n: max(0, n - lost))  # type: ignore[misc]
 
 
 @pytest.mark.parametrize("stalled", [True, False])
 def test_a_step_that_stalls_leaves_whole_lines_to_the_next_step(stalled: bool) -> None:
     damage, whole = Damage(), b"ap00.10,bp00.10,cp00.10,dp00.10\r\n"
     damage.fed(whole + whole[9:] + 2 * whole)
-    damage.look(NS, lambda: 2)
+    damage.judge(NS, lambda: 2)
     damage.fed(4 * whole)
-    damage.look(2 * NS, lambda: 5, stalled)
+    damage.judge(2 * NS, lambda: 5, stalled)
     with nullcontext() if stalled else pytest.raises(BrokenError, match="are heard behind"):
-        damage.look(3 * NS, lambda: 5, stalled)
+        damage.judge(3 * NS, lambda: 5, stalled)
     if stalled:
-        damage.look(4 * NS, lambda: 6)
+        damage.judge(4 * NS, lambda: 6)
 
 
-SIGNED = made(1)["senders"][0] | {
+SIGNED = make_plan(1)["senders"][0] | {
     "way": "signed", "source": "app", "wheels": False, "delay": 0.0, "churn": False,
     "jitter": 0.0, "congestion": [], "clock": [], "bursts": [], "bad_stamps": 0.0, "junk": 0.0,
     "ahead": 0.0, "drift": 0.0, "loss": 0.0, "twice": 0.0, "swap": 0.0,
@@ -1833,7 +1838,7 @@ def test_shrinking_leaves_what_the_finding_needs(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(shrink, "played", broken)
     dice = random.Random(1)
     large = next(
-        p for p in map(made, range(99)) if any(e.get("verb") == "clear" for e in p["events"])
+        p for p in map(make_plan, range(99)) if any(e.get("verb") == "clear" for e in p["events"])
     )
     dice.shuffle(large["events"])
     small = shrink.shrunk(large, broken(large))
@@ -1875,7 +1880,9 @@ def test_a_paired_run_finds_no_difference_to_the_same_code_and_names_the_first_o
 
 
 def test_an_event_that_is_left_out_of_pairs_is_in_no_plan_of_theirs() -> None:
-    plan = next(p for p in map(made, range(99)) if any(e["do"] == "restart" for e in p["events"]))
+    plan = next(
+        p for p in map(make_plan, range(99)) if any(e["do"] == "restart" for e in p["events"])
+    )
     less = pairs.comparable(plan, (("do", "restart", "it restarts in another way"),))
     assert {event["do"] for event in plan["events"]} - {
         event["do"] for event in less["events"]
@@ -1922,7 +1929,7 @@ def test_a_listed_difference_is_taken_out_on_both_sides() -> None:
 def plans_of_moments() -> dict[str, Plan]:
     """Return, for each moment of `bad_moments.py`, the first plan that has it."""
     plans: dict[str, Plan] = {}
-    for plan in map(made, range(2000)):
+    for plan in map(make_plan, range(2000)):
         plans.setdefault(plan.get("moment", ""), plan)
         if plans.keys() >= MOMENTS.keys():
             break
@@ -1969,11 +1976,11 @@ def test_a_heading_that_jumps_while_the_robot_stands_is_a_finding(
 def test_a_reason_without_the_client_that_stopped_the_robot_is_a_finding() -> None:
     witness = Witness(PLAIN["config"])
     inputs = Inputs(witness, reports=True)
-    step = Seen(0, 0, "stopped", "stopped by op1 (native)", None, "up", [], ())
+    step = StepResult(0, 0, "stopped", "stopped by op1 (native)", None, "up", [], ())
     witness.stops = [0]
-    inputs.asked(0, "op1")
+    inputs.note_stop(0, "op1")
     inputs.step(1, step, 0, True, dict)
-    pressed = Seen(2, 2, "stopped", "front bumper pressed", None, "up", [], ())
+    pressed = StepResult(2, 2, "stopped", "front bumper pressed", None, "up", [], ())
     with pytest.raises(BrokenError, match="a stop keeps the name of its client"):
         inputs.step(2, pressed, 0, True, dict)
 
@@ -1987,13 +1994,13 @@ def test_a_reason_may_leave_out_a_client_only_if_it_names_four_others(
     witness = Witness(PLAIN["config"])
     inputs = Inputs(witness, reports=True)
     witness.stops = [0]
-    inputs.asked(0, "op1")
+    inputs.note_stop(0, "op1")
     causes = [f"was stopped by client {n}, before the restart" for n in range(clients)]
     causes += ["stopped when the daemon started, because the disk is full"] * daemon
     reason = "; also ".join(["front bumper pressed", *causes])
     expected = pytest.raises(BrokenError, match="keeps the name") if finding else nullcontext()
     with expected:
-        inputs.step(1, Seen(0, 0, "stopped", reason, None, "up", [], ()), 0, True, dict)
+        inputs.step(1, StepResult(0, 0, "stopped", reason, None, "up", [], ()), 0, True, dict)
 
 
 def test_a_message_in_a_hole_is_lost_and_every_message_of_a_doubling_network_comes_twice() -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from tests.simulate.actors import Run
-from tests.simulate.product import Seen
+from tests.simulate.product import StepResult
 from tests.simulate.roads import NS, Message, sample
 
 
@@ -39,7 +39,7 @@ class Unjudged(Run):
 
     def _fed(self, at_ns: int, data: bytes) -> None: ...
 
-    def _look(self) -> None: ...
+    def _check_state(self) -> None: ...
 
     def _weigh(self) -> None: ...
 
@@ -47,7 +47,7 @@ class Unjudged(Run):
         for ticket, _ in self.product.replies():
             self._calls.pop(ticket, None)
 
-    def _judge(self, snapshot: Seen) -> None:
+    def _judge(self, snapshot: StepResult) -> None:
         if self._calls:
             self._take_answers()
         if self.log is not None:

@@ -78,7 +78,9 @@ class Page(Program):
         trusted = ssl.create_default_context(cafile=str(self.tls / "ca.pem"))
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         local = (address, 0) if address else None
-        connector = aiohttp.TCPConnector(resolver=_Here(), ssl=trusted, limit=0, local_addr=local)
+        connector = aiohttp.TCPConnector(
+            resolver=_LocalResolver(), ssl=trusted, limit=0, local_addr=local
+        )
         return aiohttp.ClientSession(connector=connector, headers=headers)
 
     def refused(self) -> dict[str, float]:
@@ -92,7 +94,7 @@ class Page(Program):
         return counts
 
 
-class _Here(aiohttp.abc.AbstractResolver):
+class _LocalResolver(aiohttp.abc.AbstractResolver):
     """A resolver for which every name is this machine."""
 
     async def resolve(self, host: str, port: int = 0, family: int = 0) -> list[Any]:

@@ -85,7 +85,7 @@ class Browser:
         """Start the browser, and wait until it accepts commands."""
         assert CHROMIUM is not None
         words = [CHROMIUM, *OPTIONS, *self._options, f"--user-data-dir={self._where}"]
-        with self._there():
+        with self._on_host():
             self.process = subprocess.Popen(
                 [*words, "about:blank"],
                 stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
@@ -97,7 +97,7 @@ class Browser:
 
         self._wait(self._connect(until(port, 20.0, "a browser")))
 
-    def _there(self) -> AbstractContextManager[None]:
+    def _on_host(self) -> AbstractContextManager[None]:
         return inside(self._host) if self._host else nullcontext()
 
     def end(self) -> None:
@@ -116,7 +116,7 @@ class Browser:
 
     async def _tabs(self) -> dict[str, str]:
         """Return the debugger addresses of the tabs, the front one first."""
-        with self._there():
+        with self._on_host():
             async with self._session.get("/json") as answer:
                 pages = await answer.json()
         return {
@@ -125,7 +125,7 @@ class Browser:
 
     async def _attend(self, tab: str) -> None:
         url = (await self._tabs())[tab]
-        with self._there():
+        with self._on_host():
             self._socket = await self._session.ws_connect(url, max_msg_size=1 << 26)
         self.tab = tab
         self._reader = asyncio.ensure_future(self._read())

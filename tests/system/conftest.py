@@ -29,7 +29,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     The summary lists such tests. Any other failure counts.
     """
-    again = pytest.mark.flaky(reruns=2, condition=lambda: cores.taken(_before, cores.idle()))
+    again = pytest.mark.flaky(
+        reruns=2, condition=lambda: cores.cores_were_busy(_before, cores.idle())
+    )
     for item in items:
         if item.path.is_relative_to(Path(__file__).parent) and not item.get_closest_marker("soak"):
             item.add_marker(again)

@@ -52,7 +52,7 @@ def idle_class() -> float:
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
-def taken(before: Idle, after: Idle) -> bool:
+def cores_were_busy(before: Idle, after: Idle) -> bool:
     """Return whether nearly all cores were busy all the time between the two moments."""
     whole = (after.at - before.at) * (os.cpu_count() or 1)
     return after.idle_s - before.idle_s < FREE * whole

@@ -269,7 +269,7 @@ class DdsNode(Client):
 
     def _take(self) -> None:
         for reader, samples in list(self._following):
-            for payload in taken(reader):
+            for payload in take_payloads(reader):
                 samples.take(received(reader.topic.name, payload))
 
     def _reader(
@@ -333,7 +333,7 @@ class _ServiceClient:
         replies: list[Sample] = []
 
         def answered() -> bool:
-            for answer in taken(self._replies):
+            for answer in take_payloads(self._replies):
                 if answer[4:20] == header:
                     replies.append(received(self.service, answer[:4] + answer[20:]))
             return bool(replies)
@@ -345,7 +345,7 @@ class _ServiceClient:
         return Called(replies, 0, time.monotonic() - begun)
 
 
-def taken(reader: DataReader[Any]) -> list[bytes]:
+def take_payloads(reader: DataReader[Any]) -> list[bytes]:
     """Return the messages that have arrived at a reader, encoded in CDR."""
     samples = reader.take(100)
     return [sample.serialize() for sample in samples if isinstance(sample, IdlStruct)]

@@ -15,7 +15,7 @@ import zenoh
 from acsard.daemon.gateway.fleet_router import router_file
 from acsard.machine.authority import Authority
 from tests.system.harness import ROOT, Program, acsard
-from tests.system.strangers import words
+from tests.system.strangers import command_line
 
 FILES = ROOT / "deploy" / "zenoh"
 ROUTER_FILE, ROBOT_FILE = FILES / "router.json5", FILES / "robot.toml"
@@ -95,7 +95,7 @@ def _changes(file: Path, where: Path, endpoint: str) -> dict[str, object]:
     }
 
 
-def here(file: Path, where: Path, endpoint: str) -> Path:
+def write_local_copy(file: Path, where: Path, endpoint: str) -> Path:
     """Write a copy of a router's file with this address, these certificates and no plugins."""
     config = zenoh.Config.from_file(str(file))
     for key, value in _changes(file, where, endpoint).items():
@@ -108,12 +108,12 @@ def here(file: Path, where: Path, endpoint: str) -> Path:
 def router(where: Path, endpoint: str) -> Program:
     """Run a router with the Zenoh library of Python. It prints "routing" when it is ready."""
     file = for_two(where)
-    return Program(words(_ROUTER, file, json.dumps(_changes(file, where, endpoint))), where)
+    return Program(command_line(_ROUTER, file, json.dumps(_changes(file, where, endpoint))), where)
 
 
 def watched_router(where: Path, endpoint: str) -> Program:
     """Run `acsard router` with that file. Its log says when it listens."""
-    return Program(acsard("router", str(here(for_two(where), where, endpoint))), where)
+    return Program(acsard("router", str(write_local_copy(for_two(where), where, endpoint))), where)
 
 
 def zenohd(where: Path, endpoint: str) -> Program:
@@ -121,4 +121,4 @@ def zenohd(where: Path, endpoint: str) -> Program:
     program = shutil.which("zenohd")
     if program is None:
         pytest.skip("needs zenohd")
-    return Program([program, "-c", str(here(for_two(where), where, endpoint))], where)
+    return Program([program, "-c", str(write_local_copy(for_two(where), where, endpoint))], where)

@@ -365,7 +365,7 @@ def silence(speeds: Speeds) -> bytes:
     return b""
 
 
-class Heard(NamedTuple):
+class ReceivedLine(NamedTuple):
     """A line as it arrived, and the time of arrival."""
 
     at: float
@@ -377,14 +377,14 @@ class Session:
 
     def __init__(self) -> None:
         self.plugged = time.monotonic()
-        self.raw: list[Heard] = []
-        self.lines: list[Heard] = []
+        self.raw: list[ReceivedLine] = []
+        self.lines: list[ReceivedLine] = []
 
     @property
     def stream(self) -> bytes:
         return b"".join(piece.line for piece in list(self.raw))
 
-    def said(self) -> list[bytes]:
+    def raw_lines(self) -> list[bytes]:
         """Return the lines without their times."""
         return [entry.line for entry in list(self.lines)]
 
@@ -412,7 +412,7 @@ class Peer:
         return self.sessions[-1]
 
     @property
-    def lines(self) -> list[Heard]:
+    def lines(self) -> list[ReceivedLine]:
         return list(self.session.lines)
 
     def __enter__(self) -> Peer:
@@ -471,12 +471,12 @@ class Peer:
         except BlockingIOError:
             return size
 
-    def say(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         """Send bytes without being asked."""
         assert self._ends is not None
         os.write(self._ends[0], data)
 
-    def await_lines(self, count: int, within: float = 5.0) -> list[Heard]:
+    def await_lines(self, count: int, within: float = 5.0) -> list[ReceivedLine]:
         """Wait for the next `count` lines from now on."""
         start = len(self.session.lines)
         until(lambda: len(self.lines) >= start + count, within, f"{count} lines on the wire")
@@ -486,7 +486,7 @@ class Peer:
         """Wait until no more output of the ended daemon arrives, and return its last line."""
         idle = self._idle
         until(lambda: self._idle > idle, 5.0, "the line falls silent")
-        return self.session.said()[-1]
+        return self.session.raw_lines()[-1]
 
     def _serve(self, master: int, session: Session) -> None:
         buffer, turning, target = b"", STANDING, STANDING
@@ -500,10 +500,10 @@ class Peer:
                 continue
             data = os.read(master, 4096)
             now = time.monotonic()
-            session.raw.append(Heard(now, data))
+            session.raw.append(ReceivedLine(now, data))
             *lines, buffer = (buffer + data).split(b"\n")
             for line in lines:
-                session.lines.append(Heard(now, line + b"\n"))
+                session.lines.append(ReceivedLine(now, line + b"\n"))
                 speeds = _speeds(line)
                 if speeds is not None:
                     # Replies that equal the command lines would look like an echo, so the wheels
@@ -551,7 +551,7 @@ class FarPeer(Program):
 
     def __init__(self, where: Path, name: str = "far_mcu") -> None:
         self.path = where / name
-        self._heard: list[Heard] = []
+        self._heard: list[ReceivedLine] = []
         super().__init__([sys.executable, "-c", _FAR, str(self.path)], where)
 
     def __enter__(self) -> FarPeer:
@@ -560,23 +560,23 @@ class FarPeer(Program):
         return self
 
     @property
-    def lines(self) -> list[Heard]:
+    def lines(self) -> list[ReceivedLine]:
         """Return all lines so far, without their ends; "-" stands for an empty one."""
         return list(self._all())
 
-    def since(self, at: float, to: float = float("inf")) -> list[Heard]:
+    def since(self, at: float, to: float = float("inf")) -> list[ReceivedLine]:
         """Return the lines between two times."""
         lines = self._all()
         first, last = (bisect.bisect_right(lines, time, key=lambda h: h.at) for time in (at, to))
         return lines[first:last]
 
-    def _all(self) -> list[Heard]:
+    def _all(self) -> list[ReceivedLine]:
         for text in self.out[1 + len(self._heard) :]:
             at, _, line = text.partition(" ")
-            self._heard.append(Heard(float(at), line.encode()))
+            self._heard.append(ReceivedLine(float(at), line.encode()))
         return self._heard
 
-    def awaits(self, line: bytes, within: float = 5.0, after: float = 0.0) -> Heard:
+    def awaits(self, line: bytes, within: float = 5.0, after: float = 0.0) -> ReceivedLine:
         """Wait for a line that begins with `line` and arrives after `after`, and return it."""
         return until(
             lambda: next((h for h in self.since(after) if h.line.startswith(line)), None),
@@ -627,7 +627,7 @@ def read(sample: zenoh.Sample) -> Any:
     return msgspec.msgpack.decode(data)
 
 
-class Seen(NamedTuple):
+class ReceivedMessage(NamedTuple):
     """A message, its encoding and its time of arrival."""
 
     at: float
@@ -639,19 +639,19 @@ class Following:
     """Collects the messages that arrive on a key."""
 
     def __init__(self) -> None:
-        self.seen: list[Seen] = []
+        self.seen: list[ReceivedMessage] = []
         self._news = threading.Condition()
 
     def add(self, sample: zenoh.Sample) -> None:
         """Store a sample. Zenoh calls this function."""
-        entry = Seen(time.monotonic(), read(sample), str(sample.encoding))
+        entry = ReceivedMessage(time.monotonic(), read(sample), str(sample.encoding))
         with self._news:
             self.seen.append(entry)
             self._news.notify_all()
 
     def find(
         self, wanted: Callable[[Any], bool], within: float, what: str, after: float = 0.0
-    ) -> Seen:
+    ) -> ReceivedMessage:
         """Return the first message that is `wanted` and arrived after the time `after`."""
         deadline, looked = time.monotonic() + within + PATIENCE_S, 0
         with self._news:
@@ -917,7 +917,7 @@ def kept_waiting(pid: int) -> float:
     return sum(waits_for_a_core(pid).values())
 
 
-def held_up(before: dict[int, float], after: dict[int, float], pid: int) -> float:
+def delayed_s(before: dict[int, float], after: dict[int, float], pid: int) -> float:
     """Return how long a busy machine may have delayed the control loop, s.
 
     The sum has two parts: the loop's own wait for a core, and the longest wait of another thread,

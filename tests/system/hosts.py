@@ -63,16 +63,16 @@ class Hosts:
 
         Nothing arrives, and no program gets an error. The direction to the robot is cut first.
         """
-        self._way(self.stranger, ROBOT_AT, NOBODY)
-        self._way(self.robot, STRANGER_AT, NOBODY)
+        self._add_neighbour(self.stranger, ROBOT_AT, NOBODY)
+        self._add_neighbour(self.robot, STRANGER_AT, NOBODY)
 
     def heal(self) -> None:
         """Restore the network."""
-        self._way(self.stranger, ROBOT_AT, CARDS[ROBOT_AT])
-        self._way(self.robot, STRANGER_AT, CARDS[STRANGER_AT])
+        self._add_neighbour(self.stranger, ROBOT_AT, CARDS[ROBOT_AT])
+        self._add_neighbour(self.robot, STRANGER_AT, CARDS[STRANGER_AT])
 
     @staticmethod
-    def _way(host: str, to: str, card: str) -> None:
+    def _add_neighbour(host: str, to: str, card: str) -> None:
         ip("-n", host, "neighbour", "replace", to, "lladdr", card, "dev", "cable",
            "nud", "permanent")  # fmt: skip
 

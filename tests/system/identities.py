@@ -31,11 +31,11 @@ class Certificates:
     def __init__(self, where: Path, *addresses: str) -> None:
         self.robot = where / "tls"
         reached = [word for address in addresses for word in ("--address", address)]
-        self._made("init", "--directory", str(self.robot), *reached)
-        self._made(
+        self._run_tls("init", "--directory", str(self.robot), *reached)
+        self._run_tls(
             "add", "unlisted", "--role", "operator", "--directory", str(self.robot)
         )  # the lines it prints are not written to the configuration
-        self._made("init", "--directory", str(where / "another"))
+        self._run_tls("init", "--directory", str(where / "another"))
         self._client: dict[Identity, Path] = {
             role: self.robot / "clients" / role
             for role in ("viewer", "operator", "maintainer", "unlisted")
@@ -45,7 +45,7 @@ class Certificates:
         self.issue(self._client["expired"], "operator", -1.0)
 
     @staticmethod
-    def _made(*words: str) -> None:
+    def _run_tls(*words: str) -> None:
         done = finish(acsard("tls", *words), "/")
         assert done.code == 0, done
 
@@ -60,13 +60,13 @@ class Certificates:
         """
         if identity == "local":
             return client_config(plain)
-        return self.shown(tls, self.own(identity))
+        return self.client_settings(tls, self.own(identity))
 
     def own(self, identity: Identity) -> Path | None:
         """Return the directory of the identity's certificate."""
         return self._client.get(identity)
 
-    def shown(self, endpoint: str, own: Path | None) -> zenoh.Config:
+    def client_settings(self, endpoint: str, own: Path | None) -> zenoh.Config:
         """Return the Zenoh settings of a client that presents the certificate in `own`, if any."""
         config = client_config(endpoint)
         config.insert_json5("transport/link/tls", json.dumps(self.settings(own)))

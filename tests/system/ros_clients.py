@@ -36,7 +36,7 @@ from tests.system.harness import (
     free_endpoint,
     until,
 )
-from tests.system.strangers import ROUTER, words
+from tests.system.strangers import ROUTER, command_line
 
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 ODOMETRY, TF = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
@@ -368,7 +368,8 @@ class Client(ABC):
     """
 
     PAUSE_S = 0.0
-    """The time from one message of `heard` to the next, in which the daemon counts it."""
+    """The time from one message of `publish_until_accepted` to the next, in which the daemon counts
+    it."""
 
     def __init__(self, namespace: str = "") -> None:
         self.namespace = namespace
@@ -394,7 +395,7 @@ class Client(ABC):
     ) -> AbstractContextManager[Samples]:
         """Subscribe as transient local, which includes earlier samples."""
 
-    def heard(
+    def publish_until_accepted(
         self, bus: Bus, name: str, type_name: str, payload: bytes | Callable[[], bytes]
     ) -> None:
         """Publish a command repeatedly until the daemon accepts one.
@@ -416,13 +417,13 @@ class Client(ABC):
     def zeros(self, bus: Bus) -> None:
         """Publish zeros on every source until the daemon accepts them. This arms each source."""
         for name in TWISTS:
-            self.heard(bus, name, TWIST, twist(0.0))
-        self.heard(bus, "joint_commands", JOINTS, lambda: joints(0.0))
+            self.publish_until_accepted(bus, name, TWIST, twist(0.0))
+        self.publish_until_accepted(bus, "joint_commands", JOINTS, lambda: joints(0.0))
 
     @contextmanager
     def driving(self, bus: Bus, name: str, type_name: str, speed: float) -> Iterator[None]:
         """Send a zero first, and then this speed at 20 Hz while the body runs."""
-        self.heard(bus, name, type_name, lambda: PAYLOADS[type_name](0.0))
+        self.publish_until_accepted(bus, name, type_name, lambda: PAYLOADS[type_name](0.0))
         silenced = threading.Event()
         if not isinstance(self, RmwClient):
             # All nodes behind a bridge are one sender: no speed may follow its zero for a second.
@@ -485,7 +486,7 @@ class ZenohClient(Client):
         finally:
             subscriber.undeclare()
 
-    def _ask(self, key: str, payload: bytes, attachment: bytes | None, **how: Any) -> Called:
+    def _query(self, key: str, payload: bytes, attachment: bytes | None, **how: Any) -> Called:
         replies, errors, begun = [], 0, time.monotonic()
         for reply in self.session.get(
             key, payload=payload, attachment=attachment, timeout=5.0, **how
@@ -523,7 +524,7 @@ class RmwClient(ZenohClient):
         payload: bytes = EMPTY_REQUEST,
         attachment: bytes | None = None,
     ) -> Called:
-        return self._ask(
+        return self._query(
             self.key(name, type_name),
             payload,
             self.attachment() if attachment is None else attachment or None,
@@ -549,7 +550,7 @@ class BridgeHalf(ZenohClient):
 
     def call(self, name: str, type_name: str = TRIGGER, payload: bytes = EMPTY_REQUEST) -> Called:
         attachment = b"rqh" + os.urandom(16) + b"\1"
-        return self._ask(self.key(name, type_name), payload, attachment)
+        return self._query(self.key(name, type_name), payload, attachment)
 
 
 @contextmanager
@@ -588,7 +589,7 @@ def two_robots(where: Path, *names: str) -> Iterator[tuple[str, dict[str, Daemon
     Yields the router's address and the daemons by name. A robot's id is also its ROS namespace.
     """
     meeting, daemons = free_endpoint(), {}
-    with Program(words(ROUTER, meeting), where) as router, ExitStack() as stack:
+    with Program(command_line(ROUTER, meeting), where) as router, ExitStack() as stack:
         router.says("routing")
         for name, mode in zip(names, ("peer", "client"), strict=True):
             config: Tables = {
@@ -851,7 +852,7 @@ class Sdk(Program):
 
     def __init__(self, endpoint: str, where: Path) -> None:
         port = endpoint.rpartition(":")[2]
-        program = words(SDK, port, json.dumps(HASHES))
+        program = command_line(SDK, port, json.dumps(HASHES))
         super().__init__(program, where, bare_environment(), stdin=subprocess.PIPE)
         self._number = 0
 

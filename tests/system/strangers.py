@@ -232,7 +232,7 @@ BUSY = "while True: pass"
 """Keeps a core busy."""
 
 
-def words(program: str, *arguments: object) -> list[str]:
+def command_line(program: str, *arguments: object) -> list[str]:
     """Return the command line that runs a program of this module."""
     return [sys.executable, "-c", program, *map(str, arguments)]
 

@@ -79,7 +79,7 @@ class Terminal:
 
 
 @contextmanager
-def held(terminal: Terminal, key: str) -> Iterator[None]:
+def key_held(terminal: Terminal, key: str) -> Iterator[None]:
     """Hold a key down while the body runs. The key repeats 20 times a second."""
     released = threading.Event()
 

@@ -258,7 +258,7 @@ class Robot:
     def config(self, identity: Identity) -> zenoh.Config:
         return self.certificates.config(identity, self.plain, self.tls)
 
-    def comes(self, look: Callable[[], bool], steps: int = 5) -> bool:
+    def comes_true(self, look: Callable[[], bool], steps: int = 5) -> bool:
         """Return whether `look` returns True within `steps` control periods.
 
         A period is long compared with the delivery of a message on one machine.
@@ -271,7 +271,7 @@ class Robot:
 
     def settled(self) -> None:
         """Wait some control periods, so that every earlier message has certainly arrived."""
-        self.comes(lambda: False)
+        self.comes_true(lambda: False)
 
     def switched(self) -> None:
         """Switch the robot off and on, which produces events."""
@@ -299,12 +299,14 @@ class Robot:
             return dict.fromkeys((row.label for row in rows), False)
         with visitor:
             if verb == "query":
-                outcome = visitor.asked([r for r in rows if not r.payload and "/srv/" not in r.key])
+                outcome = visitor.query_outcomes(
+                    [r for r in rows if not r.payload and "/srv/" not in r.key]
+                )
                 assert self.here.state()["mode"] != "stopped"
-                outcome |= visitor.asked([row for row in rows if row.label not in outcome])
+                outcome |= visitor.query_outcomes([row for row in rows if row.label not in outcome])
                 self.restored()
                 return outcome
-            attempt = visitor.followed if verb == "subscribe" else partial(visitor.sent, verb)
+            attempt = visitor.followed if verb == "subscribe" else partial(visitor.has_effect, verb)
             # Try all rows that should have no effect at once, and one by one only if something
             # happened.
             idle = [row for row in rows if identity not in row.who]
@@ -351,10 +353,10 @@ class Visitor:
         # Last values are sent again every 5 s, for clients that cannot ask for them.
         return 700 if any(row.how == "late" for row in rows) else 200
 
-    def sent(self, verb: Verb, rows: Sequence[Try]) -> bool:
+    def has_effect(self, verb: Verb, rows: Sequence[Try]) -> bool:
         """Return whether any of these puts or deletes had an effect."""
         here = self._robot.here
-        before = _heard(here.state())
+        before = _accepted_commands(here.state())
         for row in rows:
             attachment = self._attachment(row.key)
             if verb == "put":
@@ -365,14 +367,14 @@ class Visitor:
 
         def effect() -> bool:
             state = here.state()
-            return bool(state["mode"] == "stopped" or _heard(state) != before)
+            return bool(state["mode"] == "stopped" or _accepted_commands(state) != before)
 
-        done = self._robot.comes(effect, self._patience(rows)) or self._robot.fooled()
+        done = self._robot.comes_true(effect, self._patience(rows)) or self._robot.fooled()
         if here.state()["mode"] == "stopped":
             self._robot.restored()
         return done
 
-    def asked(self, rows: Sequence[Try]) -> Outcome:
+    def query_outcomes(self, rows: Sequence[Try]) -> Outcome:
         """Send these queries. Return for each whether an answer arrived."""
         waiting = {}
         for row in rows:
@@ -401,7 +403,7 @@ class Visitor:
             outcome[row.label] = False
             if look(row.label) or self._who not in row.who:
                 continue
-            self._robot.comes(partial(look, row.label), 100)
+            self._robot.comes_true(partial(look, row.label), 100)
         return outcome
 
     def followed(self, rows: Sequence[Try]) -> bool:
@@ -425,13 +427,13 @@ class Visitor:
                 here.session.put(RMW_CMD, CDR_TWIST, attachment=self._attachment(RMW_CMD))
             if any(row.key.endswith("events") for row in rows):
                 self._robot.switched()
-            done = self._robot.comes(event.is_set, self._patience(rows))
+            done = self._robot.comes_true(event.is_set, self._patience(rows))
             for subscriber in subscribers:
                 subscriber.undeclare()
         return done
 
 
-def _heard(state: Any) -> int:
+def _accepted_commands(state: Any) -> int:
     """Return the number of commands that the daemon has admitted, from its counters.
 
     This includes the first commands of a new sender, which do not drive the robot yet.
@@ -475,8 +477,8 @@ def test_each_certificate_may_do_exactly_what_the_access_table_allows(
 def test_a_put_that_no_certificate_may_send_never_reaches_the_daemon(robot: Robot) -> None:
     before = robot.here.state()["counters"]
     with Visitor(robot, "maintainer") as visitor:
-        assert not visitor.sent("put", [row for row in ROWS["put"] if not row.who])
-        assert not visitor.sent("delete", ROWS["delete"])
+        assert not visitor.has_effect("put", [row for row in ROWS["put"] if not row.who])
+        assert not visitor.has_effect("delete", ROWS["delete"])
     after = robot.here.state()["counters"]
     refused = {name for name in after if name.startswith("command_")}
     assert {name: after[name] for name in refused} == {name: before.get(name) for name in refused}
@@ -486,7 +488,7 @@ def test_a_link_ends_with_its_certificate(robot: Robot, tmp_path: Path) -> None:
     days = 2.0 / 86400.0
     robot.certificates.issue(tmp_path, "operator", days)
     end = time.monotonic() + 2.0
-    with zenoh.open(robot.certificates.shown(robot.tls, tmp_path)) as session:
+    with zenoh.open(robot.certificates.client_settings(robot.tls, tmp_path)) as session:
         assert list(session.get(f"{ME}/info", timeout=1.0))
         until(lambda: not list(session.info.routers_zid()), 6.0, "the link ends")
         assert time.monotonic() > end - 1.1  # certificates count whole seconds

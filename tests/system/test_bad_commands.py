@@ -28,7 +28,7 @@ from tests.system.harness import (
 )
 from tests.system.ros_clients import TWIST, rmw_key
 from tests.system.ros_clients import twist as ros_twist
-from tests.system.strangers import FLOOD, words
+from tests.system.strangers import FLOOD, command_line
 
 TICK_S = 0.01
 
@@ -182,7 +182,7 @@ def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_immedia
         bus.linked()
         before, memory = bus.state(), resident_kb(daemon.pid)
         waited = kept_waiting(daemon.pid)
-        with Program(words(FLOOD, daemon.endpoint, 0.2, 2.0), tmp_path) as flood:
+        with Program(command_line(FLOOD, daemon.endpoint, 0.2, 2.0), tmp_path) as flood:
             flood.says("flooding")
             begun = time.monotonic()
             driving = states.find(
@@ -287,7 +287,7 @@ def test_a_flood_from_ros_is_limited_to_a_thousand_commands_a_second(
     flooded: Daemon, tmp_path: Path, way: str
 ) -> None:
     key = "cmd_vel" if way == "bridge" else rmw_key("cmd_vel", TWIST)
-    program = words(ROS_FLOOD, flooded.endpoint, key, 1.0, ros_twist(0.0).hex(), way)
+    program = command_line(ROS_FLOOD, flooded.endpoint, key, 1.0, ros_twist(0.0).hex(), way)
     with Bus(flooded.endpoint) as bus:
         bus.linked()
         before = bus.state()
@@ -318,7 +318,7 @@ def test_messages_that_are_slow_to_decode_cost_no_periods_and_a_stop_still_latch
     flooded: Daemon, tmp_path: Path
 ) -> None:
     assert len(EMPTY_JOINTS) == len(EMPTY_NAMES) == 4096
-    program = words(
+    program = command_line(
         SLOW_WORK, flooded.endpoint, "joint_commands", 2.0, "acsard/describe_parameters",
         EMPTY_JOINTS.hex(), EMPTY_NAMES.hex(),
     )  # fmt: skip

@@ -32,7 +32,7 @@ from tests.system.harness import (
     twist,
     until,
 )
-from tests.system.strangers import DELETES, words
+from tests.system.strangers import DELETES, command_line
 
 PUBLISHED = {
     "odom": "Odometry",
@@ -282,7 +282,7 @@ def test_a_flood_of_deletes_on_the_stop_key_displaces_no_stop(
         return bus.count("bus_overrun")
 
     with restored(bus), bus.follow("state") as states:
-        with Program(words(DELETES, shared.endpoint), tmp_path) as flood:
+        with Program(command_line(DELETES, shared.endpoint), tmp_path) as flood:
             flood.says("deleting")
             took = []
             for _ in range(10):

@@ -35,7 +35,7 @@ from acsard.core.link.link_diagnosis import blames_host
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
 from acsard.daemon.bus.zenoh_sessions import client_session
-from acsard.terminal.prompt import Ask
+from acsard.terminal.prompt import NumberQuestion
 from acsard.terminal.terminal_prompt import NoPrompt
 from tests.system.bystander import lost
 from tests.system.harness import (
@@ -95,7 +95,7 @@ def asks(terminal: Terminal, program: Program, words: str, times: int, within: f
 
     def look() -> bool:
         assert program.process.poll() is None, terminal.screen
-        return shown(terminal).count(words) >= times
+        return screen_text(terminal).count(words) >= times
 
     until(look, within, f"{words!r} for the {times}. time")
 
@@ -112,7 +112,7 @@ def begun(terminal: Terminal, program: Program, bus: Bus) -> int:
     def moves() -> bool:
         nonlocal starts
         assert program.process.poll() is None, terminal.screen
-        if shown(terminal).count(STARTS) > starts:
+        if screen_text(terminal).count(STARTS) > starts:
             terminal.press("\n")
             starts += 1
         return bool((bus.state()["linear"] or 0.0) > 0.25)
@@ -131,8 +131,10 @@ def ends(terminal: Terminal, program: Program, starts: int) -> None:
 
     def ended() -> bool:
         nonlocal starts
-        if (asked := shown(terminal).count(STARTS)) > starts and program.process.poll() is None:
-            assert "was disturbed" in shown(terminal)
+        if (
+            asked := screen_text(terminal).count(STARTS)
+        ) > starts and program.process.poll() is None:
+            assert "was disturbed" in screen_text(terminal)
             terminal.press("\n")
             starts = asked
         return program.process.poll() is not None
@@ -222,7 +224,7 @@ def measured(bus: Bus, words: str) -> str:
 ENDED = "ended"
 
 
-def shown(terminal: Terminal) -> str:
+def screen_text(terminal: Terminal) -> str:
     """Return the whole screen as one line."""
     return " ".join(terminal.screen.split())
 
@@ -232,7 +234,7 @@ def question(terminal: Terminal, program: Program, offset: int) -> str | None:
 
     Returns `ENDED` if the program has ended.
     """
-    words = shown(terminal)[offset:]
+    words = screen_text(terminal)[offset:]
     if words.endswith((" mm:", " m:", " deg:", "q quits.")):
         return words
     return ENDED if program.process.poll() is not None else None
@@ -259,7 +261,7 @@ def goes_through(daemon: Daemon, bus: Bus, way: str, reads: Reads) -> str:
         offset = 0
         while program.process.poll() is None:
             words = until(lambda: question(terminal, program, offset), RIDES_S, "a question")  # noqa: B023
-            offset = len(shown(terminal))
+            offset = len(screen_text(terminal))
             if STARTS in words:
                 reads(words)
                 terminal.press("\n")
@@ -305,7 +307,7 @@ class Beside:
         self._player.place = (place - self._place) * cmath.exp(-1j * self._yaw)
         self._player.yaw = yaw - self._yaw
         unit = words.rstrip(":").rpartition(" ")[2]
-        return f"{self._player.answer(Ask(words, unit, -math.inf, math.inf)):.4g}"
+        return f"{self._player.answer(NumberQuestion(words, unit, -math.inf, math.inf)):.4g}"
 
     def _true(self) -> tuple[complex, float]:
         pose = self._bus.get("sim/pose")["pose"]

@@ -37,7 +37,7 @@ from tests.system.terminals import (
     UNDER_A_SHELL,
     Terminal,
     at_terminal,
-    held,
+    key_held,
     screens,
 )
 from tests.system.typed import typed
@@ -652,7 +652,7 @@ def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
     shared: Daemon, bus: Bus, columns: int
 ) -> None:
     with screened(shared, columns) as (terminal, _):
-        with held(terminal, "i"):
+        with key_held(terminal, "i"):
             until(lambda: "DRIVING" in screens(terminal)[-1], 5.0, "driving")
         frames = screens(terminal)
     assert all("u  i  o" in frame for frame in frames if "as teleop" in frame)
@@ -675,7 +675,7 @@ def test_a_drive_that_is_suspended_stops_gives_the_terminal_back_and_goes_on(
     with screened(shared, 80) as (terminal, program), bus.follow("cmd/teleop") as commands:
         during = terminal.settings
         assert during != usual
-        with held(terminal, "i"):
+        with key_held(terminal, "i"):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.1, 5.0, "moving")
         suspended = time.monotonic()
         program.signal(signal.SIGTSTP)
@@ -696,7 +696,7 @@ def test_drive_without_a_screen_prints_the_help_and_a_line_a_second_that_fits(
 ) -> None:
     with without_a_screen(shared, columns=50) as (terminal, _):
         begun = time.monotonic()
-        with held(terminal, "i"):
+        with key_held(terminal, "i"):
             until(lambda: terminal.screen.count("driving: ") >= 3, 10.0, "some news")
         took = time.monotonic() - begun
     lines = terminal.screen.splitlines()
@@ -711,7 +711,7 @@ def test_drive_without_a_screen_ends_with_a_line_that_the_robot_is_at_rest(
     shared: Daemon, bus: Bus
 ) -> None:
     with without_a_screen(shared) as (terminal, program):
-        with held(terminal, "i"):
+        with key_held(terminal, "i"):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.2, 5.0, "moving")
         terminal.press("\x03")
         assert program.ended(5.0) == 0
@@ -730,7 +730,7 @@ def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silenc
         bus.follow("cmd/teleop") as commands,
         without_a_screen(shared, how=UNDER_A_SHELL) as (terminal, _),
     ):
-        with held(terminal, "i"):
+        with key_held(terminal, "i"):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.2, 5.0, "moving")
         closed = time.monotonic()
         terminal.close()
@@ -741,7 +741,7 @@ def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silenc
 @pytest.mark.slow
 def test_a_held_key_drives_and_its_release_stops_the_robot(shared: Daemon, bus: Bus) -> None:
     with without_a_screen(shared) as (terminal, program):
-        with held(terminal, "i"):
+        with key_held(terminal, "i"):
             until(lambda: bus.state()["linear"] == pytest.approx(0.5, abs=0.01), 5.0, "0.5 m/s")
             assert bus.state()["source"] == "teleop"
         released = time.monotonic()
@@ -756,7 +756,7 @@ def test_a_held_key_drives_and_its_release_stops_the_robot(shared: Daemon, bus: 
 @pytest.mark.slow
 def test_space_stops_the_robot_within_the_ramp(shared: Daemon, bus: Bus) -> None:
     with without_a_screen(shared) as (terminal, _):
-        with held(terminal, "i"):
+        with key_held(terminal, "i"):
             until(lambda: bus.state()["linear"] == pytest.approx(0.5, abs=0.01), 5.0, "0.5 m/s")
         pressed = time.monotonic()
         terminal.press(" ")
@@ -774,7 +774,7 @@ ARROWS = {"A": (1, 0), "B": (-1, 0), "D": (0, 1), "C": (0, -1)}
 def test_arrows_drive_forward_back_left_and_right(shared: Daemon, bus: Bus) -> None:
     with without_a_screen(shared) as (terminal, _):
         for letter, (ahead, left) in ARROWS.items():
-            with held(terminal, f"\x1b[{letter}"):
+            with key_held(terminal, f"\x1b[{letter}"):
 
                 def right_way(ahead: int = ahead, left: int = left) -> bool:
                     state = bus.state()
@@ -791,7 +791,7 @@ def test_speed_keys_change_the_speed_of_the_next_key(shared: Daemon, bus: Bus) -
     with without_a_screen(shared, "--linear", "0.2") as (terminal, _):
         terminal.press("w")
         until(lambda: "0.22 m/s" in terminal.screen, 3.0, "the new speed on the screen")
-        with held(terminal, "i"):
+        with key_held(terminal, "i"):
             until(lambda: bus.state()["linear"] == pytest.approx(0.22, abs=0.005), 5.0, "0.22 m/s")
     bus.at_rest()
 
@@ -802,7 +802,7 @@ def test_ctrl_c_while_driving_stops_and_leaves_with_0_and_the_terminal_as_it_was
 ) -> None:
     with without_a_screen(shared) as (terminal, program):
         during = terminal.settings
-        with held(terminal, "i"):
+        with key_held(terminal, "i"):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.3, 5.0, "moving")
         with bus.follow("cmd/teleop") as commands:
             terminal.press("\x03")
@@ -837,7 +837,7 @@ def test_a_stranger_s_put_on_every_key_does_not_end_a_drive(shared: Daemon, bus:
     with without_a_screen(shared) as (terminal, program):
         for payload in (b"\xff", b"{}", b""):
             bus.session.put("acsard/**", payload)
-        with held(terminal, "i"):
+        with key_held(terminal, "i"):
             until(
                 lambda: (bus.state()["linear"] or 0.0) > 0.2 or program.process.poll() is not None,
                 5.0,

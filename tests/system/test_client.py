@@ -43,7 +43,7 @@ from tests.system.harness import (
     silences,
     until,
 )
-from tests.system.strangers import words
+from tests.system.strangers import command_line
 
 DEFAULT = "tcp/127.0.0.1:7448"
 
@@ -110,7 +110,9 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
             before[name] = kept_waiting(bus.get("info")["pid"])
         samples = {name: stack.enter_context(bus.follow("cmd/app")) for name, bus in buses.items()}
         running = {
-            name: stack.enter_context(Program(words(at_endpoint(code, endpoints[name])), where))
+            name: stack.enter_context(
+                Program(command_line(at_endpoint(code, endpoints[name])), where)
+            )
             for name, code in codes.items()
         }
         for name, program in running.items():

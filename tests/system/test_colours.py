@@ -74,7 +74,7 @@ print("that was", "all")
 """Includes the subcommands of the verbs, and the error for an unknown option."""
 
 
-def shown(words: Sequence[str], where: Path, text: str, **more: str) -> str:
+def colour_output(words: Sequence[str], where: Path, text: str, **more: str) -> str:
     """Return the output of a program at a colour terminal, until it contains this text."""
     with Terminal() as terminal:
         fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
@@ -108,7 +108,7 @@ def typed_at(daemon: Daemon, words: Sequence[str]) -> list[str]:
 def test_no_screen_has_a_colour_if_no_color_is_set(
     shared: Daemon, bus: Bus, tmp_path: Path, words: list[str], text: str
 ) -> None:
-    assert colours(shown(typed_at(shared, words), tmp_path, text, NO_COLOR="1")) == []
+    assert colours(colour_output(typed_at(shared, words), tmp_path, text, NO_COLOR="1")) == []
 
 
 @pytest.mark.variations(4)
@@ -118,13 +118,13 @@ def test_a_screen_has_colours_unless_no_color_is_set(
     shared: Daemon, bus: Bus, tmp_path: Path, words: list[str]
 ) -> None:
     text = next(text for verb, text in SCREENS if verb == words)
-    assert colours(shown(typed_at(shared, words), tmp_path, text))
+    assert colours(colour_output(typed_at(shared, words), tmp_path, text))
 
 
 @pytest.mark.slow
 def test_no_help_and_no_usage_error_has_a_colour_if_no_color_is_set(tmp_path: Path) -> None:
     words = [sys.executable, "-c", EVERY_HELP]
-    output = shown(words, tmp_path, "that was all", NO_COLOR="1")
+    output = colour_output(words, tmp_path, "that was all", NO_COLOR="1")
     assert output.count("usage: acsard") >= 2 * len(VERBS)
     assert colours(output) == []
 

@@ -24,14 +24,14 @@ from tests.system.harness import (
     twist,
     until,
 )
-from tests.system.strangers import ROUTER, words
+from tests.system.strangers import ROUTER, command_line
 from tests.system.test_doctor import examined
 
 pytestmark = pytest.mark.network
 
 
 def router(where: Path, endpoint: str) -> Program:
-    return Program(words(ROUTER, endpoint), where)
+    return Program(command_line(ROUTER, endpoint), where)
 
 
 def row(bus: Bus) -> Any:
@@ -42,7 +42,7 @@ def row(bus: Bus) -> Any:
     return rows[0] if rows else None
 
 
-def told(daemon: Daemon, name: str, times: int) -> str:
+def wait_for_event(daemon: Daemon, name: str, times: int) -> str:
     """Wait until the daemon has logged this event `times` times. Return the last one's text."""
     until(lambda: len(daemon.events(name)) >= times, 5.0, f"{name}, {times} times")
     return str(daemon.events(name)[times - 1]["text"])
@@ -52,7 +52,7 @@ def test_a_peer_says_that_its_router_is_missing_and_that_it_came_and_went(tmp_pa
     meeting = free_endpoint()
     config = {"bus": {"connect": [meeting]}}
     with Daemon(tmp_path, config=config) as daemon, Bus(daemon.endpoint) as bus:
-        assert meeting in told(daemon, "router_missing", 1)
+        assert meeting in wait_for_event(daemon, "router_missing", 1)
         until(lambda: row(bus) is not None, 2.0, "diagnostics say it")
         assert (row(bus)["level"], row(bus)["message"]) == (1, f"not connected to {meeting}")
         toml = f'[bus]\nlisten = ["{daemon.endpoint}"]\nconnect = ["{meeting}"]\n'
@@ -61,13 +61,13 @@ def test_a_peer_says_that_its_router_is_missing_and_that_it_came_and_went(tmp_pa
         assert ("warning", f"no program listens at {meeting}") in rows
         assert ("warning", f"the daemon is not connected to {meeting}") in rows
         with router(tmp_path, meeting) as there:
-            assert told(daemon, "router_found", 1) == f"connected to {meeting}"
+            assert wait_for_event(daemon, "router_found", 1) == f"connected to {meeting}"
             until(lambda: row(bus)["level"] == 0, 2.0, "diagnostics say it")
             _, findings = examined(tmp_path, toml)
             rows = [(finding["level"], finding["text"]) for finding in findings["router"]]
             assert rows == [("ok", "the daemon is connected")]
             there.signal(signal.SIGKILL)
-            told(daemon, "router_missing", 2)
+            wait_for_event(daemon, "router_missing", 2)
         assert bus.count("router_missing") == 2
         assert bus.state()["link"] == "up"  # local driving does not depend on the router
 
@@ -82,10 +82,10 @@ def test_a_client_says_that_its_router_went_and_came_back(tmp_path: Path) -> Non
         assert findings["router"][0]["text"] == f"no program listens at {meeting}"
         assert "only through the Zenoh router" in findings["daemon"][0]["text"]
         with router(tmp_path, meeting):
-            told(daemon, "router_found", 1)
-        told(daemon, "router_missing", 1)
+            wait_for_event(daemon, "router_found", 1)
+        wait_for_event(daemon, "router_missing", 1)
         with router(tmp_path, meeting):
-            told(daemon, "router_found", 2)
+            wait_for_event(daemon, "router_found", 2)
             with Bus(meeting) as bus:
                 until(lambda: row(bus)["message"] == "connected", 2.0, "diagnostics say it")
 
@@ -105,7 +105,7 @@ def test_two_directly_connected_daemons_report_it_and_a_wildcard_stop_reaches_on
         "ros": {"namespace": "two"},
     }
     with first, Daemon(tmp_path, config=config, name="two", endpoint=free_endpoint()) as two:
-        assert first.endpoint in told(two, "not_a_router", 1)
+        assert first.endpoint in wait_for_event(two, "not_a_router", 1)
         with Bus(two.endpoint, robot_id="two") as bus:
             until(lambda: "is not a router" in row(bus)["message"], 2.0, "diagnostics say it")
         toml = f'[robot]\nid = "two"\n[bus]\nlisten = ["{two.endpoint}"]\n'
@@ -138,12 +138,12 @@ def test_the_zeros_of_a_program_behind_routers_release_no_other_program(
     ends = [free_endpoint() for _ in range(routers)]
     with ExitStack() as stack:
         for place, endpoint in enumerate(ends):
-            program = Program(words(ROUTER, endpoint, *ends[:place][-1:]), tmp_path)
+            program = Program(command_line(ROUTER, endpoint, *ends[:place][-1:]), tmp_path)
             stack.enter_context(program).says("routing")
         daemon = stack.enter_context(Daemon(tmp_path, config={"bus": {"connect": ends[-1:]}}))
         bus = stack.enter_context(Bus(daemon.endpoint))
         zeros, speeds = [stack.enter_context(zenoh.open(client_config(ends[0]))) for _ in range(2)]
-        told(daemon, "router_found", 1)
+        wait_for_event(daemon, "router_found", 1)
         bus.linked()
 
         def put(session: zenoh.Session, linear: float) -> Any:

@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 
 from tests.system import cores
-from tests.system.cores import Idle, idle, idle_class, taken
+from tests.system.cores import Idle, cores_were_busy, idle, idle_class
 from tests.system.harness import Program
 
 
 def test_a_failure_counts_if_a_core_was_idle_for_a_while() -> None:
     cores = os.cpu_count() or 1
-    assert taken(Idle(100.0, 7.0), Idle(110.0, 7.0))
-    assert taken(Idle(100.0, 7.0), Idle(110.0, 7.0 + 0.2 * cores))
-    assert not taken(Idle(100.0, 7.0), Idle(110.0, 7.0 + 0.4 * cores))
+    assert cores_were_busy(Idle(100.0, 7.0), Idle(110.0, 7.0))
+    assert cores_were_busy(Idle(100.0, 7.0), Idle(110.0, 7.0 + 0.2 * cores))
+    assert not cores_were_busy(Idle(100.0, 7.0), Idle(110.0, 7.0 + 0.4 * cores))
 
 
 def test_the_idle_time_grows_and_is_at_most_the_uptime_of_all_cores() -> None:

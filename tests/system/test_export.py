@@ -30,7 +30,7 @@ MEASURED = {"acsard: control loop", "acsard: recording"}
 RECORDED = ROOT / "tests" / "recordings" / "quiet.mcap"
 
 
-class Told(NamedTuple):
+class ExportedFile(NamedTuple):
     """The contents of an exported file: the bytes of each topic, and a function to decode them."""
 
     data: dict[str, list[bytes]]
@@ -38,7 +38,7 @@ class Told(NamedTuple):
     decode: Callable[[str, bytes], Any]
 
 
-def bag(path: Path) -> Told:
+def bag(path: Path) -> ExportedFile:
     store: Any = get_typestore(Stores.EMPTY)
     data: dict[str, list[bytes]] = {}
     times: dict[str, list[int]] = {}
@@ -49,10 +49,10 @@ def bag(path: Path) -> Told:
         for connection, time_ns, raw in reader.messages():
             data.setdefault(connection.topic, []).append(raw)
             times.setdefault(connection.topic, []).append(time_ns)
-    return Told(data, times, lambda topic, raw: store.deserialize_cdr(raw, types[topic]))
+    return ExportedFile(data, times, lambda topic, raw: store.deserialize_cdr(raw, types[topic]))
 
 
-class Live:
+class LiveMessages:
     """The messages that arrived while the recording was made."""
 
     def __init__(self) -> None:
@@ -74,9 +74,9 @@ def _take_numbered(items: list[tuple[int, bytes]], sample: Any) -> None:
 
 
 @contextmanager
-def heard(bus: Bus) -> Iterator[Live]:
+def collect_messages(bus: Bus) -> Iterator[LiveMessages]:
     """Collect all messages for ROS nodes (rmw_zenoh and bridge), and `state` and `events`."""
-    live = Live()
+    live = LiveMessages()
     with ExitStack() as stack:
         for key in (*ROS, f"{bus.root}/state", f"{bus.root}/events"):
             payloads = live.data.setdefault(key.rpartition("/")[2], [])
@@ -144,7 +144,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Any:
     with (
         Daemon(where, config=OFTEN, words=words) as daemon,
         Bus(daemon.endpoint) as bus,
-        heard(bus) as live,
+        collect_messages(bus) as live,
     ):
         bus.linked()
         with bus.commanding(0.3, 0.2):

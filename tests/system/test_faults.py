@@ -30,10 +30,10 @@ from tests.system.harness import (
     Daemon,
     FarPeer,
     Following,
-    Heard,
     Peer,
     Periods,
     Program,
+    ReceivedLine,
     alive_at,
     broken,
     environment,
@@ -44,7 +44,7 @@ from tests.system.harness import (
     until,
     wheels,
 )
-from tests.system.strangers import BUSY, COMMANDER, words
+from tests.system.strangers import BUSY, COMMANDER, command_line
 
 TIMEOUT_S = 0.25
 TICK_S = 0.01
@@ -62,17 +62,19 @@ ZERO_TEXT = ZERO_LINE.strip()
 
 def commander(daemon: Daemon, speed: float, source: str = "app", zeros: int = 1) -> Program:
     """Run a process that sends stamped commands at 20 Hz until it is ended."""
-    return Program(words(COMMANDER, daemon.endpoint, source, speed, zeros), daemon.config.parent)
+    return Program(
+        command_line(COMMANDER, daemon.endpoint, source, speed, zeros), daemon.config.parent
+    )
 
 
-def drives(peer: FarPeer, driver: Program, speed: float = 0.3) -> Heard:
+def drives(peer: FarPeer, driver: Program, speed: float = 0.3) -> ReceivedLine:
     """Wait for the first line with this speed in m/s, and return it.
 
     If a busy machine has delayed the commander's first zero, the commander must send zeros again.
     """
     begun = said = time.monotonic()
 
-    def look() -> Heard | None:
+    def look() -> ReceivedLine | None:
         nonlocal said
         if time.monotonic() > said + 4.0 and len(driver.out) > 3:
             said = time.monotonic()
@@ -129,7 +131,7 @@ def text(speed: float) -> bytes:
     return f"ap{speed / 0.05:05.2f},".encode()
 
 
-def gaps(lines: list[Heard]) -> list[float]:
+def gaps(lines: list[ReceivedLine]) -> list[float]:
     return [after.at - before.at for before, after in itertools.pairwise(lines)]
 
 
@@ -253,7 +255,7 @@ def three_sources(where: Path, peer: FarPeer) -> Iterator[Daemon]:
 
 def taken_over(
     peer: FarPeer, daemon: Daemon, bus: Bus, successor: str
-) -> tuple[float, list[Heard]] | None:
+) -> tuple[float, list[ReceivedLine]] | None:
     """Kill a commander while another one waits.
 
     Returns the time of its last command, and the lines from then until the other one's speed.
@@ -313,7 +315,7 @@ def kinds_of(pid: int) -> tuple[int, int]:
 
 
 @contextmanager
-def taken(name: str) -> Iterator[None]:
+def pty_name_occupied(name: str) -> Iterator[None]:
     """Occupy the pty of this name, so that the next program that opens a pty gets another name."""
     pairs: list[tuple[int, int]] = []
 
@@ -354,14 +356,14 @@ def replugged(tmp_path: Path, peer: Peer, cycles: int) -> tuple[list[float], lis
             name = os.readlink(peer.path)
             pulled = peer.unplug()
             down = states.find(lambda state: state["link"] == "down", 5.0, "down", after=pulled)
-            with taken(name):
+            with pty_name_occupied(name):
                 peer.plug()
             plugged = time.monotonic()
             assert os.readlink(peer.path) != name
             first = until(lambda: peer.lines[1:2], 5.0, "the first line")[0]
             states.find(lambda state: state["link"] == "up", 5.0, "up", after=down.at)
             assert peer.session.stream.startswith(b"\r\n" + ZERO_LINE)
-            assert set(peer.session.said()[1:]) == {ZERO_LINE}
+            assert set(peer.session.raw_lines()[1:]) == {ZERO_LINE}
             if cycle == 0:
                 # The first loss may start a thread that stays.
                 before = kinds_of(daemon.pid)
@@ -454,7 +456,7 @@ def test_no_line_waits_in_the_daemon_while_the_serial_line_is_full(
             spoke, silent = begun, 0.0
             while (now := time.monotonic()) < begun + 0.2:
                 spoke, silent = now, max(silent, now - spoke)
-                peer.say(PLAIN((10.0,) * 4))
+                peer.send(PLAIN((10.0,) * 4))
                 time.sleep(TICK_S)
             after = bus.state()
             ended = time.monotonic()
@@ -502,7 +504,7 @@ def busy(where: Path) -> ExitStack:
     """Run two processes per core that use all the time they get."""
     stack = ExitStack()
     for _ in range(2 * (os.cpu_count() or 1)):
-        stack.enter_context(Program(words(BUSY), where))
+        stack.enter_context(Program(command_line(BUSY), where))
     return stack
 
 
@@ -590,7 +592,7 @@ def stalled(daemon: Daemon) -> Iterator[None]:
         daemon.signal(signal.SIGCONT)
 
 
-def no_burst(lines: list[Heard]) -> float:
+def no_burst(lines: list[ReceivedLine]) -> float:
     """Check that lines do not come in a burst, and return the smallest gap between two lines.
 
     The lines in each tenth of a second are counted. Two or three more than the control rate are
@@ -731,7 +733,7 @@ def test_control_goes_on_and_ends_well_when_output_is_blocked_for_the_whole_run(
         daemon = stack.enter_context(Daemon(tmp_path, peer.path, ready=False, **how))
         with alive_at(daemon.endpoint, daemon) as alive:
             until(alive.try_recv, 5.0, "the alive token")
-        until(lambda: ZERO_LINE in peer.session.said(), 5.0, "the first line on the wire")
+        until(lambda: ZERO_LINE in peer.session.raw_lines(), 5.0, "the first line on the wire")
         with Bus(daemon.endpoint) as bus:
             with bus.commanding(0.5):
                 until(lambda: peer.lines[-1].line.startswith(text(0.5)), 5.0, "steady driving")

@@ -29,21 +29,21 @@ from tests.system.harness import (
     Bus,
     Daemon,
     FarPeer,
-    Heard,
     Periods,
     Program,
+    ReceivedLine,
     Tables,
     broken,
     client_config,
+    delayed_s,
     free_endpoint,
-    held_up,
     resident_kb,
     seconds,
     until,
     waits_for_a_core,
     wheels,
 )
-from tests.system.strangers import CODED_FLOOD, COMMANDER, HOARDER, ROUTER, words
+from tests.system.strangers import CODED_FLOOD, COMMANDER, HOARDER, ROUTER, command_line
 
 TIMEOUT_S = 0.25
 TICK_S = 0.01
@@ -71,7 +71,7 @@ PROMPT_FEEDBACK: dict[str, object] = {"wheel_acceleration": 1e6}
 """A feedback limit that accepts the reports of wheels that obey at once."""
 
 
-def gaps(lines: list[Heard]) -> list[float]:
+def gaps(lines: list[ReceivedLine]) -> list[float]:
     """Return the gaps between the lines in s.
 
     The time lost to other programs is subtracted from gaps of more than two periods.
@@ -230,7 +230,7 @@ class Numbered:
             if self._leave.wait(0.02):
                 return
 
-    def age(self, entry: Heard) -> float | None:
+    def age(self, entry: ReceivedLine) -> float | None:
         """Return the age in s that the command of this line had when the line appeared.
 
         Returns None if the line has no command's speed.
@@ -255,7 +255,7 @@ class Hole(NamedTuple):
     resumed: float
 
 
-def appeared(lines: list[Heard]) -> list[Heard]:
+def appeared(lines: list[ReceivedLine]) -> list[ReceivedLine]:
     """Return the first line of each new command."""
     return [b for a, b in itertools.pairwise(lines) if b.line != a.line]
 
@@ -276,7 +276,7 @@ def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
         Numbered(client) as numbered,
     ):
 
-        def driving(after: float) -> Heard | None:
+        def driving(after: float) -> ReceivedLine | None:
             lines = appeared(peer.since(after))
             return next((h for h in lines if (numbered.age(h) or 9.0) < 0.1), None)
 
@@ -315,7 +315,7 @@ def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
     return results
 
 
-def told(results: list[Hole]) -> None:
+def print_holes(results: list[Hole]) -> None:
     for way in ("fast", "slow"):
         these = [hole for hole in results if hole.way == way]
         print(
@@ -339,7 +339,7 @@ def test_after_a_partition_heals_fast_or_slowly_no_stale_command_is_obeyed(
             lambda way: holes(tmp_path / way, [(way, 0.6)]), tuple[Way, Way](("fast", "slow"))
         )
         results = list(itertools.chain.from_iterable(both))
-    told(results)
+    print_holes(results)
     assert [hole.stale for hole in results] == [0, 0]
     assert all(hole.held > 3000 for hole in results), "a backlog came back"
     assert all(hole.refused > 0 for hole in results), "and was refused"
@@ -355,7 +355,7 @@ def test_over_200_partitions_no_stale_command_is_obeyed(tmp_path: Path) -> None:
     with ThreadPoolExecutor(3) as pool:
         lots = pool.map(holes, [tmp_path / str(n) for n in range(3)], plans)
         results = list(itertools.chain.from_iterable(lots))
-    told(results)
+    print_holes(results)
     assert len(results) >= 200
     assert sum(hole.stale for hole in results) == 0
 
@@ -418,7 +418,9 @@ def flooded(where: Path, length: float) -> Flooded:
         bus.linked()
         before, memory = bus.state(), resident_kb(daemon.pid)
         cores = waits_for_a_core(daemon.pid)
-        with Program(words(CODED_FLOOD, daemon.endpoint, BASE, SLOPE, length), where) as flood:
+        with Program(
+            command_line(CODED_FLOOD, daemon.endpoint, BASE, SLOPE, length), where
+        ) as flood:
             begun = float(flood.says("flooding").split()[1])
             asked = []
             while time.monotonic() < begun + length - 0.1:
@@ -427,7 +429,7 @@ def flooded(where: Path, length: float) -> Flooded:
             sent = json.loads(flood.says("sent").removeprefix("sent"))
             assert flood.ended(5.0) == 0
         after, grown = bus.state(), resident_kb(daemon.pid) - memory
-        waited = held_up(cores, waits_for_a_core(daemon.pid), daemon.pid)
+        waited = delayed_s(cores, waits_for_a_core(daemon.pid), daemon.pid)
         start = begun + time.time() - time.monotonic()
         steps = [
             (seconds(step.value["header"]["stamp"]) - start, step.value["twist"]["linear"]["x"])
@@ -546,7 +548,9 @@ def hoarded(where: Path, rounds: int, length: float) -> tuple[list[float], list[
             return max(gaps(peer.since(begun)))
 
         endpoint = f"{daemon.endpoint}#so_rcvbuf=4096"
-        four = [stack.enter_context(Program(words(HOARDER, endpoint), where)) for _ in range(4)]
+        four = [
+            stack.enter_context(Program(command_line(HOARDER, endpoint), where)) for _ in range(4)
+        ]
         for listener in four:
             listener.says("listening")
         filler = stack.enter_context(Bus(daemon.endpoint))
@@ -598,11 +602,11 @@ def rerouted(where: Path, cycles: int) -> list[float]:
     routed, times, worst = free_endpoint(), [], 0.0
     with ExitStack() as stack:
         peer = stack.enter_context(FarPeer(where))
-        router = stack.enter_context(Program(words(ROUTER, routed), where))
+        router = stack.enter_context(Program(command_line(ROUTER, routed), where))
         router.says("routing")
         config: Tables = {"bus": {"connect": [routed]}}
         daemon = stack.enter_context(Daemon(where, peer.path, config))
-        stack.enter_context(Program(words(COMMANDER, daemon.endpoint, "app", 0.2, 1), where))
+        stack.enter_context(Program(command_line(COMMANDER, daemon.endpoint, "app", 0.2, 1), where))
         with Bus(routed) as remote, remote.follow("odom") as odom:
             odom.find(lambda _: True, 5.0, "odometry behind the router")
         states = stack.enter_context(stack.enter_context(Bus(daemon.endpoint)).follow("state"))
@@ -610,7 +614,7 @@ def rerouted(where: Path, cycles: int) -> list[float]:
         for _ in range(cycles):
             router.signal(signal.SIGKILL)
             router.ended(5.0)
-            router = stack.enter_context(Program(words(ROUTER, routed), where))
+            router = stack.enter_context(Program(command_line(ROUTER, routed), where))
             back = float(router.says("routing").split()[1])
             with zenoh.open(client_config(routed)) as session:
                 samples = session.declare_subscriber(

@@ -288,7 +288,7 @@ class Fleet:
         self._fooled.clear()
         return was
 
-    def comes(self, look: Callable[[], bool], steps: int = 5) -> bool:
+    def comes_true(self, look: Callable[[], bool], steps: int = 5) -> bool:
         """Return whether `look` returns True within `steps` control periods.
 
         A period is long compared with the delivery of a message on one machine.
@@ -312,12 +312,12 @@ class Fleet:
             rows = ROWS[verb]
             if verb == "query":
                 calls = [row for row in rows if "/srv/" in row.key]
-                outcome = visitor.asked([row for row in rows if row not in calls])
+                outcome = visitor.query_outcomes([row for row in rows if row not in calls])
                 assert not any(robot.state()["mode"] == "stopped" for robot in self.robots)
-                outcome |= visitor.asked(calls)
+                outcome |= visitor.query_outcomes(calls)
                 self.restored()
                 return {row.label: outcome[row.label] for row in rows}
-            attempt = visitor.followed if verb == "subscribe" else partial(visitor.sent, verb)
+            attempt = visitor.followed if verb == "subscribe" else partial(visitor.has_effect, verb)
             # Try all rows that should have no effect at once, and one by one only if something
             # happened.
             idle = [row for row in rows if name not in row.who]
@@ -340,9 +340,9 @@ class Visitor:
         for root in self._answering:
             assert list(self._session.get(f"{root}/info", timeout=5.0))
         if len(self._answering) < 2:
-            self._fleet.comes(lambda: False)
+            self._fleet.comes_true(lambda: False)
 
-    def sent(self, verb: Verb, rows: Sequence[Try]) -> bool:
+    def has_effect(self, verb: Verb, rows: Sequence[Try]) -> bool:
         """Return whether any of these puts or deletes had an effect.
 
         It has one if a robot obeys it, or if it reaches the witness like a message of a robot.
@@ -367,14 +367,14 @@ class Visitor:
             else:
                 self._session.delete(row.key)
         self._behind()
-        done = fleet.comes(obeyed)
+        done = fleet.comes_true(obeyed)
         fooled = fleet.fooled()
         if done:
             fleet.restored()
             assert not fooled, f"received by others: {rows}"
         return done or fooled
 
-    def asked(self, rows: Sequence[Try]) -> dict[str, bool]:
+    def query_outcomes(self, rows: Sequence[Try]) -> dict[str, bool]:
         """Send these queries. Return for each whether an answer arrived."""
         waiting = {}
         for row in rows:
@@ -391,7 +391,7 @@ class Visitor:
                 outcome[label] = outcome.get(label) or _answered(waiting[label])
             return all(outcome.values())
 
-        self._fleet.comes(all_mine, 200)
+        self._fleet.comes_true(all_mine, 200)
         return {label: outcome.get(label) or _answered(waiting[label]) for label in waiting}
 
     def followed(self, rows: Sequence[Try]) -> bool:
@@ -410,7 +410,7 @@ class Visitor:
         # Last values are sent again every 5 s, for clients that cannot ask for them.
         mine = [row for row in rows if self._name in row.who]
         late = any(row.how == "late" for row in mine)
-        done = self._fleet.comes(event.is_set, 700 if late else 50 if mine else 5)
+        done = self._fleet.comes_true(event.is_set, 700 if late else 50 if mine else 5)
         for subscriber in subscribers:
             subscriber.undeclare()
         return done
@@ -548,7 +548,7 @@ def test_on_a_robot_that_is_a_peer_programs_need_no_router_and_reach_no_other_ro
             for reply in replies
         }
         two.ask("info")
-        fleet.comes(lambda: False)
+        fleet.comes_true(lambda: False)
         first.comes_to("ready")
         assert first.count("commands") == before
     two.at_rest()

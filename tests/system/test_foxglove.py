@@ -39,7 +39,7 @@ from tests.system.harness import (
     until,
 )
 from tests.system.ros_clients import JOINTS, STAMPED, TWIST, BridgeHalf, RmwClient, session_at
-from tests.system.viewer import Looked, Viewer, opened
+from tests.system.viewer import SubscribedTopic, Viewer, opened
 
 SLOW = pytest.mark.slow
 
@@ -284,7 +284,7 @@ def every_way(session: zenoh.Session) -> Iterator[Sent]:
             yield source, speed, partial(client.put, topic, name, payload)
 
 
-def asked(messages: list[Any]) -> list[tuple[str, float, float]]:
+def requested_speeds(messages: list[Any]) -> list[tuple[str, float, float]]:
     """Return the frame and the two speeds of each message."""
     return [(m.header.frame_id, m.twist.linear.x, m.twist.angular.z) for m in messages]
 
@@ -301,7 +301,7 @@ def test_commands_of_every_type_and_transport_are_shown_as_in_an_export(tmp_path
         def shown(source: str) -> list[tuple[str, float, float]]:
             stream, known = looked[source], read[source]
             known += [stream.read(came.payload) for came in stream.came[len(known) :]]
-            return asked(known)
+            return requested_speeds(known)
 
         with session_at(daemon.endpoint) as session:
             for source, speed, send in every_way(session):
@@ -320,7 +320,7 @@ def test_commands_of_every_type_and_transport_are_shown_as_in_an_export(tmp_path
     assert ended.code == 0, ended
     messages = exported(tmp_path / "new.mcap")
     for source in sources:
-        live, written = shown(source), asked(messages[f"/cmd_vel_in/{source}"])
+        live, written = shown(source), requested_speeds(messages[f"/cmd_vel_in/{source}"])
         # The first message may have come before the subscription.
         assert live == written[-len(live) :]
 
@@ -361,7 +361,7 @@ def test_the_log_topic_has_each_event_of_the_daemon_once(viewer: Viewer, bus: Bu
     assert len(payloads) == len(set(payloads))
 
 
-def lines(log: Looked) -> list[str]:
+def lines(log: SubscribedTopic) -> list[str]:
     return [log.read(message.payload).msg for message in list(log.came)]
 
 

@@ -76,7 +76,7 @@ def robot(tmp_path: Path, certificates: Certificates) -> Iterator[Open]:
         yield robot
 
 
-def gone(pid: int) -> bool:
+def has_ended(pid: int) -> bool:
     """Return whether the process has ended. A zombie counts as ended."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
@@ -136,7 +136,7 @@ def test_the_gateway_closes_with_the_daemon(robot: Open, number: signal.Signals)
     gateway = robot.gateway()
     robot.daemon.signal(number)
     robot.daemon.ended(5.0)
-    until(lambda: gone(gateway), 1.0, "it closes")
+    until(lambda: has_ended(gateway), 1.0, "it closes")
     assert not robot.lets_in()
 
 
@@ -146,7 +146,9 @@ def test_no_gateway_that_hangs_outlives_its_daemon(robot: Open) -> None:
     robot.daemon.signal(signal.SIGTERM)
     begun = time.monotonic()
     assert robot.daemon.ended(2.0) == 0
-    until(lambda: gone(gateway), 1.0, f"gone, {time.monotonic() - begun:.1f} s after the signal")
+    until(
+        lambda: has_ended(gateway), 1.0, f"gone, {time.monotonic() - begun:.1f} s after the signal"
+    )
 
 
 @pytest.mark.nightly
@@ -155,7 +157,7 @@ def test_a_gateway_that_is_suspended_is_ended_and_restarted(robot: Open) -> None
     os.kill(first, signal.SIGSTOP)
     robot.daemon.gateway_opens(times=2)
     assert robot.lets_in()
-    assert gone(first)
+    assert has_ended(first)
     (line,) = robot.daemon.events("gateway_ended")
     assert "stopped or hung" in line["text"]
 

@@ -77,7 +77,7 @@ async def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_th
             assert (end["ended"], end["meaning"]) == (1, "failure")  # it was another map
             frames = guided.ours.heard
             findings = [s["guide"]["finding"] for s in frames if "finding" in str(s)]
-            kinds = {"Subject", "Doing", "Progress", "Question", "Found", "Result"}
+            kinds = {"Subject", "Doing", "Progress", "Question", "FindingMessage", "Result"}
             assert described.kinds(frames) >= kinds
     names = [finding["name"] for finding in findings]
     assert names[0] == "baud rate"
@@ -124,7 +124,7 @@ async def test_a_key_stops_the_leg_and_other_clients_see_the_procedure_and_canno
     assert page.refused()["malformed"] >= before.get("malformed", 0) + 200
 
 
-def gone(guided: Guided, page: Page) -> None:
+def cut_connection(guided: Guided, page: Page) -> None:
     """Cut the connection like a browser that is killed."""
     cast(Any, guided.ours.socket)._response.connection.transport.abort()
 
@@ -133,7 +133,7 @@ def left(guided: Guided, page: Page) -> None:
     asyncio.get_running_loop().create_task(guided.ours.say(press="leave"))
 
 
-@pytest.mark.parametrize("how", [gone, left])
+@pytest.mark.parametrize("how", [cut_connection, left])
 async def test_a_browser_that_disconnects_during_a_leg_leaves_zeros_and_no_child_process(
     page: Page, standing: Bus, how: Callable[[Guided, Page], None]
 ) -> None:
@@ -366,7 +366,7 @@ async def test_a_browser_that_disconnects_while_a_motor_turns_leaves_zeros_and_a
                 await guided.begin("check", port=port)
                 await guided.lifted()
                 await guided.says(lambda message: "motor a" in message.get("doing", ""))
-                gone(guided, served)
+                cut_connection(guided, served)
             await beside(lambda: none_left(served))
         # The next check finds the wheels at rest, and the port free.
         with Program(acsard("mcu", "check", "--port", port, "--yes"), tmp_path) as again:

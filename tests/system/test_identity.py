@@ -42,7 +42,7 @@ class Robot:
     @contextmanager
     def operator(self) -> Iterator[zenoh.Session]:
         """A plain Zenoh session that shows the operator's certificate."""
-        config = self.certificates.shown(self.tls, self.certificates.own("operator"))
+        config = self.certificates.client_settings(self.tls, self.certificates.own("operator"))
         with zenoh.open(config) as session:
             until(
                 lambda: list(session.get("acsard/acsar/info", timeout=1.0)), 10.0, "the TLS gateway"

@@ -39,7 +39,7 @@ from tests.system.harness import (
     wheels,
 )
 from tests.system.identities import Certificates, Identity, free_tls_endpoint
-from tests.system.strangers import HOSTILE, words
+from tests.system.strangers import HOSTILE, command_line
 
 pytestmark = [pytest.mark.network, pytest.mark.timeout(120)]
 
@@ -185,7 +185,7 @@ class Robot:
         with self._peer, self.daemon, self._joined() as bus, bus.follow("odom"):
             bus.linked()
             begun, now = bus.state(), time.monotonic()
-            attack = words(HOSTILE, "many", self._plain, "{}", 1.0)
+            attack = command_line(HOSTILE, "many", self._plain, "{}", 1.0)
             with Program(attack, self._where) as attacker:
                 attacker.says("declared")
                 assert attacker.ended(10.0) == 0
@@ -211,7 +211,7 @@ class Robot:
         """
         memory_kb, most_kb = resident_kb(self.daemon.pid), 0
         network, text = self._network, HOSTILE.replace("acsard/acsar", self._root)
-        attack = words(text, form, network.tls, json.dumps(network.shown(identity)), seconds)
+        attack = command_line(text, form, network.tls, json.dumps(network.shown(identity)), seconds)
         with Program(attack, self._where) as attacker:
             attacker.says("begun")
             end = time.monotonic() + seconds

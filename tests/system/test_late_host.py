@@ -69,7 +69,7 @@ def test_a_planted_cause_is_named_eight_of_eight_times(
         )
 
 
-def shown(*words: str) -> str:
+def output_of(*words: str) -> str:
     """Return what a subcommand prints."""
     done = subprocess.run(acsard(*words), capture_output=True, text=True, timeout=60, check=False)
     return done.stdout
@@ -87,7 +87,7 @@ def test_log_recording_report_and_doctor_name_the_same_cause(tmp_path: Path) -> 
         with hog() as busy:
             spin(busy, 5)
             (event, *_) = until(lambda: causes_of(daemon), 10.0, "the cause is in the log")
-            doctor = shown("doctor", "--config", str(daemon.config))
+            doctor = output_of("doctor", "--config", str(daemon.config))
             busy.kill()
         daemon.signal(signal.SIGTERM)
         assert daemon.ended(5.0) == 0
@@ -96,8 +96,8 @@ def test_log_recording_report_and_doctor_name_the_same_cause(tmp_path: Path) -> 
         assert clause.startswith("other programs used the processor for ")
         assert re.search(rf"the real-time program \S+ \(pid {busy.pid}\)", clause)
     (file,) = directory.rglob("*.mcap")
-    sentences = shown("recording", "show", str(file))
+    sentences = output_of("recording", "show", str(file))
     page = tmp_path / "report.html"
-    shown("recording", "report", str(file), str(page))
+    output_of("recording", "report", str(file), str(page))
     for text in (doctor, sentences, page.read_text()):
         assert clause in " ".join(text.split())

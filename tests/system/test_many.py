@@ -51,7 +51,7 @@ class Robots:
     def __init__(self, where: Path, endpoint: str, daemons: dict[str, Daemon]) -> None:
         self.where, self.endpoint, self.daemons = where, endpoint, daemons
 
-    def words(self, *words: str, who: str = "*") -> list[str]:
+    def command_line(self, *words: str, who: str = "*") -> list[str]:
         return acsard(*words, "--connect", self.endpoint, "--id", who)
 
     def tool(self, *words: str, who: str = "*") -> Finished:
@@ -83,7 +83,7 @@ def messages(program: Program) -> list[Any]:
 
 
 def test_echo_of_all_robots_names_the_robot_of_each_message(robots: Robots) -> None:
-    with Program(robots.words("echo", "state"), robots.where) as program:
+    with Program(robots.command_line("echo", "state"), robots.where) as program:
         until(lambda: {entry["robot"] for entry in messages(program)} >= {ONE, TWO}, 10.0, "both")
     assert all(entry["message"]["link"] for entry in messages(program))
     assert "following robot1, robot2" in program.stderr
@@ -190,7 +190,7 @@ def test_a_table_for_a_pipe_does_not_wait_for_the_connection_to_be_closed(
 
     monkeypatch.setattr(synchronous, "close", close)
     with os.fdopen(near, "rb"), os.fdopen(far, "w") as pipe, redirect_stdout(pipe):
-        main(robots.words("fleet", "--once", who=f"{ONE},{TWO}")[3:])
+        main(robots.command_line("fleet", "--once", who=f"{ONE},{TWO}")[3:])
     assert b"ready" in chunks[-1]
 
 

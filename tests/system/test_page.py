@@ -1113,14 +1113,14 @@ web.run_app(app, host="127.0.0.1", port=0, print=lambda text: print(text, flush=
 """The smallest page that shows messages from a WebSocket."""
 
 
-class Look(NamedTuple):
+class PageLoad(NamedTuple):
     """The cost of opening a page once."""
 
     ms: float
     received: int
 
     @classmethod
-    def at(cls, url: str, browser: Browser) -> Look:
+    def at(cls, url: str, browser: Browser) -> PageLoad:
         browser.open("about:blank")
         before = browser.received
         browser.open(url)
@@ -1138,7 +1138,7 @@ def test_the_first_visit_loads_little_and_the_second_one_less(page: Phone, tmp_p
         looks = {}
         for name, place in (("the page", page.server.here), ("a bare one", url)):
             browser.ask("Network.clearBrowserCache")
-            looks[name] = [Look.at(place, browser) for _ in range(2)]
+            looks[name] = [PageLoad.at(place, browser) for _ in range(2)]
             first, second = looks[name]
             print(
                 f"\n{name:10} first look {first.ms:4.0f} ms, {first.received / 1000:5.1f} kB; "

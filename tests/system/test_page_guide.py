@@ -53,7 +53,7 @@ class Person:
             self.browser.js(f"document.getElementById({name!r}).value = {value!r}")
         self.click(what)
 
-    def asked(self, words: str, within: float = 10.0) -> None:
+    def check_question(self, words: str, within: float = 10.0) -> None:
         """Check that this is the current question, and that it has the focus."""
         self.shows("guide-words", words, within)
         until(lambda: not self.hidden("guide-question"), 5.0, "a question")
@@ -107,7 +107,7 @@ def test_a_board_is_checked_without_a_daemon_and_the_lines_are_written(
         person = Person(browser, server)
         sound(browser)
         person.begin("check", **{"check-port": "sim"})
-        person.asked("tick this")
+        person.check_question("tick this")
         person.shows("guide-where", "SIMULATED")
         # The box is not ticked, so the check does not go on.
         person.press("lifted")
@@ -117,13 +117,13 @@ def test_a_board_is_checked_without_a_daemon_and_the_lines_are_written(
         person.click("guide-tick")
         person.press("lifted")
         for n, wheel in enumerate(("fl", "fr", "rl", "rr")):
-            person.asked(f"which wheel did motor {'abcd'[n]} turn")
+            person.check_question(f"which wheel did motor {'abcd'[n]} turn")
             if n == 0:
                 sound(browser)
             person.press(wheel)
-            person.asked("which way did the wheel turn")
+            person.check_question("which way did the wheel turn")
             person.press("forward")
-        person.asked("Write these lines")
+        person.check_question("Write these lines")
         person.shows("guide-result", 'front_left = "+a"')
         assert browser.js("document.getElementById('guide-progress').value") == 1
         person.press("write")
@@ -147,14 +147,14 @@ def test_the_lifted_wheels_can_be_confirmed_by_the_keyboard_alone(
     with Page(alone, tmp_path) as server:
         person = Person(browser, server)
         person.begin("check", **{"check-port": "sim"})
-        person.asked("tick this")
+        person.check_question("tick this")
         # From the question, Tab leads to the box. Space is STOP everywhere, so Enter ticks the box.
         browser.type_key("Tab")
         assert browser.js("document.activeElement.id") == "guide-tick"
         browser.type_key("Enter")
         browser.type_key("Tab")
         browser.type_key("Enter")
-        person.asked("which wheel did motor a turn")
+        person.check_question("which wheel did motor a turn")
         person.click("guide-leave")
         person.ended("ended")
 
@@ -177,13 +177,13 @@ def drives(person: Person, bus: Bus) -> None:
         nonlocal disturbed
         if person.hidden("guide"):
             person.begin("calibrate", method="")
-            person.asked("1. Place the", 30.0)
+            person.check_question("1. Place the", 30.0)
             person.shows("guide-where", "SIMULATED")
             person.press("start")
             disturbed = 0
         elif person.browser.text("guide-story").count("was disturbed") > disturbed:
             disturbed += 1
-            person.asked("1. Place the", 30.0)
+            person.check_question("1. Place the", 30.0)
             person.press("start")
         elif not person.hidden("guide-close"):
             texts.append(person.browser.text("guide-story"))
@@ -270,7 +270,7 @@ def test_on_the_simulator_the_card_recommends_and_preselects_a_method(
     person.shows("advice", "no floor to measure with a tape")
     # The default works, and a different choice is kept.
     person.click("calibrate")
-    person.asked("1. Place the", 30.0)
+    person.check_question("1. Place the", 30.0)
     person.click("guide-leave")
     person.ended("stopped")
     person.click("guide-close")
@@ -290,19 +290,19 @@ def test_the_simulator_is_calibrated_from_the_first_question_to_the_written_line
     person = Person(browser, server)
     drives(person, bus)
     assert commands(server)
-    person.asked("from its mark", RIDES_S)
+    person.check_question("from its mark", RIDES_S)
     assert "leave this empty" in browser.text("guide-words")
     assert "any key or the button stops the robot" in browser.text("guide-story")
     where = bus.get("sim/pose")["pose"]["position"]
     person.types("far")
     person.shows("guide-wrong", "a number in m")
     person.types(f"{math.hypot(where['x'], where['y']):.3f}".replace(".", ","))
-    person.asked("2. The robot drives back")
+    person.check_question("2. The robot drives back")
     person.press("start")
     until(
         lambda: browser.js("document.getElementById('guide-progress').value") > 0.1, 60.0, "a bar"
     )
-    person.asked("Write these lines", RIDES_S)
+    person.check_question("Write these lines", RIDES_S)
     person.shows("guide-result", "standard deviation")
     sound(browser)
     person.press("write")

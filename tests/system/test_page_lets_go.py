@@ -28,7 +28,7 @@ from acsard.machine.authority import Authority
 from tests.system.browser import Page, hands, run
 from tests.system.bystander import lost
 from tests.system.chromium import CHROMIUM, HAS_WINDOWS, PHONE, browsing
-from tests.system.harness import ZERO_LINE, Daemon, FarPeer, Heard, until, wheels
+from tests.system.harness import ZERO_LINE, Daemon, FarPeer, ReceivedLine, until, wheels
 from tests.system.hosts import Hosts, inside, on
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell")
@@ -120,7 +120,7 @@ class Field:
         if not str(self.browser.js("location.href")).startswith(self.server.away):
             self.open()
         try:
-            until(self._live, 30.0, "the page is live")
+            until(self._is_live, 30.0, "the page is live")
         except AssertionError as error:
             texts = [self.browser.text(name) for name in ("mode", "reason", "age", "told", "alarm")]
             raise AssertionError(f"{error}; the page says {texts}") from None
@@ -130,7 +130,7 @@ class Field:
         self.browser.open("about:blank")
         self.browser.open(f"{self.server.away}/#token={self.token}")
 
-    def _live(self) -> bool:
+    def _is_live(self) -> bool:
         """Return whether the page is live. First reload the page if it asks for a reload.
 
         On a very busy machine one of the page's files may take longer than the server allows.
@@ -170,7 +170,7 @@ class Field:
         Waits until the robot is at rest.
         """
 
-        def slower() -> Heard | None:
+        def slower() -> ReceivedLine | None:
             since = self.peer.since(release)
             return next((entry for entry in since if not entry.line.startswith(STEADY)), None)
 
@@ -329,7 +329,7 @@ def browser_frozen(field: Field, number: int) -> Iterator[float]:
 
 
 @contextmanager
-def network_gone(
+def network_outage(
     field: Field, number: int, before_return: Callable[[], None] = lambda: None
 ) -> Iterator[float]:
     """The network delivers nothing in either direction, and no program gets an error.
@@ -369,11 +369,11 @@ def server_frozen(field: Field, number: int) -> Iterator[float]:
 
 WAYS: tuple[Way, ...] = (
     finger_lifted, second_finger, window_blurred, window_minimised, tab_hidden, tab_closed,
-    tab_killed, page_left, page_stalled, browser_killed, browser_frozen, network_gone,
+    tab_killed, page_left, page_stalled, browser_killed, browser_frozen, network_outage,
     server_killed, server_frozen,
 )  # fmt: skip
 
-IN_CI = (finger_lifted, tab_killed, network_gone, server_frozen)
+IN_CI = (finger_lifted, tab_killed, network_outage, server_frozen)
 """The most different ways. The nightly job tries the others."""
 
 
@@ -403,7 +403,7 @@ def field(hosts: Hosts, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fi
         field.end()
 
 
-def tell(what: str, rounds: list[Round]) -> None:
+def report_delays(what: str, rounds: list[Round]) -> None:
     """Print the delays of these rounds, and fail if a robot slowed down late or sped up again."""
     ticks = sorted(result.took_s / TICK_S for result in rounds)
     print(
@@ -439,7 +439,7 @@ def test_the_robot_brakes_after_every_way_to_release_the_stick(
         pytest.skip("needs the whole chromium")
     if times > 1:
         field.longest_s = 30.0
-    tell(way.__name__, [field.lets_go(way, number) for number in range(times)])
+    report_delays(way.__name__, [field.lets_go(way, number) for number in range(times)])
 
 
 class Program:
@@ -449,7 +449,7 @@ class Program:
         self._field = field
         self.speed = SPEED
         self._ends = threading.Event()
-        self._thread = threading.Thread(target=self._there)
+        self._thread = threading.Thread(target=self._run_on_stranger)
 
     def __enter__(self) -> Program:
         begun = time.monotonic()
@@ -469,7 +469,7 @@ class Program:
         """Send this speed from now on."""
         self.speed = speed
 
-    def _there(self) -> None:
+    def _run_on_stranger(self) -> None:
         with inside(self._field.hosts.stranger):
             run(self._story, 300.0)
 
@@ -491,7 +491,7 @@ def goes_on(field: Field, number: int) -> Round:
     """
     with Program(field) as program:
         # After the network has returned, the program must not send a backward speed any more.
-        with network_gone(field, number, lambda: program.turn(SPEED)) as cut:
+        with network_outage(field, number, lambda: program.turn(SPEED)) as cut:
             program.turn(-SPEED)
             took, allowed = field.braking(cut)
         # There is one connection, so messages sent without a network arrive before later ones. They
@@ -507,4 +507,4 @@ def test_commands_that_a_program_sent_without_a_network_are_not_obeyed_later(
 ) -> None:
     if times > 1:
         field.longest_s = 30.0
-    tell("program_goes_on", [goes_on(field, number) for number in range(times)])
+    report_delays("program_goes_on", [goes_on(field, number) for number in range(times)])

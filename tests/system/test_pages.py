@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 from tests.pages import COMMANDS, Block, Run, blocks, promises
-from tests.system.fleet_router import ROBOT_FILE, here
+from tests.system.fleet_router import ROBOT_FILE, write_local_copy
 from tests.system.harness import (
     ROOT,
     Bus,
@@ -215,7 +215,7 @@ def test_one_authority_and_one_file_serve_the_ten_robots_of_the_fleet_page(tmp_p
     own = tomllib.loads(ROBOT_FILE.read_text())
     own["robot"]["id"] = "robot10"
     own["bus"] |= {"connect": [endpoint], "tls": str(clients / "robot10")}
-    file = here(place / "router.json5", clients, endpoint)
+    file = write_local_copy(place / "router.json5", clients, endpoint)
     with Program(acsard("router", str(file)), place) as program:
         until(lambda: "router_open" in program.stderr, 20.0, "the router")
         with Daemon(place, config=own, name="robot10", ready=False):

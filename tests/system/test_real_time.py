@@ -27,7 +27,7 @@ def locked_kb(pid: int) -> int:
     return int(status.partition("VmLck:")[2].split()[0])
 
 
-def held(pid: int) -> set[str]:
+def open_files(pid: int) -> set[str]:
     """Return the files that the process has open."""
     return {os.readlink(link) for link in Path(f"/proc/{pid}/fd").iterdir()}
 
@@ -44,7 +44,7 @@ def test_the_control_loop_alone_is_real_time_and_memory_is_locked(tmp_path: Path
         assert len(policies) > 3, "the bus has threads"
         assert set(policies.values()) == {os.SCHED_OTHER}
         assert locked_kb(daemon.pid) > 0
-        assert not Path(WAKE_UP_LATENCY).exists() or WAKE_UP_LATENCY in held(daemon.pid)
+        assert not Path(WAKE_UP_LATENCY).exists() or WAKE_UP_LATENCY in open_files(daemon.pid)
         assert daemon.events("real_time") == []
 
 
@@ -53,7 +53,7 @@ def test_real_time_scheduling_can_be_switched_off(tmp_path: Path) -> None:
     with Daemon(tmp_path, config={"control": {"real_time": False}}) as daemon:
         assert os.sched_getscheduler(daemon.pid) == os.SCHED_OTHER
         assert locked_kb(daemon.pid) == 0
-        assert WAKE_UP_LATENCY not in held(daemon.pid)
+        assert WAKE_UP_LATENCY not in open_files(daemon.pid)
         assert daemon.events("real_time") == []
 
 

@@ -33,7 +33,7 @@ from tests.system.harness import (
     until,
     write_config,
 )
-from tests.system.strangers import STOP_AND_GO, words
+from tests.system.strangers import STOP_AND_GO, command_line
 
 Kind = Literal["stop", "fault", "inactive"]
 Way = Literal["kill", "crash", "abort", "term"]
@@ -95,7 +95,7 @@ def robot(tmp_path: Path, peer: Peer) -> Iterator[Robot]:
     (bug := tmp_path / "bug").mkdir()
     (bug / "sitecustomize.py").write_text(CRASH)
     endpoint = free_endpoint()
-    with Program(words(STOP_AND_GO, endpoint), tmp_path):
+    with Program(command_line(STOP_AND_GO, endpoint), tmp_path):
         yield Robot(tmp_path, peer, endpoint, environment(PYTHONPATH=f"{bug}:{ROOT}"))
 
 
@@ -116,15 +116,15 @@ def latch(robot: Robot, bus: Bus, kind: Kind) -> None:
             until(lambda: bus.state()["mode"] == "fault", 5.0, "a fault")
             robot.peer.reply = PLAIN
             # The fault has no caller, so no answer waits for the file.
-            until(lambda: kept(robot, kind), 1.0, "the fault is in the file")
+            until(lambda: is_latched(robot, kind), 1.0, "the fault is in the file")
 
 
-def kept(robot: Robot, kind: Kind) -> bool:
+def is_latched(robot: Robot, kind: Kind) -> bool:
     """Return whether the latch file contains a latch of this kind."""
     return json.loads(robot.file.read_bytes())["latches"].get(kind) is not None
 
 
-def stands(robot: Robot, bus: Bus, mode: str, since: float) -> Any:
+def check_at_rest(robot: Robot, bus: Bus, mode: str, since: float) -> Any:
     """Wait for one and a half cycles of the commander, and check that the robot stood in this mode.
 
     Returns the last state.
@@ -151,10 +151,10 @@ def release(bus: Bus, kind: Kind) -> None:
     assert "nothing to clear" in bus.get("srv/clear")["message"]
 
 
-def found(robot: Robot, bus: Bus, before: End, since: float) -> None:
+def check_and_release_latch(robot: Robot, bus: Bus, before: End, since: float) -> None:
     """Check that the latch of the previous daemon still stops the robot, and release it."""
     spoiled = before.spoil is not whole
-    state = stands(robot, bus, "stopped" if spoiled else MODES[before.kind], since)
+    state = check_at_rest(robot, bus, "stopped" if spoiled else MODES[before.kind], since)
     assert ("may have been lost" if spoiled else "before the restart") in state["reason"]
     release(bus, "stop" if spoiled else before.kind)
 
@@ -169,7 +169,7 @@ def restarted(robot: Robot, *ends: End) -> None:
         started = time.monotonic()
         with robot.daemon() as daemon, Bus(robot.endpoint) as bus:
             if before:
-                found(robot, bus, before, started)
+                check_and_release_latch(robot, bus, before, started)
             else:
                 bus.linked()
             drives(robot, bus)
@@ -178,7 +178,7 @@ def restarted(robot: Robot, *ends: End) -> None:
             daemon.signal(SIGNALS[end.way if end else "kill"])
             assert (daemon.ended(5.0) == 0) is (end is not None and end.way == "term")
         if end:
-            assert kept(robot, end.kind), end
+            assert is_latched(robot, end.kind), end
             end.spoil(robot.file)
         before = end
     with robot.daemon(), Bus(robot.endpoint) as bus:

@@ -422,17 +422,19 @@ PLAIN: dict[str, tuple[str, Callable[[], bytes]]] = {
 def test_unusual_but_valid_encodings_are_accepted(bus: Bus, ros: RmwClient, name: str) -> None:
     kind, payload = PLAIN[name]
     before = bus.state()
-    ros.heard(bus, "joint_commands" if kind == JOINTS else "cmd_vel", kind, payload)
+    ros.publish_until_accepted(
+        bus, "joint_commands" if kind == JOINTS else "cmd_vel", kind, payload
+    )
     assert changes(before, bus.state()).keys() <= {"commands", "commands_of_new_senders"}
 
 
 def test_a_big_endian_twist_says_the_same_speed(bus: Bus, ros: RmwClient) -> None:
     payload = b"\0\0\0\0" + struct.pack(">6d", 0.2, 0, 0, 0, 0, 0)
-    ros.heard(bus, "cmd_vel", TWIST, twist(0.0))
+    ros.publish_until_accepted(bus, "cmd_vel", TWIST, twist(0.0))
     with bus.follow("cmd_vel_out") as applied:
         end = time.monotonic() + 3.0
         while time.monotonic() < end:
-            ros.heard(bus, "cmd_vel", TWIST, payload)
+            ros.publish_until_accepted(bus, "cmd_vel", TWIST, payload)
             if applied.seen and applied.seen[-1].value["twist"]["linear"]["x"] > 0.199:
                 break
         assert max(s.value["twist"]["linear"]["x"] for s in applied.seen) == pytest.approx(
@@ -519,7 +521,7 @@ def test_a_topic_of_a_source_that_is_not_listed_is_refused(tmp_path: Path) -> No
     with Daemon(tmp_path, config=only) as daemon, Bus(daemon.endpoint) as bus:
         ros = RmwClient(bus.session)
         bus.linked()
-        ros.heard(bus, "cmd_vel_teleop", TWIST, twist(0.0))
+        ros.publish_until_accepted(bus, "cmd_vel_teleop", TWIST, twist(0.0))
         for topic, kind, text in (
             ("cmd_vel", TWIST, "commands.sources"),
             ("joint_commands", JOINTS, "ros2_control"),

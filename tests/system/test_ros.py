@@ -358,7 +358,7 @@ def test_a_trigger_is_answered_once_for_every_form_of_an_empty_request(
         assert called.seconds < 1.0
 
 
-def asked(ros: Client, service: str, **request: Any) -> Any:
+def call_parameters(ros: Client, service: str, **request: Any) -> Any:
     """Call one of the parameter services of ROS and return its only reply."""
     kind = PARAMETER_SERVICES[service]
     question, answer = REQUESTS[kind]
@@ -368,19 +368,21 @@ def asked(ros: Client, service: str, **request: Any) -> Any:
 
 
 def test_the_parameters_are_listed_described_and_read(bus: Bus, ros: Client) -> None:
-    names = asked(ros, "list_parameters", prefixes=[], depth=0).result.names
+    names = call_parameters(ros, "list_parameters", prefixes=[], depth=0).result.names
     assert len(names) > 100
     assert "limits.linear_speed" in names
-    described = asked(ros, "describe_parameters", names=names).descriptors
-    types = asked(ros, "get_parameter_types", names=names).types
-    values = asked(ros, "get_parameters", names=names).values
+    described = call_parameters(ros, "describe_parameters", names=names).descriptors
+    types = call_parameters(ros, "get_parameter_types", names=names).types
+    values = call_parameters(ros, "get_parameters", names=names).values
     assert [entry.name for entry in described] == names
     assert [entry.type for entry in described] == list(types) == [entry.type for entry in values]
     (limit,) = (entry for entry in described if entry.name == "limits.linear_speed")
     assert (limit.floating_point_range[0].from_value, limit.read_only) == (0.0, False)
     value = values[names.index("limits.linear_speed")].double_value
     assert value == bus.get("config")["limits"]["linear_speed"]
-    atomically = asked(ros, "set_parameters_atomically", parameters=[_limit(value)]).result
+    atomically = call_parameters(
+        ros, "set_parameters_atomically", parameters=[_limit(value)]
+    ).result
     assert atomically.successful, atomically.reason
 
 
@@ -395,7 +397,7 @@ def _limit(value: float) -> Any:
 
 def test_a_ros_parameter_sets_the_live_setting_within_its_range(bus: Bus, ros: Client) -> None:
     def ask(value: float) -> Any:
-        return asked(ros, "set_parameters", parameters=[_limit(value)]).results[0]
+        return call_parameters(ros, "set_parameters", parameters=[_limit(value)]).results[0]
 
     before = bus.get("config")["limits"]["linear_speed"]
     try:

@@ -63,8 +63,8 @@ def test_a_twist_has_52_bytes_and_a_stamped_twist_76(bus: Bus, ros: BridgeHalf) 
     before = bus.state()
     # Nothing in the envelope distinguishes them, and a bridge may pad either by up to 3 bytes.
     for more in (b"", bytes(3)):
-        ros.heard(bus, "cmd_vel", TWIST, plain + more)
-        ros.heard(bus, "cmd_vel", TWIST, lambda more=more: stamped(0.0) + more)  # type: ignore[misc]
+        ros.publish_until_accepted(bus, "cmd_vel", TWIST, plain + more)
+        ros.publish_until_accepted(bus, "cmd_vel", TWIST, lambda more=more: stamped(0.0) + more)  # type: ignore[misc]
     assert changes(before, bus.state()).keys() <= {"commands", "commands_of_new_senders"}
 
 

@@ -132,7 +132,7 @@ def test_a_command_has_the_time_at_which_the_bridge_sent_it(driven: Bus, domain:
     samples = Samples()
     subscribers = [driven.session.declare_subscriber(key, samples.add) for key in ("cmd_vel", "tf")]
     with domain.node() as node:
-        node.heard(driven, "cmd_vel", TWIST, twist(0.0))
+        node.publish_until_accepted(driven, "cmd_vel", TWIST, twist(0.0))
         command = samples.first("a command", lambda s: s.key == "cmd_vel")
     of_daemon = samples.first("a transform", lambda s: s.key == "tf").origin
     for subscriber in subscribers:
@@ -227,7 +227,7 @@ def test_an_idle_stamped_publisher_blocks_twist_until_both_publishers_have_ended
             until(route, ROUTE_S, "the idle one has the route")
             publisher = driver.publisher("cmd_vel", TWIST)
             ignored(driver)
-            idle.heard(driven, "cmd_vel", STAMPED, lambda: stamped(0.0))
+            idle.publish_until_accepted(driven, "cmd_vel", STAMPED, lambda: stamped(0.0))
         ignored(driver)
     with (
         domain.node(name="driver") as driver,
@@ -241,7 +241,7 @@ def test_a_publisher_of_a_type_that_is_no_command_moves_nothing(
     driven: Bus, domain: DdsDomain
 ) -> None:
     with domain.node() as node:
-        node.heard(driven, "cmd_vel", TWIST, twist(0.0))
+        node.publish_until_accepted(driven, "cmd_vel", TWIST, twist(0.0))
     with domain.node() as node:
         text = encode(make("std_msgs/msg/String", data="forward"))
         send = lambda: node.put("cmd_vel", "std_msgs/msg/String", text)  # noqa: E731

@@ -44,7 +44,7 @@ def the_router(program: Program) -> int:
     return until(lambda: children(program.pid, "--supervised"), 5.0, "its process")[0]
 
 
-def gone(pid: int) -> bool:
+def has_ended(pid: int) -> bool:
     return not Path(f"/proc/{pid}").exists()
 
 
@@ -71,7 +71,7 @@ def test_a_router_that_is_suspended_is_ended_and_restarted(where: Path) -> None:
         first = the_router(router)
         os.kill(first, signal.SIGSTOP)
         listens(router, 2)
-        assert gone(first)
+        assert has_ended(first)
         assert "stopped or hung" in router.stderr
 
 
@@ -133,7 +133,7 @@ def test_a_signal_ends_the_router_and_its_child_process(
         inner = the_router(router)
         router.signal(number)
         assert router.ended(5.0) == (-number if number == signal.SIGKILL else 0)
-        until(lambda: gone(inner), 5.0, "nothing of it is left")
+        until(lambda: has_ended(inner), 5.0, "nothing of it is left")
 
 
 def test_an_address_in_use_is_reported_and_retried(where: Path) -> None:

@@ -17,9 +17,9 @@ from tests.system.harness import (
     ZERO_LINE,
     Bus,
     Daemon,
-    Heard,
     Peer,
     Program,
+    ReceivedLine,
     Tables,
     environment,
     free_endpoint,
@@ -28,7 +28,7 @@ from tests.system.harness import (
     until,
     wheels,
 )
-from tests.system.strangers import STUCK, words
+from tests.system.strangers import STUCK, command_line
 
 SLOW_STOP = {
     "linear_stop_deceleration": 1.0,
@@ -39,12 +39,12 @@ SLOW_STOP = {
 """From 2 m/s this ramp takes 2 s, the longest possible: more than a shutdown is allowed."""
 
 
-def ramp_after(peer: Peer, at: float) -> list[Heard]:
+def ramp_after(peer: Peer, at: float) -> list[ReceivedLine]:
     """Return the lines that the board received after this time."""
     return [entry for entry in peer.lines if entry.at > at]
 
 
-def last_speed(ramp: list[Heard]) -> float:
+def last_speed(ramp: list[ReceivedLine]) -> float:
     """Return the last wheel speed of the ramp that is not zero, rad/s."""
     return next(wheels(entry.line)[0] for entry in reversed(ramp) if entry.line != ZERO_LINE)
 
@@ -207,7 +207,7 @@ def test_a_signal_while_a_bus_client_is_stopped_still_ends_within_1_s(
 ) -> None:
     with (
         running(tmp_path, peer.path) as (daemon, bus),
-        Program(words(STUCK, daemon.endpoint), tmp_path) as client,
+        Program(command_line(STUCK, daemon.endpoint), tmp_path) as client,
     ):
         client.says("listening")
         client.signal(signal.SIGSTOP)

@@ -31,14 +31,14 @@ from tests.system.harness import (
     wheels,
     write_config,
 )
-from tests.system.strangers import DRIVE, FIRST_ODOMETRY, words
+from tests.system.strangers import DRIVE, FIRST_ODOMETRY, command_line
 from tests.system.typed import typed
 
 
 @pytest.mark.slow
 def test_first_odometry_reaches_another_process_within_3_s_of_the_start(tmp_path: Path) -> None:
     endpoint = free_endpoint()
-    with Program(words(FIRST_ODOMETRY, endpoint), tmp_path) as watcher:
+    with Program(command_line(FIRST_ODOMETRY, endpoint), tmp_path) as watcher:
         watcher.says("ready")
         # Only the address is configured, because 7448 may be in use on this machine.
         with Program(acsard("run", "--listen", endpoint), tmp_path) as daemon:
@@ -52,7 +52,7 @@ def test_first_odometry_reaches_another_process_within_3_s_of_the_start(tmp_path
 def test_half_a_metre_per_second_for_2_s_moves_odometry_by_1_m(tmp_path: Path) -> None:
     with running(tmp_path) as (daemon, bus):
         begun = time.monotonic()
-        driven = finish(words(DRIVE, daemon.endpoint, 0.5, 2.0), tmp_path)
+        driven = finish(command_line(DRIVE, daemon.endpoint, 0.5, 2.0), tmp_path)
         late = lost(begun)
         assert driven.code == 0, driven
         until(lambda: bus.get("odom")["twist"]["twist"]["linear"]["x"] == 0.0, 3.0, "standstill")
@@ -117,7 +117,7 @@ def test_a_second_daemon_on_the_port_ends_with_75_and_names_the_owner(
             path = write_config(tmp_path / "second.toml", config)
             second = finish(acsard("run", "--config", str(path)), tmp_path)
             peer.await_lines(10)
-            lines = peer.session.said()[count:]
+            lines = peer.session.raw_lines()[count:]
             assert bus.state()["mode"] == "driving"
     print(f"second daemon on the port: exit {second.code} after {second.seconds:.2f} s")
     assert second.code == 75

@@ -30,7 +30,7 @@ from tests.system.harness import (
 )
 from tests.system.hosts import Hosts, inside, on
 from tests.system.identities import Certificates, Identity, free_tls_endpoint
-from tests.system.strangers import words
+from tests.system.strangers import command_line
 
 pytestmark = pytest.mark.network
 
@@ -50,7 +50,7 @@ def visit(
     """Run a stranger on this host for a second, and return its report of all it found and did."""
     arguments = [json.dumps(endpoints), json.dumps(tls)]
     with inside(host):
-        done = finish(words(VISIT, 1.0, *arguments), where)
+        done = finish(command_line(VISIT, 1.0, *arguments), where)
     assert done.code == 0, done
     report: dict[str, Any] = json.loads(done.out)
     return report
@@ -129,7 +129,7 @@ FAR = [f"tcp/198.18.77.1:{port}" for port in (PORT, 7447)]
 def test_a_stranger_on_another_host_neither_sees_nor_commands_the_default_daemon(
     hosts: Hosts, tmp_path: Path
 ) -> None:
-    ordinary = Program(words(ORDINARY), tmp_path, stdin=subprocess.PIPE)
+    ordinary = Program(command_line(ORDINARY), tmp_path, stdin=subprocess.PIPE)
     with daemon_on(hosts.robot, tmp_path, {}), on(hosts.robot, ordinary):
         other = ordinary.says("here").split()[1]
         there = visit(hosts.stranger, tmp_path, FAR)
@@ -282,7 +282,7 @@ class Robot:
         viewer = self._certificates.robot / "clients" / "viewer"
         settings = json.dumps(self._certificates.settings(viewer))
         arguments = (kind, json.dumps(doors), settings, seconds, count)
-        with Program(words(ATTACK, *arguments), self._where) as attack:
+        with Program(command_line(ATTACK, *arguments), self._where) as attack:
             attack.says("begun")
             yield attack
 

@@ -75,4 +75,4 @@ def drives_and_leaves(daemon: Daemon, peer: Peer) -> None:
         assert daemon.ended(5.0) == 0
     assert peer.last_line() == ZERO_LINE
     # The motors received only lines of four wheels, whichever descriptor the streams have.
-    assert {len(line) for line in peer.session.said()[1:]} == {33}
+    assert {len(line) for line in peer.session.raw_lines()[1:]} == {33}

@@ -87,7 +87,7 @@ def _robot(tls: Path) -> Iterator[str]:
         yield endpoint
 
 
-def told(endpoint: str, directory: str) -> MendableError:
+def connection_error(endpoint: str, directory: str) -> MendableError:
     with pytest.raises(MendableError) as error:
         client_session(endpoint, directory)
     return error.value
@@ -98,13 +98,13 @@ def test_a_client_with_a_valid_certificate_connects(tls: Path, robot: str) -> No
 
 
 def test_connecting_without_a_certificate_directory_asks_for_the_option_tls() -> None:
-    error = told("tls/no.such.host.invalid:7449", "")
+    error = connection_error("tls/no.such.host.invalid:7449", "")
     assert isinstance(error, CertificateError)
     assert "--tls DIRECTORY" in str(error)
 
 
 def test_the_certificate_directory_is_checked_before_the_network(tmp_path: Path) -> None:
-    error = told("tls/no.such.host.invalid:7449", str(tmp_path / "none"))
+    error = connection_error("tls/no.such.host.invalid:7449", str(tmp_path / "none"))
     assert isinstance(error, CertificateError)
     assert f"there is no directory {tmp_path / 'none'}" in str(error)
 
@@ -126,7 +126,7 @@ def test_the_error_says_what_is_wrong_with_the_robot_s_certificate(
 ) -> None:
     endpoint = free_endpoint().replace("tcp/", "tls/")
     with listening(tls / robot_has, endpoint):
-        error = told(endpoint, str(tls / "client"))
+        error = connection_error(endpoint, str(tls / "client"))
     assert isinstance(error, UnreachableError)
     assert sentence in str(error)
 
@@ -144,7 +144,7 @@ def test_an_expired_authority_does_not_hide_what_is_wrong_with_the_robot_s_certi
 ) -> None:
     endpoint = free_endpoint().replace("tcp/", "tls/")
     with listening(tls / robot_has, endpoint):
-        assert sentence in str(told(endpoint, str(tls / "old client")))
+        assert sentence in str(connection_error(endpoint, str(tls / "old client")))
 
 
 def test_zenoh_ignores_that_the_authority_has_expired_so_no_trouble_is_reported(tls: Path) -> None:
@@ -165,11 +165,11 @@ def test_zenoh_ignores_that_the_authority_has_expired_so_no_trouble_is_reported(
 def test_the_error_says_what_is_wrong_with_the_client_s_certificate(
     tls: Path, robot: str, client: str, sentence: str
 ) -> None:
-    assert sentence in str(told(robot, str(tls / client)))
+    assert sentence in str(connection_error(robot, str(tls / client)))
 
 
 def test_a_tool_with_a_key_that_zenoh_refuses_names_the_key(tls: Path, robot: str) -> None:
-    error = told(robot, str(tls / "P-521"))
+    error = connection_error(robot, str(tls / "P-521"))
     assert isinstance(error, CertificateError)
     assert f"the key {tls / 'P-521' / 'key.pem'} cannot be used" in str(error)
     assert "(failed to parse private key" in str(error)
@@ -184,13 +184,13 @@ def test_a_daemon_with_a_key_that_zenoh_refuses_names_the_key_instead_of_waiting
 
 
 def test_the_error_names_a_host_that_does_not_resolve(tls: Path) -> None:
-    error = told("tls/no.such.host.invalid:7449", str(tls / "client"))
+    error = connection_error("tls/no.such.host.invalid:7449", str(tls / "client"))
     assert "the name no.such.host.invalid does not resolve" in str(error)
 
 
 def test_the_error_says_that_no_program_listens_on_the_port(tls: Path) -> None:
     endpoint = free_endpoint().replace("tcp/", "tls/")
-    assert "no program listens on port" in str(told(endpoint, str(tls / "client")))
+    assert "no program listens on port" in str(connection_error(endpoint, str(tls / "client")))
 
 
 def test_the_error_says_that_the_server_does_not_speak_tls(tls: Path) -> None:
@@ -207,4 +207,4 @@ def test_the_error_says_that_the_server_does_not_speak_tls(tls: Path) -> None:
                 pass
 
         Thread(target=greet, daemon=True).start()
-        assert "does not speak TLS" in str(told(endpoint, str(tls / "client")))
+        assert "does not speak TLS" in str(connection_error(endpoint, str(tls / "client")))

@@ -27,7 +27,7 @@ def top(daemon: Daemon) -> Iterator[tuple[Terminal, Program]]:
         yield session
 
 
-def shown(terminal: Terminal) -> list[str]:
+def last_screen(terminal: Terminal) -> list[str]:
     """Return the lines of the last complete screen without colours, or [] if there is none yet."""
     for frame in reversed(terminal.screen.split(FRAME)):
         lines = re.sub(r"\x1b\[[0-9;]*m", "", frame).split("\r\n")
@@ -40,7 +40,7 @@ def shows(terminal: Terminal, text: str, within: float) -> list[str]:
     """Wait for the text, and return the first screen that contains it."""
 
     def look() -> list[str] | None:
-        lines = shown(terminal)
+        lines = last_screen(terminal)
         return lines if any(text in line for line in lines) else None
 
     return until(look, within, f"{text!r} on the screen")

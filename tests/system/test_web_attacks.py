@@ -284,7 +284,7 @@ async def test_a_viewer_moves_nothing_with_any_message(
     assert bus.count("commands") == commands
 
 
-async def _known(ours: Hands, bus: Bus) -> None:
+async def _introduce_sender(ours: Hands, bus: Bus) -> None:
     """Drive briefly, so that the robot knows this sender and its clock. Then stop."""
     await ours.say(subscribe="state", rate=50)
     await ours.until_driving(0.3)
@@ -304,7 +304,7 @@ async def test_a_command_with_a_stale_or_future_stamp_is_not_obeyed(
 ) -> None:
     number = int(what.split()[0])
     async with hands(table.page) as ours:
-        await _known(ours, bus)
+        await _introduce_sender(ours, bus)
         answer = "not handed on" if by == "page" else "not obeyed"
         with table.attack(what, answer, reason, number, by):
             for _ in range(number):

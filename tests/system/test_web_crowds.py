@@ -26,7 +26,7 @@ from tests.system.browser import Hands, Page
 from tests.system.bystander import lost
 from tests.system.harness import PATIENCE_S, Daemon, Program, free_endpoint, resident_kb, until
 from tests.system.hosts import ROBOT_AT, STRANGER_AT, Hosts, inside, ip, on
-from tests.system.strangers import words
+from tests.system.strangers import command_line
 
 pytestmark = pytest.mark.network
 
@@ -115,14 +115,14 @@ class Scene:
         kind, count, sources = CROWDS[crowd]
         where = newer if ":" in sources[0] else page.away
         host, _, port = where.removeprefix("https://").rpartition(":")
-        self._words = words(CROWD, kind, host.strip("[]"), port, count, *sources)
+        self._words = command_line(CROWD, kind, host.strip("[]"), port, count, *sources)
         self._token = page.invite("operator", "phone")
         self._trusted = ssl.create_default_context(cafile=str(page.tls / "ca.pem"))
 
     def crowd(self) -> Program:
         return Program(self._words, self.page.tls)
 
-    async def comes(self, crowd: Program) -> None:
+    async def start_crowd(self, crowd: Program) -> None:
         """Start the crowd on the other host, and wait until it has opened all its connections."""
         with inside(self._hosts.stranger):
             crowd.__enter__()
@@ -177,7 +177,7 @@ class Scene:
             await ours.state(lambda state: state["link"] == "up")
             await ours.until_driving(0.3)
             holding = asyncio.create_task(ours.hold(0.3, 3 * PATIENCE_S))
-            coming = asyncio.create_task(self.comes(crowd))
+            coming = asyncio.create_task(self.start_crowd(crowd))
             modes, end = list[str](), 0.0
             # A state that was sent before the hold began does not count.
             await ours.state(lambda state: state["mode"] == "driving")
@@ -215,7 +215,7 @@ def test_a_page_that_runs_out_of_files_stops_the_robot_and_recovers(
     place = (server.here if near else server.away).rpartition("//")[2]
     host, _, port = place.rpartition(":")
     crowd = Program(
-        words(CROWD, "silent", host, port, SILENT, *([host] if near else OLDER)), server.tls
+        command_line(CROWD, "silent", host, port, SILENT, *([host] if near else OLDER)), server.tls
     )
     try:
         until(scene.reaches_the_daemon, 10.0, "the page reaches the daemon")
@@ -310,7 +310,7 @@ def _drive_and_stop(scene: Scene, crowd: str, most: int) -> None:
         assert modes.count("driving") + modes.count("waiting") == len(modes)
         assert modes.count("driving") > 0.9 * len(modes)
         alone = await _stops(scene.stop_here)
-        coming = asyncio.create_task(scene.comes(crowds[1]))
+        coming = asyncio.create_task(scene.start_crowd(crowds[1]))
         here, away = await _stops(scene.stop_here), await _stops(scene.stop_away)
         await coming
         more = resident_kb(page.pid) - before

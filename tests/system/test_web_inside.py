@@ -86,7 +86,7 @@ async def test_a_client_that_must_disconnect_drives_no_more_even_if_it_does_not_
         (viewer,) = inside.page._viewers
         wire = cast(Any, ours.socket)._response.connection.transport
         wire.pause_reading()
-        viewer._out.say({"more than a kernel holds": "x" * 20_000_000})
+        viewer._out.enqueue({"more than a kernel holds": "x" * 20_000_000})
         inside.page.end_all("your token has expired")
         before = inside.counts.all()
         for _ in range(20):
@@ -115,7 +115,7 @@ async def test_a_client_that_stops_reading_later_gets_only_the_newest_message(
             wire.pause_reading()
             (viewer,) = inside.page._viewers
             while viewer._out._unread() <= MAX_UNREAD_BYTES:  # more than the kernels hold
-                viewer._out.say("x" * 4096)
+                viewer._out.enqueue("x" * 4096)
                 await asyncio.sleep(0)
             await eventually(lambda: left_out() >= MISSED)
             wire.resume_reading()
@@ -196,7 +196,7 @@ async def test_a_client_that_pings_without_reading_gets_one_answer_to_all_pings(
         wire = cast(Any, ours.socket)._response.connection.transport
         wire.pause_reading()
         (viewer,) = inside.page._viewers
-        viewer._out.say({"more than a kernel holds": "x" * 3_000_000})
+        viewer._out.enqueue({"more than a kernel holds": "x" * 3_000_000})
         await eventually(lambda: viewer._out._unread() > MAX_UNREAD_BYTES)
         for n in range(300):
             await ours.socket.ping(b"%0125d" % n)

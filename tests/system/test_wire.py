@@ -22,8 +22,8 @@ from tests.system.harness import (
     Daemon,
     Following,
     Peer,
+    ReceivedMessage,
     Reply,
-    Seen,
     Speeds,
     Tables,
     form,
@@ -64,7 +64,7 @@ def started(tmp_path_factory: pytest.TempPathFactory) -> Started:
 
     def steady(*others: bytes) -> bytes | None:
         """Return the first line outside `others` that the board received thirty times in a row."""
-        for line, same in itertools.groupby(peer.session.said()):
+        for line, same in itertools.groupby(peer.session.raw_lines()):
             if line not in others and sum(1 for _ in same) >= 30:
                 return line
         return None
@@ -84,7 +84,7 @@ def started(tmp_path_factory: pytest.TempPathFactory) -> Started:
     begun, yaws = time.monotonic(), [0.0]
     with Peer(where / "mcu") as peer, running(where, peer) as bus, bus.commanding(0.5) as sender:
         straight = until(lambda: drives(0.5, 0.0), 5.0, "steady driving")
-        stream, lines = peer.session.stream, peer.session.said()
+        stream, lines = peer.session.stream, peer.session.raw_lines()
         left = until(lambda: drives(0.0, 1.0, straight), 5.0, "steady turning")
         yaws.append(bus.state()["yaw"])
         return Started(stream, lines, straight, left, max(yaws))
@@ -130,7 +130,7 @@ def test_a_trailing_comma_and_wired_signs_and_letters_apply_on_the_wire(
         steady = b"ap10.00,bn10.00,cp10.00,dp10.00,\r\n"
         until(lambda: peer.lines[-1].line == steady, 5.0, f"{steady!r} on the wire")
         until(lambda: bus.state()["linear"] == pytest.approx(0.5), 5.0, "0.5 m/s measured")
-    first, *lines = peer.session.said()
+    first, *lines = peer.session.raw_lines()
     assert first == b"\r\n"
     assert wheels(lines[0]) == STANDING
     assert {(line[-3:], len(line)) for line in lines} == {(b",\r\n", 34)}
@@ -235,7 +235,7 @@ def test_every_refused_form_is_counted_and_only_zeros_are_sent_until_a_good_one_
         # The peer sends unasked, because a silent peer gets only 10 lines a second to answer.
         for reason, reply in REFUSED.values():
             # A line may need more than one piece to be too long.
-            peer.say(reply(STANDING) * (5 if reason == "too_long" else 1))
+            peer.send(reply(STANDING) * (5 if reason == "too_long" else 1))
             bus.put("cmd/app", twist(0.5))
         wanted = Counter(reason for reason, _ in REFUSED.values() if reason != "too_long")
 
@@ -249,9 +249,9 @@ def test_every_refused_form_is_counted_and_only_zeros_are_sent_until_a_good_one_
         state = until(counted, 5.0, "each line is counted by its reason")
         assert (state["link"], state["x"], state["linear"]) == ("booting", 0.0, None)
         assert state["counters"]["lines"] == 0
-        assert set(peer.session.said()[1:]) == {ZERO_LINE}
+        assert set(peer.session.raw_lines()[1:]) == {ZERO_LINE}
         # The next newline resynchronises: after three good lines the link is up.
-        peer.say(b"\r\n")
+        peer.send(b"\r\n")
         peer.reply = PLAIN
         bus.linked()
 
@@ -307,7 +307,7 @@ def test_after_a_silence_of_a_second_the_commander_must_be_neutral_first(
             until(lambda: _moving_since(peer, zeros_from), 5.0, "driving after the zero")
 
 
-def _fall_silent(peer: Peer, states: Following) -> tuple[float, Seen, float]:
+def _fall_silent(peer: Peer, states: Following) -> tuple[float, ReceivedMessage, float]:
     """Mute the board and wait until the daemon sends zeros.
 
     Returns the time of the muting, the state that reports the stale link, and the time of the last

@@ -89,13 +89,13 @@ class Viewer:
         try:
             for frame in self._socket:
                 if isinstance(frame, str):
-                    self._told(json.loads(frame))
+                    self._process(json.loads(frame))
                 else:
                     self._data(frame)
         except ConnectionClosed:
             pass
 
-    def _told(self, message: dict[str, Any]) -> None:
+    def _process(self, message: dict[str, Any]) -> None:
         match message["op"]:
             case "serverInfo":
                 self.info = message
@@ -123,22 +123,22 @@ class Viewer:
             _, call, size = struct.unpack_from("<III", frame, 1)
             self._answers[call] = True, frame[13 + size :].decode()
 
-    def _say(self, op: str, **fields: Any) -> None:
+    def _send(self, op: str, **fields: Any) -> None:
         self._socket.send(json.dumps({"op": op, **fields}))
 
     # looking
 
-    def show(self, topic: str) -> Looked:
+    def show(self, topic: str) -> SubscribedTopic:
         """Subscribe to a channel."""
         until(lambda: topic in self.channels, 5.0, f"{topic} in {sorted(self.channels)}")
         number, channel = next(self._numbers), self.channels[topic]
         subscriptions = [{"id": number, "channelId": channel["id"]}]
         self._came[number] = []
-        self._say("subscribe", subscriptions=subscriptions)
-        return Looked(channel, self._came[number], lambda: self._hide(number))
+        self._send("subscribe", subscriptions=subscriptions)
+        return SubscribedTopic(channel, self._came[number], lambda: self._hide(number))
 
     def _hide(self, number: int) -> None:
-        self._say("unsubscribe", subscriptionIds=[number])
+        self._send("unsubscribe", subscriptionIds=[number])
 
     def status(self, words: str, within: float = 5.0) -> dict[str, Any]:
         """Wait for a status message that contains these words, and return it."""
@@ -160,12 +160,12 @@ class Viewer:
         channel = {"id": number, "topic": topic, "encoding": encoding, "schemaName": schema_name}
         if encoding == "cdr":
             channel |= {"schemaEncoding": "ros2msg", "schema": TWIST}
-        self._say("advertise", channels=[channel])
+        self._send("advertise", channels=[channel])
         return lambda data: self._socket.send(struct.pack("<BI", MESSAGE, number) + data), number
 
     def withdraw(self, number: int) -> None:
         """Unadvertise a channel of this viewer."""
-        self._say("unadvertise", channelIds=[number])
+        self._send("unadvertise", channelIds=[number])
 
     def call(self, service: str, request: object) -> Any:
         """Return the answer of a service. Fails if it refuses."""
@@ -178,25 +178,25 @@ class Viewer:
 
     def get(self) -> dict[str, Any]:
         """Return all parameters."""
-        return self._asked("getParameters", parameterNames=[])
+        return self._request_parameters("getParameters", parameterNames=[])
 
     def follow(self, *names: str) -> None:
         """Subscribe to changes of parameters. The changes appear in `parameters`."""
-        self._say("subscribeParameterUpdates", parameterNames=names)
+        self._send("subscribeParameterUpdates", parameterNames=names)
 
     def set(self, wishes: Mapping[str, Any]) -> dict[str, Any]:
         """Ask for these values; return the present values of the parameters."""
         wanted = [{"name": name, "value": value} for name, value in wishes.items()]
-        return self._asked("setParameters", parameters=wanted)
+        return self._request_parameters("setParameters", parameters=wanted)
 
-    def _asked(self, op: str, **fields: Any) -> dict[str, Any]:
+    def _request_parameters(self, op: str, **fields: Any) -> dict[str, Any]:
         number = f"q{next(self._numbers)}"
-        self._say(op, id=number, **fields)
+        self._send(op, id=number, **fields)
         reply = until(lambda: self.replies.get(number), 5.0, f"an answer to {op}")
         return {parameter["name"]: parameter.get("value") for parameter in reply["parameters"]}
 
 
-class Looked:
+class SubscribedTopic:
     """A topic to which the viewer has subscribed, and its received messages."""
 
     def __init__(

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, NoReturn
 
 import pytest
 
-from tests.system.harness import ROOT, Heard, Program, until
+from tests.system.harness import ROOT, Program, ReceivedLine, until
 
 OURS = sys.version_info[:2]
 
@@ -381,7 +381,7 @@ class Board(Program):
     """
 
     def __init__(self, container: Container) -> None:
-        self._heard: list[Heard] = []
+        self._heard: list[ReceivedLine] = []
         container.path(PORT).unlink(missing_ok=True)
         super().__init__(container.inside("python3", "-c", _BOARD, PORT, LIES, only="mnC"), "/")
 
@@ -390,14 +390,14 @@ class Board(Program):
         self.says("plugged")
         return self
 
-    def since(self, at: float) -> list[Heard]:
+    def since(self, at: float) -> list[ReceivedLine]:
         """Return the lines after this time without their line ends, and "-" for an empty line."""
         for text in self.out[1 + len(self._heard) :]:
             stamp, _, line = text.partition(" ")
-            self._heard.append(Heard(float(stamp), line.encode()))
+            self._heard.append(ReceivedLine(float(stamp), line.encode()))
         return [entry for entry in self._heard if entry.at > at]
 
-    def awaits(self, line: bytes, after: float = 0.0, within: float = 5.0) -> Heard:
+    def awaits(self, line: bytes, after: float = 0.0, within: float = 5.0) -> ReceivedLine:
         """Wait for the first line after this time that starts with this prefix, and return it."""
         return until(
             lambda: next((h for h in self.since(after) if h.line.startswith(line)), None),

@@ -59,7 +59,7 @@ class Phone:
             return True
         return False
 
-    def shown(self, port: int) -> str:
+    def presented_certificate(self, port: int) -> str:
         """Return the certificate that the robot presents at this port, or "" if nothing answers.
 
         The connection fails unless our authority has signed the certificate.

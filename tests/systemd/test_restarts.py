@@ -15,7 +15,7 @@ from typing import Literal
 
 import pytest
 
-from tests.system.harness import Heard, until
+from tests.system.harness import ReceivedLine, until
 from tests.systemd.container import (
     ACSARD,
     CONFIG,
@@ -43,7 +43,7 @@ CYCLE_S = 2.0
 FILE = f"{STATES}/acsard/acsar.latches.json"
 
 
-def moves(board: Board, since: float) -> list[Heard]:
+def moves(board: Board, since: float) -> list[ReceivedLine]:
     """Return the lines after this time that turn a wheel."""
     return [entry for entry in board.since(since) if entry.line not in (ZERO, b"-")]
 
@@ -76,7 +76,9 @@ def latch(container: Container, board: Board, driver: Driver, kind: Kind) -> flo
     return board.awaits(ZERO, after=time.monotonic()).at
 
 
-def stands(container: Container, board: Board, driver: Driver, kind: Kind, since: float) -> None:
+def check_at_rest(
+    container: Container, board: Board, driver: Driver, kind: Kind, since: float
+) -> None:
     """Check that the robot stands although the commander has tried to drive it."""
     has_mode(driver, MODES[kind])
     up = time.monotonic()
@@ -119,7 +121,7 @@ def test_a_latched_robot_stays_at_rest_after_the_unit_ended_until_it_is_released
         drives(board)
         since = latch(container, board, driver, kind)
         end(container, way)
-        stands(container, board, driver, kind, since)
+        check_at_rest(container, board, driver, kind, since)
         call(container, "activate" if kind == "inactive" else "clear")
         drives(board)
     end(container, way)
@@ -147,7 +149,7 @@ def test_a_latched_robot_stays_at_rest_after_a_reboot_until_it_is_released(
             since = time.monotonic()
             assert container.start().code == 0
             if boot == 2:
-                stands(container, board, driver, kind, since)
+                check_at_rest(container, board, driver, kind, since)
                 call(container, "clear")
             drives(board)
             latch(container, board, driver, kind)

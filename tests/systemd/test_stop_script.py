@@ -43,7 +43,7 @@ class Wire:
         os.set_blocking(self.master, False)
         self.name = os.ttyname(self.slave)
 
-    def heard(self) -> bytes:
+    def read_bytes(self) -> bytes:
         try:
             return os.read(self.master, 65536)
         except BlockingIOError:
@@ -118,7 +118,7 @@ def test_the_stop_script_finds_the_port_in_every_toml_notation(
 ) -> None:
     ended = stop(config(tmp_path, text.replace("PORT", wire.name)))
     assert (ended.code, ended.err) == (0, "")
-    assert wire.heard() == STOP
+    assert wire.read_bytes() == STOP
 
 
 def test_the_stop_script_finds_the_port_in_the_reference_configuration(
@@ -126,7 +126,7 @@ def test_the_stop_script_finds_the_port_in_the_reference_configuration(
 ) -> None:
     text = (ROOT / "acsard.toml").read_text().replace('port = "sim"', f'port = "{wire.name}"')
     stop(config(tmp_path, text))
-    assert wire.heard() == STOP
+    assert wire.read_bytes() == STOP
 
 
 def test_the_stop_script_reads_the_configuration_that_the_environment_names(
@@ -134,16 +134,16 @@ def test_the_stop_script_reads_the_configuration_that_the_environment_names(
 ) -> None:
     path = config(tmp_path, f'[mcu]\nport = "{wire.name}"\n')
     assert stop("", ACSARD_CONFIG=str(path)).code == 0
-    assert wire.heard() == STOP
+    assert wire.read_bytes() == STOP
 
 
 def test_the_stop_script_adds_a_trailing_comma_if_it_is_configured(
     tmp_path: Path, wire: Wire
 ) -> None:
     stop(config(tmp_path, f'[mcu]\nport = "{wire.name}"\ntrailing_comma = true\n'))
-    assert wire.heard() == b"\r\n" + 3 * ZERO_LINE.replace(b"\r\n", b",\r\n")
+    assert wire.read_bytes() == b"\r\n" + 3 * ZERO_LINE.replace(b"\r\n", b",\r\n")
     stop(config(tmp_path, f'[mcu]\nport = "{wire.name}"\ntrailing_comma = false # true\n'))
-    assert wire.heard() == STOP
+    assert wire.read_bytes() == STOP
 
 
 @pytest.mark.parametrize(

@@ -96,11 +96,11 @@ def phone(robot: Container) -> Iterator[Phone]:
 
 def is_served(robot: Container, phone: Phone) -> None:
     """Check that both the page and the daemon behind it answer the phone."""
-    until(lambda: phone.shown(8443), SERVED_S, "the page is served")
-    until(lambda: '"mode"' in here(robot, "/api/state"), SERVED_S, "it hears the robot")
+    until(lambda: phone.presented_certificate(8443), SERVED_S, "the page is served")
+    until(lambda: '"mode"' in fetch_on_robot(robot, "/api/state"), SERVED_S, "it hears the robot")
 
 
-def here(robot: Container, path: str) -> str:
+def fetch_on_robot(robot: Container, path: str) -> str:
     """Return the page's answer to a client on the robot itself, or "" if there is none."""
     return robot.run("python3", "-c", ASK, f"http://127.0.0.1:8080{path}").out
 
@@ -166,7 +166,7 @@ def test_an_invited_phone_drives_and_stops_the_installed_robot_until_it_is_revok
 
     on(phone, story)
     stands = until(
-        lambda: (state := json.loads(here(robot, "/api/state")))["linear"] == 0 and state,
+        lambda: (state := json.loads(fetch_on_robot(robot, "/api/state")))["linear"] == 0 and state,
         SERVED_S,
         "the robot stands",
     )
@@ -204,9 +204,13 @@ def test_a_renewed_certificate_is_shown_after_the_reload_and_tokens_still_count(
     robot: Container, phone: Phone
 ) -> None:
     token = invited(robot, "--name guest")
-    before = phone.shown(8443)
+    before = phone.presented_certificate(8443)
     robot.types(RENEWING)
-    until(lambda: phone.shown(8443) not in ("", before), SERVED_S, "the new one is shown")
+    until(
+        lambda: phone.presented_certificate(8443) not in ("", before),
+        SERVED_S,
+        "the new one is shown",
+    )
 
     async def story() -> None:
         async with phone.browser(token) as guest, guest.get(f"{AWAY}/api/whoami") as answer:

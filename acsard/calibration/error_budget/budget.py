@@ -336,7 +336,7 @@ class _Model:
             if along or yaw:
                 pose.doubt(along, yaw)
             if any(missed):
-                pose.stand(*missed)
+                pose.add_gap(*missed)
             rolled, turned = rolled + abs(distance), turned + abs(turn)
             if rolled >= metres or turned >= angle:
                 break

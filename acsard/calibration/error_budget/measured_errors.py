@@ -79,7 +79,7 @@ def line_times(t: Floats, sent: Floats) -> LineTimes:
         sent: the time at which the daemon sent each of its lines to the board, s.
     """
     even = _even(t)
-    asked = _asked(t, sent)
+    asked = _prompted_delays(t, sent)
     if asked is None or np.ptp(t) == 0.0:
         return even
     return min(even, asked, key=lambda estimate: float(np.mean(np.abs(estimate.late))))
@@ -102,7 +102,7 @@ def _even(t: Floats) -> LineTimes:
     return LineTimes(late - np.median(late), missing, float(slope))
 
 
-def _asked(t: Floats, sent: Floats) -> LineTimes | None:
+def _prompted_delays(t: Floats, sent: Floats) -> LineTimes | None:
     """Estimate how late the replies arrived, for a board that answers each line of the daemon.
 
     `sent` contains the times of the daemon's lines. Return None if it does not contain the line

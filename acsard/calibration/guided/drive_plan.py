@@ -24,7 +24,7 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config, DriveConfig, FeedbackConfig, OdometryConfig
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import AcsardError, Twist
-from acsard.terminal.prompt import Ask
+from acsard.terminal.prompt import NumberQuestion
 
 NEEDS: dict[str, str] = {
     "gyro": "a gyro on the Zenoh key imu, and a tape measure",
@@ -143,7 +143,7 @@ class Leg(Struct, frozen=True):
     words: str
     """Text that tells the person, before the leg, what to do and how the robot will move."""
     moves: tuple[Move, ...]
-    asks: tuple[Ask, ...] = ()
+    asks: tuple[NumberQuestion, ...] = ()
     """Questions that the person answers after the moves."""
     measures: tuple[Measure, ...] = ()
     by_key: bool = False
@@ -306,7 +306,7 @@ class Method(Struct, frozen=True):
     """A method of calibration by a guided drive."""
 
     legs: Legs
-    asks: tuple[Ask, ...] = ()
+    asks: tuple[NumberQuestion, ...] = ()
     """Questions that the person answers before the first leg."""
     tool: str = ""
     """Name of the measuring tool that the person uses, such as "a tape".

@@ -181,7 +181,7 @@ class LegDriver:
         if self.phase is Phase.MOVING and now >= self._ends:
             self._next(now)
         if self.phase is Phase.SETTLING:
-            self._stand(now)
+            self._await_standstill(now)
         return self._command
 
     def _open(self, now: float) -> None:
@@ -212,7 +212,7 @@ class LegDriver:
         self.phase, self._command = Phase.SETTLING, REST
         self._ends, self._still_since = now, None
 
-    def _stand(self, now: float) -> None:
+    def _await_standstill(self, now: float) -> None:
         if self._still_since is not None and now - self._still_since >= STANDING_S:
             self.phase = Phase.DONE
         elif now - self._ends > STANDS_S:

@@ -24,7 +24,7 @@ from acsard.calibration.guided.drive_plan import (
     Slant,
 )  # fmt: skip
 from acsard.calibration.multipliers import MIN_TAPE_M
-from acsard.terminal.prompt import Ask
+from acsard.terminal.prompt import NumberQuestion
 
 STRAIGHT_LEG_STD_M = 0.005
 """Standard deviation of the length of a straight drive that a person measures by tape, m.
@@ -62,7 +62,7 @@ In `STOP`, the robot comes to rest. In `SETTLE`, the robot also stops shaking.
 ROUND_LEG = "once round"
 """Name of the leg in which the robot turns once in place, until the person presses a key."""
 
-FROM_MARK = Ask(
+FROM_MARK = NumberQuestion(
     "How far is the marked wheel from its mark now, in a straight line?",
     "m", MIN_TAPE_M, 2 * FLOOR_M,
     name="metres",
@@ -78,7 +78,9 @@ def _at_the_edge(setup: Setup) -> str:
     )
 
 
-def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: Measure) -> Leg:
+def once_round(
+    setup: Setup, until: str, asks: tuple[NumberQuestion, ...] = (), *measures: Measure
+) -> Leg:
     """Return the leg of one left turn in place, which the person ends with a key.
 
     Args:
@@ -107,14 +109,14 @@ def turns(setup: Setup, rate: float, track: float, most: int) -> int:
 # The method "tape": a tape measure, and a straight line on the floor.
 
 TO_LINE = (
-    Ask(
+    NumberQuestion(
         "How far is the front left wheel from the line, measured at a right angle to the line?",
         "mm",
         0,
         1500,
         name="front",
     ),
-    Ask(
+    NumberQuestion(
         "How far is the rear left wheel from the line, measured in the same way?",
         "mm",
         0,
@@ -191,10 +193,12 @@ PLACE_ROBOT_BACK = (
 )
 
 
-def _corners(end: str) -> tuple[Ask, Ask]:
+def _corners(end: str) -> tuple[NumberQuestion, NumberQuestion]:
     return (
-        Ask(f"How far is the robot's {end} left corner from the wall?", "mm", 0, 2500, name="left"),
-        Ask(
+        NumberQuestion(
+            f"How far is the robot's {end} left corner from the wall?", "mm", 0, 2500, name="left"
+        ),
+        NumberQuestion(
             f"How far is the robot's {end} right corner from the wall?", "mm", 0, 2500, name="right"
         ),
     )
@@ -231,7 +235,7 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
             f"{setup.length:.2f} m.",
             (STOP, out, STOP),
             (
-                Ask(
+                NumberQuestion(
                     "How far is the robot's back from the wall now?", "m", MIN_TAPE_M, 2 * FLOOR_M,
                     name="metres",
                 ),
@@ -288,9 +292,9 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
         "How far ahead of its mark is the middle of the robot's {} side (negative if behind it)?"
     )
     ends = (
-        Ask(marks.format("left"), "mm", -1500, 1500, name="left"),
-        Ask(marks.format("right"), "mm", -1500, 1500, name="right"),
-        Ask(
+        NumberQuestion(marks.format("left"), "mm", -1500, 1500, name="left"),
+        NumberQuestion(marks.format("right"), "mm", -1500, 1500, name="right"),
+        NumberQuestion(
             "How far to the left of its marks is the robot (negative if to the right of them)?",
             "mm", -1500, 1500, name="aside",
         ),
@@ -330,7 +334,7 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
             "exactly when it has turned one full circle and faces as before; the tool then asks "
             "how far past that point the robot has turned.",
             (
-                Ask(
+                NumberQuestion(
                     "How many degrees past a full circle did the robot turn (negative if less)?",
                     "deg", -90, 90, name="past",
                 ),
@@ -373,7 +377,7 @@ STRAIGHT_LEG = "straight"
 """Name of the leg straight ahead. In the method "gyro", a person may measure its length by tape."""
 
 
-def _straight(setup: Setup, asks: tuple[Ask, ...] = ()) -> Leg:
+def _straight(setup: Setup, asks: tuple[NumberQuestion, ...] = ()) -> Leg:
     return Leg(
         STRAIGHT_LEG,
         f"{_at_the_edge(setup)} Mark on the floor where one of its wheels stands. Do not move the "
@@ -390,7 +394,7 @@ def _gyro(setup: Setup, track: float) -> tuple[Leg, ...]:
         moves += [setup.spin(rate, SPIN_S), PAUSE]
     for rate in (CURVE, -CURVE, 0.0):
         moves += _there_and_back(setup, rate)
-    far = Ask(
+    far = NumberQuestion(
         "How far is the marked wheel from its mark now, in a straight line? If you did not measure "
         "it, press only Enter",
         "m", 0.0, 2 * setup.length, 0.0, "metres",
@@ -432,18 +436,18 @@ def _there_and_back(setup: Setup, rate: float) -> tuple[Move, ...]:
     return setup.arc(rate, metres), SHORT, setup.arc(-rate, -metres), SHORT
 
 
-WHEELBASE = Ask(
+WHEELBASE = NumberQuestion(
     "How far apart are the front left and the rear left wheel, axle to axle?", "mm", 50, 2000,
     name="wheelbase",
 )  # fmt: skip
-REAR_WIDTH = Ask(
+REAR_WIDTH = NumberQuestion(
     "How far apart are the robot's rear corners, where they touch the wall?", "mm", 50, 2000,
     name="rear width",
 )  # fmt: skip
-FRONT_WIDTH = Ask(
+FRONT_WIDTH = NumberQuestion(
     "How far apart are the robot's front corners?", "mm", 50, 2000, name="front width"
 )
-WIDTH = Ask("How wide is the robot, from side to side?", "mm", 50, 2000, name="width")
+WIDTH = NumberQuestion("How wide is the robot, from side to side?", "mm", 50, 2000, name="width")
 
 METHODS: dict[str, Method] = {
     "gyro": Method(_gyro),

@@ -267,13 +267,13 @@ class RobotOnBus:
             raise GuideError(text)
         log = recorder.log()
         for note in log.notes:
-            self._prompt.say(f"note: {note}")
+            self._prompt.show_text(f"note: {note}")
         return log.runs[0]
 
     def _returns(self) -> bool:
         end = clock.steady_s() + RECONNECT_TIMEOUT_S
         while clock.steady_s() < end:
-            if self._watch.look(clock.steady_s()):
+            if self._watch.poll(clock.steady_s()):
                 return True
             time.sleep(POLL_PERIOD_S)
         return False
@@ -297,7 +297,7 @@ class RobotOnBus:
         self._prompt.progress(1.0)
 
     def _receive(self, driver: LegDriver, recorder: Recorder, now: float) -> None:
-        for state in self._watch.look(now):
+        for state in self._watch.poll(now):
             driver.state(state, now)
 
         def wheels(message: JointState, arrival: float) -> None:
@@ -310,7 +310,7 @@ class RobotOnBus:
     def _drain(self) -> None:
         for sensor in (self._wheels, *(sensor for sensor, _ in self._sensors)):
             sensor.receive(lambda message, now: None, 0.0)
-        self._watch.look(clock.steady_s())
+        self._watch.poll(clock.steady_s())
 
     def _full(self, key: str) -> str:
         """Return `key`, with this robot's id in front if acsard itself defines the key ("imu")."""

@@ -26,7 +26,7 @@ from acsard.calibration.multipliers import MIN_TAPE_M, Tape
 from acsard.calibration.runs import Log, Run
 from acsard.calibration.solve import Calibration, calibrate
 from acsard.calibration.wheel_response import response
-from acsard.terminal.prompt import Ask, Prompt
+from acsard.terminal.prompt import NumberQuestion, Prompt
 
 MAX_REPEATS = 2
 """Maximum number of times that a disturbed leg is repeated on a real robot."""
@@ -85,7 +85,7 @@ def guide(
     """
     method = METHODS[name]
     longest = method.longest_s(setup)
-    prompt.say(
+    prompt.show_text(
         f"Calibration with {NEEDS[name]}. The robot drives for at most {longest:.0f} s in total, "
         "in several legs. If a leg is disturbed, the drive continues with that leg or an earlier "
         "one. Stay near the robot: any key stops the robot immediately."
@@ -99,7 +99,7 @@ def guide(
     repeats: dict[str, int] = {}
     most = MAX_SIMULATED_REPEATS if simulated else MAX_REPEATS
 
-    def ask_for(leg: str, asks: tuple[Ask, ...]) -> None:
+    def ask_for(leg: str, asks: tuple[NumberQuestion, ...]) -> None:
         for ask in asks:
             answers[leg, ask.name] = UNITS[ask.unit] * prompt.number(ask)
 
@@ -110,7 +110,7 @@ def guide(
             raise disturbed
         again = begins_again(legs, number, sensor=not method.tool)
         back = "" if simulated else ": put the robot back where it stood when that leg began"
-        prompt.say(
+        prompt.show_text(
             f"Leg {number + 1} was disturbed: {disturbed.why}. The drive continues with leg "
             f"{again + 1}{back}."
         )

@@ -106,7 +106,7 @@ key of a command source, "*" stands for the name of the source, as in `commands.
 SECTIONS: dict[str, type[Struct]] = {field.name: field.type for field in fields(Config)}
 
 
-def live(key: str) -> Live | None:
+def find_live_setting(key: str) -> Live | None:
     """Return the entry of `LIVE` for the setting with the dotted key `key`.
 
     The result is None if the setting takes effect only at the next start of the daemon.
@@ -143,7 +143,7 @@ class Difference(Struct, frozen=True):
     ours: object
     """Value in the configuration file; None if the setting does not exist there."""
 
-    def words(self, key: str) -> str:
+    def describe(self, key: str) -> str:
         """Return a text with both values, such as `log.level = "info", not "debug"`.
 
         The value in force comes first. `key` is the dotted key of the setting.
@@ -184,7 +184,7 @@ def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tupl
     tables: dict[str, Any] = effective(config)
     before = dict(flat(tables))
     new = {key: value for key, value in wishes.items() if not _same(before.get(key), value)}
-    fixed = [key for key in new if live(key) is None or key not in before]
+    fixed = [key for key in new if find_live_setting(key) is None or key not in before]
     if fixed:
         more = [f"and {len(fixed) - 1} more of these keys cannot be set"] if len(fixed) > 1 else []
         raise ConfigError([_refusal(fixed[0], new[fixed[0]], before), *more])
@@ -192,7 +192,7 @@ def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tupl
     # `build` accepts the tables of the sources only as a list, as a TOML file has them.
     tables["commands"]["sources"] = list(tables["commands"]["sources"])
     for key, value in new.items():
-        _put(tables, key.split("."), value)
+        _set_value(tables, key.split("."), value)
     sections = {key.partition(".")[0] for key in new}
     built = {name: build(SECTIONS[name], tables[name], name, problems) for name in sections}
     if problems:
@@ -223,7 +223,7 @@ def _refusal(key: str, value: object, known: Mapping[str, object]) -> str:
     return f"{show(key)}: unknown key; {hint(key, known, '`acsard set` lists the settings')}"
 
 
-def _put(tables: dict[str, Any], path: list[str], value: object) -> None:
+def _set_value(tables: dict[str, Any], path: list[str], value: object) -> None:
     inner: Any = tables
     for part in path[:-1]:
         if isinstance(inner, list):
@@ -234,7 +234,7 @@ def _put(tables: dict[str, Any], path: list[str], value: object) -> None:
 
 
 def _must_stand(key: str, before: object, after: object) -> str:
-    row = live(key)
+    row = find_live_setting(key)
     if row is None or row.when == "always":
         return ""
     if row.when == "raised":

@@ -50,7 +50,7 @@ class Bus(Protocol):
     """The methods of the bus that the control loop calls."""
 
     @property
-    def wanted(self) -> AbstractSet[str]:
+    def wanted_keys(self) -> AbstractSet[str]:
         """The native keys of the topics that are latched or have a subscriber at present."""
 
     def take(self, queries: int) -> BusInput:
@@ -138,16 +138,18 @@ class RouterFollower:
         made = [endpoint for endpoint in status.connected if endpoint not in before.connected]
         if lost:
             counters["router_missing"] = counters.get("router_missing", 0) + len(lost)
-            events.append(Event("router_missing", _words("not connected to", lost), "warning"))
+            events.append(
+                Event("router_missing", _connection_text("not connected to", lost), "warning")
+            )
         if made:
-            events.append(Event("router_found", _words("connected to", made)))
+            events.append(Event("router_found", _connection_text("connected to", made)))
         peers = [endpoint for endpoint in status.peers if endpoint not in before.peers]
         if peers:
             text = f"these endpoints are peers, not routers: {', '.join(peers)}. {PEER_ADVICE}"
             events.append(Event("not_a_router", text, "warning"))
 
 
-def _words(what: str, endpoints: list[str]) -> str:
+def _connection_text(what: str, endpoints: list[str]) -> str:
     tried = (
         "; the daemon tries again until it connects, and the robot can drive meanwhile"
         if what.startswith("not")

@@ -77,11 +77,11 @@ def as_text(status: BoardStatus) -> dict[str, str]:
     """
     bumpers = status.bumpers
     values = {
-        "emergency_stop": _word(status.estop, "pressed", "released"),
+        "emergency_stop": _flag_text(status.estop, "pressed", "released"),
         "bumpers": None
         if bumpers is None
         else "".join("X" if bumper else "." for bumper in bumpers),
-        "motor_driver": _word(status.driver_fault, "fault", "ok"),
+        "motor_driver": _flag_text(status.driver_fault, "fault", "ok"),
         "volts": None if status.volts is None else f"{status.volts:.2f}",
         "amperes": None if status.amps is None else f"{status.amps:.2f}",
         "charge": None if status.charge is None else f"{status.charge:.2f}",
@@ -127,7 +127,7 @@ def decode_status(line: bytes, check: bool) -> BoardStatus:
     )
 
 
-def _word(value: bool | None, yes: str, no: str) -> str | None:
+def _flag_text(value: bool | None, yes: str, no: str) -> str | None:
     return None if value is None else yes if value else no
 
 

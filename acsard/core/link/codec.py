@@ -107,7 +107,7 @@ class Codec:
 
         `line` has no line end.
         """
-        words = _words(line)
+        words = _parse_tokens(line)
         if words is None:
             raise FrameError("malformed", line)
         wheel: list[float | None] = [None] * 4
@@ -125,7 +125,7 @@ class Codec:
 
 # A robot at rest repeats the same line, so the last lines are cached.
 @lru_cache(16)
-def _words(line: bytes) -> tuple[tuple[bytes, float], ...] | None:
+def _parse_tokens(line: bytes) -> tuple[tuple[bytes, float], ...] | None:
     """Return a motor token and a speed, such as `(b"ap", 12.5)`, for each of the four motors.
 
     The token is the motor letter and the direction. The speed is in rad/s. Return None if `line` is

@@ -142,7 +142,7 @@ class ReplyStyle:
         """Count a command that was written to the port."""
         self._left += 1
 
-    def read(self, lines: int, periods: float) -> None:
+    def process_read(self, lines: int, periods: float) -> None:
         """Process a read of the port that completed `lines` lines.
 
         `periods` is the time since the previous read that completed a line, in reply periods of the
@@ -177,8 +177,8 @@ class ReplyStyle:
 class Timeline:
     """Assigns a sample time to each good line, in order.
 
-    For each read of the port, call `read`. Then, for each line of the read in order, call `place`
-    if the line is good and `skip_bad` if it is bad.
+    For each read of the port, call `process_read`. Then, for each line of the read in order, call
+    `place` if the line is good and `skip_bad` if it is bad.
     """
 
     def __init__(
@@ -239,7 +239,7 @@ class Timeline:
         self._style.written()
         self._rest_ns = at_ns + WATCHDOG_NS if moves else min(self._rest_ns, at_ns)
 
-    def read(self, at: Instant, size: int, lines: int, following: int) -> None:
+    def process_read(self, at: Instant, size: int, lines: int, following: int) -> None:
         """Process a read of the port that completes at least one line.
 
         `at` is the time of the read, `size` is its number of bytes, and `lines` is the number of
@@ -254,15 +254,15 @@ class Timeline:
         self._share_ns = (end_ns - before) / lines
         style, slots = self._style, self._slots
         if style.speaks is not False:
-            slots.read(end_ns, lines, size < FULL_READ_BYTES)
+            slots.process_read(end_ns, lines, size < FULL_READ_BYTES)
         spoke = style.speaks
-        style.read(lines, (end_ns - before) / self._usual_ns)
+        style.process_read(lines, (end_ns - before) / self._usual_ns)
         if style.speaks is False:
             slots.forget()
             if spoke and self._last_placed.clock != "prompts":
                 # While the board seemed to report by itself, no reply was assigned to a command.
                 self._prompts.restart()
-        self._prompts.read(end_ns, lines, following > 0)
+        self._prompts.process_read(end_ns, lines, following > 0)
 
     def skip_bad(self) -> None:
         """Skip the next line of the read, because this line is bad.

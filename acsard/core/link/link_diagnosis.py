@@ -113,7 +113,7 @@ class Lateness:
         self.step_s = 0.0
         """Time between the last two control steps, s, if the last step was late; otherwise 0."""
 
-    def look(self, now_ns: int, good: bool) -> bool:
+    def record_step(self, now_ns: int, good: bool) -> bool:
         """Record a control step. Return whether this step ends a silence that this computer caused.
 
         Only a good line from the board ends a silence. The built-in simulator runs on this
@@ -131,7 +131,7 @@ class Lateness:
         self.late_s = 0.0 if good else late_s
         return good and (late_s > 0.0 or self._simulated)
 
-    def words(self, link: LinkState) -> str:
+    def describe(self, link: LinkState) -> str:
         """Return a sentence that describes the state `link` for the operator.
 
         If the link is stale because a control step was late, the sentence blames this computer. If
@@ -211,7 +211,7 @@ class Heard(Struct):
         return f"{many(self.lines, 'line')} received, {good}{last}"
 
     @property
-    def words(self) -> str:
+    def diagnosis(self) -> str:
         """The complete diagnosis as a sentence for the message `state`."""
         if self.looks == "sparse" and self.late_s:
             return (
@@ -282,7 +282,7 @@ class UnansweredLines:
         self._since: tuple[int, int] | None = None
         self._told = False
 
-    def look(self, sent: int, good: int, linked: bool) -> Event | None:
+    def check(self, sent: int, good: int, linked: bool) -> Event | None:
         """Return the warning if it is due, else None.
 
         `sent` is the number of lines sent, and `good` the number of good lines received, both since
@@ -314,7 +314,7 @@ def damaged(link: Link, check: Negotiation) -> bool:
     return link.damaged and check.asking
 
 
-def words(
+def describe_link(
     link: Link,
     check: Negotiation,
     silence: SilenceDiagnosis,
@@ -332,7 +332,7 @@ def words(
         if check.trouble:
             return ADVICE[check.trouble]
         if traffic is not None and not traffic.good:
-            return traffic.words
+            return traffic.diagnosis
         if damaged(link, check):
             return (
                 "the microcontroller's replies arrive damaged, so the daemon asks it for the "
@@ -341,8 +341,8 @@ def words(
         if link.sparse_s:
             return _sparse(link.sparse_s, longest_reply)
         if traffic is not None:
-            return traffic.words
-    return lateness.words(link.state)
+            return traffic.diagnosis
+    return lateness.describe(link.state)
 
 
 def _sparse(sparse_s: float, longest_reply: float) -> str:

@@ -154,7 +154,7 @@ class CountRecovery:
         """
         return (self._configured if self._whole.believed else 0,) * 4
 
-    def look(self, line: Feedback) -> Feedback:
+    def recover_counts(self, line: Feedback) -> Feedback:
         """Return a copy of a good line with the fields `counted`, `steps` and `count` set.
 
         `counted` is None if the angles in whole counts are unknown. If these angles include the

@@ -3,9 +3,9 @@
 The host reads a line later than its sample time, because an adapter, the scheduler or a stall of
 the host may have delayed the line. `FreeRunningTimes` finds the period of a board that reports by
 its own clock. For a board that answers each command, `PromptedTimes` uses the times at which the
-commands were written. Each class serves as a clock: after every read of the port, call `read` on
-both objects, and then `place` to get the time of each line of the read. `feedback.py` chooses the
-better clock for each line.
+commands were written. Each class serves as a clock: after every read of the port, call
+`process_read` on both objects, and then `place` to get the time of each line of the read.
+`feedback.py` chooses the better clock for each line.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ class FreeRunningTimes:
         self._last: float | None = None
         """Slot of the last line that the present clock has placed. None before the first line."""
 
-    def read(self, at_ns: int, lines: int, drained: bool) -> int:
+    def process_read(self, at_ns: int, lines: int, drained: bool) -> int:
         """Process a read of the port, and return the number of missing lines before its last line.
 
         The result is -1 if the count of missing lines in earlier reads was too high by one. `at_ns`
@@ -564,7 +564,7 @@ class PromptedTimes:
         self._sent = at_ns
         self._left.append(at_ns)
 
-    def read(self, at_ns: int, lines: int, cut: bool = False) -> None:
+    def process_read(self, at_ns: int, lines: int, cut: bool = False) -> None:
         """Process a read of the port that contains `lines` complete replies.
 
         The last complete reply was received at the monotonic time `at_ns`. `cut` is true if the

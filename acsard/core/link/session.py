@@ -166,12 +166,12 @@ class McuSession:
             self._begin(port_open, opened, now.mono_ns)
         if port_open:
             for piece in received:
-                feedback += self._read(piece)
+                feedback += self._decode(piece)
             more = self._lines.too_long - self.rejects.get("too_long", 0) if received else 0
             if more > 0:
                 self._reject("too_long", more=more)
                 self._bad()
-            if self.lateness.look(now.mono_ns, good=bool(feedback)):
+            if self.lateness.record_step(now.mono_ns, good=bool(feedback)):
                 self._link.reset_silences()
             if 0.0 < self.lateness.step_s < WATCHDOG_S and self._answers and not feedback:
                 # The board may have had nothing to answer, because this computer sent nothing. If
@@ -222,7 +222,7 @@ class McuSession:
         """
         return None if self._heard_ns is None else (now_ns - self._heard_ns) / NS_PER_S
 
-    def words(self, port_trouble: str = "") -> str:
+    def describe_link(self, port_trouble: str = "") -> str:
         """Return a sentence for the operator about the state of the link.
 
         `port_trouble` is the reason why the port is closed, or "" if there is none.
@@ -231,7 +231,7 @@ class McuSession:
             return port_trouble
         if self.blocked:
             return link_diagnosis.PORT_BLOCKED
-        return link_diagnosis.words(
+        return link_diagnosis.describe_link(
             self._link, self.negotiation, self._hearing, self.lateness, self._longest_reply
         )
 
@@ -324,7 +324,7 @@ class McuSession:
         if up or self.blocked:
             self._hearing.forget()
         elif self._hearing.judge(now_ns, self.lateness.step_s):
-            self.events.append(Event(NAMES[self.link], self.words(), "warning"))
+            self.events.append(Event(NAMES[self.link], self.describe_link(), "warning"))
 
     def _reject(self, reason: str, line: bytes = b"", more: int = 1) -> None:
         """Count `more` rejected lines.
@@ -357,7 +357,7 @@ class McuSession:
             return
         if link != before[0] or self.blocked > before[3]:
             plain = not (self.blocked or link_diagnosis.damaged(self._link, check))
-            text = self.lateness.words(link) if plain else self.words()
+            text = self.lateness.describe(link) if plain else self.describe_link()
             good = link in ("up", "booting") and not self.blocked
             self.events.append(Event(NAMES[link], text, "info" if good else "warning"))
         if check.in_force != before[1] and not check.asking:
@@ -367,7 +367,7 @@ class McuSession:
 
     # lines
 
-    def _read(self, piece: Received) -> list[Feedback]:
+    def _decode(self, piece: Received) -> list[Feedback]:
         lines, timeline, feedback = self._lines.feed(piece.data), self._timeline, []
         link, data = self._link, piece.data
         statuses = [line for line, _ in lines if line.startswith(STATUS)]
@@ -379,7 +379,7 @@ class McuSession:
         if link.state != "up":
             self._hearing.now.take(data)
         if lines:
-            timeline.read(piece.at, len(piece.data), len(lines), lines[-1][1])
+            timeline.process_read(piece.at, len(piece.data), len(lines), lines[-1][1])
         for line, following in lines:
             reply = self._line(line, piece.at, following)
             if reply is None:
@@ -461,4 +461,4 @@ class McuSession:
             self._reject("count_leap", more=more)
         if self._timeline.restarted:
             self._restart("has restarted: its clock went back")
-        return self.count_recovery.look(feedback)
+        return self.count_recovery.recover_counts(feedback)

@@ -232,7 +232,12 @@ def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
     values |= {name: f"{value:.2f}" for name, value in numbers.items() if value is not None}
     values |= {f"{level}_below": f"{below:g}" for level, below in bounds.items()}
     return [
-        Row("battery", BATTERY_LEVELS[status.level], battery.words(config.battery, status), values)
+        Row(
+            "battery",
+            BATTERY_LEVELS[status.level],
+            battery.status_text(config.battery, status),
+            values,
+        )
     ]
 
 

@@ -198,10 +198,12 @@ class _Source:
         If `lasting` is true, and the sender is live but not armed, the result also says for how
         long the sender has sent speeds.
         """
-        if not sender.live(now_ns):
+        if not sender.is_live(now_ns):
             return self.stale_wait(sender, now_ns)
         since_ns = sender.speeds_ns if lasting else None
-        return self.neutral(sender, 0.0 if since_ns is None else _lasts(now_ns - since_ns))
+        return self.neutral(
+            sender, 0.0 if since_ns is None else _reported_duration_s(now_ns - since_ns)
+        )
 
 
 class Arbiter:
@@ -333,14 +335,18 @@ class Arbiter:
         source, sender = first
         armed = sender.armed(now_ns)
         self._holder, self._followed = source, sender if armed or sender is previous else None
-        if not (armed and sender.live(now_ns)):
+        if not (armed and sender.is_live(now_ns)):
             return Choice(source.name, None, source.wait_of(sender, now_ns), sender=sender.name)
         wait = NOTHING
-        if sender.zeros_ns is not None and (lasts := _lasts(now_ns - sender.zeros_ns)):
-            wait = Wait("zeros", source.name, lasts=lasts, kept=self._kept(source, now_ns))
+        if sender.zeros_ns is not None and (
+            lasts := _reported_duration_s(now_ns - sender.zeros_ns)
+        ):
+            wait = Wait(
+                "zeros", source.name, lasts=lasts, kept=self._blocked_source(source, now_ns)
+            )
         return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
 
-    def _kept(self, holder: _Source, now_ns: int) -> str:
+    def _blocked_source(self, holder: _Source, now_ns: int) -> str:
         """Return the name of a source whose speeds have no effect because `holder` sends zeros.
 
         If another sender of `holder` itself sends these speeds, the text begins with "another
@@ -376,14 +382,14 @@ class Arbiter:
         if not present:
             return source.doubt_wait(now_ns) or COMMAND
         first = self._followed if source is holder and self._followed else present[0]
-        if not (first.armed(now_ns) and first.live(now_ns)):
+        if not (first.armed(now_ns) and first.is_live(now_ns)):
             return source.wait_of(first, now_ns, lasting=False)
         if holder is None or source is holder:
             return Wait("senders", senders=len(present) - 1) if len(present) > 1 else NOTHING
         return Wait("equal" if holder.priority == source.priority else "higher", holder.name)
 
 
-def _lasts(ns: int) -> float:
+def _reported_duration_s(ns: int) -> float:
     if ns < REPORTED_DURATIONS_S[0] * NS_PER_S:
         return 0.0  # Nearly every step ends here.
     return max(seconds for seconds in REPORTED_DURATIONS_S if ns >= seconds * NS_PER_S)

@@ -52,7 +52,7 @@ MISSING_REASON = (
 SILENT_REASON = f"the board has not reported its battery for {SILENCE_TIMEOUT_S:g} s"
 
 
-def words(config: BatteryConfig, status: BatteryStatus) -> str:
+def status_text(config: BatteryConfig, status: BatteryStatus) -> str:
     """Return a text with the battery's values and with the reason if its level is not "ok"."""
     forms = ((status.volts, "{:.2f} V"), (status.percent, "{:g} %"), (status.amps, "{:.2f} A"))
     values = [form.format(value) for value, form in forms if value is not None]
@@ -93,7 +93,7 @@ class Battery:
         """Reported values and battery level; None if the board has never reported its voltage or
         charge."""
         self.stopped_now = False
-        """Whether the level fell to "stop" in the last call of `look`."""
+        """Whether the level fell to "stop" in the last call of `process_reports`."""
         self._values: dict[str, tuple[float, int]] = {}
         """Last value of each quantity by its name ("volts", "percent", "amps"), with its monotonic
         time of arrival, ns."""
@@ -113,7 +113,7 @@ class Battery:
         """Sum of the weights of all reports in `_mean`, ns (see `MAX_WEIGHT_NS`)."""
 
     @property
-    def held(self) -> bool:
+    def refuses_clear(self) -> bool:
         """Whether the call `clear` is refused, because the last known battery level is "stop"."""
         return self._known == "stop"
 
@@ -125,7 +125,7 @@ class Battery:
     @property
     def mend(self) -> str:
         """Advice on how to end the level "stop", as text without measured values."""
-        if self.held and self._told is None:
+        if self.refuses_clear and self._told is None:
             return "wait until the board has reported its battery for some seconds"
         config = self._config
         return f"charge the battery to {_with_unit(config, config.stop_below + config.hysteresis)}"
@@ -146,7 +146,9 @@ class Battery:
             if not ("volts" in self._values or "percent" in self._values):
                 self.status = None
 
-    def look(self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
+    def process_reports(
+        self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int
+    ) -> list[Event]:
         """Process the status lines since the last control step.
 
         Return a list with one log event if the level changed, otherwise an empty list. Each item of
@@ -229,7 +231,7 @@ class Battery:
 
     def _event(self, level: BatteryLevel, before: BatteryLevel | None) -> Event:
         assert self.status is not None
-        text = words(self._config, self.status)
+        text = status_text(self._config, self.status)
         if level == "stop":
             return Event("battery_stop", f"{text}; {self.mend}, then call srv/clear", "error")
         if before == "stop" and level != "unknown":

@@ -91,7 +91,7 @@ class Bumpers(BoardInput):
         return not self._away or self.state == "silent"
 
     @property
-    def held(self) -> str:
+    def clear_refusal(self) -> str:
         """Reason, as text, why `clear` must not release a stop now; "" if the bumpers allow it."""
         return self.why if self.latching else ""
 
@@ -133,7 +133,7 @@ class Bumpers(BoardInput):
             return bumpers
         return None
 
-    def words(self) -> str:
+    def reason_text(self) -> str:
         """Return a text that lists the pressed bumpers."""
         return pressed_words(self._places, self.pressed or ())
 

@@ -29,7 +29,7 @@ from acsard.core.values import Event, GyroSample, GyroStatus
 class ConsistencyChecks:
     """All consistency checks of one robot.
 
-    For each feedback line, the odometry calls `look`, updates the pose, and calls `learn`.
+    For each feedback line, the odometry calls `check_line`, updates the pose, and calls `learn`.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class ConsistencyChecks:
         if self.gyro is not None:
             self.gyro.drop_corrections()
 
-    def look(self, line: Feedback, rolled: Rolled) -> bool:
+    def check_line(self, line: Feedback, rolled: Rolled) -> bool:
         """Check a feedback line, and return whether it has proved a wheel faulty.
 
         If it has, the caller must recompute the pose from the earlier lines without this wheel.
@@ -97,7 +97,7 @@ class ConsistencyChecks:
             self.on_trial = gyro.owes
             by_gyro = None if turn is None else turn.wheels
         self.turn = turn
-        is_faulty = wheels.look(rolled.seen, line.speeds, rolled.seconds, by_gyro)
+        is_faulty = wheels.check_line(rolled.seen, line.speeds, rolled.seconds, by_gyro)
         self.slips = wheels.slips or (turn is not None and turn.slips)
         return is_faulty
 
@@ -130,7 +130,7 @@ class ConsistencyChecks:
             if gyro.events:
                 self.events = gyro.events + self.events
             return None
-        track.look(gyro.learned)
+        track.choose(gyro.learned)
         if gyro.events or track.event is not None:
             of_track = [] if track.event is None else [track.event]
             self.events = gyro.events + of_track + self.events

@@ -89,8 +89,8 @@ class BoardInput(ABC):
         self._awaited = True
         """True from the opening of the port until the board reports the inputs."""
         self.pressed_now = ""
-        """Reason, as text, if an input began to count as pressed in the last call of `look`;
-        otherwise an empty text."""
+        """Reason, as text, if an input began to count as pressed in the last call of
+        `process_reports`; otherwise an empty text."""
         self._reported_ns = self._looked_ns = 0
         self._excused = False
 
@@ -99,7 +99,7 @@ class BoardInput(ABC):
         """Why an input counts as pressed, as text; "" while no input counts as pressed."""
         if self.state == "silent":
             return self.silent
-        return self.words() if self.state == "pressed" else ""
+        return self.reason_text() if self.state == "pressed" else ""
 
     @property
     def mend(self) -> str:
@@ -131,7 +131,9 @@ class BoardInput(ABC):
         if self._awaited:
             self.state, self.pressed = "", None
 
-    def look(self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
+    def process_reports(
+        self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int
+    ) -> list[Event]:
         """Process the status lines since the last control step; return the log events of changes.
 
         Each item of `reports` is a pair: the monotonic time of arrival, ns, and the status line.
@@ -158,7 +160,7 @@ class BoardInput(ABC):
         """Return whether each input is pressed; None if `status` does not report the inputs."""
 
     @abstractmethod
-    def words(self) -> str:
+    def reason_text(self) -> str:
         """Return the reason of a stop as text: it says which inputs are pressed."""
 
     @abstractmethod
@@ -193,8 +195,8 @@ class EmergencyStop(BoardInput):
     def __init__(self, use: EstopUse, unpowered: bool = False) -> None:
         super().__init__(use)
         self.driver_fault = False
-        """Whether the status lines in the last call of `look` reported a motor-driver fault that
-        counts.
+        """Whether the status lines in the last call of `process_reports` reported a motor-driver
+        fault that counts.
 
         A fault does not count while the drivers may have no power (`_unpowered`).
         """
@@ -206,7 +208,9 @@ class EmergencyStop(BoardInput):
         fault counts until `clear` has released the stop.
         """
 
-    def look(self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int) -> list[Event]:
+    def process_reports(
+        self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int
+    ) -> list[Event]:
         """Process the status lines since the last control step; return the log events of changes.
 
         Each item of `reports` is a pair: the monotonic time of arrival, ns, and the status line.
@@ -219,7 +223,7 @@ class EmergencyStop(BoardInput):
                 pressed = status.estop
                 self._unpowered |= pressed
             self.driver_fault |= bool(status.driver_fault) and not (pressed or self._unpowered)
-        events = super().look(reports, now_ns)
+        events = super().process_reports(reports, now_ns)
         if self.why:
             self.driver_fault = False
         return events
@@ -236,7 +240,7 @@ class EmergencyStop(BoardInput):
         """Return `(status.estop,)`, or None if the status line does not report `estop`."""
         return None if status.estop is None else (status.estop,)
 
-    def words(self) -> str:
+    def reason_text(self) -> str:
         """Return the text that names the pressed emergency stop as the reason of a stop."""
         return PRESSED_REASON
 

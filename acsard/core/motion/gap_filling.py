@@ -264,7 +264,7 @@ class Confirmation:
         self._seconds = 0.0
         """Time that the held feedback lines and the gaps before these lines cover, s."""
 
-    def look(
+    def confirm(
         self,
         line: Feedback,
         skipped: float,

@@ -211,7 +211,7 @@ class Gyro:
     @property
     def status(self) -> GyroStatus:
         """The present state of the gyro."""
-        known, learned = self._bias.value if self._bias.known else None, self.learned
+        known, learned = self._bias.value if self._bias.is_known else None, self.learned
         track, deviation = (None, 0.0) if learned is None else (learned.share, learned.deviation)
         return GyroStatus(self._does, known, self._delay_ns / NS_PER_S, track, deviation)
 
@@ -278,7 +278,7 @@ class Gyro:
         bias_variance = self._bias.variance + self._unsure
         variance += 2.0 * bias_variance * self._since_rest_s * dt
         tried = False if lost else self._try(wheels, angle, variance, dt, resting)
-        if not lost and self._bias.known and dt > 0.0 and not self._trial.open:
+        if not lost and self._bias.is_known and dt > 0.0 and not self._trial.open:
             self._compare(wheels, angle, dt)
         if resting:
             self._shift()
@@ -385,7 +385,7 @@ class Gyro:
             bias.drift(passed)
             new = abs(sample.rate - bias.value) < MAX_BIAS_STEP or sample.rate == self._suspect
             learns = not self._frozen or (new and not self._hangs)
-            stands = resting and learns and bias.rest(sample.rate, sample.variance, span)
+            stands = resting and learns and bias.update_at_rest(sample.rate, sample.variance, span)
             if stands:
                 self._unsure, self._rested_s, self._frozen = 0.0, 0.0, False
                 if not self._hangs:
@@ -447,7 +447,7 @@ class Gyro:
 
         While the wheels rest, the gyro provides the turn, because a person may turn the robot.
         """
-        trial, known = self._trial, self._bias.known
+        trial, known = self._trial, self._bias.is_known
         if not trial.open or resting:
             return False
         if dt > 0.0:
@@ -546,7 +546,7 @@ class Gyro:
             self._does = verdict
         elif silent:
             self._does = "silent"
-        elif not self._bias.known:
+        elif not self._bias.is_known:
             self._does = "waiting for rest"
         elif wrong or self._frozen or self._slipped_s > MAX_SLIP_S:
             self._does = "not believed"

@@ -55,7 +55,7 @@ class Bias:
         """A second estimate, from consecutive samples that contradict this estimate."""
 
     @property
-    def known(self) -> bool:
+    def is_known(self) -> bool:
         """Whether the robot has stood still long enough to determine the bias."""
         return self._rested_s >= LEARNING_TIME_S
 
@@ -63,14 +63,14 @@ class Bias:
         """Increase the variance of the bias by the drift that may occur in `dt` s."""
         self.variance += BIAS_RANDOM_WALK * BIAS_RANDOM_WALK * dt
 
-    def rest(self, rate: float, variance: float, dt: float) -> bool:
+    def update_at_rest(self, rate: float, variance: float, dt: float) -> bool:
         """Update the bias with a sample that was measured while the wheels stood still.
 
         Return False if the sample shows that the robot turns, for example by hand. `rate` is in
         rad/s, and `dt` is the time since the previous sample, s. `variance` is the variance of
         `rate` according to the gyro, rad2/s2; 0 if the gyro declares no variance.
         """
-        if not self.known:
+        if not self.is_known:
             return self._average(rate, variance, dt)
         self._rested_s += dt
         error = rate - self.value
@@ -87,7 +87,7 @@ class Bias:
 
     def _doubt(self, rate: float, variance: float, dt: float, noise: float) -> bool:
         other = self._other = self._other or Bias()
-        if not other.rest(rate, variance, dt) or other._rested_s < NEW_BIAS_TIME_S:
+        if not other.update_at_rest(rate, variance, dt) or other._rested_s < NEW_BIAS_TIME_S:
             return False
         self._other = None
         if math.sqrt(other.noise) > MAX_DEVIATIONS * math.sqrt(noise) + DEVIATION_MARGIN:
@@ -104,6 +104,6 @@ class Bias:
         error = rate - self.value
         self.value += error / self._samples
         self.noise += (error * (rate - self.value) - self.noise) / self._samples
-        if self.known:
+        if self.is_known:
             self.variance = max(self.noise, variance, MIN_NOISE**2) / self._samples
         return True

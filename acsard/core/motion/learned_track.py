@@ -63,9 +63,9 @@ class LearnedTrack:
         self.used = CONFIGURED
         """The effective track in use, configured or learned."""
         self.event: Event | None = None
-        """Log event if the last call of `look` changed `use`, otherwise None."""
+        """Log event if the last call of `choose` changed `use`, otherwise None."""
 
-    def look(self, learned: Track | None) -> None:
+    def choose(self, learned: Track | None) -> None:
         """Choose the effective track to use. `learned` is the track learned so far, or None.
 
         The method stores the chosen track in `used`, the reason in `use`, and a log event in

@@ -121,7 +121,7 @@ class Lifecycle:
         self._stopped_ns = now.mono_ns
         self._latch(stop=self._stop(now, "", why))
 
-    def hold(self, why: str, mend: str, now_ns: int) -> None:
+    def refuse_clear(self, why: str, mend: str, now_ns: int) -> None:
         """Record whether the board's reports forbid the call `clear` now.
 
         `why` is the reason as text, and `mend` is the advice to the operator about it. Both are ""
@@ -156,7 +156,7 @@ class Lifecycle:
             if _without_values(why) in known or len(known) >= MAX_FAULTS:
                 return False
         self._faulted_ns = now.mono_ns
-        self._latch(fault=with_causes(self._made(now, "", why), latch))
+        self._latch(fault=with_causes(self._new_latch(now, "", why), latch))
         return True
 
     # requests
@@ -231,7 +231,7 @@ class Lifecycle:
                 was = f"the robot was {_stopped(stop or latch)}"
             else:
                 was = f"the robot went into fault ({latches.fault.why})"
-            self._require_seen(was, _in_force(latches), set_ns, asked_ns, "srv/clear")
+            self._require_latch_was_seen(was, _in_force(latches), set_ns, asked_ns, "srv/clear")
         else:
             if number != latch.number:
                 raise RefusedError(_not_in_force(number, _in_force(latches), "srv/clear"))
@@ -276,7 +276,7 @@ class Lifecycle:
             raise RefusedError(_not_in_force(number, still, "srv/activate"))
         if latch is not None:
             if number is None:
-                self._require_seen(
+                self._require_latch_was_seen(
                     f"the robot was {_stopped(latch)}",
                     _still(latch),
                     self._off_ns,
@@ -299,7 +299,7 @@ class Lifecycle:
         """
         require_allowed(self.mode, "deactivate")
         self._off_ns = now.mono_ns
-        self._latch(inactive=self._made(now, by, f"switched off by {by or 'request'}"))
+        self._latch(inactive=self._new_latch(now, by, f"switched off by {by or 'request'}"))
         return "inactive: the robot brakes to rest; call srv/activate to switch it on again"
 
     def lower(self, limits: dict[str, float]) -> None:
@@ -320,12 +320,12 @@ class Lifecycle:
                 # The cause that lasts differs from all latched causes. For example, one of two
                 # pressed bumpers has been released.
                 parts.append(reason)
-            parts += [_said(cause) for cause in causes]
+            parts += [_latch_text(cause) for cause in causes]
             before = f"{self._mend}, then " if reason else ""
             twice = f" twice, {LATCH_REQUIRED_S:g} s apart" if fault and stop else ""
             return f"{'; also '.join(parts)}; {before}call srv/clear{twice}"
         if latches.inactive is not None:
-            return f"{_said(latches.inactive)}; call srv/activate"
+            return f"{_latch_text(latches.inactive)}; call srv/activate"
         return "switched off; call srv/activate"
 
     # latches and mode
@@ -334,7 +334,7 @@ class Lifecycle:
     def _off(self) -> bool:
         return self._dormant or self.latches.inactive is not None
 
-    def _made(self, now: Instant, by: str, why: str) -> Latch:
+    def _new_latch(self, now: Instant, by: str, why: str) -> Latch:
         if self._numbered:
             self._number = max(self._number + 1, now.wall_ns // 1_000_000)
         else:
@@ -342,7 +342,7 @@ class Lifecycle:
         return Latch(self._number, now.wall_ns, by, why)
 
     def _stop(self, now: Instant, by: str, why: str) -> Latch:
-        return with_causes(self._made(now, by, why), self.latches.stop)
+        return with_causes(self._new_latch(now, by, why), self.latches.stop)
 
     def _latch(self, **changes: Latch | None) -> None:
         before = self.latches
@@ -360,7 +360,9 @@ class Lifecycle:
             commanded=self._commanded,
         )
 
-    def _require_seen(self, was: str, still: str, set_ns: int, asked_ns: int, call: str) -> None:
+    def _require_latch_was_seen(
+        self, was: str, still: str, set_ns: int, asked_ns: int, call: str
+    ) -> None:
         """Raise `RefusedError` if the sender of the request may not know the latch yet.
 
         Args:
@@ -447,7 +449,7 @@ def _asked_for(latch: Latch) -> bool:
     return latch.why.endswith(f" by {latch.by or 'request'}")
 
 
-def _said(latch: Latch) -> str:
+def _latch_text(latch: Latch) -> str:
     if not _asked_for(latch):
         return f"{latch.why} (latched {_when(latch)})"
     return f"{'was ' if latch.kept else ''}{latch.why} {_when(latch)}"

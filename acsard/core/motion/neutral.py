@@ -97,7 +97,7 @@ class Sender:
         """Use this timeout and this `commands.neutral_pause` from now on, both in ns."""
         self._timeout_ns, self._pause_ns = timeout_ns, pause_ns
 
-    def live(self, now_ns: int) -> bool:
+    def is_live(self, now_ns: int) -> bool:
         """Return whether the last accepted command is not older than the timeout of its source.
 
         `now_ns` is the monotonic time, ns.
@@ -127,7 +127,7 @@ class Sender:
         first comes first. The key does not say whether a sender is armed: `_Source.present` puts
         the armed senders of a source before the unarmed ones.
         """
-        return not self.live(now_ns), self.came_ns
+        return not self.is_live(now_ns), self.came_ns
 
     def doubtful(self, now_ns: int) -> bool:
         """Return whether a recent command was not accepted because of its stamp.

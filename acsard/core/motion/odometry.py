@@ -209,7 +209,9 @@ class Odometry:
         in the order of time. The time of a dropped line counts as a gap.
         """
         rolling, believed = self._rolling, self.checks.wheels.believed
-        lines, dropped = self._confirmation.look(feedback, rolling.skipped, self.speeds, believed)
+        lines, dropped = self._confirmation.confirm(
+            feedback, rolling.skipped, self.speeds, believed
+        )
         for line in dropped:
             rolling.skip(replace(line, bridged=line.dt))
         return lines, len(dropped)
@@ -233,7 +235,7 @@ class Odometry:
             known = [step for step in feedback.steps if step < math.inf]
             self._coarsest = max(known, default=0.0)
             self._largest_step = max(known, default=math.inf)
-        if checks.look(feedback, rolled):
+        if checks.check_line(feedback, rolled):
             self._take_back()
         turn, slips = checks.turn, checks.slips
         believed = checks.wheels.believed(speeds.as_tuple())
@@ -245,7 +247,7 @@ class Odometry:
         after_gap = rolled.bridged > 0.0 or rolled.unknown > 0.0
         self._rounding.add(believed, own, self._still, after_gap, self._largest_step)
         if rolled.unknown > 0.0:
-            self._stand(rolled.unknown, before, twist)
+            self._add_unseen_motion(rolled.unknown, before, twist)
         turned = self._move(self._settled(rolled, at_rest), turn, speeds, slips)
         self._go_on(rolled, feedback, before, twist)
         variances = self._twist_variances(twist, feedback, at_rest, turn, slips)
@@ -386,14 +388,14 @@ class Odometry:
         square = seconds * seconds
         return linear * square, 0.0 if self.checks.turn is not None else angular * square
 
-    def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
+    def _add_unseen_motion(self, seconds: float, before: Twist, after: Twist) -> None:
         """Add the uncertainty of `seconds` s of unknown motion, but do not move the pose."""
         if before != REST or after != REST or self._highest != REST:
             self.gaps += 1
             self.unseen += seconds
         along, yaw = self._gaps.unseen(seconds, before, after, self._highest)
         by_counts, turn_by_counts = self._rounded(seconds)
-        self._uncertainty.stand(
+        self._uncertainty.add_gap(
             seconds * (before.linear + after.linear) / 2,
             seconds * (before.angular + after.angular) / 2,
             along + by_counts,

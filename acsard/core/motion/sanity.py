@@ -181,11 +181,11 @@ class Sanity:
         if why:
             self._dropped += 1
             if self._dropped == int(WARNING_FRACTION * WINDOW_LINES) + 1:
-                self.warning = Event("lines_implausible", self._words(why), "warning")
+                self.warning = Event("lines_implausible", self._warning_text(why), "warning")
         if self._lines == WINDOW_LINES:
             self._lines = self._dropped = 0
 
-    def _words(self, why: str) -> str:
+    def _warning_text(self, why: str) -> str:
         # Each reason ends with the name of the setting.
         setting = why.rpartition(" over ")[2]
         return (

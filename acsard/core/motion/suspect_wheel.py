@@ -137,7 +137,7 @@ class Suspect:
             return "stuck"
         if reverses(own, other, count) or (self.sign == "reversed" and own * other == 0.0):
             return "reversed"
-        if stands(own, other):
+        if seems_still(own, other):
             return "dead"
         return "stuck" if same else None
 
@@ -251,7 +251,7 @@ class Stuck:
         )
 
 
-def stands(own: float, other: float) -> bool:
+def seems_still(own: float, other: float) -> bool:
     """Return whether a wheel seems to stand still.
 
     The wheel turned `own` rad, and the other wheel of its side turned `other` rad.
@@ -279,4 +279,4 @@ def was_faulty(fault: WheelFault, own: float, other: float, now: float) -> bool:
     """
     if fault == "reversed":
         return own * other <= 0.0
-    return stands(own, other) if fault == "dead" else own == now
+    return seems_still(own, other) if fault == "dead" else own == now

@@ -170,7 +170,7 @@ class PoseUncertainty:
             self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
             self._publish()
 
-    def stand(self, distance: float, turn: float, along: float, yaw: float) -> None:
+    def add_gap(self, distance: float, turn: float, along: float, yaw: float) -> None:
         """Add the uncertainty of a gap in the feedback during which the pose was not updated.
 
         The motions that the pose missed in several gaps add up and do not average out. Therefore

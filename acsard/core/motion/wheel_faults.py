@@ -125,12 +125,12 @@ class _Side:
         """Check both wheels of this side, and return whether one of them may be faulty.
 
         `speeds` contains the reported speeds of all four wheels, rad/s. The other arguments are as
-        in `Witness.look`.
+        in `Witness.check_speed`.
         """
         i, j = self.wheels
         front, rear = self.witnesses
-        bad = front.look(speeds[i], self.expected, dt, most, count, still)
-        bad = rear.look(speeds[j], self.expected, dt, most, count, still) or bad
+        bad = front.check_speed(speeds[i], self.expected, dt, most, count, still)
+        bad = rear.check_speed(speeds[j], self.expected, dt, most, count, still) or bad
         self.late = (front.slow and self.out != 0) or (rear.slow and self.out != 1)
         return bad or self._out_s > 0.0
 
@@ -333,7 +333,7 @@ class WheelFaults:
 
         If a wheel has contradicted its command for `feedback.fault_time`, return the reason of a
         fault, which names the wheel. Otherwise return "". In both cases, the caller must call
-        `look` for the same line next.
+        `check_line` for the same line next.
 
         Args:
             commanded: the commanded wheel speeds, rad/s. None means that the motors may have no
@@ -384,7 +384,7 @@ class WheelFaults:
                 f"wheels turn at {fastest:.1f} rad/s without a command: is the robot being pushed?"
             )
 
-    def look(
+    def check_line(
         self, turned: Motors, speeds: WheelSpeeds, dt: float, turn: float | None = None
     ) -> bool:
         """Compare the wheels of each side, and return whether this line proves a wheel faulty.

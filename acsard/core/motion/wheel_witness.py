@@ -158,18 +158,18 @@ class Witness:
         power.
 
         When the wheel comes to rest, `driven` becomes false: until the next command, only a push
-        can turn the wheel. The arguments `dt` and `count` are as in `look`.
+        can turn the wheel. The arguments `dt` and `count` are as in `check_speed`.
         """
-        self.driven = self.driven and not self._rests(raw_speed, dt, count)
+        self.driven = self.driven and not self._is_surely_slow(raw_speed, dt, count)
 
-    def _rests(self, raw_speed: float, dt: float, count: float) -> bool:
+    def _is_surely_slow(self, raw_speed: float, dt: float, count: float) -> bool:
         """Return whether the wheel is certainly not faster than `MIN_FAULT_SPEED`."""
         # An encoder with few counts often reports 0 although the wheel turns. Therefore the
         # reported speed must stay low for the time of one count at the speed `MIN_FAULT_SPEED`.
         self._rested_s = 0.0 if abs(raw_speed) > MIN_FAULT_SPEED else self._rested_s + dt
         return self._rested_s >= count / MIN_FAULT_SPEED and abs(raw_speed) <= MIN_FAULT_SPEED
 
-    def look(
+    def check_speed(
         self,
         raw_speed: float,
         expected: Expected,
@@ -195,7 +195,7 @@ class Witness:
         speed = self.speed = self.speed + (raw_speed - self.speed) * share
         constant, self._seen = raw_speed == self._seen, raw_speed
         size, wish, turns = abs(goal), abs(command), abs(speed)
-        rests = self._rests(raw_speed, dt, count) and turns <= MIN_FAULT_SPEED
+        rests = self._is_surely_slow(raw_speed, dt, count) and turns <= MIN_FAULT_SPEED
         driven = self.driven = not still or (self.driven and not rests)
         fastest, least = (size, wish) if size > wish else (wish, size)
         due = self._due + (fastest - self._due) * share

@@ -17,7 +17,7 @@ from typing import Annotated, TypeVar
 from msgspec import Meta, Struct, inspect
 from msgspec.structs import fields
 
-from acsard.core.config.live import WHEN_TEXTS, flat, live
+from acsard.core.config.live import WHEN_TEXTS, find_live_setting, flat
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import expected
 from acsard.core.messages.cdr import Cdr, CdrError
@@ -70,7 +70,7 @@ def described(name: str, type_of: int) -> ParameterDescriptor:
 # The cache stays small, because only about a hundred names exist.
 @cache
 def _described(name: str, type_of: int) -> ParameterDescriptor:
-    kind, row = kind_of(name), live(name)
+    kind, row = kind_of(name), find_live_setting(name)
     words = expected(kind)
     bounds = kind.type if isinstance(kind, inspect.Metadata) else kind
     floats, whole = [], []

@@ -57,11 +57,11 @@ class WatchedMcu(FakeMcu):
         out = b""
         while self._look_ns <= now_ns:
             out += super().advance(self._look_ns)
-            self._look()
+            self._observe()
             self._look_ns += OBSERVATION_PERIOD_NS
         return out + super().advance(now_ns)
 
-    def _look(self) -> None:
+    def _observe(self) -> None:
         now_ns, sim = self._look_ns, self._sim
         self._history.append((now_ns, self.vehicle.turned))
         end_ns = now_ns - self._delay_ns

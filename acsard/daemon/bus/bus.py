@@ -65,7 +65,7 @@ class ZenohBus:
     # The control loop calls the methods below.
 
     @property
-    def wanted(self) -> frozenset[str]:
+    def wanted_keys(self) -> frozenset[str]:
         """Keys of the topics whose messages the daemon must publish now.
 
         These topics are latched or have a subscriber. The subscriber may use the topic's native key

@@ -57,7 +57,7 @@ class Identity(Struct, frozen=True):
             return self.silence
         if has(self.role, least):
             return ""
-        return f"{self.words()}; {key} needs at least the role {least}"
+        return f"{self.describe()}; {key} needs at least the role {least}"
 
     @property
     def silence(self) -> str:
@@ -85,7 +85,7 @@ class Identity(Struct, frozen=True):
             "a router, they are in the router's file. The robot answers only certificates in a list"
         )
 
-    def words(self) -> str:
+    def describe(self) -> str:
         """Return a sentence about the client's role and certificate.
 
         If the role is unknown, the text says instead why the robot may not have answered.

@@ -290,7 +290,7 @@ class ListenerProcess:
             return self._leaving
         parent.beat()
         readable, _, _ = select.select([parent.fd], [], [], CHECK_PERIOD_S)
-        return self._leaving or (bool(readable) and parent.gone())
+        return self._leaving or (bool(readable) and parent.is_gone())
 
     def _open(self) -> SessionHealth:
         listener = self._listener

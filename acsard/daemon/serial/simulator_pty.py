@@ -159,7 +159,7 @@ class Simulated(SimPty):
         self._last = sight, wall_ns
         if bus is None:
             return
-        if TRUE_POSE_KEY in bus.wanted:
+        if TRUE_POSE_KEY in bus.wanted_keys:
             bus.publish(TRUE_POSE_KEY, true_pose(sight, wall_ns))
         # The daemon receives this sample from the bus, like a sample of a gyro on a real robot.
         if self._gyro:

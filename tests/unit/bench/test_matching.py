@@ -14,9 +14,9 @@ from acsard.bench.matching import (
     LOSS_TIMEOUT_NS,
     MatchedLine,
     Record,
+    RecordedTraffic,
     Sample,
-    Seen,
-    Sent,
+    SentCommand,
     Summary,
     command_waits,
     commands_to_lines,
@@ -156,22 +156,26 @@ def test_only_lines_between_start_and_end_count() -> None:
         Sample(Instant(at_ns + 5, 0), 0, staircase(number) * config.drive.wheel_radius)
         for number, (at_ns, _) in enumerate(lines, 1)
     ]
-    record = Record(0, (first_ns, last_ns), Seen(to_daemon=lines), [], samples)
+    record = Record(0, (first_ns, last_ns), RecordedTraffic(to_daemon=lines), [], samples)
     assert record.feedback_lines == [(at_ns, line.strip()) for at_ns, line in lines[3:7]]
     assert feedback_fates(config, record) == [MatchedLine(5, 0)] * 4
 
 
 def test_a_command_is_found_on_the_wire() -> None:
     record = Record(
-        0, (0, 100), Seen(from_daemon=[(5, b"\r\nap"), (9, b"1\r\n")]), [Sent(4, b"x")], []
+        0,
+        (0, 100),
+        RecordedTraffic(from_daemon=[(5, b"\r\nap"), (9, b"1\r\n")]),
+        [SentCommand(4, b"x")],
+        [],
     )
     assert command_waits(record) == []
-    traffic = Seen(from_daemon=[(5, b"\r\n"), (7, b"ap1,\r\n")])
-    assert command_waits(Record(0, (0, 100), traffic, [Sent(4, b"ap1")], [])) == [3]
+    traffic = RecordedTraffic(from_daemon=[(5, b"\r\n"), (7, b"ap1,\r\n")])
+    assert command_waits(Record(0, (0, 100), traffic, [SentCommand(4, b"ap1")], [])) == [3]
 
 
 def test_a_record_of_a_real_port_has_no_lines_and_no_delays() -> None:
-    record = Record(0, (0, 100), None, [Sent(4, b"x")], [])
+    record = Record(0, (0, 100), None, [SentCommand(4, b"x")], [])
     assert not record.feedback_lines
     assert not command_waits(record)
     assert not feedback_fates(Config(), record)

@@ -26,7 +26,7 @@ from tests.unit.calibration.robots import GUIDED, Drive
 RATE = Rates(0.5, 1.0)
 
 
-def held(drive: Drive, *, places: bool = True) -> tuple[list[Fold], Improvement]:
+def cross_validation(drive: Drive, *, places: bool = True) -> tuple[list[Fold], Improvement]:
     """Fit this drive, and return its cross-validation folds and the measured improvement."""
     log = table(drive, places=places)
     made, runs = ready(log), log_of(log).runs
@@ -37,7 +37,7 @@ def held(drive: Drive, *, places: bool = True) -> tuple[list[Fold], Improvement]
 
 
 def test_every_part_of_one_run_is_left_out_in_turn() -> None:
-    cv_folds, _ = held(ideal(), places=False)
+    cv_folds, _ = cross_validation(ideal(), places=False)
     assert len(cv_folds) == 5
     assert np.all(np.sum([fold.blocks for fold in cv_folds], axis=0) >= 1)
 
@@ -57,7 +57,7 @@ def test_positions_of_a_drive_are_cut_at_gaps_of_the_wheels() -> None:
 
 @pytest.mark.slow
 def test_an_ideal_robot_has_its_track_error_before_and_no_error_after() -> None:
-    _, better = held(ideal())
+    _, better = cross_validation(ideal())
     assert better.turn.before == pytest.approx(0.6 * 360, rel=0.02)
     assert better.turn.after is not None
     assert better.turn.after < 1.0
@@ -79,14 +79,16 @@ def test_without_a_drive_to_leave_out_no_improvement_is_sure() -> None:
 
 def test_a_slow_curve_is_not_taken_for_a_straight_drive() -> None:
     """The turn rate is as low as in a straight drive, but the turn per metre is much larger."""
-    _, better = held(ideal([*GUIDED, (60.0, 0.04, 0.06)]), places=False)
+    _, better = cross_validation(ideal([*GUIDED, (60.0, 0.04, 0.06)]), places=False)
     assert better.straight.before is not None
     assert better.straight.before < 5.0
 
 
 def test_a_straight_drive_of_half_a_metre_gives_no_error_after_ten() -> None:
     curves = [(8.0, 0.2, 1.0), (8.0, 0.2, -1.0)] * 2
-    _, better = held(ideal([(3.0, 0.0, 0.0), *curves, (3.0, 0.17, 0.0), *curves]), places=False)
+    _, better = cross_validation(
+        ideal([(3.0, 0.0, 0.0), *curves, (3.0, 0.17, 0.0), *curves]), places=False
+    )
     assert better.straight.before is None
     assert better.turn.before is not None
 

@@ -88,7 +88,7 @@ def stalled(trip: Drive, *, gyro: bool, places: bool) -> Table:
     return table(late, gyro=gyro, places=places)
 
 
-def held(trip: Drive, *, gyro: bool, places: bool) -> Table:
+def log_with_repeats(trip: Drive, *, gyro: bool, places: bool) -> Table:
     """Return a log in rows of 20 Hz, which repeat each position until the next one arrives."""
     assert places
     count = len(trip.t) // LINES * LINES
@@ -172,7 +172,7 @@ WAYS = {"gyro": (True, False), "positions": (False, True), "both": (True, True)}
 
 ONE_WAY = {
     ("skid, held positions of 10 Hz", "positions"): Set(
-        replace(SKID, place_hz=10.0), recorded=held
+        replace(SKID, place_hz=10.0), recorded=log_with_repeats
     ),
     ("skid, IMU on its side", "gyro"): Set(SKID, recorded=lying),
     ("skid, five minutes", "positions"): Set(SKID, seconds=300.0),

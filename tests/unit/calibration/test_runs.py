@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from acsard.calibration.log_table import LogError, read
-from acsard.calibration.runs import Notes, blocks, gaps, inside, rests, runs
+from acsard.calibration.runs import Notes, blocks, gaps, inside, rest_intervals, runs
 from tests.unit.calibration.cut import log_of
 
 HEADER = "t,left,right,yaw_rate,run\n"
@@ -253,7 +253,7 @@ def test_a_rest_is_an_interval_in_which_all_wheels_stand_long_enough() -> None:
     run = log_of(drive((0, 2, 0.0), (2, 4, 1.0), (4, 4.5, 0.0), (4.5, 6, 1.0), (6, 8, 0.01))).runs[
         0
     ]
-    intervals = rests(run, 1.0, 0.2)
+    intervals = rest_intervals(run, 1.0, 0.2)
     assert np.allclose(intervals, [[0.2, 1.79], [6.2, 7.79]], atol=0.02)
 
 

@@ -58,7 +58,9 @@ def log(plan: Plan, seconds: float, fastest: float = 99.0) -> Log:
     )  # fmt: skip
 
 
-def found(plan: Plan, seconds: float, fastest: float = 99.0, **feedback: float) -> WheelResponse:
+def measured_response(
+    plan: Plan, seconds: float, fastest: float = 99.0, **feedback: float
+) -> WheelResponse:
     made = response(
         log(plan, seconds, fastest).runs, DriveConfig(), FeedbackConfig(**feedback)
     )  # fmt: skip
@@ -68,7 +70,7 @@ def found(plan: Plan, seconds: float, fastest: float = 99.0, **feedback: float) 
 
 @pytest.mark.parametrize("seconds", [0.05, 0.2, 0.9])
 def test_the_response_time_is_found(seconds: float) -> None:
-    made = found(GUIDED, seconds)
+    made = measured_response(GUIDED, seconds)
     assert made.seconds == pytest.approx(seconds, rel=0.15, abs=0.012)
     assert made.fastest == np.inf
 
@@ -78,18 +80,18 @@ def test_a_slow_robot_that_reverses_would_be_faulty_and_its_response_time_is_pro
 
     The calibration therefore proposes a longer response time.
     """
-    made = found(REVERSING, 2.0)
+    made = measured_response(REVERSING, 2.0)
     assert made.false_fault
     assert made.proposed is not None
     assert 1.0 < made.proposed < 3.0
     assert made.settings() == {"response_time": made.proposed}
     assert "would report a wheel fault" in made.sentences()[0]
-    assert not found(REVERSING, 2.0, response_time=made.proposed).false_fault
+    assert not measured_response(REVERSING, 2.0, response_time=made.proposed).false_fault
 
 
 @pytest.mark.parametrize("seconds", [1.0, 1.1, 1.2, 1.3, 1.4])
 def test_the_proposed_response_time_is_at_least_the_one_that_fits_best(seconds: float) -> None:
-    made = found(REVERSING, seconds, fault_time=0.3)
+    made = measured_response(REVERSING, seconds, fault_time=0.3)
     assert made.proposed is not None
     assert made.proposed >= made.seconds
 
@@ -110,15 +112,15 @@ def test_if_no_response_time_leaves_a_reserve_the_sentence_names_the_fault_time(
 
 
 def test_a_response_time_that_causes_no_fault_is_one_sentence() -> None:
-    made = found(GUIDED, 0.05)
+    made = measured_response(GUIDED, 0.05)
     assert made.settings() == {}
     (sentence,) = made.sentences()
     assert "feedback.response_time = 0.2 s differs, but causes no fault in this log" in sentence
-    assert found(REVERSING, 2.0, fault_time=0.0).settings() == {}
+    assert measured_response(REVERSING, 2.0, fault_time=0.0).settings() == {}
 
 
 def test_wheels_that_stay_below_their_commands_show_their_highest_speed() -> None:
-    made = found(GUIDED, 0.1, 6.0)
+    made = measured_response(GUIDED, 0.1, 6.0)
     assert made.fastest == pytest.approx(6.0, rel=0.02)
     assert made.seconds == pytest.approx(0.1, rel=0.3)
     assert "write limits.wheel_speed = 6" in made.sentences()[1]

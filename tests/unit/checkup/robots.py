@@ -68,7 +68,7 @@ class Robot(VirtualWire):
         """
         with self.faulty(), Board(self, self.config.mcu, self.config.rate_hz) as board:
             if rest:
-                board.rest()
+                board.stop_motors()
                 board.armed = True
             yield board
 

@@ -43,7 +43,7 @@ def test_driving_returns_a_reply_to_every_line_with_the_measured_speeds() -> Non
         assert replies[-1].motors[0] == pytest.approx(SPEED, abs=0.2)
         assert replies[-1].motors[1:] == (0.0, 0.0, 0.0)
         assert board.turning() == [0]
-        board.rest()
+        board.stop_motors()
         assert board.turning() == []
 
 
@@ -63,7 +63,7 @@ def test_a_last_motor_that_keeps_its_speed_is_stopped_by_the_other_comma(sent: b
         board.comma = True
         board.drive((0.0, 0.0, 0.0, SPEED), 0.3)
         board.comma = sent
-        board.rest()
+        board.stop_motors()
         assert board.latched is not sent
         assert board.comma
     assert robot.later() == [0.0] * 4
@@ -80,7 +80,7 @@ def test_a_motor_that_zeros_do_not_stop_ends_the_check() -> None:
     with robot.board() as board:
         board.drive((SPEED, 0.0, 0.0, 0.0), 0.3)
         with pytest.raises(StoppedError) as end:
-            board.rest()
+            board.stop_motors()
         sent = len(robot.sent)
     assert end.value.finding.name == "stop"
     assert f"{2 * MOTOR_TIMEOUT_S:g} s" in end.value.finding.figure
@@ -100,7 +100,7 @@ def test_a_message_names_the_motors_that_turn_after_the_second_attempt_to_stop()
             return [(until_ns, f"ap03.00,{b},cp00.00,dp00.00\r\n".encode())]
 
     with Board(Blocked("mute"), McuConfig(), 100.0) as board, pytest.raises(StoppedError) as end:
-        board.rest()
+        board.stop_motors()
     assert end.value.finding.name == "stop"
     assert "motor a (front right)" in end.value.finding.text
     assert "motor b" not in end.value.finding.text
@@ -111,7 +111,7 @@ def test_a_board_that_falls_silent_while_its_motors_must_stop_is_reported_as_sil
     with robot.board() as board:
         board.drive((SPEED, 0.0, 0.0, 0.0), 0.3)
         with robot.mcu.mute(), pytest.raises(StoppedError) as end:
-            board.rest()
+            board.stop_motors()
         assert not board.runaway_seen
         assert board.silent_s == pytest.approx(2 * MOTOR_TIMEOUT_S, abs=0.1)
     assert end.value.finding.name == "link"
@@ -129,7 +129,7 @@ def test_a_board_that_ignores_lines_with_the_other_ending_is_not_reported_as_sil
             return [(until_ns, line)] if until_ns < MOTOR_TIMEOUT_S * 1e9 else []
 
     with Board(Picky("mute"), McuConfig(), 100.0) as board, pytest.raises(StoppedError) as end:
-        board.rest()
+        board.stop_motors()
     assert end.value.finding.name == "stop"
     assert "motor a (front right)" in end.value.finding.text
 
@@ -177,7 +177,7 @@ def test_short_drives_without_a_reply_add_up_unless_a_reply_arrives_between_them
         for _ in range(10):
             with robot.mcu.mute():
                 board.drive(ZERO, 0.2)
-            board.ask()
+            board.send_zero()
         with robot.mcu.mute():
             for _ in range(2):
                 board.drive(ZERO, 0.14)
@@ -196,7 +196,7 @@ def test_the_check_waits_for_wheels_that_slow_down_and_blames_no_comma(sent: boo
     with robot.board() as board:
         board.drive((0.0, 0.0, 0.0, SPEED), 3.0)
         began_s = board.now_s
-        board.rest()
+        board.stop_motors()
         assert not board.latched
         assert board.comma is sent
         assert MOTOR_TIMEOUT_S < board.now_s - began_s < SLOWING_TIMEOUT_S
@@ -208,7 +208,7 @@ def test_the_wait_for_wheels_that_slow_down_has_an_end() -> None:
     with robot.board() as board:
         board.drive((0.0, 0.0, 0.0, SPEED), 4.0)
         began = robot.now_ns()
-        board.rest()  # the second wait succeeds
+        board.stop_motors()  # the second wait succeeds
         assert SLOWING_TIMEOUT_S * 1e9 < robot.now_ns() - began < 2 * SLOWING_TIMEOUT_S * 1e9
         assert not board.latched
         assert not board.comma

@@ -54,17 +54,17 @@ def test_the_summary_counts_the_verdicts_and_has_the_lines_of_toml() -> None:
     assert "nothing to change" in summary(report("sim", [RATE], {}, "", ""), "acsard.toml")
 
 
-def found(**keys: object) -> list[Finding]:
+def findings_for(**keys: object) -> list[Finding]:
     return [Finding(k, "PASS", keys={f"mcu.{k}": v}) for k, v in keys.items()]
 
 
 def test_only_settings_that_differ_are_proposed() -> None:
-    findings = found(baud_rate=115200, trailing_comma=True, reply_period=0.0)
+    findings = findings_for(baud_rate=115200, trailing_comma=True, reply_period=0.0)
     assert checkup_report.changes(findings, Config()) == {"mcu.trailing_comma": True}
 
 
 def test_longer_lines_are_not_proposed_if_the_wire_has_no_room() -> None:
-    wanted = found(link_check="auto", encoder_counts=3200)
+    wanted = findings_for(link_check="auto", encoder_counts=3200)
     assert len(checkup_report.changes(wanted, Config())) == 2
     slow = configured(Config(), baud_rate=57600)
     assert checkup_report.changes(wanted, slow) == {"mcu.link_check": "auto"}
@@ -73,7 +73,7 @@ def test_longer_lines_are_not_proposed_if_the_wire_has_no_room() -> None:
 
 
 def test_a_slow_wire_also_changes_the_control_rate() -> None:
-    keys = checkup_report.changes(found(baud_rate=9600, link_check="auto"), Config())
+    keys = checkup_report.changes(findings_for(baud_rate=9600, link_check="auto"), Config())
     assert keys == {"mcu.baud_rate": 9600, "control.rate": "auto"}
     config = checkup_report.applied(keys, Config())
     assert config is not None
@@ -82,8 +82,8 @@ def test_a_slow_wire_also_changes_the_control_rate() -> None:
 
 def test_settings_in_use_are_not_removed() -> None:
     text = b'[mcu]\nlink_check = "require"\nencoder_counts = 3200\n'
-    keys = checkup_report.changes(found(baud_rate=38400, link_check="require", encoder_counts=3200),
-                          parse(text))  # fmt: skip
+    findings = findings_for(baud_rate=38400, link_check="require", encoder_counts=3200)
+    keys = checkup_report.changes(findings, parse(text))
     assert keys == {"mcu.baud_rate": 38400, "control.rate": "auto"}
 
 
@@ -92,7 +92,7 @@ def test_a_value_that_its_key_does_not_accept_is_refused() -> None:
 
 
 def test_the_port_at_which_a_board_answered_is_proposed() -> None:
-    assert checkup_report.changes(found(trailing_comma=True), Config(), "/dev/one") == {
+    assert checkup_report.changes(findings_for(trailing_comma=True), Config(), "/dev/one") == {
         "mcu.trailing_comma": True
     }
     answered = [Finding("baud rate", "PASS", keys={"mcu.baud_rate": 115200})]

@@ -58,7 +58,7 @@ def test_configured_counts_pass_unless_they_differ_from_the_identified_counts(
             identity(board)
         for motor in range(4):
             turn(board, motor, 3.0)
-            board.rest()
+            board.stop_motors()
         finding = encoder_counts.finding(board, [0, 1, 2, 3])
     assert (finding.verdict, finding.keys) == (verdict, keys)
 
@@ -68,7 +68,7 @@ def test_coarse_encoders_without_configured_counts_are_a_warning(counts: int) ->
     with Robot(config=Config(sim=SimConfig(encoder_counts=counts))).board() as board:
         for motor in range(4):
             turn(board, motor, 3.0)
-            board.rest()
+            board.stop_motors()
         finding = encoder_counts.finding(board, [0, 1, 2, 3])
     assert (finding.verdict, finding.keys) == ("WARN", {})
     assert "write mcu.encoder_counts" in finding.mend

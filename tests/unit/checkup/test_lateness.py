@@ -24,7 +24,7 @@ from tests.unit.checkup.robots import Busy, Robot, Starved
 def test_the_largest_lateness_since_a_time_is_reported() -> None:
     lateness = Lateness()
     for late_s, now_s in ((0.3, 1.0), (0.02, 2.0), (0.05, 3.0), (MIN_DELAY_S / 2, 4.0)):
-        lateness.look(late_s, now_s)
+        lateness.record(late_s, now_s)
     assert [lateness.since(s) for s in (0.0, 1.0, 1.5, 3.0, 3.5)] == [0.3, 0.3, 0.05, 0.05, 0.0]
 
 
@@ -79,7 +79,7 @@ def test_the_time_to_ask_a_person_is_not_lateness() -> None:
     robot = Robot()
     with robot.board() as board:
         board.drive((0.0, 0.0, 0.0, 3.0), 0.3)
-        board.rest()
+        board.stop_motors()
         robot.listen(robot.now_ns() + 20_000_000_000)
         board.drive((0.0, 0.0, 0.0, 3.0), 0.3)
         assert board.lateness.since(0.0) == 0.0

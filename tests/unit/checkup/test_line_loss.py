@@ -14,7 +14,7 @@ from acsard.core.config.settings import Config, SimConfig
 from tests.unit.checkup.robots import Checked, Nobody, Robot, check, configured
 
 
-def known(board: Board) -> None:
+def run_earlier_steps(board: Board) -> None:
     """Run the steps of the check that come before the count of lost lines."""
     for step in (dialect.baud, dialect.rate, dialect.check):
         step(board)
@@ -38,7 +38,7 @@ def test_lost_lines_are_counted_and_other_reply_styles_are_not_losses(
     faults: tuple[str, ...], outcome: str, share: float
 ) -> None:
     with Robot(*faults).board() as board:
-        known(board)
+        run_earlier_steps(board)
         finding = line_loss.finding(board)
         assert finding.verdict == outcome
         assert board.lost == pytest.approx(share, abs=0.03)
@@ -51,14 +51,14 @@ def test_a_loss_of_more_than_two_percent_fails(way: str, every: int, verdict: st
     robot = Robot()
     setattr(robot.mcu, way, every)
     with robot.board() as board:
-        known(board)
+        run_earlier_steps(board)
         assert line_loss.finding(board).verdict == verdict
 
 
 @pytest.mark.parametrize("baud", [9600, 19200])
 def test_a_slow_wire_loses_nothing(baud: int) -> None:
     with Robot(config=configured(Config(), baud_rate=baud)).board() as board:
-        known(board)
+        run_earlier_steps(board)
         assert (line_loss.finding(board).verdict, board.lost) == ("PASS", 0.0)
 
 
@@ -75,7 +75,7 @@ def test_a_board_whose_plain_lines_arrive_damaged_ends_the_check_before_motors_t
 
     robot = Noisy("plain_only")
     with robot.board() as board:
-        known(board)
+        run_earlier_steps(board)
         with pytest.raises(StoppedError) as end:
             line_loss.finding(board)
     assert "arrived damaged from the board, the last one is `" in end.value.finding.text
@@ -85,7 +85,7 @@ def test_a_board_whose_plain_lines_arrive_damaged_ends_the_check_before_motors_t
 
 def test_a_silence_is_reported_as_a_silence() -> None:
     with Robot("stalls=1:0.2").board() as board:
-        known(board)
+        run_earlier_steps(board)
         finding = line_loss.finding(board)
     assert finding.verdict == "WARN"
     assert "but nothing arrived for" in finding.figure
@@ -104,7 +104,7 @@ def test_a_link_that_loses_lines_proposes_no_counts(fault: str) -> None:
 ALL = [0, 1, 2, 3]
 
 
-def found(board: Board, motors: list[int], lost: float = 0.2) -> Finding | None:
+def line_loss_finding(board: Board, motors: list[int], lost: float = 0.2) -> Finding | None:
     board.lost = lost
     return line_loss.direction(board, Nobody(), motors)
 
@@ -164,7 +164,7 @@ def test_slow_motors_and_coarse_encoders_do_not_blame_the_wrong_direction(
 ) -> None:
     config = Config(sim=SimConfig(motor_time_constant=lag, encoder_counts=per_turn))
     with Robot(fault, config=config).board() as board:
-        finding = found(board, ALL)
+        finding = line_loss_finding(board, ALL)
         assert finding is not None
         assert finding.verdict == "SKIPPED" or f"the lead from {right}" in finding.mend
         assert not board.turning()
@@ -172,7 +172,7 @@ def test_slow_motors_and_coarse_encoders_do_not_blame_the_wrong_direction(
 
 def test_without_a_motor_that_turns_the_lossy_direction_is_skipped() -> None:
     with Robot("lost_replies").board() as board:
-        finding = found(board, [])
+        finding = line_loss_finding(board, [])
     assert finding is not None
     assert finding.verdict == "SKIPPED"
 
@@ -180,13 +180,13 @@ def test_without_a_motor_that_turns_the_lossy_direction_is_skipped() -> None:
 def test_if_no_lines_are_lost_no_motor_turns() -> None:
     robot = Robot()
     with robot.board() as board:
-        assert found(board, ALL, line_loss.MAX_LOSS) is None
+        assert line_loss_finding(board, ALL, line_loss.MAX_LOSS) is None
     assert robot.mcu.vehicle.angles == [0.0] * 4
 
 
 def test_the_test_of_the_lossy_direction_leaves_no_motor_turning() -> None:
     robot = Robot("lost_commands", "no_watchdog")
     with robot.board() as board:
-        assert found(board, ALL) is not None
+        assert line_loss_finding(board, ALL) is not None
         assert not board.turning()
     assert not any(robot.later())

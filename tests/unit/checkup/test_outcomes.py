@@ -14,7 +14,7 @@ from tests.each import each
 
 @each("outcome", OUTCOMES_BY_NAME)
 def test_every_outcome_has_complete_texts(outcome: str) -> None:
-    finding = find(outcome, {"mcu.baud_rate": 9600}, **dict.fromkeys(SEEN, Seen()))
+    finding = find(outcome, {"mcu.baud_rate": 9600}, **dict.fromkeys(SEEN, AnyObservation()))
     assert finding.name == outcome.partition(":")[0]
     assert finding.keys == {"mcu.baud_rate": 9600}
     assert not {"{", "}", "  ", "->"} & {*finding.figure, *finding.text.split(" "), *finding.mend}
@@ -24,7 +24,7 @@ def test_every_outcome_has_complete_texts(outcome: str) -> None:
         assert finding.mend or outcome in ("encoder counts: many", "wheels: not lifted")
 
 
-class Seen(float):
+class AnyObservation(float):
     """A stand-in for any observation: a number or words."""
 
     def __format__(self, how: str) -> str:

@@ -172,9 +172,9 @@ def test_a_board_that_does_not_come_back_is_reported() -> None:
     ],
 )
 def test_the_boot_cause_that_the_board_states_decides_the_remedy(cause: str, mend: str) -> None:
-    restarts = heard(reply(0.0, 0))
+    restarts = detector_after(reply(0.0, 0))
     name = NAME + b" trips=0 reset=" + cause.encode()
-    restart = restarts.look(name, 9.0, None)
+    restart = restarts.check_line(name, 9.0, None)
     assert restart is not None
     assert restart.cause == cause
     result = finding(Config().mcu, [restart])
@@ -191,11 +191,11 @@ def reply(at_s: float, mcu_ms: int) -> Reply:
     return Reply(at_s, ZERO, b"", Reading(mcu_ms % CLOCK_RANGE_MS, (0, 0, 0, 0)))
 
 
-def heard(*replies: Reply) -> Restarts:
+def detector_after(*replies: Reply) -> Restarts:
     """Return a restart detector that has received these replies."""
     restarts = Restarts()
     for answer in replies:
-        assert restarts.look(b"", answer.at_s, answer) is None
+        assert restarts.check_line(b"", answer.at_s, answer) is None
     return restarts
 
 
@@ -204,28 +204,28 @@ def sign(restart: Restart | None) -> str:
 
 
 def test_the_name_sent_when_the_port_was_opened_is_not_a_restart() -> None:
-    assert Restarts().look(NAME, 2.0, None) is None
+    assert Restarts().check_line(NAME, 2.0, None) is None
 
 
 def test_the_name_of_the_board_is_a_restart_unless_it_was_requested() -> None:
-    restarts = heard(reply(0.0, 0))
-    restarts.asked(1.0)
-    assert restarts.look(NAME, 1.0 + ANSWER_TIMEOUT_S, None) is None
+    restarts = detector_after(reply(0.0, 0))
+    restarts.record_request(1.0)
+    assert restarts.check_line(NAME, 1.0 + ANSWER_TIMEOUT_S, None) is None
     assert (
-        sign(restarts.look(NAME, 1.1 + ANSWER_TIMEOUT_S, None))
+        sign(restarts.check_line(NAME, 1.1 + ANSWER_TIMEOUT_S, None))
         == "the board sent its name without a request"
     )
 
 
 def test_a_text_is_a_restart_after_a_silence_and_a_debug_print_otherwise() -> None:
-    restarts = heard(reply(0.0, 0))
+    restarts = detector_after(reply(0.0, 0))
     for _ in range(RESTART_UNANSWERED_LINES - 1):
-        restarts.sent(ZERO, 0.0)
-    assert restarts.look(TEXT, 0.1, None) is None
-    restarts.sent(ZERO, 0.1)
+        restarts.record_speeds(ZERO, 0.0)
+    assert restarts.check_line(TEXT, 0.1, None) is None
+    restarts.record_speeds(ZERO, 0.1)
     # a damaged line is not taken for text
-    assert restarts.look(b"ap0\x00.00,b~p00.00#0AFFE", 0.2, None) is None
-    assert "text" in sign(restarts.look(TEXT, 0.2, None))
+    assert restarts.check_line(b"ap0\x00.00,b~p00.00#0AFFE", 0.2, None) is None
+    assert "text" in sign(restarts.check_line(TEXT, 0.2, None))
 
 
 @each("start_ms", [0, 40_000, CLOCK_RANGE_MS - 5_000])
@@ -234,37 +234,39 @@ def test_a_clock_that_continues_is_not_a_restart_at_any_pace_or_at_its_overflow(
     start_ms: int, clock: float
 ) -> None:
     times = [n * 0.3 for n in range(100)]
-    heard(*(reply(t, round(start_ms + 1000 * clock * t)) for t in times))
+    detector_after(*(reply(t, round(start_ms + 1000 * clock * t)) for t in times))
 
 
 def test_replies_that_were_held_up_and_arrive_together_are_not_a_restart() -> None:
     late = [reply(1.5 + n / 1000, 100 + 100 * n) for n in range(14)]
-    heard(reply(0.0, 0), *late, reply(1.6, 1600))
+    detector_after(reply(0.0, 0), *late, reply(1.6, 1600))
     assert CLOCK_TOLERANCE_S > 1.5
 
 
 @pytest.mark.parametrize("before_ms", [3_000, 20_000, 40_000, CLOCK_RANGE_MS - 1])
 def test_a_clock_that_restarted_is_a_restart_of_the_board(before_ms: int) -> None:
-    restarts = heard(reply(10.0, before_ms))
+    restarts = detector_after(reply(10.0, before_ms))
     again = reply(12.1, 100)
     gone_ms = (100 - before_ms) % CLOCK_RANGE_MS
-    assert ("started again" in sign(restarts.look(b"", again.at_s, again))) == (gone_ms > 4100)
+    assert ("started again" in sign(restarts.check_line(b"", again.at_s, again))) == (
+        gone_ms > 4100
+    )
 
 
 def test_a_restart_has_the_last_turning_command_and_the_time_since_the_last_line() -> None:
-    restarts = heard(reply(10.0, 0))
-    restart = restarts.look(NAME, 20.0, None)
+    restarts = detector_after(reply(10.0, 0))
+    restart = restarts.check_line(NAME, 20.0, None)
     assert restart is not None
     assert (restart.turned, restart.silent_s) == (ZERO, 0.0)
-    restarts.sent((3.0, 0.0, 0.0, 0.0), 10.1)
-    restarts.sent(ZERO, 11.0)
-    restart = restarts.look(NAME, 11.5, None)
+    restarts.record_speeds((3.0, 0.0, 0.0, 0.0), 10.1)
+    restarts.record_speeds(ZERO, 11.0)
+    restart = restarts.check_line(NAME, 11.5, None)
     assert restart is not None
     assert restart.turned == (3.0, 0.0, 0.0, 0.0)
     assert restart.silent_s == pytest.approx(0.9)
 
 
 def test_restarts_after_the_end_of_the_check_are_not_reported() -> None:
-    restarts = heard(reply(0.0, 0))
+    restarts = detector_after(reply(0.0, 0))
     restarts.watched = False
-    assert restarts.look(NAME, 9.0, None) is None
+    assert restarts.check_line(NAME, 9.0, None) is None

@@ -36,7 +36,7 @@ def turned(robot: Robot) -> Iterator[Board]:
         dialect.check(board)
         for motor in ALL:
             turn(board, motor, 3.0)
-            board.rest()
+            board.stop_motors()
         yield board
         assert board.turning() == []
 
@@ -176,7 +176,7 @@ def test_motors_that_turn_alone_but_not_together_end_the_check() -> None:
     with robot.board() as board:
         robot.mcu.understand = gives_in
         assert turn(board, 0, 3.0)[0][0] == pytest.approx(3.0, abs=0.1)
-        board.rest()
+        board.stop_motors()
         with pytest.raises(StoppedError) as end:
             run(board, ALL, 0.0)
     assert "not together" in end.value.finding.text

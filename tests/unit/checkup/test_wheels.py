@@ -17,7 +17,7 @@ from tests.unit.checkup.robots import Robot
 MCU = McuConfig()
 
 
-def seen(motor: int, encoder: int, forth: float = 3.0, back: float = -3.0) -> Channel:
+def channel_of(motor: int, encoder: int, forth: float = 3.0, back: float = -3.0) -> Channel:
     def speeds(value: float) -> Motors:
         a, b, c, d = (value if index == encoder else 0.0 for index in range(4))
         return a, b, c, d
@@ -28,19 +28,19 @@ def seen(motor: int, encoder: int, forth: float = 3.0, back: float = -3.0) -> Ch
 @each(
     ("channel", "kind"),
     [
-        (seen(0, 0), "right"),
-        (seen(0, 0, 3.1, -2.9), "right"),
-        (seen(0, 0, 3.7, -2.3), "off"),
-        (seen(0, 0, 2.4, -2.4), "off"),
-        (seen(0, 0, 2.9, -3.2), "off"),
-        (seen(0, 0, 4.0, -3.0), "size"),
-        (seen(0, 0, 2.0, -2.0), "size"),
-        (seen(0, 0, -3.0, 3.0), "reversed"),
-        (seen(0, 0, 3.0, 3.0), "size"),
-        (seen(0, 0, 0.0, 0.0), "dead"),
-        (seen(0, 0, 3.0, 0.0), "one way"),
-        (seen(0, 2), "other"),
-        (seen(0, 2, -3.0, 3.0), "other"),
+        (channel_of(0, 0), "right"),
+        (channel_of(0, 0, 3.1, -2.9), "right"),
+        (channel_of(0, 0, 3.7, -2.3), "off"),
+        (channel_of(0, 0, 2.4, -2.4), "off"),
+        (channel_of(0, 0, 2.9, -3.2), "off"),
+        (channel_of(0, 0, 4.0, -3.0), "size"),
+        (channel_of(0, 0, 2.0, -2.0), "size"),
+        (channel_of(0, 0, -3.0, 3.0), "reversed"),
+        (channel_of(0, 0, 3.0, 3.0), "size"),
+        (channel_of(0, 0, 0.0, 0.0), "dead"),
+        (channel_of(0, 0, 3.0, 0.0), "one way"),
+        (channel_of(0, 2), "other"),
+        (channel_of(0, 2, -3.0, 3.0), "other"),
         (Channel(1, (3.0, 3.0, 0.0, 0.0), (-3.0, -3.0, 0.0, 0.0)), "several"),
         (Channel(1, (3.0, 0.0, 0.0, 0.0), (0.0, -3.0, 0.0, 0.0)), "several"),
     ],
@@ -55,38 +55,43 @@ def test_the_speeds_of_the_encoders_decide_the_kind_and_verdict_of_a_motor(
 
 
 def test_a_swapped_encoder_that_counts_back_is_also_called_reversed() -> None:
-    assert "reversed" in encoder_finding(MCU, seen(0, 1, -3.0, 3.0)).text
-    assert "reversed" not in encoder_finding(MCU, seen(0, 1)).text
+    assert "reversed" in encoder_finding(MCU, channel_of(0, 1, -3.0, 3.0)).text
+    assert "reversed" not in encoder_finding(MCU, channel_of(0, 1)).text
 
 
 def test_findings_name_the_configured_wheel_of_a_motor() -> None:
     mcu = McuConfig(wheels=WheelMap("-d", "+b", "+c", "+a"))
-    assert encoder_finding(mcu, seen(0, 0)).name == "motor a (rear right)"
-    assert encoder_finding(mcu, seen(3, 3)).name == "motor d (front right)"
+    assert encoder_finding(mcu, channel_of(0, 0)).name == "motor a (rear right)"
+    assert encoder_finding(mcu, channel_of(3, 3)).name == "motor d (front right)"
 
 
 def test_a_map_needs_a_person_for_every_motor() -> None:
-    channels = [Channel(m, seen(m, m).forth, seen(m, m).back, WHEELS[m]) for m in range(4)]
+    channels = [
+        Channel(m, channel_of(m, m).forth, channel_of(m, m).back, WHEELS[m]) for m in range(4)
+    ]
     assert wheel_map(MCU, channels).verdict == "PASS"
-    assert wheel_map(MCU, [*channels[:3], seen(3, 3)]).verdict == "SKIPPED"
+    assert wheel_map(MCU, [*channels[:3], channel_of(3, 3)]).verdict == "SKIPPED"
 
 
 def test_a_wheel_that_was_seen_for_two_motors_fails_the_wheel_map() -> None:
-    channels = [Channel(m, seen(m, m).forth, seen(m, m).back, WHEELS[min(m, 2)]) for m in range(4)]
+    channels = [
+        Channel(m, channel_of(m, m).forth, channel_of(m, m).back, WHEELS[min(m, 2)])
+        for m in range(4)
+    ]
     finding = wheel_map(MCU, channels)
     assert (finding.verdict, finding.keys) == ("FAIL", {})
     assert "rear left" in finding.text
 
 
 def test_a_motor_a_fifth_weak_is_reported_with_its_share() -> None:
-    finding = encoder_finding(MCU, seen(2, 2, 2.4, -2.45))
+    finding = encoder_finding(MCU, channel_of(2, 2, 2.4, -2.45))
     assert "20% slower than the commanded 3 rad/s" in finding.text
-    assert "faster" in encoder_finding(MCU, seen(2, 2, 3.3, -3.3)).text
+    assert "faster" in encoder_finding(MCU, channel_of(2, 2, 3.3, -3.3)).text
     assert "turn freely" in finding.mend
 
 
 def test_the_uncertainty_of_a_coarse_encoder_is_not_blamed_on_the_motor() -> None:
-    channel = seen(0, 0, 3.0, -2.75)
+    channel = channel_of(0, 0, 3.0, -2.75)
     assert channel.kind == "off"
     assert structs.replace(channel, unsure=0.05).kind == "right"
 

@@ -181,7 +181,7 @@ def test_every_key_that_run_can_set_has_the_name_of_its_option() -> None:
         assert known.parse_args(["run", OPTIONS[key], "1"])
 
 
-def asked(
+def address_of(
     config: Path,
     connect: str | None = None,
     robot_id: str | None = None,
@@ -196,20 +196,20 @@ def test_a_tool_talks_to_the_robot_of_the_configuration(places: Places) -> None:
     places.option.write_text(
         '[robot]\nid = "r7"\n[bus]\nlisten = ["tcp/[::1]:9", "tcp/127.0.0.1:8"]\n'
     )
-    assert asked(places.option) == ("tcp/[::1]:9", "r7", "")
+    assert address_of(places.option) == ("tcp/[::1]:9", "r7", "")
 
 
 def test_the_options_of_a_tool_win_over_the_configuration(places: Places) -> None:
     places.fill()
-    assert asked(places.option, "tcp/10.0.0.1:1", "r8") == ("tcp/10.0.0.1:1", "r8", "")
-    assert asked(places.option, robot_id="r8") == ("tcp/127.0.0.1:7448", "r8", "")
+    assert address_of(places.option, "tcp/10.0.0.1:1", "r8") == ("tcp/10.0.0.1:1", "r8", "")
+    assert address_of(places.option, robot_id="r8") == ("tcp/127.0.0.1:7448", "r8", "")
 
 
 def test_a_tool_connects_to_the_router_of_a_daemon_in_client_mode(places: Places) -> None:
     places.option.write_text(
         '[bus]\nmode = "client"\nlisten = ["tcp/127.0.0.1:8"]\nconnect = ["tcp/127.0.0.1:7447"]\n'
     )
-    assert asked(places.option)[0] == "tcp/127.0.0.1:7447"
+    assert address_of(places.option)[0] == "tcp/127.0.0.1:7447"
 
 
 def test_a_certificate_goes_with_a_tls_endpoint_only(
@@ -218,11 +218,11 @@ def test_a_certificate_goes_with_a_tls_endpoint_only(
     places.option.write_text(
         '[bus]\nlisten = ["tls/0.0.0.0:7449", "tcp/127.0.0.1:8"]\ntls = "/etc/acsard/tls"\n'
     )
-    assert asked(places.option) == ("tcp/127.0.0.1:8", "acsar", "")
-    assert asked(places.option, "tls/robot:7449")[2] == "/etc/acsard/tls"
+    assert address_of(places.option) == ("tcp/127.0.0.1:8", "acsar", "")
+    assert address_of(places.option, "tls/robot:7449")[2] == "/etc/acsard/tls"
     monkeypatch.setenv("ACSARD_TLS", "/home/a")
-    assert asked(places.option, "tls/robot:7449")[2] == "/home/a"
-    assert asked(places.option, "tls/robot:7449", tls="/home/b")[2] == "/home/b"
+    assert address_of(places.option, "tls/robot:7449")[2] == "/home/a"
+    assert address_of(places.option, "tls/robot:7449", tls="/home/b")[2] == "/home/b"
 
 
 def test_a_tool_without_an_address_is_refused(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from acsard.calibration.log_table import HEADER
 from acsard.cli import main
-from acsard.cli.echo import Quota, _print, _record, _shown
+from acsard.cli.echo import Quota, _message_text, _print, _record
 from acsard.cli.replies import json_line
 from acsard.core.messages.encodings import Decoder, Format, encode, encoding_name
 from acsard.core.messages.schema import (
@@ -157,14 +157,16 @@ def test_a_key_without_a_short_form_is_refused_with_those_that_have_one(
 def test_a_short_line_of_several_robots_begins_with_the_robot(form: Format, whose: str) -> None:
     twist = TwistStamped(Header(), Twist(Vector3(0.5), Vector3(z=0.2)))
     payload = encode(twist, form)
-    line = _shown(Decoder(TwistStamped), encoding_name(form, "TwistStamped"), payload, whose)
+    line = _message_text(Decoder(TwistStamped), encoding_name(form, "TwistStamped"), payload, whose)
     assert line == f"{whose}{': ' if whose else ''}forward +0.50 m/s  turn +0.20 rad/s"
 
 
 def test_a_message_without_a_short_form_is_shown_as_its_json() -> None:
     decoder = Decoder(TwistStamped)
-    assert _shown(decoder, "", b'{"a": 1}', "") == '{"a":1}'
-    assert msgspec.json.decode(_shown(decoder, "", b"\xff", "")) == {"undecodable": repr(b"\xff")}
+    assert _message_text(decoder, "", b'{"a": 1}', "") == '{"a":1}'
+    assert msgspec.json.decode(_message_text(decoder, "", b"\xff", "")) == {
+        "undecodable": repr(b"\xff")
+    }
 
 
 def test_a_message_that_does_not_fit_into_the_csv_log_is_left_out_and_reported_once_per_key(

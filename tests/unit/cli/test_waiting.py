@@ -79,7 +79,7 @@ def test_a_silence_that_ends_with_the_timeout_is_explained_before_it_ends(
     assert capsys.readouterr().err == "acsard: it is published only when it changes\n"
 
 
-def told(lines: int, capsys: pytest.CaptureFixture[str]) -> str:
+def wait_for_lines(lines: int, capsys: pytest.CaptureFixture[str]) -> str:
     """Wait until standard error has this many lines, and return its text."""
     output, end = "", time.monotonic() + 10.0
     while output.count("\n") < lines:
@@ -93,7 +93,7 @@ def test_each_silence_is_explained_once(capsys: pytest.CaptureFixture[str]) -> N
     with explained(lambda: "", lambda: "its certificate has ended", 0.01) as notify:
         for _ in range(2):
             notify()
-            assert told(1, capsys) == "acsard: its certificate has ended\n"
+            assert wait_for_lines(1, capsys) == "acsard: its certificate has ended\n"
     await_end()
     assert capsys.readouterr().err == ""
 
@@ -104,5 +104,5 @@ def test_a_silence_without_a_found_cause_is_diagnosed_again(
     causes = iter(["", "", "the way to it is cut"])
     with explained(lambda: "", lambda: next(causes), 0.001) as notify:
         notify()
-        assert told(1, capsys) == "acsard: the way to it is cut\n"
+        assert wait_for_lines(1, capsys) == "acsard: the way to it is cut\n"
     await_end()

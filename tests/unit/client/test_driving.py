@@ -91,7 +91,7 @@ class World:
         self.stored = self._sample()
         return self.stored
 
-    def ask(self, name: str, take: Any) -> None:
+    def start_query(self, name: str, take: Any) -> None:
         self.asked += 1
         sample = self._sample() if self.now - 100.0 < self.dies else self.stored
         if self.answers and sample is not None:
@@ -191,7 +191,7 @@ def test_an_answer_of_another_thread_is_processed_on_the_driving_thread(
         thread.start()
         thread.join()
 
-    monkeypatch.setattr(world, "ask", ask)
+    monkeypatch.setattr(world, "start_query", ask)
     world.drive(monkeypatch)
     assert readers == {get_ident()}
 

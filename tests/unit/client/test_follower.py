@@ -29,7 +29,7 @@ def at(sec: int) -> RobotState:
     return replace(STATE, stamp=Time(sec))
 
 
-def asked(follower: Follower, since: float, until: float) -> list[float]:
+def query_times(follower: Follower, since: float, until: float) -> list[float]:
     """Return the times at which the follower queries the state."""
     times = [since + n * TICK for n in range(round((until - since) / TICK))]
     return [now for now in times if follower.query_is_due(now)]
@@ -46,12 +46,12 @@ def test_the_age_of_a_state_is_the_time_since_its_arrival() -> None:
 def test_a_robot_that_publishes_often_is_never_queried() -> None:
     follower = Follower(0.0)
     for n in range(100):
-        assert not asked(follower, n / 10, (n + 1) / 10)
+        assert not query_times(follower, n / 10, (n + 1) / 10)
         follower.published(at(n), (n + 1) / 10)
 
 
 def test_a_robot_that_rarely_publishes_is_queried_at_even_intervals() -> None:
-    times = asked(Follower(0.0), 0.0, 10.0)
+    times = query_times(Follower(0.0), 0.0, 10.0)
     assert times == pytest.approx(
         [QUERY_PERIOD_S * n for n in range(1, len(times) + 1)], abs=10 * TICK
     )
@@ -71,7 +71,7 @@ def test_a_robot_that_is_rarely_queried_is_not_silent_between_its_answers() -> N
     follower, now = Follower(0.0, FLEET_QUERY_PERIOD_S), 0.0
     follower.published(at(1), now)
     for sec in range(2, 10):
-        (now,) = asked(follower, now, now + 1.5 * FLEET_QUERY_PERIOD_S)
+        (now,) = query_times(follower, now, now + 1.5 * FLEET_QUERY_PERIOD_S)
         now += 0.5
         assert not follower.silent(now)
         assert follower.answered(at(sec), now)
@@ -139,7 +139,7 @@ class Robot:
     def _end(self) -> None:
         self.followed = False
 
-    def ask(self, name: str, take: Any) -> None:
+    def start_query(self, name: str, take: Any) -> None:
         assert name == "state"
         if self.answer is not None:
             take(self.answer)
@@ -152,8 +152,8 @@ def test_the_states_that_arrived_are_returned_in_order() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.extend(map(sample_of, (at(1), at(2))))
-    assert watch.look(0.1) == [at(1), at(2)]
-    assert watch.look(0.2) == []
+    assert watch.poll(0.1) == [at(1), at(2)]
+    assert watch.poll(0.2) == []
     assert watch.age(0.2) == 0.1
 
 
@@ -161,11 +161,11 @@ def test_a_state_published_after_the_answer_replaces_the_answer() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.append(sample_of(at(1)))
-    watch.look(0.0)
+    watch.poll(0.0)
     robot.answer = sample_of(at(2))
-    watch.look(QUERY_PERIOD_S + 0.1)
+    watch.poll(QUERY_PERIOD_S + 0.1)
     robot.queue.append(sample_of(at(3)))
-    assert watch.look(QUERY_PERIOD_S + 0.2) == [at(3)]
+    assert watch.poll(QUERY_PERIOD_S + 0.2) == [at(3)]
     assert watch.state == at(3)
 
 
@@ -173,21 +173,21 @@ def test_a_state_that_was_published_before_the_answer_comes_first() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.append(sample_of(at(1)))
-    watch.look(0.0)
+    watch.poll(0.0)
     robot.answer = sample_of(at(3))
-    watch.look(QUERY_PERIOD_S + 0.1)
+    watch.poll(QUERY_PERIOD_S + 0.1)
     robot.queue.append(sample_of(at(2)))
-    assert watch.look(QUERY_PERIOD_S + 0.2) == [at(2), at(3)]
+    assert watch.poll(QUERY_PERIOD_S + 0.2) == [at(2), at(3)]
 
 
 def test_unreadable_messages_are_counted_until_a_readable_one_arrives() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.extend([UNREADABLE] * 3)
-    assert watch.look(0.0) == []
+    assert watch.poll(0.0) == []
     assert watch.unreadable == 3
     robot.queue.append(sample_of(at(1)))
-    watch.look(0.0)
+    watch.poll(0.0)
     assert watch.unreadable == 0
 
 
@@ -195,7 +195,7 @@ def test_a_flood_of_messages_does_not_block_the_caller() -> None:
     robot = Robot()
     watch = Watch(robot, 0.0)
     robot.queue.extend([UNREADABLE] * (MAX_QUEUED_SAMPLES + 7))
-    watch.look(0.0)
+    watch.poll(0.0)
     assert len(robot.queue) == 7
 
 
@@ -204,14 +204,14 @@ def test_commands_have_no_effect_on_a_daemon_that_is_silent_or_objects() -> None
     watch = Watch(robot, 0.0)
     assert watch.objection("app", STATE.sender, 0.0) == ""
     robot.queue.append(sample_of(STATE))
-    watch.look(0.0)
+    watch.poll(0.0)
     assert watch.objection("app", STATE.sender, 0.0) == ""
     assert "nothing received from the daemon" in watch.objection(
         "app", STATE.sender, ROBOT_SILENCE_TIMEOUT_S + 0.01
     )
     stopped = replace(STATE, mode="stopped", reason="stopped by request")
     robot.queue.append(sample_of(stopped))
-    watch.look(5.0)
+    watch.poll(5.0)
     assert watch.objection("app", STATE.sender, 5.0) == "stopped by request"
 
 

@@ -134,7 +134,7 @@ def guard() -> Guarded:
     return Guarded(STOP, 40.0, SOURCES)
 
 
-def sent(guard: Guarded, *wheels: float) -> Guarded:
+def guard_after_line(guard: Guarded, *wheels: float) -> Guarded:
     """Return a guard that has passed a line with these speeds, which was then sent."""
     data = line(*wheels)
     assert guard.check(outputs(data)) == data
@@ -155,7 +155,7 @@ def objection(guard: Guarded, result: Outputs) -> str:
 @pytest.mark.parametrize("linked", [True, False])
 @pytest.mark.parametrize("mode", ["inactive", "waiting", "ready", "driving", "stopped", "fault"])
 def test_zero_passes_always(guard: Guarded, mode: str, linked: bool) -> None:
-    sent(guard, 10.0)
+    guard_after_line(guard, 10.0)
     assert objection(guard, outputs(STOP, mode=mode, linked=linked, age_ms=None)) == ""
 
 
@@ -254,7 +254,7 @@ def test_a_wheel_at_its_limit_passes_however_the_limit_is_rounded(limit: float) 
 
 
 def test_without_a_link_even_a_slower_line_becomes_stop(guard: Guarded) -> None:
-    sent(guard, 10.0)
+    guard_after_line(guard, 10.0)
     assert objection(guard, outputs(line(1.0), linked=False)) == NO_LINK
     assert objection(guard, outputs(line(0.0, 0.0, 0.0, 0.01), linked=False)) == NO_LINK
 
@@ -268,14 +268,14 @@ def test_without_a_link_even_a_slower_line_becomes_stop(guard: Guarded) -> None:
 def test_without_a_command_no_wheel_may_speed_up_or_reverse(
     guard: Guarded, wheel: int, sign: float, before: float, speed: float
 ) -> None:
-    sent(guard, sign * before)
+    guard_after_line(guard, sign * before)
     speeds = [sign * min(9.0, before)] * 4
     speeds[wheel] = sign * speed
     assert objection(guard, coasting(line(*speeds))) == GROWS
 
 
 def test_a_wheel_at_rest_may_stay_at_rest_while_others_slow_down(guard: Guarded) -> None:
-    sent(guard, 5.0, 0.0, -5.0, 0.0)
+    guard_after_line(guard, 5.0, 0.0, -5.0, 0.0)
     assert objection(guard, coasting(line(4.0, 0.0, -4.0, 0.0))) == ""
 
 
@@ -314,40 +314,40 @@ def test_a_command_from_the_far_future_is_not_fresh(guard: Guarded) -> None:
 
 
 def test_the_next_line_is_not_compared_with_a_line_that_was_not_sent(guard: Guarded) -> None:
-    sent(guard, 5.0)
+    guard_after_line(guard, 5.0)
     assert objection(guard, outputs(line(6.0))) == ""  # passed but not sent
     assert objection(guard, coasting(line(6.0))) == GROWS
     assert objection(guard, coasting(line(5.0))) == ""
 
 
 def test_a_slower_line_that_was_not_sent_does_not_lower_the_allowed_speed(guard: Guarded) -> None:
-    sent(guard, 5.0)
+    guard_after_line(guard, 5.0)
     assert objection(guard, coasting(line(3.0))) == ""  # passed but not sent
     assert objection(guard, coasting(line(4.0))) == ""
 
 
 def test_each_sent_line_lowers_the_speed_that_the_next_line_may_have(guard: Guarded) -> None:
-    sent(guard, 5.0)
+    guard_after_line(guard, 5.0)
     assert objection(guard, coasting(line(3.0))) == ""
     guard.note_sent()
     assert objection(guard, coasting(line(3.01))) == GROWS
 
 
 def test_after_a_trip_the_last_sent_line_is_the_stop(guard: Guarded) -> None:
-    sent(guard, 5.0)
+    guard_after_line(guard, 5.0)
     assert objection(guard, coasting(line(6.0))) == GROWS
     guard.note_sent()
     assert objection(guard, coasting(line(1.0))) == GROWS
 
 
 def test_a_trip_whose_stop_was_not_sent_keeps_the_last_sent_line(guard: Guarded) -> None:
-    sent(guard, 5.0)
+    guard_after_line(guard, 5.0)
     assert objection(guard, coasting(line(6.0))) == GROWS
     assert objection(guard, coasting(line(4.0))) == ""
 
 
 def test_a_step_without_a_line_keeps_the_last_sent_line(guard: Guarded) -> None:
-    sent(guard, 5.0)
+    guard_after_line(guard, 5.0)
     assert guard.check(outputs(None)) is None
     assert objection(guard, coasting(line(5.0))) == ""
 

@@ -165,7 +165,7 @@ class Bench:
         assert answer.id == 7
         return answer
 
-    def said(self) -> WheelSpeeds | None:
+    def sent_speeds(self) -> WheelSpeeds | None:
         """Return the wheel speeds of the last sent line, or None if no line was sent."""
         return None if self.out.line is None else self.codec.decode(self.out.line.rstrip(b",\r\n"))
 

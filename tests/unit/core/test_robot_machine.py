@@ -154,13 +154,13 @@ class Books:
         self.wish, self.heard_ns, self.since_ns = REST, -(10**15), 0
         self.neutral = not self.neutral_first
 
-    def live(self, now_ns: int) -> bool:
+    def is_live(self, now_ns: int) -> bool:
         return now_ns - self.heard_ns <= self.timeout_ns
 
     def take(self, wish: Twist, at_ns: int) -> None:
         if wish == REST:
             self.neutral = True
-        if not self.live(at_ns):
+        if not self.is_live(at_ns):
             self.since_ns = at_ns
         self.wish, self.heard_ns = wish, at_ns
 
@@ -223,7 +223,7 @@ class RobotMachine(RuleBasedStateMachine):
         if rolling:
             for _ in range(4):
                 self.step(reply=True)
-            self.ask("activate")
+            self.add_request("activate")
             self.command("app", REST)
             self.command("nav", REST)
             self.step(reply=True)
@@ -374,7 +374,7 @@ class RobotMachine(RuleBasedStateMachine):
 
         A `clear` or `activate` names the latch, a number next to it, or none.
         """
-        self.ask(verb, off)
+        self.add_request(verb, off)
         if now:
             self.step(reply=True)
 
@@ -390,9 +390,9 @@ class RobotMachine(RuleBasedStateMachine):
             self.button = False
             self.step(reply=True)
         for _ in range(2):
-            self.ask("clear")
+            self.add_request("clear")
             self.step(reply=True)
-        self.ask("activate")
+        self.add_request("activate")
         for _ in range(4):
             self.step(reply=True)
         for name in NAMES:
@@ -431,7 +431,7 @@ class RobotMachine(RuleBasedStateMachine):
 
     @rule()
     def the_odometry_is_reset(self) -> None:
-        self.ask("reset_odometry")
+        self.add_request("reset_odometry")
         self.step(reply=True)
 
     @precondition(lambda self: self.now_ns % 7 == 0)
@@ -442,7 +442,7 @@ class RobotMachine(RuleBasedStateMachine):
 
     # inputs of the robot
 
-    def ask(self, verb: Verb, off: int | None = 0) -> None:
+    def add_request(self, verb: Verb, off: int | None = 0) -> None:
         active_latch = self.latches.in_force
         named = active_latch is not None and verb in ("clear", "activate") and off is not None
         latch = active_latch.number + (off or 0) if active_latch is not None and named else None
@@ -763,10 +763,10 @@ class RobotMachine(RuleBasedStateMachine):
         assert outputs.mode == "driving"
         book = self.books[outputs.source]
         assert book.neutral
-        assert book.live(self.now_ns)
+        assert book.is_live(self.now_ns)
         assert outputs.command_ns == book.heard_ns
         for other in self.books.values():
-            if other.live(self.now_ns):
+            if other.is_live(self.now_ns):
                 assert (-book.priority, book.since_ns) <= (-other.priority, other.since_ns)
         for now, last, wish, most in (
             (
@@ -858,7 +858,7 @@ def test_settings_for_a_robot_at_rest_are_refused_until_the_zero_lines_were_sent
     machine.start(config=CONFIGS[0], rolling=True)
     machine.cruise("app", Twist(0.5, 0.0), 60, 1)
     machine.the_output_blocks(blocked=True)
-    machine.ask("stop")
+    machine.add_request("stop")
     for _ in range(19):
         machine.step(reply=True)
     assert machine.before is not None

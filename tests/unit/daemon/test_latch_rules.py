@@ -273,9 +273,9 @@ def test_latches_are_held_once_the_keeper_holds_them() -> None:
     keeper = Keeper()
     handover = Handover(Latches(), keeper)
     handover.take(ALL)
-    assert not handover.held
+    assert not handover.is_stored
     keeper.held = ALL
-    assert handover.held
+    assert handover.is_stored
 
 
 def test_each_stop_that_no_step_served_is_latched_with_the_name_of_its_client() -> None:
@@ -372,6 +372,6 @@ def test_without_a_keeper_the_handover_never_waits_and_reports_no_trouble() -> N
     handover = Handover(Latches(), None)
     handover.take(ALL)
     handover.wait()
-    assert handover.held
+    assert handover.is_stored
     assert handover.take_events() == []
     assert handover.trouble is None

@@ -15,7 +15,7 @@ from acsard.core.values import Event
 from acsard.daemon.supervisor import GATEWAY, ROUTER, Kind, keep_running
 
 
-async def told(kind: Kind = GATEWAY) -> Event:
+async def first_event(kind: Kind = GATEWAY) -> Event:
     """Return the first event of the supervisor."""
     queue: asyncio.Queue[Event] = asyncio.Queue()
     keeper = asyncio.create_task(keep_running(["gateway"], queue.put_nowait, kind))
@@ -28,7 +28,7 @@ async def told(kind: Kind = GATEWAY) -> Event:
 
 def test_a_program_that_cannot_be_started_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
-    event = asyncio.run(told())
+    event = asyncio.run(first_event())
     assert (event.name, event.level) == ("gateway_ended", "warning")
     assert "could not be started" in event.text
 
@@ -38,7 +38,7 @@ def test_a_thread_that_cannot_be_started_is_reported(monkeypatch: pytest.MonkeyP
         raise RuntimeError("can't start new thread")
 
     monkeypatch.setattr(threading.Thread, "start", full)
-    assert "can't start new thread" in asyncio.run(told()).text
+    assert "can't start new thread" in asyncio.run(first_event()).text
 
 
 def program(monkeypatch: pytest.MonkeyPatch, where: Path, text: str) -> None:
@@ -56,7 +56,7 @@ def test_a_program_that_falls_silent_is_killed(
     pid = tmp_path / "pid"
     stops = f"import os; os.write(0, b'.'); open({str(pid)!r}, 'w').write(str(os.getpid())); "
     program(monkeypatch, tmp_path, stops + "os.kill(os.getpid(), 19)")
-    assert "stopped or hung" in asyncio.run(told()).text
+    assert "stopped or hung" in asyncio.run(first_event()).text
     with pytest.raises(ProcessLookupError):
         os.kill(int(pid.read_text()), signal.SIGCONT)
 
@@ -116,7 +116,7 @@ def test_a_program_that_may_start_later_is_restarted(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Kind, code: int
 ) -> None:
     program(monkeypatch, tmp_path, f"raise SystemExit({code})")
-    event = asyncio.run(told(kind))
+    event = asyncio.run(first_event(kind))
     assert (event.name, event.text.partition(";")[0]) == (
         kind.ended,
         f"{kind.name} ended with exit code {code}",

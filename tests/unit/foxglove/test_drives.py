@@ -83,7 +83,7 @@ class Viewers:
         channel = 2 if isinstance(message, TwistStamped) else 1
         self.drives.received(viewer, channel, encode(message, "cdr"))
 
-    def heard(self, viewer: int, count: int) -> list[Command]:
+    def wait_for_commands(self, viewer: int, count: int) -> list[Command]:
         """Wait until the bus has at least `count` commands of this viewer, and return them."""
         commands = self.sessions[viewer].heard
         until(
@@ -109,7 +109,7 @@ def test_a_viewer_that_leaves_while_its_message_is_decoded_sends_nothing_more(
     viewers: Viewers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     viewers.publish(1, AHEAD)
-    viewers.heard(1, 2)
+    viewers.wait_for_commands(1, 2)
 
     def leaves(encoding: str, data: bytes) -> Wish:
         viewers.drives.withdrawn(1, 1)
@@ -119,7 +119,7 @@ def test_a_viewer_that_leaves_while_its_message_is_decoded_sends_nothing_more(
     monkeypatch.setattr(drives, "wish", leaves)
     viewers.publish(1, AHEAD)
     viewers.drives.outbox.flush(HOLD_S)
-    assert viewers.heard(1, 3)[-1].twist == REST
+    assert viewers.wait_for_commands(1, 3)[-1].twist == REST
     assert not viewers.drives.driving()
 
 
@@ -132,15 +132,15 @@ def test_a_viewer_that_has_just_connected_sends_no_zero_of_its_own(viewers: View
         viewers.drives.withdrawn(1, channel)
     viewers.drives.advertised(1, 3, "/cmd_vel", "cdr", "geometry_msgs/msg/Twist")
     viewers.drives.received(1, 3, encode(AHEAD, "cdr"))
-    assert viewers.heard(1, 1)[0].twist.linear == 0.3
+    assert viewers.wait_for_commands(1, 1)[0].twist.linear == 0.3
 
 
 def test_a_stamp_is_passed_on_and_the_added_zeros_use_the_same_clock(viewers: Viewers) -> None:
     long_ago_ns = clock.now().wall_ns - 100 * NS_PER_S
     viewers.publish(1, TwistStamped(Header(Time.from_ns(long_ago_ns)), AHEAD))
-    viewers.heard(1, 2)
+    viewers.wait_for_commands(1, 2)
     viewers.drives.withdrawn(1, 2)
-    commands = viewers.heard(1, 3)
+    commands = viewers.wait_for_commands(1, 3)
     assert [command.twist.linear for command in commands] == [0.0, 0.3, 0.0]
     assert [command.stamp_ns for command in commands[:2]] == [
         long_ago_ns - BURST_WINDOW_NS,
@@ -154,7 +154,7 @@ def test_a_stamp_is_passed_on_and_the_added_zeros_use_the_same_clock(viewers: Vi
 def test_a_plain_twist_has_the_time_of_its_receipt(viewers: Viewers) -> None:
     before_ns = clock.now().wall_ns
     viewers.publish(1, AHEAD)
-    for command in viewers.heard(1, 2):
+    for command in viewers.wait_for_commands(1, 2):
         assert command.stamp_ns is not None
         assert abs(command.stamp_ns - before_ns) < HOLD_S * NS_PER_S
 
@@ -164,7 +164,7 @@ def test_a_command_that_waited_for_another_viewer_s_locked_bus_is_dropped(
 ) -> None:
     for viewer in viewers.sessions:
         viewers.publish(viewer, AHEAD)
-        viewers.heard(viewer, 2)
+        viewers.wait_for_commands(viewer, 2)
     first, second = viewers.sessions.values()
     first.locked = True
     # the sender thread waits for this lock, so both commands fall due in one round
@@ -175,7 +175,7 @@ def test_a_command_that_waited_for_another_viewer_s_locked_bus_is_dropped(
     assert first.entered.wait(HOLD_S)
     until(lambda: clock.mono_ns() - given_ns > STALE_NS, HOLD_S, "that it is too old")
     first.free.set()
-    viewers.heard(1, 3)
+    viewers.wait_for_commands(1, 3)
     viewers.publish(2, STILL)
     until(lambda: second.heard[-1].twist == REST, HOLD_S, "the zero behind it")
     assert [command.twist.linear for command in second.heard if command.twist != REST] == [0.3]
@@ -196,34 +196,34 @@ def test_a_bus_that_fails_for_one_viewer_is_reported_and_serves_the_others(
 ) -> None:
     viewers.sessions[1].broken = True
     viewers.publish(1, AHEAD)
-    until(lambda: said(viewers.notices), HOLD_S, "that the bus takes nothing")
-    assert "the bus accepts no commands" in said(viewers.notices)[0]
+    until(lambda: waiting_texts(viewers.notices), HOLD_S, "that the bus takes nothing")
+    assert "the bus accepts no commands" in waiting_texts(viewers.notices)[0]
     viewers.publish(2, AHEAD)
-    assert [command.twist.linear for command in viewers.heard(2, 2)] == [0.0, 0.3]
+    assert [command.twist.linear for command in viewers.wait_for_commands(2, 2)] == [0.0, 0.3]
     viewers.sessions[1].broken = False
     viewers.publish(1, AHEAD)
-    viewers.heard(1, 1)
+    viewers.wait_for_commands(1, 1)
 
 
 @each(("rate", "slow"), [(1.0, True), (2.0, True), (5.0, False), (20.0, False)])
 def test_a_panel_that_publishes_too_seldom_is_detected(rate: float, slow: bool) -> None:
-    assert told_slow(NS_PER_S / rate) is slow
+    assert is_called_slow(NS_PER_S / rate) is slow
 
 
 def test_single_presses_are_not_reported_as_a_slow_panel() -> None:
-    assert not told_slow(4.0 * NS_PER_S)
+    assert not is_called_slow(4.0 * NS_PER_S)
 
 
 def test_a_command_on_a_channel_beyond_the_limit_is_reported(viewers: Viewers) -> None:
     for channel in range(100):
         viewers.drives.advertised(1, channel, "/cmd_vel", "cdr", "geometry_msgs/msg/Twist")
     viewers.drives.received(1, 63, encode(AHEAD, "cdr"))
-    assert not said(viewers.notices)
+    assert not waiting_texts(viewers.notices)
     viewers.drives.received(1, 64, encode(AHEAD, "cdr"))
-    assert ["64 topics at most" in text for text in said(viewers.notices)] == [True]
+    assert ["64 topics at most" in text for text in waiting_texts(viewers.notices)] == [True]
 
 
-def told_slow(every_ns: float) -> bool:
+def is_called_slow(every_ns: float) -> bool:
     """Return whether the bridge warns a panel that publishes at this interval to be too slow."""
     robot: Any = None
     viewer = Viewer(robot)
@@ -231,7 +231,7 @@ def told_slow(every_ns: float) -> bool:
     return [viewer.is_slow(viewer.commander.take(Wish(AHEAD_AT), at)) for at in times][-1]
 
 
-def said(notices: Notices) -> list[str]:
+def waiting_texts(notices: Notices) -> list[str]:
     return [notice.text for notice in notices._waiting.waiting]
 
 

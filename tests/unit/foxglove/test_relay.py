@@ -100,7 +100,7 @@ STAMPED = TwistStamped(Header(Time(5), "elsewhere"), TWIST)
 NAMES = list(Config().joints.as_tuple())
 
 
-def found(source: str, ros: RosConfig) -> dict[str, CommandForm]:
+def forms_of(source: str, ros: RosConfig) -> dict[str, CommandForm]:
     return command_forms(lambda key: full_key("robot", key), ros, source)
 
 
@@ -118,8 +118,8 @@ def read(payload: bytes, form: CommandForm = NAV, put: bool = True) -> TwistStam
 
 def test_a_source_commands_on_its_native_keys_and_those_of_ros() -> None:
     app = {f"acsard/robot/{kind}/app{end}" for kind in ("cmd", "wheel_cmd") for end in ("", "/*")}
-    assert set(found("app", RosConfig())) == app
-    nav = found("nav", RosConfig())
+    assert set(forms_of("app", RosConfig())) == app
+    nav = forms_of("nav", RosConfig())
     assert {form.via for form in nav.values()} == {"native", "bridge", "rmw"}
     native = {form.native for form in nav.values()}
     assert native == {"cmd/nav", "wheel_cmd/nav", "cmd/nav/*", "wheel_cmd/nav/*"}
@@ -128,15 +128,15 @@ def test_a_source_commands_on_its_native_keys_and_those_of_ros() -> None:
 
 def test_every_ros_command_key_belongs_to_a_source() -> None:
     ros = RosConfig()
-    source_keys = {key for source in SOURCES.values() for key in found(source, ros)}
+    source_keys = {key for source in SOURCES.values() for key in forms_of(source, ros)}
     others = ("imu", "speed_limit")
     assert {key for key in command_keys(ros) if not any(o in key for o in others)} <= source_keys
 
 
 def test_a_namespace_is_before_the_names_of_ros_and_a_tree_that_is_off_has_none() -> None:
-    apart = found("nav", RosConfig(namespace="one", rmw=False))
+    apart = forms_of("nav", RosConfig(namespace="one", rmw=False))
     assert [key for key, form in apart.items() if form.via != "native"] == ["one/cmd_vel"]
-    assert len(found("nav", RosConfig(bridge=False, rmw=False))) == 4
+    assert len(forms_of("nav", RosConfig(bridge=False, rmw=False))) == 4
 
 
 @each("form", FORMATS)
@@ -151,7 +151,7 @@ def test_a_twist_is_reported_with_the_time_it_came(
 @pytest.mark.parametrize("message", [TWIST, STAMPED], ids=["plain", "stamped"])
 def test_a_twist_over_ros_is_decoded_the_same_way(message: Twist | TwistStamped) -> None:
     name = f"geometry_msgs::msg::dds_::{type(message).__name__}_"
-    every = found("nav", RosConfig()).items()
+    every = forms_of("nav", RosConfig()).items()
     fit = [form for key, form in every if form.via == "bridge" or f"/{name}/" in key]
     assert [form.via for form in fit] == ["bridge", "rmw"]
     for form in fit:

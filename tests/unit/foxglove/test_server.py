@@ -24,10 +24,10 @@ from acsard.foxglove.server import (
     POLL_PERIOD_NS,
     Listener,
     Settings,
-    Shown,
-    asked,
+    ShownTopics,
     changes,
     live_settings,
+    select_settings,
 )
 from acsard.host import clock
 
@@ -71,7 +71,7 @@ def of_robot(robot: Robot) -> tuple[Settings, Callable[[], list[str]]]:
 def settings_after(monkeypatch: pytest.MonkeyPatch, *calls: tuple[str, list[str]]) -> Settings:
     """Return the settings after these calls of the server, at a time at which a poll is due."""
     made, _ = of_robot(Robot())
-    listener = Listener(Shown(lambda: None), cast(Drives, None), made)
+    listener = Listener(ShownTopics(lambda: None), cast(Drives, None), made)
     for name, keys in calls:
         getattr(listener, f"on_parameters_{name}")(keys)
     later_ns = clock.mono_ns() + 2 * POLL_PERIOD_NS
@@ -155,7 +155,7 @@ def test_parameter_values_have_only_types_of_the_protocol() -> None:
     ],
 )
 def test_a_request_gets_the_named_parameters_or_all(names: list[str], parameters: set[str]) -> None:
-    assert set(asked(NOW, names)) == parameters
+    assert set(select_settings(NOW, names)) == parameters
 
 
 def test_changes_are_only_settings_with_another_value() -> None:

@@ -63,7 +63,7 @@ def is_alive(pid: int) -> bool:
         return False
 
 
-def until_gone(pid: int) -> None:
+def wait_for_end(pid: int) -> None:
     end_ns = clock.mono_ns() + WAIT_S * NS_PER_S
     while is_alive(pid):
         assert clock.mono_ns() < end_ns
@@ -256,7 +256,7 @@ def test_a_child_ends_when_its_parent_is_killed() -> None:
     assert is_alive(grandchild)
     process.kill()
     process.wait(WAIT_S)
-    until_gone(grandchild)
+    wait_for_end(grandchild)
 
 
 # the parent, as the child sees it
@@ -276,13 +276,13 @@ def test_a_parent_that_closed_its_end_is_gone_and_beats_raise_no_error() -> None
     ours, its = socket.socketpair()
     with its:
         parent = Parent(its.fileno())
-        assert not parent.gone()  # nothing to read
+        assert not parent.is_gone()  # nothing to read
         ours.send(b"?")
-        assert not parent.gone()
+        assert not parent.is_gone()
         parent.beat()
         ours.close()
-        assert parent.gone()  # it left a sign of life unread
-        assert parent.gone()
+        assert parent.is_gone()  # it left a sign of life unread
+        assert parent.is_gone()
         parent.beat()
 
 
@@ -292,7 +292,7 @@ def test_a_terminal_receives_no_signs_of_life_and_remains_blocking() -> None:
     parent.beat()
     assert (os.get_blocking(its), select.select([ours], [], [], 0.05)[0]) == (True, [])
     os.close(ours)
-    assert parent.gone()
+    assert parent.is_gone()
     os.close(its)
 
 
@@ -301,7 +301,7 @@ def test_a_parent_is_gone_when_its_end_of_the_pipe_is_closed() -> None:
     parent = Parent(reads)
     parent.beat()
     os.close(writes)
-    assert parent.gone()
+    assert parent.is_gone()
     os.close(reads)
 
 

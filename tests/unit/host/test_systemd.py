@@ -31,7 +31,7 @@ class Manager:
         self._socket.bind("\0" + address[1:] if address.startswith("@") else address)
         self._socket.setblocking(False)
 
-    def heard(self) -> list[dict[str, str]]:
+    def read_datagrams(self) -> list[dict[str, str]]:
         """Return the datagrams since the last call, each as a dict of NAME=value assignments."""
         datagrams: list[dict[str, str]] = []
         while True:
@@ -83,7 +83,7 @@ def outputs(
 
 
 def statuses(manager: Manager) -> list[str]:
-    return [datagram["STATUS"] for datagram in manager.heard() if "STATUS" in datagram]
+    return [datagram["STATUS"] for datagram in manager.read_datagrams() if "STATUS" in datagram]
 
 
 # the receiving socket
@@ -107,7 +107,7 @@ def test_an_abstract_socket_address_is_accepted() -> None:
     manager = Manager(f"@acsard-test-{os.getpid()}")
     try:
         systemd(manager).ready()
-        assert manager.heard() == [{"READY": "1"}]
+        assert manager.read_datagrams() == [{"READY": "1"}]
     finally:
         manager.close()
 
@@ -138,19 +138,19 @@ def sockets() -> set[int]:
 
 def test_ready_is_sent_in_one_datagram(manager: Manager) -> None:
     systemd(manager).ready()
-    assert manager.heard() == [{"READY": "1"}]
+    assert manager.read_datagrams() == [{"READY": "1"}]
 
 
 def test_stopping_is_reported_with_a_status(manager: Manager) -> None:
     systemd(manager).stopping()
-    assert manager.heard() == [{"STOPPING": "1", "STATUS": "ramping to zero"}]
+    assert manager.read_datagrams() == [{"STOPPING": "1", "STATUS": "ramping to zero"}]
 
 
 def test_waiting_extends_the_start_timeout_by_30_s(
     manager: Manager,
 ) -> None:
     systemd(manager).waiting("the daemon waits for the Zenoh router")
-    assert manager.heard() == [
+    assert manager.read_datagrams() == [
         {"EXTEND_TIMEOUT_USEC": "30000000", "STATUS": "the daemon waits for the Zenoh router"}
     ]
 
@@ -161,7 +161,7 @@ def test_after_close_nothing_is_sent(manager: Manager) -> None:
     there.ready()
     there.step(outputs(NS_PER_S))
     there.close()
-    assert manager.heard() == []
+    assert manager.read_datagrams() == []
 
 
 # the watchdog
@@ -173,7 +173,7 @@ def feeds(manager: Manager, there: Systemd, period_ns: int, steps: int) -> list[
     for step in range(1, steps + 1):
         at = NS_PER_S + step * period_ns
         there.step(outputs(at))
-        if {"WATCHDOG": "1"} in manager.heard():
+        if {"WATCHDOG": "1"} in manager.read_datagrams():
             fed.append(at)
     return fed
 
@@ -225,7 +225,7 @@ def test_only_a_step_feeds_the_watchdog(manager: Manager) -> None:
     there.ready()
     there.waiting("for the router")
     there.stopping()
-    assert not [datagram for datagram in manager.heard() if "WATCHDOG" in datagram]
+    assert not [datagram for datagram in manager.read_datagrams() if "WATCHDOG" in datagram]
 
 
 # the status
@@ -290,9 +290,9 @@ def test_a_full_queue_neither_blocks_nor_raises_and_the_watchdog_is_fed_after_it
     began = time.monotonic()
     steps = fill(there)
     assert time.monotonic() - began < 5.0
-    assert 0 < len(manager.heard()) < steps, "the queue was not full"
+    assert 0 < len(manager.read_datagrams()) < steps, "the queue was not full"
     there.step(outputs(2000 * NS_PER_S))
-    assert {"WATCHDOG": "1"} in manager.heard()
+    assert {"WATCHDOG": "1"} in manager.read_datagrams()
 
 
 def test_a_manager_that_disappears_causes_no_error(manager: Manager) -> None:
@@ -310,7 +310,7 @@ def test_a_status_that_a_full_queue_refused_is_sent_later(manager: Manager) -> N
     fill(there)
     at = 2000 * NS_PER_S
     there.step(outputs(at, mode="stopped", reason="by teleop", changed=True))
-    manager.heard()
+    manager.read_datagrams()
     for step in range(1, 30):
         there.step(outputs(at + step * 100 * MS, mode="stopped", reason="by teleop"))
     assert statuses(manager) == ["stopped: by teleop"]

@@ -75,7 +75,7 @@ def test_a_daemon_with_the_settings_of_the_file_is_ok() -> None:
 
 def test_each_key_that_differs_from_the_file_is_reported_with_both_values() -> None:
     runs = replace(FILE, mcu=McuConfig(port="/dev/pts/3", baud_rate=57600))
-    assert [difference.words(key) for key, difference in differences(runs, FILE).items()] == [
+    assert [difference.describe(key) for key, difference in differences(runs, FILE).items()] == [
         'mcu.port = "/dev/pts/3", not "sim"',
         "mcu.baud_rate = 57600, not 115200",
     ]
@@ -142,7 +142,7 @@ NOW = 1_800_000_000_000_000_000
 S = 10**9
 
 
-def seen(apart: float, trip: float = 0.0, here: bool = False, **counters: int) -> Running:
+def running_daemon(apart: float, trip: float = 0.0, here: bool = False, **counters: int) -> Running:
     """Return the doctor's view of a daemon.
 
     The daemon's clock is `apart` s ahead, and the query took `trip` s.
@@ -153,35 +153,39 @@ def seen(apart: float, trip: float = 0.0, here: bool = False, **counters: int) -
 
 @pytest.mark.parametrize("apart", [0.0, 0.3, -0.3])
 def test_clocks_that_agree_cause_no_finding(apart: float) -> None:
-    assert list(clocks(seen(apart, commands=7))) == []
+    assert list(clocks(running_daemon(apart, commands=7))) == []
 
 
 @pytest.mark.parametrize(
     ("apart", "words"), [(3600.0, "3600.0 s ahead of"), (-0.5, "0.5 s behind")]
 )
 def test_clocks_that_disagree_are_a_warning_with_a_remedy(apart: float, words: str) -> None:
-    (finding,) = clocks(seen(apart))
+    (finding,) = clocks(running_daemon(apart))
     assert (finding.subject, finding.level) == ("clock", "warning")
     assert words in finding.text
     assert "timedatectl" in finding.mend
 
 
 def test_a_late_answer_is_not_taken_for_a_wrong_clock() -> None:
-    assert list(clocks(seen(-0.5, trip=1.0))) == list(clocks(seen(0.5, trip=1.0))) == []
-    assert len(list(clocks(seen(-2.0, trip=1.0)))) == 1
+    assert (
+        list(clocks(running_daemon(-0.5, trip=1.0)))
+        == list(clocks(running_daemon(0.5, trip=1.0)))
+        == []
+    )
+    assert len(list(clocks(running_daemon(-2.0, trip=1.0)))) == 1
 
 
 def test_a_daemon_on_this_machine_has_its_clock() -> None:
-    assert list(clocks(seen(-3.0, here=True))) == []
+    assert list(clocks(running_daemon(-3.0, here=True))) == []
 
 
 def test_stamps_that_were_replaced_are_reported() -> None:
-    (finding,) = clocks(seen(0.0, stamps_replaced=12))
+    (finding,) = clocks(running_daemon(0.0, stamps_replaced=12))
     assert "12 commands" in finding.text
 
 
 def test_periods_missed_in_the_last_minute_are_a_warning_after_months() -> None:
-    running = seen(0.0, lines_sent=345_600_000, missed_periods=600)
+    running = running_daemon(0.0, lines_sent=345_600_000, missed_periods=600)
     assert not list(late(running))
     row = DiagnosticStatus(1, "acsard: control loop", "600 of 6000 periods missed", "acsar", [])
     (finding,) = late(replace(running, rows=(row,)))
@@ -226,7 +230,7 @@ def test_a_stop_that_a_restart_would_lose_is_a_warning_with_a_remedy() -> None:
         "a stop would not survive a restart: the latch file (/x/a.latches.json) cannot be written: "
         "Read-only file system"
     )
-    running = seen(0.0)
+    running = running_daemon(0.0)
     running = replace(running, state=replace(running.state, latch_file_error=trouble))
     (finding,) = (item for item in daemon(running) if item.subject == "latch file")
     assert (finding.level, finding.text) == ("warning", trouble)
@@ -256,7 +260,7 @@ def test_an_expiring_certificate_in_use_is_a_warning_with_a_remedy(here: bool, m
 
 @pytest.mark.parametrize("here", [True, False])
 def test_settings_that_differ_from_the_file_of_another_machine_are_a_warning(here: bool) -> None:
-    running = seen(0.0, here=here)
+    running = running_daemon(0.0, here=here)
     running = replace(running, state=replace(running.state, settings_differ="rates.state = 7.5"))
     texts = [finding.text for finding in daemon(running) if finding.subject == "configuration"]
     words = (
@@ -266,7 +270,7 @@ def test_settings_that_differ_from_the_file_of_another_machine_are_a_warning(her
     assert texts == ([] if here else [words])
 
 
-def found(before: dict[str, int], after: dict[str, int], **state: str) -> list[Finding]:
+def link_findings(before: dict[str, int], after: dict[str, int], **state: str) -> list[Finding]:
     first, two = replace(STATE, counters=before), replace(STATE, counters=after, **state)
     return list(link(Running(INFO, CONFIG, first, two, 0)))
 
@@ -313,7 +317,7 @@ def test_the_advice_about_a_fault_fits_its_cause(reason: str, mend: str, unfit: 
 
 
 def test_a_sound_link_gives_one_ok_finding() -> None:
-    (finding,) = found({"lines": 5, "lines_sent": 900}, {"lines": 104, "lines_sent": 1000})
+    (finding,) = link_findings({"lines": 5, "lines_sent": 900}, {"lines": 104, "lines_sent": 1000})
     assert (finding.subject, finding.level) == ("link", "ok")
 
 
@@ -336,7 +340,7 @@ def test_a_sound_link_says_which_lines_were_judged(
 
 @pytest.mark.parametrize("state", ["booting", "stale"])
 def test_a_missing_link_is_a_failure_with_its_reason_and_the_check_command(state: str) -> None:
-    (finding,) = found({}, {}, link=state, mode="waiting", reason="nothing was received")
+    (finding,) = link_findings({}, {}, link=state, mode="waiting", reason="nothing was received")
     assert finding.level == "failure"
     assert "nothing was received" in finding.text
     assert "acsard mcu check --port /dev/ttyX" in finding.mend
@@ -344,12 +348,12 @@ def test_a_missing_link_is_a_failure_with_its_reason_and_the_check_command(state
 
 
 def test_a_closed_port_is_reported_with_a_remedy_for_the_port() -> None:
-    (finding,) = found({}, {}, link="down", mode="waiting", reason="no such device")
+    (finding,) = link_findings({}, {}, link="down", mode="waiting", reason="no such device")
     assert "port above" in finding.mend
 
 
 def test_lines_that_are_not_answered_are_a_warning() -> None:
-    (finding,) = found({"lines": 80, "lines_sent": 100}, {"lines": 160, "lines_sent": 200})
+    (finding,) = link_findings({"lines": 80, "lines_sent": 100}, {"lines": 160, "lines_sent": 200})
     assert finding.level == "warning"
     assert "answered only 80 of the 100 lines that the daemon sent in a second" in finding.text
     assert "mcu check" in finding.mend
@@ -376,11 +380,11 @@ def test_rejected_lines_are_reported_by_kind_above_one_in_fifty() -> None:
 
 
 def test_a_link_lost_because_the_computer_was_late_is_not_blamed_on_the_board() -> None:
-    (late,) = found({}, {"link_lost": 3, "link_lost_host_stall": 3})
+    (late,) = link_findings({}, {"link_lost": 3, "link_lost_host_stall": 3})
     assert "lost 3 times" in late.text
     assert "the daemon's computer" in late.text
     assert "mcu check" not in late.mend
-    late, board = found({}, {"link_lost": 5, "link_lost_host_stall": 3})
+    late, board = link_findings({}, {"link_lost": 5, "link_lost_host_stall": 3})
     assert "lost 2 times" in board.text
     assert "mcu check" in board.mend
     states = replace(STATE, counters={"link_lost": 2})
@@ -388,13 +392,13 @@ def test_a_link_lost_because_the_computer_was_late_is_not_blamed_on_the_board() 
     assert "the daemon's computer" in sim.text
     assert "mcu check" not in sim.mend
     why = "this computer did not run the daemon for 0.80 s, and heard nothing"
-    (finding,) = found({}, {}, link="stale", mode="waiting", reason=why)
+    (finding,) = link_findings({}, {}, link="stale", mode="waiting", reason=why)
     assert why in finding.text
     assert "mcu check" not in finding.mend
 
 
 def test_a_wheel_fault_is_a_warning() -> None:
-    *_, finding = found({}, {}, wheel_fault="rear left: its encoder stands")
+    *_, finding = link_findings({}, {}, wheel_fault="rear left: its encoder stands")
     assert (finding.subject, finding.level) == ("wheels", "warning")
 
 
@@ -407,7 +411,7 @@ def test_a_wheel_fault_is_a_warning() -> None:
     ],
 )
 def test_the_emergency_stop_of_the_board_is_reported(state: str, level: str, text: str) -> None:
-    *_, finding = found({}, {}, emergency_stop=state)
+    *_, finding = link_findings({}, {}, emergency_stop=state)
     assert (finding.subject, finding.level) == ("emergency stop", level)
     assert finding.text.startswith(text)
 
@@ -481,7 +485,7 @@ def test_the_battery_of_the_board_is_reported(
 
 
 def test_a_board_without_a_battery_has_no_finding_unless_thresholds_need_it() -> None:
-    assert [finding.subject for finding in found({}, {})] == ["link"]
+    assert [finding.subject for finding in link_findings({}, {})] == ["link"]
 
 
 DAYS_40 = {"lines": 340_000_000, "lines_sent": 345_600_000}
@@ -489,20 +493,20 @@ DAYS_40 = {"lines": 340_000_000, "lines_sent": 345_600_000}
 
 
 def test_after_months_only_present_problems_are_warnings() -> None:
-    (finding,) = found(DAYS_40, DAYS_40 | {"link_lost": 40})
+    (finding,) = link_findings(DAYS_40, DAYS_40 | {"link_lost": 40})
     assert finding.level == "ok"
     assert "lost 40 times" in finding.text
-    (finding,) = found(DAYS_40, DAYS_40 | {"link_lost": 41})
+    (finding,) = link_findings(DAYS_40, DAYS_40 | {"link_lost": 41})
     assert finding.level == "warning"
     now = {"lines": DAYS_40["lines"] + 90, "lines_sent": DAYS_40["lines_sent"] + 100}
-    _, finding = found(DAYS_40, now | {"line_malformed": 10})
+    _, finding = link_findings(DAYS_40, now | {"line_malformed": 10})
     assert finding.level == "warning"
     assert "10 malformed" in finding.text
 
 
 def test_a_lost_link_is_reported_with_the_number_of_losses() -> None:
     assert not link_losses({"lines": 9})
-    (finding,) = found({}, {"link_lost": 4})
+    (finding,) = link_findings({}, {"link_lost": 4})
     assert finding.level == "warning"
     assert "lost 4 times" in finding.text
 
@@ -516,7 +520,7 @@ def test_the_last_causes_of_lateness_are_warnings_only_if_periods_are_missed_now
         LogEvent(Time.from_ns(NOW + n * S), "missed_periods", "warning", text, "", 1)
         for n, text in enumerate(texts)
     )
-    calm = replace(seen(0.0, lines_sent=345_600_000, missed_periods=600), events=events)
+    calm = replace(running_daemon(0.0, lines_sent=345_600_000, missed_periods=600), events=events)
     findings = list(late(calm))
     assert [finding.level for finding in findings] == ["ok", "ok", "ok"]
     assert [finding.text.rpartition("because ")[2] for finding in findings] == [

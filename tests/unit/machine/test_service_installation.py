@@ -112,7 +112,7 @@ PAGE_FILE = File(ETC / PAGE, b"page")
 ALL = [UNIT_FILE, GATEWAY_FILE, PAGE_FILE, STOP_FILE, RULES, OWN]
 
 
-def there(**other: bytes | None) -> Found:
+def installed_files(**other: bytes | None) -> Found:
     """Return a machine with all files installed. `other` replaces the content of some files."""
     names = {
         "unit": UNIT_FILE,
@@ -141,7 +141,7 @@ def test_the_daemon_starts_before_the_page_whose_unit_mounts_its_directory() -> 
 
 
 def test_unchanged_files_are_kept_and_the_commands_run_again() -> None:
-    assert installing(ALL, there(), (), force=False) == [
+    assert installing(ALL, installed_files(), (), force=False) == [
         *(Keep(f.path) for f in ALL),
         *INSTALL_COMMANDS,
     ]
@@ -149,12 +149,12 @@ def test_unchanged_files_are_kept_and_the_commands_run_again() -> None:
 
 def test_a_file_with_a_wrong_mode_is_written_again_unless_its_content_differs() -> None:
     # Without its mode the stop script sends no zeros after the daemon's end.
-    steps = installing(ALL, there(), {STOP_FILE.path, OWN.path}, force=False)
+    steps = installing(ALL, installed_files(), {STOP_FILE.path, OWN.path}, force=False)
     (step,) = (step for step in steps if isinstance(step, Write))
     assert step.file == STOP_FILE
     assert str(step).endswith("(4 bytes, mode 755; it has a wrong mode or owner)")
     with pytest.raises(MendableError, match="differ"):
-        installing(ALL, there(stop=b"mine"), {STOP_FILE.path}, force=False)
+        installing(ALL, installed_files(stop=b"mine"), {STOP_FILE.path}, force=False)
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
@@ -180,7 +180,7 @@ def test_a_wrong_mode_or_owner_is_detected_and_corrected(
 
 
 def test_a_file_with_other_content_is_overwritten_only_by_force() -> None:
-    state = there(unit=b"mine", own=None)
+    state = installed_files(unit=b"mine", own=None)
     with pytest.raises(MendableError, match=f"this version of acsard installs: {UNIT_FILE.path};"):
         installing(ALL, state, (), force=False)
     steps = installing(ALL, state, (), force=True)
@@ -189,18 +189,22 @@ def test_a_file_with_other_content_is_overwritten_only_by_force() -> None:
 
 @pytest.mark.parametrize("force", [False, True])
 def test_an_edited_configuration_is_never_replaced(force: bool) -> None:
-    assert Keep(OWN.path) in installing(ALL, there(own=b"mine"), (), force=force)
+    assert Keep(OWN.path) in installing(ALL, installed_files(own=b"mine"), (), force=force)
 
 
 def test_all_unchanged_files_are_removed() -> None:
     removed = [Remove(file.path) for file in ALL]
     leaving = Run(("systemctl", "disable", "--now", PAGE, GATEWAY, UNIT))
-    assert uninstalling(ALL, there(), (), force=False) == [leaving, *removed, *REMOVE_COMMANDS]
+    assert uninstalling(ALL, installed_files(), (), force=False) == [
+        leaving,
+        *removed,
+        *REMOVE_COMMANDS,
+    ]
 
 
 def test_a_missing_unit_is_not_disabled() -> None:
     """The machine has an older version, which had no units for the TLS gateway and the page."""
-    leaving, *_ = uninstalling(ALL, there(gateway=None, page=None), force=False)
+    leaving, *_ = uninstalling(ALL, installed_files(gateway=None, page=None), force=False)
     assert leaving == Run(("systemctl", "disable", "--now", UNIT))
 
 
@@ -208,22 +212,25 @@ def test_without_installed_files_no_unit_is_stopped_and_no_file_is_removed() -> 
     assert uninstalling(ALL, NOTHING, (), force=False) == [*REMOVE_COMMANDS]
 
 
-def kept(state: Found, *, force: bool) -> set[Path]:
+def kept_paths(state: Found, *, force: bool) -> set[Path]:
     steps = uninstalling(ALL, state, (), force=force)
     return {step.path for step in steps if isinstance(step, Keep)}
 
 
 def test_a_changed_file_is_kept_unless_forced() -> None:
-    assert kept(there(rules=b"mine"), force=False) == {RULES.path}
-    assert kept(there(rules=b"mine"), force=True) == set()
+    assert kept_paths(installed_files(rules=b"mine"), force=False) == {RULES.path}
+    assert kept_paths(installed_files(rules=b"mine"), force=True) == set()
 
 
 def test_a_changed_configuration_is_kept_even_if_forced() -> None:
-    assert kept(there(own=b"mine"), force=True) == {OWN.path}
+    assert kept_paths(installed_files(own=b"mine"), force=True) == {OWN.path}
 
 
 def test_a_unit_that_is_kept_also_keeps_its_stop_script() -> None:
-    assert kept(there(unit=b"mine"), force=False) == {UNIT_FILE.path, STOP_FILE.path}
+    assert kept_paths(installed_files(unit=b"mine"), force=False) == {
+        UNIT_FILE.path,
+        STOP_FILE.path,
+    }
 
 
 def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
@@ -235,7 +242,7 @@ def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
 
 def test_each_kept_path_is_reported_with_its_reason_and_how_to_remove_it() -> None:
     tls, own = Path("/etc/acsard/tls"), ETC / "own.conf"
-    state = there(unit=b"mine", own=b"mine")
+    state = installed_files(unit=b"mine", own=b"mine")
     steps = uninstalling(ALL, state, [tls, own], force=False)
     assert {step.path: step.why for step in steps if isinstance(step, Keep)} == {
         UNIT_FILE.path: "the file differs from what this version installs; --force removes it",
@@ -247,7 +254,7 @@ def test_each_kept_path_is_reported_with_its_reason_and_how_to_remove_it() -> No
 
 
 def test_a_forced_purge_keeps_no_file() -> None:
-    tls, state = Path("/etc/acsard/tls"), there(unit=b"mine", own=b"mine")
+    tls, state = Path("/etc/acsard/tls"), installed_files(unit=b"mine", own=b"mine")
     steps = uninstalling(ALL, state, [tls], force=True, purge=True)
     assert not [step for step in steps if isinstance(step, Keep)]
     assert {step.path for step in steps if isinstance(step, (Remove, Remove))} == {
@@ -257,7 +264,9 @@ def test_a_forced_purge_keeps_no_file() -> None:
 
 
 def test_a_purge_reinstalls_a_unit_so_that_systemd_can_clean_its_state() -> None:
-    steps = uninstalling(ALL, dict.fromkeys(there()), force=True, purge=True, stateful=[UNIT])
+    steps = uninstalling(
+        ALL, dict.fromkeys(installed_files()), force=True, purge=True, stateful=[UNIT]
+    )
     clean = Run(("systemctl", "clean", "--what=state", UNIT))
     before, after = steps[: steps.index(clean)], steps[steps.index(clean) :]
     assert before[:2] == [Write(UNIT_FILE), Run(("systemctl", "daemon-reload"))]
@@ -266,7 +275,9 @@ def test_a_purge_reinstalls_a_unit_so_that_systemd_can_clean_its_state() -> None
 
 @pytest.mark.parametrize("purge", [False, True])
 def test_recordings_and_invitations_are_kept_unless_purged(purge: bool) -> None:
-    steps = uninstalling(ALL, there(), (), force=False, purge=purge, stateful=STATE_DIRECTORIES)
+    steps = uninstalling(
+        ALL, installed_files(), (), force=False, purge=purge, stateful=STATE_DIRECTORIES
+    )
     paths = {step.path for step in steps if isinstance(step, Keep)}
     cleans = {Run(("systemctl", "clean", "--what=state", unit)) for unit in (UNIT, PAGE)}
     assert paths == (set() if purge else {where for where, _ in STATE_DIRECTORIES.values()})
@@ -308,7 +319,7 @@ def test_after_a_write_and_a_removal_the_directory_is_unchanged(tmp_path: Path) 
     (tmp_path / "elsewhere").write_text("untouched")
     file = File(tmp_path / "acsard" / "bin" / "tool", b"new", 0o755)
     Write(file).do()
-    assert file.found() == b"new"
+    assert file.current_content() == b"new"
     assert file.path.stat().st_mode & 0o777 == 0o755
     file.path.unlink()
     file.path.symlink_to(tmp_path / "elsewhere")
@@ -370,4 +381,4 @@ def test_an_unreadable_file_is_reported_in_a_sentence(tmp_path: Path) -> None:
     place.path.mkdir()
     assert place.condition() == "unreadable"
     with pytest.raises(MendableError, match=r"cannot read .*acsard\.toml"):
-        place.found()
+        place.current_content()

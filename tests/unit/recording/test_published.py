@@ -18,7 +18,7 @@ from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 
 
-def said(tape: Tape, config: Config) -> list[Published]:
+def published_messages(tape: Tape, config: Config) -> list[Published]:
     robot = Robot(config)
     publisher = Publisher(robot, START.wall_ns)
     return [m for step in tape.steps() for m in publisher.step(step, replay_step(robot, step))]
@@ -42,13 +42,16 @@ def test_a_transform_that_is_switched_off_is_not_published() -> None:
         lidar=replace(config.lidar, publish_tf=False),
         footprint=replace(config.footprint, publish_tf=False),
     )
-    assert names(said(tape, config)) - names(said(tape, quiet)) == {"tf", "tf_static"}
+    assert names(published_messages(tape, config)) - names(published_messages(tape, quiet)) == {
+        "tf",
+        "tf_static",
+    }
 
 
 def test_other_parameters_change_the_pose_but_not_the_received_commands() -> None:
     tape, config = driven(), Config()
     wider = replace(config, drive=replace(config.drive, wheel_separation=0.6))
-    then, now = said(tape, config), said(tape, wider)
+    then, now = published_messages(tape, config), published_messages(tape, wider)
     (last, other) = (
         [m for m in messages if m.channel.name == "odom"][-1] for messages in (then, now)
     )
@@ -61,7 +64,7 @@ def test_other_parameters_change_the_pose_but_not_the_received_commands() -> Non
 
 
 def test_odometry_is_published_after_its_sample_and_a_command_at_its_arrival() -> None:
-    published = said(driven(), Config())
+    published = published_messages(driven(), Config())
     odom = [m for m in published if m.channel.name == "odom"]
     assert all(m.message.header.stamp.to_ns() <= m.wall_ns for m in odom)
     times = [m.wall_ns for m in odom]
@@ -71,7 +74,7 @@ def test_odometry_is_published_after_its_sample_and_a_command_at_its_arrival() -
 
 
 def test_values_that_a_recording_lacks_are_not_published() -> None:
-    published = said(driven(), Config())
+    published = published_messages(driven(), Config())
     rows = {
         row.name for m in published if m.channel.name == "diagnostics" for row in m.message.status
     }
@@ -86,7 +89,7 @@ def test_the_log_has_the_same_lines_as_the_timeline() -> None:
     tape = driven()
     timeline, steps = TimelineWriter(Config()), tape.steps()
     entries = [entry for step in steps for entry in timeline.step(step)]
-    lines = [m for m in said(tape, Config()) if m.channel.name == "log"]
+    lines = [m for m in published_messages(tape, Config()) if m.channel.name == "log"]
     assert [line.message.name for line in lines] == [entry.name for entry in entries]
     assert [line.message.msg for line in lines] == [entry.sentence for entry in entries]
     assert "start" in [line.message.name for line in lines]

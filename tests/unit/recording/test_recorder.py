@@ -61,7 +61,7 @@ class Bench:
 
     def write(self) -> None:
         """Do the work that the recorder's thread does once a second."""
-        self.recorder._writer.write(self.recorder._taken(), False)
+        self.recorder._writer.write(self.recorder._take_queue(), False)
 
     def drive(self, seconds: float) -> None:
         """Continue the drive for this time, and let the recorder write after each second."""

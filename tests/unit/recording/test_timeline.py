@@ -102,7 +102,7 @@ def test_a_drive_that_has_ended_has_no_second_entry() -> None:
     assert not list(writer.end())
 
 
-def held_by_neutral_first() -> tuple[Tape, float]:
+def stopped_by_neutral_first() -> tuple[Tape, float]:
     """Return a drive that is stopped, and whose sender then sends speeds for 2.5 s without a zero.
 
     Also returns the wall-clock time at which these speeds begin, s.
@@ -121,7 +121,7 @@ def held_by_neutral_first() -> tuple[Tape, float]:
 
 @pytest.mark.slow
 def test_a_reason_that_changes_without_the_mode_has_an_entry() -> None:
-    tape, began = held_by_neutral_first()
+    tape, began = stopped_by_neutral_first()
     waiting, silent = [entry for entry in story(tape) if entry.name == "reason"]
     sentence = "ready: send a zero first: app must send a zero before it can drive"
     assert (waiting.text, waiting.seconds - began < 0.1) == (sentence, True)
@@ -276,7 +276,7 @@ def test_a_restart_that_the_robot_reports_has_no_second_entry() -> None:
 
 
 def test_reasons_that_alternate_in_every_step_make_an_entry_a_second() -> None:
-    tape, _ = held_by_neutral_first()
+    tape, _ = stopped_by_neutral_first()
     steps, changes = tape.steps()[-500:], ReasonChanges()
     entries = list[TimelineEntry]()
     for number, step in enumerate(steps):

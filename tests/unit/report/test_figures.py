@@ -29,7 +29,7 @@ def figures() -> dict[str, Figure]:
     return {figure.name: figure for figure in TimeFigures(report, OFFSET_S).all()}
 
 
-def known(values: Iterable[float]) -> list[float | None]:
+def without_nan(values: Iterable[float]) -> list[float | None]:
     """Return the values with None in place of NaN, so that they compare as equal."""
     return [None if math.isnan(value) else value for value in values]
 
@@ -68,7 +68,7 @@ def test_plotly_knows_every_attribute_of_the_pictures(figures: dict[str, Figure]
 def test_speeds_are_drawn_at_local_times(figures: dict[str, Figure]) -> None:
     report, _ = drive_of_two()
     points, drawn = report.linear["measured"].points(), trace(figures["speeds"], "measured")
-    assert known(column(drawn["y"])) == known(point.value for point in points)
+    assert without_nan(column(drawn["y"])) == without_nan(point.value for point in points)
     zero_ms = 1000 * (START.wall_ns / 1e9 + OFFSET_S)
     times = [(ms - zero_ms) / 1000 for ms in column(drawn["x"])]
     assert times == pytest.approx([point.t for point in points], abs=0.02)
@@ -102,7 +102,9 @@ def test_one_command_of_99_m_s_does_not_flatten_the_speeds() -> None:
 def test_commands_near_the_driven_speeds_are_drawn_as_they_are(figures: dict[str, Figure]) -> None:
     report, _ = drive_of_two()
     drawn = column(trace(figures["speeds"], "commanded")["y"])
-    assert known(drawn) == known(point.value for point in report.linear["commanded"].points())
+    assert without_nan(drawn) == without_nan(
+        point.value for point in report.linear["commanded"].points()
+    )
     assert "triangle" not in figures["speeds"].caption
     assert [curve["name"] for curve in figures["speeds"].data].count("commanded outside") == 0
 
@@ -112,7 +114,7 @@ def test_a_curve_is_marked_each_time_it_leaves_the_scale_of_the_others() -> None
     points = [Point(float(t), value) for t, value in enumerate(values)]
     drawn, clips = clipped(points, [[Point(0.0, 1.0), Point(1.0, math.nan)]], 0.1, 1.0)
     expected = [0.0, 1.5, 1.5, 0.5, -0.5, None, -0.5, 1.4]
-    assert known(point.value for point in drawn) == expected
+    assert without_nan(point.value for point in drawn) == expected
     assert clips == [Clip(1.0, 1.5, 12.0), Clip(4.0, -0.5, -7.0), Clip(6.0, -0.5, -6.0)]
 
 
@@ -120,7 +122,9 @@ def test_each_wheel_has_a_picture_of_its_own(figures: dict[str, Figure]) -> None
     report, _ = drive_of_two()
     for n, curve in enumerate(report.measured_wheels):
         drawn = trace(figures["wheels"], "measured", f"y{n + 1}" if n else "y")
-        assert known(column(drawn["y"])) == known(point.value for point in curve.points())
+        assert without_nan(column(drawn["y"])) == without_nan(
+            point.value for point in curve.points()
+        )
 
 
 def test_bands_show_the_reason_on_hover(figures: dict[str, Figure]) -> None:

@@ -24,7 +24,7 @@ EVIL = '</script><script>alert(1)</script><img src=x onerror="alert(2)">\'"&lt;\
 LIBRARY = "var Plotly = {};"
 
 
-class Read(HTMLParser):
+class PageElements(HTMLParser):
     """The elements of a page that a browser would see."""
 
     def __init__(self, text: str) -> None:
@@ -84,7 +84,7 @@ def evil() -> str:
 
 
 def test_text_of_a_client_never_becomes_markup_or_code() -> None:
-    read = Read(evil())
+    read = PageElements(evil())
     assert not {"img", "iframe", "object", "a", "link"} & {tag for tag, _ in read.tags}
     assert all(not name.startswith("on") for _, attrs in read.tags for name in attrs)
     assert [bool(text) for _, text in read.scripts] == [True, True, True]
@@ -97,7 +97,9 @@ def test_text_of_a_client_never_becomes_markup_or_code() -> None:
 
 
 def test_texts_in_the_pictures_contain_no_markup_of_plotly() -> None:
-    (pictures,) = [text for attrs, text in Read(evil()).scripts if attrs.get("id") == "pictures"]
+    (pictures,) = [
+        text for attrs, text in PageElements(evil()).scripts if attrs.get("id") == "pictures"
+    ]
     assert "<" not in pictures
     traces = [trace for figure in json.loads(pictures) for trace in figure["data"]]
     texts = [text for t in traces for key in ("hovertext", "text") for text in t.get(key, ())]
@@ -112,7 +114,7 @@ def test_the_page_loads_nothing_and_runs_only_its_own_scripts() -> None:
     report, _ = drive_of_two()
     text = page(report, origin(), LIBRARY, clock)
     assert re.findall(r"(?:https?:)?//[\w.]+\.\w+", text) == []
-    read = Read(text)
+    read = PageElements(text)
     assert all(not {"src", "href"} & set(attrs) for _, attrs in read.tags)
     (policy,) = [
         attrs["content"] for tag, attrs in read.tags if attrs.get("http-equiv") is not None
@@ -128,7 +130,7 @@ def test_the_page_loads_nothing_and_runs_only_its_own_scripts() -> None:
 
 def test_every_event_has_a_row_with_the_client_that_caused_it() -> None:
     report, _ = drive_of_two()
-    words = Read(page(report, origin(), LIBRARY, clock)).words
+    words = PageElements(page(report, origin(), LIBRARY, clock)).words
     marks = report.marks.all()
     assert f"All {len(marks)} events" in words
     for mark in marks:
@@ -143,7 +145,7 @@ def test_the_events_of_several_days_have_a_date(apart_s: int) -> None:
     noon, report = 1_800_014_400.0, ReportData(Config())
     for seconds in (noon, noon + apart_s):
         report.marks.add(Mark(0.0, "stop", "stopped", "info", "", 1, None, seconds))
-    times = Read(page(report, origin(), LIBRARY, clock)).words
+    times = PageElements(page(report, origin(), LIBRARY, clock)).words
     at = f"{noon:.1f}"
     assert (at if apart_s == 3600 else f"{date(noon)} {at}") in times
 
@@ -158,7 +160,7 @@ def test_missing_steps_are_reported_at_the_top() -> None:
     notes = Origin(
         "a", "r", "1", "3", ("the file has no end: it was cut off, or is still being recorded",)
     )
-    words = Read(page(report, notes, LIBRARY, clock)).words
+    words = PageElements(page(report, notes, LIBRARY, clock)).words
     assert "the file has no end: it was cut off, or is still being recorded" in words
     assert any(text.startswith("60 steps are missing: ") for text in words)
 
@@ -173,7 +175,9 @@ def test_a_long_list_of_events_is_folded(count: int, opened: bool) -> None:
     for n in range(count):
         report.marks.add(Mark(float(n), f"name{n}", "text", "info", "", 1, None, float(n)))
     (details,) = [
-        a for tag, a in Read(page(report, origin(), LIBRARY, clock)).tags if tag == "details"
+        a
+        for tag, a in PageElements(page(report, origin(), LIBRARY, clock)).tags
+        if tag == "details"
     ]
     assert ("open" in details) is opened
 

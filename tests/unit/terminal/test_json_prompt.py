@@ -17,10 +17,10 @@ import pytest
 from acsard.checkup.findings import Finding
 from acsard.terminal import json_prompt
 from acsard.terminal.json_prompt import MAX_LINE_BYTES, JsonPrompt
-from acsard.terminal.prompt import Ask, ended_by_signals
+from acsard.terminal.prompt import NumberQuestion, ended_by_signals
 
-DISTANCE = Ask("How far?", "m", 0.5, 3.0)
-OPTIONAL = Ask("How far, if you like?", "m", 0.0, 3.0, 0.0)
+DISTANCE = NumberQuestion("How far?", "m", 0.5, 3.0)
+OPTIONAL = NumberQuestion("How far, if you like?", "m", 0.0, 3.0, 0.0)
 
 
 class Program:
@@ -36,10 +36,10 @@ class Program:
         monkeypatch.setattr("sys.stdin", self._asked)
         self.said: list[dict[str, Any]] = []
         self.answers: list[object] = []
-        self._thread = threading.Thread(target=self._live, daemon=True)
+        self._thread = threading.Thread(target=self._answer, daemon=True)
         self._thread.start()
 
-    def say(self, *messages: object, raw: bytes = b"") -> None:
+    def send(self, *messages: object, raw: bytes = b"") -> None:
         lines = b"".join(json.dumps(message).encode() + b"\n" for message in messages)
         os.write(self._to_child, raw + lines)
 
@@ -60,7 +60,7 @@ class Program:
         if self._to_child >= 0:
             self.hang_up()
 
-    def _live(self) -> None:
+    def _answer(self) -> None:
         with os.fdopen(self._from_child) as lines:
             for line in lines:
                 message = json.loads(line)
@@ -70,9 +70,9 @@ class Program:
                     if callable(value):
                         value(message["question"])
                     else:
-                        self.say({"answer": message["question"], "value": value})
+                        self.send({"answer": message["question"], "value": value})
 
-    def told(self, name: str) -> list[Any]:
+    def values_of(self, name: str) -> list[Any]:
         """Close the output, and return the value of this key in every message that has it."""
         self._told.close()
         self._thread.join()
@@ -90,8 +90,8 @@ def test_a_number_is_asked_for_until_it_is_valid_and_within_its_bounds(program: 
     program.answers = ["far", 0.1, -2, None, "1,75"]
     with program.hears(JsonPrompt()) as person:
         assert person.number(DISTANCE) == 1.75
-    assert program.told("question") == [1, 2, 3, 4, 5]
-    assert program.told("wrong") == ["type a number in m, from 0.5 to 3"] * 4
+    assert program.values_of("question") == [1, 2, 3, 4, 5]
+    assert program.values_of("wrong") == ["type a number in m, from 0.5 to 3"] * 4
     assert {key: program.said[0][key] for key in ("words", "unit", "least", "most")} == {
         "words": "How far?", "unit": "m", "least": 0.5, "most": 3.0,
     }  # fmt: skip
@@ -107,7 +107,7 @@ def test_an_empty_answer_is_the_default(program: Program) -> None:
 def test_nothing_but_start_starts_a_leg_and_no_key_from_before_stops_it(program: Program) -> None:
     program.answers = ["go", "start"]
     with program.hears(JsonPrompt()) as person:
-        program.say({"key": True})
+        program.send({"key": True})
         person.start("Go.", by_key=True)
         assert person.keys(0.05) == ""
     assert [message.get("leg") for message in program.said] == [True, True]
@@ -117,7 +117,7 @@ def test_nothing_but_start_starts_a_leg_and_no_key_from_before_stops_it(program:
 
 def test_a_key_right_after_the_start_stops(program: Program) -> None:
     def both(number: int) -> None:
-        program.say({"answer": number, "value": "start"}, {"key": True})
+        program.send({"answer": number, "value": "start"}, {"key": True})
 
     program.answers = [both]
     with program.hears(JsonPrompt()) as person:
@@ -128,14 +128,14 @@ def test_a_key_right_after_the_start_stops(program: Program) -> None:
 
 def test_a_line_that_does_not_answer_the_question_leaves_it_open(program: Program) -> None:
     def noise(number: int) -> None:
-        program.say(raw=b'\xff\n[]\n{"answer": "1"}\n{"answer": 1, "value": {}}\n\n')
-        program.say({"answer": number + 1, "value": "start"}, {"answer": -1}, {})
-        program.say({"answer": number, "value": "start", "more": 1})
+        program.send(raw=b'\xff\n[]\n{"answer": "1"}\n{"answer": 1, "value": {}}\n\n')
+        program.send({"answer": number + 1, "value": "start"}, {"answer": -1}, {})
+        program.send({"answer": number, "value": "start", "more": 1})
 
     program.answers = [noise]
     with program.hears(JsonPrompt()) as person:
         person.start("Go.")
-    assert program.told("question") == [1]
+    assert program.values_of("question") == [1]
 
 
 def interrupted(program: Program, do: Callable[[], object]) -> None:
@@ -180,8 +180,8 @@ def test_a_line_with_too_deep_nesting_leaves_the_question_open(program: Program)
     with program.hears(JsonPrompt()) as person:
 
         def nested(number: int) -> None:
-            program.say(raw=b'{"x":' + b"[" * 30_000 + b"\n")
-            program.say({"answer": number, "value": "lifted"})
+            program.send(raw=b'{"x":' + b"[" * 30_000 + b"\n")
+            program.send({"answer": number, "value": "lifted"})
 
         program.answers = [nested]
         assert person.ask("lifted?", ("lifted",)) == "lifted"
@@ -194,7 +194,7 @@ def test_a_line_without_an_end_ends_the_prompt(
 
         def flood(number: int) -> None:
             for _ in range(MAX_LINE_BYTES // 4096 + 1):
-                program.say(raw=b"x" * 4096)
+                program.send(raw=b"x" * 4096)
 
         program.answers = [flood]
         interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
@@ -210,7 +210,7 @@ def test_silence_of_the_program_ends_a_motion_and_keepalives_continue_it(
     with program.hears(JsonPrompt()) as person:
         person.start("Go.")
         for _ in range(10):
-            program.say({})
+            program.send({})
             assert person.keys(0.05) == ""
         interrupted(program, lambda: person.keys(60.0))
     assert (
@@ -225,7 +225,7 @@ def test_a_question_waits_without_a_timeout(
     monkeypatch.setattr(json_prompt, "POLL_S", 0.01)
 
     def late(number: int) -> None:
-        threading.Timer(0.3, program.say, [{"answer": number, "value": 1.0}]).start()
+        threading.Timer(0.3, program.send, [{"answer": number, "value": 1.0}]).start()
 
     program.answers = ["start", late]
     with program.hears(JsonPrompt()) as person:
@@ -238,11 +238,11 @@ def test_findings_are_reported_as_they_are_made_with_the_progress(program: Progr
         person.begin("port sim", simulated=True)
         person.doing("a motor turns")
         for _ in range(20):
-            person.found(Finding("baud rate", "PASS", "115200 baud"))
-    assert program.told("doing") == ["a motor turns"]
+            person.show_finding(Finding("baud rate", "PASS", "115200 baud"))
+    assert program.values_of("doing") == ["a motor turns"]
     assert program.said[0] == {"subject": "port sim", "simulated": True}
-    assert program.told("finding")[0]["figure"] == "115200 baud"
-    shares = program.told("progress")
+    assert program.values_of("finding")[0]["figure"] == "115200 baud"
+    shares = program.values_of("progress")
     assert shares == sorted(shares)
     assert max(shares) < 1.0
 
@@ -251,7 +251,7 @@ def test_the_result_ends_the_progress(program: Program) -> None:
     with program.hears(JsonPrompt()) as person:
         person.progress(0.5)
         person.result("\nall of it\n")
-    assert program.told("progress") == [0.5, 1.0]
+    assert program.values_of("progress") == [0.5, 1.0]
     assert program.said[-1] == {"result": "all of it"}
 
 
@@ -281,7 +281,7 @@ def test_an_unwritable_result_is_not_offered_and_has_a_reason(
     with program.hears(JsonPrompt()) as lines:
         assert not lines.offer(None, OFFERED)
         assert not lines.offer(None, OFFERED, "the daemon runs with another")
-    assert program.told("question") == []
-    first, second = program.told("message")
+    assert program.values_of("question") == []
+    first, second = program.values_of("message")
     assert "no configuration file" in first
     assert "the daemon runs with another" in second

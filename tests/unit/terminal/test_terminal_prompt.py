@@ -16,11 +16,11 @@ import pytest
 from acsard.checkup.findings import Finding
 from acsard.host.terminal_modes import single_key_mode
 from acsard.terminal.output import plain
-from acsard.terminal.prompt import Ask, NobodyError
+from acsard.terminal.prompt import NobodyError, NumberQuestion
 from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt, row
 
-DISTANCE = Ask("How far?", "m", 0.5, 3.0)
-OPTIONAL = Ask("How far, if you like?", "m", 0.0, 3.0, 0.0)
+DISTANCE = NumberQuestion("How far?", "m", 0.5, 3.0)
+OPTIONAL = NumberQuestion("How far, if you like?", "m", 0.0, 3.0, 0.0)
 
 Types = Callable[[str], None]
 

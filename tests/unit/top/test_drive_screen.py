@@ -26,7 +26,7 @@ def of(**what: object) -> Teleop:
     return replace(SEEN, state=replace(STATE, **what))
 
 
-def told(lines: list[str]) -> str:
+def joined(lines: list[str]) -> str:
     """Return the lines as one text with single spaces."""
     return " ".join(" ".join(lines).split())
 
@@ -83,14 +83,14 @@ def test_keys_that_do_not_drive_are_reported() -> None:
     why = "app has the same priority and came first: wait until it is silent"
     data = replace(SEEN, objection=why)
     assert why in " ".join(" ".join(texts(data, 40)).split())
-    assert why in told(report_lines(data, 40))
+    assert why in joined(report_lines(data, 40))
 
 
 def test_a_silence_is_reported_with_its_length() -> None:
     silent = replace(SEEN, age=7.0, silent=True)
     for data in (silent, replace(silent, state=None)):
         assert "nothing received from the daemon for 7 s" in " ".join(texts(data, 80))
-        assert "nothing received from the daemon for 7 s" in told(report_lines(data, 80))
+        assert "nothing received from the daemon for 7 s" in joined(report_lines(data, 80))
     assert "first state" in texts(replace(SEEN, state=None), 80)[1]
 
 
@@ -105,27 +105,27 @@ def test_the_mode_is_not_repeated_in_its_reason(mode: Mode) -> None:
 def test_without_a_screen_no_word_and_no_figure_is_broken_at_the_edge(width: int) -> None:
     rows = report_lines(of(mode="waiting", reason=LONG, x=1.5), width)
     assert max(map(len, rows)) <= width
-    assert LONG in told(rows)
+    assert LONG in joined(rows)
     assert sum("x   +1.500 m" in line for line in rows) == 1
     assert sum("turn -0.60 rad/s" in line for line in rows) == 1
 
 
 def test_the_final_report_says_whether_the_robot_stands_and_where() -> None:
     still = {"linear": 0.0, "angular": 0.0, "wheels": [0.0] * 4}
-    assert told(last_report_lines(of(**still), 80)).startswith(
+    assert joined(last_report_lines(of(**still), 80)).startswith(
         "drive ended: the robot stands still; driving: commanded"
     )
     for moving in (of(), of(**still | {"wheels": [0.0, 0.1, 0.0, 0.0]})):
-        assert told(last_report_lines(moving, 80)).startswith(
+        assert joined(last_report_lines(moving, 80)).startswith(
             "drive ended: the robot still moves; driving: "
         )
     unknown = of(**still | {"linear": None, "angular": None, "wheels": []})
-    assert told(last_report_lines(unknown, 80)).startswith(
+    assert joined(last_report_lines(unknown, 80)).startswith(
         "drive ended: the robot reports no speed; driving: "
     )
-    assert "forward - m/s" in told(last_report_lines(unknown, 80))
-    assert "yaw +57.3°" in told(last_report_lines(of(**still), 40))
-    assert told(last_report_lines(replace(SEEN, age=7.0, silent=True), 80)).startswith(
+    assert "forward - m/s" in joined(last_report_lines(unknown, 80))
+    assert "yaw +57.3°" in joined(last_report_lines(of(**still), 40))
+    assert joined(last_report_lines(replace(SEEN, age=7.0, silent=True), 80)).startswith(
         "drive ended: nothing received from the daemon"
     )
 

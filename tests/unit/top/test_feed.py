@@ -32,7 +32,7 @@ class Robot:
         self.state: RobotState | DecodeError = STATE
         self.queue: deque[Any] = deque()
 
-    def ask(self, name: str, take: Any) -> None:
+    def start_query(self, name: str, take: Any) -> None:
         """Do nothing: the query of the follower gets no answer."""
 
     def key(self, name: str) -> str:
@@ -74,28 +74,28 @@ def at(sec: int, lines: int = 1300) -> RobotState:
 
 def test_a_query_gets_the_present_state_before_one_is_published(robot: Robot) -> None:
     feed = feed_of(robot)
-    assert feed.seen().state is None
-    feed.ask()
-    assert feed.seen().state == STATE
+    assert feed.screen_data().state is None
+    feed.query_state()
+    assert feed.screen_data().state == STATE
 
 
 def test_two_queries_give_two_states_to_compute_rates(robot: Robot) -> None:
     feed = feed_of(robot)
     robot.state = BEFORE
-    feed.ask()
+    feed.query_state()
     robot.state = STATE
-    feed.ask()
-    assert (feed.seen().before, feed.seen().state) == (BEFORE, STATE)
+    feed.query_state()
+    assert (feed.screen_data().before, feed.screen_data().state) == (BEFORE, STATE)
 
 
 def test_the_time_between_two_states_is_measured_by_the_viewer_s_clock(robot: Robot) -> None:
     feed = feed_of(robot)
-    assert feed.seen().passed == 0.0
-    feed.ask()
+    assert feed.screen_data().passed == 0.0
+    feed.query_state()
     robot.now += 0.8
     robot.state = at(9000)
-    feed.ask()
-    assert feed.seen().passed == pytest.approx(0.8)
+    feed.query_state()
+    assert feed.screen_data().passed == pytest.approx(0.8)
 
 
 @pytest.mark.parametrize("sec", [999, 1001])
@@ -103,9 +103,9 @@ def test_the_later_of_an_answer_and_a_published_state_is_shown(robot: Robot, sec
     feed = feed_of(robot)
     robot.state = at(1000)
     robot.tells(at(sec, lines=1300 + sec - 1000))
-    feed.ask()
+    feed.query_state()
     feed.poll()
-    state = feed.seen().state
+    state = feed.screen_data().state
     assert state is not None
     assert state.stamp == Time(max(1000, sec))
 
@@ -114,29 +114,29 @@ def test_a_put_on_a_wildcard_is_not_a_state(robot: Robot) -> None:
     feed = feed_of(robot)
     robot.tells(STATE, "acsard/**")
     feed.poll()
-    assert feed.seen().state is None
+    assert feed.screen_data().state is None
 
 
 def test_a_state_of_another_version_is_reported_as_such(robot: Robot) -> None:
     feed = feed_of(robot)
     robot.state = DecodeError("bad", "unknown field")
     with pytest.raises(ReplyError, match="a different version"):
-        feed.ask()
-    assert feed.seen().undecodable == 1
+        feed.query_state()
+    assert feed.screen_data().undecodable == 1
 
 
 def test_a_silence_is_reported_sooner_once_a_state_has_arrived(robot: Robot) -> None:
     feed = feed_of(robot)
     robot.now += FIRST_STATE_TIMEOUT_S - 0.01
-    assert not feed.seen().silent
+    assert not feed.screen_data().silent
     robot.now += 0.02
-    assert feed.seen().silent
+    assert feed.screen_data().silent
     robot.tells(STATE)
     feed.poll()
     robot.now += ROBOT_SILENCE_TIMEOUT_S - 0.01
-    assert not feed.seen().silent
+    assert not feed.screen_data().silent
     robot.now += 0.02
-    assert feed.seen().silent
+    assert feed.screen_data().silent
 
 
 def test_the_rates_begin_again_when_another_daemon_answers(robot: Robot) -> None:
@@ -146,4 +146,4 @@ def test_the_rates_begin_again_when_another_daemon_answers(robot: Robot) -> None
     robot.now += 0.1
     robot.tells(BEFORE)  # its counters are smaller
     feed.poll()
-    assert (feed.seen().before, feed.seen().state) == (BEFORE, BEFORE)
+    assert (feed.screen_data().before, feed.screen_data().state) == (BEFORE, BEFORE)

@@ -246,7 +246,7 @@ class Session:
             self.tell = take
         return SimpleNamespace(undeclare=lambda: None)
 
-    def comes(self, name: str, kind: Any = zenoh.SampleKind.PUT) -> None:
+    def announce(self, name: str, kind: Any = zenoh.SampleKind.PUT) -> None:
         self.tell(SimpleNamespace(key_expr=f"acsard/{name}/alive", kind=kind))
 
 
@@ -274,7 +274,9 @@ def fleet_of(
     """Return a fleet in which only the robots in `answering` answer queries."""
     robot: Any = SimpleNamespace(session=session, where=Address("tcp/127.0.0.1:7448", "acsar", ""))
     stamps = count(2000)
-    robot.sibling = lambda name: SimpleNamespace(ask=lambda key, take: answer(name, key, take))
+    robot.sibling = lambda name: SimpleNamespace(
+        start_query=lambda key, take: answer(name, key, take)
+    )
 
     def answer(name: str, key: str, take: Callable[[Any], object]) -> None:
         if name in answering:
@@ -290,10 +292,10 @@ INFO = Info("robot1", "0.1", 1, "sim", simulated=True, rate=100.0, listen=[], co
 def test_robots_beyond_the_limit_are_reported_as_left_out(session: Session) -> None:
     fleet = fleet_of(session)
     for number in range(3):
-        session.comes(f"robot{number}")
+        session.announce(f"robot{number}")
     assert fleet.left_out_text == ""
-    assert fleet.seen == "all robots visible at tcp/127.0.0.1:7448: 3 robots"
-    session.comes("robot3")
+    assert fleet.presence_text == "all robots visible at tcp/127.0.0.1:7448: 3 robots"
+    session.announce("robot3")
     assert [row.robot_id for row in fleet.rows()] == ["robot0", "robot1", "robot2"]
     assert "more than 3 robots, and this list shows only 3 of them" in fleet.left_out_text
     assert "--id" in fleet.left_out_text
@@ -304,19 +306,19 @@ def test_the_robot_that_is_gone_for_longest_makes_room_for_a_new_one(
 ) -> None:
     fleet = fleet_of(session, ("robot0", "*"))
     for number in range(3):
-        session.comes(f"robot{number}")
+        session.announce(f"robot{number}")
     for name in ("robot0", "robot2", "robot1"):
         clock.now += 1.0
-        session.comes(name, zenoh.SampleKind.DELETE)
-    session.comes("robot3")
+        session.announce(name, zenoh.SampleKind.DELETE)
+    session.announce("robot3")
     assert sorted(row.robot_id for row in fleet.rows()) == ["robot0", "robot1", "robot3"]
     assert fleet.left_out_text == ""
 
 
 def test_a_robot_whose_liveliness_token_is_deleted_is_not_present(session: Session) -> None:
     fleet = fleet_of(session)
-    session.comes("robot1")
-    session.comes("robot1", zenoh.SampleKind.DELETE)
+    session.announce("robot1")
+    session.announce("robot1", zenoh.SampleKind.DELETE)
     assert [row.here for row in fleet.rows()] == [False]
     assert fleet.left_out_text == ""
 
@@ -325,7 +327,7 @@ def test_the_version_of_a_robot_that_publishes_its_state_often_is_queried(
     session: Session, clock: Clock
 ) -> None:
     fleet = fleet_of(session, ("robot1",), ("robot1",))
-    session.comes("robot1")
+    session.announce("robot1")
     for _ in range(3):
         fleet._state(sample_of(STATE, "acsard/robot1/state"))
         version = fleet.rows()[0].version
@@ -338,7 +340,7 @@ def test_a_state_from_before_a_suspend_is_old(
 ) -> None:
     """The age must include the suspend, in which the monotonic clock stands still."""
     fleet = fleet_of(session)
-    session.comes("robot1")
+    session.announce("robot1")
     fleet._state(sample_of(STATE, "acsard/robot1/state"))
     slept_ns = clocks.asleep_ns() + 3600 * NS_PER_S
     monkeypatch.setattr(clocks, "asleep_ns", lambda: slept_ns)
@@ -363,7 +365,7 @@ def test_the_fleet_is_complete_once_each_named_robot_is_present_and_has_answered
     fleet = fleet_of(session, ids, answering)
     assert not fleet.all_reported
     for name in here:
-        session.comes(name)
+        session.announce(name)
     # the first query may be answered by a storage, the second one only by the robot
     for _ in range(2):
         fleet.rows()
@@ -385,12 +387,12 @@ class Remembers:
     def sibling(self, name: str) -> Remembers:
         return self
 
-    def ask(self, key: str, take: Callable[[Any], object]) -> None:
+    def start_query(self, key: str, take: Callable[[Any], object]) -> None:
         if key == "state":
             take(sample_of(self.stored, f"acsard/robot1/{key}"))
 
 
-def told(fleet: Roster, clock: Clock, seconds: float) -> str:
+def line_after(fleet: Roster, clock: Clock, seconds: float) -> str:
     """Return the line of the robot after watching it for this many seconds."""
     for _ in range(int(seconds / 0.25)):
         fleet.rows()
@@ -402,7 +404,7 @@ def test_a_robot_whose_state_only_a_storage_has_is_gone_and_was_never_seen(
     session: Session, clock: Clock
 ) -> None:
     robot: Any = Remembers(session)
-    line = told(Roster(robot, ("robot1",)), clock, 20.0)
+    line = line_after(Roster(robot, ("robot1",)), clock, 20.0)
     assert "never" in line
     assert line.endswith("GONE, was: commanded by app")
 
@@ -412,10 +414,10 @@ def test_a_daemon_that_hangs_is_silent_though_a_storage_answers_for_it(
 ) -> None:
     robot: Any = Remembers(session)
     fleet = Roster(robot, ("robot1",))
-    session.comes("robot1")
-    assert told(fleet, clock, 0.5).endswith("waiting for its state")
-    assert told(fleet, clock, 5.0).endswith("SILENT, was: commanded by app")
+    session.announce("robot1")
+    assert line_after(fleet, clock, 0.5).endswith("waiting for its state")
+    assert line_after(fleet, clock, 5.0).endswith("SILENT, was: commanded by app")
     robot.stored = replace(STATE, stamp=Time(1001))
-    assert told(fleet, clock, 2.5).endswith("commanded by app")
-    assert "SILENT" not in told(fleet, clock, 0.0)
-    assert told(fleet, clock, 9.0).endswith("SILENT, was: commanded by app")
+    assert line_after(fleet, clock, 2.5).endswith("commanded by app")
+    assert "SILENT" not in line_after(fleet, clock, 0.0)
+    assert line_after(fleet, clock, 9.0).endswith("SILENT, was: commanded by app")

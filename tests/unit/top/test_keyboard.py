@@ -185,7 +185,7 @@ class Robot:
     def subscribe(self, name: str) -> Any:
         return SimpleNamespace(try_recv=lambda: self.said.popleft() if self.said else None)
 
-    def ask(self, name: str, take: Any) -> None:
+    def start_query(self, name: str, take: Any) -> None:
         """Do nothing: the query of the follower gets no answer."""
 
     def send(self, linear: float, angular: float = 0.0) -> None:
@@ -342,7 +342,7 @@ NOT_FOLLOWING = [
 ]
 
 
-class Held(Drive):
+class HeldKeyDrive(Drive):
     """A keyboard drive with a held key. A state then shows why the robot does not obey it."""
 
     def __init__(self, why: RobotState, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -367,7 +367,7 @@ class Held(Drive):
 def test_a_key_that_is_held_while_the_robot_ceases_to_follow_does_not_drive_after_a_pause(
     why: RobotState, pause: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keyboard = Held(why, monkeypatch)
+    keyboard = HeldKeyDrive(why, monkeypatch)
     assert not keyboard.drives("i")
     keyboard.robot.said.append(sample_of(STATE))
     assert not keyboard.drives("", round(pause / 0.05))
@@ -377,7 +377,7 @@ def test_a_key_that_is_held_while_the_robot_ceases_to_follow_does_not_drive_afte
 def test_delayed_keys_do_not_release_a_key_that_no_longer_drives(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    keyboard = Held(STOPPED, monkeypatch)
+    keyboard = HeldKeyDrive(STOPPED, monkeypatch)
     keyboard.robot.said.append(sample_of(STATE))
     keyboard.step(times=60)
     keyboard.step(45 * "i")
@@ -391,7 +391,7 @@ def test_a_delayed_space_does_not_release_a_key_that_no_longer_drives(
 
     Only a space that arrives in time releases the key.
     """
-    keyboard = Held(STOPPED, monkeypatch)
+    keyboard = HeldKeyDrive(STOPPED, monkeypatch)
     keyboard.robot.said.append(sample_of(STATE))
     keyboard.step("i", times=10)
     keyboard.now += 1.2 * GRACE_S
@@ -409,7 +409,7 @@ def test_delayed_keys_do_not_drive_if_the_robot_was_stopped_late_in_their_delay(
 
     After 2 s the robot is stopped and cleared.
     """
-    keyboard = Held(STATE, monkeypatch)
+    keyboard = HeldKeyDrive(STATE, monkeypatch)
     keyboard.step("i", times=10)
     keyboard.step(times=40)
     keyboard.robot.said.append(sample_of(STOPPED))
@@ -424,7 +424,7 @@ def test_delayed_keys_do_not_drive_if_the_robot_was_stopped_late_in_their_delay(
 def test_a_key_that_no_longer_drives_does_so_after_a_key_that_stops(
     key: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keyboard = Held(ZERO_FIRST, monkeypatch)
+    keyboard = HeldKeyDrive(ZERO_FIRST, monkeypatch)
     keyboard.step("i", times=10)
     keyboard.robot.sent.clear()
     keyboard.step(key)
@@ -435,7 +435,7 @@ def test_a_key_that_no_longer_drives_does_so_after_a_key_that_stops(
 def test_a_key_that_no_longer_drives_does_so_after_its_release(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    keyboard = Held(ZERO_FIRST, monkeypatch)
+    keyboard = HeldKeyDrive(ZERO_FIRST, monkeypatch)
     keyboard.step("i", times=10)
     keyboard.step(times=round(RELEASE_TIMEOUT_NS / NS_PER_S / 0.05) + 2)
     keyboard.robot.sent.clear()
@@ -458,14 +458,14 @@ def test_a_state_from_before_a_press_does_not_end_the_hold(
 def test_the_operator_is_informed_that_a_held_key_no_longer_drives(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    keyboard = Held(STOPPED, monkeypatch)
+    keyboard = HeldKeyDrive(STOPPED, monkeypatch)
     keyboard.step("i", times=12)
-    assert keyboard.ride.seen().objection == "stopped by request"
+    assert keyboard.ride.screen_data().objection == "stopped by request"
     keyboard.robot.said.append(sample_of(replace(STATE, mode="ready", source="")))
     keyboard.step("i", times=12)
-    assert keyboard.ride.seen().objection == RELEASE_REASON
+    assert keyboard.ride.screen_data().objection == RELEASE_REASON
     keyboard.step(" ")
-    assert keyboard.ride.seen().objection == ""
+    assert keyboard.ride.screen_data().objection == ""
 
 
 def test_a_space_stops_at_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -480,9 +480,9 @@ def test_the_operator_is_informed_that_a_robot_is_silent(monkeypatch: pytest.Mon
     robot = Robot(STATE)
     drive = Drive(robot, monkeypatch)
     drive.step("i")
-    assert not drive.ride.seen().silent
+    assert not drive.ride.screen_data().silent
     drive.now += ROBOT_SILENCE_TIMEOUT_S
-    assert drive.ride.seen().silent
+    assert drive.ride.screen_data().silent
 
 
 def test_the_operator_is_informed_why_keys_have_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -491,6 +491,6 @@ def test_the_operator_is_informed_why_keys_have_no_effect(monkeypatch: pytest.Mo
     drive = Drive(robot, monkeypatch)
     drive.step(times=10)
     drive.step("i", times=round(GRACE_S / 0.05) - 2)
-    assert drive.ride.seen().objection == ""
+    assert drive.ride.screen_data().objection == ""
     drive.step("i", times=4)
-    assert drive.ride.seen().objection == "stopped by request"
+    assert drive.ride.screen_data().objection == "stopped by request"

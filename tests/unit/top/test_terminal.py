@@ -19,27 +19,29 @@ from tests.unit.top.test_drive_screen import SEEN
 from tests.unit.top.test_fleet_table import ROW
 
 
-def told(states: list[tuple[float, RobotState]]) -> list[RobotState]:
+def printed_states(states: list[tuple[float, RobotState]]) -> list[RobotState]:
     """Return the states that are printed when these states arrive at these times, s."""
     throttle = ReportThrottle()
-    return [state for now, state in states if throttle.tell(replace(SEEN, state=state), now)]
+    return [
+        state for now, state in states if throttle.should_print(replace(SEEN, state=state), now)
+    ]
 
 
 def test_a_robot_that_moves_is_a_line_a_second_and_one_at_rest_one_in_ten() -> None:
     moving = [(n / 20, replace(STATE, x=n / 40, linear=0.5)) for n in range(200)]
-    assert len(told(moving)) == 10
+    assert len(printed_states(moving)) == 10
     sliding = [(n / 20, replace(STATE, linear=0.0, angular=0.0)) for n in range(200)]
-    assert len(told(sliding)) == 10  # its wheels turn
+    assert len(printed_states(sliding)) == 10  # its wheels turn
     resting = [(now, replace(state, wheels=[0.0] * 4)) for now, state in sliding]
-    assert len(told(resting)) == 1
+    assert len(printed_states(resting)) == 1
 
 
 def test_another_reason_is_reported_immediately_up_to_two_lines_a_second() -> None:
     stopped = replace(STATE, mode="stopped", reason="stopped by request")
-    states = told([(0.0, STATE), (0.5, stopped), (0.6, STATE), (1.0, STATE)])
+    states = printed_states([(0.0, STATE), (0.5, stopped), (0.6, STATE), (1.0, STATE)])
     assert [state.mode for state in states] == ["driving", "stopped", "driving"]
     flickering = [(n / 20, replace(STATE, reason=f"because {n}")) for n in range(200)]
-    assert len(told(flickering)) <= 20
+    assert len(printed_states(flickering)) <= 20
 
 
 def test_the_help_is_repeated_before_reports_scroll_it_off_the_terminal() -> None:
@@ -71,7 +73,7 @@ class Ended:
         if len(self.states) > 1:
             self.states.pop(0)
 
-    def seen(self) -> Teleop:
+    def screen_data(self) -> Teleop:
         return replace(SEEN, state=self.states[0], age=0.0)
 
 
@@ -105,8 +107,8 @@ def test_a_terminal_of_any_height_shows_the_heading_of_the_table_of_robots(
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setenv("LINES", str(height))
     monkeypatch.setattr(terminal, "_watch", watch)
-    monkeypatch.setattr(terminal, "_hold", lambda shows: shows([]))
-    fleet = SimpleNamespace(rows=lambda: [ROW], left_out_text="", seen="1 robot")
+    monkeypatch.setattr(terminal, "_run_suspendable", lambda shows: shows([]))
+    fleet = SimpleNamespace(rows=lambda: [ROW], left_out_text="", presence_text="1 robot")
     terminal.roster(cast(Roster, fleet))
     head, *others = capsys.readouterr().out.splitlines()
     assert head.startswith("ROBOT")

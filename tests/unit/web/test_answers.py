@@ -19,7 +19,15 @@ import pytest
 from aiohttp.test_utils import make_mocked_request
 
 from acsard.machine.authority import Authority
-from acsard.web.answers import INLINED, PAGE_DIRECTORY, PIECE_BYTES, Files, _unpacked, cut, sent
+from acsard.web.answers import (
+    INLINED,
+    PAGE_DIRECTORY,
+    PIECE_BYTES,
+    Files,
+    _unpacked,
+    cut,
+    file_answer,
+)
 
 
 @pytest.fixture
@@ -104,8 +112,8 @@ def test_a_page_that_the_browser_has_already_keeps_its_policy() -> None:
     """
     page = Files().get("index.html")
     assert page is not None
-    first = sent(make_mocked_request("GET", "/"), page)
-    again = sent(make_mocked_request("GET", "/", {"If-None-Match": page.tag}), page)
+    first = file_answer(make_mocked_request("GET", "/"), page)
+    again = file_answer(make_mocked_request("GET", "/", {"If-None-Match": page.tag}), page)
     assert (first.status, again.status) == (200, 304)
     policies = [response.headers["Content-Security-Policy"] for response in (first, again)]
     assert policies[0] == policies[1]
@@ -115,7 +123,7 @@ def test_a_page_that_the_browser_has_already_keeps_its_policy() -> None:
 def test_any_other_file_allows_no_inline_script() -> None:
     file = Files().get("main.js")
     assert file is not None
-    answer = sent(make_mocked_request("GET", "/page/main.js"), file)
+    answer = file_answer(make_mocked_request("GET", "/page/main.js"), file)
     assert "script-src" not in answer.headers["Content-Security-Policy"]
     assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
 

@@ -63,9 +63,9 @@ async def test_stops_beyond_the_limit_share_the_reply_of_a_stop_sent_after_them(
         return ServiceReply(False, "not stopped")
 
     stops = Stops()
-    first = [asyncio.create_task(stops.ask(held)) for _ in range(MAX_STOPS)]
+    first = [asyncio.create_task(stops.send_stop(held)) for _ in range(MAX_STOPS)]
     await asyncio.sleep(0)
-    later = [asyncio.create_task(stops.ask(refused)) for _ in range(100)]
+    later = [asyncio.create_task(stops.send_stop(refused)) for _ in range(100)]
     done, _ = await asyncio.wait(later, timeout=0.1)
     assert not done
     go.set()
@@ -86,15 +86,15 @@ async def test_a_stop_that_fails_fails_its_waiting_callers_and_not_the_next_stop
         raise ConnectionError("gone")
 
     stops = Stops()
-    first = [asyncio.create_task(stops.ask(held)) for _ in range(MAX_STOPS)]
+    first = [asyncio.create_task(stops.send_stop(held)) for _ in range(MAX_STOPS)]
     await asyncio.sleep(0)
-    later = [asyncio.create_task(stops.ask(fails)) for _ in range(3)]
+    later = [asyncio.create_task(stops.send_stop(fails)) for _ in range(3)]
     await asyncio.sleep(0)
     go.set()
     async with asyncio.timeout(PATIENCE_S):
         results = await asyncio.gather(*later, return_exceptions=True)
         assert [str(result) for result in results] == ["gone"] * 3
-        assert (await stops.ask(held)).success
+        assert (await stops.send_stop(held)).success
         await asyncio.gather(*first)
 
 
@@ -181,7 +181,7 @@ async def test_stops_of_one_client_to_one_robot_are_merged_without_a_loss() -> N
 
     async def asked() -> None:
         begun = loop.time()
-        reply = await merged.ask(("viewer", "r2"), stop)
+        reply = await merged.send_stop(("viewer", "r2"), stop)
         assert sent[int(reply.message) - 1] >= begun
 
     for _ in range(3):
@@ -190,7 +190,7 @@ async def test_stops_of_one_client_to_one_robot_are_merged_without_a_loss() -> N
     assert 4 <= (merged_stops := len(sent)) < 20
     # The time begins shortly before a stop is sent.
     assert all(later - sooner > 0.9 * MIN_STOP_INTERVAL_S for sooner, later in pairwise(sent))
-    await asyncio.gather(*(merged.ask((f"viewer {n}", "r2"), stop) for n in range(9)))
+    await asyncio.gather(*(merged.send_stop((f"viewer {n}", "r2"), stop) for n in range(9)))
     assert len(sent) == merged_stops + 9
     await asyncio.sleep(2 * MIN_STOP_INTERVAL_S)
     assert not merged._rests
@@ -204,12 +204,12 @@ async def test_a_stop_that_comes_as_the_pause_ends_is_sent_and_so_are_the_later_
         sent += 1
         return ServiceReply(True, "stopped")
 
-    await merged.ask("viewer", stop)
+    await merged.send_stop("viewer", stop)
     # The event loop is late, so it runs the next stop and the end of the pause in one turn.
     time.sleep(2 * MIN_STOP_INTERVAL_S)
     for _ in range(2):
         async with asyncio.timeout(PATIENCE_S):
-            assert (await asyncio.create_task(merged.ask("viewer", stop))).success
+            assert (await asyncio.create_task(merged.send_stop("viewer", stop))).success
     assert sent == 3
 
 

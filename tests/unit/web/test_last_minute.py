@@ -32,7 +32,7 @@ STATE = RobotState(
 WISHED = Twist(Vector3(0.3, 0.0, 0.0), Vector3(0.0, 0.0, -0.6))
 
 
-def lived(seconds: float, look_ns: int = NS_PER_S // 10) -> Minute:
+def minute_after(seconds: float, look_ns: int = NS_PER_S // 10) -> Minute:
     """Return the stored last minute after the robot has sent states for this time."""
     minute = Minute()
     for at_ns in range(0, int(seconds * NS_PER_S) + 1, look_ns):
@@ -59,7 +59,7 @@ def test_a_row_has_what_each_line_of_the_plots_shows() -> None:
 
 
 def test_the_plots_show_only_the_last_minute_of_a_longer_run() -> None:
-    plot = lived(150.0).plotted(150 * NS_PER_S)
+    plot = minute_after(150.0).plotted(150 * NS_PER_S)
     assert 0.98 * MINUTE_NS / STEP_NS < len(plot.age) <= MINUTE_NS // STEP_NS + 1
     assert max(plot.age) <= MINUTE_NS // 1_000_000
     assert plot.age == sorted(plot.age, reverse=True)
@@ -69,7 +69,7 @@ def test_the_plots_show_only_the_last_minute_of_a_longer_run() -> None:
 
 @each("look_ns", [1_000_000, 30_000_000, 90_000_000, 110_000_000])
 def test_the_plots_are_bounded_and_cover_a_minute_at_any_sampling_interval(look_ns: int) -> None:
-    plot = lived(100.0, look_ns).plotted(100 * NS_PER_S)
+    plot = minute_after(100.0, look_ns).plotted(100 * NS_PER_S)
     assert len(plot.age) <= MAX_ROWS
     assert max(plot.age) > 0.98 * MINUTE_NS / 1_000_000
 
@@ -88,7 +88,7 @@ def test_before_the_first_state_the_plots_are_empty() -> None:
 
 
 def test_without_new_states_the_plots_become_empty_within_a_minute() -> None:
-    minute = lived(10.0)
+    minute = minute_after(10.0)
     assert 0 < len(minute.plotted(65 * NS_PER_S).age) < len(minute.plotted(10 * NS_PER_S).age)
     assert minute.plotted(71 * NS_PER_S).age == []
 

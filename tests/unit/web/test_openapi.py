@@ -16,7 +16,7 @@ from acsard.core.messages.keys_and_roles import SERVICES, TOPICS
 from acsard.core.messages.permissions import SERVICE_ROLES, least_role
 from acsard.web.app import ROUTES
 from acsard.web.openapi import FROM_ROBOT, TO_ROBOT, document
-from acsard.web.routes import PARAMETERS, asked
+from acsard.web.routes import PARAMETERS, is_queryable
 from acsard.web.socket_messages import MESSAGE_TYPES, FrameError, decode
 from tests.each import each
 
@@ -37,7 +37,7 @@ def test_every_key_that_answers_and_every_service_is_described() -> None:
     paths = WHOLE["paths"]
     for topic in TOPICS:
         path = f"/api/{topic.key.replace('<Type>', '{type}')}"
-        assert (path in paths and "get" in paths[path]) == asked(topic), path
+        assert (path in paths and "get" in paths[path]) == is_queryable(topic), path
     assert all("post" in paths[f"/api/srv/{verb}"] for verb in SERVICES)
     assert "requestBody" in paths["/api/srv/set"]["post"]
 

@@ -86,14 +86,14 @@ def drawn_by(program: str) -> Reports:
 async def become(renderer: Reports, path: Path, *states: str, stamp: int = 1) -> ReportState:
     """Wait until the report's progress has one of these states, and return the progress."""
     async with asyncio.timeout(PATIENCE_S):
-        while (progress := renderer.ask(path, (stamp, 0))).report not in states:
+        while (progress := renderer.request(path, (stamp, 0))).report not in states:
             await asyncio.sleep(0.01)
     return progress
 
 
 async def test_a_request_starts_the_report_and_a_later_one_gets_it() -> None:
     renderer = drawn_by(DRAWS)
-    assert renderer.ask(A, (1, 0)).report == "drawing"
+    assert renderer.request(A, (1, 0)).report == "drawing"
     assert renderer.drawn("a.mcap") is None
     progress = await become(renderer, A, "ready", "failed")
     assert progress == ReportState("ready", href="report/a.mcap")
@@ -105,22 +105,22 @@ async def test_a_request_starts_the_report_and_a_later_one_gets_it() -> None:
 
 async def test_a_report_has_its_progress_and_a_second_report_waits() -> None:
     renderer = drawn_by(WAITS)
-    renderer.ask(A, (1, 0))
+    renderer.request(A, (1, 0))
     async with asyncio.timeout(PATIENCE_S):
-        while renderer.ask(A, (1, 0)).percent != 40:
+        while renderer.request(A, (1, 0)).percent != 40:
             await asyncio.sleep(0.01)
-    assert renderer.ask(B, (1, 0)).report == "busy"
-    assert "a.mcap" in renderer.ask(B, (1, 0)).text
+    assert renderer.request(B, (1, 0)).report == "busy"
+    assert "a.mcap" in renderer.request(B, (1, 0)).text
     renderer.end()
-    assert renderer.ask(B, (1, 0)).report == "drawing"
+    assert renderer.request(B, (1, 0)).report == "drawing"
     renderer.end()
 
 
 async def test_a_report_is_made_again_only_if_its_recording_has_grown() -> None:
     renderer = drawn_by(DRAWS)
     await become(renderer, A, "ready")
-    assert renderer.ask(A, (1, 0)).report == "ready"
-    assert renderer.ask(A, (2, 0)).report == "drawing"
+    assert renderer.request(A, (1, 0)).report == "ready"
+    assert renderer.request(A, (2, 0)).report == "drawing"
     # The recording grows while it is drawn, so the report has the stamp that was requested.
     await become(renderer, A, "ready", stamp=3)
 
@@ -151,7 +151,7 @@ async def test_a_failed_report_has_its_reason_and_the_next_request_starts_it_aga
     assert progress.report == "failed"
     assert why in progress.text
     assert "acsard: " not in progress.text
-    assert renderer.ask(A, (1, 0)).report == "drawing"
+    assert renderer.request(A, (1, 0)).report == "drawing"
     renderer.end()
 
 
@@ -202,12 +202,12 @@ async def test_a_report_without_further_requests_is_cancelled_and_its_process_en
     pid_file = tmp_path / "pid"
     program = f"import os; open({str(pid_file)!r}, 'w').write(str(os.getpid())); {WAITS}"
     renderer = drawn_by(program)
-    renderer.ask(A, (1, 0))
+    renderer.request(A, (1, 0))
     async with asyncio.timeout(PATIENCE_S):
         while not (pid_file.exists() and pid_file.read_text()):
             await asyncio.sleep(0.01)
         renderer.tidy()
-        assert renderer.ask(A, (1, 0)).report == "drawing"
+        assert renderer.request(A, (1, 0)).report == "drawing"
         monkeypatch.setattr(reports, "ABANDONED_NS", -NS_PER_S)
         renderer.tidy()
         while Path(f"/proc/{pid_file.read_text()}").exists():

@@ -29,7 +29,7 @@ from acsard.host import clock
 from acsard.host.threads import NoThreadError
 from acsard.web import robots
 from acsard.web.metrics import Counts
-from acsard.web.robots import PROCESS_PERIOD_S, About, Robots, _Asking
+from acsard.web.robots import PROCESS_PERIOD_S, About, Robots, _TaskQueries
 from tests.each import each
 from tests.unit.client.test_follower import UNREADABLE, Robot
 from tests.unit.top.screens import INFO, STATE, sample_of
@@ -59,7 +59,9 @@ class World:
     def state(self) -> Any:
         return sample_of(replace(STATE, stamp=Time.from_ns(round(self.now * NS_PER_S))))
 
-    def told(self, seconds: float, publishes: Callable[[float], Any]) -> list[tuple[float, str]]:
+    def reachability_changes(
+        self, seconds: float, publishes: Callable[[float], Any]
+    ) -> list[tuple[float, str]]:
         """Run for this time, and return each change of `gone` with the time of its report.
 
         `publishes` returns the sample that the robot publishes at a time, or None.
@@ -68,7 +70,7 @@ class World:
 
         async def story() -> None:
             client: Any = self.robot
-            watch = Watch(_Asking(client), self.now)
+            watch = Watch(_TaskQueries(client), self.now)
             watching = asyncio.create_task(self.robots._follow(watch))
             began, before = self.now, self.robots.gone
             while self.now - began < seconds:
@@ -94,10 +96,10 @@ class Answering(Robot):
         super().__init__()
         self._world = world
 
-    def ask(self, name: str, take: Any) -> None:
+    def start_query(self, name: str, take: Any) -> None:
         self._world.asked += 1
         self.answer = self._world.answers()
-        super().ask(name, take)
+        super().start_query(name, take)
 
 
 @pytest.fixture
@@ -106,7 +108,7 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
 
 
 def test_a_robot_that_falls_silent_is_reported_within_its_time(world: World) -> None:
-    changes = world.told(10.0, lambda t: world.state() if t < 5.0 else None)
+    changes = world.reachability_changes(10.0, lambda t: world.state() if t < 5.0 else None)
     (_, here), (at, reason) = changes
     assert here == ""
     assert "nothing is received from the daemon at tcp/x:1" in reason
@@ -121,19 +123,21 @@ def test_a_robot_that_publishes_once_in_ten_seconds_is_queried_and_is_not_gone(
     world: World,
 ) -> None:
     world.answers = world.state
-    changes = world.told(30.0, lambda t: world.state() if round(t * 10) % 100 == 0 else None)
+    changes = world.reachability_changes(
+        30.0, lambda t: world.state() if round(t * 10) % 100 == 0 else None
+    )
     assert [reason for _, reason in changes] == [""]
     assert world.asked > 30.0 / (2 * QUERY_PERIOD_S + 2 * PROCESS_PERIOD_S)
 
 
 def test_a_daemon_of_another_version_is_reported_as_such(world: World) -> None:
-    ((at, reason),) = world.told(10.0, lambda t: UNREADABLE)
+    ((at, reason),) = world.reachability_changes(10.0, lambda t: UNREADABLE)
     assert "another version" in reason
     assert at <= FIRST_STATE_TIMEOUT_S + 2 * PROCESS_PERIOD_S
 
 
 def test_a_robot_that_returns_is_present_without_delay(world: World) -> None:
-    changes = world.told(10.0, lambda t: None if 2.0 < t < 6.0 else world.state())
+    changes = world.reachability_changes(10.0, lambda t: None if 2.0 < t < 6.0 else world.state())
     assert [bool(reason) for _, reason in changes] == [False, True, False]
     assert changes[-1][0] <= 6.0 + 2 * PROCESS_PERIOD_S
 
@@ -149,13 +153,13 @@ def test_a_robot_whose_last_state_is_older_than_a_suspend_is_silent_immediately(
             world.now += 60.0
         return None
 
-    (_, here), (at, reason) = world.told(70.0, publishes)
+    (_, here), (at, reason) = world.reachability_changes(70.0, publishes)
     assert here == ""
     assert "nothing is received" in reason
     assert 65.0 <= at <= 65.0 + 2 * PROCESS_PERIOD_S
 
 
-class Known(Robot):
+class AnsweringRobot(Robot):
     """A client whose robot also answers with its version and its configuration."""
 
     def get(self, name: str) -> Any:
@@ -185,7 +189,7 @@ async def test_the_page_says_why_it_cannot_follow_the_robot_yet(
         return call()
 
     monkeypatch.setattr(robots, "in_thread", in_thread)
-    client: Any = Known()
+    client: Any = AnsweringRobot()
     page = Robots(Address("tcp/x:1", "acsar", ""), lambda: client, ABOUT, Counts())
     running = asyncio.create_task(page.run())
     for _ in range(10):
@@ -212,7 +216,7 @@ async def test_the_page_learns_about_its_robot_although_a_thread_could_not_start
     monkeypatch.setattr(robots, "in_thread", in_thread)
     monkeypatch.setattr(robots, "RETRY_DELAY_S", 0.0)
     monkeypatch.setattr(robots, "ABOUT_RETRY_S", 0.0)
-    client: Any = Known()
+    client: Any = AnsweringRobot()
     page = Robots(Address("tcp/x:1", "acsar", ""), lambda: client, ABOUT, Counts())
     running = asyncio.create_task(page.run())
     for _ in range(100):

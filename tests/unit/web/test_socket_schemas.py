@@ -19,7 +19,7 @@ from acsard.web.last_minute import Minute
 from acsard.web.openapi import GUIDE_MESSAGES, KEYS, SENT_MESSAGES, VALUE_PREFIX
 from acsard.web.socket_sender import Following
 from acsard.web.streams import VIEWER_KEYS as FOLLOWED
-from tests.described import FRAMES, GUIDES, SCHEMAS, kinds, spoilt, taken
+from tests.described import FRAMES, GUIDES, SCHEMAS, is_described_frame, kinds, spoilt
 from tests.each import each
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
 
@@ -36,7 +36,7 @@ SAID: tuple[Struct, ...] = (
     socket_messages.Rows([socket_messages.Row("acsar", None, "", None, "", None, "")], ""),
     socket_messages.Pong(12.5, 1e12),
     socket_messages.Refused("cmd", "why"),
-    socket_messages.Gone("why"),
+    socket_messages.DaemonUnreachable("why"),
 )
 
 GUIDED: tuple[Struct, ...] = (
@@ -47,12 +47,12 @@ GUIDED: tuple[Struct, ...] = (
     json_prompt.Doing("so"),
     json_prompt.Progress(0.5),
     json_prompt.Question(question=1, words="How far?", unit="m", least=0.5, most=3.0),
-    json_prompt.Found(Finding("watchdog", "PASS", keys={"mcu.port": "sim"})),
+    json_prompt.FindingMessage(Finding("watchdog", "PASS", keys={"mcu.port": "sim"})),
     json_prompt.Result("all"),
 )
 
 
-def as_told(message: object) -> Any:
+def as_sent(message: object) -> Any:
     return msgspec.json.decode(msgspec.json.encode(message))
 
 
@@ -65,16 +65,18 @@ def test_every_key_that_may_be_followed_is_described() -> None:
 
 @each("message", SAID)
 def test_each_sent_message_matches_its_schema_only_if_it_is_complete(message: Struct) -> None:
-    frame = as_told(message)
+    frame = as_sent(message)
     assert kinds([frame]) == {type(message).__name__}
-    assert [variant for variant in spoilt(frame) if taken(variant)] == []
+    assert [variant for variant in spoilt(frame) if is_described_frame(variant)] == []
 
 
 @each("line", GUIDED)
 def test_each_line_of_a_check_or_calibration_is_as_described(line: Struct) -> None:
-    assert kinds([as_told({"guide": line})]) == {"Guided", type(line).__name__}
-    assert not taken({"guide": {}})
-    assert not taken({"guide": as_told(line) | {next(iter(as_told(line))): {"of": "nothing"}}})
+    assert kinds([as_sent({"guide": line})]) == {"Guided", type(line).__name__}
+    assert not is_described_frame({"guide": {}})
+    assert not is_described_frame(
+        {"guide": as_sent(line) | {next(iter(as_sent(line))): {"of": "nothing"}}}
+    )
 
 
 def test_each_kind_of_sent_message_has_an_example() -> None:
@@ -85,9 +87,9 @@ def test_each_kind_of_sent_message_has_an_example() -> None:
 
 @pytest.mark.parametrize("role", get_args(Role))
 def test_a_greeting_may_have_only_an_existing_role(role: Role) -> None:
-    hello = as_told(socket_messages.Hello(msgspec.structs.replace(GREETING, role=role)))
-    assert taken(hello)
-    assert not taken({"hello": hello["hello"] | {"role": "king"}})
+    hello = as_sent(socket_messages.Hello(msgspec.structs.replace(GREETING, role=role)))
+    assert is_described_frame(hello)
+    assert not is_described_frame({"hello": hello["hello"] | {"role": "king"}})
 
 
 @pytest.mark.parametrize("robot", ["acsar", "robot2"])
@@ -97,10 +99,10 @@ def test_a_message_of_a_key_has_its_type_by_reference(robot: str) -> None:
     odom = report.current("odom", lambda: SNAPSHOT)
     assert odom is not None
     head = Following(robot, "odom", "acsar", 0.1).head
-    frame = as_told(msgspec.Raw(b'%b%b,"age":1.5}' % (head, encode(odom, "json"))))
+    frame = as_sent(msgspec.Raw(b'%b%b,"age":1.5}' % (head, encode(odom, "json"))))
     assert kinds([frame, frame | {"value": None}]) == {"Value.odom"}
-    assert [variant for variant in spoilt(frame) if taken(variant)] == _without(frame)
-    assert not taken(frame | {"key": "state"})
+    assert [variant for variant in spoilt(frame) if is_described_frame(variant)] == _without(frame)
+    assert not is_described_frame(frame | {"key": "state"})
     assert SCHEMAS["Value.odom"]["properties"]["value"]["anyOf"][0] == {
         "$ref": "#/components/schemas/Odometry"
     }

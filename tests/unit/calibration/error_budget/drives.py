@@ -25,7 +25,7 @@ Real wheels do not turn more evenly.
 """
 
 
-class Told(Struct, frozen=True):
+class ReportedDrive(Struct, frozen=True):
     """The lines of a drive, and the final position error of odometry that uses these lines."""
 
     lines: list[Line]
@@ -51,14 +51,14 @@ class Drive:
         self.left, self.right = angles
         self.t: Array = np.arange(len(self.left)) * PERIOD
 
-    def told(
+    def report(
         self,
         at: Array,
         left: Array,
         right: Array,
         dt: Array,
         mask: npt.NDArray[np.bool_] | None = None,
-    ) -> Told:
+    ) -> ReportedDrive:
         """Integrate the speeds of the lines as odometry does, and return lines and final error.
 
         `at` has the timestamps of the lines. `mask` marks the lines that arrive.
@@ -75,14 +75,14 @@ class Drive:
                 Line(float(at[k]), (other, first, first, other), (b, a, a, b), float(eyaw[k]), 0.0)
             )
         metres = float(np.abs(np.diff(self.left) + np.diff(self.right)).sum()) * RADIUS / 2
-        return Told(lines, metres, float(np.hypot(x[-1] - ex[-1], y[-1] - ey[-1])))
+        return ReportedDrive(lines, metres, float(np.hypot(x[-1] - ex[-1], y[-1] - ey[-1])))
 
     def speeds(self) -> tuple[Array, Array]:
         """Return the mean speeds of each period, rad/s."""
         return np.diff(self.left) / PERIOD, np.diff(self.right) / PERIOD
 
 
-def late(seed: int, seconds: float, how: str) -> Told:
+def late(seed: int, seconds: float, how: str) -> ReportedDrive:
     """Return a drive whose timestamps are the times at which the host read the lines.
 
     `how` says why they are late: an adapter that sends lines in batches, or stalls of the host.
@@ -102,10 +102,10 @@ def late(seed: int, seconds: float, how: str) -> Told:
     else:
         at = true + rng.exponential(0.002, len(true))
     at = np.maximum.accumulate(at)
-    return drive.told(at, left, right, np.diff(at, prepend=at[0] - PERIOD))
+    return drive.report(at, left, right, np.diff(at, prepend=at[0] - PERIOD))
 
 
-def rounded(seed: int, seconds: float, counts: int = 0) -> Told:
+def rounded(seed: int, seconds: float, counts: int = 0) -> ReportedDrive:
     """Return a drive with speeds rounded to two decimals.
 
     If `counts` is not 0, the firmware computes each speed from whole counts, `counts` per turn.
@@ -120,10 +120,12 @@ def rounded(seed: int, seconds: float, counts: int = 0) -> Told:
             for angle, phase in zip((drive.left, drive.right), phases, strict=True)
         )
     left, right = np.round(left, 2), np.round(right, 2)
-    return drive.told(drive.t[1:], left, right, np.full(len(left), PERIOD))
+    return drive.report(drive.t[1:], left, right, np.full(len(left), PERIOD))
 
 
-def lost(seed: int, seconds: float, share: float, longest: int, stands: bool = False) -> Told:
+def lost(
+    seed: int, seconds: float, share: float, longest: int, stands: bool = False
+) -> ReportedDrive:
     """Return a drive that loses about this share of its lines, up to `longest` in a row.
 
     The next line's speed is used for all of the missing time. With `stands`, a gap of more than 0.1
@@ -138,7 +140,7 @@ def lost(seed: int, seconds: float, share: float, longest: int, stands: bool = F
     dt = np.diff(at, prepend=at[0] - PERIOD)
     if stands:
         dt[dt > 0.1] = 0.0
-    return drive.told(at, left[mask], right[mask], dt)
+    return drive.report(at, left[mask], right[mask], dt)
 
 
 def _path(left: Array, right: Array) -> tuple[Array, Array, Array]:

@@ -15,11 +15,11 @@ from acsard.calibration.error_budget.measured_errors import Line
 from acsard.core.config.settings import Config, McuConfig, OdometryConfig
 from acsard.core.motion.uncertainty import GYRO_SCALE_STD
 from tests.unit.calibration.error_budget import drives
-from tests.unit.calibration.error_budget.drives import Told
+from tests.unit.calibration.error_budget.drives import ReportedDrive
 
 CONFIG = Config()
 
-Make = Callable[[int, float], Told]
+Make = Callable[[int, float], ReportedDrive]
 
 CASES: dict[str, tuple[Cause, Make]] = {
     "an adapter that holds lines for 16 ms": ("time", partial(drives.late, how="batches")),
@@ -77,7 +77,7 @@ def test_the_share_of_a_cause_is_within_half_of_the_error_it_makes_in_450_m(case
 # robots that do not drive, causes that are not measured, and a gyro
 
 
-def driven() -> Told:
+def driven() -> ReportedDrive:
     return drives.rounded(1, 10.0)
 
 

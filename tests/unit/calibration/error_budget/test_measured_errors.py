@@ -19,7 +19,7 @@ from acsard.calibration.log_table import Floats
 from acsard.core.config.settings import DriveConfig
 from acsard.core.motion.kinematics import Kinematics
 from tests.each import each
-from tests.unit.calibration.error_budget.drives import Told, late, rounded
+from tests.unit.calibration.error_budget.drives import ReportedDrive, late, rounded
 
 PERIOD = 0.01
 KINEMATICS = Kinematics(DriveConfig())
@@ -203,18 +203,18 @@ def test_firmware_that_filters_is_not_taken_for_firmware_that_counts(seed: int) 
     assert rounding(speeds, PERIOD).count == 0.0
 
 
-def driving(drive: Told, gyro: bool = False) -> Driving:
+def driving(drive: ReportedDrive, gyro: bool = False) -> Driving:
     moved = motion(drive.lines, np.zeros(0), KINEMATICS, whole=True)
     result = rounding(np.array([line.speeds for line in drive.lines]), moved.period)
     return Driving(drive.lines, moved, result, KINEMATICS, 0.1, gyro)
 
 
 @pytest.fixture(scope="module")
-def told() -> Told:
+def told() -> ReportedDrive:
     return rounded(1, 10.0)
 
 
-def test_the_steps_add_up_to_the_driven_way_and_heading(told: Told) -> None:
+def test_the_steps_add_up_to_the_driven_way_and_heading(told: ReportedDrive) -> None:
     rows = driving(told).plain().rows
     assert len(rows) == pytest.approx(100, abs=1)
     first, last = told.lines[0], told.lines[-1]
@@ -223,7 +223,7 @@ def test_the_steps_add_up_to_the_driven_way_and_heading(told: Told) -> None:
     assert rows[:, 1].sum() == pytest.approx(last.yaw - first.yaw)
 
 
-def test_every_step_that_moves_has_a_rounding_error(told: Told) -> None:
+def test_every_step_that_moves_has_a_rounding_error(told: ReportedDrive) -> None:
     rows = driving(told).rounded().rows
     assert rows[np.abs(rows[:, 0]) > 0.01, 2].all()
 
@@ -232,15 +232,17 @@ def test_time_errors_occur_in_blocks() -> None:
     assert 10 <= np.count_nonzero(driving(late(1, 10.0, "batches")).late().rows[:, 2]) <= 21
 
 
-def test_no_step_has_a_gap_error_if_all_lines_came(told: Told) -> None:
+def test_no_step_has_a_gap_error_if_all_lines_came(told: ReportedDrive) -> None:
     assert not driving(told).missed().rows[:, 2:].any()
 
 
-def test_wheels_of_a_side_that_agree_show_no_slip(told: Told) -> None:
+def test_wheels_of_a_side_that_agree_show_no_slip(told: ReportedDrive) -> None:
     assert not driving(told).contradicted().rows[:, 2:].any()
 
 
-def test_if_a_gyro_gives_the_heading_rounding_changes_only_the_distance(told: Told) -> None:
+def test_if_a_gyro_gives_the_heading_rounding_changes_only_the_distance(
+    told: ReportedDrive,
+) -> None:
     steps = driving(told, gyro=True).rounded()
     assert steps.by_gyro
     assert steps.rows[:, 2].any()

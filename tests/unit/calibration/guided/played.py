@@ -18,7 +18,7 @@ from acsard.calibration.log_table import Table
 from acsard.calibration.runs import Run, runs
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config
-from acsard.terminal.prompt import Ask
+from acsard.terminal.prompt import NumberQuestion
 from acsard.terminal.terminal_prompt import NoPrompt
 from tests.unit.calibration.robots import Drive, Plan, Robot, drive
 
@@ -87,14 +87,14 @@ class Player:
             rate = abs(angular) / (self.robot.chi * (1 + self.robot.rate * rate))
         return (2 * math.pi + float(self.robot.rng.normal(0, REACTION_RAD))) / rate
 
-    def answer(self, ask: Ask) -> float:
-        number = self._seen(ask.words)
+    def answer(self, ask: NumberQuestion) -> float:
+        number = self._measure(ask.words)
         if ask.unit == "mm":
             number = round(1000 * number)
         assert ask.least <= number <= ask.most, ask
         return float(number)
 
-    def _seen(self, words: str) -> float:
+    def _measure(self, words: str) -> float:
         noise = float(self.robot.rng.normal(0, READ_M))
         off = math.remainder(self.yaw, math.pi)
         half = math.sin(off) / 2
@@ -119,20 +119,20 @@ class Player:
         return round(math.degrees(off) + float(self.robot.rng.normal(0, 2.0)))
 
 
-class Asked(NoPrompt):
+class PlayedPrompt(NoPrompt):
     """A prompt that passes every question to the simulated person."""
 
     def __init__(self, player: Player) -> None:
         super().__init__()
         self._player = player
 
-    def number(self, ask: Ask) -> float:
+    def number(self, ask: NumberQuestion) -> float:
         return self._player.answer(ask)
 
 
 def play(way: str, player: Player) -> Calibration:
     """Run a guided calibration with the simulated person and robot to its end."""
-    return guide(way, usual_setup(), Asked(player), player.ride)
+    return guide(way, usual_setup(), PlayedPrompt(player), player.ride)
 
 
 def leg(way: str, name: str, track: float = 1.6) -> Leg:

@@ -24,9 +24,16 @@ from acsard.calibration.guided.runner import guide
 from acsard.calibration.log_table import LogError, RefusedError
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config, DriveConfig
-from acsard.terminal.prompt import Ask
+from acsard.terminal.prompt import NumberQuestion
 from tests.unit.calibration.cut import IDEAL
-from tests.unit.calibration.guided.played import Asked, Player, anyone, leg, play, usual_setup
+from tests.unit.calibration.guided.played import (
+    PlayedPrompt,
+    Player,
+    anyone,
+    leg,
+    play,
+    usual_setup,
+)
 from tests.unit.calibration.robots import SEPARATION, Drive, Robot, drive, wander
 from tests.unit.calibration.test_solve import off
 
@@ -121,21 +128,21 @@ def test_the_improvement_is_reported(way: str) -> None:
 # the legs of each way
 
 
-class Talk(Asked):
+class Talk(PlayedPrompt):
     """A prompt that records what it shows and asks."""
 
     def __init__(self, player: Player) -> None:
         super().__init__(player)
         self.shown: list[str] = []
-        self.asked: list[Ask] = []
+        self.asked: list[NumberQuestion] = []
 
-    def say(self, text: str) -> None:
+    def show_text(self, text: str) -> None:
         self.shown.append(text)
 
     def start(self, text: str, by_key: bool = False) -> None:
         self.shown.append(text)
 
-    def number(self, ask: Ask) -> float:
+    def number(self, ask: NumberQuestion) -> float:
         self.asked.append(ask)
         return super().number(ask)
 
@@ -226,7 +233,7 @@ class Exact(Player):
         super().__init__(robot)
         self.ends: list[complex] = []
 
-    def answer(self, ask: Ask) -> float:
+    def answer(self, ask: NumberQuestion) -> float:
         if "left of its marks" in ask.words:
             self.ends.append(self.place)
         return super().answer(ask)
@@ -260,7 +267,7 @@ def test_two_squares_end_near_enough_to_their_start_to_be_measured() -> None:
 class Blind(Player):
     """A person without a tape, who answers each question with its default."""
 
-    def answer(self, ask: Ask) -> float:
+    def answer(self, ask: NumberQuestion) -> float:
         assert ask.usual is not None
         return ask.usual
 

@@ -16,7 +16,7 @@ from acsard.calibration.guided.runner import (
 from acsard.calibration.runs import Run
 from acsard.calibration.solve import Calibration
 from tests.each import each
-from tests.unit.calibration.guided.played import Asked, Player, anyone, usual_setup
+from tests.unit.calibration.guided.played import PlayedPrompt, Player, anyone, usual_setup
 
 SET_BACK_RAD = 0.3
 """Error with which the person sets the robot back."""
@@ -48,7 +48,7 @@ class Disturbed:
     def __init__(self, way: str, leg: str, times: int) -> None:
         self._way, self._leg, self._left = way, leg, times
         self.player = Player(anyone(5), gyro=way == "gyro", places=way == "positions")
-        self.prompt = Asked(self.player)
+        self.prompt = PlayedPrompt(self.player)
         self.driven: list[str] = []
 
     def ride(self, leg: Leg) -> Run:
@@ -59,7 +59,7 @@ class Disturbed:
             raise DisturbedError("a person stood in the way", "stopped")
         return self.player.ride(leg)
 
-    def found(self, *, simulated: bool = False) -> Calibration:
+    def calibrate(self, *, simulated: bool = False) -> Calibration:
         return guide(self._way, usual_setup(), self.prompt, self.ride, simulated=simulated)
 
 
@@ -71,8 +71,8 @@ def test_a_disturbed_leg_is_repeated_and_the_result_is_right(
     way: str, leg: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drive = Disturbed(way, leg, MAX_REPEATS)
-    values = drive.found().multipliers.values
-    expected = Disturbed(way, leg, 0).found().multipliers
+    values = drive.calibrate().multipliers.values
+    expected = Disturbed(way, leg, 0).calibrate().multipliers
     robot = drive.player.robot
     assert drive.driven.count(leg) == 1 + MAX_REPEATS
     assert values[0] == pytest.approx(robot.chi * (1 + 0.5 * robot.rate), rel=0.05)
@@ -85,7 +85,7 @@ def test_a_disturbed_leg_is_repeated_and_the_result_is_right(
 def test_a_leg_that_is_disturbed_three_times_ends_the_drive() -> None:
     drive = Disturbed("gyro", "turns", MAX_REPEATS + 1)
     with pytest.raises(DisturbedError, match="stopped"):
-        drive.found()
+        drive.calibrate()
     assert drive.driven == ["straight", *["turns"] * (MAX_REPEATS + 1)]
 
 
@@ -93,5 +93,5 @@ def test_on_the_simulator_a_leg_is_repeated_more_often_without_putting_it_back(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     drive = Disturbed("gyro", "turns", MAX_SIMULATED_REPEATS)
-    assert drive.found(simulated=True).multipliers.values[0] > 0.9
+    assert drive.calibrate(simulated=True).multipliers.values[0] > 0.9
     assert "put the robot back" not in capsys.readouterr().err

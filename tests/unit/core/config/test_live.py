@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.live import LIVE, changed, flat, live
+from acsard.core.config.live import LIVE, changed, find_live_setting, flat
 from acsard.core.config.parsing import ConfigError, effective, parse
 from acsard.core.config.settings import Config, LimitsConfig, RobotConfig
 from acsard.core.config.toml_text import document
@@ -53,7 +53,7 @@ def by_file(wishes: dict[str, object]) -> Config | list[str]:
 
 
 def test_every_live_setting_is_a_key_and_every_source_has_a_live_timeout() -> None:
-    keys = {key for key in KEYS if live(key)}
+    keys = {key for key in KEYS if find_live_setting(key)}
     sources = {f"commands.sources.{source.name}.timeout" for source in CONFIG.commands.sources}
     assert keys == {key for key in LIVE if "*" not in key} | sources
     assert all(row.what for row in LIVE.values())
@@ -66,7 +66,7 @@ def test_every_live_setting_is_a_key_and_every_source_has_a_live_timeout() -> No
      "odometry.gyro", "odometry.distance_scale_std", "log.format", "commands.sources.nav"],
 )  # fmt: skip
 def test_settings_of_wire_base_and_permissions_need_a_restart(key: str) -> None:
-    assert live(key) is None
+    assert find_live_setting(key) is None
 
 
 def test_a_change_sets_exactly_the_given_keys() -> None:

@@ -40,7 +40,7 @@ def problems_of(table: object) -> list[str]:
     return problems
 
 
-def made(table: object) -> Table:
+def build_table(table: object) -> Table:
     problems: list[str] = []
     result = build(Table, table, "", problems)
     assert problems == []
@@ -49,7 +49,7 @@ def made(table: object) -> Table:
 
 
 def test_an_empty_table_gives_all_defaults() -> None:
-    assert made({}) == Table()
+    assert build_table({}) == Table()
 
 
 def test_every_kind_of_value_is_accepted() -> None:
@@ -63,7 +63,7 @@ def test_every_kind_of_value_is_accepted() -> None:
         "first": {"name": "x", "length": 2},
         "legs": [{"name": "y"}, {"name": "z", "length": 0.5}],
     }
-    assert made(table) == Table(
+    assert build_table(table) == Table(
         toes=5,
         wood="ash",
         heavy=True,
@@ -76,7 +76,7 @@ def test_every_kind_of_value_is_accepted() -> None:
 
 
 def test_a_whole_number_is_accepted_as_a_float() -> None:
-    assert made({"speed": 3}).speed == 3.0
+    assert build_table({"speed": 3}).speed == 3.0
 
 
 @each(

@@ -44,13 +44,13 @@ def arrival(
     return Arrival("imu", put, payload, encoding, at_ns, None, who)
 
 
-def said(at_ns: int = 7, sender: str = "imu", **fields: Any) -> Arrival:
+def imu_message(at_ns: int = 7, sender: str = "imu", **fields: Any) -> Arrival:
     """Return a sample in hand-written JSON."""
     return arrival(json.dumps(fields).encode(), at_ns=at_ns, who=sender)
 
 
 def turning(rate: float, at_ns: int = 7, sender: str = "imu") -> Arrival:
-    return said(at_ns, sender, angular_velocity={"z": rate})
+    return imu_message(at_ns, sender, angular_velocity={"z": rate})
 
 
 @each("named", [True, False])
@@ -84,7 +84,7 @@ def test_a_turn_rate_beyond_the_maximum_is_refused(rate: float) -> None:
 
 
 REFUSED: dict[str, Arrival] = {
-    "wrong_shape": said(linear_acceleration={"z": 9.81}),
+    "wrong_shape": imu_message(linear_acceleration={"z": 9.81}),
     "malformed": arrival(encode(FULL, "cdr")[:100]),
     "unknown_encoding": arrival(b"0.5"),
     "not_finite": arrival(
@@ -93,7 +93,9 @@ REFUSED: dict[str, Arrival] = {
         )
     ),
     "out_of_range": turning(50.1),
-    "no_rate": said(angular_velocity={"z": 0.1}, angular_velocity_covariance=[-1.0, *ZEROS[1:]]),
+    "no_rate": imu_message(
+        angular_velocity={"z": 0.1}, angular_velocity_covariance=[-1.0, *ZEROS[1:]]
+    ),
     "too_big": arrival(b"{" + b" " * 5000),
     "not_a_put": arrival(encode(FULL, "json"), put=False),
 }
@@ -110,7 +112,9 @@ def test_a_refused_sample_is_counted_and_reported_with_its_reason(reason: str) -
 
 def test_a_negative_variance_is_refused() -> None:
     with pytest.raises(DecodeError, match="the turn rate is below zero: -1"):
-        reading(said(angular_velocity={"z": 0.1}, angular_velocity_covariance=[0.0] * 8 + [-1.0]))
+        reading(
+            imu_message(angular_velocity={"z": 0.1}, angular_velocity_covariance=[0.0] * 8 + [-1.0])
+        )
 
 
 class Daemon:

@@ -36,7 +36,7 @@ def arrival(payload: bytes, encoding: str = "", put: bool = True, via: Via = "na
     return Arrival("speed_limit", put, payload, encoding, 7, None, "", via, attachment)
 
 
-def said(value: object, **fields: Any) -> Arrival:
+def limit_message(value: object, **fields: Any) -> Arrival:
     """Return a message in hand-written JSON."""
     return arrival(json.dumps({"speed_limit": value} | fields).encode())
 
@@ -49,7 +49,7 @@ def test_a_speed_limit_is_read_in_every_encoding(form: Format, named: bool) -> N
 
 
 def test_in_json_only_the_number_is_required_and_is_in_metres_per_second() -> None:
-    assert decode_limit(said(0.3), 1.0).speed == 0.3
+    assert decode_limit(limit_message(0.3), 1.0).speed == 0.3
 
 
 @each(
@@ -60,7 +60,7 @@ def test_in_json_only_the_number_is_required_and_is_in_metres_per_second() -> No
 def test_zero_means_no_limit_and_a_percentage_refers_to_the_configured_speed(
     value: float, percentage: bool, speed: float
 ) -> None:
-    assert decode_limit(said(value, percentage=percentage), 0.8).speed == speed
+    assert decode_limit(limit_message(value, percentage=percentage), 0.8).speed == speed
 
 
 def test_the_sender_of_a_limit_is_named() -> None:
@@ -69,13 +69,22 @@ def test_the_sender_of_a_limit_is_named() -> None:
 
 
 REFUSED: dict[str, list[Arrival]] = {
-    "out_of_range": [said(-0.1), said(-5.0, percentage=True), said(100.1, percentage=True)],
+    "out_of_range": [
+        limit_message(-0.1),
+        limit_message(-5.0, percentage=True),
+        limit_message(100.1, percentage=True),
+    ],
     "not_finite": [
         arrival(encode(SpeedLimit(Header(), share, value), "cdr"))
         for value in (math.nan, math.inf, -math.inf)
         for share in (False, True)
     ],
-    "wrong_shape": [arrival(b"{}"), said("fast"), said(0.3, percent=True), said(None)],
+    "wrong_shape": [
+        arrival(b"{}"),
+        limit_message("fast"),
+        limit_message(0.3, percent=True),
+        limit_message(None),
+    ],
     "malformed": [arrival(encode(FULL, "cdr")[:-1]), arrival(b'{"speed_limit": NaN}')],
     "unknown_encoding": [arrival(b"0.5")],
     "too_big": [arrival(b"{" + b" " * 5000)],
@@ -89,7 +98,7 @@ def test_a_refused_message_is_reported_with_its_reason_and_keeps_the_earlier_lim
 ) -> None:
     for message in REFUSED[reason]:
         limiter, refusals = SpeedLimiter(Config()), list[Refusal]()
-        limiter.receive(said(0.5), 1.0, refusals)
+        limiter.receive(limit_message(0.5), 1.0, refusals)
         limiter.requests((), MIN_INTERVAL_NS)
         limiter.receive(message, 1.0, refusals)
         assert [refusal.reason for refusal in refusals] == [reason]
@@ -129,7 +138,7 @@ class Robot:
         """Highest speed that was allowed at any moment of the last step, m/s."""
 
     def limit(self, value: float, percentage: bool = False) -> None:
-        self.limiter.receive(said(value, percentage=percentage), 1.0, [])
+        self.limiter.receive(limit_message(value, percentage=percentage), 1.0, [])
 
     def step(self, *wishes: Mapping[str, Plain], at_rest: bool = True) -> dict[int, Answer]:
         """Run a step with a `set` request for each dict. Return the answers by request number."""
@@ -275,7 +284,7 @@ def test_two_sets_of_one_step_are_processed_one_after_the_other() -> None:
 def test_a_flood_of_messages_changes_the_limit_at_most_ten_times_a_second() -> None:
     limiter, changes = SpeedLimiter(Config()), 0
     for step in range(200):
-        limiter.receive(said(0.2 + 0.001 * step), 1.0, [])
+        limiter.receive(limit_message(0.2 + 0.001 * step), 1.0, [])
         batch, _ = limiter.requests((), 10 * MIN_INTERVAL_NS + step * MIN_INTERVAL_NS // 10)
         changes += len(batch)
         config = Config() if not batch else changed(Config(), batch[0].settings, True)[0]

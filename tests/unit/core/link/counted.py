@@ -97,7 +97,7 @@ class Host:
         self.lines = self.dropped = 0
         self.why = ""
 
-    def hear(self, line: bytes, after_ns: int = PERIOD_NS) -> None:
+    def receive(self, line: bytes, after_ns: int = PERIOD_NS) -> None:
         self.now_ns += after_ns
         now = Instant(self.now_ns, self.now_ns + WALL_NS)
         for feedback in self.session.update(now, True, 1, (Received(now, line),)):

@@ -231,17 +231,17 @@ def test_damage_never_changes_the_state_of_a_bumper(
         line = sealed(line) if check else line
         whole = [(number, decode_status.__wrapped__(line, check))]
         # Without places the number of the bumpers counts from the second line on.
-        bumpers.look(whole * 2, number)
+        bumpers.process_reports(whole * 2, number)
         for _ in range(4):
             frame = damaged(line, (line, *REPLIES), dice)
             if frame.startswith(STATUS):
                 with suppress(FrameError):
                     status = decode_status.__wrapped__(frame, check)
-                    bumpers.look([(number, status)], number)
+                    bumpers.process_reports([(number, status)], number)
             assert bumpers.state == state, (number, line, frame)
             if not places:
                 # Without places only a single damaged line is known by its number of bumpers.
-                bumpers.look(whole, number)
+                bumpers.process_reports(whole, number)
 
 
 def test_a_false_press_needs_half_a_second_of_damage() -> None:
@@ -256,7 +256,7 @@ def test_a_false_press_needs_half_a_second_of_damage() -> None:
         if step % 10 == 0 and (step == 0 or dice.random() < 0.5):
             reports = [(now_ns, decode_status(OK, False))]
             last_ns = now_ns
-        estop.look(reports, now_ns)
+        estop.process_reports(reports, now_ns)
         presses += bool(estop.pressed_now)
         runs += now_ns - last_ns == int(SILENCE_TIMEOUT_S * NS_PER_S) + step_ns
     assert presses == runs

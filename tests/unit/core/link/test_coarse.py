@@ -48,7 +48,7 @@ def drive(counts: int, seed: int, seconds: float, configured: int = 0) -> Driven
     wheels = angles(np.random.default_rng(seed), seconds)
     host = Host(counts=configured)
     for line in lines(wheels, counts):
-        host.hear(line)
+        host.receive(line)
     assert host.session.count_recovery.counts == (configured,) * 4
     pose, true = host.odometry.pose, end(np.diff(wheels, axis=0))
     exact = counted(wheels, counts) * math.tau / counts
@@ -105,10 +105,10 @@ def test_the_error_after_450_m_is_that_of_the_raw_counter(counts: int, configure
 # other effects with coarse encoders: no counts are found for others, and no line is dropped
 
 
-def heard(rows: Array, feedback: FeedbackConfig | None = None) -> Host:
+def host_after(rows: Array, feedback: FeedbackConfig | None = None) -> Host:
     host = Host(feedback)
     for row in rows:
-        host.hear(text(row))
+        host.receive(text(row))
     return host
 
 
@@ -122,7 +122,7 @@ def test_no_line_of_a_firmware_that_divides_by_its_measured_time_is_dropped(
     read = np.concatenate([[0.0], np.cumsum(dice.uniform(0.7, 1.3, len(wheels) - 100))])
     at = [np.interp(read, np.arange(len(wheels)), wheel) for wheel in wheels.T]
     rows = counted(np.array(at).T, counts) * math.tau / counts / PERIOD / np.diff(read)[:, None]
-    host = heard(np.round(rows, 2), FeedbackConfig(wheel_acceleration=acceleration))
+    host = host_after(np.round(rows, 2), FeedbackConfig(wheel_acceleration=acceleration))
     assert (host.dropped, host.why) == (0, "")
 
 
@@ -134,7 +134,7 @@ def test_no_line_of_a_firmware_that_filters_is_dropped(counts: int, share: float
     for row in counted(wheels, counts) * math.tau / counts / PERIOD:
         speed = speed + share * (row - speed)
         rows.append(speed)
-    host = heard(np.round(np.array(rows), 2))
+    host = host_after(np.round(np.array(rows), 2))
     assert (host.dropped, host.why) == (0, "")
     assert host.session.count_recovery.counts == (0,) * 4
 
@@ -148,7 +148,7 @@ def wild(wheels: int, seed: int) -> Host:
     for right, left in speeds(np.random.default_rng(seed), 9.0)[150:]:
         row = np.array([right, left, left, right])
         row[:wheels] = dice.uniform(-60.0, 60.0, wheels)
-        host.hear(text(np.round(row, 2)))
+        host.receive(text(np.round(row, 2)))
         if host.sanity.doubtful:
             break
     return host

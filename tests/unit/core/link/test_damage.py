@@ -121,7 +121,7 @@ def test_the_slew_check_distinguishes_a_leap_from_a_step() -> None:
     assert not plausible(sanity, STILL, WheelSpeeds(0.0, 40.0, 0.0, 0.0))
 
 
-def live(lines: list[bytes], every: int) -> tuple[int, int, int]:
+def count_errors(lines: list[bytes], every: int) -> tuple[int, int, int]:
     """Flip one bit in one of `every` lines, and count the wrong readings.
 
     Return the number of wrong readings, the number of accepted ones, and the number that would be
@@ -136,7 +136,7 @@ def live(lines: list[bytes], every: int) -> tuple[int, int, int]:
             speeds = codec.decode(sent[:-2])
         except FrameError:
             continue
-        steps = recovery.look(Feedback(AT, speeds, 0.01)).steps
+        steps = recovery.recover_counts(Feedback(AT, speeds, 0.01)).steps
         if speeds != truth and i > len(lines) // 10:
             wrong += 1
             believed[0] += plausible(sanity, before, speeds, steps)
@@ -151,7 +151,7 @@ def test_learned_steps_of_fine_encoders_let_hardly_more_damage_pass(every: int) 
     lines = drive(random.Random(6), 20_000)
     wrong = passed = would = 0
     for start in range(1 if every == 50 else 4):
-        more = live(lines[start:], every)
+        more = count_errors(lines[start:], every)
         wrong, passed, would = wrong + more[0], passed + more[1], would + more[2]
     print(f"\none line in {every}: {wrong} wrong, {passed} pass, {would} with nothing learned")
     assert wrong > 10

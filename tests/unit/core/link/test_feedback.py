@@ -49,7 +49,7 @@ class Bench:
             a, b, c, d = (count % 65536 for count in counts)
             reading = Reading(self.mcu_ms % 65536, (a, b, c, d))
         at = Instant(self.now_ns, self.now_ns + 7)
-        self.timeline.read(at, LENGTH, 1, following)
+        self.timeline.process_read(at, LENGTH, 1, following)
         return self.timeline.place(SPEEDS, reading, following, LENGTH, gap)
 
 
@@ -173,7 +173,7 @@ def read(bench: Bench, ms: float, lines: int, silent: bool = False) -> list[Feed
     """
     bench.now_ns += int(ms * MS)
     at = Instant(bench.now_ns, bench.now_ns + 7)
-    bench.timeline.read(at, LENGTH * lines, lines, 0)
+    bench.timeline.process_read(at, LENGTH * lines, lines, 0)
     return [
         bench.timeline.place(SPEEDS, None, LENGTH * (lines - i), LENGTH, silent and i == 1)
         for i in range(1, lines + 1)
@@ -243,7 +243,7 @@ def test_a_backlog_whose_missing_lines_last_for_a_second_begins_with_a_gap() -> 
 def test_a_spoilt_line_still_occupies_its_slot() -> None:
     bench = reporting(Bench(counts=0))
     bench.now_ns += 10 * MS
-    bench.timeline.read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
+    bench.timeline.process_read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
     bench.timeline.skip_bad()
     sample = bench.line()
     assert (sample.dt, sample.bridged) == (0.02, 0.01)
@@ -258,7 +258,7 @@ def test_the_first_prompted_reply_fills_the_time_of_the_ignored_replies(
     bench.line()
     for _ in range(ignored):
         bench.now_ns += 50 * MS
-        bench.timeline.read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
+        bench.timeline.process_read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
         bench.timeline.skip_bad()
     bench.now_ns += (4 - ignored) * 50 * MS
     bench.timeline.written(bench.now_ns)
@@ -322,7 +322,7 @@ def test_replies_that_waited_in_a_stall_beyond_the_open_commands_cover_no_time_o
     bench = prompted(Bench(counts=0), 80)
     bench.timeline.written(bench.now_ns + 2 * MS)
     bench.now_ns += 1200 * MS
-    bench.timeline.read(Instant(bench.now_ns, bench.now_ns), 3 * LENGTH, 3, 0)
+    bench.timeline.process_read(Instant(bench.now_ns, bench.now_ns), 3 * LENGTH, 3, 0)
     samples = [bench.timeline.place(SPEEDS, None, 0, LENGTH, False) for _ in range(3)]
     assert sum(line.dt for line in samples) < 0.02
     assert all(line.gap == line.bridged == 0.0 for line in samples)
@@ -333,7 +333,7 @@ def test_the_dt_of_an_answer_that_names_its_line_is_that_of_the_named_lines() ->
     for number, ms in enumerate((0, 10, 20, 37)):
         bench.timeline.written(10**9 + ms * MS)
         bench.now_ns += (10, 3, 25, 1)[number] * MS
-        bench.timeline.read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
+        bench.timeline.process_read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
         sample = bench.timeline.place(SPEEDS, None, 0, LENGTH, False, 10**9 + ms * MS)
         assert sample.asked_ns == 10**9 + ms * MS
         assert sample.dt == pytest.approx((0.0, 0.01, 0.01, 0.017)[number])
@@ -351,7 +351,7 @@ def test_a_stall_counts_once_if_replies_name_their_line_and_many_are_lost() -> N
             bench.timeline.written(left_ns + 3 * MS)
             bench.timeline.written(left_ns + 6 * MS)
         came_ns = bench.now_ns = left_ns + (109 if number == 100 else 9) * MS
-        bench.timeline.read(Instant(came_ns, came_ns), LENGTH, 1, 0)
+        bench.timeline.process_read(Instant(came_ns, came_ns), LENGTH, 1, 0)
         total += bench.timeline.place(SPEEDS, None, 0, LENGTH, number == 100, left_ns).dt
         if number > 90:
             assert total == pytest.approx((left_ns - began_ns) / 1e9, abs=0.005), number
@@ -395,7 +395,7 @@ def test_a_change_from_slots_to_answers_as_the_clock_keeps_the_elapsed_time(seed
         bench.timeline.written(left_ns)
         bench.now_ns = left_ns + int(chance.uniform(7.0, 8.2) * MS)
         at = Instant(bench.now_ns, bench.now_ns)
-        bench.timeline.read(at, LENGTH, 1, 0)
+        bench.timeline.process_read(at, LENGTH, 1, 0)
         dt = bench.timeline.place(SPEEDS, None, 0, LENGTH, False).dt
         total += dt if number >= 150 else 0.0
     assert bench.timeline._last_placed.clock == "prompts"
@@ -453,5 +453,5 @@ def test_a_host_stall_reveals_whether_the_board_reports_by_itself(
     for lines, periods, left in stalls:
         for _ in range(left):
             style.written()
-        style.read(lines, periods)
+        style.process_read(lines, periods)
     assert style.speaks is speaks

@@ -64,22 +64,22 @@ def test_a_board_that_only_prints_noise_is_reported_with_its_noise() -> None:
     reports = [text for text in texts if "none good" in text]
     assert len(reports) == 1
     assert "150 lines received, none good, the last one is `" in reports[0]
-    assert bench.session.words() == reports[0]
+    assert bench.session.describe_link() == reports[0]
     bench.wait(10, GOOD * 3)
-    assert bench.session.words() == "the link to the microcontroller is up"
+    assert bench.session.describe_link() == "the link to the microcontroller is up"
 
 
 def test_a_silent_link_is_reported_first_and_the_received_data_later() -> None:
     bench = Bench().up()
     for _ in range(20):
         bench.wait(10)
-    assert bench.session.words().startswith(
+    assert bench.session.describe_link().startswith(
         "the built-in simulator is silent because of a fault in sim.faults, or because the daemon, "
         "which runs the simulator, is late: "
     )
     for _ in range(302):
         bench.wait(10)
-    assert "nothing was received" in bench.session.words()
+    assert "nothing was received" in bench.session.describe_link()
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_lines_too_far_apart_are_reported_with_a_setting_only_if_it_is_valid(
     bench = Bench(McuConfig(port="/dev/board"), longest_reply=longest).open()
     for tick in range(600):
         bench.wait(10, *([] if tick % apart else [GOOD]))
-    words = bench.session.words()
+    words = bench.session.describe_link()
     seconds = f"{apart / 100:.2f} s"
     assert re.search(rf"lines come {seconds} apart|a line only every {seconds}", words)
     assert advice in words
@@ -109,7 +109,7 @@ def test_a_single_silence_does_not_suggest_a_reply_period() -> None:
     for _ in range(20):
         bench.wait(10)
     bench.wait(10, GOOD)
-    assert (bench.link(), "reply_period" in bench.session.words()) == ("stale", False)
+    assert (bench.link(), "reply_period" in bench.session.describe_link()) == ("stale", False)
 
 
 @pytest.mark.parametrize("port", ["sim", "/dev/board"])
@@ -118,9 +118,9 @@ def test_lines_that_the_host_read_late_give_no_advice_about_the_board(port: str)
     texts = set()
     for _ in range(20):  # this computer runs a step late and finds the bytes that arrived meanwhile
         bench.wait(300)
-        texts.add(bench.session.words())
+        texts.add(bench.session.describe_link())
         bench.wait(10, GOOD)
-        texts.add(bench.session.words())
+        texts.add(bench.session.describe_link())
     assert not [words for words in texts if "reply_period" in words or "seldom" in words]
     assert any(blames_host(words) for words in texts)
 
@@ -132,21 +132,21 @@ def after(*steps_ms: int, good: bool = False, simulated: bool = False) -> Latene
     """
     lateness = Lateness(simulated, QUIET_NS)
     now_ns = 0
-    lateness.look(now_ns, good=True)
+    lateness.record_step(now_ns, good=True)
     for number, step_ms in enumerate(steps_ms, 1):
         now_ns += step_ms * MS
-        lateness.look(now_ns, good=good and number == len(steps_ms))
+        lateness.record_step(now_ns, good=good and number == len(steps_ms))
     return lateness
 
 
 def test_silence_during_punctual_steps_is_blamed_on_the_board() -> None:
-    assert after(*[10] * 11).words("stale") == STATE_TEXTS["stale"]
+    assert after(*[10] * 11).describe("stale") == STATE_TEXTS["stale"]
     assert after(*[49] * 3).late_s == 0.0
 
 
 def test_a_host_stall_is_reported_with_its_length() -> None:
     for steps in ((800,), (10, 800, 10), (60, 800)):
-        text = after(*steps).words("stale")
+        text = after(*steps).describe("stale")
         assert text.startswith(
             "this computer did not run the daemon for 0.80 s, so the daemon received nothing from "
             "the microcontroller: "
@@ -156,29 +156,29 @@ def test_a_host_stall_is_reported_with_its_length() -> None:
 
 def test_a_good_line_ends_the_host_stall() -> None:
     assert after(800, 10, good=True).late_s == 0.0
-    assert after(800, good=True).words("stale") == STATE_TEXTS["stale"]
+    assert after(800, good=True).describe("stale") == STATE_TEXTS["stale"]
 
 
 def test_a_late_simulator_is_not_reported_as_a_silent_microcontroller() -> None:
-    assert "simulator" in after(10, 10, simulated=True).words("stale")
-    assert after(800, simulated=True).words("stale").startswith("this computer")
+    assert "simulator" in after(10, 10, simulated=True).describe("stale")
+    assert after(800, simulated=True).describe("stale").startswith("this computer")
 
 
 def test_a_link_that_is_not_stale_is_reported_unchanged_despite_a_host_stall() -> None:
     late = after(800)
-    assert [late.words(state) for state in ("up", "booting", "down")] == [
+    assert [late.describe(state) for state in ("up", "booting", "down")] == [
         STATE_TEXTS["up"], STATE_TEXTS["booting"], STATE_TEXTS["down"]
     ]  # fmt: skip
 
 
 def test_the_text_of_a_silence_shows_whether_the_host_caused_it() -> None:
     ours = [after(800), after(800, simulated=True), after(10, simulated=True)]
-    assert all(blames_host(lateness.words("stale")) for lateness in ours)
-    others = (STATE_TEXTS["stale"], "", after(800).words("down"))
+    assert all(blames_host(lateness.describe("stale")) for lateness in ours)
+    others = (STATE_TEXTS["stale"], "", after(800).describe("down"))
     assert not any(blames_host(words) for words in others)
 
 
-def heard(data: bytes) -> Heard:
+def diagnosis_of(data: bytes) -> Heard:
     diagnosis = Heard()
     diagnosis.take(data)
     for line, _ in LineReader().feed(data):
@@ -190,12 +190,12 @@ def heard(data: bytes) -> Heard:
 def test_the_diagnosis_says_what_was_received_how_it_looks_and_what_to_do(
     data: bytes, looks: ReceivedClass, counted: str
 ) -> None:
-    diagnosis = heard(data)
+    diagnosis = diagnosis_of(data)
     assert diagnosis.looks == looks
     assert counted in diagnosis.counted
     text = f"no link to the microcontroller: {diagnosis.counted}; {RECEIVED_ADVICE[looks]}"
-    assert diagnosis.words.startswith(text)
-    assert "`acsard mcu check`" in diagnosis.words
+    assert diagnosis.diagnosis.startswith(text)
+    assert "`acsard mcu check`" in diagnosis.diagnosis
 
 
 def test_the_diagnosis_comes_after_three_seconds_and_again_only_when_it_changes() -> None:
@@ -232,14 +232,14 @@ def test_a_stall_while_the_link_was_up_does_not_explain_later_sparse_lines() -> 
     for _ in range(11):
         bench.wait(10)
     assert bench.link() == "stale"
-    assert "did not run" not in sparse(bench).words
+    assert "did not run" not in sparse(bench).diagnosis
 
 
 def test_a_closed_port_is_not_a_host_stall() -> None:
     bench = Bench(McuConfig(port="/dev/board")).up().close()
     for _ in range(500):
         bench.wait(10)
-    assert "did not run" not in sparse(bench.open()).words
+    assert "did not run" not in sparse(bench.open()).diagnosis
 
 
 def test_a_stall_within_the_time_of_the_sparse_lines_explains_them() -> None:
@@ -247,11 +247,11 @@ def test_a_stall_within_the_time_of_the_sparse_lines_explains_them() -> None:
     bench.wait(10)
     bench.wait(800)
     diagnosis = sparse(bench)
-    assert diagnosis.words.startswith(
+    assert diagnosis.diagnosis.startswith(
         "this computer did not run the daemon for 0.80 s, so the daemon received too few lines for "
         "a link: "
     )
-    assert blames_host(diagnosis.words)
+    assert blames_host(diagnosis.diagnosis)
 
 
 def test_lines_that_came_while_the_output_was_blocked_are_not_counted_afterwards() -> None:
@@ -265,7 +265,7 @@ def events_of(every: int, windows: int = 3, period: float = 0.0, linked: bool = 
     """Return the events of a link that loses every n-th line."""
     answered = UnansweredLines(period)
     events = [
-        answered.look(sent, sent - sent // every if every else sent, linked)
+        answered.check(sent, sent - sent // every if every else sent, linked)
         for sent in range(windows * WINDOW_LINES + 1)
     ]
     return [event.text for event in events if event is not None]
@@ -288,5 +288,5 @@ def test_losses_are_not_judged_for_a_free_running_board_or_without_a_link() -> N
 def test_losses_are_reported_again_after_the_link_was_down() -> None:
     answered, events = UnansweredLines(0.0), []
     for sent in range(3 * WINDOW_LINES):
-        events.append(answered.look(sent, sent // 2, sent != WINDOW_LINES + 10))
+        events.append(answered.check(sent, sent // 2, sent != WINDOW_LINES + 10))
     assert len([event for event in events if event]) == 2

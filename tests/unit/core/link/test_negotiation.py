@@ -46,7 +46,7 @@ class Bench:
         self.check = Negotiation(mcu, STOP)
         self.now_ns = 1000 * MS
 
-    def ask(self, ms: float = 0) -> list[bytes]:
+    def questions_within(self, ms: float = 0) -> list[bytes]:
         """Let this time pass in periods of 10 ms without answers, and return the sent questions."""
         asked = []
         for _ in range(int(ms / 10) + 1):
@@ -79,7 +79,7 @@ class Bench:
 
     def checked(self, reading: Reading | None = None) -> Bench:
         """Negotiate until the board has answered."""
-        (_, question) = self.ask(110)
+        (_, question) = self.questions_within(110)
         self.reply(sequence_of(question), reading)
         assert self.check.checked
         return self
@@ -107,7 +107,7 @@ def test_with_the_check_off_lines_leave_unchanged() -> None:
 
 def test_every_question_to_the_board_is_a_stop() -> None:
     for mcu in (AUTO, SAMPLES, REQUIRE):
-        for line in Bench(mcu).ask(3000):
+        for line in Bench(mcu).questions_within(3000):
             assert line == STOP or line.startswith(STOP[:-2] + b"#")
 
 
@@ -130,7 +130,7 @@ def test_a_question_that_was_not_sent_is_repeated_immediately() -> None:
 
 def test_a_silent_mcu_gets_plain_and_checked_questions_in_turn_at_10_hz() -> None:
     bench = Bench()
-    asked = bench.ask(2000)
+    asked = bench.questions_within(2000)
     assert [kind(line) for line in asked[:4]] == ["plain", "checked", "plain", "checked"]
     assert len(asked) == 21
     assert bench.check.asking
@@ -139,7 +139,7 @@ def test_a_silent_mcu_gets_plain_and_checked_questions_in_turn_at_10_hz() -> Non
 def test_after_a_gap_a_board_that_had_the_check_gets_a_checked_question_first() -> None:
     bench = Bench().checked()
     bench.check.begin()
-    assert kind(bench.ask()[0]) == "checked"
+    assert kind(bench.questions_within()[0]) == "checked"
 
 
 def test_a_right_reply_to_a_question_confirms_the_check() -> None:
@@ -150,7 +150,7 @@ def test_a_right_reply_to_a_question_confirms_the_check() -> None:
 
 def test_a_right_reply_to_a_sequence_that_was_not_sent_confirms_nothing() -> None:
     bench = Bench()
-    (_, question) = bench.ask(110)
+    (_, question) = bench.questions_within(110)
     for sequence in set(range(256)) - {sequence_of(question)}:
         assert bench.stale(sequence)
     assert bench.check.asking
@@ -158,7 +158,7 @@ def test_a_right_reply_to_a_sequence_that_was_not_sent_confirms_nothing() -> Non
 
 def test_a_reply_to_a_question_that_was_not_sent_is_stale() -> None:
     bench = Bench()
-    (_, question) = bench.ask(100)
+    (_, question) = bench.questions_within(100)
     bench.check.settle(False)
     bench.check.settle(True)  # reported once; a later report belongs to another line
     assert bench.stale(sequence_of(question))
@@ -166,9 +166,9 @@ def test_a_reply_to_a_question_that_was_not_sent_is_stale() -> None:
 
 def test_unanswered_checked_questions_end_in_the_plain_state() -> None:
     bench = Bench()
-    bench.ask()
+    bench.questions_within()
     bench.check.record_plain_reply()
-    asked = bench.ask(1000)
+    asked = bench.questions_within(1000)
     assert [kind(line) for line in asked] == ["checked"] * (1 + MAX_UNANSWERED_QUESTIONS)
     assert (bench.check.state, bench.check.in_force) == ("plain", "plain")
     assert bench.check.seal(GO, bench.now_ns) == GO
@@ -176,9 +176,9 @@ def test_unanswered_checked_questions_end_in_the_plain_state() -> None:
 
 def test_the_board_is_asked_three_times_with_samples_and_then_three_times_without() -> None:
     bench = Bench(SAMPLES)
-    bench.ask()
+    bench.questions_within()
     bench.check.record_plain_reply()
-    asked = bench.ask(2000)
+    asked = bench.questions_within(2000)
     assert [kind(line) for line in asked] == ["sampled"] * MAX_UNANSWERED_QUESTIONS + [
         "checked"
     ] * MAX_UNANSWERED_QUESTIONS
@@ -189,7 +189,7 @@ def test_questions_that_were_not_sent_are_not_counted() -> None:
     bench = Bench()
     bench.check.record_plain_reply()
     for _ in range(300):
-        if bench.ask():
+        if bench.questions_within():
             bench.check.settle(False)
     assert bench.check.asking
 
@@ -197,7 +197,7 @@ def test_questions_that_were_not_sent_are_not_counted() -> None:
 def test_a_question_is_counted_once_however_often_the_negotiation_is_judged() -> None:
     bench = Bench()
     bench.check.record_plain_reply()
-    bench.ask()
+    bench.questions_within()
     for _ in range(100):
         bench.now_ns += 10 * MS
         bench.check.judge(bench.now_ns)
@@ -206,7 +206,7 @@ def test_a_question_is_counted_once_however_often_the_negotiation_is_judged() ->
 
 def test_a_silent_board_is_asked_for_ever() -> None:
     bench = Bench(SAMPLES)
-    bench.ask(60_000)
+    bench.questions_within(60_000)
     assert bench.check.asking
     assert not bench.check.trouble
 
@@ -214,20 +214,20 @@ def test_a_silent_board_is_asked_for_ever() -> None:
 def test_a_board_on_a_slow_wire_has_more_time_to_answer() -> None:
     bench = Bench(McuConfig(link_check="auto", baud_rate=9600))
     bench.check.record_plain_reply()
-    bench.ask(4 * 190)
+    bench.questions_within(4 * 190)
     assert bench.check.in_force == "not checked yet"
-    bench.ask(100)
+    bench.questions_within(100)
     assert bench.check.in_force == "plain"
 
 
 def test_a_required_check_that_is_refused_is_asked_for_ever_with_its_reason() -> None:
     bench = Bench(REQUIRE)
     bench.check.record_plain_reply()
-    assert len(bench.ask(5000)) > 50
+    assert len(bench.questions_within(5000)) > 50
     assert (bench.check.asking, bool(bench.check.trouble)) == (True, True)
     assert 'mcu.link_check = "require"' in ADVICE[bench.check.trouble]
     assert 'mcu.link_check = "auto"' in ADVICE[bench.check.trouble]
-    (question,) = bench.ask(40)
+    (question,) = bench.questions_within(40)
     bench.reply(sequence_of(question))
     assert (bench.check.state, bench.check.trouble) == ("checked", "")
 
@@ -236,7 +236,7 @@ def test_a_board_that_answered_with_a_check_is_not_accepted_without_it() -> None
     bench = Bench().checked()
     bench.check.begin()
     bench.check.record_plain_reply()
-    bench.ask(5000)
+    bench.questions_within(5000)
     assert bench.check.asking
     assert "damaged" in ADVICE[bench.check.trouble]
 
@@ -245,13 +245,13 @@ def test_a_new_opening_forgets_that_a_board_had_the_check() -> None:
     bench = Bench().checked()
     bench.check.begin(fresh=True)
     bench.check.record_plain_reply()
-    bench.ask(1000)
+    bench.questions_within(1000)
     assert bench.check.state == "plain"
 
 
 def test_an_unsent_plain_question_leaves_the_question_before_it_valid() -> None:
     bench = Bench()
-    plain, question, again = bench.ask(200)
+    plain, question, again = bench.questions_within(200)
     assert [kind(line) for line in (plain, question, again)] == ["plain", "checked", "plain"]
     bench.check.settle(False)
     bench.reply(sequence_of(question))
@@ -384,7 +384,7 @@ def test_the_pace_of_questions_is_bounded() -> None:
     assert SILENT_BOARD_PERIOD_NS == 100 * MS
     bench = Bench(REQUIRE)
     bench.check.record_plain_reply()
-    assert len(bench.ask(1000)) <= 25
+    assert len(bench.questions_within(1000)) <= 25
 
 
 def test_an_echo_of_a_question_is_reported_and_ends_no_negotiation() -> None:
@@ -392,7 +392,7 @@ def test_an_echo_of_a_question_is_reported_and_ends_no_negotiation() -> None:
         bench = Bench(mcu)
         bench.check.record_plain_reply()
         for _ in range(50):
-            for line in bench.ask():
+            for line in bench.questions_within():
                 assert bench.check.check_question_echo(line[:-2])
         assert (bench.check.asking, bool(bench.check.trouble)) == (True, True)
         assert "the daemon's own lines come back" in ADVICE[bench.check.trouble]
@@ -402,7 +402,7 @@ def test_an_echo_of_a_question_is_reported_and_ends_no_negotiation() -> None:
 
 def test_an_answer_is_not_an_echo() -> None:
     bench = Bench()
-    (_, question) = bench.ask(110)
+    (_, question) = bench.questions_within(110)
     answer = question.replace(b"H", b"")[:-2]
     assert not bench.check.check_question_echo(answer)
 

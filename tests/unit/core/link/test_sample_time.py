@@ -49,13 +49,13 @@ class Bench:
         if held or not self.waiting:
             return
         had = self.slots.period is not None
-        lost_slots = self.slots.read(self.time_ns() + int(late_ms * MS), self.waiting, True)
+        lost_slots = self.slots.process_read(self.time_ns() + int(late_ms * MS), self.waiting, True)
         if had:
             self.counted += self.waiting + lost_slots
             self.least = min(self.least, lost_slots)
         self.waiting = 0
 
-    def found(self) -> Bench:
+    def until_clock_is_known(self) -> Bench:
         """Send lines until the clock is known."""
         while self.slots.period is None:
             self.line()
@@ -78,7 +78,7 @@ def test_no_period_is_known_before_half_a_second() -> None:
     for _ in range(45):
         bench.line()
         assert bench.slots.period is None
-    bench.found()
+    bench.until_clock_is_known()
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_the_period_is_rounded_to_the_one_that_the_firmware_intends(
 
 
 def test_punctual_lines_are_not_counted_as_lost() -> None:
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     for _ in range(1000):
         bench.line(0.2)
     assert (bench.error, bench.least) == (0, 0)
@@ -117,7 +117,7 @@ def test_a_lossless_link_counts_each_line_once_despite_host_stalls(
     stalls: list[tuple[int, float]], seed: int, drift: float
 ) -> None:
     chance = random.Random(seed)
-    bench = Bench(PERIOD * (1 + drift)).found()
+    bench = Bench(PERIOD * (1 + drift)).until_clock_is_known()
     for count, late_ms in stalls:
         for _ in range(count):
             bench.line(held=True)
@@ -141,7 +141,7 @@ def test_a_batched_link_without_loss_counts_each_line_once(seed: int, held: int)
         if stall or not waiting:
             continue
         had = slots.period is not None
-        lost = slots.read(10**12 + due, waiting, True)
+        lost = slots.process_read(10**12 + due, waiting, True)
         if had:
             counted += lost
         waiting = 0
@@ -180,7 +180,7 @@ def test_lines_that_fill_the_packets_of_an_adapter_keep_their_real_period(
     slots, counted = FreeRunningTimes((PERIOD,)), 0
     for at, lines in packets(size, 1000, phase):
         had = slots.period is not None
-        counted += had * slots.read(at, lines, True)
+        counted += had * slots.process_read(at, lines, True)
         if not had and slots.period is not None:
             assert slots.period == PERIOD
     assert (slots.period, counted) == (PERIOD, 0)
@@ -202,7 +202,7 @@ def test_an_early_first_line_does_not_change_the_period_of_a_batched_link() -> N
     for late in [*OUT_OF_TURN, *OUT_OF_TURN[5:]]:
         lines = round(1.6 - late + before)  # the lines of 16 ms
         slot, before = slot + lines, late
-        slots.read(10**12 + int((slot + late) * 10 * MS), lines, True)
+        slots.process_read(10**12 + int((slot + late) * 10 * MS), lines, True)
         if slots.period is not None:
             break
     assert slots.period == PERIOD
@@ -220,7 +220,7 @@ def test_early_replies_to_commands_between_two_periods_do_not_shift_the_slots(
         # The command leaves at once instead of with the next period, so its reply is early.
         late = 0.04 * (slot % 4) - (early if slot in turns else 0.0)
         at_ns = 10**12 + int((slot + late) * period_ns)
-        slots.read(at_ns, 1, True)
+        slots.process_read(at_ns, 1, True)
         placed = slots.place(0)
         if placed is not None:
             assert at_ns - placed.due_ns < period_ns / 2
@@ -240,7 +240,7 @@ def test_replies_to_commands_at_odd_times_do_not_delay_the_slots(
     slots = FreeRunningTimes((0.1,))
     for at in [*odd, *(2.0 + 0.1 * n for n in range(40))]:
         at_ns = 10**12 + int(at * 1e9)
-        slots.read(at_ns, 1, True)
+        slots.process_read(at_ns, 1, True)
         placed = slots.place(0)
         assert placed is None or at_ns - placed.due_ns < 50 * MS
     assert slots.period == 0.1
@@ -248,7 +248,7 @@ def test_replies_to_commands_at_odd_times_do_not_delay_the_slots(
 
 @pytest.mark.parametrize("lost", [1, 2, 7, 50])
 def test_missing_lines_are_counted_with_the_next_one(lost: int) -> None:
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     for _ in range(100):
         bench.line(0.3)
     for _ in range(lost):
@@ -261,7 +261,7 @@ def test_missing_lines_are_counted_with_the_next_one(lost: int) -> None:
 @given(seed=st.integers(0, 1000))
 def test_every_lost_line_is_counted_when_a_fifth_is_lost(seed: int) -> None:
     chance = random.Random(seed)
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     for _ in range(2000):
         bench.line(chance.uniform(0.0, 1.0), lost=chance.random() < 0.2)
     bench.line(lost=False)
@@ -270,7 +270,7 @@ def test_every_lost_line_is_counted_when_a_fifth_is_lost(seed: int) -> None:
 
 
 def test_a_slot_counted_for_a_late_single_line_is_subtracted_at_the_next_line() -> None:
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     for _ in range(100):
         bench.line(0.2)
     bench.line(9.0)
@@ -280,7 +280,7 @@ def test_a_slot_counted_for_a_late_single_line_is_subtracted_at_the_next_line() 
 
 
 def test_lines_missing_in_a_backlog_are_counted_with_the_backlog() -> None:
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     for _ in range(100):
         bench.line(0.2)
     for number in range(20):
@@ -300,12 +300,12 @@ def forgets(bench: Bench, lines: Iterable[Callable[[], None]]) -> bool:
 
 @each("period", [0.005, 0.0093, 0.0108, 0.02, 0.05])
 def test_a_changed_period_is_noticed_and_learned(period: float) -> None:
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     began = bench.time_ns()
     bench.made, bench.period_ns = 0, period * 1e9
     slots, periods = bench.slots, []
     for number in range(1, 1500):
-        slots.read(began + int(number * bench.period_ns), 1, True)
+        slots.process_read(began + int(number * bench.period_ns), 1, True)
         periods.append(slots.period)
     assert None in periods
     assert periods[-1] == pytest.approx(period, rel=1e-3)
@@ -317,13 +317,13 @@ def test_irregular_lines_have_no_period(seed: int) -> None:
     slots, at, known = FreeRunningTimes((PERIOD,)), 10**12, 0
     for _ in range(3000):
         at += int(chance.uniform(4.0, 30.0) * MS)
-        slots.read(at, 1, True)
+        slots.process_read(at, 1, True)
         known += slots.period is not None
     assert known < 300
 
 
 def test_the_age_of_a_line_comes_from_its_slot_and_not_from_its_read() -> None:
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     chance = random.Random(1)
     errors, raw = [], []
     for number in range(5000):
@@ -343,10 +343,10 @@ def deviation(values: list[float]) -> float:
 
 
 def test_a_forgotten_period_is_learned_again() -> None:
-    bench = Bench().found()
+    bench = Bench().until_clock_is_known()
     bench.slots.forget()
     assert bench.slots.period is None
-    bench.found()
+    bench.until_clock_is_known()
 
 
 # boards that answer each line
@@ -371,7 +371,7 @@ class Prompted:
 
         `cut` says whether the read also contains the beginning of the next reply.
         """
-        self.prompts.read(int(ms * MS), lines, cut)
+        self.prompts.process_read(int(ms * MS), lines, cut)
         times = []
         for _ in range(lines):
             asked = None if asked_ms is None else int(asked_ms * MS)
@@ -390,7 +390,7 @@ class Prompted:
 
 def test_a_reply_without_a_waiting_line_is_not_placed() -> None:
     prompts = PromptedTimes(0)
-    prompts.read(10 * MS, 1)
+    prompts.process_read(10 * MS, 1)
     assert prompts.place() is None
 
 
@@ -424,7 +424,7 @@ def test_a_lost_reply_is_a_filled_gap() -> None:
 def test_a_damaged_reply_is_a_filled_gap() -> None:
     bench = Prompted().talk()
     bench.leave(200.0)
-    bench.prompts.read(int((200.0 + DELAY_MS) * MS), 1)
+    bench.prompts.process_read(int((200.0 + DELAY_MS) * MS), 1)
     bench.prompts.skip()
     bench.leave(210.0)
     assert bench.reply(210.0 + DELAY_MS) == [20.0, 10.0]
@@ -543,7 +543,7 @@ def assigned(prompts: PromptedTimes, replies: dict[int, float], hz: int) -> list
         if not line:
             prompts.written(int(ms * MS))
             continue
-        prompts.read(int(ms * MS), 1)
+        prompts.process_read(int(ms * MS), 1)
         if prompts.place() is not None:
             older.append(line - prompts._line / MS)
     assert len(older) > 0.9 * len(replies)
@@ -557,7 +557,7 @@ def test_a_first_reply_that_is_read_late_hides_no_lost_replies() -> None:
     """
     prompts, chance = PromptedTimes(soonest_ns=2 * MS), random.Random(1)
     prompts.written(0)
-    prompts.read(81 * MS, 1)
+    prompts.process_read(81 * MS, 1)
     assert prompts.place() is not None
     replies = {n: 37 + 3 * chance.random() for n in range(3000) if n < 15 or n % 16 == 0}
     assert max(assigned(prompts, replies, 300)) < 4.0
@@ -613,7 +613,7 @@ def batched(
         ready = [i for i in answers if i * 10 + DELAY_MS <= batch * 16]
         answers = answers[len(ready) :]
         if ready:
-            bench.prompts.read(int(at * MS), len(ready))
+            bench.prompts.process_read(int(at * MS), len(ready))
         for number in ready:
             answered = bench.prompts.place()
             if number > 100 and answered is not None:

@@ -170,7 +170,7 @@ def off_by(lost: str, counts: int, jitter: float) -> float:
             Instant(0, 0), WheelSpeeds(*np.round(speeds, 2).tolist()), bridged + PERIOD,
             bridged=bridged,
         )  # fmt: skip
-        result = recovery.look(line)
+        result = recovery.recover_counts(line)
         rates = np.array(result.speeds.as_tuple())
         counted = result.counted or rates * (result.dt - result.bridged)
         total += np.array(counted) + result.bridged * (before + rates) / 2

@@ -58,7 +58,7 @@ def row(name: str, *args: Any, **changes: Any) -> DiagnosticStatus:
     return status
 
 
-def seen(**changes: Any) -> Snapshot:
+def changed_snapshot(**changes: Any) -> Snapshot:
     return replace(SNAPSHOT, **changes)
 
 
@@ -79,7 +79,9 @@ def test_every_status_names_its_robot() -> None:
 @each("link", ["up", "stale", "booting", "down"])
 def test_no_row_appears_or_disappears_in_any_state_of_the_robot(mode: str, link: str) -> None:
     outputs = replace(OUTPUTS, mode=mode, link=link, source="", reason="words")
-    snapshot = seen(figures={}, counters={}, sources=(), refused_age_s=0.0, missed_last_minute=9)
+    snapshot = changed_snapshot(
+        figures={}, counters={}, sources=(), refused_age_s=0.0, missed_last_minute=9
+    )
     names = [(status.name, status.hardware_id) for status in rows()]
     assert [
         (status.name, status.hardware_id) for status in rows(CONFIG, outputs, snapshot)
@@ -88,7 +90,7 @@ def test_no_row_appears_or_disappears_in_any_state_of_the_robot(mode: str, link:
 
 @each("does", ["waiting for rest", "waiting for turn", "used", "silent", "dead", "not believed"])
 def test_a_configured_gyro_has_a_row_in_each_of_its_states(does: Any) -> None:
-    assert [status.name for status in rows(snapshot=seen(gyro=GyroStatus(does)))] == [
+    assert [status.name for status in rows(snapshot=changed_snapshot(gyro=GyroStatus(does)))] == [
         *(status.name for status in rows()),
         "acsard: gyro",
     ]
@@ -105,7 +107,9 @@ def test_a_configured_gyro_has_a_row_in_each_of_its_states(does: Any) -> None:
 )
 def test_a_board_that_sends_status_lines_has_a_row(estop: Any, level: int, message: str) -> None:
     counters = {"line_status_malformed": 2, "emergency_stops": 1, "lines": 9}
-    status = row("board", snapshot=seen(estop=estop, board={"volts": "24.31"}, counters=counters))
+    status = row(
+        "board", snapshot=changed_snapshot(estop=estop, board={"volts": "24.31"}, counters=counters)
+    )
     assert (status.level, status.message) == (level, message)
     assert values(status) == {
         "volts": "24.31", "line_status_malformed": "2", "emergency_stops": "1",
@@ -116,7 +120,7 @@ def test_a_required_emergency_stop_has_a_row_before_the_board_reports_it() -> No
     config = replace(CONFIG, safety=SafetyConfig(estop="required"))
     status = row("board", config)
     assert (status.level, status.message) == (ERROR, MISSING_REASON)
-    assert row("board", config, snapshot=seen(estop="released")).level == OK
+    assert row("board", config, snapshot=changed_snapshot(estop="released")).level == OK
 
 
 @each(
@@ -132,7 +136,7 @@ def test_the_row_of_the_board_shows_the_state_of_its_bumpers(
     bumpers: Any, why: str, level: int, message: str
 ) -> None:
     counters = {"bumper_presses": 1, "lines": 9}
-    snapshot = seen(estop="released", bumpers=bumpers, bumper=why, counters=counters)
+    snapshot = changed_snapshot(estop="released", bumpers=bumpers, bumper=why, counters=counters)
     status = row("board", BUMPERS, snapshot=snapshot)
     assert (status.level, status.message) == (level, f"emergency stop released; {message}")
     assert values(status) == {"bumper_presses": "1"}
@@ -144,7 +148,7 @@ def test_ignored_bumpers_need_no_row() -> None:
 
 
 def test_a_motor_drivers_fault_is_an_error_of_the_board() -> None:
-    status = row("board", snapshot=seen(board={"motor_driver": "fault"}))
+    status = row("board", snapshot=changed_snapshot(board={"motor_driver": "fault"}))
     assert (status.level, status.message) == (
         ERROR,
         f"no emergency-stop input; {DRIVER_FAULT_REASON}",
@@ -182,7 +186,7 @@ def test_a_battery_that_the_board_reports_has_a_row(
     level: BatteryLevel, number: int, message: str
 ) -> None:
     status = BatteryStatus(level, 0, 22.5, 40.0, -1.5, 21.756)
-    entry = row("battery", BATTERY, snapshot=seen(battery=status))
+    entry = row("battery", BATTERY, snapshot=changed_snapshot(battery=status))
     assert (entry.level, entry.message) == (number, message)
     assert values(entry) == {
         "level": level, "volts": "22.50", "percent": "40.00", "amperes": "-1.50", "mean": "21.76",
@@ -191,10 +195,14 @@ def test_a_battery_that_the_board_reports_has_a_row(
 
 
 def test_a_battery_has_a_row_once_it_is_reported_or_has_thresholds() -> None:
-    assert "acsard: battery" not in {status.name for status in rows(snapshot=seen(battery=None))}
-    status = row("battery", BATTERY, snapshot=seen(battery=None))
+    assert "acsard: battery" not in {
+        status.name for status in rows(snapshot=changed_snapshot(battery=None))
+    }
+    status = row("battery", BATTERY, snapshot=changed_snapshot(battery=None))
     assert (status.level, status.message) == (WARN, MISSING_BATTERY)
-    status = row("battery", snapshot=seen(battery=BatteryStatus("ok", 0, 24.0, mean=24.0)))
+    status = row(
+        "battery", snapshot=changed_snapshot(battery=BatteryStatus("ok", 0, 24.0, mean=24.0))
+    )
     assert values(status) == {"level": "ok", "volts": "24.00"}
 
 
@@ -207,13 +215,15 @@ def test_a_router_has_a_row_before_the_first_check_of_its_connection() -> None:
     status = row("router", config)
     assert (status.level, status.message) == (OK, "not connected yet")
     assert values(status) == {"tcp/a:7447": "not connected yet"}
-    looked = seen(routers=RoutersStatus(missing=("tcp/a:7447",)))
+    looked = changed_snapshot(routers=RoutersStatus(missing=("tcp/a:7447",)))
     assert [of.name for of in rows(config, snapshot=looked)] == [of.name for of in rows(config)]
 
 
 def test_a_lost_router_is_named_although_another_one_was_never_connected() -> None:
     config = replace(CONFIG, bus=BusConfig(connect=("tcp/a:7447", "tcp/b:7447")))
-    status = row("router", config, snapshot=seen(routers=RoutersStatus(missing=("tcp/a:7447",))))
+    status = row(
+        "router", config, snapshot=changed_snapshot(routers=RoutersStatus(missing=("tcp/a:7447",)))
+    )
     assert (status.level, status.message) == (WARN, "not connected to tcp/a:7447")
     assert values(status) == {"tcp/a:7447": "not connected", "tcp/b:7447": "not connected yet"}
 
@@ -276,7 +286,7 @@ def test_the_link_shows_its_port_its_wire_use_and_its_rejects_by_reason() -> Non
 def test_more_than_one_period_in_a_hundred_missed_in_the_last_minute_is_a_warning(
     missed: int, level: int
 ) -> None:
-    status = row("control loop", snapshot=seen(missed_last_minute=missed))
+    status = row("control loop", snapshot=changed_snapshot(missed_last_minute=missed))
     assert status.level == level
     assert status.message == f"{missed} of {100 + missed} periods missed in the last minute"
     assert values(status) == {
@@ -290,13 +300,16 @@ def test_more_than_one_period_in_a_hundred_missed_in_the_last_minute_is_a_warnin
 
 
 def test_periods_missed_an_hour_ago_are_counted_but_cause_no_warning() -> None:
-    status = row("control loop", snapshot=seen(counters={"missed_periods": 100_000}))
+    status = row("control loop", snapshot=changed_snapshot(counters={"missed_periods": 100_000}))
     assert (status.level, values(status)["missed_periods"]) == (OK, "100000")
 
 
 def test_a_bad_minute_is_a_warning_after_any_number_of_good_hours() -> None:
     long = {"period_lateness": Measured(Spread(10_000_000), Spread(5_800))}
-    assert row("control loop", snapshot=seen(figures=long, missed_last_minute=200)).level == WARN
+    assert (
+        row("control loop", snapshot=changed_snapshot(figures=long, missed_last_minute=200)).level
+        == WARN
+    )
 
 
 # commands
@@ -331,7 +344,7 @@ def test_the_commands_name_the_speed_limit_that_slows_the_robot() -> None:
 def test_two_senders_of_one_source_are_a_warning_that_names_the_source() -> None:
     two = SourceStatus("nav", 10, 0.1, Wait("senders", senders=1))
     alone = SourceStatus("app", 50, 0.1, Wait("nothing"))
-    status = row("commands", snapshot=seen(sources=(alone, two)))
+    status = row("commands", snapshot=changed_snapshot(sources=(alone, two)))
     assert (status.level, status.message) == (
         WARN,
         "commanded by app; 2 programs send as nav, and the robot follows one of them: end the "
@@ -341,14 +354,14 @@ def test_two_senders_of_one_source_are_a_warning_that_names_the_source() -> None
         values(status)["nav"]
         == "1 other sender of this source must wait until the sender that drives falls silent"
     )
-    assert row("commands", snapshot=seen(sources=(alone,))).level == OK
+    assert row("commands", snapshot=changed_snapshot(sources=(alone,))).level == OK
 
 
 def test_a_refused_source_makes_the_commands_a_warning_with_the_reason() -> None:
-    status = row("commands", snapshot=seen(refused_age_s=SHOW_REFUSAL_S / 2))
+    status = row("commands", snapshot=changed_snapshot(refused_age_s=SHOW_REFUSAL_S / 2))
     assert (status.level, status.message) == (
         WARN,
         "commanded by app; refused: source nav: held up",
     )
-    later = row("commands", snapshot=seen(refused_age_s=SHOW_REFUSAL_S))
+    later = row("commands", snapshot=changed_snapshot(refused_age_s=SHOW_REFUSAL_S))
     assert (later.level, later.message) == (OK, "commanded by app")

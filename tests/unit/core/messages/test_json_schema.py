@@ -177,7 +177,7 @@ TURN: dict[str, Any] = {"angular_velocity": {"z": 0.5}}
 WHEELS: dict[str, Any] = {"name": NAMES, "velocity": [1.0, 1, 1, 1.0]}
 
 
-def taken(name: str, value: object) -> bool:
+def is_accepted(name: str, value: object) -> bool:
     """Return whether the daemon accepts a value on the key of this type."""
     key = {"J": "wheel_cmd/app", "T": "cmd/app", "I": "imu"}.get(name[0], "set_pose")
     payload = msgspec.json.encode(value)
@@ -236,4 +236,4 @@ def _decodes(call: Any) -> bool:
 def test_the_schema_accepts_a_value_exactly_if_the_daemon_accepts_it(
     name: str, value: object, good: bool
 ) -> None:
-    assert (refused(name, value) == [], taken(name, value)) == (good, good)
+    assert (refused(name, value) == [], is_accepted(name, value)) == (good, good)

@@ -14,14 +14,14 @@ def at(seconds: float) -> Instant:
     return Instant(round(seconds * NS_PER_S), round((1_000 + seconds) * NS_PER_S))
 
 
-def told(happened: RecentEvents) -> Events:
+def message_of(happened: RecentEvents) -> Events:
     message = happened.message()
     assert message is not None
     return message
 
 
 def names(happened: RecentEvents) -> list[str]:
-    return [event.name for event in told(happened).events]
+    return [event.name for event in message_of(happened).events]
 
 
 def test_without_events_there_is_no_message() -> None:
@@ -33,22 +33,22 @@ def test_a_fault_is_still_listed_after_an_hour_of_missed_periods() -> None:
     happened.add([FAULT], at(0))
     for second in range(1, 3600):
         happened.add([missed(3)], at(second))
-    fault, others = told(happened).events
+    fault, others = message_of(happened).events
     assert (fault.name, fault.stamp) == ("fault", Time.from_ns(at(0).wall_ns))
     assert (others.name, others.count) == ("missed_periods", 3 * 3599)
     assert (
         others.text
         == f"{3 * 3599} times; the last: no control step ran in 3 successive control periods"
     )
-    assert others.stamp == told(happened).stamp == Time.from_ns(at(3599).wall_ns)
-    assert told(happened).total == 3600
+    assert others.stamp == message_of(happened).stamp == Time.from_ns(at(3599).wall_ns)
+    assert message_of(happened).total == 3600
 
 
 def test_a_repeated_event_gets_a_new_row_after_a_minute_without_it() -> None:
     happened = RecentEvents()
     for second in (0, 60, 121):
         happened.add([missed(1)], at(second))
-    assert [event.count for event in told(happened).events] == [2, 1]
+    assert [event.count for event in message_of(happened).events] == [2, 1]
 
 
 def test_a_repeated_event_moves_after_newer_events() -> None:
@@ -73,7 +73,7 @@ def test_the_oldest_events_are_dropped_when_the_list_is_full() -> None:
     happened = RecentEvents()
     for second in range(MAX_ROWS + 5):
         happened.add([Event("commander", f"{second}")], at(second))
-    assert [event.text for event in told(happened).events] == [
+    assert [event.text for event in message_of(happened).events] == [
         str(n) for n in range(5, MAX_ROWS + 5)
     ]
-    assert told(happened).total == MAX_ROWS + 5
+    assert message_of(happened).total == MAX_ROWS + 5

@@ -80,7 +80,7 @@ CONFIG = Config(robot=RobotConfig("r7"), odometry=FRAMES)
 HALF = math.sqrt(0.5)
 
 
-def look() -> Snapshot:
+def get_snapshot() -> Snapshot:
     return SNAPSHOT
 
 
@@ -90,7 +90,7 @@ def never() -> Snapshot:
 
 def published(outputs: Outputs = OUTPUTS, config: Config = CONFIG) -> dict[str, Any]:
     """Return the messages, keyed by key, that a new daemon publishes after these outputs."""
-    return dict(Report(config, START).due(outputs, ALL, look))
+    return dict(Report(config, START).due(outputs, ALL, get_snapshot))
 
 
 def rates(**hz: float) -> Config:
@@ -103,7 +103,7 @@ def times_of(key: str, config: Config, steps: int = 1000, **changes: Any) -> lis
     return [
         step
         for step in range(steps)
-        for name, _ in report.due(at(later(step / 100), **changes), {key}, look)
+        for name, _ in report.due(at(later(step / 100), **changes), {key}, get_snapshot)
         if name == key
     ]
 
@@ -141,7 +141,7 @@ def test_each_message_has_the_type_of_its_topic() -> None:
     list(report.due(OUTPUTS, set(), never))
     for topic in PUBLISHED:
         if topic.key in ALL:
-            assert type(report.current(topic.key, look)).__name__ == topic.type
+            assert type(report.current(topic.key, get_snapshot)).__name__ == topic.type
 
 
 # odometry and transforms
@@ -186,7 +186,7 @@ def test_tf_has_the_same_pose_as_odom() -> None:
 def test_without_publish_tf_only_odom_is_published() -> None:
     config = replace(CONFIG, odometry=replace(FRAMES, publish_tf=False))
     report = Report(config, START)
-    keys = [key for key, _ in report.due(OUTPUTS, ALL, look)]
+    keys = [key for key, _ in report.due(OUTPUTS, ALL, get_snapshot)]
     assert "tf" not in keys
     assert "odom" in keys
     assert report.current("tf", never) is None
@@ -399,7 +399,7 @@ def test_a_router_that_is_missing_is_a_warning(
     routers: RoutersStatus, level: int, message: str, fields: dict[str, str]
 ) -> None:
     report = Report(CONFIG, START)
-    list(report.due(OUTPUTS, ALL, look))
+    list(report.due(OUTPUTS, ALL, get_snapshot))
     array = report.current("diagnostics", lambda: replace(SNAPSHOT, routers=routers))
     assert isinstance(array, DiagnosticArray)
     (row,) = (status for status in array.status if status.name == "acsard: router")
@@ -415,7 +415,7 @@ def test_a_daemon_without_routers_has_no_router_row() -> None:
 
 @each("wanted", [set(), *({key} for key in ALL), {"odom", "state"}, ALL])
 def test_only_topics_with_subscribers_are_published(wanted: set[str]) -> None:
-    messages = Report(CONFIG, START).due(OUTPUTS, wanted, look)
+    messages = Report(CONFIG, START).due(OUTPUTS, wanted, get_snapshot)
     assert sorted(key for key, _ in messages) == sorted(wanted - {"tf_static"})
 
 
@@ -431,16 +431,16 @@ def test_no_snapshot_is_taken_for_a_summary_without_subscribers() -> None:
 
 def test_no_snapshot_is_taken_for_a_summary_that_is_not_due() -> None:
     report = Report(CONFIG, START)
-    list(report.due(at(later(0)), ALL, look))
+    list(report.due(at(later(0)), ALL, get_snapshot))
     assert not list(report.due(at(later(0.01), estimates=()), {"state", "diagnostics"}, never))
 
 
 def test_events_are_kept_without_subscribers_and_published_with_earlier_events() -> None:
     report = Report(CONFIG, START)
-    assert report.current("events", look) is None
+    assert report.current("events", get_snapshot) is None
     many = tuple(Event("commander", f"the {n}. takes over", by="app", count=2) for n in range(25))
-    assert not list(report.due(replace(OUTPUTS, events=many, due=False), set(), look))
-    assert not list(report.due(replace(OUTPUTS, events=()), {"events"}, look))
+    assert not list(report.due(replace(OUTPUTS, events=many, due=False), set(), get_snapshot))
+    assert not list(report.due(replace(OUTPUTS, events=()), {"events"}, get_snapshot))
     quiet = replace(OUTPUTS, now=later(7), due=False, estimates=())
     ((key, message),) = report.due(quiet, {"events"}, never)
     assert isinstance(message, Events)
@@ -456,7 +456,7 @@ def test_events_are_kept_without_subscribers_and_published_with_earlier_events()
 def test_a_fault_stays_in_the_list_during_a_repeated_event() -> None:
     report, fault = Report(CONFIG, START), Event("fault", "a wheel is dead", "error")
     for second, event in enumerate([fault, *[missed(3)] * 100]):
-        list(report.due(replace(OUTPUTS, events=(event,), now=later(second)), set(), look))
+        list(report.due(replace(OUTPUTS, events=(event,), now=later(second)), set(), get_snapshot))
     message = report.current("events", never)
     assert isinstance(message, Events)
     assert [(row.name, row.count) for row in message.events] == [
@@ -468,7 +468,7 @@ def test_a_fault_stays_in_the_list_during_a_repeated_event() -> None:
 def test_every_sample_of_a_step_is_published_in_order() -> None:
     estimates: list[Estimate] = [replace(ESTIMATE, at=Instant(n, n)) for n in (1_000, 2_000, 3_000)]
     messages = Report(CONFIG, START).due(
-        replace(OUTPUTS, estimates=tuple(estimates)), {"odom"}, look
+        replace(OUTPUTS, estimates=tuple(estimates)), {"odom"}, get_snapshot
     )
     stamps = [m.header.stamp.nanosec for _, m in messages if isinstance(m, Odometry)]
     assert stamps == [1_000, 2_000, 3_000]
@@ -504,7 +504,7 @@ def test_steps_a_little_early_or_late_do_not_change_the_average(hz: float) -> No
     report, count = Report(rates(odom=hz), START), 0
     for step in range(1000):
         late = (step * 7 % 11 - 5) * 1e-4  # up to half a millisecond early or late
-        count += len(list(report.due(at(later(1.0 + step / 100 + late)), {"odom"}, look)))
+        count += len(list(report.due(at(later(1.0 + step / 100 + late)), {"odom"}, get_snapshot)))
     assert abs(count - hz * 10) <= 1
 
 
@@ -515,7 +515,7 @@ def test_steps_a_little_early_or_late_do_not_make_the_intervals_uneven(
     report, indices = Report(rates(odom=hz), START), []
     for step in range(1000):
         late = (5 - step * 7 % 11) * 1e-5  # the first step is the latest of all
-        if list(report.due(at(later(1.0 + step / 100 + late)), {"odom"}, look)):
+        if list(report.due(at(later(1.0 + step / 100 + late)), {"odom"}, get_snapshot)):
             indices.append(step)
     assert {b - a for a, b in pairwise(indices)} == {steps}
 
@@ -527,7 +527,7 @@ def test_a_rate_above_the_sample_rate_publishes_every_sample() -> None:
 def test_odom_and_tf_are_published_together_at_a_limited_rate() -> None:
     report = Report(rates(odom=10.0), START)
     for step in range(300):
-        keys = [key for key, _ in report.due(at(later(step / 100)), {"odom", "tf"}, look)]
+        keys = [key for key, _ in report.due(at(later(step / 100)), {"odom", "tf"}, get_snapshot)]
         assert keys in ([], ["odom", "tf"])
 
 
@@ -539,10 +539,10 @@ def test_state_has_10_hz_and_diagnostics_have_1_hz_by_default() -> None:
 @pytest.mark.parametrize("key", ["state", "diagnostics", "battery"])
 def test_a_change_of_the_status_is_published_immediately(key: str) -> None:
     report = Report(CONFIG, START)
-    list(report.due(at(later(0)), {key}, look))
+    list(report.due(at(later(0)), {key}, get_snapshot))
     for step in (1, 2, 3):
         changed = at(later(step / 100), status_changed=True)
-        assert [name for name, _ in report.due(changed, {key}, look)] == [key]
+        assert [name for name, _ in report.due(changed, {key}, get_snapshot)] == [key]
 
 
 def test_after_a_change_the_next_state_comes_a_period_later() -> None:
@@ -550,7 +550,9 @@ def test_after_a_change_the_next_state_comes_a_period_later() -> None:
     steps = [
         step
         for step in range(60)
-        if list(report.due(at(later(step / 100), status_changed=step == 25), {"state"}, look))
+        if list(
+            report.due(at(later(step / 100), status_changed=step == 25), {"state"}, get_snapshot)
+        )
     ]
     after = [step for step in steps if step > 25]
     assert 25 in steps
@@ -559,8 +561,10 @@ def test_after_a_change_the_next_state_comes_a_period_later() -> None:
 
 def test_no_burst_of_messages_follows_a_pause() -> None:
     report = Report(CONFIG, START)
-    list(report.due(at(later(0)), {"state"}, look))
-    steps = [s for s in range(500, 520) if list(report.due(at(later(s / 100)), {"state"}, look))]
+    list(report.due(at(later(0)), {"state"}, get_snapshot))
+    steps = [
+        s for s in range(500, 520) if list(report.due(at(later(s / 100)), {"state"}, get_snapshot))
+    ]
     assert steps[0] == 500
     assert len(steps) <= 3
 
@@ -583,28 +587,30 @@ def test_the_urdf_is_available_before_the_first_step_if_the_robot_has_one() -> N
     assert report.current("robot_description", never) is None
     report.description = '<robot name="r7"/>'
     assert report.current("robot_description", never) == String('<robot name="r7"/>')
-    assert "robot_description" not in dict(report.due(OUTPUTS, ALL | {"robot_description"}, look))
+    assert "robot_description" not in dict(
+        report.due(OUTPUTS, ALL | {"robot_description"}, get_snapshot)
+    )
 
 
 @each("key", sorted(ALL - {"tf_static"}))
 def test_the_current_value_equals_the_published_message_even_without_subscribers(key: str) -> None:
     report = Report(CONFIG, START)
     list(report.due(OUTPUTS, set(), never))
-    assert report.current(key, look) == published()[key]
+    assert report.current(key, get_snapshot) == published()[key]
 
 
 def test_the_last_sample_stays_the_current_value_without_new_feedback() -> None:
     report = Report(CONFIG, START)
     list(report.due(OUTPUTS, set(), never))
     report.due(at(later(9), estimates=()), set(), never)
-    odom: Message | None = report.current("odom", look)
+    odom: Message | None = report.current("odom", get_snapshot)
     assert odom == published()["odom"]
 
 
 @each("key", ["", "alive", "cmd/app", "info", "nonsense"])
 def test_a_topic_that_is_not_published_has_no_current_value(key: str) -> None:
     report = Report(CONFIG, START)
-    report.due(OUTPUTS, ALL, look)
+    report.due(OUTPUTS, ALL, get_snapshot)
     assert report.current(key, never) is None
 
 
@@ -613,7 +619,7 @@ def test_state_at_10_hz_has_even_intervals_despite_jitter() -> None:
     steps: list[int] = []
     for step in range(3000):
         late = rnd.uniform(0, 1e-4)
-        if list(report.due(at(later(1.0 + step / 100 + late)), {"state"}, look)):
+        if list(report.due(at(later(1.0 + step / 100 + late)), {"state"}, get_snapshot)):
             steps.append(step)
     assert {b - a for a, b in pairwise(steps[2:])} == {10}
 

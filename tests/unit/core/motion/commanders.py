@@ -69,7 +69,7 @@ class Bench:
             Command(source.name, twist, self.now_ns, stamp_ns, clock, sender, shared=shared)
         )
 
-    def known(self, source: Source, clock: str = "", sender: str = "") -> Bench:
+    def prove_clock(self, source: Source, clock: str = "", sender: str = "") -> Bench:
         """Send zeros until the arbiter accepts the stamps of this sender's clock."""
         for _ in range(60):
             self.wait(50).stamped(source, 0.0, clock, REST, sender)

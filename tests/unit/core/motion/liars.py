@@ -81,7 +81,7 @@ def rolled(speeds: Array, robot: Robot, rng: np.random.Generator) -> Array:
     return angles
 
 
-def said(angles: Array, counts: int) -> Array:
+def reported_speeds(angles: Array, counts: int) -> Array:
     """Return the speeds that encoders with this many counts report, rad/s, shape (lines, 4)."""
     count = math.tau / counts
     whole = np.floor(angles / count)

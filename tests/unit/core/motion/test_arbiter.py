@@ -77,7 +77,7 @@ def test_an_unknown_source_is_refused_and_never_listed() -> None:
 
 
 def test_a_stale_command_adds_no_sender_to_its_source() -> None:
-    bench = Bench(HIGH, LOW, armed=False).known(HIGH, "clock", "a")
+    bench = Bench(HIGH, LOW, armed=False).prove_clock(HIGH, "clock", "a")
     assert bench.stamped(LOW, 5000.0, "clock", sender="a") == "stale"
     assert bench.status(LOW).waits_for == Wait("command")
 
@@ -294,7 +294,7 @@ def test_a_source_s_age_is_that_of_the_last_command_of_any_sender() -> None:
 def test_a_source_whose_stamps_are_in_doubt_keeps_its_priority_for_four_seconds(
     seconds: float, driver: str
 ) -> None:
-    bench = Bench(HIGH, LOW).known(HIGH, "clock", "a")
+    bench = Bench(HIGH, LOW).prove_clock(HIGH, "clock", "a")
     for at in range(round(seconds * 20)):
         bench.wait(50).send(LOW)
         assert bench.stamped(HIGH, 9000.0 + 20.0 * at, "clock", REST, "a") == "stale"
@@ -307,7 +307,7 @@ def test_a_source_whose_stamps_are_in_doubt_keeps_its_priority_for_four_seconds(
 
 
 def test_late_commands_do_not_restore_the_priority_of_a_silent_source() -> None:
-    bench = Bench(HIGH, LOW).known(HIGH, "clock", "a")
+    bench = Bench(HIGH, LOW).prove_clock(HIGH, "clock", "a")
     bench.wait(300)
     for _ in range(20):
         bench.wait(50).send(LOW)
@@ -321,7 +321,7 @@ def test_the_followed_sender_keeps_the_robot_while_its_stamps_are_in_doubt(
 ) -> None:
     bench = Bench(HIGH, SLOW, armed=False)
     bench.send(other, REST, "b")
-    bench.wait(2000).known(HIGH, "clock", "a")
+    bench.wait(2000).prove_clock(HIGH, "clock", "a")
     assert bench.choice().sender == "a"
     for _ in range(20):
         bench.wait(50).send(other, GO, "b")
@@ -337,7 +337,7 @@ def test_the_followed_sender_keeps_the_robot_while_its_stamps_are_in_doubt(
 def test_a_waiting_sender_with_stamps_in_doubt_does_not_block_another_sender(other: Source) -> None:
     """Senders c, a and b send in this order, and c falls silent. Sender a has doubtful stamps."""
     own = LEFT if other is RIGHT else other
-    bench = Bench(HIGH, LEFT, RIGHT, armed=False).known(own, "clock", "a")
+    bench = Bench(HIGH, LEFT, RIGHT, armed=False).prove_clock(own, "clock", "a")
     bench.wait(300).send(own, REST, "c")
     bench.wait(10).stamped(own, 0.0, "clock", REST, "a")
     bench.wait(10).send(other, REST, "b")
@@ -350,7 +350,7 @@ def test_a_waiting_sender_with_stamps_in_doubt_does_not_block_another_sender(oth
 
 
 def test_doubt_about_one_clock_of_a_bridge_does_not_disarm_a_program_with_another_clock() -> None:
-    bench = Bench(HIGH, LOW, armed=False).known(HIGH, "one", "bridge")
+    bench = Bench(HIGH, LOW, armed=False).prove_clock(HIGH, "one", "bridge")
     for _ in range(60):
         bench.wait(50).stamped(LOW, 0.0, "two", REST, "bridge")
         bench.stamped(HIGH, 0.0, "one", REST, "bridge")
@@ -396,7 +396,7 @@ def test_a_shared_sender_whose_clock_was_set_waits_for_a_new_pause_and_keeps_the
 
 
 def test_a_sender_that_must_send_a_zero_again_is_not_forgotten_for_a_new_one() -> None:
-    bench = Bench(LEFT, RIGHT, armed=False).known(LEFT, "clock", "a")
+    bench = Bench(LEFT, RIGHT, armed=False).prove_clock(LEFT, "clock", "a")
     for number in range(15):
         bench.send(LEFT, REST, f"sender {number}")
     for _ in range(40):
@@ -408,7 +408,7 @@ def test_a_sender_that_must_send_a_zero_again_is_not_forgotten_for_a_new_one() -
 
 
 def test_a_sender_whose_clock_is_set_again_and_again_keeps_the_robot_once_only() -> None:
-    bench = Bench(LEFT, RIGHT, armed=False).known(LEFT, "clock", "a")
+    bench = Bench(LEFT, RIGHT, armed=False).prove_clock(LEFT, "clock", "a")
     bench.send(RIGHT, REST, "b")
     late_ms, drives = 0.0, []
     for at in range(400):
@@ -447,7 +447,11 @@ def test_a_risen_delay_is_forgiven_within_the_budget_despite_a_longer_timeout_el
     The arbiter then follows only the source with the long timeout.
     """
     long = Source("long", 10, timeout=2.0)
-    bench = Bench(HIGH, long, armed=False).known(HIGH, "clock", "a").known(long, "clock", "a")
+    bench = (
+        Bench(HIGH, long, armed=False)
+        .prove_clock(HIGH, "clock", "a")
+        .prove_clock(long, "clock", "a")
+    )
     for at in range(130):
         # The delay rises slowly enough that no stamp goes back.
         late_ms = min(12.0 * at, most_ms)
@@ -460,7 +464,7 @@ def test_a_risen_delay_is_forgiven_within_the_budget_despite_a_longer_timeout_el
 
 
 def test_a_late_sender_that_is_not_armed_is_reported_as_late() -> None:
-    bench = Bench(HIGH, armed=False).known(HIGH, "clock", "a")
+    bench = Bench(HIGH, armed=False).prove_clock(HIGH, "clock", "a")
     bench.arbiter.require_neutral(bench.now_ns + 1)
     for at in range(10):
         bench.wait(50).stamped(HIGH, 20.0 * at + 9000.0 * (at > 0), "clock", GO, "a")
@@ -560,7 +564,7 @@ def test_many_senders_of_one_source_do_not_displace_a_sender_of_another_source()
 # commands that last but do not move the robot
 
 
-def held(bench: Bench, source: Source, seconds: float, twist: Twist = REST) -> Wait:
+def wait_after(bench: Bench, source: Source, seconds: float, twist: Twist = REST) -> Wait:
     """Send this twist ten times a second for this time, and return why the robot waits."""
     for _ in range(round(10 * seconds)):
         bench.wait(100).send(source, twist)
@@ -569,22 +573,22 @@ def held(bench: Bench, source: Source, seconds: float, twist: Twist = REST) -> W
 
 def test_a_sender_of_only_zeros_holds_the_robot_and_is_reported_after_three_seconds() -> None:
     bench = Bench(HIGH)
-    assert held(bench, HIGH, 3.0) == Wait("nothing")
-    assert held(bench, HIGH, 0.2) == Wait("zeros", "high", lasts=3.0)
+    assert wait_after(bench, HIGH, 3.0) == Wait("nothing")
+    assert wait_after(bench, HIGH, 0.2) == Wait("zeros", "high", lasts=3.0)
     assert bench.choice().twist == REST
-    assert held(bench, HIGH, 60.0) == Wait("zeros", "high", lasts=60.0)
+    assert wait_after(bench, HIGH, 60.0) == Wait("zeros", "high", lasts=60.0)
     assert bench.status(HIGH).waits_for == Wait("nothing")
 
 
 def test_a_speed_or_a_silence_restarts_the_time_of_only_zeros() -> None:
     bench = Bench(HIGH)
-    held(bench, HIGH, 5.0)
+    wait_after(bench, HIGH, 5.0)
     bench.wait(100).send(HIGH, GO)
     assert bench.choice().wait == Wait("nothing")
-    assert held(bench, HIGH, 2.9) == Wait("nothing")
+    assert wait_after(bench, HIGH, 2.9) == Wait("nothing")
     bench.wait(300)
-    assert held(bench, HIGH, 2.9) == Wait("nothing")
-    assert held(bench, HIGH, 0.3).what == "zeros"
+    assert wait_after(bench, HIGH, 2.9) == Wait("nothing")
+    assert wait_after(bench, HIGH, 0.3).what == "zeros"
 
 
 def test_wheel_speeds_that_cancel_out_do_not_count_as_zeros() -> None:
@@ -614,8 +618,8 @@ def test_the_report_of_only_zeros_names_another_sender_of_the_source_that_must_w
 
 def test_an_unarmed_sender_that_keeps_sending_speeds_is_reported_after_three_seconds() -> None:
     bench = Bench(HIGH, armed=False)
-    assert held(bench, HIGH, 3.0, GO) == Wait("neutral", "high", 1.0)
-    assert held(bench, HIGH, 0.2, GO) == Wait("neutral", "high", 1.0, lasts=3.0)
+    assert wait_after(bench, HIGH, 3.0, GO) == Wait("neutral", "high", 1.0)
+    assert wait_after(bench, HIGH, 0.2, GO) == Wait("neutral", "high", 1.0, lasts=3.0)
 
 
 # the published state
@@ -696,7 +700,7 @@ def test_a_new_timeout_applies_to_a_sender_that_drives() -> None:
 
 
 def test_the_delay_that_is_forgiven_to_an_adjusted_clock_is_counted() -> None:
-    bench = Bench(HIGH, armed=False).known(HIGH)
+    bench = Bench(HIGH, armed=False).prove_clock(HIGH)
     assert bench.arbiter.clock_adjustment_ns == 0
     for number in range(60):
         bench.wait(50).stamped(HIGH, min(10.0 * number, 300.0), twist=REST)

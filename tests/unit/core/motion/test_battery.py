@@ -15,7 +15,7 @@ from acsard.core.motion.battery import (
     SILENT_REASON,
     TIME_CONSTANT_S,
     Battery,
-    words,
+    status_text,
 )
 from acsard.core.values import BatteryLevel, BatteryStatus
 from tests.each import each
@@ -40,7 +40,7 @@ class Pack:
         """Process these status lines `ms` after the last step, and return the level."""
         self.now_ms += ms
         reports = [(self.now_ms * MS, line) for line in lines]
-        events = self.battery.look(reports, self.now_ms * MS)
+        events = self.battery.process_reports(reports, self.now_ms * MS)
         self.events += [(event.name, event.text) for event in events]
         self.stops += self.battery.stopped_now
         return None if self.battery.status is None else self.battery.status.level
@@ -66,7 +66,7 @@ class Pack:
 def test_a_battery_that_is_never_reported_has_no_status() -> None:
     pack = Pack()
     assert pack.quiet(20.0) is pack.step(BoardStatus(estop=False, amps=-1.0)) is None
-    assert (pack.events, pack.stops, pack.battery.held) == ([], 0, False)
+    assert (pack.events, pack.stops, pack.battery.refuses_clear) == ([], 0, False)
 
 
 def test_a_battery_without_thresholds_is_ok_from_the_first_report() -> None:
@@ -149,13 +149,13 @@ def test_while_the_mean_falls_the_level_never_gets_better(volts: list[float]) ->
 def test_the_stop_is_reported_once_and_held_until_the_hysteresis() -> None:
     pack = Pack()
     pack.at(20.9, 5.0)
-    assert (pack.stops, pack.battery.held) == (1, True)
+    assert (pack.stops, pack.battery.refuses_clear) == (1, True)
     assert pack.battery.why == "battery below battery.stop_below = 21 V"
     assert pack.battery.mend == "charge the battery to 21.4 V"
     pack.at(21.3, 60.0)
-    assert pack.battery.held
+    assert pack.battery.refuses_clear
     pack.at(24.0, 10.0)
-    assert (pack.stops, pack.battery.held) == (1, False)
+    assert (pack.stops, pack.battery.refuses_clear) == (1, False)
     pack.at(20.0, 60.0)
     assert pack.stops == 2
     # The mean rises through each of the levels.
@@ -176,9 +176,9 @@ def test_an_exchanged_battery_ends_the_stop_within_seconds() -> None:
     pack = Pack()
     pack.at(20.5, 30.0)
     pack.quiet(SILENCE_TIMEOUT_S + 0.1)
-    assert pack.battery.held
+    assert pack.battery.refuses_clear
     assert pack.at(25.0, 3.2) == "ok"
-    assert not pack.battery.held
+    assert not pack.battery.refuses_clear
 
 
 # motor starts
@@ -277,7 +277,7 @@ def test_the_level_of_a_silent_board_is_unknown_and_stops_nothing() -> None:
     assert pack.status == BatteryStatus("unknown")
     assert pack.quiet(600.0) == "unknown"
     assert pack.events == [("battery", "24.00 V"), ("battery", SILENT_REASON)]
-    assert (pack.stops, pack.battery.held) == (0, False)
+    assert (pack.stops, pack.battery.refuses_clear) == (0, False)
     assert pack.at(24.0, 3.0) == "unknown"
     assert pack.at(24.0, 0.1) == "ok"
     assert pack.events[2:] == [("battery", "24.00 V")]
@@ -295,7 +295,7 @@ def test_a_silence_does_not_release_a_stop() -> None:
     pack = Pack()
     pack.at(20.0, 10.0)
     assert pack.quiet(600.0) == "unknown"
-    assert pack.battery.held
+    assert pack.battery.refuses_clear
     # A clear would be refused, so the event does not advise it.
     assert pack.events[-1] == ("battery", SILENT_REASON)
     assert pack.at(20.0, 10.0) == "stop"
@@ -318,7 +318,7 @@ def test_a_board_that_does_not_report_the_measure_is_named(
     for _ in range(100):
         assert pack.step(line) == "unknown"
     assert pack.events == [("battery", text)]
-    assert words(pack.battery._config, pack.status) == text
+    assert status_text(pack.battery._config, pack.status) == text
 
 
 def test_a_measure_that_the_board_no_longer_reports_is_named() -> None:
@@ -334,7 +334,7 @@ def test_a_measure_that_the_board_no_longer_reports_is_named() -> None:
 def test_the_text_says_that_the_level_is_not_known_yet() -> None:
     pack = Pack()
     pack.at(24.0, 1.0)
-    assert words(CONFIG, pack.status) == (
+    assert status_text(CONFIG, pack.status) == (
         "24.00 V; the level is not known until the board has reported for at least 3 s"
     )
 
@@ -345,15 +345,15 @@ def test_the_text_says_that_the_level_is_not_known_yet() -> None:
 def test_a_stop_level_is_forgotten_unless_the_new_board_reports_the_measure() -> None:
     pack = Pack()
     pack.at(19.0, 20.0)
-    assert pack.battery.held
+    assert pack.battery.refuses_clear
     pack.battery.reopen()
     pack.step(BoardStatus(volts=19.0))
     pack.battery.forget()
-    assert pack.battery.held
+    assert pack.battery.refuses_clear
     pack.battery.reopen()
     pack.step(BoardStatus(charge=0.9, amps=-1.0))
     pack.battery.forget()
-    assert not pack.battery.held
+    assert not pack.battery.refuses_clear
     assert pack.step(BoardStatus(charge=0.9)) == "unknown"
     pack.quiet(6.0)
     pack.battery.reopen()

@@ -39,7 +39,7 @@ class Pins:
             (self.now_ms * MS, BoardStatus(bumpers=tuple(mark == "X" for mark in marks) or None))
             for marks in reports
         ]
-        self.events += self.bumpers.look(statuses, self.now_ms * MS)
+        self.events += self.bumpers.process_reports(statuses, self.now_ms * MS)
         return self.bumpers.state
 
     def quiet(self, ms: int) -> str:
@@ -112,7 +112,7 @@ def test_a_pressed_bumper_that_limits_says_which_motion_it_allows(pressed: str, 
     pins.step("....")
     pins.step(pressed)
     assert pins.bumpers.limiting
-    assert pins.bumpers.held == ""
+    assert pins.bumpers.clear_refusal == ""
     assert pins.bumpers.note() == note
     why, _, rest = note.partition(": ")
     assert pins.events[-1] == Event("bumper_pressed", f"{why}; {rest}", "error")
@@ -129,13 +129,13 @@ def test_a_press_counts_immediately_until_the_release() -> None:
     pins.step("..")
     assert pins.step("X.") == "pressed"
     assert pins.bumpers.pressed == (True, False)
-    assert pins.bumpers.pressed_now == pins.bumpers.held == "front bumper pressed"
+    assert pins.bumpers.pressed_now == pins.bumpers.clear_refusal == "front bumper pressed"
     assert pins.bumpers.mend == RELEASE
     assert not pins.bumpers.limiting
     pins.step("X.")
-    assert (pins.bumpers.pressed_now, pins.bumpers.held) == ("", "front bumper pressed")
+    assert (pins.bumpers.pressed_now, pins.bumpers.clear_refusal) == ("", "front bumper pressed")
     assert pins.step("..") == "released"
-    assert (pins.bumpers.held, pins.bumpers.pressed) == ("", (False, False))
+    assert (pins.bumpers.clear_refusal, pins.bumpers.pressed) == ("", (False, False))
     assert pins.events == [
         Event("bumper_released", "the board reports 2 bumpers, and none is pressed"),
         Event("bumper_pressed",
@@ -152,7 +152,7 @@ def test_a_second_pressed_bumper_is_a_new_press_but_the_release_of_one_bumper_is
     pins.step("XX")
     assert pins.bumpers.pressed_now == "front and rear bumpers pressed"
     pins.step(".X")
-    assert (pins.bumpers.pressed_now, pins.bumpers.held) == ("", "rear bumper pressed")
+    assert (pins.bumpers.pressed_now, pins.bumpers.clear_refusal) == ("", "rear bumper pressed")
     assert len(pins.events) == 2
     pins.step("XX", ".X", "..")
     assert (pins.bumpers.pressed_now, pins.bumpers.state) == (
@@ -170,7 +170,7 @@ def test_half_a_second_of_silence_latches_with_both_choices(
     assert pins.quiet(500) != "silent"
     assert pins.step("") == "silent"
     assert pins.bumpers.pressed == (True, True)
-    assert pins.bumpers.pressed_now == pins.bumpers.held == SILENT_REASON
+    assert pins.bumpers.pressed_now == pins.bumpers.clear_refusal == SILENT_REASON
     assert pins.bumpers.mend == CHECK
     assert not pins.bumpers.limiting
     assert pins.events[-1].text == f"{SILENT_REASON}; {CHECK}, then call srv/clear"
@@ -220,7 +220,7 @@ def test_without_places_every_bumper_counts_wherever_it_is() -> None:
     assert pins.step("....") == ""
     assert pins.step("....") == "released"
     assert pins.step("..X.") == "pressed"
-    assert pins.bumpers.held == "bumper 3 pressed"
+    assert pins.bumpers.clear_refusal == "bumper 3 pressed"
 
 
 def test_without_places_the_first_line_with_another_number_of_bumpers_releases_nothing() -> None:
@@ -236,7 +236,7 @@ def test_without_places_the_first_line_with_another_number_of_bumpers_releases_n
 def test_without_places_no_motion_leads_away_so_a_press_latches() -> None:
     pins = away()
     pins.step("X")
-    assert (pins.bumpers.limiting, pins.bumpers.held) == (False, "bumper 1 pressed")
+    assert (pins.bumpers.limiting, pins.bumpers.clear_refusal) == (False, "bumper 1 pressed")
 
 
 def test_bumpers_that_are_off_are_ignored() -> None:

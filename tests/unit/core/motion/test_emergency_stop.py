@@ -45,7 +45,9 @@ class Input:
         """Process these reports `ms` after the last step, and return the state."""
         self.now_ms += ms
         statuses = [(self.now_ms * MS, BoardStatus(estop=pressed)) for pressed in reports]
-        self.events += [event.name for event in self.estop.look(statuses, self.now_ms * MS)]
+        self.events += [
+            event.name for event in self.estop.process_reports(statuses, self.now_ms * MS)
+        ]
         return self.estop.state
 
     def quiet(self, ms: int) -> str:

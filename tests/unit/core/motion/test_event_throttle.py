@@ -19,7 +19,7 @@ def mode(change: str = "ready -> driving") -> Event:
     return Event("mode", "why", kind=change)
 
 
-def told(events: list[Event], seconds: float, every_ms: int = 10) -> list[Event]:
+def logged(events: list[Event], seconds: float, every_ms: int = 10) -> list[Event]:
     """Repeat these events every `every_ms` for this many seconds, and return the logged lines."""
     tally = EventThrottle()
     lines: list[Event] = []
@@ -29,7 +29,7 @@ def told(events: list[Event], seconds: float, every_ms: int = 10) -> list[Event]
 
 
 def test_no_events_give_no_lines() -> None:
-    assert told([], 3.0) == []
+    assert logged([], 3.0) == []
 
 
 def test_a_single_event_is_reported_immediately_and_unchanged() -> None:
@@ -44,7 +44,7 @@ def test_the_kind_of_an_event_precedes_its_text() -> None:
 
 
 def test_repeated_events_give_one_line_a_second_with_their_count() -> None:
-    lines = told([refused()], 2.5)
+    lines = logged([refused()], 2.5)
     assert [line.count for line in lines] == [1, 100, 100]
     assert lines[1].text == "100 x stale; the last: late"
 
@@ -83,7 +83,7 @@ def test_an_event_may_count_for_many() -> None:
 
 
 def test_news_is_reported_immediately_until_it_comes_too_often() -> None:
-    lines = told([mode()], 10.0)
+    lines = logged([mode()], 10.0)
     assert [line.count for line in lines[:BURST]] == [1] * BURST
     assert len(lines) == BURST + 9
     assert sum(line.count for line in lines) <= 1000

@@ -141,13 +141,13 @@ def test_a_proof_takes_the_source_s_timeout_but_no_more_than_two_seconds() -> No
 
 @pytest.mark.parametrize("source", [SLOW, Source("quick", 1, timeout=0.02)])
 def test_a_command_later_than_the_timeout_of_its_source_is_stale(source: Source) -> None:
-    bench = Bench(source).known(source)
+    bench = Bench(source).prove_clock(source)
     assert bench.wait(1100).stamped(source, late_ms=source.timeout * 1000) == ""
     assert bench.wait(1100).stamped(source, late_ms=source.timeout * 1000 + 1) == "stale"
 
 
 def test_a_stale_command_does_not_refresh_the_timeout() -> None:
-    bench = Bench(HIGH).known(HIGH)
+    bench = Bench(HIGH).prove_clock(HIGH)
     for _ in range(5):
         bench.wait(51)
         assert bench.stamped(HIGH, late_ms=5000) == "stale"
@@ -156,7 +156,7 @@ def test_a_stale_command_does_not_refresh_the_timeout() -> None:
 
 
 def test_a_backlog_is_refused_until_its_commands_are_fresh_again() -> None:
-    bench = Bench(HIGH).known(HIGH)
+    bench = Bench(HIGH).prove_clock(HIGH)
     bench.wait(3000)
     ages = [float(age) for age in range(3000, -1, -50)]
     answers = [bench.stamped(HIGH, late_ms=age) for age in ages]
@@ -165,21 +165,21 @@ def test_a_backlog_is_refused_until_its_commands_are_fresh_again() -> None:
 
 
 def test_each_clock_is_known_separately_and_on_all_its_sources() -> None:
-    bench = Bench(HIGH, LOW).known(HIGH, clock="alice")
+    bench = Bench(HIGH, LOW).prove_clock(HIGH, clock="alice")
     bench.offset_ns -= HOUR_NS
     assert bench.stamped(HIGH, clock="bob") == "unproven"
     assert bench.stamped(LOW, clock="alice") == "stale"
 
 
 def test_a_command_without_a_stamp_is_as_old_as_its_arrival() -> None:
-    bench = Bench(HIGH).known(HIGH)
+    bench = Bench(HIGH).prove_clock(HIGH)
     assert bench.wait(5000).send(HIGH) == ""
 
 
 @pytest.mark.parametrize("drift", [1e-4, -1e-4])
 def test_an_hour_with_a_drifting_clock_loses_no_command(drift: float) -> None:
     # 1e-4 x 3600 s = 360 ms, which exceeds the timeout if the estimate did not follow the drift.
-    bench = Bench(HIGH).known(HIGH)
+    bench = Bench(HIGH).prove_clock(HIGH)
     for _ in range(3600 * 5):
         bench.offset_ns -= int(drift * 200 * MS)
         assert bench.wait(200).stamped(HIGH) == ""
@@ -257,7 +257,7 @@ def test_a_sender_among_others_gets_the_same_verdicts_as_alone(
 def test_no_command_within_the_timeout_is_ever_stale(jitter: list[float], offset_s: float) -> None:
     bench = Bench(HIGH)
     bench.offset_ns = int(offset_s * NS_PER_S)
-    bench.known(HIGH)
+    bench.prove_clock(HIGH)
     for late in jitter:
         assert bench.wait(250).stamped(HIGH, late_ms=late) == ""
 
@@ -314,7 +314,7 @@ def test_a_delay_that_jumped_and_still_rises_is_a_growing_queue_and_stays_stale(
 
 
 def test_a_sender_whose_clock_was_adjusted_must_send_a_zero() -> None:
-    bench = Bench(HIGH).known(HIGH)
+    bench = Bench(HIGH).prove_clock(HIGH)
     assert bench.stamped(HIGH) == ""
     assert bench.driver() == "high"
     bench.offset_ns -= NS_PER_S
@@ -345,7 +345,9 @@ def test_unproven_zeros_do_not_arm_a_sender_whose_clock_wavers_on_another_source
 
 
 def test_a_sender_whose_clock_was_adjusted_must_send_a_zero_on_each_of_its_sources() -> None:
-    bench = Bench(HIGH, LOW, armed=False).known(HIGH, "joe", "joe").known(LOW, "joe", "joe")
+    bench = (
+        Bench(HIGH, LOW, armed=False).prove_clock(HIGH, "joe", "joe").prove_clock(LOW, "joe", "joe")
+    )
     bench.wait(50).stamped(LOW, 0.0, "joe", GO, "joe")
     assert bench.driver() == "high" or bench.driver() == "low"
     bench.wait(1000)

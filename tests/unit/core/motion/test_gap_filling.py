@@ -217,7 +217,7 @@ def test_a_gap_before_a_skipped_line_has_the_next_lines_speed_if_that_line_has_c
 # doubtful lines
 
 
-def one(index: int, speed: float, others: float = 4.0) -> WheelSpeeds:
+def one_wheel_at(index: int, speed: float, others: float = 4.0) -> WheelSpeeds:
     return WheelSpeeds(*[speed if i == index else others for i in range(4)])
 
 
@@ -226,13 +226,13 @@ class Doubtful:
 
     def __init__(self, before: WheelSpeeds = FOUR) -> None:
         self.confirmation, self.before, self.lines = Confirmation(FeedbackConfig()), before, 0
-        self.hear(before, 0.01)
+        self.receive(before, 0.01)
 
-    def hear(self, speeds: WheelSpeeds, dt: float, **more: Any) -> tuple[list[int], list[int]]:
+    def receive(self, speeds: WheelSpeeds, dt: float, **more: Any) -> tuple[list[int], list[int]]:
         """Receive a further line, and return the numbers of the lines to use and to drop."""
         self.lines += 1
         line = Feedback(Instant(self.lines, 0), speeds, dt, **more)
-        used, dropped = self.confirmation.look(line, self.skipped, self.before, self.believed)
+        used, dropped = self.confirmation.confirm(line, self.skipped, self.before, self.believed)
         if used:
             self.before = used[-1].speeds
         return [each.at.mono_ns for each in used], [each.at.mono_ns for each in dropped]
@@ -250,47 +250,52 @@ def test_a_wheel_that_changes_alone_in_a_gap_is_refuted_by_the_next_line(
     wheel: int, gap: dict[str, float]
 ) -> None:
     doubtful = Doubtful()
-    assert doubtful.hear(one(wheel, 14.0), **gap) == ([], [])
-    assert doubtful.hear(FOUR, 0.01) == ([3], [2])
-    assert doubtful.hear(one(wheel, 14.0), 0.01) == ([4], []), "a usual line is used at once"
+    assert doubtful.receive(one_wheel_at(wheel, 14.0), **gap) == ([], [])
+    assert doubtful.receive(FOUR, 0.01) == ([3], [2])
+    assert doubtful.receive(one_wheel_at(wheel, 14.0), 0.01) == ([4], []), (
+        "a usual line is used at once"
+    )
 
 
 def test_a_wheel_that_changes_alone_in_a_gap_is_confirmed_by_the_next_line() -> None:
     doubtful = Doubtful()
-    assert doubtful.hear(one(1, 14.0), 0.51, bridged=0.5) == ([], [])
-    assert doubtful.hear(one(1, 14.1), 0.01) == ([2, 3], [])
+    assert doubtful.receive(one_wheel_at(1, 14.0), 0.51, bridged=0.5) == ([], [])
+    assert doubtful.receive(one_wheel_at(1, 14.1), 0.01) == ([2, 3], [])
 
 
 def test_wheels_of_a_side_that_change_alike_in_a_gap_need_no_other_line() -> None:
     doubtful = Doubtful()
-    assert doubtful.hear(WheelSpeeds(40.0, -9.0, -9.2, 40.1), 0.51, bridged=0.5) == ([2], [])
+    assert doubtful.receive(WheelSpeeds(40.0, -9.0, -9.2, 40.1), 0.51, bridged=0.5) == ([2], [])
 
 
 def test_a_doubtful_angle_no_larger_than_that_of_a_usual_line_is_used_immediately() -> None:
     # (1500 rad/s2 x 10 ms + 2 rad/s) x 10 ms / 0.51 s is 0.333 rad/s.
-    assert Doubtful().hear(one(2, 4.33), 0.51, bridged=0.5) == ([2], [])
-    assert Doubtful().hear(one(2, 4.34), 0.51, bridged=0.5) == ([], [])
+    assert Doubtful().receive(one_wheel_at(2, 4.33), 0.51, bridged=0.5) == ([2], [])
+    assert Doubtful().receive(one_wheel_at(2, 4.34), 0.51, bridged=0.5) == ([], [])
 
 
 def test_known_quantization_steps_make_no_line_doubtful() -> None:
     for steps, used in (((9.8,) * 4, [2]), ((9.6,) * 4, []), ((math.inf,) * 4, [])):
-        assert Doubtful().hear(one(2, 14.0), 0.51, bridged=0.5, steps=steps) == (used, [])
+        assert Doubtful().receive(one_wheel_at(2, 14.0), 0.51, bridged=0.5, steps=steps) == (
+            used,
+            [],
+        )
 
 
 def test_a_pause_without_lost_lines_is_judged_like_a_gap() -> None:
     doubtful = Doubtful()
-    assert doubtful.hear(one(0, 14.0), 0.3) == ([], [])
-    assert doubtful.hear(FOUR, 0.01) == ([3], [2])
+    assert doubtful.receive(one_wheel_at(0, 14.0), 0.3) == ([], [])
+    assert doubtful.receive(FOUR, 0.01) == ([3], [2])
 
 
 def test_a_line_after_skipped_lines_is_doubtful_like_a_line_after_a_gap() -> None:
     doubtful = Doubtful()
     doubtful.skipped = 0.5
-    assert doubtful.hear(one(0, 14.0), 0.01) == ([], [])
+    assert doubtful.receive(one_wheel_at(0, 14.0), 0.01) == ([], [])
 
 
 def test_a_line_with_counts_is_used_immediately() -> None:
-    assert Doubtful().hear(one(0, 14.0), 0.51, turned=(0.0,) * 4) == ([2], [])
+    assert Doubtful().receive(one_wheel_at(0, 14.0), 0.51, turned=(0.0,) * 4) == ([2], [])
 
 
 @pytest.mark.parametrize(
@@ -308,7 +313,7 @@ def test_the_line_that_differs_much_from_two_others_is_dropped(
 ) -> None:
     """Only one wheel of the side changes, because the encoder of the other wheel is dead."""
     doubtful = Doubtful(STILL)
-    results = [doubtful.hear(one(3, speed, 0.0), 0.01 + gap, bridged=gap)
+    results = [doubtful.receive(one_wheel_at(3, speed, 0.0), 0.01 + gap, bridged=gap)
             for speed, gap in zip(speeds, (0.5, 0.0, 0.0), strict=True)]  # fmt: skip
     assert results == [([], []), ([], []), (used, dropped)]
 
@@ -316,25 +321,25 @@ def test_the_line_that_differs_much_from_two_others_is_dropped(
 def test_a_wheel_that_is_known_to_be_faulty_makes_no_line_doubtful() -> None:
     doubtful = Doubtful()
     doubtful.believed = lambda wheels: (wheels[3], *wheels[1:])  # type: ignore[method-assign]
-    assert doubtful.hear(one(0, 0.0, 14.0), 0.51, bridged=0.5) == ([2], [])
+    assert doubtful.receive(one_wheel_at(0, 0.0, 14.0), 0.51, bridged=0.5) == ([2], [])
 
 
 def test_a_slower_board_makes_the_usual_time_longer() -> None:
     doubtful = Doubtful()
     for _ in range(300):
-        doubtful.hear(STILL, 0.05)
-    wild = one(0, 0.0, 14.0)
-    assert doubtful.hear(wild, 0.05) == ([302], [])
+        doubtful.receive(STILL, 0.05)
+    wild = one_wheel_at(0, 0.0, 14.0)
+    assert doubtful.receive(wild, 0.05) == ([302], [])
 
 
 def test_on_a_slow_link_the_usual_time_is_longer() -> None:
     slow = Doubtful()
     slow.confirmation = Confirmation(FeedbackConfig())
     for _ in range(3):
-        assert slow.hear(FOUR, 0.1) == ([slow.lines], [])
-    assert slow.hear(one(1, 70.0), 0.1) == ([5], [])
-    assert slow.hear(one(1, 4.0), 0.1) == ([6], [])
-    assert slow.hear(one(1, 70.0), 0.6, bridged=0.5) == ([], [])
+        assert slow.receive(FOUR, 0.1) == ([slow.lines], [])
+    assert slow.receive(one_wheel_at(1, 70.0), 0.1) == ([5], [])
+    assert slow.receive(one_wheel_at(1, 4.0), 0.1) == ([6], [])
+    assert slow.receive(one_wheel_at(1, 70.0), 0.6, bridged=0.5) == ([], [])
 
 
 CRUISE = Twist(0.5, 0.5)

@@ -19,19 +19,19 @@ def rested(seconds: float, bias: float = 0.01, noise: float = 0.0, seed: int = 1
     learned = Bias()
     for n in range(round(seconds / DT)):
         learned.drift(DT)
-        assert learned.rest(bias + noise * gauss(seed, n), 0.0, DT)
+        assert learned.update_at_rest(bias + noise * gauss(seed, n), 0.0, DT)
     return learned
 
 
 @given(st.floats(-0.9 * MAX_BIAS, 0.9 * MAX_BIAS))
 def test_the_bias_of_a_gyro_without_noise_is_exact_after_the_shortest_rest(bias: float) -> None:
     learned = rested(LEARNING_TIME_S + DT, bias)
-    assert learned.known
+    assert learned.is_known
     assert learned.value == pytest.approx(bias, abs=1e-6)
 
 
 def test_the_bias_is_unknown_until_the_robot_has_rested_long_enough() -> None:
-    assert not rested(LEARNING_TIME_S - DT).known
+    assert not rested(LEARNING_TIME_S - DT).is_known
 
 
 def test_the_error_of_the_bias_is_that_of_a_mean_and_matches_the_variance() -> None:
@@ -59,29 +59,29 @@ def test_a_bias_that_has_walked_is_found_again() -> None:
     learned = rested(2.0, bias=0.01, noise=0.005)
     learned.drift(3600.0)
     for n in range(100):
-        assert learned.rest(0.016 + 0.005 * gauss(9, n), 0.0, DT)
+        assert learned.update_at_rest(0.016 + 0.005 * gauss(9, n), 0.0, DT)
     assert learned.value == pytest.approx(0.016, abs=0.0015)
 
 
 def test_a_fast_turn_while_the_wheels_stand_does_not_change_the_bias() -> None:
     learned = rested(2.0, noise=0.005)
     before = learned.value
-    assert not learned.rest(0.3, 0.0, DT)
+    assert not learned.update_at_rest(0.3, 0.0, DT)
     assert learned.value == before
 
 
 @pytest.mark.parametrize("rate", [1.1 * MAX_BIAS, -3.0])
 def test_a_rate_above_the_largest_bias_is_not_taken_as_the_first_bias(rate: float) -> None:
     learned = Bias()
-    assert not learned.rest(rate, 0.0, DT)
-    assert (learned.value, learned.known) == (0.0, False)
+    assert not learned.update_at_rest(rate, 0.0, DT)
+    assert (learned.value, learned.is_known) == (0.0, False)
 
 
 def test_the_noise_that_a_gyro_claims_reduces_the_weight_of_its_samples() -> None:
     claiming, silent = rested(2.0), rested(2.0)
     for learned, claim in ((claiming, 0.05**2), (silent, 0.0)):
         learned.drift(1000.0)
-        assert learned.rest(0.012, claim, DT)
+        assert learned.update_at_rest(0.012, claim, DT)
     assert silent.value == pytest.approx(0.012, abs=1e-4)
     assert claiming.value == pytest.approx(0.01, abs=1e-4)
 
@@ -93,7 +93,7 @@ def test_a_bias_that_has_jumped_is_learned_again_at_rest(jump: float, noise: flo
     for n in range(6000):
         learned.drift(DT)
         rate = 0.01 + jump + noise * gauss(2, n)
-        if not learned.rest(rate, 0.0, DT):
+        if not learned.update_at_rest(rate, 0.0, DT):
             off += (rate - learned.value) * DT
     assert learned.value == pytest.approx(0.01 + jump, abs=0.002)
     assert abs(off) < 1.2 * abs(jump)  # the error of one second, not of the whole minute
@@ -102,5 +102,5 @@ def test_a_bias_that_has_jumped_is_learned_again_at_rest(jump: float, noise: flo
 def test_swinging_to_and_fro_while_the_wheels_stand_does_not_change_the_bias() -> None:
     learned = rested(10.0)
     for n in range(300):
-        learned.rest(0.01 + 0.15 * math.sin(n * DT), 0.0, DT)
+        learned.update_at_rest(0.01 + 0.15 * math.sin(n * DT), 0.0, DT)
     assert learned.value == pytest.approx(0.01, abs=2e-3)

@@ -43,7 +43,7 @@ class Listening(Gyro):
         raise AssertionError("it owes nothing")
 
 
-class One(Struct):
+class Line(Struct):
     """A feedback line: its speeds, its missing time, and whether it is skipped."""
 
     left: float
@@ -54,7 +54,7 @@ class One(Struct):
     skipped: bool = False
 
 
-def said(state: One, dt: float = 0.01) -> Feedback:
+def feedback_of(state: Line, dt: float = 0.01) -> Feedback:
     speeds = WheelSpeeds(state.right, state.left, state.left, state.right)
     if state.gap:
         return Feedback(Instant(0, 0), speeds, 0.0, state.gap)
@@ -68,7 +68,7 @@ WHEEL = st.floats(1.0, 20.0)  # never at rest, because counts are held back ther
 
 LINES = st.lists(
     st.builds(
-        One,
+        Line,
         WHEEL,
         WHEEL,
         st.sampled_from([0.0, 0.0, 0.3]),
@@ -82,32 +82,32 @@ LINES = st.lists(
 
 @given(LINES)
 def test_the_turn_of_the_wheels_that_a_gyro_gets_is_the_turn_of_the_heading(
-    lines: list[One],
+    lines: list[Line],
 ) -> None:
     robot, listening = Odometry(OdometryConfig(), KINEMATICS, 3200), Listening()
     robot.checks.gyro = listening
     for state in lines:
         if state.skipped:
-            robot.skip(said(state))
+            robot.skip(feedback_of(state))
         else:
-            robot.fold(said(state))
+            robot.fold(feedback_of(state))
     off = math.remainder(robot.pose.yaw - listening.turned, math.tau)
     assert off == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_gap_before_a_skipped_line_counts_for_the_next_line() -> None:
     robot = Odometry(OdometryConfig(), KINEMATICS)
-    robot.fold(said(One(10.0, 10.0)))
-    robot.skip(said(One(10.0, 10.0, gap=0.5)))
-    robot.fold(said(One(10.0, 10.0)))
+    robot.fold(feedback_of(Line(10.0, 10.0)))
+    robot.skip(feedback_of(Line(10.0, 10.0, gap=0.5)))
+    robot.fold(feedback_of(Line(10.0, 10.0)))
     assert robot.missed() == {"gaps": 1, "gap_ms": 500}
 
 
 def test_the_gyro_is_compared_with_the_wheels_over_no_unknown_distance() -> None:
     robot, listening = Odometry(OdometryConfig(), KINEMATICS), Listening()
     robot.checks.gyro = listening
-    for state in (One(9.0, 9.0), One(9.0, 9.0, bridged=0.3), One(9.0, 9.0, gap=0.5)):
-        robot.fold(said(state))
+    for state in (Line(9.0, 9.0), Line(9.0, 9.0, bridged=0.3), Line(9.0, 9.0, gap=0.5)):
+        robot.fold(feedback_of(state))
     assert listening.seconds == [0.01, pytest.approx(0.31), 0.0]
 
 

@@ -22,20 +22,20 @@ from acsard.core.values import GyroStatus, TrackUse
 SURE = CERTAIN / 2
 
 
-def told(track: LearnedTrack) -> str | None:
+def event_kind(track: LearnedTrack) -> str | None:
     return None if track.event is None else track.event.kind
 
 
 def test_the_configured_track_is_used_until_the_learned_track_is_certain() -> None:
     track = LearnedTrack(1.0)
-    track.look(None)
-    track.look(Track(1.6, 2 * CERTAIN))
+    track.choose(None)
+    track.choose(Track(1.6, 2 * CERTAIN))
     assert (track.used, track.use, track.event) == (CONFIGURED, "uncertain", None)
 
 
 def test_a_certain_learned_track_is_used_and_reported_once() -> None:
     track = LearnedTrack(1.5)
-    track.look(Track(1.2, CERTAIN))
+    track.choose(Track(1.2, CERTAIN))
     assert track.used == Track(1.2, CERTAIN)
     assert track.event is not None
     assert (track.event.name, track.event.kind, track.event.level) == (
@@ -44,9 +44,9 @@ def test_a_certain_learned_track_is_used_and_reported_once() -> None:
         "info",
     )
     assert track.event.text.endswith(": learned 1.800 ± 0.180 (in use), configured 1.500")
-    track.look(Track(1.25, SURE))
+    track.choose(Track(1.25, SURE))
     assert track.used == Track(1.25, SURE)
-    assert told(track) is None
+    assert event_kind(track) is None
 
 
 def test_a_learned_track_in_use_is_dropped_only_if_it_becomes_clearly_uncertain() -> None:
@@ -55,7 +55,7 @@ def test_a_learned_track_in_use_is_dropped_only_if_it_becomes_clearly_uncertain(
         (SURE, "used"), (1.5 * CERTAIN, "used"), (1.01 * UNCERTAIN, "uncertain"),
         (1.5 * CERTAIN, "uncertain"), (CERTAIN, "used"),
     ):  # fmt: skip
-        track.look(Track(1.6, deviation))
+        track.choose(Track(1.6, deviation))
         assert track.use == use
         assert (track.used == CONFIGURED) is (use != "used")
 
@@ -65,13 +65,13 @@ def test_a_learned_track_too_far_from_the_configured_one_is_reported_and_not_use
     share: float,
 ) -> None:
     track = LearnedTrack(1.0)
-    track.look(Track(share, SURE))
+    track.choose(Track(share, SURE))
     assert track.used == CONFIGURED
     assert track.event is not None
     assert track.event.level == "warning"
     assert "(out of range, not used), configured 1.000 (in use)" in track.event.text
-    track.look(Track(share, SURE))
-    assert told(track) is None
+    track.choose(Track(share, SURE))
+    assert event_kind(track) is None
 
 
 @pytest.mark.parametrize(
@@ -86,25 +86,25 @@ def test_a_learned_track_at_a_bound_is_not_switched_on_and_off(
     """
     within, beyond = (Track(bound * (1.0 + inwards * off), SURE) for off in (0.001, -0.001))
     track = LearnedTrack(1.0)
-    track.look(Track(1.0, SURE))
-    track.look(Track(bound, SURE))
+    track.choose(Track(1.0, SURE))
+    track.choose(Track(bound, SURE))
     assert track.use == "used"
     reports = []
     for _ in range(10):
         for learned in (beyond, within):
-            track.look(learned)
-            reports.append(told(track))
+            track.choose(learned)
+            reports.append(event_kind(track))
     assert reports == ["too far off", *[None] * 19]
-    track.look(Track(bound * (1.0 + inwards * 0.06), SURE))
-    assert told(track) == "used"
+    track.choose(Track(bound * (1.0 + inwards * 0.06), SURE))
+    assert event_kind(track) == "used"
 
 
 def test_a_learned_track_too_far_off_is_reported_once_while_it_is_nearly_certain() -> None:
     track, reports = LearnedTrack(1.0), []
     for _ in range(10):
         for deviation in (0.99 * CERTAIN, 1.01 * CERTAIN):
-            track.look(Track(2 * TRACK_RATIO_RANGE[1], deviation))
-            reports.append(told(track))
+            track.choose(Track(2 * TRACK_RATIO_RANGE[1], deviation))
+            reports.append(event_kind(track))
     assert reports == ["too far off", *[None] * 19]
 
 

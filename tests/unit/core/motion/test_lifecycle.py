@@ -53,7 +53,7 @@ def activate(life: Lifecycle, seconds: float, number: int | None = None) -> bool
 
 def press(life: Lifecycle, seconds: float, why: str = PRESSED_REASON) -> None:
     life.press(why, at(seconds))
-    life.hold(why, CHECK if why == SILENT_REASON else RELEASE, ns(seconds))
+    life.refuse_clear(why, CHECK if why == SILENT_REASON else RELEASE, ns(seconds))
 
 
 def number(life: Lifecycle) -> int:
@@ -213,7 +213,7 @@ def test_a_press_keeps_the_name_of_the_client_that_stopped_the_robot() -> None:
     stop(life, 1.0)
     latch = number(life)
     press(life, 2.0)
-    life.hold("", "", ns(3.0))
+    life.refuse_clear("", "", ns(3.0))
     both = f"{PRESSED_REASON} (latched at {AT}:02 UTC); also stopped by ann at {AT}:01 UTC"
     assert life.why == f"{both}; call srv/clear"
     with pytest.raises(RefusedError) as caught:
@@ -242,7 +242,7 @@ def test_a_cause_that_comes_many_times_is_named_once_under_the_newest_number() -
         press(life, seconds + 0.5)
         numbers.append(number(life))
     assert numbers == sorted(set(numbers))
-    life.hold("", "", ns(60.0))
+    life.refuse_clear("", "", ns(60.0))
     assert life.why == (
         f"{PRESSED_REASON} (latched at {AT}:49 UTC); also stopped by ann at {AT}:49 UTC; call "
         f"srv/clear"
@@ -252,11 +252,11 @@ def test_a_cause_that_comes_many_times_is_named_once_under_the_newest_number() -
 def test_the_reason_after_many_stops_names_the_first_clients_the_last_and_each_press() -> None:
     life = ready()
     press(life, 0.5)
-    life.hold("", "", ns(0.6))
+    life.refuse_clear("", "", ns(0.6))
     for client in range(1000):
         stop(life, 1.0 + client / 100, f"client {client}")
     press(life, 20.0, SILENT_REASON)
-    life.hold("", "", ns(21.0))
+    life.refuse_clear("", "", ns(21.0))
     stop(life, 30.0, "joe")
     why = life.why.replace(SILENT_REASON, "silent")
     assert re.findall(r"(client \d+|joe|silent|pressed) ", why) == [
@@ -304,7 +304,7 @@ def test_every_cause_survives_restarts() -> None:
     press(life, 5.0, SILENT_REASON)
     life = Lifecycle(active=True, latches=life.latches.after_restart())
     press(life, 6.0)
-    life.hold("", "", ns(7.0))
+    life.refuse_clear("", "", ns(7.0))
     assert life.why == (
         f"{PRESSED_REASON} (latched at {AT}:06 UTC); also {SILENT_REASON} (latched at {AT}:05 UTC, "
         f"before the restart); also was stopped by ann at {AT}:01 UTC, before the restart; call "
@@ -315,7 +315,7 @@ def test_every_cause_survives_restarts() -> None:
 # clear
 
 
-class Held(NamedTuple):
+class LatchCase(NamedTuple):
     """How one client stops or deactivates a robot, and how another client releases it."""
 
     said: str
@@ -329,8 +329,8 @@ class Held(NamedTuple):
 HELD = each(
     "held",
     [
-        Held("stopped", Mode.STOPPED, stop, "clear", " and stopped by ann"),
-        Held("switched off", Mode.INACTIVE, lambda life, s, by: life.deactivate(by, at(s)),
+        LatchCase("stopped", Mode.STOPPED, stop, "clear", " and stopped by ann"),
+        LatchCase("switched off", Mode.INACTIVE, lambda life, s, by: life.deactivate(by, at(s)),
              "activate", ""),
     ],
 )  # fmt: skip
@@ -340,7 +340,7 @@ HELD = each(
 @pytest.mark.parametrize("asked_s", [0.5, 1.0])
 @pytest.mark.parametrize("named", [True, False])
 def test_a_release_that_arrived_before_the_latch_is_refused(
-    held: Held, asked_s: float, named: bool
+    held: LatchCase, asked_s: float, named: bool
 ) -> None:
     life = ready()
     held.hold(life, 1.0, "ann")
@@ -350,7 +350,7 @@ def test_a_release_that_arrived_before_the_latch_is_refused(
 
 
 @HELD
-def test_a_release_of_the_same_step_as_the_latch_is_refused(held: Held) -> None:
+def test_a_release_of_the_same_step_as_the_latch_is_refused(held: LatchCase) -> None:
     life = ready()
     held.hold(life, 1.0, "ann")
     with pytest.raises(RefusedError, match="at the same time as this call or after it"):
@@ -360,7 +360,7 @@ def test_a_release_of_the_same_step_as_the_latch_is_refused(held: Held) -> None:
 @HELD
 @pytest.mark.parametrize(("since_s", "age"), [(0.1, "0.1"), (0.4, "0.4"), (1.999, "1.9")])
 def test_a_release_without_a_number_is_refused_until_two_seconds_after_the_latch(
-    held: Held, since_s: float, age: str
+    held: LatchCase, since_s: float, age: str
 ) -> None:
     life = ready()
     held.hold(life, 1.0, "ann")
@@ -379,7 +379,7 @@ def test_a_release_without_a_number_is_refused_until_two_seconds_after_the_latch
 
 @HELD
 @pytest.mark.parametrize("none", [False, True])
-def test_a_release_that_names_another_latch_is_refused(held: Held, none: bool) -> None:
+def test_a_release_that_names_another_latch_is_refused(held: LatchCase, none: bool) -> None:
     life = ready()
     held.hold(life, 1.0, "ann")
     latch = 0 if none else number(life)
@@ -589,7 +589,7 @@ def test_a_pressed_emergency_stop_is_latched_and_says_what_to_do() -> None:
     assert (
         str(caught.value) == f"{PRESSED_REASON}: release it at the robot, then call srv/clear again"
     )
-    life.hold("", "", ns(9.2))
+    life.refuse_clear("", "", ns(9.2))
     with pytest.raises(RefusedError, match="before the cause of the stop or fault had ended"):
         life.clear(number(life), ns(9.2), at(9.3))
     assert (mode(life), life.why) == (Mode.STOPPED, f"{latched}; call srv/clear")
@@ -617,7 +617,7 @@ def test_a_stop_and_a_fault_beside_a_pressed_emergency_stop_are_named_with_it() 
         f"a wheel is dead, latched at {AT}:03 UTC; also {stopped}; release it at the robot, then "
         "call srv/clear twice, 2 s apart"
     )
-    life.hold("", "", ns(8.0))
+    life.refuse_clear("", "", ns(8.0))
     assert clear(life, 9.0) == (
         "fault cleared, but the robot is still stopped by joe and "
         f"stopped ({PRESSED_REASON}): call srv/clear again in 2 s"
@@ -628,7 +628,7 @@ def test_a_stop_and_a_fault_beside_a_pressed_emergency_stop_are_named_with_it() 
 def test_a_fault_that_the_board_still_reports_is_not_cleared() -> None:
     life = ready()
     life.fault("a motor driver is hot", at(1.0))
-    life.hold("a motor driver is hot", "let it cool", ns(1.0))
+    life.refuse_clear("a motor driver is hot", "let it cool", ns(1.0))
     fault = f"a motor driver is hot, latched at {AT}:01 UTC"
     assert life.why == f"{fault}; let it cool, then call srv/clear"
     with pytest.raises(RefusedError) as caught:
@@ -644,7 +644,7 @@ def test_a_fault_that_the_board_still_reports_is_not_cleared() -> None:
 def test_a_fault_beside_one_that_the_board_reports_names_both() -> None:
     life = ready()
     life.fault("a wheel is dead", at(1.0))
-    life.hold("a motor driver is hot", "let it cool", ns(1.0))
+    life.refuse_clear("a motor driver is hot", "let it cool", ns(1.0))
     assert life.why == (
         f"a wheel is dead, latched at {AT}:01 UTC; also a motor driver is hot; let it cool, then "
         "call srv/clear"
@@ -655,9 +655,9 @@ def test_a_press_after_a_release_is_a_new_latch() -> None:
     life = ready()
     press(life, 1.0)
     latch = number(life)
-    life.hold("", "", ns(8.0))
+    life.refuse_clear("", "", ns(8.0))
     press(life, 5.0)
-    life.hold("", "", ns(8.0))
+    life.refuse_clear("", "", ns(8.0))
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, latch)
     assert str(caught.value) == (
@@ -670,7 +670,7 @@ def test_a_press_after_a_release_is_a_new_latch() -> None:
 def test_a_plain_clear_is_refused_right_after_a_press() -> None:
     life = ready()
     press(life, 1.0)
-    life.hold("", "", ns(1.2))
+    life.refuse_clear("", "", ns(1.2))
     with pytest.raises(RefusedError) as caught:
         clear(life, 1.5)
     assert str(caught.value).startswith(
@@ -771,7 +771,7 @@ FACTS: dict[str, Do] = {
     "fault": lambda life, now: life.fault("a wheel is dead", at(now)),
     "leave": lambda life, _: life.leave(),
     "press": lambda life, now: press(life, now),
-    "release": lambda life, _: life.hold("", "", ns(8.0)),
+    "release": lambda life, _: life.refuse_clear("", "", ns(8.0)),
 }
 
 REQUESTS: dict[str, Do] = {

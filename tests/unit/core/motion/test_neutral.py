@@ -24,17 +24,17 @@ def sender() -> Sender:
     return Sender(250 * MS, 1000 * MS, neutral_first=True)
 
 
-def sent(twist: Twist, at_ms: float, shared: bool = False) -> Command:
+def command_at(twist: Twist, at_ms: float, shared: bool = False) -> Command:
     return Command("high", twist, int(at_ms * MS), shared=shared)
 
 
 def test_a_zero_of_an_unshared_sender_arms_immediately_even_right_after_a_speed() -> None:
     peer = sender()
-    peer.take(sent(GO, 0), 0)
+    peer.take(command_at(GO, 0), 0)
     assert not peer.armed(0)
-    peer.take(sent(REST, 0), 0)
+    peer.take(command_at(REST, 0), 0)
     assert peer.armed(0)
-    peer.take(sent(GO, 1), 0)
+    peer.take(command_at(GO, 1), 0)
     assert peer.armed(MS)
 
 
@@ -50,28 +50,28 @@ def test_a_shared_zero_that_a_speed_follows_too_soon_does_not_arm(after_ms: floa
 
 def test_a_shared_zero_arms_if_no_speed_follows_during_the_pause() -> None:
     peer = sender()
-    peer.take(sent(REST, 0, shared=True), 0)
+    peer.take(command_at(REST, 0, shared=True), 0)
     assert not peer.armed(1000 * MS - 1)
     assert peer.armed(1000 * MS)
-    peer.take(sent(GO, 1001, shared=True), 0)
+    peer.take(command_at(GO, 1001, shared=True), 0)
     assert peer.armed(1001 * MS)
 
 
 def test_more_zeros_do_not_restart_the_pause() -> None:
     peer = sender()
     for at_ms in range(0, 1000, 100):
-        peer.take(sent(REST, at_ms, shared=True), 0)
-    peer.take(sent(GO, 1000, shared=True), 0)
+        peer.take(command_at(REST, at_ms, shared=True), 0)
+    peer.take(command_at(GO, 1000, shared=True), 0)
     assert peer.armed(1000 * MS)
 
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_a_zero_that_arrived_before_zeros_were_required_does_not_arm(shared: bool) -> None:
     peer = sender()
-    peer.take(sent(REST, 0, shared), since_ns=1)
+    peer.take(command_at(REST, 0, shared), since_ns=1)
     assert not peer.armed(HOUR_NS)
     assert (peer.arrived_ns, peer.noticed_ns) == (0, 0)
-    peer.take(sent(REST, 0, shared), since_ns=0)
+    peer.take(command_at(REST, 0, shared), since_ns=0)
     assert peer.armed(1000 * MS)
 
 
@@ -80,7 +80,7 @@ def test_a_pause_without_a_zero_does_not_arm_however_long(pause_ms: int) -> None
     for shared in (False, True):
         peer = sender()
         for number in range(10):
-            peer.take(sent(GO, number * pause_ms, shared), 0)
+            peer.take(command_at(GO, number * pause_ms, shared), 0)
             assert not peer.armed(number * pause_ms * MS)
 
 
@@ -155,12 +155,12 @@ def test_messages_that_were_lost_unread_end_the_wait_of_a_shared_zero() -> None:
 def test_an_unproven_zero_arms_unless_its_clock_proves_wrong(shared: bool) -> None:
     for wrong in (False, True):
         peer = sender()
-        peer.take(sent(REST, 0, shared), 0, "unproven")
+        peer.take(command_at(REST, 0, shared), 0, "unproven")
         if wrong:
             peer.unlearn()
         if not shared:
-            peer.take(sent(GO, 500, shared), 0, "unproven")
-        peer.take(sent(GO, 1100, shared), 0)
+            peer.take(command_at(GO, 500, shared), 0, "unproven")
+        peer.take(command_at(GO, 1100, shared), 0)
         assert peer.armed(1100 * MS) is not wrong
         peer.unlearn()
         assert peer.armed(1100 * MS) is not wrong, "a proven zero is never forgotten"
@@ -168,9 +168,9 @@ def test_an_unproven_zero_arms_unless_its_clock_proves_wrong(shared: bool) -> No
 
 def test_a_proven_shared_zero_arms_after_the_pause_even_if_later_zeros_prove_wrong() -> None:
     peer = sender()
-    peer.take(sent(REST, 0, shared=True), 0)
-    peer.take(sent(REST, 900, shared=True), 0, "unproven")
-    peer.take(sent(REST, 1100, shared=True), 0, "unproven")
+    peer.take(command_at(REST, 0, shared=True), 0)
+    peer.take(command_at(REST, 900, shared=True), 0, "unproven")
+    peer.take(command_at(REST, 1100, shared=True), 0, "unproven")
     peer.unlearn()
     assert peer.armed(1100 * MS)
 
@@ -178,11 +178,11 @@ def test_a_proven_shared_zero_arms_after_the_pause_even_if_later_zeros_prove_wro
 def test_a_shared_zero_that_armed_is_not_forgotten_when_a_later_speed_proves_wrong() -> None:
     for refused in (False, True):
         peer = sender()
-        peer.take(sent(REST, 0, shared=True), 0)
+        peer.take(command_at(REST, 0, shared=True), 0)
         if refused:
-            peer.refuse(sent(GO, 1100, shared=True), "stale")
+            peer.refuse(command_at(GO, 1100, shared=True), "stale")
         else:
-            peer.take(sent(GO, 1100, shared=True), 0, "unproven")
+            peer.take(command_at(GO, 1100, shared=True), 0, "unproven")
         peer.unlearn()
         assert peer.armed(1100 * MS)
 
@@ -190,8 +190,8 @@ def test_a_shared_zero_that_armed_is_not_forgotten_when_a_later_speed_proves_wro
 @pytest.mark.parametrize("shared", [False, True])
 def test_a_speed_before_an_unproven_zero_is_not_followed_once_the_zero_arms(shared: bool) -> None:
     peer = Sender(5000 * MS, 1000 * MS, neutral_first=True)
-    peer.take(sent(GO, 0, shared), 0)
-    peer.take(sent(REST, 10, shared), 0, "unproven")
+    peer.take(command_at(GO, 0, shared), 0)
+    peer.take(command_at(REST, 10, shared), 0, "unproven")
     assert peer.armed(1010 * MS if shared else 10 * MS)
     assert peer.twist == REST
 
@@ -201,9 +201,9 @@ def test_an_unproven_zero_leaves_an_unarmed_sender_live_so_its_source_keeps_prio
     shared: bool,
 ) -> None:
     peer = sender()
-    peer.take(sent(GO, 0, shared), 0)
-    peer.take(sent(REST, 10, shared), 0, "unproven")
-    assert peer.live(20 * MS)
+    peer.take(command_at(GO, 0, shared), 0)
+    peer.take(command_at(REST, 10, shared), 0, "unproven")
+    assert peer.is_live(20 * MS)
     assert peer.armed(20 * MS) is not shared
 
 
@@ -213,7 +213,7 @@ def test_a_stall_does_not_count_as_pause_and_leaves_time_for_commands_that_waite
     before_ms: int, rest_ms: int, proven: bool
 ) -> None:
     peer = sender()
-    peer.take(sent(REST, 0, shared=True), 0, "fresh" if proven else "unproven")
+    peer.take(command_at(REST, 0, shared=True), 0, "fresh" if proven else "unproven")
     peer.resume(before_ms * MS, 5000 * MS)
     end_ns = (5000 + rest_ms) * MS
     assert not peer.armed(end_ns - 1)
@@ -224,7 +224,7 @@ def test_a_stall_does_not_count_as_pause_and_leaves_time_for_commands_that_waite
 
 def test_a_pause_that_was_over_before_a_stall_stays_over() -> None:
     peer = sender()
-    peer.take(sent(REST, 0, shared=True), 0)
+    peer.take(command_at(REST, 0, shared=True), 0)
     peer.resume(1000 * MS, 1700 * MS)
     assert peer.armed(1700 * MS)
 
@@ -234,22 +234,22 @@ def test_a_sender_that_was_not_silent_before_a_stall_keeps_its_place_after_the_s
     silent_ms: int, stays: bool
 ) -> None:
     peer = sender()
-    peer.take(sent(GO, 0), 0)
+    peer.take(command_at(GO, 0), 0)
     peer.resume(silent_ms * MS, 1000 * MS)
     assert peer.present(1250 * MS) is stays
-    assert not peer.live(1000 * MS)
+    assert not peer.is_live(1000 * MS)
     assert not peer.present(1251 * MS)
 
 
 def test_a_sender_whose_clock_was_set_keeps_its_place_but_must_send_a_zero() -> None:
     peer = sender()
-    peer.take(sent(REST, 0), 0)
+    peer.take(command_at(REST, 0), 0)
     peer.disarm(100 * MS)
-    peer.take(sent(GO, 100), 0)
+    peer.take(command_at(GO, 100), 0)
     assert not peer.armed(100 * MS)
     assert peer.came_ns == 0
     for at_ms in range(200, 5000, 100):
-        peer.take(sent(GO, at_ms), 0)
+        peer.take(command_at(GO, at_ms), 0)
         assert peer.holds(at_ms * MS) is (at_ms <= 4100)
     assert not peer.holds(9000 * MS)
 
@@ -260,9 +260,9 @@ def test_commands_in_doubt_count_as_zeros_or_speeds_too() -> None:
     for at_ms, twist, late in ((0, GO, 0), (100, GO, 1), (200, REST, 1), (300, REST, 0),
                                (400, GO, 1), (500, GO, 0)):  # fmt: skip
         if late:
-            peer.refuse(sent(twist, at_ms), "stale")
+            peer.refuse(command_at(twist, at_ms), "stale")
         else:
-            peer.take(sent(twist, at_ms), 0)
+            peer.take(command_at(twist, at_ms), 0)
         marks.append((peer.speeds_ns, peer.zeros_ns))
     assert marks == [
         (0, None), (0, None), (None, 200 * MS), (None, 200 * MS), (400 * MS, None),
@@ -272,27 +272,27 @@ def test_commands_in_doubt_count_as_zeros_or_speeds_too() -> None:
 
 def test_a_shared_zero_that_arrived_in_a_stall_begins_its_pause_at_the_end_of_the_stall() -> None:
     peer = sender()
-    peer.take(sent(REST, 0, shared=True), 0, watched_ns=800 * MS)
-    peer.take(sent(REST, 5, shared=True), 0)
+    peer.take(command_at(REST, 0, shared=True), 0, watched_ns=800 * MS)
+    peer.take(command_at(REST, 5, shared=True), 0)
     assert not peer.armed(1700 * MS)
     assert peer.armed(1800 * MS)
 
 
 def test_a_sender_whose_stamps_are_in_doubt_keeps_its_place_for_four_seconds() -> None:
     peer = sender()
-    peer.take(sent(GO, 0), 0)
+    peer.take(command_at(GO, 0), 0)
     for at_ms in range(200, 5000, 200):
-        peer.refuse(sent(GO, at_ms), "stale")
+        peer.refuse(command_at(GO, at_ms), "stale")
         assert peer.present(at_ms * MS) is (at_ms <= 4000)
-        assert peer.live(at_ms * MS) is (at_ms <= 250)
+        assert peer.is_live(at_ms * MS) is (at_ms <= 250)
 
 
 def test_a_sender_that_was_silent_gets_no_place_by_a_command_in_doubt() -> None:
     peer = sender()
-    peer.take(sent(GO, 0), 0)
-    peer.refuse(sent(GO, 200), "stale")
+    peer.take(command_at(GO, 0), 0)
+    peer.refuse(command_at(GO, 200), "stale")
     assert peer.present(450 * MS)
-    peer.refuse(sent(GO, 451), "stale")
+    peer.refuse(command_at(GO, 451), "stale")
     assert not peer.present(451 * MS)
 
 
@@ -302,9 +302,9 @@ def test_a_zero_whose_stamp_is_in_doubt_ends_an_earlier_speed_but_refreshes_no_t
     way: Verdict, stamp: int | None, twist: Twist
 ) -> None:
     peer = sender()
-    peer.take(sent(REST, 0), 0)
-    peer.take(replace(sent(GO, 10), stamp_ns=15), 0)
-    zero = replace(sent(REST, 20), stamp_ns=stamp)
+    peer.take(command_at(REST, 0), 0)
+    peer.take(replace(command_at(GO, 10), stamp_ns=15), 0)
+    zero = replace(command_at(REST, 20), stamp_ns=stamp)
     if way == "stale":
         peer.refuse(zero, way)
     else:
@@ -323,11 +323,13 @@ def test_a_speed_that_a_zero_in_doubt_overtook_is_not_followed_again(
 ) -> None:
     """A stamp that is ahead by more than the timeout of 250 ms is doubtful."""
     peer, stamp_ns = sender(), 5000 * MS
-    peer.take(replace(sent(GO, 10), stamp_ns=stamp_ns - MS, clock="a"), 0)
-    peer.refuse(replace(sent(REST, 20), stamp_ns=stamp_ns + ahead_ms * MS, clock="a"), "stale")
-    peer.take(replace(sent(GO, 30), stamp_ns=stamp_ns, clock=clock), 0)
+    peer.take(replace(command_at(GO, 10), stamp_ns=stamp_ns - MS, clock="a"), 0)
+    peer.refuse(
+        replace(command_at(REST, 20), stamp_ns=stamp_ns + ahead_ms * MS, clock="a"), "stale"
+    )
+    peer.take(replace(command_at(GO, 30), stamp_ns=stamp_ns, clock=clock), 0)
     assert peer.twist == twist
-    peer.take(replace(sent(GO, 40), stamp_ns=stamp_ns + 251 * MS, clock="a"), 0)
+    peer.take(replace(command_at(GO, 40), stamp_ns=stamp_ns + 251 * MS, clock="a"), 0)
     assert peer.twist == GO
 
 
@@ -336,14 +338,14 @@ def test_a_zero_in_doubt_whose_number_is_higher_ends_an_earlier_speed(
     number: int | None, twist: Twist
 ) -> None:
     peer = sender()
-    peer.take(replace(sent(GO, 10), stamp_ns=15, sequence=7), 0)
-    peer.refuse(replace(sent(REST, 20), stamp_ns=5, sequence=number), "stale")
+    peer.take(replace(command_at(GO, 10), stamp_ns=15, sequence=7), 0)
+    peer.refuse(replace(command_at(REST, 20), stamp_ns=5, sequence=number), "stale")
     assert peer.twist == twist
 
 
 def test_a_shared_zero_that_armed_unproven_is_forgotten_when_its_clock_proves_wrong() -> None:
     peer = sender()
-    peer.take(sent(REST, 0, shared=True), 0, "unproven")
+    peer.take(command_at(REST, 0, shared=True), 0, "unproven")
     assert peer.armed(1100 * MS)
     peer.unlearn()
     assert not peer.armed(HOUR_NS)
@@ -361,17 +363,17 @@ def test_a_sender_keeps_the_twist_the_name_and_the_kind_of_its_last_command() ->
 def test_the_first_zero_after_a_speed_is_remembered_while_the_sender_is_not_silent() -> None:
     peer, zeros = sender(), []
     for at_ms, twist in ((0, GO), (100, REST), (200, REST), (300, GO), (400, REST), (900, REST)):
-        peer.take(sent(twist, at_ms), 0)
+        peer.take(command_at(twist, at_ms), 0)
         zeros.append(peer.zeros_ns)
     assert zeros == [None, 100 * MS, 100 * MS, None, 400 * MS, 900 * MS]
 
 
 def test_requiring_a_zero_again_forgets_the_zeros_that_wait() -> None:
     peer = sender()
-    peer.take(sent(REST, 0, shared=True), 0)
+    peer.take(command_at(REST, 0, shared=True), 0)
     peer.require_neutral()
     assert not peer.armed(HOUR_NS)
-    peer.take(sent(REST, 0), 0)
+    peer.take(command_at(REST, 0), 0)
     peer.require_neutral()
     peer.unlearn()
     assert not peer.armed(HOUR_NS)
@@ -386,17 +388,17 @@ def test_without_neutral_first_every_sender_is_armed() -> None:
 
 def test_a_command_counts_until_its_timeout_unless_its_stamp_is_in_doubt() -> None:
     peer = sender()
-    peer.take(sent(GO, 600), 0, "unproven")
-    assert not peer.live(600 * MS)
+    peer.take(command_at(GO, 600), 0, "unproven")
+    assert not peer.is_live(600 * MS)
     assert peer.doubtful(850 * MS)
     assert not peer.doubtful(850 * MS + 1)
-    peer.take(sent(GO, 610), 0)
-    assert peer.live(860 * MS)
-    assert not peer.live(860 * MS + 1)
+    peer.take(command_at(GO, 610), 0)
+    assert peer.is_live(860 * MS)
+    assert not peer.is_live(860 * MS + 1)
     assert not peer.doubtful(610 * MS)
-    peer.refuse(sent(GO, 620), "stale")
+    peer.refuse(command_at(GO, 620), "stale")
     assert (peer.doubtful(620 * MS), peer.doubt, peer.noticed_ns) == (True, "stale", 620 * MS)
-    assert peer.live(860 * MS)
+    assert peer.is_live(860 * MS)
 
 
 # neutral first
@@ -425,7 +427,7 @@ def test_a_tiny_speed_is_not_neutral(twist: Twist) -> None:
 
 def test_a_refused_zero_is_not_neutral() -> None:
     bench = Bench(HIGH, armed=False)
-    bench.known(HIGH).arbiter.require_neutral(bench.now_ns + 1)
+    bench.prove_clock(HIGH).arbiter.require_neutral(bench.now_ns + 1)
     bench.wait(300).send(HIGH, Twist(0.0, math.nan))
     stamp_ns = bench.now_ns + bench.offset_ns - HOUR_NS
     zero = Command("high", REST, bench.now_ns, stamp_ns)
@@ -489,7 +491,7 @@ def test_without_neutral_first_the_first_command_drives() -> None:
 
 
 def test_a_zero_that_waits_never_counts_once_its_delay_proved_wrong() -> None:
-    bench = Bench(HIGH, armed=False).known(HIGH)
+    bench = Bench(HIGH, armed=False).prove_clock(HIGH)
     bench.arbiter.require_neutral(bench.now_ns + 1)
     bench.wait(50).stamped(HIGH)
     bench.wait(300_000)  # long enough that its clock counts as new
@@ -504,7 +506,7 @@ def test_a_zero_that_waits_never_counts_once_its_delay_proved_wrong() -> None:
 
 
 def test_commands_that_a_network_held_back_do_not_arm() -> None:
-    bench = Bench(HIGH, armed=False).known(HIGH)
+    bench = Bench(HIGH, armed=False).prove_clock(HIGH)
     bench.wait(50).arbiter.require_neutral(bench.now_ns)
     assert bench.stamped(HIGH) == ""
     bench.wait(400)
@@ -514,7 +516,7 @@ def test_commands_that_a_network_held_back_do_not_arm() -> None:
 
 
 def test_late_commands_that_arrive_together_soon_after_a_clear_do_not_arm() -> None:
-    bench = Bench(HIGH, armed=False).known(HIGH)
+    bench = Bench(HIGH, armed=False).prove_clock(HIGH)
     bench.wait(600).arbiter.require_neutral(bench.now_ns)
     assert [bench.wait(5).stamped(HIGH, late_ms=late) for late in (500, 400, 100)] == [
         "stale",
@@ -583,7 +585,7 @@ def test_no_twist_of_a_sender_that_no_zero_has_armed_is_followed(
 ) -> None:
     bench = Bench(HIGH, armed=False)
     for name in TWISTS:
-        bench.known(HIGH, name, name)
+        bench.prove_clock(HIGH, name, name)
     bench.arbiter.require_neutral(bench.now_ns + 1)
     bench.wait(1)
     armed: set[str] = set()

@@ -323,7 +323,7 @@ def test_standing_adds_no_uncertainty() -> None:
     assert estimate.covariance == START
 
 
-def gone(gap: float, linear: float, angular: float) -> PoseCovariance:
+def covariance_after_gap(gap: float, linear: float, angular: float) -> PoseCovariance:
     """Return the covariance after a gap of this length, s.
 
     The twist is 0.3 m/s and 0.5 rad/s before the gap, and `linear` and `angular` after it.
@@ -338,13 +338,13 @@ def gone(gap: float, linear: float, angular: float) -> PoseCovariance:
 def test_a_gap_adds_the_distance_at_the_speeds_around_it_to_the_deviation(gap: float) -> None:
     # The speed goes from 0.3 to 0.1 m/s at a constant 0.5 rad/s. The mean is 0.2 m/s and 0.5 rad/s,
     # and the bound is twice that.
-    grown = matrix(gone(gap, 0.1, 0.5)) - matrix(START)
+    grown = matrix(covariance_after_gap(gap, 0.1, 0.5)) - matrix(START)
     assert (0.2 * gap) ** 2 <= grown[0, 0] <= 2 * (0.3 * gap) ** 2
     assert (0.5 * gap) ** 2 <= grown[2, 2] <= 2 * (0.5 * gap) ** 2
 
 
 def test_a_longer_gap_makes_the_pose_less_certain() -> None:
-    ways = [gone(gap, 0.3, 0.5) for gap in (0.1, 0.2, 0.5, 1.0, 2.0)]
+    ways = [covariance_after_gap(gap, 0.3, 0.5) for gap in (0.1, 0.2, 0.5, 1.0, 2.0)]
     for cell in ("xx", "yy", "yawyaw"):
         grown = [getattr(way, cell) for way in ways]
         assert grown == sorted(grown)

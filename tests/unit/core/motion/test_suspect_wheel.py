@@ -18,21 +18,21 @@ Known = tuple[Expected, float | None]
 """The expected speed and the gyro's turn, rad or None."""
 
 
-def told(speed: float, slow: float | None = None, gyro: float | None = None) -> Known:
+def known_from_command(speed: float, slow: float | None = None, gyro: float | None = None) -> Known:
     expected = Expected()
     expected.commanded, expected.speed = speed, speed if slow is None else slow
     expected.clear = expected.settled = speed >= MIN_COMMANDED_SPEED
     return expected, gyro
 
 
-NOTHING = told(0.0)
+NOTHING = known_from_command(0.0)
 
 
 def felt(speed: float) -> Known:
-    return told(0.0, gyro=speed * DT)
+    return known_from_command(0.0, gyro=speed * DT)
 
 
-def lies(
+def judge(
     own: float, other: float, known: Known, lines: int = 4, same: bool = False
 ) -> tuple[bool, WheelFault | None]:
     """Return whether the wheel is found faulty after these lines, and its kind of fault.
@@ -46,37 +46,37 @@ def lies(
     return suspect.sign is not None and suspect.is_faulty(FINE), suspect.sign
 
 
-@each("known", [told(10.0), told(12.0, slow=8.0), felt(10.0)])
+@each("known", [known_from_command(10.0), known_from_command(12.0, slow=8.0), felt(10.0)])
 @each(("own", "lie"), [(0.0, "dead"), (0.4, "dead"), (-10.0, "reversed")])
 def test_a_wheel_that_the_command_or_the_gyro_contradicts_is_faulty(
     own: float, lie: WheelFault, known: Known
 ) -> None:
-    assert lies(own, 10.0, known) == (True, lie)
+    assert judge(own, 10.0, known) == (True, lie)
 
 
 @pytest.mark.parametrize("own", [0.0, -10.0])
 def test_two_lines_are_too_few_to_find_a_faulty_wheel(own: float) -> None:
-    assert not lies(own, 20.0, told(20.0), lines=2)[0]
+    assert not judge(own, 20.0, known_from_command(20.0), lines=2)[0]
 
 
 @pytest.mark.parametrize("own", [0.0, -10.0])
 def test_no_wheel_is_found_faulty_without_a_command_and_a_gyro(own: float) -> None:
-    assert not lies(own, 10.0, NOTHING, lines=1000)[0]
+    assert not judge(own, 10.0, NOTHING, lines=1000)[0]
 
 
 def test_a_wheel_that_follows_its_command_is_not_faulty() -> None:
-    assert not lies(0.0, 10.0, told(0.4), lines=100)[0]
-    assert not lies(10.0, -10.0, told(10.0), lines=100)[0]
+    assert not judge(0.0, 10.0, known_from_command(0.4), lines=100)[0]
+    assert not judge(10.0, -10.0, known_from_command(10.0), lines=100)[0]
 
 
 def test_a_gyro_takes_precedence_over_the_command() -> None:
-    spins = told(10.0, gyro=0.0)
-    assert lies(0.0, 10.0, told(10.0))[0]
-    assert not lies(0.0, 10.0, spins, lines=100)[0]
+    spins = known_from_command(10.0, gyro=0.0)
+    assert judge(0.0, 10.0, known_from_command(10.0))[0]
+    assert not judge(0.0, 10.0, spins, lines=100)[0]
 
 
 def test_half_the_speed_is_no_sign_of_a_fault() -> None:
-    assert lies(5.0, 10.0, told(10.0), lines=100) == (False, None)
+    assert judge(5.0, 10.0, known_from_command(10.0), lines=100) == (False, None)
 
 
 def test_a_constant_wheel_speed_while_the_command_and_the_other_wheel_change_is_stuck() -> None:
@@ -85,7 +85,7 @@ def test_a_constant_wheel_speed_while_the_command_and_the_other_wheel_change_is_
     while lines < 40:
         lines += 1
         speed -= 0.3
-        command = told(speed - 1.0, speed + 2.0)
+        command = known_from_command(speed - 1.0, speed + 2.0)
         assert suspect.looks(10.0 * DT, speed * DT, True, DT, FINE)
         suspect.compare(10.0 * DT, speed * DT, DT, FINE, *command)
         if suspect.is_faulty(FINE):
@@ -98,7 +98,7 @@ def test_a_constant_wheel_speed_while_the_command_and_the_other_wheel_change_is_
 def test_a_wheel_of_a_slow_robot_may_turn_against_a_new_command_while_it_slows_down(
     change: float, out: bool
 ) -> None:
-    suspect, against = Suspect(), told(10.0)
+    suspect, against = Suspect(), known_from_command(10.0)
     against[0].clear, against[0].settled = True, False
     speed = -5.0
     for _ in range(10):
@@ -109,8 +109,8 @@ def test_a_wheel_of_a_slow_robot_may_turn_against_a_new_command_while_it_slows_d
 
 
 def test_a_wheel_that_turns_more_evenly_than_by_hand_is_stuck() -> None:
-    assert not lies(3.0, 0.0, NOTHING, lines=25, same=True)[0]
-    assert lies(3.0, 0.0, NOTHING, lines=35, same=True) == (True, "stuck")
+    assert not judge(3.0, 0.0, NOTHING, lines=25, same=True)[0]
+    assert judge(3.0, 0.0, NOTHING, lines=35, same=True) == (True, "stuck")
 
 
 @each(
@@ -146,7 +146,7 @@ def after(acceleration: float, other: float = 1.0, same: bool = True, count: flo
         command += acceleration * DT if line >= 100 else 0.0
         slow += (command - slow) * DT / (SLOW_S + DT)
         turned = 10.0 + other * (command - 10.0)
-        if stuck.add(same, (turned - 10.0) * DT, DT, count, told(command, slow)[0]):
+        if stuck.add(same, (turned - 10.0) * DT, DT, count, known_from_command(command, slow)[0]):
             return (line - 99) * DT
     return math.inf
 
@@ -180,7 +180,9 @@ def test_a_changed_speed_in_between_restarts_the_evidence_of_a_stuck_wheel() -> 
     stuck = Stuck()
     for line in range(1, 100):
         command = 10.0 + 0.2 * line
-        result = stuck.add(line % 3 != 0, 0.002 * line, DT, FINE, told(command, command - 1.0)[0])
+        result = stuck.add(
+            line % 3 != 0, 0.002 * line, DT, FINE, known_from_command(command, command - 1.0)[0]
+        )
         assert not result
 
 
@@ -201,5 +203,7 @@ def test_a_sound_wheel_with_an_encoder_of_any_kind_is_not_stuck(
             math.floor(angle / count) - before for angle, before in zip(angles, totals, strict=True)
         )
         totals = [totals[0] + own, totals[1] + other]
-        assert not stuck.add(own == last, (other - own) * count, DT, count, told(command, slow)[0])
+        assert not stuck.add(
+            own == last, (other - own) * count, DT, count, known_from_command(command, slow)[0]
+        )
         last = own

@@ -104,7 +104,7 @@ def bursts(a_minute: float) -> Heard:
     It fills them with values between the neighbouring lines.
     """
 
-    def heard(drive: Array, rng: np.random.Generator) -> list[Feedback]:
+    def lines_of(drive: Array, rng: np.random.Generator) -> list[Feedback]:
         lost, at = np.zeros(len(drive), dtype=bool), 0
         while (at := at + 10 + int(rng.exponential(6000 / a_minute))) < len(drive) - 60:
             length = int(rng.uniform(10, 50))
@@ -119,7 +119,7 @@ def bursts(a_minute: float) -> Heard:
             for (le, r), missing in zip(samples.tolist(), lost, strict=True)
         ]
 
-    return heard
+    return lines_of
 
 
 @pytest.mark.soak
@@ -159,7 +159,7 @@ def counting(counts: int) -> Heard:
     Each counter starts at a random fraction of a count.
     """
 
-    def heard(drive: Array, rng: np.random.Generator) -> list[Feedback]:
+    def lines_of(drive: Array, rng: np.random.Generator) -> list[Feedback]:
         wheels = drive[:, [1, 0, 0, 1]] * PERIOD / math.tau * counts
         counted = np.floor(np.cumsum(wheels, axis=0) + rng.random(4))
         turned = np.diff(counted, axis=0, prepend=counted[:1]) * math.tau / counts
@@ -169,7 +169,7 @@ def counting(counts: int) -> Heard:
             for (le, r), row in rows
         ]
 
-    return heard
+    return lines_of
 
 
 DRIVES = SCENARIOS | {"minute": lambda rng: random(rng, 60.0)}
@@ -303,12 +303,12 @@ def test_the_error_of_a_track_counts_for_the_turns_that_it_made() -> None:
 def test_the_yaw_errors_of_the_gyro_and_of_gaps_are_separate_whichever_came_first() -> None:
     gaps_first, gyro_first = uncertainty(), uncertainty()
     before = gyro_first.covariance.yawyaw
-    gaps_first.stand(0.0, 0.0, 0.0, 0.0)
+    gaps_first.add_gap(0.0, 0.0, 0.0, 0.0)
     for model in (gaps_first, gyro_first):
         model.advance(0.0, 10.0, 0.0, 0.0, 0.0, variance=0.0)
-        model.stand(0.0, 0.2, 0.0, 0.0)
+        model.add_gap(0.0, 0.2, 0.0, 0.0)
         model.advance(0.0, 10.0, 0.0, 0.0, 0.0, variance=0.0)
-        model.stand(0.0, -0.2, 0.0, 0.0)
+        model.add_gap(0.0, -0.2, 0.0, 0.0)
     of_skidding = 0.4 * DEFAULT.skid
     for model in (gaps_first, gyro_first):
         grown = model.covariance.yawyaw - before

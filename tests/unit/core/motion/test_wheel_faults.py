@@ -30,8 +30,8 @@ from tests.unit.core.motion.liars import (
     fold,
     lines,
     odometry,
+    reported_speeds,
     rolled,
-    said,
     wishes,
 )
 from tests.unit.core.motion.test_odometry import Says
@@ -74,7 +74,7 @@ class Bench:
             )  # fmt: skip
             by_gyro = None if turn is None else turn * PERIOD
             self.faults.watch(command, speeds, PERIOD)
-            if self.faults.look(turned, speeds, PERIOD, by_gyro):
+            if self.faults.check_line(turned, speeds, PERIOD, by_gyro):
                 time_s = min(time_s, (line + 1) * PERIOD)
             self.events += [event.kind for event in self.faults.events]
         return time_s
@@ -183,7 +183,7 @@ def test_a_wheel_left_out_as_stuck_is_a_fault_only_while_it_repeats_that_speed(
         speeds = only(0, pair[line % 2], others=5.0)
         turned = tuple(speed * PERIOD for speed in speeds.as_tuple())
         text = text or bench.faults.watch(five, speeds, PERIOD)
-        bench.faults.look(turned, speeds, PERIOD)  # type: ignore[arg-type]
+        bench.faults.check_line(turned, speeds, PERIOD)  # type: ignore[arg-type]
     assert ("stuck" in text) is fault
     assert bench.faults.status.left_out == ("front_right",)
 
@@ -302,7 +302,7 @@ class Fall:
     def __init__(self, kind: str, seed: int, counts: int) -> None:
         rng = np.random.default_rng(seed)
         speeds = commands(rng, 8.0, stops=0.05)
-        true = said(rolled(speeds, Robot(counts, tyres=0.005), rng), counts)
+        true = reported_speeds(rolled(speeds, Robot(counts, tyres=0.005), rng), counts)
         wheel = int(rng.integers(4))
         begun = int(rng.integers(300, 700))
         fast = 300 + np.flatnonzero(abs(speeds[300:700, wheel]) >= 2.0)
@@ -393,7 +393,7 @@ def out_after(kind: str, counts: int, speed: float, seed: int) -> float:
     rng = np.random.default_rng(seed)
     speeds, angles = steady(counts, speed, rng)
     wheel, begun = int(rng.integers(4)), int(rng.integers(300, 400))
-    lying = LIES[kind](said(angles, counts), wheel, begun)
+    lying = LIES[kind](reported_speeds(angles, counts), wheel, begun)
     robot = odometry()
     for i, (line, wish) in enumerate(zip(lines(lying, counts), wishes(speeds), strict=True)):
         fold(robot, line, wish)
@@ -433,7 +433,7 @@ def healthy(
     rng = np.random.default_rng(10_000 + seed)
     targets = commands(rng, seconds)
     robot, plain, alarms, slips = odometry(), Plain(), 0, False
-    speeds = said(rolled(targets, Robot(counts, load=0.02), rng), counts)
+    speeds = reported_speeds(rolled(targets, Robot(counts, load=0.02), rng), counts)
     for entry in before:
         robot.fold(Feedback(AT, entry, PERIOD))
         plain.fold(Feedback(AT, entry, PERIOD))
@@ -485,7 +485,9 @@ def slipping(rng: np.random.Generator, counts: int, speed: float = 0.0) -> float
         angles[begun:, wheel] - angles[begun - 1, wheel]
     )  # fmt: skip
     robot = odometry()
-    for i, (line, wish) in enumerate(zip(lines(said(angles, counts)), wishes(speeds), strict=True)):
+    for i, (line, wish) in enumerate(
+        zip(lines(reported_speeds(angles, counts)), wishes(speeds), strict=True)
+    ):
         fold(robot, line, wish)
         if i >= begun and robot.checks.wheels.status.slipping:
             return (i - begun + 1) * PERIOD

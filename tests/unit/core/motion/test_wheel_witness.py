@@ -510,7 +510,7 @@ def slow(robot: WheelFaults, share: float, seconds: float, wheel: int = 0) -> li
     for step in range(round(seconds / DT)):
         speeds = noisy(only(wheel, 10.0 * share, 10.0), step)
         assert robot.watch(TEN, speeds, DT) == ""
-        robot.look((0.1, 0.1, 0.1, 0.1), TEN, DT)
+        robot.check_line((0.1, 0.1, 0.1, 0.1), TEN, DT)
         events += [f"{event.level} {event.kind}: {event.text}" for event in robot.events]
     return events
 
@@ -545,7 +545,7 @@ def test_a_reversed_encoder_that_is_left_out_is_a_fault_at_a_creep_too() -> None
         speeds = only(2, right if step < 200 else -right, right)
         fault = robot.watch(target, speeds, DT)
         front_right, front_left, rear_left, rear_right = (DT * s for s in speeds.as_tuple())
-        robot.look((front_right, front_left, rear_left, rear_right), speeds, DT)
+        robot.check_line((front_right, front_left, rear_left, rear_right), speeds, DT)
         if robot.status.left_out and out == math.inf:
             out = step * DT
         if fault:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from acsard.core.config.live import flat, live
+from acsard.core.config.live import find_live_setting, flat
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.messages.cdr import Cdr, CdrError
@@ -33,18 +33,18 @@ TABLES: dict[str, object] = {
 }
 
 
-def ask(service: str, request: Any, reply: type[Any]) -> Any:
+def call(service: str, request: Any, reply: type[Any]) -> Any:
     answer = Parameters(TABLES).answer(service, Cdr(type(request)).encode(request))
     return Cdr(reply).decode(answer)
 
 
 def names(prefixes: list[str], depth: int = 0) -> list[str]:
-    reply: rcl.ListReply = ask("list_parameters", rcl.ListRequest(prefixes, depth), rcl.ListReply)
+    reply: rcl.ListReply = call("list_parameters", rcl.ListRequest(prefixes, depth), rcl.ListReply)
     return reply.names
 
 
 def value(name: str) -> rcl.ParameterValue:
-    reply: rcl.Values = ask("get_parameters", rcl.Names([name]), rcl.Values)
+    reply: rcl.Values = call("get_parameters", rcl.Names([name]), rcl.Values)
     return reply.values[0]
 
 
@@ -63,7 +63,7 @@ ALL = [
 
 
 def test_every_parameter_and_its_prefixes_are_listed() -> None:
-    reply: rcl.ListReply = ask("list_parameters", rcl.ListRequest([], 0), rcl.ListReply)
+    reply: rcl.ListReply = call("list_parameters", rcl.ListRequest([], 0), rcl.ListReply)
     assert reply.names == ALL
     assert reply.prefixes == [
         "bus",
@@ -115,12 +115,12 @@ def test_each_value_has_its_ros_type() -> None:
 def test_an_unknown_parameter_has_no_value_and_no_type() -> None:
     assert value("robot.weight") == rcl.ParameterValue()
     asked = rcl.Names(["robot.weight", "robot.id"])
-    assert ask("get_parameter_types", asked, rcl.Types).types == [rcl.NOT_SET, rcl.STRING]
+    assert call("get_parameter_types", asked, rcl.Types).types == [rcl.NOT_SET, rcl.STRING]
 
 
 def test_the_description_of_a_parameter_is_that_of_its_key() -> None:
     asked = rcl.Names(["drive.wheel_radius", "no.such"])
-    descriptor, nothing = ask("describe_parameters", asked, rcl.Descriptors).descriptors
+    descriptor, nothing = call("describe_parameters", asked, rcl.Descriptors).descriptors
     assert descriptor == described("drive.wheel_radius", rcl.DOUBLE)
     assert nothing == ParameterDescriptor("no.such", rcl.NOT_SET)
 
@@ -238,7 +238,7 @@ def test_the_description_of_a_choice_lists_its_values() -> None:
 def test_every_key_has_a_description_and_is_read_only_unless_it_can_be_set(key: str) -> None:
     descriptor = described(key, DOUBLE)
     assert descriptor.description
-    assert descriptor.read_only == (live(key) is None)
+    assert descriptor.read_only == (find_live_setting(key) is None)
 
 
 def test_an_unknown_key_has_no_description() -> None:

@@ -31,13 +31,13 @@ REAL = McuConfig(port="/dev/ttyACM0")
 DESCRIBED = RosConfig(urdf="/etc/acsard/robot.urdf")
 
 
-def found(ros: RosConfig) -> list[Endpoint]:
+def all_endpoints(ros: RosConfig) -> list[Endpoint]:
     return list(endpoints(ros, ZID))
 
 
 def keys(ros: RosConfig, transport: str) -> dict[str, str]:
     """Return the native key of each ROS name. The two types of twist count as one."""
-    return {e.native: e.key for e in found(ros) if e.transport == transport}
+    return {e.native: e.key for e in all_endpoints(ros) if e.transport == transport}
 
 
 def test_both_trees_have_the_same_names() -> None:
@@ -84,7 +84,9 @@ def test_every_key_has_the_namespace_and_every_service_the_node_name() -> None:
 
 
 def test_over_rmw_a_topic_with_two_types_has_a_key_for_each_type() -> None:
-    twists = [e.key for e in found(RosConfig()) if e.transport == "rmw" and e.native == "cmd/nav"]
+    twists = [
+        e.key for e in all_endpoints(RosConfig()) if e.transport == "rmw" and e.native == "cmd/nav"
+    ]
     assert [key.split("/")[2] for key in twists] == [
         "geometry_msgs::msg::dds_::Twist_",
         "geometry_msgs::msg::dds_::TwistStamped_",
@@ -97,14 +99,14 @@ def test_over_rmw_a_topic_with_two_types_has_a_key_for_each_type() -> None:
 )
 def test_one_type_of_twist_can_be_chosen(kind: str, types: list[str]) -> None:
     ros = RosConfig(cmd_vel_type=kind)  # type: ignore[arg-type]
-    rmw = [e for e in found(ros) if e.transport == "rmw" and e.native.startswith("cmd/")]
+    rmw = [e for e in all_endpoints(ros) if e.transport == "rmw" and e.native.startswith("cmd/")]
     assert [e.key.split("/")[2].rpartition("::")[2] for e in rmw] == types * 3
 
 
 @pytest.mark.parametrize(("bridge", "rmw"), [(True, False), (False, True), (False, False)])
 def test_each_tree_can_be_switched_off(bridge: bool, rmw: bool) -> None:
     ros = RosConfig(bridge=bridge, rmw=rmw)
-    transports = {e.transport for e in found(ros)}
+    transports = {e.transport for e in all_endpoints(ros)}
     assert transports == {name for name, on in (("bridge", bridge), ("rmw", rmw)) if on}
     tokens = node_tokens(ros, ZID)
     assert any(token.startswith("@ros2_lv/") for token in tokens) == rmw
@@ -141,40 +143,44 @@ def test_every_ros_name_belongs_to_a_row_of_the_topic_table() -> None:
 
 
 def test_only_the_latched_topics_of_the_native_tree_are_latched() -> None:
-    assert {e.native for e in found(RosConfig()) if e.latched} == {
+    assert {e.native for e in all_endpoints(RosConfig()) if e.latched} == {
         "tf_static",
         "robot_description",
     }
 
 
 def test_every_rmw_endpoint_has_its_own_token() -> None:
-    tokens = [e.token for e in found(RosConfig()) if e.transport == "rmw"]
+    tokens = [e.token for e in all_endpoints(RosConfig()) if e.transport == "rmw"]
     assert len(set(tokens)) == len(tokens)
     numbers = [int(token.split("/")[4]) for token in tokens]
     assert numbers == list(range(1, len(tokens) + 1))
     kinds = {"out": "MP", "in": "MS", "query": "SS", "service": "SS"}
-    for endpoint in found(RosConfig()):
+    for endpoint in all_endpoints(RosConfig()):
         if endpoint.transport == "rmw":
             assert endpoint.token.split("/")[5] == kinds[endpoint.direction]
 
 
 def test_every_bridge_endpoint_with_a_single_type_is_announced() -> None:
-    silent = {e.native for e in found(RosConfig()) if e.transport == "bridge" and not e.token}
+    silent = {
+        e.native for e in all_endpoints(RosConfig()) if e.transport == "bridge" and not e.token
+    }
     assert silent == {"cmd/nav", "cmd/dock", "cmd/teleop"}
     chosen = RosConfig(cmd_vel_type="twist_stamped")
-    assert all(e.token for e in found(chosen))
-    assert "/MS/cmd_vel/geometry_msgs§msg§TwistStamped/" in "".join(e.token for e in found(chosen))
+    assert all(e.token for e in all_endpoints(chosen))
+    assert "/MS/cmd_vel/geometry_msgs§msg§TwistStamped/" in "".join(
+        e.token for e in all_endpoints(chosen)
+    )
 
 
 def test_no_bridge_endpoint_is_announced_if_announcing_is_off() -> None:
     ros = RosConfig(announce=False)
-    assert not any(e.token for e in found(ros) if e.transport == "bridge")
+    assert not any(e.token for e in all_endpoints(ros) if e.transport == "bridge")
     assert node_tokens(ros, ZID) == ("@ros2_lv/0/abc/0/0/NN/%/%/acsard",)
 
 
 def test_the_command_keys_are_the_incoming_keys_of_both_trees() -> None:
     rate_limited = command_keys(RosConfig())
-    assert set(rate_limited) == {e.key for e in found(RosConfig()) if e.direction == "in"}
+    assert set(rate_limited) == {e.key for e in all_endpoints(RosConfig()) if e.direction == "in"}
     assert len(rate_limited) == 6 + 9
 
 
@@ -201,7 +207,7 @@ def test_a_robot_without_a_urdf_has_no_robot_description() -> None:
     config = Config(mcu=REAL, odometry=OdometryConfig(gyro=True))
     assert left_out(config) == {"robot_description"}
     native_keys = {e.native for e in endpoints(RosConfig(), ZID, left_out(config))}
-    assert {e.native for e in found(RosConfig())} - native_keys == {"robot_description"}
+    assert {e.native for e in all_endpoints(RosConfig())} - native_keys == {"robot_description"}
 
 
 def test_a_gyro_from_ros_is_used_if_configured_on_a_robot_that_is_not_simulated() -> None:
@@ -218,7 +224,9 @@ def test_a_gyro_from_ros_is_used_if_configured_on_a_robot_that_is_not_simulated(
 
 def test_the_gyro_subscription_is_best_effort_like_sensor_publishers() -> None:
     bridge, rmw = (
-        next(e for e in found(RosConfig()) if e.native == "imu" and e.transport == transport)
+        next(
+            e for e in all_endpoints(RosConfig()) if e.native == "imu" and e.transport == transport
+        )
         for transport in ("bridge", "rmw")
     )
     assert "/MS/imu§data/sensor_msgs§msg§Imu/:0:0:0,10:" in bridge.token

@@ -52,7 +52,7 @@ def drive(mcu: FakeMcu, start_ns: int, count: int, line: bytes = LINE) -> Heard:
     return chunks
 
 
-def told(line: bytes, config: Config = TRUE) -> FakeMcu:
+def mcu_after_line(line: bytes, config: Config = TRUE) -> FakeMcu:
     """Return an MCU that received this line once, after enough time to act on it."""
     mcu = FakeMcu(config)
     mcu.receive(0, line)
@@ -226,7 +226,7 @@ INVALID = [
 
 @each("line", INVALID)
 def test_a_line_that_is_not_whole_and_valid_is_recorded_but_has_no_effect(line: bytes) -> None:
-    mcu = told(line)
+    mcu = mcu_after_line(line)
     assert mcu.vehicle.set_points == STILL
     assert mcu.valid_lines == 0
     assert replies(mcu, 200 * MS) == []
@@ -235,7 +235,7 @@ def test_a_line_that_is_not_whole_and_valid_is_recorded_but_has_no_effect(line: 
 
 @pytest.mark.parametrize("line", [LINE, LINE.replace(b"\r", b""), LINE[:-2] + b",\r\n"])
 def test_any_line_end_and_a_trailing_comma_are_accepted(line: bytes) -> None:
-    mcu = told(line)
+    mcu = mcu_after_line(line)
     assert mcu.vehicle.set_points == SPEEDS
     assert mcu.valid_lines == 1
 
@@ -253,7 +253,7 @@ def test_a_line_in_two_pieces_is_one_line(cut: int) -> None:
 
 
 def test_noise_spoils_only_the_line_that_it_hits() -> None:
-    mcu = told(b"\xff~" + LINE + b"garbage\r\n" + LINE)
+    mcu = mcu_after_line(b"\xff~" + LINE + b"garbage\r\n" + LINE)
     assert mcu.valid_lines == 1
     assert [data for _, data in mcu.heard] == [b"\xff~" + LINE, b"garbage\r\n", LINE]
 
@@ -309,13 +309,13 @@ def test_invalid_lines_do_not_keep_the_motors_running() -> None:
 
 
 def test_the_watchdog_does_not_trip_at_rest() -> None:
-    mcu = told(ZERO)
+    mcu = mcu_after_line(ZERO)
     mcu.advance(10_000 * MS)
     assert mcu.watchdog_trips == 0
 
 
 def test_after_a_trip_the_next_line_drives_again() -> None:
-    mcu = told(LINE)
+    mcu = mcu_after_line(LINE)
     mcu.advance(1000 * MS)
     assert drive(mcu, 1000 * MS, 3)[-1][1] == LINE
 
@@ -346,7 +346,7 @@ def test_a_watchdog_fed_by_bad_lines_keeps_the_motors_running_until_silence() ->
 
 
 def test_a_reset_stops_the_motors_and_leaves_the_board_deaf_for_its_bootloader() -> None:
-    mcu = told(LINE)
+    mcu = mcu_after_line(LINE)
     mcu.reset(100 * MS)
     assert mcu.vehicle.set_points == STILL
     deaf_until = 100 * MS + RESET_NS

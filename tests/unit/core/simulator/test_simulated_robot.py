@@ -17,7 +17,9 @@ RATE = 2.0 * 2 * 0.05 / 0.30
 """Turn rate that the line commands, rad/s."""
 
 
-def seen(config: Config = TRUE, seconds: float = 1.0, step_ms: int = 5) -> list[Observation]:
+def observations(
+    config: Config = TRUE, seconds: float = 1.0, step_ms: int = 5
+) -> list[Observation]:
     """Return all observations of a robot that is commanded to turn from 100 ms on."""
     sights: list[Observation] = []
     mcu = WatchedMcu(config, 0, sights.append)
@@ -30,14 +32,14 @@ def seen(config: Config = TRUE, seconds: float = 1.0, step_ms: int = 5) -> list[
 
 def test_the_robot_is_observed_every_10_ms_for_any_step_size() -> None:
     for step_ms in (1, 5, 20):
-        assert [sight.at_ns for sight in seen(step_ms=step_ms)] == [
+        assert [sight.at_ns for sight in observations(step_ms=step_ms)] == [
             (n + 1) * OBSERVATION_PERIOD_NS for n in range(100)
         ]
 
 
 def test_an_observation_has_the_true_pose_of_its_time() -> None:
     config = Config(sim=replace(TRUE.sim, track_multiplier=1.6))
-    late, early = seen(config)[-1], seen(config)[49]
+    late, early = observations(config)[-1], observations(config)[49]
     turned = late.pose.yaw - early.pose.yaw
     assert turned == pytest.approx(RATE / 1.6 * 0.5)
 
@@ -57,34 +59,36 @@ def test_the_next_observation_is_the_next_event_of_an_idle_board() -> None:
 
 
 def test_an_ideal_gyro_measures_the_true_turn_rate() -> None:
-    sights = seen()
+    sights = observations()
     assert [sight.gyro for sight in sights[50:]] == pytest.approx([RATE] * 50)
     assert sum(sight.gyro for sight in sights) * 0.01 == pytest.approx(sights[-1].pose.yaw)
 
 
 def test_the_gyro_bias_is_added_to_every_sample() -> None:
-    biased = seen(Config(sim=replace(TRUE.sim, gyro_bias=-0.03)))
-    assert [b.gyro - g.gyro for b, g in zip(biased, seen(), strict=True)] == pytest.approx(
+    biased = observations(Config(sim=replace(TRUE.sim, gyro_bias=-0.03)))
+    assert [b.gyro - g.gyro for b, g in zip(biased, observations(), strict=True)] == pytest.approx(
         [-0.03] * 100
     )
 
 
 def test_the_gyro_noise_varies_and_depends_on_the_seed_only() -> None:
     sim = replace(TRUE.sim, gyro_noise=0.02)
-    noise = [b.gyro - g.gyro for b, g in zip(seen(Config(sim=sim)), seen(), strict=True)]
+    noise = [
+        b.gyro - g.gyro for b, g in zip(observations(Config(sim=sim)), observations(), strict=True)
+    ]
     assert statistics.pstdev(noise) == pytest.approx(0.02, rel=0.3)
-    assert seen(Config(sim=sim)) == seen(Config(sim=sim))
-    assert seen(Config(sim=sim)) != seen(Config(sim=replace(sim, seed=2)))
+    assert observations(Config(sim=sim)) == observations(Config(sim=sim))
+    assert observations(Config(sim=sim)) != observations(Config(sim=replace(sim, seed=2)))
 
 
 @pytest.mark.parametrize("periods", [1, 5, 20])
 def test_a_late_gyro_repeats_the_ideal_samples_later(periods: int) -> None:
-    late = seen(Config(sim=replace(TRUE.sim, gyro_delay=periods * 0.01)))
-    prompt = [0.0] * periods + [sight.gyro for sight in seen()]
+    late = observations(Config(sim=replace(TRUE.sim, gyro_delay=periods * 0.01)))
+    prompt = [0.0] * periods + [sight.gyro for sight in observations()]
     assert [sight.gyro for sight in late] == pytest.approx(prompt[:100])
 
 
 def test_a_gyro_delay_between_two_observations_is_exact() -> None:
-    late = seen(Config(sim=replace(TRUE.sim, gyro_delay=0.025)))
+    late = observations(Config(sim=replace(TRUE.sim, gyro_delay=0.025)))
     turned = sum(sight.gyro for sight in late) * 0.01
-    assert turned == pytest.approx(seen()[-1].pose.yaw - RATE * 0.025)
+    assert turned == pytest.approx(observations()[-1].pose.yaw - RATE * 0.025)

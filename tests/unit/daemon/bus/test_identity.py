@@ -56,15 +56,15 @@ def test_a_missing_permission_is_reported_with_the_role_that_it_needs() -> None:
 
 def test_a_silent_robot_leads_to_questions_first_about_the_id_and_to_no_claim() -> None:
     nobody = Identity("", "anna", "joe/1/aa", "robot1", "tls/a.local:7449")
-    for text in (nobody.words(), nobody.lacks("state"), nobody.lacks("srv/stop")):
+    for text in (nobody.describe(), nobody.lacks("state"), nobody.lacks("srv/stop")):
         assert text.startswith("no daemon answers as 'robot1' at tls/a.local:7449")
         assert "queried key: acsard/robot1/whoami/viewer" in text
         assert text.index("is --id right") < text.index("daemon run") < text.index("role's list")
         assert "your certificate, anna," in text
         assert "add" not in text
     stranger = Identity("", "", "joe/1/aa", "robot1", "tcp/127.0.0.1:7448")
-    assert stranger.words().startswith("no daemon answers as 'robot1' at tcp/127.0.0.1:7448")
-    assert "certificate" not in stranger.words()
+    assert stranger.describe().startswith("no daemon answers as 'robot1' at tcp/127.0.0.1:7448")
+    assert "certificate" not in stranger.describe()
     assert Identity("viewer", "anna", "x").silence == stranger.silence == ""
 
 

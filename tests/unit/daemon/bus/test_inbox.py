@@ -110,7 +110,7 @@ def test_a_loop_that_wakes_up_finds_the_displaced_samples_counted() -> None:
     assert overruns == [1]
 
 
-class Asked:
+class FakeQuery:
     """A stand-in for a Zenoh query. It records its replies and whether the daemon dropped it."""
 
     def __init__(self, gone: bool = False, closed: bool = False) -> None:
@@ -150,7 +150,7 @@ def ended(replies: Replies) -> None:
 
 
 def test_each_query_gets_the_replies_to_its_ticket_and_then_its_end() -> None:
-    replies, query, other = Replies("acsard/r7/"), Asked(), Asked()
+    replies, query, other = Replies("acsard/r7/"), FakeQuery(), FakeQuery()
     first, second = issued(replies, query), issued(replies, other, "acsard/stop")
     replies.send(Reply(first, "odom", b"1", ""))
     replies.send(Reply(second, "srv/stop", b"2", ""))
@@ -163,7 +163,7 @@ def test_each_query_gets_the_replies_to_its_ticket_and_then_its_end() -> None:
 
 
 def test_a_client_that_left_and_an_unknown_ticket_block_no_other_reply() -> None:
-    replies, absent, here = Replies(""), Asked(gone=True), Asked()
+    replies, absent, here = Replies(""), FakeQuery(gone=True), FakeQuery()
     first, second = issued(replies, absent), issued(replies, here)
     for ticket in (first, 999, second):
         replies.send(Reply(ticket, "odom", b"1", ""))
@@ -174,7 +174,7 @@ def test_a_client_that_left_and_an_unknown_ticket_block_no_other_reply() -> None
 
 
 def test_a_query_that_cannot_be_ended_blocks_no_other_reply() -> None:
-    replies, closed, here = Replies(""), Asked(closed=True), Asked()
+    replies, closed, here = Replies(""), FakeQuery(closed=True), FakeQuery()
     first, second = issued(replies, closed), issued(replies, here)
     replies.retire(first)
     replies.send(Reply(second, "odom", b"1", ""))
@@ -184,7 +184,7 @@ def test_a_query_that_cannot_be_ended_blocks_no_other_reply() -> None:
 
 
 def test_the_number_of_tickets_is_limited_until_some_are_retired() -> None:
-    replies, queries = Replies(""), [Asked() for _ in range(2 * MAX_OPEN_QUERIES)]
+    replies, queries = Replies(""), [FakeQuery() for _ in range(2 * MAX_OPEN_QUERIES)]
     tickets = [replies.issue(query, "") for query in queries]  # type: ignore[arg-type]
     open_tickets = [ticket for ticket in tickets if ticket is not None]
     assert len(open_tickets) == MAX_OPEN_QUERIES

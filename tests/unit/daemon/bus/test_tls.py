@@ -21,7 +21,7 @@ from acsard.machine.authority import Authority
 DAY_NS = 86400 * NS_PER_S
 
 
-def made(where: Path, days: float = 10, authority_days: int = 10) -> Path:
+def make_certificates(where: Path, days: float = 10, authority_days: int = 10) -> Path:
     Authority.make(where, "test", authority_days).issue(where, "robot", ["localhost"], days)
     return where
 
@@ -29,7 +29,7 @@ def made(where: Path, days: float = 10, authority_days: int = 10) -> Path:
 def test_the_common_name_is_read_and_is_empty_for_an_unusable_certificate(
     tmp_path: Path,
 ) -> None:
-    assert common_name(str(made(tmp_path))) == "robot"
+    assert common_name(str(make_certificates(tmp_path))) == "robot"
     Authority.load(tmp_path, str).issue(tmp_path / "anna", "laptop-anna", [], 10)
     assert common_name(str(tmp_path / "anna")) == "laptop-anna"
     (tmp_path / "certificate.pem").write_text("junk")
@@ -37,13 +37,13 @@ def test_the_common_name_is_read_and_is_empty_for_an_unusable_certificate(
 
 
 def test_the_files_of_tls_init_can_be_used(tmp_path: Path) -> None:
-    require_usable(str(made(tmp_path)))
+    require_usable(str(make_certificates(tmp_path)))
 
 
 def mixed(where: Path) -> None:
     other = where / "other"
     other.mkdir()
-    made(other)
+    make_certificates(other)
     (where / "key.pem").write_bytes((other / "key.pem").read_bytes())
 
 
@@ -66,7 +66,7 @@ BROKEN: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("how", BROKEN)
 def test_unusable_files_are_a_bad_configuration(tmp_path: Path, how: str) -> None:
-    BROKEN[how](made(tmp_path))
+    BROKEN[how](make_certificates(tmp_path))
     with pytest.raises(CertificateError) as caught:
         require_usable(str(tmp_path))
     assert str(tmp_path) in str(caught.value)
@@ -75,15 +75,15 @@ def test_unusable_files_are_a_bad_configuration(tmp_path: Path, how: str) -> Non
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
 def test_a_key_that_this_user_may_not_read_is_a_missing_permission(tmp_path: Path) -> None:
-    (made(tmp_path) / "key.pem").chmod(0)
+    (make_certificates(tmp_path) / "key.pem").chmod(0)
     with pytest.raises(NotPermittedError):
         require_usable(str(tmp_path))
 
 
 def test_the_ends_of_the_certificate_and_of_its_authority_are_read(tmp_path: Path) -> None:
     expiries, later = (
-        expiry_times(str(made(tmp_path, 10, 100))),
-        expiry_times(str(made(tmp_path, 1, 1))),
+        expiry_times(str(make_certificates(tmp_path, 10, 100))),
+        expiry_times(str(make_certificates(tmp_path, 1, 1))),
     )
     # An authority is valid for five times the days that were asked for.
     days = {whose: round((expiries[whose] - later[whose]) / DAY_NS) for whose in expiries}

@@ -129,12 +129,12 @@ def read(text: str) -> Any:
     return access | {"storages": json.loads(config.get_json("plugins/storage_manager/storages"))}
 
 
-def made(robots: Sequence[str], people: Mapping[Role, Sequence[str]] | None = None) -> Any:
+def router_config(robots: Sequence[str], people: Mapping[Role, Sequence[str]] | None = None) -> Any:
     return read(router_file(TEMPLATE, robots, people or {}))
 
 
 def test_for_the_robot_of_the_template_the_file_is_the_template() -> None:
-    assert made(["robot1"]) == read(TEMPLATE)
+    assert router_config(["robot1"]) == read(TEMPLATE)
 
 
 @each("role", ROLES)
@@ -170,7 +170,7 @@ def granted(access: Any, subjects: set[str], message: str) -> set[str]:
 
 
 def test_each_of_ten_robots_has_its_own_keys_and_none_of_another_robot() -> None:
-    single, ten = made(["robot1"]), made(TEN)
+    single, ten = router_config(["robot1"]), router_config(TEN)
     for robots in (["robot1"], TEN):
         line = f"// This file is for {', '.join(robots)}. To make a file for your own robots:\n"
         assert line in router_file(TEMPLATE, robots, {})
@@ -206,7 +206,9 @@ def test_further_certificates_are_in_the_list_of_their_role() -> None:
         "viewer": ["wall"],
         "maintainer": ["chief"],
     }
-    names = {s["id"]: s["cert_common_names"] for s in made(["a-1"], certificates)["subjects"]}
+    names = {
+        s["id"]: s["cert_common_names"] for s in router_config(["a-1"], certificates)["subjects"]
+    }
     assert names == {
         "viewers": ["viewer", "wall"],
         "operators": ["operator", "laptop-anna", "robot1-ben"],
@@ -228,7 +230,7 @@ def test_each_commanding_certificate_has_keys_of_its_own_on_each_robot(
         "maintainer": ["chief"],
         "viewer": ["wall"],
     }
-    access = made(robots, people)
+    access = router_config(robots, people)
     rules = {rule["id"]: rule for rule in access["rules"]}
     commands = [rule for rule in rules.values() if any("cmd/" in key for key in rule["key_exprs"])]
     own = {f"own-{robot}" for robot in robots}
@@ -263,7 +265,7 @@ def test_a_name_may_occur_only_once(
 
 def test_a_robot_may_have_a_name_that_the_template_uses_otherwise() -> None:
     robots = ["viewers", "hear", "learn", "a", "see-a", "own-a", "robot-a"]
-    access = made(robots)
+    access = router_config(robots)
     for kind in ("rules", "subjects"):
         ids = [entry["id"] for entry in access[kind]]
         assert len(set(ids)) == len(ids)

@@ -19,21 +19,21 @@ S = 10**9
 MOST = 4
 
 
-def look(at_ns: int, *holders: str, linked: bool = True) -> Observation:
+def observation(at_ns: int, *holders: str, linked: bool = True) -> Observation:
     return Observation(at_ns, holders, linked)
 
 
 def test_a_gateway_with_free_connections_reports_nothing() -> None:
     health = SessionHealth(MOST, 0)
-    assert health.full_event(look(S, "ann", "ben", "ben")) is None
-    assert health.restart_event(look(S), S // 4) is None
+    assert health.full_event(observation(S, "ann", "ben", "ben")) is None
+    assert health.restart_event(observation(S), S // 4) is None
     assert health.full == 0
 
 
 def test_a_full_gateway_names_its_clients_once_a_minute_and_counts_every_observation() -> None:
     health, events = SessionHealth(MOST, 0), []
     for number in range(2 * 60 * 4 + 1):
-        event = health.full_event(look(number * S // 4, "ben", "ann", "ben", ""))
+        event = health.full_event(observation(number * S // 4, "ben", "ann", "ben", ""))
         if event is not None:
             events.append((number * S // 4, event))
     assert [at for at, _ in events] == [0, 60 * S, 120 * S]
@@ -54,7 +54,7 @@ MOMENT = S // 4
 
 
 def test_an_observation_that_takes_too_long_restarts_the_gateway() -> None:
-    health, stuck = SessionHealth(MOST, 0), look(S)
+    health, stuck = SessionHealth(MOST, 0), observation(S)
     assert [health.restart_event(stuck, MOMENT) for _ in range(STUCK_AFTER_NS // MOMENT + 1)][
         -1
     ] is None
@@ -65,9 +65,9 @@ def test_an_observation_that_takes_too_long_restarts_the_gateway() -> None:
 
 def test_a_stall_of_the_whole_machine_does_not_restart_the_gateway() -> None:
     health = SessionHealth(MOST, 0)
-    assert health.restart_event(look(S), MOMENT) is None
-    assert health.restart_event(look(S), 60 * S) is None
-    assert health.restart_event(look(61 * S), MOMENT) is None
+    assert health.restart_event(observation(S), MOMENT) is None
+    assert health.restart_event(observation(S), 60 * S) is None
+    assert health.restart_event(observation(61 * S), MOMENT) is None
 
 
 def test_a_connected_daemon_that_answers_no_query_restarts_the_gateway() -> None:
@@ -82,23 +82,26 @@ def test_a_connected_daemon_that_answers_no_query_restarts_the_gateway() -> None
 
 def test_a_lost_daemon_restarts_the_gateway() -> None:
     health = SessionHealth(MOST, 0)
-    assert health.restart_event(look(S), MOMENT) is None
-    assert health.restart_event(look(S + LOST_DAEMON_NS, linked=False), MOMENT) is None, (
+    assert health.restart_event(observation(S), MOMENT) is None
+    assert health.restart_event(observation(S + LOST_DAEMON_NS, linked=False), MOMENT) is None, (
         "it may come back"
     )
-    over = health.restart_event(look(S + LOST_DAEMON_NS + 1, linked=False), MOMENT)
+    over = health.restart_event(observation(S + LOST_DAEMON_NS + 1, linked=False), MOMENT)
     assert over is not None
     assert over.name == "gateway_lost_daemon"
 
 
 def test_after_the_start_the_daemon_has_more_time_to_connect() -> None:
     health = SessionHealth(MOST, S)
-    assert health.restart_event(look(S + FIRST_CONNECTION_NS, linked=False), MOMENT) is None
-    assert health.restart_event(look(S + FIRST_CONNECTION_NS + 1, linked=False), MOMENT) is not None
+    assert health.restart_event(observation(S + FIRST_CONNECTION_NS, linked=False), MOMENT) is None
+    assert (
+        health.restart_event(observation(S + FIRST_CONNECTION_NS + 1, linked=False), MOMENT)
+        is not None
+    )
 
 
 def test_a_daemon_that_reconnects_in_time_causes_no_restart() -> None:
     health = SessionHealth(MOST, 0)
     for half_seconds in range(20):
-        now = look(half_seconds * S // 2, linked=half_seconds % 2 == 0)
+        now = observation(half_seconds * S // 2, linked=half_seconds % 2 == 0)
         assert health.restart_event(now, MOMENT) is None
