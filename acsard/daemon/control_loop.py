@@ -319,21 +319,24 @@ class ControlLoop:
         except decelerations. It does not contain the limit from the key `speed_limit`. The program
         that sent this limit may have ended before the next start, so no program would lift it.
         """
-        now, file = self._speed.settings.limits, self._settings_file
-        if file is not None:
-            latches = file.latches(latches, now)
-        if self._speed.lowers:
-            limits, cache = self._started if file is None else file.limits, self._latches_cache
-            if cache is None or not (
-                cache[0] is latches and cache[1] is now and cache[2] is limits
-            ):
-                without = replace(latches, lowered=lowered(limits, now))
-                cache = self._latches_cache = latches, now, limits, without
+        file = self._file_limits
+        if file is not self._started or self._speed.lowers:
+            # The robot compares its limits with those in the file at the start, and its limits
+            # include the limit from `speed_limit`.
+            now, cache = self._speed.settings.limits, self._latches_cache
+            if cache is None or not (cache[0] is latches and cache[1] is now and cache[2] is file):
+                result = replace(latches, lowered=lowered(file, now))
+                cache = self._latches_cache = latches, now, file, result
             latches = cache[3]
         last = self._handover.latches
         # Return the last object if nothing has changed, because the keeper writes its file again
         # for each new object, even for one with equal content.
         return last if latches == last else latches
+
+    @property
+    def _file_limits(self) -> LimitsConfig:
+        """The limits in the configuration file, including the changes that the daemon wrote."""
+        return self._started if self._settings_file is None else self._settings_file.limits
 
     def finish(self, now: Instant) -> None:
         """Store the stops that arrived after the last step, and send the waiting answers."""
@@ -378,9 +381,7 @@ class ControlLoop:
                     self._turn_rates.append(sample)
                 continue
             if arrival.key == SPEED_LIMIT:
-                file = self._settings_file
-                limits = self._started if file is None else file.limits
-                self._speed.receive(arrival, limits.linear_speed, refusals)
+                self._speed.receive(arrival, self._file_limits.linear_speed, refusals)
                 continue
             if arrival.key == "stop":
                 if arrival.put:
@@ -557,7 +558,9 @@ class ControlLoop:
 
 
 def _stops(batch: BusInput) -> list[str]:
-    puts = [arrival for arrival in batch.arrivals if arrival.key == "stop" and arrival.put]
-    calls = [query for query in batch.queries if query.topic == "srv/stop"]
-    names = [caller_name(put.via, put.attachment, put.sender) for put in puts]
-    return names + [caller_name(call.via, call.attachment) for call in calls]
+    """Return the name of the sender of each stop. A call of `srv/stop` is an arrival, too."""
+    return [
+        caller_name(arrival.via, arrival.attachment, arrival.sender)
+        for arrival in batch.arrivals
+        if arrival.key == "stop" and arrival.put
+    ]

@@ -19,13 +19,13 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.core.config.live import changed, differences
-from acsard.core.config.lowered import LIMITS_PREFIX, lowered
+from acsard.core.config.lowered import LIMITS_PREFIX
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config, LimitsConfig
 from acsard.core.formatting import listed, printable
 from acsard.core.messages.encodings import Decoder
 from acsard.core.messages.schema import Settings
-from acsard.core.values import NS_PER_S, Answer, Event, Latches, Request
+from acsard.core.values import NS_PER_S, Answer, Event, Request
 from acsard.host.config_file import Edit, apply_edit, prepare_edit
 from acsard.host.errors import MendableError
 from acsard.host.mailbox import Mailbox
@@ -132,9 +132,6 @@ class SettingsFile:
         file since its start has the new value."""
         self._no_thread = ""
         """The reason why the thread could not be started, or "" if it runs."""
-        self._latches_cache: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
-        """Cache of the method `latches`: the two arguments of its last computation, the value of
-        `_limits` at that time, and the result."""
 
     # The control loop calls the methods below.
 
@@ -266,30 +263,6 @@ class SettingsFile:
         not included.
         """
         return self._limits
-
-    def latches(self, latches: Latches, now: LimitsConfig) -> Latches:
-        """Return the robot's latches as the latch file must store them for the next start.
-
-        The next start reads the limits from the configuration file. If the daemon has not written
-        limits to that file, the result is `latches`. Otherwise the field `lowered` of the result
-        contains each limit, except decelerations, that is lower in `now` than in the file. For the
-        same arguments, the result is the same object, so that the latch file is not written again.
-
-        Args:
-            latches: the robot's latches.
-            now: the limits in force, but without the lower speed limit that a client may have set
-                with the Zenoh key `speed_limit`.
-        """
-        file = self._limits
-        if file is self._started:
-            return latches
-        cache = self._latches_cache
-        # Return the same object for the same arguments, because the latch file is written again for
-        # each new object.
-        if cache is None or not (cache[0] is latches and cache[1] is now and cache[2] is file):
-            result = replace(latches, lowered=lowered(file, now))
-            cache = self._latches_cache = latches, now, file, result
-        return cache[3]
 
     def close(self) -> None:
         """Let the thread end. Do not wait for it."""

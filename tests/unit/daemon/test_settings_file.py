@@ -18,9 +18,10 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
+from acsard.core.config.lowered import lowered
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
-from acsard.core.values import Answer, Event, Latches, Plain, Request
+from acsard.core.values import Answer, Event, Plain, Request
 from acsard.daemon import settings_file as module
 from acsard.daemon.settings_file import SettingsFile, keeps
 from acsard.host import config_edit_process, config_file
@@ -415,18 +416,15 @@ def test_a_request_that_the_robot_received_is_not_reported_as_not_set(made: Sett
 def test_a_limit_below_a_kept_one_is_lowered_at_the_next_start(
     file: Path, started: Started
 ) -> None:
-    config, latches = parse(file.read_bytes()), Latches()
+    config = parse(file.read_bytes())
     made = started(file, config, {})
-    assert made.latches(latches, with_speed(config, 0.3).limits) is latches
+    assert made.limits is config.limits
     check(made)
     assert made.defers_answer(OBEYED)
     result(made)
-    old_limits, limits = with_speed(config, 0.8).limits, with_speed(config, 0.6).limits
-    assert made.latches(latches, old_limits).lowered == {}
+    assert lowered(made.limits, with_speed(config, 0.8).limits) == {}
     # The robot itself compares with 0.5, the limit of its start.
-    to_keep = made.latches(latches, limits)
-    assert to_keep.lowered == {"limits.linear_speed": 0.6}
-    assert made.latches(latches, limits) is to_keep
+    assert lowered(made.limits, with_speed(config, 0.6).limits) == {"limits.linear_speed": 0.6}
 
 
 def test_keep_is_recognized_in_every_notation() -> None:
