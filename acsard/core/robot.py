@@ -3,8 +3,8 @@
 A step updates the odometry with the feedback from the board, and chooses one command. It checks
 that the mode allows this command, limits the command, and converts it to wheel speeds. A step does
 no I/O: its inputs are time, bytes and commands, and its outputs are decisions. Only `step` changes
-the state of a `Robot`, with one exception: the control loop also adds to `counters`. The control
-loop reads and writes the port, and `core/guard.py` checks each line before it is written.
+the state of a `Robot`, except that its caller may add to `counters`. The control loop reads and
+writes the port, and `core/guard.py` checks each line before it is written.
 """
 
 from __future__ import annotations

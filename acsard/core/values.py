@@ -569,8 +569,11 @@ class Outputs(Struct, frozen=True):
     line: bytes | None
     """The line for the board; None if no line was due."""
     speeds: WheelSpeeds
+    """The wheel speeds in `line`. If no line was due, those in the last computed line."""
     applied: Twist
+    """The twist of `speeds`, after all limits."""
     linked: bool
+    """True if the link to the board is up. Otherwise the guard lets only the stop line pass."""
     estimates: tuple[Estimate, ...]
     mode: str
     reason: str
@@ -590,7 +593,8 @@ class Outputs(Struct, frozen=True):
     news: bool = False
     """True if the board should get a new line without delay. This is the case if the command or the
     mode has changed since the previously computed line, or if the emergency stop or a bumper was
-    pressed. The value is true even if this step has computed the new line."""
+    pressed. The value is true even if this step has computed the new line, so `due` tells
+    whether the change still waits for a line."""
     latches: Latches = Latches()
     """The latches and lowered limits after the step. A latch or a lowered limit has changed if
     this is not the same object as in the previous step."""
@@ -669,3 +673,8 @@ class Snapshot(Struct, frozen=True):
     latch_file: str | None = None
     """Why the latches would be lost if the daemon restarted now, in words. It is "" if they would
     be kept, and None if this daemon has no latch file."""
+    settings_differ: str = ""
+    """The settings in force that differ from the configuration file, in words; "" if all agree
+    with the file."""
+    speed_limit: str = ""
+    """The speed limit that lowers a setting, in words; "" if no speed limit does."""

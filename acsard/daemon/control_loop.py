@@ -543,9 +543,6 @@ class ControlLoop:
 
     def _snapshot(self) -> Snapshot:
         outputs = self.outputs
-        if self._settings_file is not None:
-            self.report.settings_differ = self._settings_file.differ
-        self.report.speed_limit = self._speed.text
         now_ns = 0 if outputs is None else outputs.now.mono_ns
         return replace(
             self.robot.snapshot(now_ns),
@@ -554,6 +551,8 @@ class ControlLoop:
             routers=self._routers.status,
             latch_file=self._handover.trouble,
             recording=Recording() if self._recorder is None else self._recorder.status,
+            settings_differ="" if self._settings_file is None else self._settings_file.differ,
+            speed_limit=self._speed.text,
         )
 
 

@@ -94,8 +94,8 @@ class StepWriter:
         self.lost = 0
         """Number of steps that were not written because of errors of the disk."""
         self.syncs = 0
-        """Number of syncs that have begun, plus number of syncs that have ended. So the number is
-        odd during a sync."""
+        """Number of syncs that have begun, plus number of syncs that have ended. The number is odd
+        during a sync. If the recorder reads the same odd number for too long, the disk hangs."""
         self._lost_before = 0
         """Value of `lost` when the present error of the disk began."""
         self._safe_ns: int | None = None

@@ -88,7 +88,6 @@ def diagnostics(
     outputs: Outputs,
     snapshot: Snapshot,
     certificate: tuple[int, str],
-    speed_limit: str = "",
 ) -> DiagnosticArray:
     """Return the message `diagnostics` with one row for each part of the robot.
 
@@ -98,14 +97,13 @@ def diagnostics(
         snapshot: the other values of the robot.
         certificate: the diagnostic level and the text about the TLS certificates, as `expiry`
             returns them. If the text is "", the message has no row about certificates.
-        speed_limit: description of the speed limit that lowers a setting, or "".
     """
     mode = {"mode": outputs.mode, "source": outputs.source}
     rows = [
         Row("mode", MODE_LEVELS.get(outputs.mode, OK), outputs.reason, mode),
         _serial_link(config, outputs, snapshot),
         _control_loop(snapshot),
-        _commands(outputs, snapshot, speed_limit),
+        _commands(outputs, snapshot),
         _wheels(snapshot.doubt, snapshot.counters),
         *_board(config, snapshot),
         *_battery(config, snapshot),
@@ -161,12 +159,12 @@ def _control_loop(snapshot: Snapshot) -> Row:
     )
 
 
-def _commands(outputs: Outputs, snapshot: Snapshot, speed_limit: str) -> Row:
+def _commands(outputs: Outputs, snapshot: Snapshot) -> Row:
     values = {s.name: waiting(s.waits_for) or "driving" for s in snapshot.sources}
     values |= _counted(snapshot.counters, "command")
     message = f"commanded by {outputs.source}" if outputs.source else "waiting for a command"
-    if speed_limit:
-        message = f"{message}; speed limit: {speed_limit}"
+    if snapshot.speed_limit:
+        message = f"{message}; speed limit: {snapshot.speed_limit}"
     crowded = [s for s in snapshot.sources if s.waits_for.what == "senders"]
     for source in crowded:
         message = (

@@ -94,11 +94,6 @@ class Report:
         """Maps the owner of each TLS certificate to the time at which it expires, wall-clock ns
         since 1970. The owner of the robot's own certificate is "". If the daemon may not read this
         certificate, its time comes from a report of the TLS gateway."""
-        self.settings_differ = ""
-        """The settings in force that differ from the configuration file, in words; "" if all agree
-        with the file."""
-        self.speed_limit = ""
-        """The speed limit that lowers a setting, in words; "" if no speed limit does."""
         self.description = ""
         """The robot's URDF; "" if `[ros] urdf` names no file."""
         self._names = list(config.joints.as_tuple())
@@ -297,8 +292,8 @@ class Report:
             emergency_stop=snapshot.estop,
             bumpers=None if snapshot.bumpers is None else list(snapshot.bumpers),
             battery=_summary(snapshot.battery),
-            settings_differ=self.settings_differ,
-            speed_limit=self.speed_limit,
+            settings_differ=snapshot.settings_differ,
+            speed_limit=snapshot.speed_limit,
             certificate_days=self._certificate_days(outputs.now),
         )
 
@@ -337,7 +332,7 @@ class Report:
 
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
         certificate = self._certificate(outputs.now)
-        return diagnostics(self._config, outputs, snapshot, certificate, self.speed_limit)
+        return diagnostics(self._config, outputs, snapshot, certificate)
 
 
 def _summary(battery: BatteryStatus | None) -> BatterySummary | None:

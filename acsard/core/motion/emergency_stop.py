@@ -50,9 +50,7 @@ control period that can be configured is 100 ms."""
 
 CATCH_UP_NS = 100_000_000
 """Extra time that a late control step gives the board before it counts as silent, ns. In this time,
-the daemon reads the lines and commands that arrived while no control step ran. The daemon grants
-the extra time only once between two reports of the board, so that a control loop that is always
-late does not delay the stop forever."""
+the daemon reads the lines and commands that arrived while no control step ran."""
 
 PRESSED_REASON = "emergency stop pressed at the robot"
 SILENT_REASON = (
@@ -149,6 +147,8 @@ class BoardInput(ABC):
                 events += self._take("pressed" if any(pressed) else "ok", pressed)
         late, self._looked_ns = now_ns - self._looked_ns > LATE_STEP_NS, now_ns
         if self.pressed is not None and now_ns - self._reported_ns > _SILENT_NS:
+            # Only once between two reports of the board: otherwise a control loop that is always
+            # late would delay the stop forever.
             if late and not self._excused:
                 self._reported_ns, self._excused = now_ns - _SILENT_NS + CATCH_UP_NS, True
             else:

@@ -55,7 +55,7 @@ MAX_RECOMPUTED_LINES = 128
 
 
 class Step(Struct, frozen=True, gc=False):
-    """The motion that one feedback line added to the pose.
+    """One step of the pose: the motion that one feedback line added to it.
 
     The odometry keeps it to recompute the pose if a wheel proves faulty.
     """

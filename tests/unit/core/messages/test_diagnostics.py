@@ -328,13 +328,7 @@ def test_the_commands_show_what_each_source_waits_for_and_what_was_refused() -> 
 
 
 def test_the_commands_name_the_speed_limit_that_slows_the_robot() -> None:
-    (status,) = [
-        status
-        for status in diagnostics(
-            CONFIG, OUTPUTS, SNAPSHOT, NO_CERTIFICATE, "0.3 m/s, set by x"
-        ).status
-        if status.name == "acsard: commands"
-    ]
+    status = row("commands", snapshot=replace(SNAPSHOT, speed_limit="0.3 m/s, set by x"))
     assert (status.level, status.message) == (
         OK,
         "commanded by app; speed limit: 0.3 m/s, set by x",
