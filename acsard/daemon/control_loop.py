@@ -455,9 +455,11 @@ class ControlLoop:
                 "no setting was changed: this daemon has no configuration file in which to keep "
                 "settings; leave `keep` out of the request"
             )
-            self._answers.append((now.mono_ns, Answer(request.id, False, text)))
+            refusal: Answer | None = Answer(request.id, False, text)
         else:
-            self._settings_file.keep(request, now.mono_ns)
+            refusal = self._settings_file.keep(request, now.mono_ns)
+        if refusal is not None:
+            self._answers.append((now.mono_ns, refusal))
 
     def _keepable(self, now: Instant) -> tuple[Request, ...]:
         """Return the `set` requests with the field `keep` that the robot must process now.

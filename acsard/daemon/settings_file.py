@@ -79,9 +79,6 @@ class _Pending(Struct):
     due_ns: int
     """Monotonic time after which the client is told that the request has failed, ns. This limit
     does not apply while the robot decides about the request."""
-    refused: str
-    """The reason why the request is refused immediately, and a remedy, in words; "" if the thread
-    checks the request."""
     edit: Edit | None = None
     """The prepared change of the file. It is None until the thread has checked the request."""
     answer: Answer | None = None
@@ -157,14 +154,14 @@ class SettingsFile:
         self._in_force = config
         self._wake_thread()
 
-    def keep(self, request: Request, now_ns: int) -> None:
+    def keep(self, request: Request, now_ns: int) -> Answer | None:
         """Queue a `set` request with the field `keep`, so that the thread checks it.
 
         If the check succeeds, a later call of `results` returns the request, and the robot must use
-        the settings in it. Otherwise `results` returns an answer for the client. `now_ns` is the
-        present monotonic time, ns.
+        the settings in it. Otherwise `results` returns an answer for the client. If the request
+        cannot be queued, return the answer for the client now, else None. `now_ns` is the present
+        monotonic time, ns.
         """
-        why = ""
         if self._no_thread:
             why = (
                 "the daemon could not start the thread that changes the file "
@@ -175,11 +172,11 @@ class SettingsFile:
                 f"more than {MAX_JOBS} changes of the file wait for the disk; try again in some "
                 "seconds"
             )
-        # A refused request is overdue from the start, so that `results` answers it in this step.
-        due_ns = now_ns - 1 if why else now_ns + REPLY_TIMEOUT_NS
-        self._pending[request.id] = _Pending(request, due_ns, why)
-        if not why:
+        else:
+            self._pending[request.id] = _Pending(request, now_ns + REPLY_TIMEOUT_NS)
             self._box.put(request)
+            return None
+        return Answer(request.id, False, f"no setting was changed: {why}")
 
     def _wake_thread(self) -> None:
         # If requests wait, the thread is awake. In a full queue, "look" would displace a request.
@@ -347,12 +344,11 @@ class SettingsFile:
 
 
 def _overdue(pending: _Pending) -> Answer:
-    """Return the answer to a request that took too long, or that is refused immediately."""
+    """Return the answer to a request that took too long."""
     answer = pending.answer
     why = f"the disk did not answer within {REPLY_TIMEOUT_NS / NS_PER_S:g} s"
     if answer is not None:
         text = f"{answer.message}, but {why}: check whether the file has the new value"
     else:
-        refused = pending.refused or f"{why}; check the disk (`dmesg`), then try again"
-        text = f"no setting was changed: {refused}"
+        text = f"no setting was changed: {why}; check the disk (`dmesg`), then try again"
     return Answer(pending.request.id, False, text)

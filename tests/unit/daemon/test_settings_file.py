@@ -357,9 +357,7 @@ def test_a_thread_that_cannot_be_started_is_named_in_the_answer_at_once(
         patch.setattr(threading.Thread, "start", full)
         made = started(file, parse(TEXT.encode()), {})
     assert "can't start new thread" in made.differ
-    made.keep(REQUEST, 0)
-    (answer,) = made.results(0, [])
-    assert answer == Answer(
+    assert made.keep(REQUEST, 0) == Answer(
         REQUEST.id,
         False,
         "no setting was changed: the daemon could not start the thread that changes the file "
@@ -465,12 +463,14 @@ def test_too_many_requests_are_refused_and_overdue_ones_take_no_more_time(
 
     monkeypatch.setattr(module, "prepare_edit", slow)
     made = started(file, Config(), {})
-    for number in range(1, module.MAX_JOBS + 11):
-        made.keep(replace(REQUEST, id=number), 0)
+    for number in range(1, module.MAX_JOBS + 1):
+        assert made.keep(replace(REQUEST, id=number), 0) is None
+    for number in range(module.MAX_JOBS + 1, module.MAX_JOBS + 11):
+        refusal = made.keep(replace(REQUEST, id=number), 0)
+        assert refusal is not None and refusal.id == number
+        assert "more than 32 changes of the file wait" in refusal.message
     until(lambda: checked)
-    refused = [answer for answer in made.results(0, []) if isinstance(answer, Answer)]
-    assert [answer.id for answer in refused] == [*range(module.MAX_JOBS + 1, module.MAX_JOBS + 11)]
-    assert "more than 32 changes of the file wait" in refused[0].message
+    assert made.results(0, []) == []
     assert len(made.results(module.REPLY_TIMEOUT_NS + 1, [])) == module.MAX_JOBS
     hangs.set()
     until(lambda: not made._box.waiting)
