@@ -10,7 +10,14 @@ import json
 import math
 import re
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import accumulate
+
+_DAYS_TO_1970 = 719_468
+"""Days from 0000-03-01 to 1970-01-01. `utc` counts years from March, so that the leap day is the
+last day of a year."""
+
+_DAYS_PER_400_YEARS = 146_097
 
 
 def printable(text: str) -> str:
@@ -121,3 +128,19 @@ def rough(seconds: float | None, finest: float = 1.0) -> str:
     unit, size = next((u, s) for u, s, most in _ROUGH if s >= finest and seconds < most)
     value = seconds / size
     return f"{value:.{int(value < 9.95)}f} {unit}"
+
+
+# The daemon publishes the time of a latch in every step, so the text is cached.
+@lru_cache(64)
+def utc(wall_ns: int) -> str:
+    """Return a time, ns since 1970, in the form `2026-11-22 13:05:07 UTC` (Gregorian calendar)."""
+    days, seconds = divmod(wall_ns // 1_000_000_000, 86_400)
+    era, day = divmod(days + _DAYS_TO_1970, _DAYS_PER_400_YEARS)
+    year = (day - day // 1_460 + day // 36_524 - day // 146_096) // 365
+    day -= 365 * year + year // 4 - year // 100
+    month = (5 * day + 2) // 153
+    day -= (153 * month + 2) // 5
+    month = month + 3 if month < 10 else month - 9
+    year += 400 * era + (month <= 2)
+    hour, minute = seconds // 3_600, seconds // 60 % 60
+    return f"{year:04}-{month:02}-{day + 1:02} {hour:02}:{minute:02}:{seconds % 60:02} UTC"

@@ -20,7 +20,7 @@ from acsard.core.config.live import Difference, differences, find_live_setting
 from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import SIMULATOR, BatteryConfig, Config
 from acsard.core.config.validation import write
-from acsard.core.formatting import listed, many
+from acsard.core.formatting import listed, many, utc
 from acsard.core.link.link_diagnosis import BUSY_ADVICE, MAX_UNANSWERED_FRACTION, blames_host
 from acsard.core.messages.diagnostics import NO_ROUTER
 from acsard.core.messages.schema import (
@@ -42,7 +42,6 @@ from acsard.core.motion.emergency_stop import (
     SILENT_REASON,
 )
 from acsard.core.motion.gyro import STATUS_TEXTS
-from acsard.core.motion.lifecycle import utc
 from acsard.core.values import NS_PER_S, AcsardError, BatteryLevel, BatteryStatus, GyroDoes
 from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.zenoh_sessions import no_endpoint, reachable

@@ -23,10 +23,10 @@ from __future__ import annotations
 
 import math
 import re
-from functools import lru_cache
 
 from msgspec.structs import replace
 
+from acsard.core.formatting import utc
 from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError, mode_of, require_allowed
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
@@ -49,12 +49,6 @@ LONG_AGO_NS = -(2**62)
 
 _VALUES = re.compile(r"[(\d]")
 """Pattern for the digit or bracket with which the measured values in the text of a fault begin."""
-
-_DAYS_TO_1970 = 719_468
-"""Days from 0000-03-01 to 1970-01-01. `utc` counts years from March, so that the leap day is the
-last day of a year."""
-
-_DAYS_PER_400_YEARS = 146_097
 
 
 class Lifecycle:
@@ -453,19 +447,3 @@ def _latch_text(latch: Latch) -> str:
     if not _asked_for(latch):
         return f"{latch.why} (latched {_when(latch)})"
     return f"{'was ' if latch.kept else ''}{latch.why} {_when(latch)}"
-
-
-# The daemon publishes the time of a latch in every step, so the text is cached.
-@lru_cache(MAX_FAULTS + MAX_CLIENTS + 8)
-def utc(wall_ns: int) -> str:
-    """Return a time, ns since 1970, in the form `2026-11-22 13:05:07 UTC` (Gregorian calendar)."""
-    days, seconds = divmod(wall_ns // NS_PER_S, 86_400)
-    era, day = divmod(days + _DAYS_TO_1970, _DAYS_PER_400_YEARS)
-    year = (day - day // 1_460 + day // 36_524 - day // 146_096) // 365
-    day -= 365 * year + year // 4 - year // 100
-    month = (5 * day + 2) // 153
-    day -= (153 * month + 2) // 5
-    month = month + 3 if month < 10 else month - 9
-    year += 400 * era + (month <= 2)
-    hour, minute = seconds // 3_600, seconds // 60 % 60
-    return f"{year:04}-{month:02}-{day + 1:02} {hour:02}:{minute:02}:{seconds % 60:02} UTC"

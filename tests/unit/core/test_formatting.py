@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from datetime import UTC, datetime
 
 import pytest
 from hypothesis import given
@@ -19,7 +20,9 @@ from acsard.core.formatting import (
     printable_bytes,
     rough,
     signed,
+    utc,
 )
+from acsard.core.values import NS_PER_S
 from tests.each import each
 
 MOST = 64
@@ -123,3 +126,23 @@ def test_an_unprintable_character_beyond_16_bits_is_escaped_in_json() -> None:
 def test_a_number_that_is_too_long_keeps_its_width(value: float) -> None:
     assert len(signed(value, 2, 5)) == 5
     assert float(signed(value, 2, 5)) == pytest.approx(value, rel=0.5)
+
+
+@each(
+    ("wall_ns", "text"),
+    [
+        (0, "1970-01-01 00:00:00 UTC"),
+        (-1, "1969-12-31 23:59:59 UTC"),
+        (1_795_352_707 * NS_PER_S + 999_999_999, "2026-11-22 13:05:07 UTC"),
+        (951_782_400 * NS_PER_S, "2000-02-29 00:00:00 UTC"),
+        (951_868_800 * NS_PER_S, "2000-03-01 00:00:00 UTC"),
+    ],
+)
+def test_a_time_is_written_as_date_and_time_in_utc(wall_ns: int, text: str) -> None:
+    assert utc(wall_ns) == text
+
+
+@given(st.datetimes(timezones=st.just(UTC)))
+def test_every_date_agrees_with_the_calendar(at: datetime) -> None:
+    seconds = int((at - datetime(1970, 1, 1, tzinfo=UTC)).total_seconds() // 1)
+    assert utc(seconds * NS_PER_S) == f"{at:%Y-%m-%d %H:%M:%S} UTC".rjust(23, "0")

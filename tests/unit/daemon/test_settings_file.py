@@ -467,7 +467,8 @@ def test_too_many_requests_are_refused_and_overdue_ones_take_no_more_time(
         assert made.keep(replace(REQUEST, id=number), 0) is None
     for number in range(module.MAX_JOBS + 1, module.MAX_JOBS + 11):
         refusal = made.keep(replace(REQUEST, id=number), 0)
-        assert refusal is not None and refusal.id == number
+        assert refusal is not None
+        assert refusal.id == number
         assert "more than 32 changes of the file wait" in refusal.message
     until(lambda: checked)
     assert made.results(0, []) == []

@@ -6,16 +6,13 @@ import re
 from collections import deque
 from collections.abc import Callable
 from copy import copy
-from datetime import UTC, datetime
 from functools import cache
 from typing import NamedTuple
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from acsard.core.motion.emergency_stop import CHECK, PRESSED_REASON, RELEASE, SILENT_REASON
-from acsard.core.motion.lifecycle import LATCH_REQUIRED_S, MAX_FAULTS, Lifecycle, utc
+from acsard.core.motion.lifecycle import LATCH_REQUIRED_S, MAX_FAULTS, Lifecycle
 from acsard.core.motion.modes import Mode, RefusedError, mode_of
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 from tests.each import each
@@ -1027,23 +1024,3 @@ def test_switching_on_by_number_is_refused_exactly_while_a_latch_holds_or_the_da
             before = edge.before
             assert edge.refused == (before.shutting_down or before.fault or before.stopped)
             assert edge.refused or not (edge.after.inactive or edge.after.dormant)
-
-
-@each(
-    ("wall_ns", "text"),
-    [
-        (0, "1970-01-01 00:00:00 UTC"),
-        (-1, "1969-12-31 23:59:59 UTC"),
-        (1_795_352_707 * NS_PER_S + 999_999_999, "2026-11-22 13:05:07 UTC"),
-        (951_782_400 * NS_PER_S, "2000-02-29 00:00:00 UTC"),
-        (951_868_800 * NS_PER_S, "2000-03-01 00:00:00 UTC"),
-    ],
-)
-def test_a_time_is_written_as_date_and_time_in_utc(wall_ns: int, text: str) -> None:
-    assert utc(wall_ns) == text
-
-
-@given(st.datetimes(timezones=st.just(UTC)))
-def test_every_date_agrees_with_the_calendar(at: datetime) -> None:
-    seconds = int((at - datetime(1970, 1, 1, tzinfo=UTC)).total_seconds() // 1)
-    assert utc(seconds * NS_PER_S) == f"{at:%Y-%m-%d %H:%M:%S} UTC".rjust(23, "0")
