@@ -324,7 +324,7 @@ def must_release_key(state: RobotState, source: str) -> bool:
     drive again, an operator who still holds the key may not expect the robot to move.
     """
     ours = next((entry for entry in state.sources if entry.name == source), None)
-    zero_first = ours is not None and "must send a zero" in ours.waits_for
+    zero_first = ours is not None and ours.wait == "neutral"
     return state.mode in NEVER_DRIVING_MODES or state.mode == "waiting" or zero_first
 
 
@@ -333,7 +333,7 @@ def receives_commands(state: RobotState, source: str) -> bool:
 
     Late commands count too.
     """
-    return any(entry.name == source and entry.waits_for != "a command" for entry in state.sources)
+    return any(entry.name == source and entry.wait != "command" for entry in state.sources)
 
 
 def refuses_for_good(state: RobotState, source: str) -> bool:

@@ -270,24 +270,28 @@ class Estimate(Struct, frozen=True, gc=False):
     """Monotonic time at which the daemon had received the complete feedback line, ns."""
 
 
+WaitKind = Literal[
+    "nothing",
+    "command",
+    "proof",
+    "late",
+    "stalled",
+    "neutral",
+    "zeros",
+    "higher",
+    "equal",
+    "senders",
+]
+"""Kind of the condition that a command source waits for. `Wait.what` explains the kinds."""
+
+
 class Wait(Struct, frozen=True):
     """The condition that must be met before a command source drives the robot.
 
     `arbiter_text.py` turns it into a sentence.
     """
 
-    what: Literal[
-        "nothing",
-        "command",
-        "proof",
-        "late",
-        "stalled",
-        "neutral",
-        "zeros",
-        "higher",
-        "equal",
-        "senders",
-    ]
+    what: WaitKind
     """Kind of the condition. `source` explains most kinds. The other kinds are:
 
     - nothing: The source need not wait.

@@ -144,7 +144,7 @@ def waits(source: SourceState, state: RobotState) -> str:
 
 def _source(source: SourceState, state: RobotState, room: int) -> Text:
     drive = drives(source, state)
-    live = drive or source.waits_for != "a command"
+    live = drive or source.wait != "command"
     mark, style = ("▶ ", "bold green") if drive else ("  ", "" if live else "dim")
     name = Text(clean(source.name))
     name.truncate(room, overflow="ellipsis", pad=True)

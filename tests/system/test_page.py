@@ -1153,7 +1153,7 @@ def test_the_first_visit_loads_little_and_the_second_one_less(page: Phone, tmp_p
 
 
 COMMANDER = """import('/page/commander.js').then(({Commander, ZERO, twist, objection}) => {
-    const ours = {name: 'teleop', waits_for: ''};
+    const ours = {name: 'teleop', waits_for: '', wait: 'nothing'};
     const driving = {mode: 'driving', source: 'teleop', sender: 'me', reason: '', sources: [ours]};
     const ready = {...driving, mode: 'ready', source: '', sender: '', reason: 'no commands'};
     const stopped = {...ready, mode: 'stopped', reason: 'stopped by request'};

@@ -270,7 +270,7 @@ class Report:
             link=outputs.link,
             source=outputs.source,
             sources=[
-                SourceState(s.name, s.priority, s.age_s, waiting(s.waits_for))
+                SourceState(s.name, s.priority, s.age_s, waiting(s.waits_for), s.waits_for.what)
                 for s in snapshot.sources
             ],
             refused=snapshot.refused,

@@ -24,6 +24,7 @@ from acsard.core.values import (
     GyroDoes,
     Level,
     Plain,
+    WaitKind,
 )
 
 # These annotations tell `cdr.py` the width of a number and the fixed length of an array.
@@ -289,7 +290,20 @@ class SourceState(Message, frozen=True):
     waits_for: str
     """Condition that must be met before the source can drive the robot, such as "a command".
 
-    It is empty while the source drives the robot.
+    It is empty while the source drives the robot. It is a text for people; programs use `wait`.
+    """
+    wait: Annotated[str, one_of(get_args(WaitKind))] = "nothing"
+    """Kind of the condition `waits_for`.
+
+    - nothing: the source need not wait.
+    - command: the source has sent no command within its timeout.
+    - neutral: a sender of the source must send a zero first.
+    - proof: the sender is new, and its delays are not proved yet.
+    - late: the commands arrive too late.
+    - stalled: the daemon stalled, and waits for the next command.
+    - zeros: another sender keeps the robot at rest with zeros.
+    - higher, equal: a source of higher or of the same priority controls the robot.
+    - senders: other senders of this source wait until the sender that drives falls silent.
     """
 
 

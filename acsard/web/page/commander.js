@@ -64,7 +64,7 @@ export function objection(state, source, sender) {
   const ours = state.sources.find((one) => one.name === source);
   if (NEVER.includes(state.mode) || state.mode === "waiting") return state.reason;
   if (!ours) return `${source} is not one of the robot's sources`;
-  if (state.source !== source) return ours.waits_for === "a command" ? "the robot has not received a command yet" : ours.waits_for || state.reason || "the robot does not follow this source";
+  if (state.source !== source) return ours.wait === "command" ? "the robot has not received a command yet" : ours.waits_for || state.reason || "the robot does not follow this source";
   if (state.mode !== "driving") return state.reason;
   if (state.sender && state.sender !== sender) return `${person(state.sender, sender)} drives`;
   return "";

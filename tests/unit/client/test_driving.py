@@ -28,7 +28,8 @@ NEUTRAL = "send a zero first: app must send a zero"
 
 
 def source(waits_for: str = "", age: float | None = 0.01, name: str = "app") -> SourceState:
-    return SourceState(name, 50, age, waits_for)
+    kinds = {"": "nothing", "a command": "command", NEUTRAL: "neutral"}
+    return SourceState(name, 50, age, waits_for, kinds.get(waits_for, "higher"))
 
 
 FOLLOWED = RobotState(

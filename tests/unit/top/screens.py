@@ -39,7 +39,7 @@ STATE = RobotState(
     link="up",
     source="app",
     sources=[
-        SourceState("teleop", 100, None, "a command"),
+        SourceState("teleop", 100, None, "a command", "command"),
         SourceState("app", 50, 0.02, ""),
         SourceState("nav", 10, 3.0, "app has priority: wait until it is silent"),
     ],

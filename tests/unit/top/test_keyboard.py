@@ -330,7 +330,9 @@ ZERO_FIRST = replace(
     mode="ready",
     reason="ready: send a zero first: teleop must send a zero before it can drive",
     sources=[
-        SourceState("teleop", 10, 0.1, "send a zero first: teleop must send a zero before it can")
+        SourceState(
+            "teleop", 10, 0.1, "send a zero first: teleop must send a zero before it can", "neutral"
+        )
     ],
 )
 RESTARTED = replace(STATE, counters={"lines": 0})

@@ -61,7 +61,7 @@ def test_on_few_lines_the_figures_since_the_start_go_first() -> None:
 
 
 def test_sources_that_do_not_fit_are_counted() -> None:
-    many = [SourceState(f"source{n}", n, None, "a command") for n in range(40)]
+    many = [SourceState(f"source{n}", n, None, "a command", "command") for n in range(40)]
     assert any("more: source" in line for line in lines_of(of(sources=many), 40, 24))
 
 

@@ -143,7 +143,7 @@ def test_more_warnings_take_one_line_of_a_wide_screen() -> None:
 
 
 def test_a_usual_screen_fits_80_by_24_without_truncation() -> None:
-    four = [*STATE.sources, SourceState("spare", 1, None, "a command")]
+    four = [*STATE.sources, SourceState("spare", 1, None, "a command", "command")]
     counters = dict.fromkeys(STATE.counters, 10**7) | {"lines_superseded": 12_345}
     lines = lines_of(
         of(

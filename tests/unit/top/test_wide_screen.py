@@ -60,7 +60,7 @@ def test_a_source_of_a_stopped_robot_is_not_shown_as_driving() -> None:
 
 
 def test_sources_that_do_not_fit_are_counted() -> None:
-    many = [SourceState(f"source{n}", n, None, "a command") for n in range(40)]
+    many = [SourceState(f"source{n}", n, None, "a command", "command") for n in range(40)]
     lines = lines_of(of(sources=many))
     assert len(lines) == 24
     assert any("and 37 more: source3, source4" in line for line in lines)

@@ -94,7 +94,7 @@ def test_wheels_that_follow_their_command_by_the_configured_radii_do_not_halt_th
 
 def test_nothing_moves_until_the_daemon_accepts_the_zeros() -> None:
     world = World(LEG)
-    waiting = [SourceState("app", 50, 0.01, "send a zero first: app must send a zero")]
+    waiting = [SourceState("app", 50, 0.01, "send a zero first: app must send a zero", "neutral")]
     world.tells = changed(sources=waiting, mode="ready", source="", sender="")
     world.run(OPEN_TIMEOUT_S + 0.5)
     assert set(world.said) == {REST}
@@ -109,10 +109,12 @@ STOPS: dict[str, Late] = {
     "the robot is shutdown": changed(mode="shutdown"),
     "teleop commands the robot now": changed(source="teleop"),
     "send a zero first": changed(
-        mode="ready", source="", sources=[SourceState("app", 50, 0.01, "send a zero first")]
+        mode="ready",
+        source="",
+        sources=[SourceState("app", 50, 0.01, "send a zero first", "neutral")],
     ),
     "the daemon receives no command of source app": changed(
-        sources=[SourceState("app", 50, 3.0, "a command")]
+        sources=[SourceState("app", 50, 3.0, "a command", "command")]
     ),
     "the daemon has received no command of source app for 0.4 s": changed(
         sources=[SourceState("app", 50, 3.0, "")]

@@ -345,7 +345,10 @@ def test_state_is_the_summary_of_outputs_and_snapshot() -> None:
         wheels=[1.1, 2.1, 3.1, 4.1],
         link="up",
         source="app",
-        sources=[SourceState("app", 50, 0.01, ""), SourceState("nav", 10, None, "a command")],
+        sources=[
+            SourceState("app", 50, 0.01, ""),
+            SourceState("nav", 10, None, "a command", "command"),
+        ],
         refused="source nav: held up",
         counters={"lines": 100, "line_malformed": 2, "commands": 7, "command_stale": 3},
         latencies={
