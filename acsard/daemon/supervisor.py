@@ -42,6 +42,8 @@ class Kind(Struct, frozen=True):
     """Exit codes after which the process is not started again if no process of this kind has run
     before. After an earlier run, a process may end with such a code because a person is changing
     its files, so it is started again."""
+    remedy: str = ""
+    """Advice on how to start the process again after a final exit code, for the log event."""
 
 
 GATEWAY = Kind("the TLS gateway", "gateway_ended")
@@ -52,6 +54,7 @@ ROUTER = Kind(
     "the router",
     "router_ended",
     final_at_first=frozenset({Exit.USAGE, Exit.BAD_CONFIG}),
+    remedy="correct its configuration or its certificates, and run `acsard router` again",
 )
 """The router of a fleet. If its files are unusable at the first start, the router is not started
 again. At a later restart a person may be changing the files, so the router is started again."""
@@ -59,11 +62,16 @@ again. At a later restart a person may be changing the files, so the router is s
 PAGE = Kind(
     "the robot's page",
     "page_ended",
-    frozenset({Exit.OK, Exit.USAGE, Exit.IN_USE, Exit.NO_PERMISSION, Exit.BAD_CONFIG}),
+    frozenset({Exit.OK}),
     LONG_RESTART_PAUSE_S,
+    frozenset({Exit.USAGE, Exit.IN_USE, Exit.NO_PERMISSION, Exit.BAD_CONFIG}),
+    "to serve the page again, run `acsard web` or restart the daemon",
 )
-"""The process of the web page, which itself reports why it ends. The pause before its restart is
-longer, because a page that fails again and again must not take processor time from the robot."""
+"""The process of the web page, which itself reports why it ends.
+
+If a person ends the page, or if its files are unusable at the first start, the page is not started
+again. The pause before its restart is longer, because a page that fails again and again must not
+take processor time from the robot."""
 
 
 async def keep_running(
@@ -72,8 +80,8 @@ async def keep_running(
     """Run `acsard` with the arguments `words`, and restart it whenever it ends.
 
     If the process ends with an exit code that `kind` declares final, do not restart it, but return
-    this code. Otherwise run until this task is cancelled. `log` is called with an event before each
-    restart.
+    this code. Otherwise run until this task is cancelled. `log` is called with an event whenever
+    the process ends. The event says whether the process is restarted, and if not, the remedy.
     """
     final = kind.final | kind.final_at_first
     while True:
@@ -86,6 +94,8 @@ async def keep_running(
             code, why = Exit.USAGE, f"could not be started ({error})"
         else:
             if code in final:
+                text = f"{kind.name} {why}; it is not restarted: {kind.remedy}"
+                log(Event(kind.ended, text, "warning"))
                 return code
             final = kind.final
         finally:

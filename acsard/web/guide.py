@@ -22,7 +22,7 @@ from msgspec import Struct
 from acsard.calibration.guided.drive_plan import NEEDS, SIMULATED
 from acsard.core.config.settings import SIMULATOR
 from acsard.host import clock
-from acsard.host.child import acsard, running
+from acsard.host.child import acsard, how_it_ended, running
 from acsard.host.errors import EXIT_TEXTS, Exit
 from acsard.host.rate_limits import Bucket, Rate
 from acsard.host.threads import in_thread
@@ -233,8 +233,8 @@ class Guide:
             )
         finally:
             self._job = None
-        meaning = EXIT_TEXTS.get(code, "ended") if not job.left else "stopped"
-        job.say(Guided(Ended(code, meaning, text)))
+        meaning = "stopped" if job.left else EXIT_TEXTS.get(code) or how_it_ended(code)
+        job.say(Guided(Ended(code if code >= 0 else 128 - code, meaning, text)))
         self._tell_all()
 
     async def _ports(self, asked: Begin) -> list[str]:
@@ -335,7 +335,7 @@ class _Job:
     async def run(self, options: Sequence[str]) -> tuple[int, str]:
         """Run `acsard` with the arguments `options`, and return the pair (exit code, error output).
 
-        If a signal ended the child, the exit code is 128 plus the number of the signal. Raises
+        If a signal ended the child, the exit code is the negative number of the signal. Raises
         `OSError` if the child cannot be started.
         """
         if self.left:
@@ -346,7 +346,7 @@ class _Job:
                 self._interrupt()
             await asyncio.gather(self._read_output(process), self._read_errors(process))
             code = await process.wait()
-        return code if code >= 0 else 128 - code, self._error_text()
+        return code, self._error_text()
 
     def answer(self, reply: Reply) -> bool:
         if not self._question or reply.reply != self._question:

@@ -322,7 +322,8 @@ class Running(Struct, frozen=True, omit_defaults=True):
 class Ended(Struct, frozen=True):
     """Report that a check or calibration has ended.
 
-    `ended` is the exit code, `meaning` is its meaning in words, and `text` is the error text.
+    `ended` is the exit code, `meaning` is its meaning in words, and `text` is the error text. If a
+    signal ended the process, the exit code is 128 plus the number of the signal.
     """
 
     ended: int

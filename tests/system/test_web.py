@@ -370,8 +370,17 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_restarts_it(
                 (second,) = until(daemon.page, START_S, "another page")
                 assert second != first
                 assert bus.get("info") == before
+            # A person saves a wrong file, and corrects it later.
+            valid = config.read_text()
+            config.write_text(f"{valid}\nbroken = [\n")
+            os.kill(second, signal.SIGKILL)
+            daemon.shows("page ended with exit code 78; it is restarted")
+            daemon.seen = ""
+            config.write_text(valid)
+            daemon.shows(rf"page +http://127.0.0.1:\d+/ +\(instead of http://127.0.0.1:{port}/")
+            (third,) = daemon.page()
             daemon.signal(signal.SIGKILL)
-            until(lambda: not Path(f"/proc/{second}").exists(), START_S, "the page ends too")
+            until(lambda: not Path(f"/proc/{third}").exists(), START_S, "the page ends too")
 
 
 @pytest.mark.slow

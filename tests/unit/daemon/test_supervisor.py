@@ -10,9 +10,10 @@ import threading
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.core.values import Event
-from acsard.daemon.supervisor import GATEWAY, ROUTER, Kind, keep_running
+from acsard.daemon.supervisor import GATEWAY, PAGE, ROUTER, Kind, keep_running
 
 
 async def first_event(kind: Kind = GATEWAY) -> Event:
@@ -61,35 +62,61 @@ def test_a_program_that_falls_silent_is_killed(
         os.kill(int(pid.read_text()), signal.SIGCONT)
 
 
-@pytest.mark.parametrize("code", [2, 78])
-def test_a_router_that_cannot_start_is_not_restarted(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int
+@pytest.mark.parametrize(
+    ("kind", "code"), [(ROUTER, 2), (ROUTER, 78), (PAGE, 2), (PAGE, 75), (PAGE, 77), (PAGE, 78)]
+)
+def test_a_program_that_cannot_start_at_first_is_given_up_and_the_log_says_the_remedy(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Kind, code: int
 ) -> None:
     program(monkeypatch, tmp_path, f"raise SystemExit({code})")
     events: list[Event] = []
-    assert asyncio.run(keep_running(["router"], events.append, ROUTER)) == code
-    assert events == []
+    assert asyncio.run(keep_running(["any"], events.append, kind)) == code
+    (event,) = events
+    assert (event.name, event.level) == (kind.ended, "warning")
+    assert event.text.startswith(f"{kind.name} ended with exit code {code}; it is not restarted: ")
+    assert kind.remedy in event.text
 
 
-@pytest.mark.parametrize("code", [2, 78])
-def test_a_router_that_once_ran_is_started_again_when_its_files_are_wrong(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int
+@pytest.mark.parametrize(
+    ("kind", "code"), [(ROUTER, 2), (ROUTER, 78), (PAGE, 2), (PAGE, 75), (PAGE, 77), (PAGE, 78)]
+)
+def test_a_program_that_once_ran_is_started_again_when_its_files_are_wrong(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Kind, code: int
 ) -> None:
     monkeypatch.setattr("acsard.daemon.supervisor.LONG_RESTART_PAUSE_S", 0.01)
+    kind = replace(kind, restart_pause_s=0.01)
     began = tmp_path / "began"
     ends = f"import os; p = {str(began)!r}; new = not os.path.exists(p); open(p, 'a').close(); "
     program(monkeypatch, tmp_path, ends + f"raise SystemExit(1 if new else {code})")
     events: list[Event] = []
 
     async def runs() -> None:
-        keeper = asyncio.create_task(keep_running(["router"], events.append, ROUTER))
+        keeper = asyncio.create_task(keep_running(["any"], events.append, kind))
         while len(events) < 3 and not keeper.done():
             await asyncio.sleep(0.01)
         keeper.cancel()
 
     asyncio.run(asyncio.wait_for(runs(), 10.0))
-    codes = [event.text.partition(";")[0] for event in events[:3]]
-    assert codes == [f"the router ended with exit code {number}" for number in (1, code, code)]
+    texts = [event.text for event in events[:3]]
+    assert texts == [
+        f"{kind.name} ended with exit code {number}; it is restarted" for number in (1, code, code)
+    ]
+
+
+def test_a_page_that_a_person_ends_after_it_ran_stays_ended_and_the_log_says_the_remedy(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    began = tmp_path / "began"
+    ends = f"import os; p = {str(began)!r}; new = not os.path.exists(p); open(p, 'a').close(); "
+    program(monkeypatch, tmp_path, ends + "raise SystemExit(1 if new else 0)")
+    events: list[Event] = []
+    page = replace(PAGE, restart_pause_s=0.01)
+    assert asyncio.run(keep_running(["web"], events.append, page)) == 0
+    assert [event.text.partition(": ")[0] for event in events] == [
+        "the robot's page ended with exit code 1; it is restarted",
+        "the robot's page ended with exit code 0; it is not restarted",
+    ]
+    assert "`acsard web`" in events[1].text
 
 
 def test_the_first_router_that_could_be_started_counts_as_the_first(
@@ -107,8 +134,9 @@ def test_the_first_router_that_could_be_started_counts_as_the_first(
         monkeypatch.setattr(sys, "executable", executable)
 
     assert asyncio.run(keep_running(["router"], log, ROUTER)) == 78
-    (event,) = events
-    assert "could not be started" in event.text
+    refused, given_up = (event.text for event in events)
+    assert "could not be started" in refused
+    assert "it is not restarted" in given_up
 
 
 @pytest.mark.parametrize(("kind", "code"), [(GATEWAY, 78), (ROUTER, 75), (ROUTER, 1)])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
+import sys
 
 import pytest
 from hypothesis import given
@@ -14,7 +16,7 @@ from acsard.cli import parser
 from acsard.host.processes import Holder
 from acsard.machine.serial_ports import SerialDevice
 from acsard.web.guide import KEY, NO_DEVICE, Guide, Reach, arguments, boards, last_part
-from acsard.web.socket_messages import Begin, FrameError
+from acsard.web.socket_messages import Begin, Ended, FrameError, Guided
 from tests.each import each
 
 MEGA = SerialDevice(
@@ -179,3 +181,26 @@ def test_an_invalid_key_is_refused_as_a_source_of_positions(key: str) -> None:
 )
 def test_a_long_error_text_is_cut_between_lines_or_characters(data: bytes, expected: str) -> None:
     assert last_part(data).decode() == expected
+
+
+@pytest.mark.parametrize(
+    ("end", "code", "meaning"),
+    [
+        ("os.kill(os.getpid(), 9)", 137, "was ended by signal 9"),
+        ("os._exit(5)", 5, "ended with exit code 5"),
+        ("os._exit(75)", 75, "port, bus address or robot id in use"),
+    ],
+)
+async def test_the_end_of_a_job_says_how_its_process_ended(
+    monkeypatch: pytest.MonkeyPatch, end: str, code: int, meaning: str
+) -> None:
+    command = [sys.executable, "-c", f"import os; {end}"]
+    monkeypatch.setattr("acsard.web.guide.acsard", lambda *words: command)
+    said: asyncio.Queue[Guided] = asyncio.Queue()
+    guide, viewer = Guide(REACH, "sim"), object()
+    guide.join(viewer, said.put_nowait)
+    assert guide.begin(viewer, "joe", Begin("calibrate")) == ""
+    async with asyncio.timeout(10.0):
+        while not isinstance(ended := (await said.get()).guide, Ended):
+            pass
+    assert ended == Ended(code, meaning, "")
