@@ -64,7 +64,7 @@ class Bridge:
             acts: whether viewers may drive the robot, call all services and change settings.
         """
         self._robot, self._id = robot, robot.where.robot_id
-        robot.name += ", a viewer"
+        robot.name += " foxglove"
         self._wake, self._ended = Event(), Event()
         self._notices = Notices(tell, self._wake.set)
         self._here = self._was_here = True

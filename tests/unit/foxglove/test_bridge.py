@@ -11,8 +11,9 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from acsard.client import Client
+from acsard.client import Client, synchronous
 from acsard.core.config.settings import Config
+from acsard.core.messages.signature import public_name
 from acsard.core.values import NS_PER_S
 from acsard.foxglove import bridge as module
 from acsard.foxglove.bridge import Bridge
@@ -85,6 +86,16 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
 
 def fail() -> None:
     raise UNREADABLE
+
+
+def test_the_daemon_logs_a_call_of_a_viewer_under_a_readable_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The daemon replaces each comma in a name by a question mark."""
+    monkeypatch.setattr(synchronous, "own_name", lambda: "alice@laptop acsard")
+    robot = World(monkeypatch).bridge._robot
+    name, _, _ = public_name(robot.caller).rpartition("/")
+    assert name == "alice@laptop acsard foxglove"
 
 
 def test_a_daemon_whose_reply_cannot_be_read_is_queried_once_a_second_and_reported_once(
