@@ -148,6 +148,16 @@ MAX_SETTING = 1.0
 The configuration accepts this value.
 """
 
+# A perfect simulated robot gave deviations of 1e-5 to 1e-25, and each deviation above 0 costs the
+# daemon a column of the covariance in each control period. The multipliers are written with five
+# decimals, so a smaller deviation is less than their rounding.
+MIN_STD = 1e-5
+"""Smallest standard deviation that is proposed. Smaller ones are replaced by 0.0.
+
+The variances per metre and per radian have no such limit. They cost no column, and without them the
+odometry would state that the pose is exact.
+"""
+
 REPORT_DISTANCE_M = 10.0
 """Distance of driving, m, for which the report states the random errors of heading and distance."""
 
@@ -341,7 +351,10 @@ def settings(
         if log_noise.places:
             values["distance_variance_per_metre"] = float(x[Source.DISTANCE])
             values["wheel_slip_std"] = math.sqrt(x[Source.SLIP])
-    return {name: min(value, MAX_SETTING) for name, value in values.items()}
+    return {
+        name: 0.0 if name.endswith("_std") and value < MIN_STD else min(value, MAX_SETTING)
+        for name, value in values.items()
+    }
 
 
 class Reference(Struct, frozen=True):

@@ -23,10 +23,18 @@ from acsard.client.commander import (
     no_command,
 )
 from acsard.client.driving import UnheardError, drive
+from acsard.core.incoming.commands import require_size
 from acsard.core.incoming.imu import UNKNOWN_COVARIANCE
-from acsard.core.incoming.queries import BUSY
+from acsard.core.incoming.queries import BUSY, invalid_call
 from acsard.core.messages import schema
-from acsard.core.messages.encodings import Decoder, Format, decode_cdr, encode, encoding_name
+from acsard.core.messages.encodings import (
+    DecodeError,
+    Decoder,
+    Format,
+    decode_cdr,
+    encode,
+    encoding_name,
+)
 from acsard.core.messages.keys_and_roles import (
     VERBS,
     by_key,
@@ -308,10 +316,16 @@ class Client:
     def request(self, service: str, fields: Mapping[str, object]) -> schema.ServiceReply:
         """Call the service `service` with `fields` as its payload, and return its reply.
 
-        Unlike `call`, this does not add the field `latch`.
+        Unlike `call`, this does not add the field `latch`. A payload that is too large for the
+        daemon is not sent, because the bus may drop it. The reply is then the daemon's refusal.
         """
-        payload = msgspec.json.encode(fields) if fields else None
-        return Decoder(schema.ServiceReply).decode(*self._query(service_key(service), payload))
+        payload, key = msgspec.json.encode(fields) if fields else None, service_key(service)
+        if payload is not None and (verb := VERBS.get(key)) is not None:
+            try:
+                require_size(verb, payload)
+            except DecodeError as error:
+                return invalid_call(verb, error)
+        return Decoder(schema.ServiceReply).decode(*self._query(key, payload))
 
     def get(self, name: str) -> Any:
         """Return the last message on a key such as `odom` or `state`, decoded to its type."""

@@ -5,8 +5,11 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from contextlib import suppress
+from functools import partial
 from threading import Event
+from typing import Any
 
 import foxglove
 import zenoh
@@ -32,6 +35,7 @@ from acsard.foxglove.server import (
     start,
 )
 from acsard.host import clock
+from acsard.host.threads import NoThreadError, future_of
 
 DAEMON_GONE_ID = "daemon"
 """Id of the status message that tells the viewers that the daemon is gone."""
@@ -64,7 +68,7 @@ class Bridge:
             acts: whether viewers may drive the robot, call all services and change settings.
         """
         self._robot, self._id = robot, robot.where.robot_id
-        robot.name += ", a viewer"
+        robot.name += " foxglove"
         self._wake, self._ended = Event(), Event()
         self._notices = Notices(tell, self._wake.set)
         self._here = self._was_here = True
@@ -98,6 +102,9 @@ class Bridge:
         """Receives the robot's `state` while a viewer drives; None while no viewer drives."""
         self._retry_s = 0.0
         """Earliest time of the next query of the facts about the robot, s."""
+        self._refresh: Future[dict[str, Any]] | None = None
+        """The changed settings, which a separate thread receives from the daemon; None if no such
+        thread runs."""
 
     def run(self) -> None:
         """Run the main loop until `end` is called.
@@ -154,9 +161,22 @@ class Bridge:
         self._relay.forward()
         self._follow(bool(driving) and here)
         self._object(driving)
-        if news := self._settings.refresh(here):
-            self._server.publish_parameter_values(as_parameters(news))
+        self._refresh_settings(here)
         self._notices.send(self._server, self._relay.log, newcomers=bool(fresh))
+
+    def _refresh_settings(self, here: bool) -> None:
+        """Publish changed settings, and start the next refresh of the settings if it is due.
+
+        The refresh may wait for the daemon for several seconds. It runs in a separate thread, so
+        that it does not delay the topics. `here` says whether the daemon is present.
+        """
+        if self._refresh is not None and self._refresh.done():
+            news, self._refresh = self._refresh.result(), None
+            if news:
+                self._server.publish_parameter_values(as_parameters(news))
+        if self._refresh is None and self._settings.is_due(here):
+            with suppress(NoThreadError):  # a later round tries again
+                self._refresh = future_of(partial(self._settings.refresh, here), self._wake.set)
 
     def _went(self) -> None:
         words = f"the daemon of robot {self._id} is gone; `acsard foxglove` waits for it"

@@ -76,9 +76,10 @@ class ShownTopics:
 class Settings:
     """The settings of the robot that viewers can read and change while the daemon runs.
 
-    The main thread calls `learn` and `refresh`, and the server's threads call `get`, `set`,
-    `follow` and `unfollow`. Only the main thread waits for the daemon, because the server's threads
-    must pass on a viewer's stop without delay.
+    The main thread calls `learn` and `is_due`, and the server's threads call `get`, `set`, `follow`
+    and `unfollow`. None of these calls waits for the daemon, because the main thread must forward
+    topics, and the server's threads must pass on a viewer's stop. `refresh` waits for the daemon,
+    so the main thread starts a separate thread for each call of `refresh`.
     """
 
     def __init__(
@@ -166,6 +167,19 @@ class Settings:
         with self._lock:
             return news | (select_settings(self._known, wishes.keys()) if wishes else {})
 
+    def is_due(self, here: bool) -> bool:
+        """Return whether `refresh` has a change to make or settings to query.
+
+        `here` says whether the daemon is present; if not, the settings are not queried.
+        """
+        return bool(self._wishes.waiting) or (here and self._is_query_due())
+
+    def _is_query_due(self) -> bool:
+        with self._lock:
+            age_ns = clock.mono_ns() - self._read_ns
+            asked = self._asked and age_ns > NS_PER_S
+            return self._readable and (asked or (bool(self._followed) and age_ns > POLL_PERIOD_NS))
+
     def refresh(self, here: bool) -> dict[str, Any]:
         """Make one queued change. If no change waits, query the settings if a viewer needs them.
 
@@ -174,15 +188,8 @@ class Settings:
         """
         wishes = self._wishes.pop()
         if wishes is not None:
-            if self._wishes.waiting:
-                self._wishes.wake()  # the next round makes the next change
             return self._change(wishes)
-        with self._lock:
-            age_ns = clock.mono_ns() - self._read_ns
-            due = (self._asked and age_ns > NS_PER_S) or (
-                self._followed and age_ns > POLL_PERIOD_NS
-            )
-        if not (due and here and self._readable):
+        if not (here and self._is_query_due()):
             return {}
         try:
             return self.learn(self._robot.get("config"))

@@ -1,4 +1,4 @@
-"""Runs blocking calls outside the event loop, with a time limit.
+"""Runs blocking calls outside the event loop or the main loop of a program.
 
 Each call runs in a new daemon thread and not in the default executor. A call that never returns,
 such as a close that hangs in a driver, must not keep the process from ending.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from contextlib import suppress
 from typing import TypeVar
 
@@ -58,11 +59,7 @@ async def in_thread(
             if not delivered:
                 late(result)  # type: ignore[arg-type]
 
-    thread = threading.Thread(target=work, name=getattr(call, "__name__", "call"), daemon=True)
-    try:
-        thread.start()
-    except RuntimeError as error:
-        raise NoThreadError(f"this process cannot start another thread ({error})") from None
+    _start(work, getattr(call, "__name__", "call"))
     try:
         # Before Python 3.12 wait_for swallows a cancellation that coincides with the result.
         async with asyncio.timeout(timeout):
@@ -71,3 +68,29 @@ async def in_thread(
         return result
     finally:
         waits_no_longer.set()
+
+
+def future_of(call: Callable[[], T], wake: Callable[[], object]) -> Future[T]:
+    """Call `call` in a new thread, and return the future of its result or its error.
+
+    The thread calls `wake` when the future is done. Raises `NoThreadError` if no thread can be
+    started.
+    """
+    future: Future[T] = Future()
+
+    def work() -> None:
+        try:
+            future.set_result(call())
+        except BaseException as error:  # noqa: BLE001 - carried to the caller, whatever it is
+            future.set_exception(error)
+        wake()
+
+    _start(work, getattr(call, "__name__", "call"))
+    return future
+
+
+def _start(work: Callable[[], None], name: str) -> None:
+    try:
+        threading.Thread(target=work, name=name, daemon=True).start()
+    except RuntimeError as error:
+        raise NoThreadError(f"this process cannot start another thread ({error})") from None

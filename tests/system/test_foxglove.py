@@ -438,6 +438,22 @@ def test_parameters_are_the_live_settings_and_errors_are_reported(viewer: Viewer
     until(lambda: viewer.get()["limits.linear_speed"] == 1.0, 5.0, "what another has set")
 
 
+@SLOW
+def test_a_change_above_the_size_limit_is_refused_and_delays_no_topic(
+    viewer: Viewer, bus: Bus
+) -> None:
+    looked = viewer.show("/odom")
+    looked.first()
+    begun, count = time.monotonic(), len(looked.came)
+    for _ in range(4):
+        viewer.set({"limits.linear_speed": "x" * 70_000})
+    refusal = "not set: the payload has over 4096 bytes"
+    viewer.status(refusal)
+    until(lambda: len(looked.came) > count + 20, 2.0, "odometry meanwhile")
+    assert time.monotonic() - begun < 3.0
+    assert bus.get("config")["limits"]["linear_speed"] == 1.0
+
+
 # driving
 
 

@@ -267,8 +267,7 @@ class Receiver:
         request = Request(verb, ticket, asked_ns=asked_ns)
         if verb not in _payloads or (SERVICES[verb].optional and not payload):
             return request
-        if len(payload) > MAX_COMMAND_BYTES:
-            raise DecodeError("too_big", f"the payload has over {MAX_COMMAND_BYTES} bytes")
+        require_size(verb, payload)
         match _payloads[verb].decode(encoding, payload):
             case Settings(settings):
                 return replace(request, settings=settings)
@@ -281,6 +280,15 @@ class Receiver:
                     )
                 return replace(request, pose=Pose(x, y, yaw))
         return request
+
+
+def require_size(verb: Verb, payload: bytes) -> None:
+    """Raise `DecodeError` if this payload is too large for a call of the service `verb`.
+
+    A service that needs no payload ignores a payload of any size.
+    """
+    if verb in _payloads and len(payload) > MAX_COMMAND_BYTES:
+        raise DecodeError("too_big", f"the payload has over {MAX_COMMAND_BYTES} bytes")
 
 
 class Identity(Struct, frozen=True):

@@ -56,7 +56,7 @@ from acsard.core.ros.parameters import (
     requested_values,
 )
 from acsard.core.ros.transports import PARAMETERS_PREFIX, in_ros_words, left_out
-from acsard.core.values import ROLES, Answer, Outputs, Request
+from acsard.core.values import ROLES, Answer, Outputs, Request, Verb
 
 Current = Callable[[str], Message | None]
 
@@ -215,7 +215,7 @@ class Queries:
                 query.arrived_ns,
             )
         except DecodeError as error:
-            message = ServiceReply(False, f"{error}; send {SERVICES[VERBS[query.topic]].example}")
+            message = invalid_call(VERBS[query.topic], error)
             payload, name = encode(message, form), encoding_name(form, "ServiceReply")
             return [Reply(query.ticket, query.topic, payload, name)]
         self._waiting[query.ticket] = _Waiting(query.topic, form, None)
@@ -309,6 +309,11 @@ def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
         payload, name = failure(query.topic.removeprefix(PARAMETERS_PREFIX), why, query.payload), ""
     encoding = encoding_name("cdr", name)
     return Reply(query.ticket, query.topic, payload, encoding, attachment=_echo(asked, wall_ns))
+
+
+def invalid_call(verb: Verb, error: DecodeError) -> ServiceReply:
+    """Return the reply to a call of the service `verb` whose payload is not valid."""
+    return ServiceReply(False, f"{error}; send {SERVICES[verb].example}")
 
 
 def most_bytes(topic: str) -> int:

@@ -29,7 +29,15 @@ from acsard.calibration import odometry_noise, ros_bag_log
 from acsard.calibration.calibration_report import keys, parts, report
 from acsard.calibration.fit import Parameter
 from acsard.calibration.log_table import LogError, RefusedError, Table
-from acsard.calibration.odometry_noise import INITIAL_NOISE, SOURCE_COUNT, Source, Windows
+from acsard.calibration.multipliers import Deviations
+from acsard.calibration.odometry_noise import (
+    INITIAL_NOISE,
+    SOURCE_COUNT,
+    Noise,
+    Source,
+    Windows,
+    settings,
+)
 from acsard.calibration.plausibility import RATIO, TRACK
 from acsard.calibration.positions import path, wheel_steps
 from acsard.calibration.ros_bag_log import Choice
@@ -445,6 +453,28 @@ def test_a_log_with_only_a_gyro_gives_no_distance_noise() -> None:
     made = SETS["differential"].calibration(LOG, "gyro")
     assert "yaw_variance_per_metre" in made.odometry
     assert not {"distance_variance_per_metre", "wheel_slip_std"} & set(made.odometry)
+
+
+@pytest.mark.parametrize(("size", "written"), [(0.9e-5, 0.0), (1.1e-5, 1.1e-5)])
+def test_a_negligible_deviation_is_written_as_zero_and_a_small_variance_is_kept(
+    size: float, written: float
+) -> None:
+    found = np.full(SOURCE_COUNT, size**2)
+    made = settings(
+        Deviations(0.0, 0.0, size), 1.0, (TRACK, RATIO), OdometryConfig(),
+        Noise(found, INITIAL_NOISE, 1.0, 0.1, True, 1.0, 0.3), scaled=True,
+    )  # fmt: skip
+    variances = {name: made.pop(name) for name in list(made) if "variance" in name}
+    assert variances == dict.fromkeys(
+        ("yaw_variance_per_metre", "yaw_variance_per_radian", "distance_variance_per_metre"),
+        size**2,
+    )
+    assert made == pytest.approx(
+        dict.fromkeys(
+            ("wheel_separation_multiplier_std", "wheel_radius_ratio_std", "distance_scale_std",
+             "wheel_slip_std"), written,
+        ), rel=1e-9, abs=0.0,
+    )  # fmt: skip
 
 
 def test_the_search_finds_the_noise_that_made_the_residuals() -> None:

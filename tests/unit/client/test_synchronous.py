@@ -8,6 +8,7 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import pytest
 import zenoh
 
@@ -17,10 +18,12 @@ from acsard.client.asynchronous import AsyncClient
 from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, MIN_SPACING_S, no_command
 from acsard.client.driving import UnheardError
 from acsard.client.synchronous import decoder
-from acsard.core.config.settings import DriveConfig, JointsConfig
-from acsard.core.incoming.commands import Arrival, Receiver
+from acsard.core.config.settings import Config, DriveConfig, JointsConfig
+from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Receiver
 from acsard.core.incoming.imu import reading
-from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode
+from acsard.core.incoming.queries import Queries, Query
+from acsard.core.messages import schema
+from acsard.core.messages.encodings import FORMATS, DecodeError, Decoder, Format, encode
 from acsard.core.messages.schema import Header, Imu, Quaternion, Time, Vector3
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import NS_PER_S, REST, Command
@@ -29,6 +32,7 @@ from acsard.host import clock
 from tests.each import each
 
 RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
+INFO = schema.Info("acsar", "1.2.3", 42, "sim", True, 100.0, [], [])
 
 
 class Session:
@@ -275,6 +279,32 @@ def test_an_unknown_key_is_reported_as_the_only_reason(session: Session, name: s
     assert f"acsard/acsar/{name}" in message
     assert "did you mean" in message
     assert "daemon" not in message
+
+
+def test_a_service_call_above_the_size_limit_is_refused_at_once_in_the_daemon_s_words(
+    session: Session,
+) -> None:
+    """The bus does not carry a much larger payload, so the daemon could not refuse it."""
+    session.close()  # each call that the client sends now raises an error
+    empty = len(b'{"settings":{"limits.linear_speed":""}}')
+    largest = {"limits.linear_speed": "x" * (MAX_COMMAND_BYTES - empty)}
+    larger = {"limits.linear_speed": largest["limits.linear_speed"] + "x"}
+    with pytest.raises(NoAnswerError):
+        client_of(session).set(largest)
+    payload = msgspec.json.encode({"settings": larger})
+    query = Query(1, "srv/set", "srv/set", "", payload, "application/json")
+    replies = Queries(Config(), INFO).serve(query, lambda _: None, None)
+    assert isinstance(replies, list)
+    (reply,) = replies
+    refusal = Decoder(schema.ServiceReply).decode(reply.encoding, reply.payload)
+    assert refusal.message.startswith("the payload has over 4096 bytes")
+    assert client_of(session).set(larger) == refusal
+
+
+def test_a_stop_is_sent_whatever_the_size_of_its_payload(session: Session) -> None:
+    session.close()
+    with pytest.raises(NoAnswerError):
+        client_of(session).request("stop", {"why": "x" * (MAX_COMMAND_BYTES + 1)})
 
 
 @pytest.mark.parametrize(

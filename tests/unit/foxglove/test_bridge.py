@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import threading
+import time
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -11,14 +13,15 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from acsard.client import Client
+from acsard.client import Client, synchronous
 from acsard.core.config.settings import Config
+from acsard.core.messages.signature import public_name
 from acsard.core.values import NS_PER_S
 from acsard.foxglove import bridge as module
 from acsard.foxglove.bridge import Bridge
 from acsard.foxglove.robot_facts import Facts
 from acsard.host import clock
-from acsard.host.errors import ReplyError
+from acsard.host.errors import NoAnswerError, ReplyError
 from tests.unit.foxglove.status_messages import Server
 
 UNREADABLE = ReplyError("cannot read the robot's state; use the same version here")
@@ -87,6 +90,16 @@ def fail() -> None:
     raise UNREADABLE
 
 
+def test_the_daemon_logs_a_call_of_a_viewer_under_a_readable_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The daemon replaces each comma in a name by a question mark."""
+    monkeypatch.setattr(synchronous, "own_name", lambda: "alice@laptop acsard")
+    robot = World(monkeypatch).bridge._robot
+    name, _, _ = public_name(robot.caller).rpartition("/")
+    assert name == "alice@laptop acsard foxglove"
+
+
 def test_a_daemon_whose_reply_cannot_be_read_is_queried_once_a_second_and_reported_once(
     world: World,
 ) -> None:
@@ -115,13 +128,12 @@ def test_a_daemon_that_ends_after_an_unreadable_reply_is_reported_as_gone(world:
 def test_the_facts_are_learned_after_a_restart_that_falls_into_one_round(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refresh(here: bool) -> dict[str, Any]:
-        monkeypatch.setattr(world.bridge._settings, "refresh", usual)
+    def forward() -> None:
+        monkeypatch.setattr(world.bridge._relay, "forward", usual)
         world.restart()
-        return {}
 
-    before_s, usual = world.known_timeout_s, world.bridge._settings.refresh
-    monkeypatch.setattr(world.bridge._settings, "refresh", refresh)
+    before_s, usual = world.known_timeout_s, world.bridge._relay.forward
+    monkeypatch.setattr(world.bridge._relay, "forward", forward)
     world.passes(1.0)
     assert world.known_timeout_s == before_s + 1.0
     assert world.server.shown == [BACK]
@@ -140,6 +152,29 @@ def test_the_facts_are_learned_again_if_the_daemon_restarts_while_it_is_queried(
     world.passes(1.0)
     assert world.queries == 2
     assert world.known_timeout_s == before_s + 2.0
+
+
+def test_a_change_that_the_daemon_does_not_answer_does_not_delay_the_topics(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gave_up, rounds = threading.Event(), list[bool]()
+
+    def unanswered(_: object) -> None:
+        assert gave_up.wait(10.0), "the bridge waits for the daemon"
+        raise NoAnswerError("no answer")
+
+    monkeypatch.setattr(world.bridge._robot, "set", unanswered)
+    monkeypatch.setattr(world.bridge._relay, "forward", lambda: rounds.append(gave_up.is_set()))
+    for _ in range(2):
+        world.bridge._settings.set({"limits.linear_speed": 1.0})
+    world.passes(3.0)
+    assert len(rounds) >= 6
+    assert not any(rounds)
+    gave_up.set()
+    begun = time.monotonic()
+    while not world.printed and time.monotonic() - begun < 10.0:
+        world.passes(0.5)
+    assert world.printed == ["not set: no answer"]
 
 
 class StartingWorld(World):

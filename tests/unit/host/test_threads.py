@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from acsard.host.threads import in_thread
+from acsard.host.threads import NoThreadError, future_of, in_thread
 
 NO_ROOM = 1 << 46
 """Stack size that no machine can provide, so that a thread with it cannot start."""
@@ -96,3 +96,24 @@ def test_a_result_that_its_caller_has_received_is_not_released() -> None:
         if thread.name == "call":
             thread.join(5.0)
     assert not released
+
+
+def test_a_future_has_the_result_or_the_error_of_its_call_when_it_wakes_the_caller() -> None:
+    def fail() -> int:
+        raise ValueError("no number")
+
+    for call, outcome in ((lambda: 7, "7"), (fail, "no number")):
+        woken = threading.Event()
+        future = future_of(call, woken.set)
+        assert woken.wait(5.0)
+        assert future.done()
+        assert str(future.exception() or future.result()) == outcome
+
+
+def test_a_future_whose_thread_cannot_be_started_raises_an_error() -> None:
+    usual = threading.stack_size(NO_ROOM)
+    try:
+        with pytest.raises(NoThreadError, match="cannot start another thread"):
+            future_of(lambda: 1, lambda: None)
+    finally:
+        threading.stack_size(usual)
