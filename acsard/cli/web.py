@@ -22,7 +22,7 @@ from acsard.daemon.bus.address import address_of
 from acsard.daemon.bus.zenoh_sessions import log_from_environment
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install
-from acsard.host.logs import Log
+from acsard.host.logs import Log, output_in_threads
 
 if TYPE_CHECKING:
     from acsard.web.listen import Listen
@@ -120,7 +120,8 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
             instead = f"  (instead of {wished.url}, at which acsard cannot listen)"
             note = "" if address == wished else instead
             for url in page_urls(address, tls):
-                print(f"  page    {url}{note}", flush=True)
+                # Write the line as one text, so that no line of the log is printed inside it.
+                sys.stdout.write(f"  page    {url}{note}\n")
 
     tls = args.tls or config.bus.tls
     listen = _listen(args, config)
@@ -136,7 +137,9 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
     )
     log = Log(config.log)
     try:
-        asyncio.run(server.serve(options, announce, log))
+        # A stopped terminal must not stop the page.
+        with output_in_threads():
+            asyncio.run(server.serve(options, announce, log))
     finally:
         log.close()
     return int(Exit.OK)

@@ -16,8 +16,9 @@ import queue
 import socket
 import sys
 import threading
-from collections.abc import Mapping, MutableMapping
-from typing import Any, Literal, TextIO
+from collections.abc import Iterator, Mapping, MutableMapping
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from typing import Any, Literal, TextIO, cast
 
 from acsard.core.config.settings import LogConfig
 from acsard.core.formatting import printable
@@ -91,6 +92,9 @@ class JournalStream(io.StringIO):
         return len(text)
 
 
+CLOSE_TIMEOUT_S = 0.2
+"""Longest time for which the end of the process waits until the queued lines are written, s."""
+
 Form = Literal["console", "json", "logfmt", "journal"]
 
 MAX_VALUE_LENGTH = 500
@@ -161,6 +165,22 @@ def write_through(stream: TextIO, text: str) -> None:
         data = data[os.write(fd, data) :]
 
 
+@contextmanager
+def output_in_threads() -> Iterator[None]:
+    """Let `sys.stdout` and `sys.stderr` never block during a `with` block.
+
+    A `Writer` replaces each of the two streams. The rule covers everything that Python code
+    writes: `print`, warnings, tracebacks, and the log records of libraries such as aiohttp.
+    """
+    output, errors = Writer(sys.stdout), Writer(sys.stderr)
+    try:
+        with redirect_stdout(cast(TextIO, output)), redirect_stderr(cast(TextIO, errors)):
+            yield
+    finally:
+        output.close(CLOSE_TIMEOUT_S)
+        errors.close(CLOSE_TIMEOUT_S)
+
+
 class Log:
     def __init__(self, settings: LogConfig, stream: TextIO = sys.stderr) -> None:
         form: Form = settings.format if settings.format != "auto" else _fitting(stream)
@@ -215,8 +235,11 @@ class Log:
         self._logger.info(name, **fields)
 
     def close(self) -> None:
-        """Wait for at most 0.2 s until the queued lines are written. Then the process may end."""
-        self._writer.close(0.2)
+        """Wait for at most `CLOSE_TIMEOUT_S` until the queued lines are written.
+
+        Then the process may end.
+        """
+        self._writer.close(CLOSE_TIMEOUT_S)
 
 
 _LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}

@@ -281,11 +281,14 @@ class Page:
 
         The arguments of the service are the fields of the JSON object in the request's body.
         """
-        body = await _body_of(request)
+        verb = request.path.removeprefix("/api/srv/")
         try:
-            arguments = msgspec.json.decode(body, type=dict[str, Any]) if body.strip() else {}
-        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-            raise RefusedError("malformed", f"the body must be a JSON object: {error}") from None
+            arguments = await _arguments_in(request)
+        except (RefusedError, web.HTTPException):
+            # The body names no other robot, and a stop of the page's own robot is never refused.
+            if verb == "stop":
+                await self._parts.calls.call(request[IDENTITY_KEY], verb, {})
+            raise
         robot = arguments.pop("robot", "")
         if not isinstance(robot, str):
             text = (
@@ -293,7 +296,6 @@ class Page:
                 "own, this page accepts only the service stop"
             )
             raise RefusedError("malformed", text)
-        verb = request.path.removeprefix("/api/srv/")
         answer = await self._parts.calls.call(request[IDENTITY_KEY], verb, arguments, robot)
         return reply(answer, 200 if answer.success else 409)
 
@@ -392,6 +394,18 @@ async def _body_of(request: web.Request) -> bytes:
         raise web.HTTPRequestTimeout(
             reason=f"no body arrived within {BODY_TIMEOUT_S:g} s"
         ) from None
+    except (web.RequestPayloadError, ConnectionError):
+        raise RefusedError(
+            "malformed", "the body is not valid HTTP, or the connection ended before its end"
+        ) from None
+
+
+async def _arguments_in(request: web.Request) -> dict[str, Any]:
+    body = await _body_of(request)
+    try:
+        return msgspec.json.decode(body, type=dict[str, Any]) if body.strip() else {}
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise RefusedError("malformed", f"the body must be a JSON object: {error}") from None
 
 
 async def _token_posted(request: web.Request) -> TokenForm:

@@ -97,6 +97,8 @@ async def serve(
         page.app, access_log=None, handle_signals=False, keepalive_timeout=20.0,
         shutdown_timeout=SHUTDOWN_S, max_line_size=FIELD_BYTES, max_field_size=FIELD_BYTES,
         max_headers=FIELDS, read_bufsize=READ_BYTES,
+        # A body is never decompressed, so compressed data is refused like any other malformed body.
+        auto_decompress=False,
     )  # fmt: skip
     async with AsyncExitStack() as stack:
         await runner.setup()

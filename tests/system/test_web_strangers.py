@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gzip
 import itertools
 import json
 import re
@@ -301,6 +302,58 @@ def test_bytes_that_are_not_a_request_get_a_json_error(page: Page, bus: Bus) -> 
         assert b"nosniff" in head
         assert words in json.loads(body)["error"]
         assert page.refused()[reason] == counted.get(reason, 0) + 1
+    assert "Traceback" not in page.stderr
+
+
+PACKED = gzip.compress(b"{}")
+BODIES = {
+    "junk as gzip": ("Content-Encoding: gzip\r\nContent-Length: 4", b"abcd"),
+    "junk as deflate": ("Content-Encoding: deflate\r\nContent-Length: 4", b"abcd"),
+    "gzip data": (f"Content-Encoding: gzip\r\nContent-Length: {len(PACKED)}", PACKED),
+    "junk": ("Content-Length: 4", b"abcd"),
+}
+"""A header and a body that is not a JSON object."""
+
+
+@pytest.mark.parametrize("what", BODIES)
+def test_a_malformed_body_gets_a_json_error_and_a_stop_with_it_stops_the_robot(
+    page: Page, bus: Bus, what: str
+) -> None:
+    port = int(page.here.rpartition(":")[2])
+    header, sent = BODIES[what]
+
+    def answered(line: str, *more: str) -> tuple[int, dict[str, Any], float]:
+        """Return the status and the JSON body of the answer, and how often the page refused."""
+        before = page.refused().get("malformed", 0)
+        lines = (f"{line} HTTP/1.1", f"Host: 127.0.0.1:{port}", "Connection: close", header, *more)
+        with socket.create_connection(("127.0.0.1", port), 30.0) as connection:
+            connection.sendall("\r\n".join([*lines, "", ""]).encode())
+            time.sleep(0.1)  # the page begins to serve the request before its body arrives
+            connection.sendall(sent)
+            head, _, body = connection.makefile("rb").read().partition(b"\r\n\r\n")
+        value = json.loads(body) if b"application/json" in head else {}
+        return int(head.split()[1]), value, page.refused().get("malformed", 0) - before
+
+    assert answered("GET /api/whoami")[0] == 200  # the server ignores the body
+    for line in ("POST /token", "POST /api/srv/clear"):
+        status, value, refused = answered(line, "Content-Type: application/json")
+        assert (status, list(value), refused) == (400, ["error"], 1), line
+    assert bus.state()["mode"] == "ready"
+    status, value, refused = answered("POST /api/srv/stop")
+    assert (status, list(value), refused) == (400, ["error"], 1)
+    assert bus.state()["mode"] == "stopped"
+    assert "Traceback" not in page.stderr
+
+
+def test_a_client_that_leaves_before_the_end_of_its_body_leaves_no_traceback(
+    page: Page, bus: Bus
+) -> None:
+    port = int(page.here.rpartition(":")[2])
+    head = f"POST /api/srv/stop HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nContent-Length: 9\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", port), 30.0) as connection:
+        connection.sendall(head.encode())
+        time.sleep(0.1)
+    until(lambda: bus.state()["mode"] == "stopped", 10.0, "the robot stops")
     assert "Traceback" not in page.stderr
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import json
 import os
+import select
 import socket
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +18,14 @@ from hypothesis import strategies as st
 
 from acsard.core.config.settings import LogConfig
 from acsard.core.values import Event
-from acsard.host.logs import MAX_VALUE_LENGTH, JournalStream, Log, is_journal, render
+from acsard.host.logs import (
+    MAX_VALUE_LENGTH,
+    JournalStream,
+    Log,
+    is_journal,
+    output_in_threads,
+    render,
+)
 from tests.each import each
 
 
@@ -257,3 +266,28 @@ def test_a_changed_log_level_applies_to_the_next_events(tmp_path: Path) -> None:
         records = [json.loads(line) for line in stream.read().splitlines()]
     assert [line["text"] for line in records] == ["info", "info"]
     assert all(set(line) == {"timestamp", "level", "event", "text"} for line in records)
+
+
+def test_a_pipe_that_nobody_reads_blocks_neither_output_stream(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    filled = 0
+    try:
+        while True:
+            filled += os.write(writer, bytes(4096))
+    except BlockingIOError:
+        os.set_blocking(writer, True)
+    with open(writer, "w") as pipe, open(reader, "rb", buffering=0) as other_end:
+        monkeypatch.setattr(sys, "stdout", pipe)
+        monkeypatch.setattr(sys, "stderr", pipe)
+        with output_in_threads():
+            print("printed\n", end="", flush=True)
+            sys.stderr.write("written\n")
+            other_end.read(filled)
+        assert (sys.stdout, sys.stderr) == (pipe, pipe)
+        output = b""
+        while not (b"printed\n" in output and b"written\n" in output):
+            assert select.select([other_end], [], [], 10.0)[0], output
+            output += other_end.read(4096)
