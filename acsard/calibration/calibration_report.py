@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from msgspec import Struct
 from rich.console import RenderableType
 
-from acsard.calibration.improvement import NOT_COMPARED, BeforeAfter
+from acsard.calibration.improvement import NOT_COMPARED, SURE_DEVIATIONS, BeforeAfter
 from acsard.calibration.multipliers import SEPARATION
 from acsard.calibration.odometry_noise import REPORT_DISTANCE_M
 from acsard.calibration.plausibility import RATIO, TRACK
@@ -29,6 +29,13 @@ DIGITS = 5
 
 A multiplier has this number of decimals. A setting of `[odometry]` has this number of significant
 digits.
+"""
+
+
+MIN_GROWTH = 0.0005
+"""Smallest change of the effective track that the text states, as a fraction.
+
+The text has one decimal of a percentage, so a smaller change would appear as 0.0 %.
 """
 
 
@@ -269,10 +276,7 @@ def parts(
         *zip(NAMES, now.values, new.values, _deviations(calibration), strict=True),
         ("effective track, m", was, report.effective_track, report.effective_track_std),
     ]
-    rows = [
-        (name, f"{old:.4f}", f"{value:.4f}", "as configured" if std is None else f"{std:.4f}")
-        for name, old, value, std in figures
-    ]
+    rows = [_row(name, float(old), float(value), std) for name, old, value, std in figures]
     yield from ("", table(rows, ("", "now", "found", "standard deviation"), right={1, 2}), "")
     yield from _better(report)
     yield ""
@@ -287,6 +291,19 @@ def parts(
     if report.notes:
         yield ""
     yield from (f"note: {note}" for note in report.notes)
+
+
+def _row(name: str, old: float, value: float, std: float | None) -> tuple[str, str, str, str]:
+    """Return a row of the table of multipliers.
+
+    `old` is the configured value, and `value` the new one. `std` is the standard deviation of the
+    new value, or None if the log does not determine the value. A tape may change such a value too,
+    because it shows the size of the wheels.
+    """
+    now, found = f"{old:.4f}", f"{value:.4f}"
+    if std is not None:
+        return name, now, found, f"{std:.4f}"
+    return name, now, "as configured" if found == now else found, "-"
 
 
 def _better(report: Report) -> list[str]:
@@ -328,21 +345,17 @@ def _two(value: float) -> str:
 
 
 def _remains(report: Report, calibration: Calibration, *, guided: bool) -> list[str]:
-    fastest = calibration.drives.fastest
     multipliers = calibration.multipliers
     share = multipliers.std[SEPARATION] / multipliers.values[SEPARATION]
-    # Adding 0.0 turns a rounded -0.0 into 0.0.
-    growth = round(report.effective_track_growth * fastest, 3) + 0.0
     known = (
         ""
         if TRACK in report.kept
         else f"This log determines the track to {share:.1%} (standard deviation). "
     )
+    verb, growth = _growth(report, calibration.drives.fastest)
     sentences = [
-        f"remaining error: skidding changes the effective track. {known}From slow to fast turns, "
-        f"it changes by {growth:+.1%} "
-        f"(+- {report.effective_track_growth_std * fastest:.1%}). It also depends on the ground, "
-        "so calibrate where you drive"
+        f"remaining error: skidding {verb} the effective track. {known}{growth}The track also "
+        "depends on the ground, so calibrate where you drive"
     ]
     if not report.scale:
         advice = (
@@ -358,3 +371,22 @@ def _remains(report: Report, calibration: Calibration, *, guided: bool) -> list[
             f"size, {advice}"
         )
     return sentences
+
+
+def _growth(report: Report, fastest: float) -> tuple[str, str]:
+    """Return a verb and a sentence that say how skidding changes the track in fast turns.
+
+    The sentence is "" if the log shows no change and also no uncertainty of the change. That is so
+    if the fit kept the track as configured. `fastest` is the turn rate of fast turns, rad/s.
+    """
+    growth, std = report.effective_track_growth * fastest, report.effective_track_growth_std
+    limit = SURE_DEVIATIONS * std * fastest
+    if abs(growth) > max(limit, MIN_GROWTH):
+        change = f"it changes by {growth:+.1%} (+- {std * fastest:.1%})"
+        return "changes", f"From slow to fast turns, {change}. "
+    if limit < MIN_GROWTH:
+        return "may change", ""
+    return "may change", (
+        "This log shows no change from slow to fast turns beyond the uncertainty "
+        f"({SURE_DEVIATIONS:g} standard deviations: {limit:.1%}). "
+    )
