@@ -39,7 +39,7 @@ The text has one decimal of a percentage, so a smaller change would appear as 0.
 """
 
 
-class Refusal(Struct, frozen=True):
+class CalibrationRefusal(Struct, frozen=True):
     """The object that `--json` prints if a log gives no calibration."""
 
     log: str
@@ -48,7 +48,7 @@ class Refusal(Struct, frozen=True):
     notes: Sequence[str] = ()
 
 
-class Report(Struct, frozen=True):
+class CalibrationReport(Struct, frozen=True):
     """The object that `--json` prints for a calibration.
 
     A field `..._error_before` is an error of the odometry with the configured multipliers. The
@@ -172,7 +172,9 @@ class Report(Struct, frozen=True):
     refused: None = None
 
 
-def report(log: str, calibration: Calibration, drive: DriveConfig, written: str) -> Report:
+def report(
+    log: str, calibration: Calibration, drive: DriveConfig, written: str
+) -> CalibrationReport:
     """Return the object that `--json` prints for a calibration.
 
     `log` is the path of the log file, or "the drive" for a guided drive. `drive` is the configured
@@ -184,7 +186,7 @@ def report(log: str, calibration: Calibration, drive: DriveConfig, written: str)
     track_std, left_std, right_std = _deviations(calibration)
     improvement, drives = calibration.improvement, calibration.drives
     heading, distance = _noise(calibration)
-    return Report(
+    return CalibrationReport(
         log=log, reference=calibration.reference, scale=calibration.scale,
         wheel_separation_multiplier=track, wheel_separation_multiplier_std=track_std,
         left_wheel_radius_multiplier=left, left_wheel_radius_multiplier_std=left_std,
@@ -257,7 +259,7 @@ def odometry(calibration: Calibration) -> dict[str, float]:
 
 
 def parts(
-    report: Report, calibration: Calibration, where: str, *, guided: bool
+    report: CalibrationReport, calibration: Calibration, where: str, *, guided: bool
 ) -> Iterator[RenderableType]:
     """Yield the parts of the printed report: sentences, and a table of the multipliers.
 
@@ -306,7 +308,7 @@ def _row(name: str, old: float, value: float, std: float | None) -> tuple[str, s
     return name, now, "as configured" if found == now else found, "-"
 
 
-def _better(report: Report) -> list[str]:
+def _better(report: CalibrationReport) -> list[str]:
     noise = (
         f"random {{}} error after {REPORT_DISTANCE_M:g} m of driving, "
         "according to the odometry messages"
@@ -344,7 +346,7 @@ def _two(value: float) -> str:
     return f"{value:.0f}" if value >= 10 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
 
 
-def _remains(report: Report, calibration: Calibration, *, guided: bool) -> list[str]:
+def _remains(report: CalibrationReport, calibration: Calibration, *, guided: bool) -> list[str]:
     multipliers = calibration.multipliers
     share = multipliers.std[SEPARATION] / multipliers.values[SEPARATION]
     known = (
@@ -373,7 +375,7 @@ def _remains(report: Report, calibration: Calibration, *, guided: bool) -> list[
     return sentences
 
 
-def _growth(report: Report, fastest: float) -> tuple[str, str]:
+def _growth(report: CalibrationReport, fastest: float) -> tuple[str, str]:
     """Return a verb and a sentence that say how skidding changes the track in fast turns.
 
     The sentence is "" if the log shows no change and also no uncertainty of the change. That is so

@@ -183,7 +183,7 @@ class LogError(AcsardError):
     """The data of a log is unreadable, incomplete or wrong. The text says where, and what to do."""
 
 
-class RefusedError(AcsardError):
+class NoCalibrationError(AcsardError):
     """The data is readable, but gives no useful calibration. The text says why and what to do."""
 
 

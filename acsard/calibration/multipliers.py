@@ -14,7 +14,7 @@ from msgspec import Struct
 
 from acsard.calibration.fit import Base, Parameter
 from acsard.calibration.heading import Rates
-from acsard.calibration.log_table import Floats, RefusedError
+from acsard.calibration.log_table import Floats, NoCalibrationError
 from acsard.core.config.settings import OdometryConfig
 
 SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
@@ -197,7 +197,7 @@ def scaled(
             distance contradicts the positions.
     """
     if tape.run and tape.run not in names:
-        raise RefusedError(
+        raise NoCalibrationError(
             f'--distance: the log has no run "{tape.run}"; its runs are {", ".join(names[:10])}'
         )
     numbers = [names.index(tape.run)] if tape.run else range(len(names))
@@ -205,7 +205,7 @@ def scaled(
     best = max(extents, key=lambda number: extents[number].straight)
     extent = extents[best]
     if extent.straight < MIN_STRAIGHTNESS:
-        raise RefusedError(
+        raise NoCalibrationError(
             f"--distance: run {names[best]} ends {extent.distance:.2f} m from its start, and its "
             f"path is {extent.length:.2f} m long, so it is too short or not straight enough: drive "
             "straight ahead for 2 m or more in a separate run, and measure from start to end"
@@ -225,7 +225,7 @@ def scaled(
     variance = float(jacobian @ covariance @ jacobian + noise)
     longer_by = math.log(tape.metres / extent.distance)
     if known and abs(longer_by) > max(CONTRADICTS, CONTRADICTS_STD * math.sqrt(variance)):
-        raise RefusedError(
+        raise NoCalibrationError(
             f"--distance: according to the positions, run {names[best]} ends "
             f"{extent.distance:.2f} m from its start, but you measured {tape.metres:g} m: was this "
             "distance measured straight from the start to the end of this run, and are x and "

@@ -26,7 +26,7 @@ from acsard.calibration.improvement import SURE_DEVIATIONS, Fold, positions_of, 
 from acsard.calibration.log_table import Floats
 from acsard.calibration.multipliers import Deviations
 from acsard.calibration.plausibility import RATIO, TRACK
-from acsard.calibration.positions import Path, WheelSteps, path
+from acsard.calibration.positions import WheelPath, WheelSteps, path
 from acsard.calibration.runs import Complexes, Mask, Run, inside
 from acsard.core.config.settings import OdometryConfig
 
@@ -136,10 +136,10 @@ In the same way, `RATIO` gives the minimum for `YAW`, and `TRACK` gives the mini
 """
 
 CERTAIN_GAIN = math.log(2.0) - 3 / 8
-"""Value of `Noise.log_likelihood_gain` above which the new noise always counts as better.
+"""Value of `LogNoise.log_likelihood_gain` above which the new noise always counts as better.
 
 The value is the mean loss of log likelihood per residual if each standard deviation is stated at
-twice its true value. Above this value, a large `Noise.gain_std` does not matter.
+twice its true value. Above this value, a large `LogNoise.gain_std` does not matter.
 """
 
 MAX_SETTING = 1.0
@@ -266,7 +266,7 @@ class Windows(Struct, frozen=True):
         return np.asarray(-(np.linalg.slogdet(covariance)[1] + squares) / 2)
 
 
-class Noise(Struct, frozen=True):
+class LogNoise(Struct, frozen=True):
     """The noise of the odometry in a log, compared with the configured noise."""
 
     found: Floats
@@ -320,7 +320,7 @@ class Noise(Struct, frozen=True):
 
 def settings(
     known: Deviations, track: float, fixed: Collection[str], odometry: OdometryConfig,
-    log_noise: Noise | None = None, *, scaled: bool,
+    log_noise: LogNoise | None = None, *, scaled: bool,
 ) -> dict[str, float]:  # fmt: skip
     """Return the new values for settings of `[odometry]`, by the name of the setting.
 
@@ -376,7 +376,7 @@ class Reference(Struct, frozen=True):
 
 def noise(
     folds: Sequence[Fold], sensors: Reference, known: Deviations, odometry: OdometryConfig
-) -> Noise | None:
+) -> LogNoise | None:
     """Return the noise that a log shows, compared with the configured noise.
 
     Return None if fewer than two drives have residuals.
@@ -416,7 +416,7 @@ def noise(
         lambda left: float(np.divide(*sums[left].sum(axis=0))), np.ones(len(sums), dtype=bool)
     )
     turning = sum(move.turned for move in motions) / max(0.1, sum(move.metres for move in motions))
-    return Noise(estimate, present, gain, gain_std, sensors.places, turning, motions[0].track)
+    return LogNoise(estimate, present, gain, gain_std, sensors.places, turning, motions[0].track)
 
 
 class _Motion(Struct, frozen=True):
@@ -438,7 +438,7 @@ class _Motion(Struct, frozen=True):
         return float(np.abs(self.turn).sum())
 
     @classmethod
-    def of(cls, t: Floats, way: Path, track: float) -> _Motion:
+    def of(cls, t: Floats, way: WheelPath, track: float) -> _Motion:
         count = max(1, round((t[-1] - t[0]) / STEP_S))
         edges = np.linspace(t[0], t[-1], count + 1)
         heading, place = np.interp(edges, way.t, way.heading), np.interp(edges, way.t, way.place)
@@ -554,7 +554,7 @@ def _times(begin: float, end: float) -> Iterator[Floats]:
 
 
 def _by_headings(
-    t: Floats, at: Floats, heading: Heading, way: Path, track: float, headings: Headings,
+    t: Floats, at: Floats, heading: Heading, way: WheelPath, track: float, headings: Headings,
     parameters: Floats,
 ) -> _Window:  # fmt: skip
     """Return a window whose residuals are measured headings minus headings from the wheels.
@@ -575,7 +575,7 @@ def _by_headings(
 
 
 def _by_places(
-    t: Floats, at: Floats, place: Complexes, way: Path, track: float, parameters: Floats
+    t: Floats, at: Floats, place: Complexes, way: WheelPath, track: float, parameters: Floats
 ) -> Iterator[_Window]:
     """Yield a window of position residuals: measured position minus the path of the robot.
 

@@ -14,7 +14,7 @@ import numpy as np
 from acsard.calibration import heading
 from acsard.calibration.fit import MIN_BLOCKS, Base, Fit, Parameter, condition
 from acsard.calibration.heading import Rows
-from acsard.calibration.log_table import Floats, RefusedError
+from acsard.calibration.log_table import Floats, NoCalibrationError
 from acsard.calibration.multipliers import Multipliers
 from acsard.calibration.positions import StartingPoint
 from acsard.calibration.runs import Block
@@ -107,10 +107,10 @@ A remark states any other ratio.
 
 
 def drives_enough(parts: Sequence[Block]) -> None:
-    """Raise `RefusedError` if the log has too few blocks (of a few seconds of driving each)."""
+    """Raise `NoCalibrationError` if the log has too few blocks (a few seconds of driving each)."""
     if len(parts) < MIN_BLOCKS:
         seconds = sum(part.end - part.begin for part in parts)
-        raise RefusedError(
+        raise NoCalibrationError(
             f"the wheels turn for only {seconds:.0f} s, which is too short: {DRIVE_ADVICE}"
         )
 
@@ -125,7 +125,7 @@ def turns_in_place(rows: Rows) -> bool:
 
 
 def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
-    """Raise `RefusedError` if the log lacks a movement of the wheels that the fit needs.
+    """Raise `NoCalibrationError` if the log lacks a movement of the wheels that the fit needs.
 
     The fit needs driving ahead or back, which is the mean of the left and the right wheel angle. It
     also needs turns, which are half of the difference of these angles. Each of the two must add up
@@ -139,7 +139,7 @@ def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
     for rolled, what in ((together, "ahead or back"), (against, "in opposite directions")):
         angle = float(np.abs(rolled).sum())
         if angle < MIN_ROLL and not (in_place and rolled is together):
-            raise RefusedError(
+            raise NoCalibrationError(
                 "in the whole log, the wheels of the two sides roll only "
                 f"{angle / (2 * np.pi):.1f} revolutions {what}, which is too little to measure the "
                 f"wheel radii and the effective track: {DRIVE_ADVICE}"
@@ -147,19 +147,19 @@ def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
     cross = float(together @ against) ** 2
     same_curve = cross > MAX_CORRELATION * float(together @ together) * float(against @ against)
     if same_curve and not in_place:
-        raise RefusedError(
+        raise NoCalibrationError(
             "the robot always drives the same curve, so the log cannot separate errors of the "
             f"wheel radii from errors of the track width: {DRIVE_ADVICE}"
         )
 
 
 def turns_enough(turned: Floats) -> None:
-    """Raise `RefusedError` if the robot hardly turns.
+    """Raise `NoCalibrationError` if the robot hardly turns.
 
     `turned` contains the robot's turn in each interval of the log, rad.
     """
     if (angle := float(np.abs(turned).sum())) < MIN_TOTAL_TURN:
-        raise RefusedError(
+        raise NoCalibrationError(
             f"the robot turned by {np.degrees(angle):.0f} deg in total, which is too little to "
             f"measure the effective track: {DRIVE_ADVICE}"
         )
@@ -216,14 +216,14 @@ def separates_track(fitted: Fit) -> bool:
 
 
 def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
-    """Raise `RefusedError` if the wheels and the heading sensor show very different turns.
+    """Raise `NoCalibrationError` if the wheels and the heading sensor show very different turns.
 
     `source` is the name of the sensor. `sides` is the result of `heading.side_factors()`.
     """
     spread = float(rows.turned @ rows.turned)
     off = rows.turned - heading.by_sides(rows, base, sides)
     if not spread or float(off @ off) > MAX_CONTRADICTION * spread:
-        raise RefusedError(
+        raise NoCalibrationError(
             f"{source} does not follow the wheels. Check that it is the yaw rate (not roll or "
             "pitch), that it and the wheel speeds come from the same run, that their clocks differ "
             "by less than 2 s, that the wheels touched the ground, and that the columns of the "
@@ -232,12 +232,12 @@ def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
 
 
 def positions_follow(starting_point: StartingPoint) -> None:
-    """Raise `RefusedError` if the positions do not follow the path computed from the wheels.
+    """Raise `NoCalibrationError` if the positions do not follow the path computed from the wheels.
 
     `starting_point` is the result of `positions.search()`.
     """
     if starting_point.unexplained > MAX_CONTRADICTION:
-        raise RefusedError(
+        raise NoCalibrationError(
             "the positions do not match the motion of the wheels: check that x is ahead and y to "
             "the left in m (not latitude and longitude), that wheels and positions come from the "
             "same drive, and that their clocks differ by less than 1 s"
@@ -247,7 +247,7 @@ def positions_follow(starting_point: StartingPoint) -> None:
 def turns_the_right_way(
     source: str, sides: Floats | None, starting_point: StartingPoint | None
 ) -> None:
-    """Raise `RefusedError` if wheels and sensors show turns in opposite directions.
+    """Raise `NoCalibrationError` if wheels and sensors show turns in opposite directions.
 
     The text of the error names the sign that is wrong.
 
@@ -266,7 +266,7 @@ def turns_the_right_way(
         by_heading = _wrong_sign(sides)
     for side in ("left", "right"):
         if side in (by_heading, by_places):
-            raise RefusedError(
+            raise NoCalibrationError(
                 f"the {side} wheels turn backwards when the robot goes ahead: their speeds have "
                 "the wrong sign; the speeds of both sides must be positive when the robot drives "
                 "ahead"
@@ -274,7 +274,7 @@ def turns_the_right_way(
     if sides is not None and starting_point is not None and by_heading != by_places:
         other = "x and y are swapped, or y is positive to the right"
         sign = f"{source} has the wrong sign (it must be positive to the left)"
-        raise RefusedError(
+        raise NoCalibrationError(
             f"wheels and positions agree on the direction of turns, but {source} does not: {sign}"
             if by_heading
             else f"wheels and {source} agree on the direction of turns, but the positions do not: "
@@ -290,7 +290,7 @@ def turns_the_right_way(
             if sides is None
             else ", or the sensor is positive to the right (it must be positive to the left)"
         )
-        raise RefusedError(
+        raise NoCalibrationError(
             f"{sensor} and the wheels show turns in opposite directions: the columns of left and "
             "right are swapped, or the wheel speeds of both sides are negative when the robot "
             f"drives ahead{or_sensor}"
@@ -305,14 +305,14 @@ def _wrong_sign(sides: Floats) -> str:
 
 
 def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
-    """Raise `RefusedError` if the heading sensor shows far smaller turns than the wheels.
+    """Raise `NoCalibrationError` if the heading sensor shows far smaller turns than the wheels.
 
     `source` is the name of the sensor. `MIN_TURN_RATIO` is the limit for the ratio of the turns.
     """
     angle = float(np.abs(rows.turned).sum())
     by_wheels = float(np.abs(heading.by_sides(rows, base, np.ones(2))).sum())
     if angle < MIN_TURN_RATIO * by_wheels:
-        raise RefusedError(
+        raise NoCalibrationError(
             f"{source} shows turns of {np.degrees(angle):.0f} deg in total, but the wheels would "
             f"turn the robot by up to {np.degrees(by_wheels):.0f} deg: is {source} the rate about "
             "the upright axis? If the IMU lies on its side, fill the column with the rate about "
@@ -322,14 +322,14 @@ def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
 
 
 def turn_rates(source: str, rows: Rows) -> None:
-    """Raise `RefusedError` if the heading sensor seems to report its turns in degrees.
+    """Raise `NoCalibrationError` if the heading sensor seems to report its turns in degrees.
 
     The turns are then too fast for a robot. This check does not use the wheel speeds, because they
     may be in degrees as well.
     """
     rate = float(np.percentile(np.abs(rows.turned) / rows.seconds, 90))
     if rate > MAX_TURN_RATE:
-        raise RefusedError(
+        raise NoCalibrationError(
             f"{source} seems to be in degrees (multiply by pi / 180), because as radians the robot "
             f"would turn at {rate:.0f} rad/s; also check that the wheel speeds are in rad/s, not "
             "deg/s, rpm or mm/s"
@@ -337,7 +337,7 @@ def turn_rates(source: str, rows: Rows) -> None:
 
 
 def turn_units(source: str, turn: float, turn_without_multipliers: float, base: Base) -> None:
-    """Raise `RefusedError` if the turns of sensor and wheels differ so much that a unit is wrong.
+    """Raise `NoCalibrationError` if the turns of sensor and wheels show that a unit is wrong.
 
     Args:
         source: the name of the heading sensor, or "" if positions show the turns.
@@ -355,7 +355,7 @@ def turn_units(source: str, turn: float, turn_without_multipliers: float, base: 
         if turn > 1
         else "the wheel speeds are in deg/s, rpm or counts, or are angles (they must be in rad/s)"
     )
-    raise RefusedError(
+    raise NoCalibrationError(
         f"the robot turns {turn:.3g} times as far as its wheels report: {may}, or "
         f"drive.wheel_radius = {base.radius:g} and drive.wheel_separation = {base.separation:g} "
         "belong to another robot (give the right file with --config)"
@@ -363,7 +363,7 @@ def turn_units(source: str, turn: float, turn_without_multipliers: float, base: 
 
 
 def distance_units(size: float, base: Base) -> None:
-    """Raise `RefusedError` if the measured size of the wheels shows that a unit must be wrong.
+    """Raise `NoCalibrationError` if the measured size of the wheels shows that a unit is wrong.
 
     `size` is the ratio of the measured to the configured wheel radius.
     """
@@ -377,7 +377,7 @@ def distance_units(size: float, base: Base) -> None:
         if size < WRONG_POSITION_UNIT_RATIO
         else "the wheel speeds are in deg/s, rpm or counts, or are angles (they must be in rad/s)"
     )
-    raise RefusedError(
+    raise NoCalibrationError(
         f"the robot drives {size:.3g} times as far as its wheels report: {may}, or "
         f"drive.wheel_radius = {base.radius:g} belongs to another robot (give the right file "
         "with --config)"
@@ -385,11 +385,11 @@ def distance_units(size: float, base: Base) -> None:
 
 
 def in_range(values: Floats) -> None:
-    """Raise `RefusedError` if the configuration does not accept the multipliers `values`."""
+    """Raise `NoCalibrationError` if the configuration does not accept the multipliers `values`."""
     if np.all((values >= LEAST_FACTOR) & (values <= MOST_FACTOR)):
         return
     text = ", ".join(f"{value:.3g}" for value in values)
-    raise RefusedError(
+    raise NoCalibrationError(
         f"the multipliers are {text} (wheel separation, left radius, right radius), but must be "
         f"from {LEAST_FACTOR:g} to {MOST_FACTOR:g}: first measure wheel radius and wheel "
         "separation by tape, and write drive.wheel_radius and drive.wheel_separation into the "

@@ -80,7 +80,7 @@ class WheelSteps(Struct, frozen=True):
     """
 
 
-class Path(Struct, frozen=True):
+class WheelPath(Struct, frozen=True):
     """The path of the robot in a run, computed from the wheels.
 
     It is interpolated linearly between the times `t`.
@@ -174,7 +174,7 @@ def wheel_steps(run: Run, fine_s: float = STEP_S) -> WheelSteps:
     return WheelSteps(t, np.diff(left), np.diff(right), np.abs(apart) * apart * steps)
 
 
-def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
+def path(steps: WheelSteps, base: Base, parameters: Floats) -> WheelPath:
     """Return the path of the robot from the origin with heading 0, computed from the wheels.
 
     Each step is an exact arc.
@@ -206,7 +206,7 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
         heading_derivatives[index] = cumulative(of_step)
         middle = heading_derivatives[index][:-1] + of_step / 2
         derivatives[index] = _sums(ahead * (rolls.get(index, 0.0) + 1j * distance * middle))
-    return Path(steps.t, _sums(ahead * distance), heading, derivatives, heading_derivatives)
+    return WheelPath(steps.t, _sums(ahead * distance), heading, derivatives, heading_derivatives)
 
 
 def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
@@ -234,7 +234,7 @@ def _sums(steps: Complexes) -> Complexes:
     return np.concatenate((np.zeros(1, dtype=np.complex128), np.cumsum(steps)))
 
 
-Paths = Sequence[Path] | Mapping[int, Path]
+Paths = Sequence[WheelPath] | Mapping[int, WheelPath]
 """Path of the robot according to the wheels in each run, by the index of the run."""
 
 
@@ -531,7 +531,7 @@ def _refined(
     def source(parameters: Floats) -> Evidence:
         return evidence(segments, paths(parameters), parameters, len(segments))
 
-    def paths(parameters: Floats) -> dict[int, Path]:
+    def paths(parameters: Floats) -> dict[int, WheelPath]:
         return {run: path(of_run, base, parameters) for run, of_run in steps.items()}
 
     def unexplained(parameters: Floats) -> float:

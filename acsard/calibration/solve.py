@@ -23,7 +23,7 @@ from acsard.calibration.improvement import (
     no_better,
     positions_of,
 )
-from acsard.calibration.log_table import Floats, RefusedError, attach_notes
+from acsard.calibration.log_table import Floats, NoCalibrationError, attach_notes
 from acsard.calibration.multipliers import (
     LEFT_RADIUS,
     RIGHT_RADIUS,
@@ -37,7 +37,7 @@ from acsard.calibration.multipliers import (
     multipliers,
     scaled,
 )  # fmt: skip
-from acsard.calibration.odometry_noise import Noise, Reference, noise, settings
+from acsard.calibration.odometry_noise import LogNoise, Reference, noise, settings
 from acsard.calibration.plausibility import DRIVE_ADVICE, MAX_LOG_STDS, RATIO, TRACK
 from acsard.calibration.positions import Segment, WheelSteps, search
 from acsard.calibration.runs import Block, Log, Run, blocks
@@ -70,7 +70,7 @@ If the difference is smaller, the sensor's data were probably computed from the 
 """
 
 
-class Drives(Struct, frozen=True):
+class DriveTotals(Struct, frozen=True):
     """Totals of the drives in a log."""
 
     runs: int
@@ -88,7 +88,7 @@ class Drives(Struct, frozen=True):
     def of(
         cls, runs: Sequence[Run], rows: Rows, by_wheels: Floats, base: Base, result: Multipliers,
         rate: Rates,
-    ) -> Drives:  # fmt: skip
+    ) -> DriveTotals:  # fmt: skip
         """Return the totals of the runs.
 
         Args:
@@ -119,7 +119,7 @@ class Calibration(Struct, frozen=True):
 
     Examples are "yaw_rate and positions" and "a tape".
     """
-    drives: Drives
+    drives: DriveTotals
     configured: Multipliers
     multipliers: Multipliers
     """New multipliers of the wheel separation and of the two wheel radii."""
@@ -145,7 +145,7 @@ class Calibration(Struct, frozen=True):
     """New values for settings of `[odometry]`, by the name of the setting.
 
     These settings state the uncertainty of the wheel radii and of the track. The noise settings
-    are included only if `Noise.better` is true.
+    are included only if `LogNoise.better` is true.
     """
     stays_configured: tuple[str, ...] = ()
     """Names of the quantities that stay as configured.
@@ -158,7 +158,7 @@ class Calibration(Struct, frozen=True):
     The dictionary is empty if the configured settings cause no false wheel fault in this log, or
     if no better settings were found.
     """
-    noise: Noise | None = None
+    noise: LogNoise | None = None
     """Noise of the odometry that this log shows; None if the log does not show it."""
 
 
@@ -220,7 +220,7 @@ def prepared(
 ) -> Prepared:
     """Divide the runs into blocks, check the log, and return the inputs of the fit.
 
-    The blocks are about `length` s long. Raises `RefusedError` if a check fails.
+    The blocks are about `length` s long. Raises `NoCalibrationError` if a check fails.
     """
     parts = blocks(driven, length)
     plausibility.drives_enough(parts)
@@ -229,7 +229,7 @@ def prepared(
     if headings is not None and headings.bias_unknown and len(every.turned):
         rows = heading.without_constant_rate(every)
     if headings is not None and not len(rows.turned):
-        raise RefusedError(
+        raise NoCalibrationError(
             f"{headings.source} has no samples while the wheels turn: record it at the same time "
             "as the wheels, with times from the same clock"
         )
@@ -254,7 +254,7 @@ def prepared(
         )
         start = by_positions.parameters.copy()
     if not sources:
-        raise RefusedError(
+        raise NoCalibrationError(
             "there are no positions or turn rates while the robot drives: record one of them at "
             "the same time as the wheels, with times from the same clock"
         )
@@ -311,7 +311,7 @@ def _calibrated(
     base = Base.of(drive)
     headings = heading.of_gyro(log.runs) or heading.of_yaw(log.runs, base.radius_per_separation)
     candidates: list[Candidate] = []
-    refusals: list[RefusedError] = []
+    refusals: list[NoCalibrationError] = []
     places = any(len(run.place) for run in log.runs)
     for length in BLOCK_LENGTHS_S[headings is None and places : None if places else 1]:
         try:
@@ -319,7 +319,7 @@ def _calibrated(
             if candidates and len(made.parts) < MIN_BLOCKS:
                 break
             candidates += _candidates(made)
-        except RefusedError as error:
+        except NoCalibrationError as error:
             refusals.append(error)  # coarse positions may still follow the wheels in longer blocks
     if not candidates:
         raise refusals[0]
@@ -334,7 +334,7 @@ def _calibrated(
     log_noise = _noise(best, known, odometry, present=bool(worse))
     # With a tape, the calibration gives the size of the wheels even if the log improves nothing.
     if worse and tape is None and (log_noise is None or not log_noise.better):
-        raise RefusedError(worse)
+        raise NoCalibrationError(worse)
     return _calibration(log, tape, best, odometry, log_noise)
 
 
@@ -350,7 +350,7 @@ def _used_deviations(best: Candidate, odometry: OdometryConfig) -> Deviations:
 
 def _noise(
     best: Candidate, known: Deviations, odometry: OdometryConfig, *, present: bool
-) -> Noise | None:
+) -> LogNoise | None:
     """Return the odometry noise that the log shows.
 
     The odometry is computed with the configured geometry if `present` is true, and otherwise with
@@ -374,7 +374,7 @@ def _candidates(made: Prepared) -> list[Candidate]:
     """Return the fit of both track and radius ratio if the log determines both accurately enough.
 
     Otherwise return one or two other fits: one that keeps the ratio as configured, and one that
-    keeps the track as configured. Raises `RefusedError` if no fit is accurate enough.
+    keeps the track as configured. Raises `NoCalibrationError` if no fit is accurate enough.
     """
     candidates: list[Candidate] = []
     deviations: dict[str, float] = {}
@@ -406,7 +406,7 @@ def _candidates(made: Prepared) -> list[Candidate]:
             # The fit of both quantities comes first, so its deviations are reported.
             refused = too_wide | refused
     if not candidates:
-        raise RefusedError(
+        raise NoCalibrationError(
             plausibility.inaccuracy(refused, MAX_LOG_STDS)
             if refused
             else f"the search for the parameters does not converge: {DRIVE_ADVICE}"
@@ -445,7 +445,11 @@ def _candidate(made: Prepared, fitted: Fit) -> Candidate:
 
 
 def _calibration(
-    log: Log, tape: Tape | None, best: Candidate, odometry: OdometryConfig, log_noise: Noise | None
+    log: Log,
+    tape: Tape | None,
+    best: Candidate,
+    odometry: OdometryConfig,
+    log_noise: LogNoise | None,
 ) -> Calibration:
     made, fitted, rows, rate = best.made, best.fitted, best.rows, best.rate
     headings, base = made.headings, made.base
@@ -467,7 +471,7 @@ def _calibration(
     known = _used_deviations(best, odometry)
     if tape is not None:
         known = replace(known, scale=result.relative_deviations().scale)
-    totals = Drives.of(log.runs, rows, by_wheels, base, result, rate)
+    totals = DriveTotals.of(log.runs, rows, by_wheels, base, result, rate)
     notes += [_stays(name, deviation) for name, deviation in best.stays_configured.items()]
     notes += _of_noise(log_noise)
     notes += _cuts(log.runs)
@@ -494,7 +498,7 @@ def _stays(name: str, deviation: float) -> str:
     return f"{name} stays as configured, because this log does not improve it{known}"
 
 
-def _of_noise(log_noise: Noise | None) -> Iterator[str]:
+def _of_noise(log_noise: LogNoise | None) -> Iterator[str]:
     if log_noise is None or not log_noise.better:
         yield (
             "the odometry's variances per metre and per radian stay as configured, because the "

@@ -16,8 +16,8 @@ from typing import Protocol
 
 from acsard.checkup import motion, outcomes
 from acsard.checkup.findings import StoppedError, WireLostError, motor_name, motor_names
-from acsard.checkup.lateness import Lateness
-from acsard.checkup.motion import ZERO, Reply
+from acsard.checkup.lateness import HostDelays
+from acsard.checkup.motion import ZERO, BoardReply
 from acsard.checkup.restarts import RestartedError, Restarts
 from acsard.core.config.settings import MAX_REPLY_PERIOD_S, McuConfig, WheelMap
 from acsard.core.config.wire_time import line_bytes, wire_ns
@@ -141,7 +141,7 @@ class Board:
         self.lost = 0.0
         """Fraction of lines that are lost or damaged, to the board and from the board together."""
         # Received lines
-        self.replies: list[Reply] = []
+        self.replies: list[BoardReply] = []
         self.unrecognized_lines: list[bytes] = []
         """Received lines that are neither valid replies nor status lines."""
         self.inputs: dict[int, bool] = {}
@@ -154,7 +154,7 @@ class Board:
         """Statistics of all bytes and lines received since the last call of `open`."""
         self.sent_lines = 0
         self.sent_s = 0.0
-        self.lateness = Lateness()
+        self.lateness = HostDelays()
         """The delays by which this computer ran the check too late. If the board is simulated on
         this computer, the delays of the simulator are included."""
         self.runaway_seen = False
@@ -308,7 +308,7 @@ class Board:
 
     def answers(
         self, lines: int, wait_s: float, comma: bool | None = None
-    ) -> list[tuple[float, Reply]]:
+    ) -> list[tuple[float, BoardReply]]:
         """Send lines of zero speeds, and return the first reply to each line with its delay.
 
         Each entry of the result is a pair: the time from the line to its reply, s, and the reply. A
@@ -321,14 +321,14 @@ class Board:
         """
         # Receive the replies to earlier lines now, so that they are not taken for replies to these.
         self.listen(max(motion.SHORT_MEASUREMENT_S / 4, wait_s))
-        pairs: list[tuple[float, Reply]] = []
+        pairs: list[tuple[float, BoardReply]] = []
         for _ in range(lines):
             self.send_zero(max(wait_s, 1.5 * self.period_s), comma)
             first = motion.since(self.replies, self.sent_s)[:1]
             pairs += [(reply.at_s - self.sent_s, reply) for reply in first]
         return pairs
 
-    def drive(self, motors: Motors, seconds: float, period_s: float = 0.0) -> list[Reply]:
+    def drive(self, motors: Motors, seconds: float, period_s: float = 0.0) -> list[BoardReply]:
         """Send lines with the speeds `motors`, rad/s, for `seconds` s, and return the replies.
 
         `period_s` is the time from one line to the next, s; 0 means `self.period_s`. Raises
@@ -338,7 +338,7 @@ class Board:
         """
         period_s = period_s or self.period_s
         end_s = self.now_s + seconds
-        replies: list[Reply] = []
+        replies: list[BoardReply] = []
         while (began_s := self.now_s) < end_s - MIN_WAIT_S:
             self.send(motors)
             answers = self.listen(min(period_s, end_s - began_s))
@@ -373,7 +373,7 @@ class Board:
 
     # Receiving
 
-    def listen(self, seconds: float) -> list[Reply]:
+    def listen(self, seconds: float) -> list[BoardReply]:
         """Receive data for `seconds` s, and return the replies that arrived in this time.
 
         Raises `RestartedError` if the board restarts. Raises `StoppedError` if a motor runs away
@@ -384,7 +384,7 @@ class Board:
             # Discard the delay of a simulated board before this call, because nothing was measured
             # then.
             self.wire.late_ns()
-        replies: list[Reply] = []
+        replies: list[BoardReply] = []
         self.abort_check()
         while True:
             until_ns = min(end_ns, self.wire.now_ns() + BEAT_NS)
@@ -397,7 +397,7 @@ class Board:
             if now_ns >= end_ns:
                 return replies
 
-    def _receive(self, until_ns: int) -> list[Reply]:
+    def _receive(self, until_ns: int) -> list[BoardReply]:
         new_replies = []
         for at_ns, data in self.wire.listen(until_ns):
             self.heard.take(data)
@@ -431,13 +431,13 @@ class Board:
             estop = {0: self.inputs[0]} if 0 in self.inputs else {}
             self.inputs = estop | dict(enumerate(status.bumpers, 1))
 
-    def _reply(self, line: bytes, at_s: float) -> Reply | None:
+    def _reply(self, line: bytes, at_s: float) -> BoardReply | None:
         try:
             plain, reading = line, None
             if self.sealed or b"#" in line:
                 checked = unseal(line)
                 plain, reading = checked.plain, checked.reading
-            return Reply(at_s, self._codecs[False].decode(plain).as_tuple(), line, reading)
+            return BoardReply(at_s, self._codecs[False].decode(plain).as_tuple(), line, reading)
         except FrameError:
             self.unrecognized_lines.append(line)
             return None

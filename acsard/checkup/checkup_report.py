@@ -89,7 +89,7 @@ def applied(updates: Changes, config: Config) -> Config | None:
         return None
 
 
-class Report(Struct, frozen=True):
+class CheckupReport(Struct, frozen=True):
     """The result of a check.
 
     `passed` says whether the check has passed. `changes` are the suggested configuration values,
@@ -116,7 +116,7 @@ def report(
     written: str,
     error: str,
     withheld: str = "",
-) -> Report:
+) -> CheckupReport:
     """Return the report of a check.
 
     The check has passed if the board answered, if every step was run and judged, and if no step
@@ -127,12 +127,12 @@ def report(
         finding.verdict == "FAIL" or finding.name == SKIPPED_STEPS for finding in findings
     )
     toml = "\n".join(excerpt(changes))
-    return Report(
+    return CheckupReport(
         port, passed, findings, changes, toml, written or None, error or None, withheld or None
     )
 
 
-def summary(result: Report, where: str) -> str:
+def summary(result: CheckupReport, where: str) -> str:
     """Return the text that the check prints last, for the report `result`.
 
     It contains the number of findings with each verdict, and the suggested changes. `where` is the

@@ -16,7 +16,7 @@ from typing import get_args
 from acsard.checkup import lateness, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError, motor_name
-from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, WATCHDOG_SILENCE_S, ZERO, Reply
+from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, WATCHDOG_SILENCE_S, ZERO, BoardReply
 from acsard.core.config.settings import Baud
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.core.link.checked_line import seal
@@ -99,7 +99,7 @@ def form(board: Board) -> Finding | None:
     return _comma_wrong(board, "refused")
 
 
-def _answers(board: Board, comma: bool) -> list[Reply]:
+def _answers(board: Board, comma: bool) -> list[BoardReply]:
     return [reply for _, reply in board.answers(5, SHORT_MEASUREMENT_S / 6, comma)]
 
 

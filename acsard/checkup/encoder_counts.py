@@ -9,7 +9,7 @@ from statistics import fmean, median
 from acsard.checkup import line_loss, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, motor_names
-from acsard.checkup.motion import SHORT_MEASUREMENT_S, Reply, steps
+from acsard.checkup.motion import SHORT_MEASUREMENT_S, BoardReply, steps
 from acsard.core.link.codec import LETTERS
 
 MAX_COUNT_DIFFERENCE = 0.02
@@ -44,7 +44,7 @@ MAX_COUNTS = 100_000
 """Largest value that `mcu.encoder_counts` accepts."""
 
 
-def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
+def per_turn(replies: Sequence[BoardReply], motors: Sequence[int]) -> float | None:
     """Return the mean number of encoder counts per wheel turn of `motors` (numbers 0 to 3).
 
     The number of turns is computed from the reported speeds. Return None if the motors turned too
@@ -61,7 +61,7 @@ def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
     return counts / angle * math.tau if angle >= 2.0 else None
 
 
-def coarse(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
+def coarse(replies: Sequence[BoardReply], motors: Sequence[int]) -> float | None:
     """Estimate the counts per wheel turn of coarse encoders from the jumps of the reported speeds.
 
     A coarse encoder has few counts per turn, so its reported speed jumps at each count. This

@@ -16,7 +16,7 @@ from acsard.checkup.findings import Finding
 from acsard.checkup.outcomes import TimingFinding
 
 MIN_DELAY_S = 0.005
-"""Shortest delay of this computer that `Lateness` records, s. Shorter delays are normal."""
+"""Shortest delay of this computer that `HostDelays` records, s. Shorter delays are normal."""
 
 MAX_LATENESS_S = motion.LINE_PERIOD_S
 """Shortest delay of this computer that can make a finding doubtful, s. It is the time between two
@@ -32,7 +32,7 @@ During such a delay the board's watchdog may have stopped the motors.
 NOT_JUDGED = "late: not judged"
 
 
-class Lateness:
+class HostDelays:
     """Record of the delays of this computer: the times by which it ran the check too late."""
 
     def __init__(self) -> None:

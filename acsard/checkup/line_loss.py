@@ -17,7 +17,7 @@ from msgspec import Struct
 from acsard.checkup import lateness, motion, outcomes
 from acsard.checkup.board import Board, Operator
 from acsard.checkup.findings import Finding, StoppedError
-from acsard.checkup.motion import ZERO, Reply
+from acsard.checkup.motion import ZERO, BoardReply
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.core.formatting import printable_bytes
 from acsard.core.link.link_diagnosis import MAX_SHOWN_BYTES
@@ -122,11 +122,11 @@ def _counted(board: Board, began_s: float, lines: int, others: int) -> Count:
     return Count(len(replies) + lost, lost, damaged)
 
 
-def _gaps(replies: Sequence[Reply]) -> list[float]:
+def _gaps(replies: Sequence[BoardReply]) -> list[float]:
     return [after.at_s - before.at_s for before, after in pairwise(replies)]
 
 
-def _left_out(replies: Sequence[Reply]) -> int:
+def _left_out(replies: Sequence[BoardReply]) -> int:
     """Return how many replies are missing, for a board that sends them at regular intervals."""
     # Compute the number from the time between the first and the last reply. A single long gap does
     # not show a lost reply, because a reply that is received late makes one gap longer and the next
@@ -137,7 +137,7 @@ def _left_out(replies: Sequence[Reply]) -> int:
     return max(0, round(sum(gaps) / fmean(alike)) - len(gaps)) if alike else 0
 
 
-def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
+def _silence_s(board: Board, replies: Sequence[BoardReply]) -> float:
     """Return the longest gap between two replies, s, or 0 if the daemon tolerates such a gap."""
     longest = max(_gaps(replies), default=0.0)
     quiet_s = max(0.1, 4 / board.rate_hz, 3 * board.mcu.reply_period)

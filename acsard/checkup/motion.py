@@ -63,7 +63,7 @@ the inverse of this limit.
 """
 
 
-class Reply(Struct, frozen=True):
+class BoardReply(Struct, frozen=True):
     """A valid reply of the board.
 
     `at_s` is the monotonic time at which the whole reply had arrived, s. `motors` are the reported
@@ -77,7 +77,7 @@ class Reply(Struct, frozen=True):
     reading: Reading | None = None
 
 
-class Step(Struct, frozen=True):
+class ReplyInterval(Struct, frozen=True):
     """The interval from one reply to the next.
 
     `seconds` is its duration on this computer's clock, s. `mcu_s` is its duration on the board's
@@ -103,7 +103,9 @@ def moving(speeds: Motors, least: float = MOVING_SPEED) -> list[int]:
     return [motor for motor in range(4) if abs(speeds[motor]) >= least]
 
 
-def since(replies: Sequence[Reply], since_s: float, until_s: float = math.inf) -> Sequence[Reply]:
+def since(
+    replies: Sequence[BoardReply], since_s: float, until_s: float = math.inf
+) -> Sequence[BoardReply]:
     """Return the replies that arrived between two monotonic times, `since_s` and `until_s`, s.
 
     `replies` must be in the order of their arrival.
@@ -112,41 +114,41 @@ def since(replies: Sequence[Reply], since_s: float, until_s: float = math.inf) -
     return replies[first : bisect_right(replies, until_s, key=lambda reply: reply.at_s)]
 
 
-def mean(replies: Sequence[Reply]) -> Motors:
+def mean(replies: Sequence[BoardReply]) -> Motors:
     """Return the mean speed of each encoder in these replies, rad/s, or zeros without replies."""
     return each(lambda motor: fmean([reply.motors[motor] for reply in replies] or [0.0]))
 
 
-def steps(replies: Sequence[Reply]) -> Iterator[Step]:
-    """Yield one `Step` for each interval from a reply to the next reply."""
+def steps(replies: Sequence[BoardReply]) -> Iterator[ReplyInterval]:
+    """Yield one `ReplyInterval` for each interval from a reply to the next reply."""
     for before, after in pairwise(replies):
         seconds, previous, other = after.at_s - before.at_s, before.reading, after.reading
         if previous is None or other is None:
-            yield Step(seconds, after.motors)
+            yield ReplyInterval(seconds, after.motors)
             continue
         pairs = zip(previous.counts, other.counts, strict=True)
         deltas = [(b - a + FIELD_VALUES // 2) % FIELD_VALUES - FIELD_VALUES // 2 for a, b in pairs]
         mcu_s = (other.mcu_ms - previous.mcu_ms) % FIELD_VALUES / 1000
-        yield Step(seconds, after.motors, mcu_s, each(deltas.__getitem__))
+        yield ReplyInterval(seconds, after.motors, mcu_s, each(deltas.__getitem__))
 
 
-def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> Motors:
+def covered(replies: Sequence[BoardReply], since_s: float, per_turn: float = 0.0) -> Motors:
     """Return the angle by which each encoder has turned since the monotonic time `since_s`, rad.
 
     The angle is computed from the reported speeds. If `per_turn`, the number of encoder counts per
     turn, is not 0, the angle is computed from the counts wherever the replies contain them.
     """
 
-    def angle(step: Step, motor: int) -> float:
+    def angle(step: ReplyInterval, motor: int) -> float:
         if per_turn and step.counts:
             return step.counts[motor] / per_turn * math.tau
         return step.speeds[motor] * step.seconds
 
-    course = list(steps([Reply(since_s, ZERO, b""), *since(replies, since_s)]))
+    course = list(steps([BoardReply(since_s, ZERO, b""), *since(replies, since_s)]))
     return each(lambda motor: sum(angle(step, motor) for step in course))
 
 
-def turning(replies: Sequence[Reply], now_s: float) -> list[int]:
+def turning(replies: Sequence[BoardReply], now_s: float) -> list[int]:
     """Return the numbers of the motors that may still turn at the monotonic time `now_s`, s.
 
     A coarse encoder reports a speed of 0 in most replies, even while its motor turns. After a reply
@@ -155,7 +157,7 @@ def turning(replies: Sequence[Reply], now_s: float) -> list[int]:
     # The motor counts as turning for the time in which it would turn by the same angle at the speed
     # `STANDING_SPEED`.
     motors: set[int] = set()
-    for reply, earlier in pairwise(reversed([Reply(-math.inf, ZERO, b""), *replies])):
+    for reply, earlier in pairwise(reversed([BoardReply(-math.inf, ZERO, b""), *replies])):
         ago_s = now_s - reply.at_s
         if ago_s > MAX_REPLY_AGE_S:
             break
@@ -168,7 +170,7 @@ def turning(replies: Sequence[Reply], now_s: float) -> list[int]:
     return sorted(motors)
 
 
-def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
+def trend(replies: Sequence[BoardReply], now_s: float, gap_s: float) -> Motors:
     """Return for each motor the ratio of its present mean speed to its mean speed shortly before.
 
     A ratio below 1 means that the motor slows down. The ratio is 1 for a motor that stands still.
@@ -183,7 +185,7 @@ def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
     return each(lambda motor: abs(now[motor] / before[motor]) if turn[motor] else 1.0)
 
 
-def grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
+def grain_s(steady: Sequence[BoardReply], motors: Sequence[int]) -> float:
     """Return the resolution of the reported speeds, expressed as a time, s.
 
     The reported speeds jump even at a steady speed, because the firmware computes them from whole
@@ -199,7 +201,7 @@ def grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
     return max(course[-2] - course[1] for course in speeds) * between_s / SPEED
 
 
-def fastest(replies: Sequence[Reply], above: float) -> tuple[int, float] | None:
+def fastest(replies: Sequence[BoardReply], above: float) -> tuple[int, float] | None:
     """Return a motor that several replies show to be faster than `above` rad/s, or None.
 
     The result is a pair: the number of the motor, and its mean speed in the last replies, rad/s. A

@@ -15,7 +15,7 @@ from msgspec import Struct
 
 from acsard.checkup import outcomes
 from acsard.checkup.findings import Finding, motor_names
-from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, ZERO, Reply
+from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, ZERO, BoardReply
 from acsard.core.config.settings import McuConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.session import IDENTITY
@@ -116,7 +116,7 @@ class Restarts:
         if any(motors):
             self._turned, self._turned_s = motors, at_s
 
-    def check_line(self, line: bytes, at_s: float, reply: Reply | None) -> Restart | None:
+    def check_line(self, line: bytes, at_s: float, reply: BoardReply | None) -> Restart | None:
         """Process a received line. Return a `Restart` if it shows that the board restarted.
 
         Otherwise return None. `at_s` is the time at which `line` arrived, s. `reply` is the decoded
@@ -145,7 +145,7 @@ class Restarts:
         boots = self._unanswered >= RESTART_UNANSWERED_LINES and _WORD.search(line)
         return "the board was silent, then sent a text instead of replies" if boots else ""
 
-    def _clock_sign(self, reply: Reply) -> str:
+    def _clock_sign(self, reply: BoardReply) -> str:
         before, reading = self._clock, reply.reading
         if reading is None:
             return ""

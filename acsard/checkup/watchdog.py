@@ -20,7 +20,7 @@ from msgspec import Struct
 from acsard.checkup import damage, encoder_counts, motion, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError
-from acsard.checkup.motion import Reply
+from acsard.checkup.motion import BoardReply
 from acsard.checkup.wheels import run_up
 from acsard.core.config.wire_time import FIELD_VALUES
 from acsard.core.link.codec import LETTERS, Motors
@@ -226,5 +226,5 @@ def _per_turn(board: Board, motors: Sequence[int]) -> float:
     return 0.0 if wraps or per_turn < 1 else per_turn
 
 
-def _share(reply: Reply, motors: Sequence[int]) -> float:
+def _share(reply: BoardReply, motors: Sequence[int]) -> float:
     return max(abs(reply.motors[motor]) for motor in motors) / motion.SPEED

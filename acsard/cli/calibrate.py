@@ -40,11 +40,11 @@ from pathlib import Path
 
 import msgspec
 
-from acsard.calibration.calibration_report import Refusal, keys, parts, report
+from acsard.calibration.calibration_report import CalibrationRefusal, keys, parts, report
 from acsard.calibration.guided.drive_plan import NEEDS, GuideError, setup
 from acsard.calibration.guided.robot_on_bus import SOURCE, RobotOnBus
 from acsard.calibration.guided.runner import guide
-from acsard.calibration.log_table import LogError, RefusedError
+from acsard.calibration.log_table import LogError, NoCalibrationError
 from acsard.calibration.multipliers import Tape
 from acsard.calibration.recorded_drive import calibrated
 from acsard.calibration.ros_bag_log import AXES, Choice
@@ -130,10 +130,13 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
             config = local_config
         else:
             calibration, config = _guided(args, local_config, where, lines)
-    except (LogError, RefusedError, GuideError, NobodyError) as error:
+    except (LogError, NoCalibrationError, GuideError, NobodyError) as error:
         notes = tuple(getattr(error, "__notes__", ()))
         if args.json:
-            print(msgspec.json.encode(Refusal(source, str(error), notes)).decode(), flush=True)
+            print(
+                msgspec.json.encode(CalibrationRefusal(source, str(error), notes)).decode(),
+                flush=True,
+            )
         notes_text = "".join(f"\nnote: {note}" for note in notes)
         raise MendableError(f"{source}: {error}{notes_text}") from None
     written, trouble = "", None

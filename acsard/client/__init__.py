@@ -42,7 +42,7 @@ from acsard.client.asynchronous import AsyncClient, connect_async
 from acsard.client.synchronous import Client, connect
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.values import AcsardError, Pose
-from acsard.daemon.bus.identity import Identity
+from acsard.daemon.bus.identity import ClientIdentity
 from acsard.daemon.bus.subscription import Subscription
 from acsard.host.errors import (
     CertificateError,
@@ -59,8 +59,8 @@ __all__ = (
     "AsyncClient",
     "CertificateError",
     "Client",
+    "ClientIdentity",
     "DecodeError",
-    "Identity",
     "NoAnswerError",
     "NotDrivenError",
     "NotPermittedError",

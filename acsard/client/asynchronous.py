@@ -18,7 +18,7 @@ from acsard.client.synchronous import REPLY_TIMEOUT_S, Client, close, decoder
 from acsard.core.messages import schema
 from acsard.core.values import AcsardError, Plain, Pose
 from acsard.daemon.bus.address import address_by_environment
-from acsard.daemon.bus.identity import Identity
+from acsard.daemon.bus.identity import ClientIdentity
 from acsard.daemon.bus.subscription import encoded
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import NoAnswerError
@@ -125,7 +125,7 @@ class AsyncClient:
         """Return the last message on a key, decoded to its type, as `Client.get` does."""
         return await _in_thread(lambda: self._client.get(name))
 
-    async def whoami(self) -> Identity:
+    async def whoami(self) -> ClientIdentity:
         """Return this client's role and name at the robot, as `Client.whoami` does."""
         return await _in_thread(self._client.whoami)
 

@@ -247,7 +247,7 @@ class Commander:
         return self._asked_ns is not None and now_ns - self._asked_ns <= DRIVING_TIMEOUT_NS
 
 
-class Sender:
+class CommandSigner:
     """Signs and numbers the commands of one sender."""
 
     def __init__(self, sender_id: str) -> None:

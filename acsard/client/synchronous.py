@@ -19,7 +19,7 @@ from acsard.client.commander import (
     MAX_SOURCE_TIMEOUT_S,
     MIN_SPACING_S,
     REPEAT_ZERO_S,
-    Sender,
+    CommandSigner,
     no_command,
 )
 from acsard.client.driving import UnheardError, drive
@@ -48,7 +48,7 @@ from acsard.core.messages.permissions import COMMAND_ROLE, has
 from acsard.core.messages.signature import Signature, public_name
 from acsard.core.values import Plain, Pose
 from acsard.daemon.bus.address import Address, address_by_environment
-from acsard.daemon.bus.identity import Identity, identity
+from acsard.daemon.bus.identity import ClientIdentity, identity
 from acsard.daemon.bus.robot_discovery import NO_BATTERY, explain_silence, presence
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
 from acsard.daemon.bus.tls import shown_at
@@ -173,7 +173,7 @@ class Client:
 
     def _sign_as(self, name: str) -> None:
         whole = sender_id(name)
-        self._sender = Sender(whole)
+        self._sender = CommandSigner(whole)
         self.sender = public_name(whole, self.certificate)
         """Public name of this client as a sender of commands. While the client drives,
         `state.sender` has this value."""
@@ -335,7 +335,7 @@ class Client:
         """Return the last message on a key, not decoded, as a pair of encoding and payload."""
         return self._query(name)
 
-    def whoami(self) -> Identity:
+    def whoami(self) -> ClientIdentity:
         """Return this client's role and name at the robot. The role is "" if it is unknown."""
         where = self.where
         try:

@@ -55,7 +55,7 @@ from acsard.daemon.late_watch import LateWatch
 from acsard.daemon.latencies import Stopwatch
 from acsard.daemon.pacing import NO_PERIOD, Pace, Period
 from acsard.daemon.settings_file import SettingsFile, keeps
-from acsard.recording.recorded_steps import BlackBox, count_superseded
+from acsard.recording.recorded_steps import StepRecorder, count_superseded
 
 FEEDBACK_TOPICS = ("odom", "tf", "wheel_states")
 """Topics whose messages are made from the feedback lines of the board."""
@@ -100,7 +100,7 @@ class ControlLoop:
         others: list[Event] | None = None,
         beside: Callable[[str], Message | None] | None = None,
         adopted: Callable[[Config], None] | None = None,
-        recorder: BlackBox | None = None,
+        recorder: StepRecorder | None = None,
         latches: Latches = Latches(),  # noqa: B008
         keeper: LatchKeeper | None = None,
         settings_file: SettingsFile | None = None,

@@ -48,7 +48,7 @@ between CLOCK_BOOTTIME and CLOCK_MONOTONIC. These clocks are not read at the sam
 difference varies a little even without a suspend."""
 
 
-class Lateness(Struct, frozen=True, omit_defaults=True):
+class LatenessEvidence(Struct, frozen=True, omit_defaults=True):
     """The lateness of a control period, and the kernel's counters from before and after it."""
 
     late_ns: int
@@ -92,12 +92,12 @@ class Cause(Struct, frozen=True):
     """A possible cause of a lateness, with its rule and with advice how to remove the cause."""
 
     name: str
-    rule: Callable[[Lateness], str]
+    rule: Callable[[LatenessEvidence], str]
     """Function that returns the cause in words, or "" if the counters do not show this cause."""
     advice: str
 
 
-def suspended(late: Lateness) -> str:
+def suspended(late: LatenessEvidence) -> str:
     """Return the cause in words if this computer was suspended, else ""."""
     asleep_ns = late.after.asleep_ns - late.before.asleep_ns
     return (
@@ -107,7 +107,7 @@ def suspended(late: Lateness) -> str:
     )
 
 
-def undervoltage(late: Lateness) -> str:
+def undervoltage(late: LatenessEvidence) -> str:
     """Return the cause in words if a low supply voltage slowed the control loop down, else ""."""
     return low_voltage(late.after.conditions) if late.computed else ""
 
@@ -117,7 +117,7 @@ def low_voltage(now: Conditions) -> str:
     return "the supply voltage is too low, which slows the processor" if now.undervoltage else ""
 
 
-def heat(late: Lateness) -> str:
+def heat(late: LatenessEvidence) -> str:
     """Return the cause in words if a hot processor slowed the control loop down, else "".
 
     Three signs show heat: a `thermal_throttle` count that has risen, a cooling device that slows
@@ -138,7 +138,7 @@ def heat_text(now: Conditions, hotter: bool = False) -> str:
     return "the processor is too hot and runs slower" if now.slowed_by_heat or hotter else ""
 
 
-def governor(late: Lateness) -> str:
+def governor(late: LatenessEvidence) -> str:
     """Return the cause in words if a limited clock frequency slowed the control loop down, else "".
 
     The rule compares the frequency limit (`scaling_max_freq`) with the processor's full frequency
@@ -160,7 +160,7 @@ def clock_text(now: Conditions) -> str:
     )
 
 
-def cgroup_quota(late: Lateness) -> str:
+def cgroup_quota(late: LatenessEvidence) -> str:
     """Return the cause in words if the CPU quota of the daemon's cgroup was used up, else ""."""
     without_ns = late.after.quota_ns - late.before.quota_ns
     if not late.explains(without_ns):
@@ -168,7 +168,7 @@ def cgroup_quota(late: Lateness) -> str:
     return f"the daemon's processor quota was used up for {_seconds(without_ns)}"
 
 
-def stolen(late: Lateness) -> str:
+def stolen(late: LatenessEvidence) -> str:
     """Return the cause in words if the host took the processor away (steal time), else ""."""
     stolen_ns = most_stolen(late.before, late.after)
     if stolen_ns < MIN_STOLEN_NS or not late.explains(stolen_ns):
@@ -186,7 +186,7 @@ def most_stolen(before: Reading, after: Reading) -> int:
     return max((new - old for old, new in pairs), default=0)
 
 
-def memory(late: Lateness) -> str:
+def memory(late: LatenessEvidence) -> str:
     """Return the cause in words if memory of the daemon had to be read from a disk, else ""."""
     pages = late.after.major_faults - late.before.major_faults
     if not pages or not late.slept:
@@ -194,7 +194,7 @@ def memory(late: Lateness) -> str:
     return f"{many(pages, 'page')} of the daemon's memory had to be read from the disk"
 
 
-def disk(late: Lateness) -> str:
+def disk(late: LatenessEvidence) -> str:
     """Return the cause in words if the control loop's thread waited for a disk, else "".
 
     If the function `memory` returns a cause, return "", because waiting for memory also counts as
@@ -212,7 +212,7 @@ def disk(late: Lateness) -> str:
     return "the daemon waited for the disk"
 
 
-def other_program(late: Lateness) -> str:
+def other_program(late: LatenessEvidence) -> str:
     """Return the cause in words if other programs used the daemon's processor time, else "".
 
     If the function `cgroup_quota` or `stolen` returns a cause, return "".
@@ -252,7 +252,7 @@ CAUSES = (
 """All causes, in the order in which an event names them. Rare causes come first."""
 
 
-def causes(late: Lateness) -> tuple[tuple[str, ...], str]:
+def causes(late: LatenessEvidence) -> tuple[tuple[str, ...], str]:
     """Return the names of the causes of a lateness, and a text with these causes and advice.
 
     Both results are empty if the counters show no cause.
@@ -266,7 +266,7 @@ BECAUSE = ", because "
 """Separator between the lateness and its causes in the text of an event."""
 
 
-def event_of(late: Lateness, clause: str, *, immediate: bool) -> Event:
+def event_of(late: LatenessEvidence, clause: str, *, immediate: bool) -> Event:
     """Return the log event that reports a lateness and its causes.
 
     `clause` is the text from `causes`. `immediate` is False if a recent event had the same causes.

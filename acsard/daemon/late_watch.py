@@ -22,7 +22,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.core.values import NS_PER_S, Event
-from acsard.daemon.late_causes import Lateness, causes, event_of
+from acsard.daemon.late_causes import LatenessEvidence, causes, event_of
 from acsard.host import clock
 from acsard.host.kernel_counters import Kernel, Program, Reading, Scheduled, scheduled
 from acsard.host.mailbox import Mailbox
@@ -184,7 +184,9 @@ class LateWatch:
             conditions, looked_ns = after.conditions, clock.mono_ns()
             self._keep(after)
             if late is not None and before is not None:
-                self._report(kernel, Lateness(late.late_ns, late.thread_times, before, after))
+                self._report(
+                    kernel, LatenessEvidence(late.late_ns, late.thread_times, before, after)
+                )
                 free_ns = clock.mono_ns() + PAUSE_NS
 
     def _keep(self, reading: Reading) -> None:
@@ -194,7 +196,7 @@ class LateWatch:
         older = [reading for read_ns, reading in self._readings if read_ns <= now_ns]
         return older[-1] if older else None
 
-    def _report(self, kernel: Kernel, late: Lateness) -> None:
+    def _report(self, kernel: Kernel, late: LatenessEvidence) -> None:
         names, clause = causes(late)
         if "processor" in names:
             late = replace(late, busiest=self._busiest_of(kernel))

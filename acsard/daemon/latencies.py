@@ -129,7 +129,7 @@ class Figure:
         self._slot, self._ends_ns = self._slots[number % SLOTS], (number + 1) * SLOT_NS
 
 
-class LastMinute:
+class LastMinuteCount:
     """A counter of the events in the last minute, with a resolution of one slot (10 s)."""
 
     def __init__(self) -> None:
@@ -151,7 +151,7 @@ class Stopwatch:
 
     def __init__(self) -> None:
         self.figures: dict[Name, Figure] = {name: Figure() for name in NAMES}
-        self._missed = LastMinute()
+        self._missed = LastMinuteCount()
         self._cached: dict[str, Measured] = {}
         self._cached_ns = -FRESH_NS
 

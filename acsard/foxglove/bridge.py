@@ -19,7 +19,7 @@ from acsard.client.commander import MAX_SOURCE_TIMEOUT_S
 from acsard.client.follower import Watch
 from acsard.core.ros.names import full_name
 from acsard.core.values import NS_PER_S, AcsardError
-from acsard.foxglove.drives import Drives
+from acsard.foxglove.drives import DrivingViewers
 from acsard.foxglove.notices import Notices, Objections
 from acsard.foxglove.relay import Relay
 from acsard.foxglove.robot_facts import Facts, learn
@@ -85,7 +85,7 @@ class Bridge:
         self._shown_topics = ShownTopics(self._wake.set)
         self._settings = Settings(robot, self._notices, facts.tables, self._wake.set)
         topic = full_name(ros.namespace, "cmd_vel")
-        self._drives = Drives(self._viewer, topic, self._notices, facts.forbidden)
+        self._drives = DrivingViewers(self._viewer, topic, self._notices, facts.forbidden)
         self._drives.timeout_s = self._timeout_s(facts)
         context = foxglove.Context()
         self._relay = Relay(robot, context, self._wake.set)

@@ -107,7 +107,7 @@ class Viewer:
         return self._slow >= SLOW_TIMES
 
 
-class Drives:
+class DrivingViewers:
     """The viewers that publish commands, and the thread that sends the commands to the robot."""
 
     def __init__(

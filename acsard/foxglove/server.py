@@ -26,7 +26,7 @@ from acsard.core.messages.keys_and_roles import PLAIN_SERVICES, SERVICES
 from acsard.core.messages.schema import MESSAGES, ServiceReply
 from acsard.core.ros.names import full_name
 from acsard.core.values import NS_PER_S, AcsardError, Verb
-from acsard.foxglove.drives import Drives
+from acsard.foxglove.drives import DrivingViewers
 from acsard.foxglove.notices import Notices
 from acsard.host import clock
 from acsard.host.errors import InUseError, NotPermittedError
@@ -220,7 +220,7 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]
 class Listener:
     """The callbacks for requests of viewers. The server runs them on its own threads."""
 
-    def __init__(self, shown: ShownTopics, drives: Drives, settings: Settings) -> None:
+    def __init__(self, shown: ShownTopics, drives: DrivingViewers, settings: Settings) -> None:
         self._shown_topics, self._drives, self._settings = shown, drives, settings
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:

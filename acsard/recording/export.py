@@ -32,7 +32,7 @@ from acsard.recording.file_replay import (
     no_progress,
 )
 from acsard.recording.published import Published, Publisher
-from acsard.recording.recorded_steps import Step
+from acsard.recording.recorded_steps import RecordedStep
 from acsard.recording.replay import replay_step
 from acsard.recording.time_span import WHOLE_SPAN, Span
 
@@ -148,7 +148,7 @@ _NO_WHEELS = "," * 4
 _NO_OUTPUTS = "," * len(OUTPUT_COLUMNS)
 
 
-def csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
+def csv_rows(step: RecordedStep, outputs: Outputs) -> Iterator[str]:
     """Yield the rows of a step for the CSV table of an export, without line breaks.
 
     `outputs` are the replayed outputs of the step.
@@ -165,7 +165,7 @@ def csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
             yield f"{wheel_columns(estimate)},{pose},{twist},{applied},{status}"
 
 
-def measured_csv_rows(step: Step, outputs: Outputs) -> Iterator[str]:
+def measured_csv_rows(step: RecordedStep, outputs: Outputs) -> Iterator[str]:
     """Yield the rows of a step for the CSV table that `acsard calibrate` reads.
 
     `MEASURED_CSV_HEADER` names the columns. The rows have no line breaks. `outputs` are the
@@ -222,10 +222,10 @@ class _Writer:
     count = 0
     """Number of messages or rows that were written so far."""
 
-    def step(self, step: Step, outputs: Outputs) -> None:
+    def step(self, step: RecordedStep, outputs: Outputs) -> None:
         raise NotImplementedError
 
-    def skip(self, step: Step, inside: bool) -> None:
+    def skip(self, step: RecordedStep, inside: bool) -> None:
         """Process a step whose outputs are not exported.
 
         `inside` is true if the step is in the exported part of the recording, but cannot be
@@ -259,13 +259,13 @@ class _MessageWriter(_Writer):
         self.times: tuple[int, int] = (0, 0)
         """Earliest and latest wall-clock time of a written message, ns since 1970."""
 
-    def step(self, step: Step, outputs: Outputs) -> None:
+    def step(self, step: RecordedStep, outputs: Outputs) -> None:
         self._publisher.robot = self._run.robot
         with self._run.state_errors():
             messages = list(self._publisher.step(step, outputs))
         self._add(messages)
 
-    def skip(self, step: Step, inside: bool) -> None:
+    def skip(self, step: RecordedStep, inside: bool) -> None:
         with self._run.state_errors():
             messages = list(self._publisher.skip(step))
         if inside:
@@ -322,7 +322,7 @@ class _TableWriter(_Writer):
         self._stream = stream
         self._stream.write(f"{CSV_HEADER}\n".encode())
 
-    def step(self, step: Step, outputs: Outputs) -> None:
+    def step(self, step: RecordedStep, outputs: Outputs) -> None:
         for row in csv_rows(step, outputs):
             self._stream.write(f"{row}\n".encode())
             self.count += 1
@@ -394,7 +394,7 @@ def _write_steps(
     # The steps before `span` are replayed too, because each step changes the robot.
     began_ns, over = recording.about.mono_ns, False
 
-    def is_inside(step: Step) -> bool:
+    def is_inside(step: RecordedStep) -> bool:
         """Return whether a step is in `span`. At the first step after `span`, end the output."""
         nonlocal over
         seconds = (step.inputs.now.mono_ns - began_ns) / NS_PER_S
@@ -404,7 +404,7 @@ def _write_steps(
                 writer.end()
         return span.begin <= seconds <= span.end
 
-    def skip(step: Step) -> None:
+    def skip(step: RecordedStep) -> None:
         inside = is_inside(step)
         if not over:
             writer.skip(step, inside)

@@ -27,7 +27,7 @@ from acsard.core.values import Outputs
 from acsard.host.errors import RecordingError
 from acsard.recording.end_record import read_end
 from acsard.recording.file import Recording, event_of
-from acsard.recording.recorded_steps import Step, UnfinishedError, unfinished
+from acsard.recording.recorded_steps import RecordedStep, UnfinishedError, unfinished
 from acsard.recording.replay import Comparison, Replay
 from acsard.recording.rows import BatchError, decode
 from acsard.recording.state import Checkpoint, State, StateError, adopt, checkpoint, short, thaw
@@ -110,8 +110,8 @@ def config_of(recording: Recording) -> Config:
         ) from None
 
 
-def steps(recording: Recording) -> Iterator[Step]:
-    """Yield every readable step in order. A jump in `Step.number` means that steps are missing."""
+def steps(recording: Recording) -> Iterator[RecordedStep]:
+    """Yield every readable step in order. Steps are missing where their numbers jump."""
     for item in _items(recording):
         if not isinstance(item, Checkpoint):
             yield from item
@@ -119,7 +119,7 @@ def steps(recording: Recording) -> Iterator[Step]:
 
 def _items(
     recording: Recording, copies: EventCopies | None = None
-) -> Iterator[list[Step] | Checkpoint]:
+) -> Iterator[list[RecordedStep] | Checkpoint]:
     for topic, _, data in recording.messages():
         if topic == "events" and copies is not None:
             copies.copy(data)
@@ -241,7 +241,7 @@ class RecordedRun(_Source):
         """The gaps that `steps()` has found so far."""
         self.number: int | None = None
         """Number of the last step that `steps()` yielded; None before the first step."""
-        self.on_skipped: Callable[[Step], None] = lambda step: None
+        self.on_skipped: Callable[[RecordedStep], None] = lambda step: None
         """Function that is called with each step that can be read, but not replayed."""
         self._next, self._state = _first_state(recording)
         """`_next` is the number of the step that `robot` can replay next. `_state` is the recorded
@@ -254,7 +254,7 @@ class RecordedRun(_Source):
             with self.state_errors():
                 adopt(self.robot, Robot(self._recorded), Robot(self.config))
 
-    def steps(self) -> Iterator[Step]:
+    def steps(self) -> Iterator[RecordedStep]:
         """Yield the steps that can be replayed, in order. Collect the gaps in `gaps`.
 
         Raises `RecordingError` if no step can be replayed.
@@ -263,7 +263,7 @@ class RecordedRun(_Source):
         replayed_ns = recording.about.mono_ns
         read, damaged = self._next, 0
         saved: Checkpoint | None = None
-        last: Step | None = None
+        last: RecordedStep | None = None
         gap: Gap | None = None
         for item in _items(recording, self._copies):
             if isinstance(item, Checkpoint):
@@ -424,7 +424,7 @@ class DisplayReplay(_Source):
                 f"that has just started, and may differ from the recorded drive: {error}"
             )
 
-    def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
+    def steps(self) -> Iterator[tuple[RecordedStep, Outputs, Robot]]:
         """Yield a triple for each readable step: the step, its replayed outputs, and the robot.
 
         The robot has just replayed the step. Raises `RecordingError` if the robot fails because its
@@ -502,7 +502,7 @@ class EventCopies:
         self._damaged = 0
         """Value of `Recording.damaged` when the most recent batch was read."""
 
-    def batch(self, steps: list[Step]) -> None:
+    def batch(self, steps: list[RecordedStep]) -> None:
         """Process the next batch of steps.
 
         The events of the previous batch are compared with their copies.

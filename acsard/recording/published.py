@@ -20,7 +20,7 @@ from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG_CHANNEL, Channel, p
 from acsard.core.ros.shapes import LEVELS, Log, command_message
 from acsard.core.ros.transports import left_out
 from acsard.core.values import NS_PER_S, Command, Instant, Outputs
-from acsard.recording.recorded_steps import Step
+from acsard.recording.recorded_steps import RecordedStep
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
 
 MEASURED_ROWS = frozenset({"acsard: control loop", "acsard: certificate"})
@@ -72,7 +72,7 @@ class Publisher:
         names = {channel.native for channel in published_channels(left_out(self._config))}
         return frozenset(names & BY_KEY.keys())
 
-    def step(self, step: Step, outputs: Outputs) -> Iterator[Published]:
+    def step(self, step: RecordedStep, outputs: Outputs) -> Iterator[Published]:
         """Yield the messages of a step that was just replayed.
 
         The received commands come first, and the log lines come last. `outputs` are the replayed
@@ -93,7 +93,7 @@ class Publisher:
             yield Published(BY_KEY[key], "", now.wall_ns, _without_measurements(message))
         yield from self.skip(step)
 
-    def skip(self, step: Step) -> Iterator[Published]:
+    def skip(self, step: RecordedStep) -> Iterator[Published]:
         """Yield only the log lines of a step. The step need not have been replayed."""
         self._now = step.inputs.now
         yield from map(self._line, self._timeline.step(step))

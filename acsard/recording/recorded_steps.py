@@ -83,7 +83,7 @@ def split_at_states(
     yield start, steps
 
 
-class BlackBox(Protocol):
+class StepRecorder(Protocol):
     """Interface through which the control loop uses the recorder. No method waits for the disk."""
 
     def begins(self, robot: Robot, guard: Guard) -> None:
@@ -129,7 +129,7 @@ class RecordedOutputs(Struct, frozen=True):
     older versions."""
 
 
-class Step(Struct, frozen=True):
+class RecordedStep(Struct, frozen=True):
     """A step that was read from a recording."""
 
     number: int

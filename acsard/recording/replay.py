@@ -24,7 +24,7 @@ from acsard.recording.recorded_steps import (
     US_PER_S,
     Micropose,
     RecordedOutputs,
-    Step,
+    RecordedStep,
     checksum,
     count_superseded,
     input_names,
@@ -129,7 +129,7 @@ class Comparison(Struct):
         return not self.same and self.first_by_output.keys() <= TEXT_OUTPUTS
 
 
-def replay_step(robot: Robot, step: Step) -> Outputs:
+def replay_step(robot: Robot, step: RecordedStep) -> Outputs:
     """Run `robot.step` with the inputs of a recorded step, and return the new outputs.
 
     Also update the robot's counters `lines_sent`, `lines_superseded` and `commands_superseded`,
@@ -177,7 +177,7 @@ class Replay:
         self._config = robot.config
         self._guard = Guard(robot.session.codec.stop, robot.config, memory)
 
-    def step(self, step: Step) -> Difference | None:
+    def step(self, step: RecordedStep) -> Difference | None:
         """Replay a step, and update `outputs` and `comparison`.
 
         Returns the difference between the recorded and the replayed outputs, or None if these
@@ -213,7 +213,9 @@ class Replay:
         if difference.replayed.status[0] == FAULT != difference.recorded.status[0]:
             comparison.fault = comparison.fault or difference
 
-    def _compare(self, step: Step, replayed: RecordedOutputs, trip: str) -> Difference | None:
+    def _compare(
+        self, step: RecordedStep, replayed: RecordedOutputs, trip: str
+    ) -> Difference | None:
         recorded = step.recorded
         exact = recorded.checksum is None or recorded.checksum == self._checksum
         self.comparison.exact = self.comparison.exact and exact
@@ -237,7 +239,7 @@ class Replay:
             return None
         return Difference(step.number, step.inputs.now, what, recorded, replayed, trip)
 
-    def _count(self, step: Step, outputs: Outputs, replayed: RecordedOutputs) -> None:
+    def _count(self, step: RecordedStep, outputs: Outputs, replayed: RecordedOutputs) -> None:
         comparison, recorded = self.comparison, step.recorded
         comparison.steps += 1
         if recorded.line is not None or replayed.line is not None:

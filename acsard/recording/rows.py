@@ -32,8 +32,8 @@ from acsard.recording.recorded_steps import (
     FinishedStep,
     Micropose,
     RecordedOutputs,
+    RecordedStep,
     Status,
-    Step,
     checksum,
     input_names,
     micropose,
@@ -245,7 +245,7 @@ def _rares(steps: Sequence[FinishedStep]) -> Iterator[OccasionalFields]:
 # Decoding
 
 
-def decode(data: bytes) -> list[Step]:
+def decode(data: bytes) -> list[RecordedStep]:
     """Return the steps of an encoded batch.
 
     Raises `BatchError` if the bytes are damaged, or if they contain values that no daemon records.
@@ -264,7 +264,7 @@ def first_of(data: bytes) -> int | None:
         return None
 
 
-def _steps(batch: Batch) -> Iterator[Step]:
+def _steps(batch: Batch) -> Iterator[RecordedStep]:
     first = batch.rows[0].rare or NO_OCCASIONAL_FIELDS
     opened, trouble, status = first.opened, first.trouble, first.status
     tick_ns, pose, last = batch.mono_ns, (0, 0, 0), len(batch.rows) - 1
@@ -318,7 +318,7 @@ def _steps(batch: Batch) -> Iterator[Step]:
         )
         if row.tick:
             tick_ns = now.mono_ns
-        yield Step(batch.first + index, inputs, recorded, begins=index == 0)
+        yield RecordedStep(batch.first + index, inputs, recorded, begins=index == 0)
 
 
 def _sent_line(row: Row) -> bytes | None:

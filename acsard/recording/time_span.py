@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from acsard.core.values import NS_PER_S, AcsardError, Instant
 from acsard.recording.file import Recording
-from acsard.recording.recorded_steps import Step
+from acsard.recording.recorded_steps import RecordedStep
 from acsard.recording.rows import BatchError, decode
 from acsard.recording.timeline import MIN_CLOCK_CHANGE_NS
 
@@ -286,8 +286,8 @@ class Contents(NamedTuple):
 
     stretches: list[Stretch]
     """Parts of the recording without an adjustment of the wall clock, in order."""
-    first: Step
-    last: Step
+    first: RecordedStep
+    last: RecordedStep
 
 
 def stretches(recording: Recording) -> list[Stretch]:
@@ -305,7 +305,7 @@ def read_contents(recording: Recording) -> Contents | None:
     A stretch is a part without an adjustment of the wall clock. Return None if no step is readable.
     """
     stretch_list: list[Stretch] = []
-    first: Step | None = None
+    first: RecordedStep | None = None
     last_ns, before = 0, b""
     for topic, wall_ns, data in recording.messages():
         if topic != "steps":
@@ -338,7 +338,7 @@ def _from(recording: Recording, now: Instant) -> Stretch:
     return Stretch(at, now.wall_ns / NS_PER_S, now.wall_ns / NS_PER_S)
 
 
-def _steps(data: bytes) -> list[Step]:
+def _steps(data: bytes) -> list[RecordedStep]:
     try:
         return list(decode(data)) if data else []
     except BatchError:

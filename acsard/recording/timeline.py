@@ -23,7 +23,7 @@ from acsard.core.link.session import IDENTITY
 from acsard.core.motion.arbiter_text import MAX_SENDER_LENGTH
 from acsard.core.ros.shapes import how_often
 from acsard.core.values import NS_PER_S, Command, Event, Instant
-from acsard.recording.recorded_steps import US_PER_S, Step
+from acsard.recording.recorded_steps import US_PER_S, RecordedStep
 
 MAX_TIME_S = 2**63 / 1e9
 """Largest time between 1970 and an entry of the timeline, s. It is 292 years, because a time in ns
@@ -148,7 +148,7 @@ class ReasonChanges:
         """Pair: the source that the robot followed last, and the sender of that source's last
         command."""
 
-    def step(self, step: Step) -> Iterator[TimelineEntry]:
+    def step(self, step: RecordedStep) -> Iterator[TimelineEntry]:
         """Yield an entry if the reason of the mode has changed in a step, but the mode has not.
 
         There is no entry if an event reports the reason, or while the robot drives. There is at
@@ -192,7 +192,7 @@ class BoardIdentity:
         self._reported_ns = -MIN_REASON_NS
         """Monotonic time of the last entry `board`, ns."""
 
-    def step(self, step: Step) -> Iterator[TimelineEntry]:
+    def step(self, step: RecordedStep) -> Iterator[TimelineEntry]:
         """Yield an entry if the board has named itself in a step, but at most one each second."""
         now = step.inputs.now
         for read in step.inputs.received:
@@ -244,7 +244,7 @@ class WaitingSenders:
         self._reported_ns = -MIN_REASON_NS
         """Monotonic time of the last entry `waits`, ns."""
 
-    def step(self, step: Step) -> Iterator[TimelineEntry]:
+    def step(self, step: RecordedStep) -> Iterator[TimelineEntry]:
         """Yield an entry for each sender that has waited for `MIN_WAIT_NS` and has no entry yet."""
         for event in step.recorded.events:
             if event.name == "commander":
@@ -334,7 +334,7 @@ class TimelineWriter:
         ""."""
         self._now: Instant | None = None
         self._shutting_down = False
-        self._continued: Step | None = None
+        self._continued: RecordedStep | None = None
         """First step of a recording that continues an earlier recording. None in other recordings,
         and after the entry `continues` was made."""
         self._losses = LinkLosses()
@@ -342,7 +342,7 @@ class TimelineWriter:
         self._reasons = ReasonChanges()
         self._waiting = WaitingSenders({source.name: source.priority for source in sources})
 
-    def step(self, step: Step) -> Iterator[TimelineEntry]:
+    def step(self, step: RecordedStep) -> Iterator[TimelineEntry]:
         """Yield the timeline entries of a step. The steps must come in order."""
         if self._number is None and step.number > 0:
             self._continued = step
@@ -369,7 +369,7 @@ class TimelineWriter:
         )
         yield TimelineEntry(first.inputs.now.wall_ns / 1e9, "continues", text, by=source)
 
-    def _entries(self, step: Step) -> Iterator[TimelineEntry]:
+    def _entries(self, step: RecordedStep) -> Iterator[TimelineEntry]:
         wall_s = step.inputs.now.wall_ns / 1e9
         if self._number is None and step.number == 0:
             yield TimelineEntry(wall_s, "start", "the daemon starts")
@@ -412,7 +412,7 @@ class TimelineWriter:
         )
         yield TimelineEntry(now.wall_ns / 1e9, "clock", text, "warning")
 
-    def _drive(self, step: Step, wall_s: float) -> Iterator[TimelineEntry]:
+    def _drive(self, step: RecordedStep, wall_s: float) -> Iterator[TimelineEntry]:
         for pose in step.recorded.poses:
             if self._pose is not None and self._began_ns is not None:
                 moved = math.hypot(pose[0] - self._pose[0], pose[1] - self._pose[1])

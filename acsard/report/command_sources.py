@@ -15,7 +15,7 @@ from acsard.core.motion.arbiter_text import REFUSED, waiting
 from acsard.core.robot import Robot
 from acsard.core.thinning import Band
 from acsard.core.values import NS_PER_S, Command, Outputs, Twist
-from acsard.recording.recorded_steps import Step
+from acsard.recording.recorded_steps import RecordedStep
 from acsard.report.robot_reader import RobotReader
 
 SOURCE_STATES = ("refused", "waits", "sends", "drives")
@@ -77,7 +77,7 @@ class CommandSources:
         """Return the name of a source, or `OTHER_SOURCES` if the source is not configured."""
         return source if source in self._timeouts else OTHER_SOURCES
 
-    def take_commands(self, step: Step, t: float, robot: Robot) -> bool:
+    def take_commands(self, step: RecordedStep, t: float, robot: Robot) -> bool:
         """Process the commands of a step.
 
         Return True if a command was refused. The caller should then call `sample`.
@@ -100,7 +100,7 @@ class CommandSources:
             self._find_refused(step, t, robot)
         return before != self._refused
 
-    def _find_refused(self, step: Step, t: float, robot: Robot) -> None:
+    def _find_refused(self, step: RecordedStep, t: float, robot: Robot) -> None:
         # The robot's counters show the reasons, but not the sources. A source counts as refused if
         # the last command that the robot accepted from it is older than its command in this step.
         counted = Counter(self._reader.refused(robot))
@@ -130,7 +130,7 @@ class CommandSources:
                 return command.twist
         return None
 
-    def sample(self, step: Step, t: float, robot: Robot) -> None:
+    def sample(self, step: RecordedStep, t: float, robot: Robot) -> None:
         """Add the present state of each source to `bands`.
 
         Args:
@@ -141,7 +141,7 @@ class CommandSources:
         for name, state, words in self._states(step, t, robot):
             self.bands[name].add(t, state, words)
 
-    def _states(self, step: Step, t: float, robot: Robot) -> Iterator[tuple[str, str, str]]:
+    def _states(self, step: RecordedStep, t: float, robot: Robot) -> Iterator[tuple[str, str, str]]:
         """Yield the name, state and reason of each source. A silent source has the state ""."""
         mode, reason, _, driver = step.recorded.status
         for source in self._reader.sources(robot, step.inputs.now.mono_ns):

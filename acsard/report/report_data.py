@@ -20,7 +20,7 @@ from acsard.core.robot import Robot
 from acsard.core.ros.shapes import how_often
 from acsard.core.thinning import Band, Curve, Place, Point, Track
 from acsard.core.values import NS_PER_S, Outputs, Twist
-from acsard.recording.recorded_steps import US_PER_S, Step
+from acsard.recording.recorded_steps import US_PER_S, RecordedStep
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
 from acsard.report.command_sources import MAX_TEXT_LENGTH, SAMPLE_PERIOD_S, CommandSources
 from acsard.report.robot_reader import RobotErrors, RobotReader
@@ -121,7 +121,7 @@ class Driven(Struct):
     metres: float = 0.0
 
 
-class Lateness:
+class StepLateness:
     """Computes how late the daemon ran the step of each control period.
 
     The delays are relative: the smallest delay in the report counts as 0.
@@ -333,7 +333,7 @@ class ReportData:
         self._reader = RobotReader(robot_errors)
         self.sources = CommandSources(config.commands.sources, self._reader)
         self.serial = SerialCounts()
-        self.lateness = Lateness(config.rate_hz)
+        self.lateness = StepLateness(config.rate_hz)
         self.marks = Marks()
         self.began: float | None = None
         """Wall-clock time of the first step of the report, s since 1970; None before this step.
@@ -378,7 +378,7 @@ class ReportData:
         """True if the last step was after the end of the report."""
         return self._wall > self._window[1]
 
-    def step(self, step: Step, outputs: Outputs, robot: Robot) -> None:
+    def step(self, step: RecordedStep, outputs: Outputs, robot: Robot) -> None:
         """Add a step of the recording.
 
         A step outside of the report's range of time adds no data to the report. It changes only the
@@ -433,7 +433,7 @@ class ReportData:
 
     # Distance and speeds.
 
-    def _drive(self, step: Step, t: float, inside: bool) -> None:
+    def _drive(self, step: RecordedStep, t: float, inside: bool) -> None:
         """Process the poses of a step. `inside` is true if the report covers this step."""
         mode, _, _, source = step.recorded.status
         driven = self._driven(source) if mode == "driving" and inside else None
@@ -456,7 +456,7 @@ class ReportData:
     def _driven(self, source: str) -> Driven:
         return self.driven.setdefault(self.sources.name(source), Driven())
 
-    def _speeds(self, step: Step, outputs: Outputs, t: float) -> None:
+    def _speeds(self, step: RecordedStep, outputs: Outputs, t: float) -> None:
         commanded = self.sources.commanded(outputs)
         for curves, axis in ((self.linear, "linear"), (self.angular, "angular")):
             curves["commanded"].add(t, None if commanded is None else getattr(commanded, axis))
@@ -478,7 +478,7 @@ class ReportData:
                 max(most.linear, abs(twist.linear)), max(most.angular, abs(twist.angular))
             )
 
-    def _add_sent(self, curve: Curve, step: Step, t: float, speed: float) -> None:
+    def _add_sent(self, curve: Curve, step: RecordedStep, t: float, speed: float) -> None:
         if step.recorded.sent is not None:
             curve.add(t, speed)
         elif t - self._sent > WATCHDOG_S:
@@ -487,7 +487,9 @@ class ReportData:
 
     # Serial port, control loop and modes.
 
-    def _serial(self, step: Step, outputs: Outputs, robot: Robot, t: float, known: bool) -> None:
+    def _serial(
+        self, step: RecordedStep, outputs: Outputs, robot: Robot, t: float, known: bool
+    ) -> None:
         inputs, sent = step.inputs, step.recorded.sent is not None
         self.serial.step(t, sent, self._reader.lines(robot))
         if inputs.tick:
@@ -495,7 +497,7 @@ class ReportData:
         elif outputs.due and sent:
             self.lateness.at_once()
 
-    def _sample(self, step: Step, t: float, robot: Robot, refused: bool) -> None:
+    def _sample(self, step: RecordedStep, t: float, robot: Robot, refused: bool) -> None:
         mode, reason, link, _ = status = step.recorded.status
         if status == self._status and t - self._sampled < SAMPLE_PERIOD_S and not refused:
             return

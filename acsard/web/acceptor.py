@@ -30,7 +30,7 @@ from aiohttp.web_protocol import RequestHandler
 from acsard.host import clock
 from acsard.host.rate_limits import Buckets
 from acsard.web.answers import HEADERS, cut, problem
-from acsard.web.callers import Identity, is_loopback, network_of, unmapped
+from acsard.web.callers import AdmittedClient, is_loopback, network_of, unmapped
 from acsard.web.limits import (
     HANDSHAKE_RATE,
     MAX_LOCAL_TCP_CONNECTIONS,
@@ -125,7 +125,7 @@ class Acceptor:
         if (connection := _connection(transport)) is not None:
             connection.spoke(body)
 
-    def admitted(self, transport: asyncio.BaseTransport | None, identity: Identity) -> None:
+    def admitted(self, transport: asyncio.BaseTransport | None, identity: AdmittedClient) -> None:
         """Record that the client of a connection has been identified as `identity`.
 
         If the server must close connections to make room, it first closes connections whose client

@@ -25,10 +25,10 @@ from acsard.web.acceptor import Acceptor
 from acsard.web.answers import READ_TIMEOUT_S, STATUS_CODES, TroubleError, problem, secured
 from acsard.web.callers import (
     LOCAL_NAME,
-    Identity,
+    AdmittedClient,
     Reason,
-    RefusedError,
     RequestFacts,
+    RequestRefusedError,
     by_listed_page,
     network_of,
     place,
@@ -56,7 +56,7 @@ STATUS_TEXTS = {
     413: f"the request has more than {MAX_MESSAGE_BYTES} bytes: send less",
 }
 
-IDENTITY_KEY: web.RequestKey[Identity] = web.RequestKey("who", Identity)
+IDENTITY_KEY: web.RequestKey[AdmittedClient] = web.RequestKey("who", AdmittedClient)
 """Key under which a request object contains the client's identity. The request contains no identity
 if its path is open to every client."""
 
@@ -114,7 +114,10 @@ class Admission:
         `names` are the robot's host names and addresses, in lower case. `rules` is the section
         `web` of the configuration.
         """
-        self._local, self._origins = Identity(rules.local, LOCAL_NAME), frozenset(rules.origins)
+        self._local, self._origins = (
+            AdmittedClient(rules.local, LOCAL_NAME),
+            frozenset(rules.origins),
+        )
         self._robot, self._names, self._vault = robot, names, vault
         self._acceptor, self._counts = acceptor, counts
         self._guesses, self._strangers = Buckets(GUESSES_OF_ONE, GUESSES), Buckets(STRANGER_RATE)
@@ -136,14 +139,14 @@ class Admission:
                 self._rows[added] = row
         return app
 
-    async def owner(self, peer: str, texts: Sequence[str]) -> Identity:
+    async def owner(self, peer: str, texts: Sequence[str]) -> AdmittedClient:
         """Return the owner of the first valid token in a request.
 
         `peer` is the client's IP address, and `texts` contains the tokens in the request. Raises
-        `RefusedError` if no token is valid, and `TimeoutError` if the disk does not answer.
+        `RequestRefusedError` if no token is valid, and `TimeoutError` if the disk does not answer.
         """
         if not any(texts):
-            raise RefusedError(
+            raise RequestRefusedError(
                 "no_token", "a token is missing: run `acsard web --invite ROLE` on the robot"
             )
         tokens = await self._lookups.read()
@@ -153,8 +156,8 @@ class Admission:
         if identity is not None:
             return replace(identity, address=peer)
         if not self._guesses.take(network_of(peer), clock.mono_ns()):
-            raise RefusedError("too_fast", "too many wrong tokens: wait a minute")
-        raise RefusedError(
+            raise RequestRefusedError("too_fast", "too many wrong tokens: wait a minute")
+        raise RequestRefusedError(
             "bad_token",
             "this token is not valid (expired, revoked, or for another robot): ask for a new one",
         )
@@ -174,7 +177,7 @@ class Admission:
             if waits and request.method == "POST":
                 await asyncio.sleep(REFUSAL_DELAY_S)
             return answer
-        except RefusedError as error:
+        except RequestRefusedError as error:
             if error.reason == "too_fast":
                 await asyncio.sleep(REFUSAL_DELAY_S)
             elif IDENTITY_KEY not in request:
@@ -212,8 +215,8 @@ class Admission:
 
         `row` is the route of the request, or None for an unknown path. If the client exceeds its
         rate limit, a request to a route with `row.waits` is delayed, and any other request is
-        refused. Raises `RefusedError` for a refused request, and if the client may not use the
-        path.
+        refused. Raises `RequestRefusedError` for a refused request, and if the client may not use
+        the path.
         """
         facts = request_facts(request)
         here = place(facts, self._names | {own_address(request)}) == "here"
@@ -245,12 +248,12 @@ class Admission:
                 f"more than {REQUEST_RATE.hz:g} requests a second with one token: use the "
                 "WebSocket /ws, which sends each change"
             )
-            raise RefusedError("too_fast", text)
+            raise RequestRefusedError("too_fast", text)
         if row is not None and row.least is not None:
             identity.require(row.least, f"{row.method} {row.path}")
         return fast
 
-    def _too_fast(self, identity: Identity, row: Route | None) -> bool:
+    def _too_fast(self, identity: AdmittedClient, row: Route | None) -> bool:
         if not identity.token:
             return False  # clients on the robot itself have no rate limit
         rate = row.rate if row else REQUEST_RATE

@@ -1,7 +1,7 @@
 """The request handlers of the page's server, and the table of all its paths (`ROUTES`).
 
-A handler raises `RefusedError` if the request itself is wrong or forbidden, and `TroubleError` if a
-permitted request cannot be fulfilled now.
+A handler raises `RequestRefusedError` if the request itself is wrong or forbidden, and
+`TroubleError` if a permitted request cannot be fulfilled now.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from acsard.web.answers import (
     sent_unpacked,
     takes_gzip,
 )
-from acsard.web.callers import PROTOCOL, RefusedError, cookie_name, tokens_offered
+from acsard.web.callers import PROTOCOL, RequestRefusedError, cookie_name, tokens_offered
 from acsard.web.camera import SEND_TIMEOUT_S, Camera
 from acsard.web.guide import SLOW_PORTS, Choices
 from acsard.web.limits import OPENINGS, PICTURES, STOPS, WebSocketLimits
@@ -193,7 +193,9 @@ class Page:
         """
         form = await _token_posted(request)
         if not request.secure:
-            raise RefusedError("plain", "over plain http, no token is needed: connect without one")
+            raise RequestRefusedError(
+                "plain", "over plain http, no token is needed: connect without one"
+            )
         identity = await self._admission.owner(peer_of(request), [form.token])
         cookie = cookie_name(self._robots.id, own_port(request))
         old_token = "" if form.replace else request.cookies.get(cookie, "")
@@ -217,12 +219,12 @@ class Page:
         offered = request.headers.get("Sec-WebSocket-Protocol", "")
         if tokens_offered(offered) and PROTOCOL not in map(str.strip, offered.split(",")):
             # If aiohttp knew none of the offered names, it would log all of them, and so the token.
-            raise RefusedError(
+            raise RequestRefusedError(
                 "malformed",
                 f"the WebSocket must offer the subprotocol {PROTOCOL} besides the token",
             )
         if full := self._websocket_limits.enter(peer, identity.token):
-            raise RefusedError("too_many", full)
+            raise RequestRefusedError("too_many", full)
         try:
             served = web.WebSocketResponse(
                 max_msg_size=MAX_MESSAGE_BYTES,
@@ -284,7 +286,7 @@ class Page:
         verb = request.path.removeprefix("/api/srv/")
         try:
             arguments = await _arguments_in(request)
-        except (RefusedError, web.HTTPException):
+        except (RequestRefusedError, web.HTTPException):
             # The body names no other robot, and a stop of the page's own robot is never refused.
             if verb == "stop":
                 await self._parts.calls.call(request[IDENTITY_KEY], verb, {})
@@ -295,7 +297,7 @@ class Page:
                 "`robot` must be the id of a robot as a JSON string; for robots other than its "
                 "own, this page accepts only the service stop"
             )
-            raise RefusedError("malformed", text)
+            raise RequestRefusedError("malformed", text)
         answer = await self._parts.calls.call(request[IDENTITY_KEY], verb, arguments, robot)
         return reply(answer, 200 if answer.success else 409)
 
@@ -343,7 +345,7 @@ class Page:
         body = self._reports.drawn(name)
         if body is None:
             text = f"the report is not drawn yet: POST /api/recordings/{name}/report first"
-            raise RefusedError("path", text)
+            raise RequestRefusedError("path", text)
         headers = {
             "Content-Type": "text/html; charset=utf-8",
             "Content-Security-Policy": POLICY,
@@ -395,7 +397,7 @@ async def _body_of(request: web.Request) -> bytes:
             reason=f"no body arrived within {BODY_TIMEOUT_S:g} s"
         ) from None
     except (web.RequestPayloadError, ConnectionError):
-        raise RefusedError(
+        raise RequestRefusedError(
             "malformed", "the body is not valid HTTP, or the connection ended before its end"
         ) from None
 
@@ -405,7 +407,7 @@ async def _arguments_in(request: web.Request) -> dict[str, Any]:
     try:
         return msgspec.json.decode(body, type=dict[str, Any]) if body.strip() else {}
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise RefusedError("malformed", f"the body must be a JSON object: {error}") from None
+        raise RequestRefusedError("malformed", f"the body must be a JSON object: {error}") from None
 
 
 async def _token_posted(request: web.Request) -> TokenForm:
@@ -419,7 +421,7 @@ async def _token_posted(request: web.Request) -> TokenForm:
             return msgspec.convert(fields, TokenForm, strict=False)
     except (msgspec.MsgspecError, ValueError, LookupError, RecursionError):
         pass
-    raise RefusedError(
+    raise RequestRefusedError(
         "malformed", "send the token in UTF-8, either as a form (token=...) or as JSON"
     )
 

@@ -45,7 +45,7 @@ MAX_TOKENS = 8
 """Maximum number of tokens that the server checks in one request. It ignores further tokens."""
 
 
-class RefusedError(AcsardError):
+class RequestRefusedError(AcsardError):
     """A request or message of a client is refused. The text gives the reason and the remedy."""
 
     def __init__(self, reason: Reason, text: str) -> None:
@@ -53,7 +53,7 @@ class RefusedError(AcsardError):
         self.reason = reason
 
 
-class Identity(Struct, frozen=True):
+class AdmittedClient(Struct, frozen=True):
     """The identity of an admitted client."""
 
     role: Role
@@ -71,12 +71,12 @@ class Identity(Struct, frozen=True):
         return has(self.role, least)
 
     def require(self, least: Role, what: str) -> None:
-        """Raise `RefusedError` if the client's role is lower than `least`.
+        """Raise `RequestRefusedError` if the client's role is lower than `least`.
 
         `what` is the name of the action that requires the role `least`, for the error message.
         """
         if not self.may(least):
-            raise RefusedError(
+            raise RequestRefusedError(
                 "role", f"{what} is {self.why_not_allowed(least)}: {ROLE_TEXTS[self.role]}"
             )
 
@@ -113,14 +113,14 @@ def place(facts: RequestFacts, names: Collection[str]) -> Place:
 
     `names` are the robot's names and addresses, in lower case.
 
-    Raises `RefusedError` in three cases:
+    Raises `RequestRefusedError` in three cases:
 
     - The request came through a proxy.
     - The client is "away" and uses plain HTTP.
     - The client is "away" and requests a host that is not in `names`.
     """
     if facts.proxied:
-        raise RefusedError(
+        raise RequestRefusedError(
             "proxy",
             "the request came through a proxy, which hides the machine of the browser: open this "
             "page without a proxy, and with https if the browser runs on another machine",
@@ -129,13 +129,13 @@ def place(facts: RequestFacts, names: Collection[str]) -> Place:
     if is_loopback(facts.peer) and (host == "localhost" or is_loopback(host)):
         return "here"
     if not facts.secure:
-        raise RefusedError(
+        raise RequestRefusedError(
             "plain" if not is_loopback(facts.peer) else "host",
             f"the request is for {host or 'no host'!r}, but plain http is only for localhost: use "
             "http://localhost on the machine of the page's server, and https from another machine",
         )
     if host not in names:
-        raise RefusedError(
+        raise RequestRefusedError(
             "host",
             f"{host or 'no name'!r} is not a name of this robot: use its host name, its address or "
             "a name in its certificate",
@@ -144,10 +144,10 @@ def place(facts: RequestFacts, names: Collection[str]) -> Place:
 
 
 def require_own_origin(facts: RequestFacts) -> None:
-    """Raise `RefusedError` if a web page of another origin made the browser send this request."""
+    """Raise `RequestRefusedError` if a page of another origin caused this request."""
     strange = facts.origin is not None and facts.origin.lower() != _own_origin(facts)
     if strange or facts.site not in (None, "same-origin", "none"):
-        raise RefusedError(
+        raise RequestRefusedError(
             "origin",
             "the request comes from a page of another site: open the robot's own page, or list the "
             "site in web.origins",

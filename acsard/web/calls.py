@@ -23,7 +23,7 @@ from acsard.host import clock
 from acsard.host.errors import MendableError, UsageError
 from acsard.host.rate_limits import Buckets, Places
 from acsard.host.threads import in_thread
-from acsard.web.callers import Identity, RefusedError
+from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.limits import REMOTE_STOP_RATE
 from acsard.web.robots import Robots
 
@@ -82,7 +82,7 @@ class Calls:
         self._elsewhere = Places(MAX_REMOTE_STOPS, MAX_REMOTE_STOPS)
 
     async def call(
-        self, identity: Identity, verb: str, payload: Mapping[str, Any], robot: str = ""
+        self, identity: AdmittedClient, verb: str, payload: Mapping[str, Any], robot: str = ""
     ) -> ServiceReply:
         """Call the service `verb` for the client `identity`, and return the reply.
 
@@ -115,7 +115,7 @@ class Calls:
         return ServiceReply(reply.success and ending.ended, f"{ending.words}; {reply.message}")
 
     async def _called(
-        self, identity: Identity, verb: str, payload: Mapping[str, Any], other: str
+        self, identity: AdmittedClient, verb: str, payload: Mapping[str, Any], other: str
     ) -> ServiceReply:
         client = self._robots.client
         if client is None:
@@ -155,7 +155,11 @@ class Calls:
         return await self._run_call(lambda: client.sibling(robot).reply(f"{name}?fmt=json"))
 
     async def _stop(
-        self, robot: str, client: Client, identity: Identity, request: Callable[[], ServiceReply]
+        self,
+        robot: str,
+        client: Client,
+        identity: AdmittedClient,
+        request: Callable[[], ServiceReply],
     ) -> ServiceReply:
         # A robot that does not exist never replies, so the number of waiting calls is limited.
         with self._elsewhere.place() as free:
@@ -177,14 +181,14 @@ class Calls:
             "robot has stopped",
         )
 
-    def _require_few(self, identity: Identity) -> None:
-        """Raise `RefusedError` if a client exceeds the limit `REMOTE_STOP_RATE`.
+    def _require_few(self, identity: AdmittedClient) -> None:
+        """Raise `RequestRefusedError` if a client exceeds the limit `REMOTE_STOP_RATE`.
 
         Call this for each stop of a robot that may not exist.
         """
         if not self._unknown.take(identity.token or identity.name, clock.mono_ns()):
             rate = REMOTE_STOP_RATE
-            raise RefusedError(
+            raise RequestRefusedError(
                 "too_fast",
                 "the stop was not sent: you have sent too many stops to robots that have not "
                 f"answered ({rate.burst:g} at once and {rate.hz:g} a second are allowed); send it "
@@ -273,10 +277,10 @@ class Stops:
             return await in_thread(call, ANSWER_TIMEOUT_S)
 
 
-def require(caller: Identity, verb: str) -> None:
-    """Raise `RefusedError` unless the service `verb` exists and the client `caller` may call it."""
+def require(caller: AdmittedClient, verb: str) -> None:
+    """Raise `RequestRefusedError` unless `verb` exists and the client may call it."""
     if verb not in SERVICES:
-        raise RefusedError(
+        raise RequestRefusedError(
             "malformed", f"{verb!r} is not a service; choose one of {', '.join(SERVICES)}"
         )
     caller.require(SERVICE_ROLES[verb], verb)
@@ -286,16 +290,16 @@ def _require_stop(verb: str, robot: str) -> None:
     try:
         require_id(robot)
     except UsageError as error:
-        raise RefusedError("malformed", str(error)) from None
+        raise RequestRefusedError("malformed", str(error)) from None
     if verb != "stop":
-        raise RefusedError(
+        raise RequestRefusedError(
             "role",
             f"{robot} is not this page's robot: here you can only see it and stop it; to call "
             f"{verb}, open that robot's own page",
         )
 
 
-def _named(client: Client, robot: str, identity: Identity) -> Client:
+def _named(client: Client, robot: str, identity: AdmittedClient) -> Client:
     """Return a bus client for a robot, with a name that contains the name of `identity`.
 
     The robot's daemon logs the calls of the bus client under this name.

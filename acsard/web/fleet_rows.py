@@ -34,7 +34,7 @@ OWN_ROBOT_NOTE = (
 only its own robot."""
 
 
-class Fleet:
+class FleetTracker:
     """Tracks all robots on the bus while any viewer is subscribed to the list of robots."""
 
     def __init__(self, robots: Robots) -> None:

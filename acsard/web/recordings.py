@@ -23,7 +23,7 @@ from acsard.host.threads import NoThreadError, in_thread
 from acsard.recording.directory import NAME_TIME_FORMAT, PART_SUFFIX, is_being_recorded, listed
 from acsard.recording.end_record import ending_text, read_end
 from acsard.web.answers import READ_TIMEOUT_S, TroubleError
-from acsard.web.callers import RefusedError, is_loopback
+from acsard.web.callers import RequestRefusedError, is_loopback
 from acsard.web.robots import Robots
 
 POLICY = (
@@ -117,8 +117,8 @@ class BlackBox:
     async def find(self, name: str) -> tuple[Path, tuple[int, int]]:
         """Return the path of the recording `name`, and the version of its file.
 
-        The version is the pair (modification time in ns, size in bytes). Raises `RefusedError` if
-        the recording does not exist.
+        The version is the pair (modification time in ns, size in bytes). Raises
+        `RequestRefusedError` if the recording does not exist.
         """
         place = self._place()
 
@@ -140,7 +140,7 @@ class BlackBox:
             raise _unread(place, error) from None
         if entry is None:
             text = "this recording does not exist; GET /api/recordings lists them"
-            raise RefusedError("path", text)
+            raise RequestRefusedError("path", text)
         return entry
 
     def _place(self) -> Path:

@@ -22,7 +22,7 @@ from msgspec import Struct
 from acsard.core.values import Role
 from acsard.host.atomic_file import replace
 from acsard.host.errors import MSGSPEC_ERRORS, MendableError, NotPermittedError, UsageError
-from acsard.web.callers import Identity
+from acsard.web.callers import AdmittedClient
 
 FILE, MODE = "tokens.json", 0o600
 
@@ -59,7 +59,7 @@ class Vault:
         last read, and all tokens in the file. They are in one tuple, because several threads
         replace them."""
 
-    def find_owner(self, text: str) -> Identity | None:
+    def find_owner(self, text: str) -> AdmittedClient | None:
         """Return the owner of the token `text`, or None if the token is not valid.
 
         This method does not read the token file. It uses the tokens that the last call of `all()`,
@@ -219,7 +219,7 @@ def place() -> Path:
     return Path(base) / "acsard-web"
 
 
-def owner_in(tokens: Sequence[Token], text: str) -> Identity | None:
+def owner_in(tokens: Sequence[Token], text: str) -> AdmittedClient | None:
     """Return the owner of the token with the text `text`.
 
     Return None if the token has expired, or if `tokens` does not contain it.
@@ -232,7 +232,7 @@ def owner_in(tokens: Sequence[Token], text: str) -> Identity | None:
             match = token
     if match is None or match.ends <= time.time():
         return None
-    return Identity(match.role, match.name, match.digest)
+    return AdmittedClient(match.role, match.name, match.digest)
 
 
 def _digest(text: str) -> str:

@@ -15,7 +15,7 @@ import aiohttp
 from aiohttp import web
 
 from acsard.client import Client
-from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, Commander, Sender, Wish
+from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, Commander, CommandSigner, Wish
 from acsard.client.outbox import Outbox
 from acsard.core.messages import schema
 from acsard.core.messages.permissions import COMMAND_ROLE, SERVICE_ROLES
@@ -25,9 +25,9 @@ from acsard.host import clock
 from acsard.host.own_identity import sender_id
 from acsard.host.rate_limits import Bucket, Buckets
 from acsard.web import socket_messages
-from acsard.web.callers import Identity, RefusedError
+from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.calls import Calls
-from acsard.web.fleet_rows import Fleet
+from acsard.web.fleet_rows import FleetTracker
 from acsard.web.guide import Guide
 from acsard.web.limits import COMMAND_RATE, MAX_OVERRUNS, MESSAGE_RATE
 from acsard.web.metrics import Counts
@@ -85,7 +85,7 @@ class ViewerCommands:
         server must exit. Otherwise it could not stop the robot when a viewer disconnects."""
 
     def give(
-        self, owner: str, source: str, commander: Commander, sender: Sender, wish: Wish
+        self, owner: str, source: str, commander: Commander, sender: CommandSigner, wish: Wish
     ) -> bool:
         """Queue a command and return True. It replaces an unsent command of the same commander.
 
@@ -108,7 +108,7 @@ class ViewerCommands:
             self._counts.add("commands_superseded")
         return True
 
-    def _publish(self, source: str, sender: Sender, wish: Wish) -> None:
+    def _publish(self, source: str, sender: CommandSigner, wish: Wish) -> None:
         try:
             client = self._client()
             if client is not None:
@@ -130,7 +130,10 @@ class Parts:
 
     def __init__(self, robots: Robots, guide: Guide, counts: Counts) -> None:
         self.robots, self.guide, self.counts = robots, guide, counts
-        self.commands, self.fleet = ViewerCommands(lambda: robots.client, counts), Fleet(robots)
+        self.commands, self.fleet = (
+            ViewerCommands(lambda: robots.client, counts),
+            FleetTracker(robots),
+        )
         self.calls = Calls(robots, guide.stop, self.fleet.sees)
 
 
@@ -141,7 +144,7 @@ class Viewer:
         self,
         socket: web.WebSocketResponse,
         request: web.Request,
-        who: Identity,
+        who: AdmittedClient,
         parts: Parts,
         *,
         camera: bool,
@@ -150,7 +153,7 @@ class Viewer:
         self._robots, self._commands, self._calls = parts.robots, parts.commands, parts.calls
         self._fleet, self._guide, self._counts = parts.fleet, parts.guide, parts.counts
         whole = sender_id(who.name)
-        self._sender, self._commanders = Sender(whole), dict[str, Commander]()
+        self._sender, self._commanders = CommandSigner(whole), dict[str, Commander]()
         self.sender = public_name(whole, parts.robots.certificate)
         """Public name of this client, which `state.sender` contains while the client drives. It
         does not reveal the secret sender id."""
@@ -248,7 +251,7 @@ class Viewer:
         self._guide.on_message(self)
         try:
             self.who.require(frame.least, frame.kind)
-        except RefusedError as error:
+        except RequestRefusedError as error:
             self._out.refuse(frame.kind, error.reason, str(error))
             return
         match frame:
@@ -332,7 +335,7 @@ class Viewer:
         try:
             reply = await self._calls.call(self.who, frame.call, frame.payload, frame.robot)
             ok, text = reply.success, reply.message
-        except RefusedError as error:
+        except RequestRefusedError as error:
             self._counts.refuse(error.reason, self.who.origin)
             ok, text = False, str(error)
         finally:

@@ -18,7 +18,7 @@ from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.faults import Fault
 from acsard.core.values import Inputs, Outputs, Recording
 from acsard.recording.file import About, RecordingWriter
-from acsard.recording.recorded_steps import FinishedStep, Step
+from acsard.recording.recorded_steps import FinishedStep, RecordedStep
 from acsard.recording.replay import Replay
 from acsard.recording.rows import decode, encode
 from acsard.recording.state import Checkpoint, freeze, thaw
@@ -76,7 +76,7 @@ class Tape:
 
     def died(self, inputs: Inputs) -> None: ...
 
-    def steps(self, first: int = 0) -> list[Step]:
+    def steps(self, first: int = 0) -> list[RecordedStep]:
         """Return the recorded steps from number `first` on, encoded and decoded again."""
         starts = range(first, len(self.taken), BATCH)
         return [s for at in starts for s in decode(encode(at, self.taken[at : at + BATCH]))]

@@ -9,7 +9,7 @@ import pytest
 
 from acsard.core.config.settings import Config, OdometryConfig, SimConfig
 from acsard.core.messages.schema import DiagnosticArray
-from acsard.recording.recorded_steps import BlackBox
+from acsard.recording.recorded_steps import StepRecorder
 from tests.scenarios.taped import Tape, replayed
 from tests.scenarios.world import World
 
@@ -22,7 +22,7 @@ def world(
     sim: SimConfig = SKIDDING,
     gyro: bool = True,
     learned_track: bool = False,
-    recorder: BlackBox | None = None,
+    recorder: StepRecorder | None = None,
 ) -> World:
     """Return a world whose robot has been at rest for 1.5 s."""
     odometry = OdometryConfig(gyro=True, learned_track=learned_track)

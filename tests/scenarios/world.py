@@ -32,7 +32,7 @@ from acsard.daemon.latch_rules import LatchKeeper
 from acsard.daemon.late_watch import LateWatch
 from acsard.daemon.pacing import NO_PERIOD, Period
 from acsard.daemon.settings_file import SettingsFile
-from acsard.recording.recorded_steps import BlackBox
+from acsard.recording.recorded_steps import StepRecorder
 
 START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
 
@@ -151,7 +151,7 @@ class World:
         config: Config | None = None,
         *,
         plugged: bool = True,
-        recorder: BlackBox | None = None,
+        recorder: StepRecorder | None = None,
         latches: Latches = Latches(),  # noqa: B008
         keeper: LatchKeeper | None = None,
         settings_file: SettingsFile | None = None,

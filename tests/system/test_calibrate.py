@@ -23,7 +23,7 @@ from acsard.calibration.guided.drive_plan import GuideError, Leg, Move
 from acsard.calibration.guided.leg_driver import STALL_REASON
 from acsard.calibration.guided.robot_on_bus import (
     POSITION_TYPES,
-    Recorder,
+    LegRecorder,
     RobotOnBus,
     Sample,
     Sensor,
@@ -451,7 +451,7 @@ def test_positions_of_another_program_are_received_as_both_types_in_every_encodi
             for form in FORMATS:
                 key = f"slam/{cls.__name__}/{form}"
                 sensor = Sensor(receiver, key, POSITION_TYPES)
-                recorder = Recorder(JointsConfig().as_tuple())
+                recorder = LegRecorder(JointsConfig().as_tuple())
 
                 def came() -> bool:
                     sender.put(key, encode(message, form))  # noqa: B023

@@ -22,7 +22,13 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.calibration.error_budget.measured_errors import Driving, Line, Steps, motion, rounding
+from acsard.calibration.error_budget.measured_errors import (
+    DriveSteps,
+    Driving,
+    Line,
+    motion,
+    rounding,
+)
 from acsard.core.config.settings import Config, OdometryConfig
 from acsard.core.motion.error_model import SPEED_RESOLUTION, ErrorModel, TwistUncertainty, columns
 from acsard.core.motion.kinematics import Kinematics
@@ -67,8 +73,8 @@ STEP_S = 0.1
 MAX_STEPS = 20_000
 """Maximum number of steps in 100 m of driving. A slow drive has longer steps than `STEP_S`."""
 
-STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
-SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
+STRAIGHT = DriveSteps(np.array([[0.05, 0.0] + [0.0] * 7]))
+SPIN = DriveSteps(np.array([[0.0, 0.05] + [0.0] * 7]))
 """Steps without errors: 0.05 m straight ahead (`STRAIGHT`), and 0.05 rad in place (`SPIN`).
 
 If the robot stood still, its budget is computed for a drive that repeats these steps.
@@ -168,7 +174,7 @@ class Budget(Struct, frozen=True):
         )
 
 
-class Received(Struct, frozen=True):
+class DriveMessages(Struct, frozen=True):
     """The messages of one drive that this program received from the daemon."""
 
     lines: list[Line]
@@ -191,7 +197,7 @@ class Received(Struct, frozen=True):
     """True if the encoders are coarse and the daemon does not know their counts per wheel turn."""
 
 
-def budget(received: Received, config: Config, metres: float = BUDGET_DISTANCE_M) -> Budget:
+def budget(received: DriveMessages, config: Config, metres: float = BUDGET_DISTANCE_M) -> Budget:
     """Return the error budget of a drive.
 
     `metres` is the distance after which the budget gives the position error, m.
@@ -221,7 +227,7 @@ def budget(received: Received, config: Config, metres: float = BUDGET_DISTANCE_M
     )  # fmt: skip
 
 
-def _standing(received: Received, config: Config, model: _Model) -> Budget:
+def _standing(received: DriveMessages, config: Config, model: _Model) -> Budget:
     lines, odometry, known = received.lines, config.odometry, model.declares_parameters
     shares = (
         model.share("slip", "settings", STRAIGHT, SPIN, _only(odometry, *NOISE)),
@@ -243,12 +249,14 @@ def _standing(received: Received, config: Config, model: _Model) -> Budget:
     )  # fmt: skip
 
 
-def _causes(received: Received, model: _Model, driving: Driving, counts: int) -> Iterator[Share]:
+def _causes(
+    received: DriveMessages, model: _Model, driving: Driving, counts: int
+) -> Iterator[Share]:
     """Yield the errors of each cause. `counts` is encoder counts per wheel turn; 0 if unknown."""
     odometry, plain = model.odometry, driving.plain()
 
     def share(
-        cause: Cause, basis: Basis, steps: Steps, only: OdometryConfig | None = None,
+        cause: Cause, basis: Basis, steps: DriveSteps, only: OdometryConfig | None = None,
         counts: int = 0, scale: float = 0.0,
     ) -> Share:  # fmt: skip
         left, only = steps.to_the_left(), only or _only(odometry)
@@ -292,7 +300,7 @@ class _Model:
         return bool(columns(_only(self.odometry, *PARAMETERS), self.kinematics))
 
     def share(
-        self, cause: Cause, basis: Basis, ahead: Steps, left: Steps, only: OdometryConfig,
+        self, cause: Cause, basis: Basis, ahead: DriveSteps, left: DriveSteps, only: OdometryConfig,
         counts: int = 0, scale: float = 0.0,
     ) -> Share:  # fmt: skip
         """Return the errors that one cause makes. They are None if `basis` is "unknown".
@@ -320,7 +328,7 @@ class _Model:
         return Share(cause, millimetres, degrees, basis)
 
     def _error(
-        self, steps: Steps, only: OdometryConfig, counts: int, scale: float, metres: float,
+        self, steps: DriveSteps, only: OdometryConfig, counts: int, scale: float, metres: float,
         angle: float,
     ) -> PoseCovariance:  # fmt: skip
         """Return the covariance of the pose after a drive that repeats `steps`.

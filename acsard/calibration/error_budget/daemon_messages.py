@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping
 
-from acsard.calibration.error_budget.budget import Budget, Received, budget
+from acsard.calibration.error_budget.budget import Budget, DriveMessages, budget
 from acsard.calibration.error_budget.measured_errors import Line
 from acsard.client import Client, Subscription
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S
@@ -63,7 +63,7 @@ def budgets(robot: Client, config: Config, seconds: float) -> Iterator[Budget]:
     """
     queues = {key: robot.subscribe(key) for key in KEYS}
     _await_line(robot, queues["wheel_states"])
-    feed = Feed(config, robot.get("state"))
+    feed = MessageCollector(config, robot.get("state"))
     while True:
         _follow(feed, queues, seconds)
         yield budget(feed.received(robot.get("state"), robot.get("diagnostics")), config)
@@ -81,7 +81,7 @@ def _await_line(robot: Client, lines: Subscription) -> None:
         time.sleep(POLL_PERIOD_S)
 
 
-def _follow(feed: Feed, queues: Mapping[str, Subscription], seconds: float) -> None:
+def _follow(feed: MessageCollector, queues: Mapping[str, Subscription], seconds: float) -> None:
     decoders = {key: decoder(key) for key in queues}
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -97,7 +97,7 @@ def _follow(feed: Feed, queues: Mapping[str, Subscription], seconds: float) -> N
                     ) from None
 
 
-class Feed:
+class MessageCollector:
     """Collects the messages of a daemon.
 
     Call `add()` for each message, and then `received()`.
@@ -129,13 +129,13 @@ class Feed:
             self._wheels[message.header.stamp.to_ns()] = message
             self._join(message.header.stamp.to_ns())
 
-    def received(self, last: RobotState, diagnostics: DiagnosticArray) -> Received:
+    def received(self, last: RobotState, diagnostics: DiagnosticArray) -> DriveMessages:
         """Return the messages of the drive so far.
 
         `last` is the daemon's latest state, and `diagnostics` its latest message `diagnostics`.
         """
         learned, deviation, used = _learned(diagnostics)
-        return Received(
+        return DriveMessages(
             list(self._lines),
             [(at - self._start_ns) / NS_PER_S for at in self._sent],
             complete=self._complete(last),
@@ -192,7 +192,7 @@ def _value(diagnostics: DiagnosticArray, key: str) -> str:
 def _learned(diagnostics: DiagnosticArray) -> tuple[float | None, float, bool]:
     """Read from `diagnostics` which effective track the daemon has learned with the gyro.
 
-    The results are the fields `learned`, `deviation` and `used` of `Received`.
+    The results are the fields `learned`, `deviation` and `used` of `DriveMessages`.
     """
     names = ("learned_multiplier", "wheel_separation_multiplier", "learned_multiplier_std")
     learned, configured, std = (_value(diagnostics, name) for name in names)

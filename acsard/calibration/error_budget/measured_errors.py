@@ -354,7 +354,7 @@ MIN_VALUES = 3
 # per period. An edge that comes too late for one period is counted in the next period, so errors of
 # the count do not accumulate. The errors from rounding the multiples to two decimals do accumulate,
 # but they can be computed.
-class Rounding(Struct, frozen=True):
+class RoundingErrors(Struct, frozen=True):
     """The errors that the rounding of wheel speeds in feedback lines causes.
 
     `variance` and `offset` have a row for each feedback line and the columns of `values.WHEELS`.
@@ -375,7 +375,7 @@ class Rounding(Struct, frozen=True):
     """Angle by which a wheel turns in one encoder count, rad; 0 if the lines do not show it."""
 
 
-def rounding(speeds: Floats, period: float) -> Rounding:
+def rounding(speeds: Floats, period: float) -> RoundingErrors:
     """Estimate the errors that the rounding of wheel speeds causes.
 
     `speeds`, rad/s, has a row for each feedback line and a column for each wheel. `period` is the
@@ -389,10 +389,12 @@ def rounding(speeds: Floats, period: float) -> Rounding:
     quantum = _quantum(speeds)
     if quantum:
         off = (speeds - quantum * np.round(speeds / quantum)) * period
-        return Rounding(np.zeros_like(speeds), off, equal_errors, quantum, quantum * period)
+        return RoundingErrors(np.zeros_like(speeds), off, equal_errors, quantum, quantum * period)
     variance = np.column_stack([_runs(column) for column in speeds.T])
     scale = (SPEED_RESOLUTION * period) ** 2 / 12
-    return Rounding(variance * scale, np.zeros_like(speeds), equal_errors, SPEED_RESOLUTION, 0.0)
+    return RoundingErrors(
+        variance * scale, np.zeros_like(speeds), equal_errors, SPEED_RESOLUTION, 0.0
+    )
 
 
 def _runs(values: Floats) -> Floats:
@@ -423,7 +425,7 @@ def _quantum(speeds: Floats) -> float:
     return quantization_step(sizes) if len(sizes) >= MIN_VALUES else 0.0
 
 
-class Steps(Struct, frozen=True):
+class DriveSteps(Struct, frozen=True):
     """A drive, divided into short steps, with the errors that one cause makes in each step."""
 
     rows: Floats
@@ -438,11 +440,11 @@ class Steps(Struct, frozen=True):
     by_gyro: bool = False
     """True if a gyro measured the turns, and false if the wheels did."""
 
-    def to_the_left(self) -> Steps:
+    def to_the_left(self) -> DriveSteps:
         """Return the steps with each right turn mirrored, so that all turns are to the left."""
         rows = self.rows.copy()
         rows[rows[:, 1] < 0.0] *= (1, -1, 1, 1, 1, -1, 1, 1, 1)
-        return Steps(rows, self.by_gyro)
+        return DriveSteps(rows, self.by_gyro)
 
 
 class Driving:
@@ -453,7 +455,7 @@ class Driving:
     """
 
     def __init__(
-        self, lines: list[Line], motion: Motion, rounding: Rounding, kinematics: Kinematics,
+        self, lines: list[Line], motion: Motion, rounding: RoundingErrors, kinematics: Kinematics,
         step_s: float, gyro: bool,
     ) -> None:  # fmt: skip
         self._lines, self._motion, self._rounding, self._gyro = lines, motion, rounding, gyro
@@ -465,7 +467,7 @@ class Driving:
         Row 0 contains the distance, m, and row 1 the turn, rad.
         """
 
-    def plain(self) -> Steps:
+    def plain(self) -> DriveSteps:
         """Return the steps without errors."""
         return self._steps()
 
@@ -474,11 +476,11 @@ class Driving:
         """True if the variance of the published heading shows how large the gyro's noise is."""
         return self._motion.yaw_variance is not None
 
-    def turned_by_gyro(self) -> Steps:
+    def turned_by_gyro(self) -> DriveSteps:
         """Return the steps with the noise that the odometry assumes for the gyro."""
         return self._steps(gyro=self._motion.yaw_variance)
 
-    def late(self) -> Steps:
+    def late(self) -> DriveSteps:
         """Return the steps with the errors that wrong stamps of feedback lines cause."""
         late = self._motion.late
         starts = np.arange(0, len(late), max(1, round(BLOCK_S / self._motion.period)))
@@ -486,11 +488,11 @@ class Driving:
         squares[starts] = np.add.reduceat(late, starts, axis=0) ** 2
         return self._steps(squares)
 
-    def missed(self) -> Steps:
+    def missed(self) -> DriveSteps:
         """Return the steps with the errors that gaps in the feedback cause."""
         return self._steps(self._motion.filled, self._motion.unfilled)
 
-    def rounded(self) -> Steps:
+    def rounded(self) -> DriveSteps:
         """Return the steps with the errors that the rounding of reported speeds causes."""
         errors = self._rounding
         if errors.count:
@@ -502,7 +504,7 @@ class Driving:
         ]
         return self._steps(np.column_stack(variances))
 
-    def contradicted(self) -> Steps:
+    def contradicted(self) -> DriveSteps:
         """Return the steps with the errors of wheels that contradict each other.
 
         On each side of the robot, the computation assumes that either the front or the rear wheel
@@ -524,7 +526,7 @@ class Driving:
     def _steps(
         self, variances: Floats | None = None, missed: Floats | None = None,
         gyro: Floats | None = None,
-    ) -> Steps:  # fmt: skip
+    ) -> DriveSteps:  # fmt: skip
         moved, count = self._motion, len(self._motion.distance)
         errors = [
             np.zeros((count, width)) if error is None else error.reshape(count, width)
@@ -536,4 +538,4 @@ class Driving:
             errors[1] = errors[1] * (1, 0, 1, 0)
         rows = np.column_stack([moved.distance, moved.turn, *errors])
         starts = np.arange(0, count, self._lines_per_step)
-        return Steps(np.add.reduceat(rows, starts, axis=0), self._gyro)
+        return DriveSteps(np.add.reduceat(rows, starts, axis=0), self._gyro)

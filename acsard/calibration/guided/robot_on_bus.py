@@ -129,7 +129,7 @@ class Sample(Struct, frozen=True):
     """Values of the columns that `COLUMNS_BY_STREAM` lists for this kind of message."""
 
 
-class Recorder:
+class LegRecorder:
     """Collects the samples of one leg, which is one drive of a guided calibration.
 
     Every argument `arrival` is the time of arrival of the message, s. `joints` contains the names
@@ -245,7 +245,7 @@ class RobotOnBus:
             LogError: there are too few wheel samples, or two wheels of a side contradict each
                 other.
         """
-        recorder = Recorder(self._joints)
+        recorder = LegRecorder(self._joints)
         self._drain()
         sender = self._client.sender
         driver = LegDriver(leg, SOURCE, self._geometry, clock.steady_s(), sender)
@@ -278,7 +278,7 @@ class RobotOnBus:
             time.sleep(POLL_PERIOD_S)
         return False
 
-    def _drive(self, driver: LegDriver, recorder: Recorder) -> None:
+    def _drive(self, driver: LegDriver, recorder: LegRecorder) -> None:
         begun = sent = display_s = clock.steady_s()
         last = None
         while not driver.over:
@@ -296,7 +296,7 @@ class RobotOnBus:
                 display_s = now
         self._prompt.progress(1.0)
 
-    def _receive(self, driver: LegDriver, recorder: Recorder, now: float) -> None:
+    def _receive(self, driver: LegDriver, recorder: LegRecorder, now: float) -> None:
         for state in self._watch.poll(now):
             driver.state(state, now)
 

@@ -40,13 +40,13 @@ from acsard.calibration.improvement import (
     rms,
     with_constant_track,
 )
-from acsard.calibration.log_table import Floats, RefusedError
+from acsard.calibration.log_table import Floats, NoCalibrationError
 from acsard.calibration.multipliers import SEPARATION, configured, multipliers
 from acsard.calibration.odometry_noise import settings
 from acsard.calibration.plausibility import in_range, remarks, too_inaccurate
 from acsard.calibration.positions import WheelSteps, extent, path, wheel_steps
 from acsard.calibration.runs import Run, blocks
-from acsard.calibration.solve import Calibration, Drives
+from acsard.calibration.solve import Calibration, DriveTotals
 from acsard.core.config.settings import DriveConfig, OdometryConfig
 
 SKID_HEADING_STD = 0.015
@@ -184,7 +184,8 @@ def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Flo
 def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
     """Fit the parameters to the readings.
 
-    Raises `RefusedError` if the readings contradict each other or do not determine the parameters.
+    Raises `NoCalibrationError` if the readings contradict each other or do not determine the
+    parameters.
     """
     parameters, normal = _solved(readings, base, _starting_parameters(readings, base))
     left, right, inverse = parameters[[Parameter.LEFT, Parameter.RIGHT, Parameter.INVERSE_TRACK]]
@@ -219,7 +220,7 @@ def _starting_parameters(readings: Sequence[Reading], base: Base) -> Floats:
         ):
             by_wheels = predicted(reading.steps, "turned", base, start).value
             if not 0.1 < by_wheels / reading.value < 10.0:
-                raise RefusedError(
+                raise NoCalibrationError(
                     f"according to the wheels the robot turned {math.degrees(by_wheels):.0f} deg, "
                     f"but you measured {math.degrees(reading.value):.0f} deg: start again, and "
                     "let the robot turn one full circle to the left"
@@ -241,8 +242,9 @@ def _compared(
 def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Floats, Floats]:
     """Return the parameters that fit the readings, and the matrix of the normal equations.
 
-    The matrix is that of the last step: J^T W J plus the prior information. Raises `RefusedError`
-    if the readings do not determine the parameters, or if they contradict each other.
+    The matrix is that of the last step: J^T W J plus the prior information. Raises
+    `NoCalibrationError` if the readings do not determine the parameters, or if they contradict each
+    other.
     """
     parameters, configured = start.copy(), base.start()
     for _ in range(MAX_STEPS):
@@ -262,7 +264,7 @@ def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Flo
         score += both * float(both @ (configured - parameters)) / PRIOR_RADIUS_STD**2
         inner = normal[np.ix_(FITTED_PARAMETERS, FITTED_PARAMETERS)]
         if condition(inner) > MAX_CONDITION:
-            raise RefusedError(
+            raise NoCalibrationError(
                 "the measurements cannot separate errors of the wheel radii from errors of the "
                 "track width, because the robot hardly moved or hardly turned: give the robot "
                 "room, and start again"
@@ -271,7 +273,7 @@ def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Flo
         parameters[FITTED_PARAMETERS] += step * min(1.0, 0.3 / (float(np.abs(step).max()) or 1.0))
         if float(np.abs(step).max()) < CONVERGED:
             return parameters, normal
-    raise RefusedError(
+    raise NoCalibrationError(
         "the measurements contradict each other: is each number in the unit that was asked for, "
         "and was it measured at the end of the robot that the question names? Start again"
     )
@@ -282,7 +284,7 @@ def _held_out_residual(
 ) -> float:
     try:
         parameters, _ = _solved([*readings[:number], *readings[number + 1 :]], base, start)
-    except RefusedError:
+    except NoCalibrationError:
         return math.nan
     ((_, residual, _),) = _compared([readings[number]], base, parameters)
     return residual
@@ -358,7 +360,7 @@ def slant(near: float, far: float, apart: float) -> float:
     """Return the angle between the robot and a line, rad, positive after a turn to the left.
 
     The angle is computed from the distances of two points of the robot to the line. Raises
-    `RefusedError` if the distances are impossible.
+    `NoCalibrationError` if the distances are impossible.
 
     Args:
         near: distance of the point that a turn to the left moves towards the line, m.
@@ -367,7 +369,7 @@ def slant(near: float, far: float, apart: float) -> float:
     """
     sine = (far - near) / apart
     if abs(sine) > 0.98:
-        raise RefusedError(
+        raise NoCalibrationError(
             f"two points of the robot that are {apart * 1000:.0f} mm apart cannot be "
             f"{near * 1000:.0f} mm and {far * 1000:.0f} mm from the line or wall: start the "
             "calibration again, and measure again"
@@ -396,7 +398,7 @@ def calibrated(
 ) -> Calibration:
     """Return the calibration from readings that a person made with `tool`, such as "a tape".
 
-    Raises `RefusedError` if the readings contradict each other or are too inaccurate.
+    Raises `NoCalibrationError` if the readings contradict each other or are too inaccurate.
     """
     base = Base.of(drive)
     rides = list({id(ride): ride for reading in readings for ride in reading.rides}.values())
@@ -410,11 +412,11 @@ def calibrated(
     inverse_track, std = fit.parameters[Parameter.INVERSE_TRACK], np.sqrt(np.diag(fit.covariance))
     chance = float(std[Parameter.INVERSE_TRACK] / abs(inverse_track))
     for name, deviation in too_inaccurate(result, chance, MAX_TAPE_STDS).items():
-        raise RefusedError(
+        raise NoCalibrationError(
             f"these readings determine {name} only to {deviation:.1%}, which is too inaccurate: "
             f"{ADVICE}"
         )
-    drives = Drives.of(rides, rows, by_wheels, base, result, rate)
+    drives = DriveTotals.of(rides, rows, by_wheels, base, result, rate)
     notes = remarks({}, 0.0, by_wheels, result.values, base, sized=True)
     return Calibration(
         reference=tool, drives=drives, configured=configured(base), multipliers=result,

@@ -30,7 +30,7 @@ Ask = Callable[[str, Callable[[zenoh.Sample], object]], None]
 """Function that queries a key of the robot. It calls the callback with each sample of the reply."""
 
 
-class Identity(Struct, frozen=True):
+class ClientIdentity(Struct, frozen=True):
     """The identity of a client at a robot: its role, its certificate and its name."""
 
     role: Role | Literal[""]
@@ -100,7 +100,9 @@ class Identity(Struct, frozen=True):
         return f"{owner} {self.role}: {ROLE_TEXTS[self.role]}"
 
 
-def identity(ask: Ask, tls: str, sender: str, robot: str = "", endpoint: str = "") -> Identity:
+def identity(
+    ask: Ask, tls: str, sender: str, robot: str = "", endpoint: str = ""
+) -> ClientIdentity:
     """Query the robot for this client's role, and return the client's identity.
 
     Blocks for up to `WHOAMI_S`.
@@ -124,7 +126,7 @@ def identity(ask: Ask, tls: str, sender: str, robot: str = "", endpoint: str = "
             end = min(end, _now_s() + WHOAMI_MORE_S)
             best = max(best, next((n for n, role in enumerate(ROLES) if role == name), -1))
     certificate = common_name(tls) if tls else ""
-    return Identity(ROLES[best] if best >= 0 else "", certificate, sender, robot, endpoint)
+    return ClientIdentity(ROLES[best] if best >= 0 else "", certificate, sender, robot, endpoint)
 
 
 def _now_s() -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 from msgspec import structs
 
-from acsard.calibration.calibration_report import NAMES, Report, keys, parts, report
+from acsard.calibration.calibration_report import NAMES, CalibrationReport, keys, parts, report
 from acsard.calibration.plausibility import RATIO, TRACK
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import DriveConfig
@@ -48,7 +48,7 @@ def test_the_text_states_the_improvement_and_the_remaining_error() -> None:
     assert "give --distance METERS" in text
 
 
-def printed(made: Report) -> str:
+def printed(made: CalibrationReport) -> str:
     return plain(*parts(made, FOUND, "acsard.toml", guided=False), width=9999)
 
 

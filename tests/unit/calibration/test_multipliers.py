@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acsard.calibration.log_table import RefusedError
+from acsard.calibration.log_table import NoCalibrationError
 from acsard.calibration.multipliers import RUN_LENGTH_STD_M, Extent, Multipliers, Tape, scaled
 
 FOUND = Multipliers(np.array([1.6, 1.0, 1.0]), np.diag([0.02, 1e-3, 1e-3]) ** 2)
@@ -38,11 +38,11 @@ def test_a_tape_hardly_changes_the_scale_of_accurate_positions() -> None:
 
 @pytest.mark.parametrize("metres", [2.5, 4.8, 5.2, 10.0])
 def test_a_tape_that_contradicts_the_positions_is_refused(metres: float) -> None:
-    with pytest.raises(RefusedError, match=r"ends 5\.00 m from its start, but you measured"):
+    with pytest.raises(NoCalibrationError, match=r"ends 5\.00 m from its start, but you measured"):
         scaled(FOUND, Tape(metres), NAMES, follow, known=True)
 
 
 @pytest.mark.parametrize(("run", "words"), [("turns", "from its start"), ("no", "no run")])
 def test_a_missing_run_or_one_that_ends_near_its_start_is_refused(run: str, words: str) -> None:
-    with pytest.raises(RefusedError, match=words):
+    with pytest.raises(NoCalibrationError, match=words):
         scaled(FOUND, Tape(5.0, run), NAMES, follow, known=False)

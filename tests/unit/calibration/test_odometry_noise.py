@@ -28,12 +28,12 @@ from msgspec import Struct, structs
 from acsard.calibration import odometry_noise, ros_bag_log
 from acsard.calibration.calibration_report import keys, parts, report
 from acsard.calibration.fit import Parameter
-from acsard.calibration.log_table import LogError, RefusedError, Table
+from acsard.calibration.log_table import LogError, NoCalibrationError, Table
 from acsard.calibration.multipliers import Deviations
 from acsard.calibration.odometry_noise import (
     INITIAL_NOISE,
     SOURCE_COUNT,
-    Noise,
+    LogNoise,
     Source,
     Windows,
     settings,
@@ -296,7 +296,7 @@ def measured(kind: Set, way: str, robots: int) -> Row:
         log = kind.log(rng, scale)
         try:
             calibration = kind.calibration(log, way)
-        except RefusedError:
+        except NoCalibrationError:
             refused += 1
             continue
         robot, made, counts = configs(calibration), calibration.multipliers, kind.robot.counts
@@ -462,7 +462,7 @@ def test_a_negligible_deviation_is_written_as_zero_and_a_small_variance_is_kept(
     found = np.full(SOURCE_COUNT, size**2)
     made = settings(
         Deviations(0.0, 0.0, size), 1.0, (TRACK, RATIO), OdometryConfig(),
-        Noise(found, INITIAL_NOISE, 1.0, 0.1, True, 1.0, 0.3), scaled=True,
+        LogNoise(found, INITIAL_NOISE, 1.0, 0.1, True, 1.0, 0.3), scaled=True,
     )  # fmt: skip
     variances = {name: made.pop(name) for name in list(made) if "variance" in name}
     assert variances == dict.fromkeys(

@@ -13,7 +13,7 @@ from msgspec.structs import replace as replace_fit
 
 from acsard.calibration.fit import Parameter, fit
 from acsard.calibration.heading import Rows
-from acsard.calibration.log_table import RefusedError
+from acsard.calibration.log_table import NoCalibrationError
 from acsard.calibration.multipliers import Multipliers
 from acsard.calibration.plausibility import (
     RATIO,
@@ -98,14 +98,14 @@ WRONG = {
 def test_a_wrong_sign_unit_or_clock_is_refused_by_name(
     what: str, gyro: bool, places: bool, words: str
 ) -> None:
-    with pytest.raises(RefusedError) as refused:
+    with pytest.raises(NoCalibrationError) as refused:
         calibrated(table(WRONG[what], gyro=gyro, places=places))
     assert words in str(refused.value)
 
 
 def test_rpm_are_refused_also_with_the_configuration_of_another_robot() -> None:
     """The configured robot has larger wheels for its separation than the default robot."""
-    with pytest.raises(RefusedError, match="rpm"):
+    with pytest.raises(NoCalibrationError, match="rpm"):
         turn_units("yaw_rate", 1.9 * 2 * np.pi / 60, 1.9 * 2 * np.pi / 60, BASE)
     turn_units("yaw_rate", 1 / 3.5, 1 / 3.5, BASE)
 
@@ -134,12 +134,14 @@ def test_an_imu_that_lies_on_its_side_is_refused() -> None:
     """The wrong axis measures only noise, although the robot turned several times."""
     rng = np.random.default_rng(0)
     lying = replace(DRIVE, gyro=rng.normal(0.0, 0.05, len(DRIVE.gyro)))
-    with pytest.raises(RefusedError, match=r"but the wheels would turn.*IMU lies on its side"):
+    with pytest.raises(
+        NoCalibrationError, match=r"but the wheels would turn.*IMU lies on its side"
+    ):
         calibrated(table(lying, places=False))
 
 
 def test_positions_alone_are_not_called_a_yaw_in_degrees() -> None:
-    with pytest.raises(RefusedError) as refused:
+    with pytest.raises(NoCalibrationError) as refused:
         turn_units("", 10.0, 10.0, BASE)
     assert "degrees" not in str(refused.value)
     assert "yaw" not in str(refused.value)
@@ -159,13 +161,13 @@ def test_motion_capture_on_a_good_floor_is_not_taken_for_wheel_odometry() -> Non
 def test_positions_of_another_drive_are_refused() -> None:
     x, y = np.random.default_rng(1).normal(size=(2, len(DRIVE.place)))
     still = replace(DRIVE, place=x + 1j * y)
-    with pytest.raises(RefusedError, match="positions"):
+    with pytest.raises(NoCalibrationError, match="positions"):
         calibrated(table(still, gyro=False))
 
 
 def test_multipliers_outside_of_the_configurable_range_are_refused() -> None:
     in_range(np.array([2.51, 1.0, 1.0]))
-    with pytest.raises(RefusedError, match=r"from 0\.1 to 10"):
+    with pytest.raises(NoCalibrationError, match=r"from 0\.1 to 10"):
         in_range(np.array([12.0, 1.0, 1.0]))
 
 
@@ -199,7 +201,7 @@ def test_the_starting_point_is_near_the_truth(gyro: bool, places: bool) -> None:
 def test_positions_from_another_time_are_refused() -> None:
     drive = usual()
     other = replace(drive, place_t=drive.place_t + 1000.0, gyro=np.zeros(0), gyro_t=np.zeros(0))
-    with pytest.raises(RefusedError, match="same clock"):
+    with pytest.raises(NoCalibrationError, match="same clock"):
         ready(table(other, gyro=False))
 
 
@@ -222,28 +224,28 @@ def test_turns_and_straight_drives_are_enough() -> None:
 def test_a_log_of_only_one_movement_is_refused_with_a_drive_to_make(
     left: list[float], right: list[float]
 ) -> None:
-    with pytest.raises(RefusedError) as refused:
+    with pytest.raises(NoCalibrationError) as refused:
         rolls_enough(rows(left, right))
     assert "a drive of 60 s" in str(refused.value)
 
 
 def test_too_little_turning_or_driving_is_refused() -> None:
-    with pytest.raises(RefusedError, match="57 deg"):
+    with pytest.raises(NoCalibrationError, match="57 deg"):
         turns_enough(np.array([0.5, -0.5]))
-    with pytest.raises(RefusedError, match="only 8 s"):
+    with pytest.raises(NoCalibrationError, match="only 8 s"):
         drives_enough([Block(0, 0, 4)] * 2)
 
 
 def test_turns_on_the_spot_are_enough_for_a_heading_sensor() -> None:
     spins = rows([-9, 9, -9], [9, -9, 9])
     rolls_enough(spins, spins=True)
-    with pytest.raises(RefusedError, match="ahead or back"):
+    with pytest.raises(NoCalibrationError, match="ahead or back"):
         rolls_enough(spins)
 
 
 def test_turns_on_the_spot_are_enough_if_one_side_always_rolls_a_little_further() -> None:
     rolls_enough(rows([-8.91, 8.91, -8.91], [9, -9, 9]), spins=True)
-    with pytest.raises(RefusedError, match="in opposite directions"):
+    with pytest.raises(NoCalibrationError, match="in opposite directions"):
         rolls_enough(rows([0.1, -0.1], [0.1, -0.1]), spins=True)
 
 

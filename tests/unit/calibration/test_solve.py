@@ -16,7 +16,7 @@ from msgspec import structs
 
 from acsard.calibration import solve
 from acsard.calibration.calibration_report import keys
-from acsard.calibration.log_table import RefusedError
+from acsard.calibration.log_table import NoCalibrationError
 from acsard.calibration.multipliers import Tape
 from acsard.calibration.plausibility import RATIO, TRACK
 from acsard.calibration.solve import Calibration, calibrate
@@ -187,7 +187,7 @@ def test_slow_squares_do_not_worsen_the_odometry_of_a_sound_robot(seed: int) -> 
     before = after = away(elsewhere, np.ones(3))
     try:
         after = away(elsewhere, calibrated(log).multipliers.values)
-    except RefusedError as refused:
+    except NoCalibrationError as refused:
         assert "not clearly better" in str(refused)  # noqa: PT017
     print(f"{100 * before:.1f} cm before, {100 * after:.1f} cm after")
     assert after <= before
@@ -251,7 +251,7 @@ def test_a_log_is_refused_with_the_quantities_that_are_too_inaccurate(
     """Turns on the spot do not determine the ratio of the radii at all."""
     monkeypatch.setattr(solve, "MAX_LOG_STDS", (1e-9, 0.03))
     plan: Plan = [(3, 0, 0), (20, 0, 1), (20, 0, -1)]
-    with pytest.raises(RefusedError) as refused:
+    with pytest.raises(NoCalibrationError) as refused:
         calibrated(table(drive(Robot(rng=np.random.default_rng(0)), plan), places=False))
     text = str(refused.value)
     assert "this log is too inaccurate: " in text
@@ -302,7 +302,7 @@ def test_a_tape_measures_the_wheels_if_positions_are_too_coarse_to_improve_them(
 
 
 def test_a_log_whose_sensors_have_no_value_is_refused() -> None:
-    with pytest.raises(RefusedError, match="no positions or turn rates"):
+    with pytest.raises(NoCalibrationError, match="no positions or turn rates"):
         calibrated(table(usual(), gyro=False, places=False))
 
 
@@ -458,7 +458,7 @@ TOO_LITTLE = [[(3, 0, 0), (30, 0.3, 0)], [(3, 0, 0), (60, 0.3, 0.8)], [(60, 0, 0
 )
 def test_a_drive_with_too_few_movements_is_refused(way: str, plan: list[tuple[float, ...]]) -> None:
     gyro, places = WAYS[way]
-    with pytest.raises(RefusedError, match="a drive of 60 s"):
+    with pytest.raises(NoCalibrationError, match="a drive of 60 s"):
         calibrated(table(drive(Robot(), plan), gyro=gyro, places=places))  # type: ignore[arg-type]
 
 

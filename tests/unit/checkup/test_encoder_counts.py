@@ -8,7 +8,7 @@ import pytest
 
 from acsard.checkup import encoder_counts, line_loss
 from acsard.checkup.dialect import check, identity
-from acsard.checkup.motion import Reply
+from acsard.checkup.motion import BoardReply
 from acsard.checkup.wheels import turn
 from acsard.core.config.settings import Config, SimConfig
 from acsard.core.link.checked_line import Reading
@@ -16,12 +16,12 @@ from tests.each import each
 from tests.unit.checkup.robots import Robot
 
 
-def replies(per_turn: float, speed: float = 3.0, start: int = 65000) -> list[Reply]:
+def replies(per_turn: float, speed: float = 3.0, start: int = 65000) -> list[BoardReply]:
     series = []
     for n in range(100):
         turned = round(n * 0.02 * speed / math.tau * per_turn)
         reading = Reading((65500 + 20 * n) % 65536, ((start + turned) % 65536, 0, 0, 0))
-        series.append(Reply(n * 0.02, (speed, 0.0, 0.0, 0.0), b"", reading))
+        series.append(BoardReply(n * 0.02, (speed, 0.0, 0.0, 0.0), b"", reading))
     return series
 
 
@@ -101,7 +101,7 @@ def test_counts_that_run_against_the_speeds_are_a_fault() -> None:
     robot = Robot()
     with robot.board() as board:
         board.sampled = True
-        board.replies = [Reply(r.at_s, (-3.0, 0.0, 0.0, 0.0), b"", r.reading)
+        board.replies = [BoardReply(r.at_s, (-3.0, 0.0, 0.0, 0.0), b"", r.reading)
                          for r in replies(3200)]  # fmt: skip
         assert "against" in encoder_counts.finding(board, [0]).text
 
@@ -120,7 +120,7 @@ def test_wrong_counts_of_one_motor_are_found(share: float, words: str) -> None:
             counts = (count, round(share * (count - 65000)) % 65536, 0, 0)
             motors = (speed, speed, 0.0, 0.0)
             reading = Reading(reply.reading.mcu_ms, counts)
-            board.replies.append(Reply(reply.at_s, motors, b"", reading))
+            board.replies.append(BoardReply(reply.at_s, motors, b"", reading))
         finding = encoder_counts.finding(board, [0, 1])
     assert (finding.verdict, finding.keys) == ("FAIL", {})
     assert words in finding.text
@@ -150,7 +150,7 @@ def test_wrong_configured_counts_are_found_by_the_speeds_and_corrected(
 def test_counts_that_do_not_change_while_the_wheels_turn_are_to_be_switched_off() -> None:
     with Robot(encoder_counts=3200).board() as board:
         board.sampled = True
-        board.replies = [Reply(r.at_s, r.motors, b"", Reading(20 * n % 65536, (7, 7, 7, 7)))
+        board.replies = [BoardReply(r.at_s, r.motors, b"", Reading(20 * n % 65536, (7, 7, 7, 7)))
                          for n, r in enumerate(replies(3200))]  # fmt: skip
         finding = encoder_counts.finding(board, [0])
     assert (finding.verdict, finding.keys) == ("FAIL", {"mcu.encoder_counts": 0})

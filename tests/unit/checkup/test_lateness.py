@@ -10,7 +10,7 @@ from acsard.checkup.lateness import (
     MAX_LATENESS_S,
     MAX_PAUSE_S,
     MIN_DELAY_S,
-    Lateness,
+    HostDelays,
     finding,
     is_doubtful,
     judged,
@@ -22,7 +22,7 @@ from tests.unit.checkup.robots import Busy, Robot, Starved
 
 
 def test_the_largest_lateness_since_a_time_is_reported() -> None:
-    lateness = Lateness()
+    lateness = HostDelays()
     for late_s, now_s in ((0.3, 1.0), (0.02, 2.0), (0.05, 3.0), (MIN_DELAY_S / 2, 4.0)):
         lateness.record(late_s, now_s)
     assert [lateness.since(s) for s in (0.0, 1.0, 1.5, 3.0, 3.5)] == [0.3, 0.3, 0.05, 0.05, 0.0]

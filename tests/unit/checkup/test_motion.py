@@ -7,20 +7,20 @@ import math
 import pytest
 
 from acsard.checkup import motion
-from acsard.checkup.motion import Reply
+from acsard.checkup.motion import BoardReply
 from acsard.core.link.checked_line import Reading
 
 
 def course(
     speed: float, per_turn: int, period_ms: int = 20, seconds: float = 1.0, sampled: bool = False
-) -> list[Reply]:
+) -> list[BoardReply]:
     """Return replies in which the speed of motor b follows from its whole counts."""
     series, before = [], 0
     for n in range(1, int(seconds * 1000 / period_ms)):
         counts = math.floor(speed * n * period_ms / 1000 / math.tau * per_turn)
         velocity = (counts - before) / per_turn * math.tau / period_ms * 1000
         reading = Reading(n * period_ms, (0, counts % 65536, 0, 0)) if sampled else None
-        series.append(Reply(n * period_ms / 1000, (0.0, velocity, 0.0, 0.0), b"", reading))
+        series.append(BoardReply(n * period_ms / 1000, (0.0, velocity, 0.0, 0.0), b"", reading))
         before = counts
     return series
 
@@ -50,7 +50,7 @@ def test_a_sudden_runaway_is_found_by_its_third_reply(sampled: bool) -> None:
         last = replies[-1]
         counts = (0, last.reading.counts[1] + 200, 0, 0) if last.reading else (0, 0, 0, 0)
         reading = last.reading and Reading(last.reading.mcu_ms + 20, counts)
-        replies.append(Reply(last.at_s + 0.02, (0.0, 19.6, 0.0, 0.0), b"", reading))
+        replies.append(BoardReply(last.at_s + 0.02, (0.0, 19.6, 0.0, 0.0), b"", reading))
     assert motion.fastest(replies, 6.0) is not None
 
 
@@ -69,7 +69,7 @@ def test_the_covered_angle_is_the_sum_of_the_speeds_over_time(per_turn: int) -> 
 
 def test_a_trend_is_the_ratio_to_the_earlier_speed() -> None:
     speeds = [3.0 * 0.99**n for n in range(100)]
-    replies = [Reply(n * 0.02, (0.0, -s, 3.0, 0.0), b"") for n, s in enumerate(speeds)]
+    replies = [BoardReply(n * 0.02, (0.0, -s, 3.0, 0.0), b"") for n, s in enumerate(speeds)]
     a, b, c, d = motion.trend(replies, replies[-1].at_s, 0.02)
     assert (a, c, d) == (1.0, 1.0, 1.0)
     assert b == pytest.approx(0.99**25, rel=0.01)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from acsard.checkup.motion import ZERO, Reply
+from acsard.checkup.motion import ZERO, BoardReply
 from acsard.checkup.procedure import AGAIN, MOST
 from acsard.checkup.restarts import (
     ANSWER_TIMEOUT_S,
@@ -187,11 +187,11 @@ def test_restarts_with_different_causes_get_the_general_remedy() -> None:
     assert finding(Config().mcu, starts).mend.startswith("is the supply weak")
 
 
-def reply(at_s: float, mcu_ms: int) -> Reply:
-    return Reply(at_s, ZERO, b"", Reading(mcu_ms % CLOCK_RANGE_MS, (0, 0, 0, 0)))
+def reply(at_s: float, mcu_ms: int) -> BoardReply:
+    return BoardReply(at_s, ZERO, b"", Reading(mcu_ms % CLOCK_RANGE_MS, (0, 0, 0, 0)))
 
 
-def detector_after(*replies: Reply) -> Restarts:
+def detector_after(*replies: BoardReply) -> Restarts:
     """Return a restart detector that has received these replies."""
     restarts = Restarts()
     for answer in replies:

@@ -12,7 +12,7 @@ from acsard.client.commander import (
     RELEASE_TIMEOUT_NS,
     STALE_NS,
     Commander,
-    Sender,
+    CommandSigner,
     Wish,
 )
 from acsard.core.values import NS_PER_S, REST, Twist
@@ -242,7 +242,7 @@ def test_the_last_zero_of_a_sender_with_a_steady_clock_has_a_stamp_of_that_clock
 
 
 def test_a_zero_has_a_stamp_not_older_than_the_commands_before_it() -> None:
-    sender = Sender("joe/aa")
+    sender = CommandSigner("joe/aa")
     sender.sign(9, steady=True)
     assert sender.sign(8, steady=True).stamp == 8  # a late speed must look late
     assert sender.sign(8, steady=True, zero=True).stamp == 9
@@ -250,7 +250,7 @@ def test_a_zero_has_a_stamp_not_older_than_the_commands_before_it() -> None:
 
 
 def test_the_commands_of_a_sender_are_numbered() -> None:
-    sender = Sender("joe/aa")
+    sender = CommandSigner("joe/aa")
     signed = [sender.sign(9, steady=False) for _ in range(3)]
     assert [signature.sequence for signature in signed] == [1, 2, 3]
     assert {signature.sender for signature in signed} == {"joe/aa"}

@@ -27,7 +27,7 @@ from acsard.core.messages.encodings import FORMATS, DecodeError, Decoder, Format
 from acsard.core.messages.schema import Header, Imu, Quaternion, Time, Vector3
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import NS_PER_S, REST, Command
-from acsard.daemon.bus.identity import Identity
+from acsard.daemon.bus.identity import ClientIdentity
 from acsard.host import clock
 from tests.each import each
 
@@ -321,7 +321,7 @@ def test_over_tls_the_error_names_the_role_only_if_no_command_arrived(
 ) -> None:
     ours = client_of(session)
     ours.where = ours.where._replace(tls="certificates")
-    monkeypatch.setattr(ours, "whoami", lambda: Identity("operator", "anna", "anna/1"))
+    monkeypatch.setattr(ours, "whoami", lambda: ClientIdentity("operator", "anna", "anna/1"))
     error = ours.explain_error(UnheardError(objection))
     assert type(error) is client.NotDrivenError
     assert str(error).startswith(objection)
@@ -333,7 +333,7 @@ def test_over_tls_a_viewer_gets_a_permission_error_whatever_the_robot_reports(
 ) -> None:
     ours = client_of(session)
     ours.where = ours.where._replace(tls="certificates")
-    monkeypatch.setattr(ours, "whoami", lambda: Identity("viewer", "anna", "anna/1"))
+    monkeypatch.setattr(ours, "whoami", lambda: ClientIdentity("viewer", "anna", "anna/1"))
     error = ours.explain_error(UnheardError("fault: rear_left wheel is stuck"))
     assert isinstance(error, client.NotPermittedError)
 

@@ -18,7 +18,7 @@ import msgspec
 
 from acsard.core.values import NS_PER_S
 from acsard.daemon import late_watch
-from acsard.daemon.late_causes import Lateness
+from acsard.daemon.late_causes import LatenessEvidence
 from acsard.daemon.late_watch import LateWatch
 from acsard.host import clock
 from acsard.host.kernel_counters import Kernel
@@ -36,13 +36,13 @@ class Noting(LateWatch):
 
     def __init__(self) -> None:
         super().__init__()
-        self.noted: list[Lateness] = []
+        self.noted: list[LatenessEvidence] = []
 
-    def _report(self, kernel: Kernel, late: Lateness) -> None:
+    def _report(self, kernel: Kernel, late: LatenessEvidence) -> None:
         self.noted.append(late)
 
 
-def record(seconds: float) -> list[Lateness]:
+def record(seconds: float) -> list[LatenessEvidence]:
     """Be late once in every `EVERY` periods, and return all late periods."""
     late_watch.PAUSE_NS = 0
     with Noting() as watch:

@@ -8,7 +8,15 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from acsard.daemon.late_causes import BECAUSE, CAUSES, Lateness, cause_in, causes, event_of, present
+from acsard.daemon.late_causes import (
+    BECAUSE,
+    CAUSES,
+    LatenessEvidence,
+    cause_in,
+    causes,
+    event_of,
+    present,
+)
 from acsard.host.kernel_counters import Conditions, Kernel, Program, Reading, Scheduled, SlowClock
 from tests.each import each
 from tests.unit.host.kernel_files import (
@@ -67,14 +75,14 @@ def planted(late_ms: int) -> dict[str, tuple[dict[str, str], tuple[float, float]
     }
 
 
-def judged(root: Path, name: str, late_ms: int) -> Lateness:
+def judged(root: Path, name: str, late_ms: int) -> LatenessEvidence:
     """Return the judgement of a late period with one simulated cause."""
     files, (ran, waited) = planted(late_ms)[name]
     kernel, late_ns = Kernel(write(root, QUIET)), late_ms * MS
     before = kernel.read()
     write(root, files)
     loop = Scheduled(int(ran * late_ns) + 200_000, int(waited * late_ns))
-    return Lateness(late_ns, loop, before, kernel.read())
+    return LatenessEvidence(late_ns, loop, before, kernel.read())
 
 
 @pytest.mark.parametrize("name", planted(10))
@@ -90,7 +98,7 @@ def test_a_suspend_is_named_eight_of_eight_times(tmp_path: Path) -> None:
     before = Kernel(write(tmp_path, QUIET)).read()
     for late_ms in SIZES_MS:
         after = replace(before, asleep_ns=before.asleep_ns + 12_300 * MS)
-        names, clause = causes(Lateness(late_ms * MS, Scheduled(), before, after))
+        names, clause = causes(LatenessEvidence(late_ms * MS, Scheduled(), before, after))
         assert names == ("suspended",)
         assert "suspended for 12.30 s" in clause
 
@@ -105,14 +113,15 @@ def test_a_quiet_computer_has_no_cause_but_waiting_for_a_processor(
     late_ms: int, share: tuple[float, float]
 ) -> None:
     loop = Scheduled(int(share[0] * late_ms * MS), int(share[1] * late_ms * MS))
-    names, clause = causes(Lateness(late_ms * MS, loop, Reading(), Reading()))
+    names, clause = causes(LatenessEvidence(late_ms * MS, loop, Reading(), Reading()))
     assert names == (("processor",) if share == WAITED else ())
     assert bool(clause) == bool(names)
 
 
 def test_normal_load_has_no_false_cause() -> None:
     recorded = [
-        msgspec.json.decode(line, type=Lateness) for line in NORMAL.read_bytes().splitlines()
+        msgspec.json.decode(line, type=LatenessEvidence)
+        for line in NORMAL.read_bytes().splitlines()
     ]
     assert len(recorded) >= 200
     assert max(lateness.late_ns for lateness in recorded) > 150 * MS
@@ -121,7 +130,8 @@ def test_normal_load_has_no_false_cause() -> None:
 
 def test_the_recorded_load_is_not_idle() -> None:
     recorded = [
-        msgspec.json.decode(line, type=Lateness) for line in NORMAL.read_bytes().splitlines()
+        msgspec.json.decode(line, type=LatenessEvidence)
+        for line in NORMAL.read_bytes().splitlines()
     ]
     assert sum(lateness.after.disk_ns > lateness.before.disk_ns for lateness in recorded) > 20
     assert sum(lateness.after.steal_ns > lateness.before.steal_ns for lateness in recorded) > 0
@@ -139,36 +149,40 @@ def test_the_recorded_load_is_not_idle() -> None:
 )
 def test_a_slow_processor_delays_no_thread_that_slept(conditions: Conditions) -> None:
     after = Reading(conditions=conditions)
-    assert causes(Lateness(30 * MS, Scheduled(200_000, 0), Reading(), after))[0] == ()
-    assert len(causes(Lateness(30 * MS, Scheduled(20 * MS, 0), Reading(), after))[0]) == 1
+    assert causes(LatenessEvidence(30 * MS, Scheduled(200_000, 0), Reading(), after))[0] == ()
+    assert len(causes(LatenessEvidence(30 * MS, Scheduled(20 * MS, 0), Reading(), after))[0]) == 1
 
 
 def test_a_disk_is_no_cause_for_a_thread_that_ran_or_did_not_use_the_disk() -> None:
     after = Reading(disk_ns=250 * MS, own_bytes=4096)
-    assert causes(Lateness(30 * MS, Scheduled(), Reading(), after))[0] == ("disk",)
-    assert causes(Lateness(30 * MS, Scheduled(25 * MS, 0), Reading(), after))[0] == ()
+    assert causes(LatenessEvidence(30 * MS, Scheduled(), Reading(), after))[0] == ("disk",)
+    assert causes(LatenessEvidence(30 * MS, Scheduled(25 * MS, 0), Reading(), after))[0] == ()
     others = replace(after, own_bytes=0)
-    assert causes(Lateness(30 * MS, Scheduled(), Reading(), others))[0] == ()
+    assert causes(LatenessEvidence(30 * MS, Scheduled(), Reading(), others))[0] == ()
 
 
 def test_the_thread_s_own_disk_delay_is_enough_to_name_the_disk() -> None:
     after = Reading(own_disk_ns=20 * MS)
-    assert causes(Lateness(30 * MS, Scheduled(), Reading(), after))[0] == ("disk",)
-    assert causes(Lateness(50 * MS, Scheduled(), Reading(), after))[0] == ()
+    assert causes(LatenessEvidence(30 * MS, Scheduled(), Reading(), after))[0] == ("disk",)
+    assert causes(LatenessEvidence(50 * MS, Scheduled(), Reading(), after))[0] == ()
 
 
 @pytest.mark.parametrize(("stolen_ms", "named"), [(10, False), (20, False), (30, True)])
 def test_one_or_two_ticks_of_steal_time_are_not_named_as_a_cause(
     stolen_ms: int, named: bool
 ) -> None:
-    late = Lateness(12 * MS, Scheduled(), Reading(0, (5, 5)), Reading(0, (5, 5 + stolen_ms * MS)))
+    late = LatenessEvidence(
+        12 * MS, Scheduled(), Reading(0, (5, 5)), Reading(0, (5, 5 + stolen_ms * MS))
+    )
     assert causes(late)[0] == (("steal",) if named else ())
 
 
 def test_two_simultaneous_causes_are_both_named() -> None:
     conditions = Conditions(slow_clock=SlowClock("powersave", 600, 1500))
     hog = Program(812, "hog", 150 * MS)
-    late = Lateness(50 * MS, Scheduled(0, 50 * MS), Reading(), Reading(conditions=conditions), hog)
+    late = LatenessEvidence(
+        50 * MS, Scheduled(0, 50 * MS), Reading(), Reading(conditions=conditions), hog
+    )
     names, clause = causes(late)
     assert names == ("governor", "processor")
     assert "powersave keeps the processor at 600 of 1500 MHz" in clause
@@ -177,13 +191,13 @@ def test_two_simultaneous_causes_are_both_named() -> None:
 
 def test_a_real_time_program_is_reported_as_real_time() -> None:
     hog = Program(812, "hog", 150 * MS, -21)
-    late = Lateness(50 * MS, Scheduled(0, 50 * MS), Reading(), Reading(), hog)
+    late = LatenessEvidence(50 * MS, Scheduled(0, 50 * MS), Reading(), Reading(), hog)
     assert "the real-time program hog (pid 812)" in causes(late)[1]
 
 
 def test_the_event_has_the_duration_and_the_cause_with_its_advice() -> None:
     after = Reading(conditions=Conditions(undervoltage=True))
-    late = Lateness(63 * MS, Scheduled(60 * MS, 0), Reading(), after)
+    late = LatenessEvidence(63 * MS, Scheduled(60 * MS, 0), Reading(), after)
     event = event_of(late, causes(late)[1], immediate=True)
     assert (event.name, event.level, event.kind) == ("missed_periods", "warning", "late")
     assert BECAUSE in event.text

@@ -17,7 +17,7 @@ from acsard.daemon.latencies import (
     SLOT_NS,
     SLOTS,
     Histogram,
-    LastMinute,
+    LastMinuteCount,
     Stopwatch,
 )
 
@@ -156,7 +156,7 @@ def test_a_day_takes_no_more_memory_than_a_minute() -> None:
 
 
 def test_an_occurrence_counts_for_a_minute_and_then_no_longer() -> None:
-    happened = LastMinute()
+    happened = LastMinuteCount()
     assert happened.count(0) == 0
     happened.add(0, 3)
     happened.add(SLOT_NS - 1, 2)
@@ -168,7 +168,7 @@ def test_an_occurrence_counts_for_a_minute_and_then_no_longer() -> None:
 
 
 def test_a_count_of_the_last_minute_takes_constant_memory() -> None:
-    happened = LastMinute()
+    happened = LastMinuteCount()
     for second in range(3600):
         happened.add(second * NS_PER_S, 1)
     assert happened.count(3599 * NS_PER_S) == 60

@@ -19,7 +19,7 @@ from acsard.core.messages.schema import Header, Message, Time, Twist, TwistStamp
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import NS_PER_S, REST, Command
 from acsard.foxglove import drives
-from acsard.foxglove.drives import Drives, Viewer, encoding_of, wish
+from acsard.foxglove.drives import DrivingViewers, Viewer, encoding_of, wish
 from acsard.foxglove.notices import Notices
 from acsard.host import clock
 from tests.each import each
@@ -69,7 +69,7 @@ class Viewers:
     def __init__(self) -> None:
         self.sessions: dict[int, Session] = {1: Session(), 2: Session()}
         self.notices = Notices(lambda text: None, lambda: None)
-        self.drives = Drives(self._robot, "/cmd_vel", self.notices, "")
+        self.drives = DrivingViewers(self._robot, "/cmd_vel", self.notices, "")
         for viewer in self.sessions:
             for channel, name in ((1, "Twist"), (2, "TwistStamped")):
                 kind = f"geometry_msgs/msg/{name}"

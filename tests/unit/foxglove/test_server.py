@@ -17,7 +17,7 @@ from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import AcsardError
-from acsard.foxglove.drives import Drives
+from acsard.foxglove.drives import DrivingViewers
 from acsard.foxglove.notices import Notices
 from acsard.foxglove.server import (
     MAX_WAITING_CHANGES,
@@ -71,7 +71,7 @@ def of_robot(robot: Robot) -> tuple[Settings, Callable[[], list[str]]]:
 def settings_after(monkeypatch: pytest.MonkeyPatch, *calls: tuple[str, list[str]]) -> Settings:
     """Return the settings after these calls of the server, at a time at which a poll is due."""
     made, _ = of_robot(Robot())
-    listener = Listener(ShownTopics(lambda: None), cast(Drives, None), made)
+    listener = Listener(ShownTopics(lambda: None), cast(DrivingViewers, None), made)
     for name, keys in calls:
         getattr(listener, f"on_parameters_{name}")(keys)
     later_ns = clock.mono_ns() + 2 * POLL_PERIOD_NS

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 from acsard.core.config.settings import Config
 from acsard.daemon.late_watch import LateWatch
-from acsard.recording.recorded_steps import Step
+from acsard.recording.recorded_steps import RecordedStep
 from acsard.recording.replay import Replay
 from acsard.recording.state import State
 from acsard.report.report_data import ReportData
@@ -21,7 +21,7 @@ def report_of(
     end: float | None = None,
     late_watch: LateWatch | None = None,
     config: Config | None = None,
-) -> tuple[ReportData, list[Step]]:
+) -> tuple[ReportData, list[RecordedStep]]:
     """Return the report's data of a drive, and the steps of the drive."""
     config, tape = config or Config(), Tape()
     world = World(config, recorder=tape, late_watch=late_watch)
@@ -31,7 +31,7 @@ def report_of(
 
 
 def report_from(
-    steps: list[Step],
+    steps: list[RecordedStep],
     config: Config | None = None,
     begin: float | None = None,
     end: float | None = None,
@@ -72,7 +72,7 @@ def two_drivers(world: World) -> None:
 
 
 @lru_cache
-def drive_of_two() -> tuple[ReportData, list[Step]]:
+def drive_of_two() -> tuple[ReportData, list[RecordedStep]]:
     """Return the report's data and the steps of a drive with two sources.
 
     Tests must not change them.

@@ -12,7 +12,7 @@ from html.parser import HTMLParser
 import pytest
 
 from acsard.core.values import Command, Event, Refusal, Twist
-from acsard.recording.recorded_steps import Step
+from acsard.recording.recorded_steps import RecordedStep
 from acsard.recording.time_span import date
 from acsard.report.page import MAX_UNFOLDED_EVENTS, escaped, page
 from acsard.report.report_data import Mark, ReportData
@@ -57,7 +57,7 @@ def origin(**others: str) -> Origin:
     return Origin(known["file"], known["robot"], known["version"], known["python"])
 
 
-def evil_steps() -> list[Step]:
+def evil_steps() -> list[RecordedStep]:
     """Return a drive in which all text of unknown origin is hostile."""
     from msgspec.structs import replace
 

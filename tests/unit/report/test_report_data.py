@@ -9,7 +9,7 @@ import pytest
 
 from acsard.core.values import NS_PER_S
 from acsard.recording.recorded_steps import US_PER_S
-from acsard.report.report_data import FIRST, LAST, Lateness, Mark, Marks, SerialCounts
+from acsard.report.report_data import FIRST, LAST, Mark, Marks, SerialCounts, StepLateness
 from acsard.report.report_text import Origin, notes
 from tests.scenarios.world import START, World
 from tests.unit.report.driven import drive_of_two, report_from, report_of
@@ -225,12 +225,12 @@ def test_an_implausible_line_counts_as_dropped() -> None:
     assert (link.good.total, link.dropped.total) == (1, 1)
 
 
-def late(lates: list[float], ahead: frozenset[int] = frozenset()) -> Lateness:
+def late(lates: list[float], ahead: frozenset[int] = frozenset()) -> StepLateness:
     """Return the lateness of periods of 10 ms, each late by this many ms.
 
     In the periods of `ahead` the daemon has already sent a line at once for a new command.
     """
-    lateness, number = Lateness(100.0), 0
+    lateness, number = StepLateness(100.0), 0
     for n, ms in enumerate(lates):
         if n in ahead:
             lateness.at_once()
@@ -251,7 +251,7 @@ def test_a_line_that_was_sent_immediately_makes_no_period_late() -> None:
 
 @pytest.mark.parametrize("at_once", [False, True])
 def test_lateness_counts_from_the_first_missed_period(at_once: bool) -> None:
-    lateness = Lateness(100.0)
+    lateness = StepLateness(100.0)
     for n in range(10):
         lateness.tick(n / 100, n * 10 * MS, 0, known=True)
     if at_once:  # it replaces the first missed line
@@ -264,7 +264,7 @@ def test_lateness_counts_from_the_first_missed_period(at_once: bool) -> None:
 
 
 def test_missing_steps_do_not_count_as_lateness() -> None:
-    lateness = Lateness(100.0)
+    lateness = StepLateness(100.0)
     lateness.tick(0.0, 0, 0, known=True)
     lateness.tick(60.0, 60_000 * MS, 2, known=False)
     lateness.tick(60.01, 60_010 * MS, 0, known=True)

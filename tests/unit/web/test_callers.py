@@ -11,9 +11,9 @@ from msgspec.structs import replace
 from acsard.web.callers import (
     LOCAL_NAME,
     MAX_TOKENS,
-    Identity,
-    RefusedError,
+    AdmittedClient,
     RequestFacts,
+    RequestRefusedError,
     by_listed_page,
     cookie_name,
     host_name,
@@ -29,7 +29,7 @@ from tests.each import each
 
 NAMES = frozenset({"robot.local", "192.168.1.7"})
 
-MAINTAINER = Identity("maintainer", LOCAL_NAME)
+MAINTAINER = AdmittedClient("maintainer", LOCAL_NAME)
 """The identity of a client on the robot itself."""
 
 
@@ -65,7 +65,7 @@ def test_a_browser_on_the_robot_s_machine_is_local(peer: str, host: str) -> None
     ],
 )
 def test_any_other_host_name_is_refused(facts: RequestFacts, reason: str) -> None:
-    with pytest.raises(RefusedError) as error:
+    with pytest.raises(RequestRefusedError) as error:
         place(facts, NAMES)
     assert error.value.reason == reason
 
@@ -73,7 +73,7 @@ def test_any_other_host_name_is_refused(facts: RequestFacts, reason: str) -> Non
 @each("secure", [False, True])
 @each("host", ["localhost:8080", "robot.local"])
 def test_a_request_through_a_proxy_is_refused(secure: bool, host: str) -> None:
-    with pytest.raises(RefusedError, match="proxy") as error:
+    with pytest.raises(RequestRefusedError, match="proxy") as error:
         place(RequestFacts("127.0.0.1", secure, host, proxied=True), NAMES)
     assert error.value.reason == "proxy"
 
@@ -115,18 +115,20 @@ def test_the_robot_s_own_page_and_programs_pass_the_origin_check(
     ],
 )
 def test_a_page_of_another_origin_is_refused(origin: str | None, site: str | None) -> None:
-    with pytest.raises(RefusedError) as error:
+    with pytest.raises(RequestRefusedError) as error:
         require_own_origin(RequestFacts("127.0.0.1", False, "localhost:8080", origin, site))
     assert error.value.reason == "origin"
 
 
 def test_a_role_has_the_permissions_of_the_roles_below_it() -> None:
-    viewer, operator = Identity("viewer", "tv"), Identity("operator", "phone")
+    viewer, operator = AdmittedClient("viewer", "tv"), AdmittedClient("operator", "phone")
     assert [viewer.may("viewer"), viewer.may("operator")] == [True, False]
     assert [operator.may("operator"), operator.may("maintainer")] == [True, False]
     assert MAINTAINER.may("maintainer")
     operator.require("operator", "clear")
-    with pytest.raises(RefusedError, match="clear is for operators; your role is viewer") as error:
+    with pytest.raises(
+        RequestRefusedError, match="clear is for operators; your role is viewer"
+    ) as error:
         viewer.require("operator", "clear")
     assert error.value.reason == "role"
 

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from acsard.client import Client
 from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.schema import ServiceReply
-from acsard.web.callers import RefusedError
+from acsard.web.callers import RequestRefusedError
 from acsard.web.calls import (
     MAX_REMOTE_STOPS,
     MAX_STOPS,
@@ -26,7 +26,7 @@ from acsard.web.calls import (
     StopMerger,
     Stops,
 )
-from acsard.web.fleet_rows import Fleet
+from acsard.web.fleet_rows import FleetTracker
 from acsard.web.limits import REMOTE_STOP_RATE
 from acsard.web.robots import Robots
 from tests.unit.web.test_callers import MAINTAINER
@@ -100,10 +100,12 @@ async def test_a_stop_that_fails_fails_its_waiting_callers_and_not_the_next_stop
 
 async def test_only_stop_may_be_called_on_another_robot_and_only_with_a_valid_id() -> None:
     calls = calls_of(robots(None))
-    with pytest.raises(RefusedError, match=r"r2 is not this page's robot.*own page") as error:
+    with pytest.raises(
+        RequestRefusedError, match=r"r2 is not this page's robot.*own page"
+    ) as error:
         await calls.call(MAINTAINER, "clear", {}, "r2")
     assert error.value.reason == "role"
-    with pytest.raises(RefusedError, match="not a robot's id") as error:
+    with pytest.raises(RequestRefusedError, match="not a robot's id") as error:
         await calls.call(MAINTAINER, "stop", {}, "**")
     assert error.value.reason == "malformed"
     # Naming the page's own robot counts as its own.
@@ -235,7 +237,7 @@ async def test_stops_to_silent_robots_are_limited_and_an_answering_robot_is_stop
         for n in range(100):
             try:
                 await stop(f"x{n}")
-            except RefusedError:
+            except RequestRefusedError:
                 refused += 1
         assert refused > 100 - 2 * REMOTE_STOP_RATE.burst
         assert await stop("r2")
@@ -245,7 +247,7 @@ async def test_stops_to_silent_robots_are_limited_and_an_answering_robot_is_stop
 async def test_a_robot_that_a_page_shows_is_stopped_however_many_stops_were_refused() -> None:
     with zenoh.open(quiet()) as session:
         known = robots(Client(session, "acsar", "teleop"))
-        fleet = Fleet(known)
+        fleet = FleetTracker(known)
         calls = calls_of(known, is_known=fleet.sees)
 
         async def stop(robot: str) -> str:
@@ -255,7 +257,7 @@ async def test_a_robot_that_a_page_shows_is_stopped_however_many_stops_were_refu
             """
             try:
                 return (await calls.call(MAINTAINER, "stop", {}, robot)).message
-            except RefusedError as error:
+            except RequestRefusedError as error:
                 return error.reason
 
         async def refused() -> None:

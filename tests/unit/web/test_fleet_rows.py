@@ -18,7 +18,7 @@ from acsard.client import Client
 from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.schema import Info
 from acsard.daemon.bus.address import Address
-from acsard.web.fleet_rows import Fleet
+from acsard.web.fleet_rows import FleetTracker
 from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
 from acsard.web.socket_messages import Row
@@ -64,7 +64,7 @@ def robots(client: Client | None) -> Robots:
     return result
 
 
-async def row(fleet: Fleet, look: Callable[[Row], Any]) -> Row:
+async def row(fleet: FleetTracker, look: Callable[[Row], Any]) -> Row:
     """Wait for a row for which `look` is true, and return it."""
     async with asyncio.timeout(PATIENCE_S):
         while True:
@@ -78,7 +78,7 @@ async def row(fleet: Fleet, look: Callable[[Row], Any]) -> Row:
 async def test_a_robot_that_is_present_and_silent_is_not_shown_in_its_last_mode(
     session: zenoh.Session,
 ) -> None:
-    fleet = Fleet(robots(Client(session, "acsar", "teleop")))
+    fleet = FleetTracker(robots(Client(session, "acsar", "teleop")))
     token = session.liveliness().declare_token("acsard/r2/alive")
     fleet.join(1)
     await row(fleet, lambda entry: entry.robot == "r2")
@@ -108,7 +108,7 @@ async def test_a_robot_is_reported_with_its_version_and_seconds_and_as_gone_when
         query.reply("acsard/r2/info", payload, encoding=encoding_name("msgpack", "Info"))
         query.drop()
 
-    fleet = Fleet(robots(Client(session, "acsar", "teleop")))
+    fleet = FleetTracker(robots(Client(session, "acsar", "teleop")))
     session.declare_queryable("acsard/r2/info", info)
     token = session.liveliness().declare_token("acsard/r2/alive")
     fleet.join(1)
@@ -136,7 +136,7 @@ async def test_the_fleet_is_searched_again_after_no_connection_or_a_failed_bus(
     with zenoh.open(quiet()) as ended:
         pass
     known = robots(None)
-    fleet = Fleet(known)
+    fleet = FleetTracker(known)
     fleet.join(1)
     assert fleet.rows() == []
     known.client = Client(ended, "acsar", "teleop")

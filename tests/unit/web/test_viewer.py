@@ -10,12 +10,12 @@ import aiohttp
 import pytest
 
 from acsard.client import Client
-from acsard.client.commander import Commander, Sender, Wish
+from acsard.client.commander import Commander, CommandSigner, Wish
 from acsard.core.messages.signature import unpack
 from acsard.core.values import NS_PER_S, Twist
 from acsard.daemon.bus.address import Address
 from acsard.host import clock
-from acsard.web.callers import Identity
+from acsard.web.callers import AdmittedClient
 from acsard.web.guide import Guide, Reach
 from acsard.web.limits import COMMAND_RATE
 from acsard.web.metrics import Counts
@@ -33,7 +33,7 @@ def test_a_command_that_cannot_be_sent_is_dropped_and_the_next_is_processed() ->
 
     counts = Counts()
     commands = ViewerCommands(broken, counts)
-    senders = {name: (Commander(), Sender(name)) for name in "ab"}
+    senders = {name: (Commander(), CommandSigner(name)) for name in "ab"}
     for name in "aba":
         commands.give(name, "app", *senders[name], AHEAD)
         commands.outbox.flush(PATIENCE_S)
@@ -52,7 +52,7 @@ def test_a_command_is_put_with_the_stamp_and_the_clock_of_its_sender() -> None:
     fake: Any = Fake()
     counts = Counts()
     commands = ViewerCommands(lambda: fake, counts)
-    commander, sender = Commander(), Sender("joe/aa")
+    commander, sender = Commander(), CommandSigner("joe/aa")
     for stamp_ns in (1000, 2000):
         wish = Wish(Twist(0.2, -0.5), stamp_ns, steady=True)
         assert commands.give("joe", "teleop", commander, sender, wish)
@@ -68,7 +68,7 @@ def test_a_command_is_put_with_the_stamp_and_the_clock_of_its_sender() -> None:
 def test_a_token_that_commands_without_end_is_refused_except_a_zero_after_a_speed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    commands, sender = ViewerCommands(lambda: None, Counts()), Sender("joe/aa")
+    commands, sender = ViewerCommands(lambda: None, Counts()), CommandSigner("joe/aa")
     flooding, driving, other = Commander(), Commander(), Commander()
     rest = Wish(Twist(0.0, 0.0), 1000, steady=True)
     assert commands.give("token", "teleop", driving, sender, AHEAD)
@@ -108,7 +108,7 @@ async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
     request: Any = SimpleNamespace(transport=None)
     socket: Any = SimpleNamespace()
     viewer = Viewer(
-        socket, request, Identity("operator", "bob", "token", "1.2.3.4"), parts, camera=False
+        socket, request, AdmittedClient("operator", "bob", "token", "1.2.3.4"), parts, camera=False
     )
 
     def take(frame: dict[str, Any]) -> None:

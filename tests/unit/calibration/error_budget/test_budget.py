@@ -10,7 +10,7 @@ from itertools import pairwise
 import pytest
 from msgspec.structs import replace
 
-from acsard.calibration.error_budget.budget import Budget, Cause, Received, Share, budget
+from acsard.calibration.error_budget.budget import Budget, Cause, DriveMessages, Share, budget
 from acsard.calibration.error_budget.measured_errors import Line
 from acsard.core.config.settings import Config, McuConfig, OdometryConfig
 from acsard.core.motion.uncertainty import GYRO_SCALE_STD
@@ -51,7 +51,7 @@ def as_predicted(case: str, seconds: float, seeds: int) -> float:
     ratios = []
     for seed in range(seeds):
         drive = make(seed, seconds)
-        result = budget(Received(drive.lines, []), CONFIG, metres=drive.metres * 0.999)
+        result = budget(DriveMessages(drive.lines, []), CONFIG, metres=drive.metres * 0.999)
         millimetres = share(result, cause).mm_per_100_m
         assert millimetres
         ratios.append(1e3 * drive.off / millimetres)
@@ -84,7 +84,7 @@ def driven() -> ReportedDrive:
 def test_the_budget_of_a_standing_robot_has_only_shares_from_settings() -> None:
     still = [Line(n / 100, (0.0,) * 4, (1.0,) * 4, 0.0, 0.0) for n in range(300)]
     known = replace(CONFIG, odometry=OdometryConfig(wheel_separation_multiplier_std=0.02))
-    result = budget(Received(still, []), known)
+    result = budget(DriveMessages(still, []), known)
     assert result.still
     assert {entry.cause: entry.basis for entry in result.shares} == {
         "slip": "settings",
@@ -96,22 +96,22 @@ def test_the_budget_of_a_standing_robot_has_only_shares_from_settings() -> None:
 
 
 def test_without_lines_the_robot_counts_as_standing_still() -> None:
-    assert budget(Received([], []), CONFIG).still
+    assert budget(DriveMessages([], []), CONFIG).still
 
 
 def test_parameters_that_were_not_measured_have_an_unknown_share_and_not_zero() -> None:
-    result = share(budget(Received(driven().lines, []), CONFIG), "parameters")
+    result = share(budget(DriveMessages(driven().lines, []), CONFIG), "parameters")
     assert (result.basis, result.mm_per_100_m, result.deg_per_turn) == ("unknown", None, None)
 
 
 def test_a_track_learned_by_the_gyro_is_a_measured_error() -> None:
-    result = share(budget(Received(driven().lines, [], learned=1.1), CONFIG), "parameters")
+    result = share(budget(DriveMessages(driven().lines, [], learned=1.1), CONFIG), "parameters")
     assert result.basis == "measured"
     assert result.deg_per_turn == pytest.approx(36.0, rel=0.02)
 
 
 def test_the_error_of_a_learned_track_in_use_is_its_own_deviation() -> None:
-    received = Received(driven().lines, [], learned=1.1, deviation=0.02, used=True)
+    received = DriveMessages(driven().lines, [], learned=1.1, deviation=0.02, used=True)
     result = share(budget(received, CONFIG), "parameters")
     assert result.basis == "measured"
     assert result.deg_per_turn == pytest.approx(7.2, rel=0.02)
@@ -119,16 +119,16 @@ def test_the_error_of_a_learned_track_in_use_is_its_own_deviation() -> None:
 
 def test_the_learned_track_is_given_as_a_multiplier_like_the_configured_one() -> None:
     config = replace(CONFIG, drive=replace(CONFIG.drive, wheel_separation_multiplier=1.5))
-    result = budget(Received(driven().lines, [], learned=1.1, deviation=0.02), config)
+    result = budget(DriveMessages(driven().lines, [], learned=1.1, deviation=0.02), config)
     assert result.multiplier == 1.5
     assert result.learned_std == pytest.approx(0.033)
     assert result.learned == pytest.approx(1.65)
-    assert budget(Received(driven().lines, []), config).learned is None
+    assert budget(DriveMessages(driven().lines, []), config).learned is None
 
 
 def test_with_a_gyro_no_error_of_the_wheels_changes_the_heading() -> None:
     lines = [replace(line, yaw_variance=1e-6 * n) for n, line in enumerate(driven().lines)]
-    result = budget(Received(lines, [], gyro=True), CONFIG)
+    result = budget(DriveMessages(lines, [], gyro=True), CONFIG)
     for cause in ("time", "quantization", "gaps", "slip"):
         assert share(result, cause).deg_per_turn == 0.0
     turns = result.turned / 360
@@ -149,7 +149,7 @@ def with_a_gyro(lines: list[Line], before: float = 0.0) -> Share:
         heading += math.remainder(line.yaw - last.yaw, math.tau)
         noise += 1e-6 if any(line.speeds) else 0.0
         made.append(replace(line, yaw_variance=noise + (GYRO_SCALE_STD * heading) ** 2))
-    return share(budget(Received(made, [], gyro=True), CONFIG), "gyro")
+    return share(budget(DriveMessages(made, [], gyro=True), CONFIG), "gyro")
 
 
 @pytest.mark.slow
@@ -181,14 +181,14 @@ def test_one_long_spin_does_not_separate_gyro_noise_from_its_scale_error() -> No
 
 def test_with_counts_the_shares_of_time_and_gaps_are_zero_and_quantization_remains() -> None:
     counted = replace(CONFIG, mcu=McuConfig(link_check="require", encoder_counts=400))
-    result = budget(Received(drives.late(1, 10.0, "batches").lines, [], counted=True), counted)
+    result = budget(DriveMessages(drives.late(1, 10.0, "batches").lines, [], counted=True), counted)
     assert share(result, "time").mm_per_100_m == share(result, "gaps").mm_per_100_m == 0.0
     assert (share(result, "quantization").mm_per_100_m or 0.0) > 0.0
     assert result.counts == 400
 
 
 def test_if_lines_are_missing_here_the_shares_of_time_and_gaps_are_unknown() -> None:
-    result = budget(Received(driven().lines, [], complete=False), CONFIG)
+    result = budget(DriveMessages(driven().lines, [], complete=False), CONFIG)
     assert {share(result, cause).basis for cause in ("time", "quantization", "gaps")} == {"unknown"}
 
 
@@ -198,7 +198,7 @@ def test_a_wheel_that_contradicts_its_neighbour_is_measured_slip() -> None:
         replace(line, positions=(0.0, *line.positions[1:]), speeds=(0.0, *line.speeds[1:]))
         for line in driven().lines
     ]
-    result = share(budget(Received(lines, []), CONFIG), "slip")
+    result = share(budget(DriveMessages(lines, []), CONFIG), "slip")
     assert result.basis == "measured"
     assert (result.mm_per_100_m or 0.0) > 10_000
 
@@ -208,14 +208,14 @@ def test_wheels_that_contradict_each_other_in_a_turn_in_place_are_measured_slip(
         Line(n / 100, (1.0, -1.0, -2.0, 2.0), (n / 100, -n / 100, -n / 50, n / 50), n / 200, 0.0)
         for n in range(3000)
     ]
-    result = share(budget(Received(lines, []), CONFIG), "slip")
+    result = share(budget(DriveMessages(lines, []), CONFIG), "slip")
     assert result.mm_per_100_m is None
     assert result.basis == "measured"
     assert (result.deg_per_turn or 0.0) > 60.0
 
 
 def test_the_largest_cause_is_chosen_among_the_requested_bases() -> None:
-    result = budget(Received(driven().lines, []), CONFIG)
+    result = budget(DriveMessages(driven().lines, []), CONFIG)
     quantization, slip = result.largest("measured"), result.largest("measured", "settings")
     assert quantization is not None
     assert slip is not None
@@ -237,5 +237,5 @@ def test_a_robot_that_only_moved_to_and_fro_within_a_step_has_no_measured_errors
         speed = round(0.1 * (ahead - back * behind) / radius, 2)
         angle += 0.01 * speed
         lines.append(Line(0.01 * number, (speed,) * 4, (angle,) * 4, 0.0, 0.0))
-    result = budget(Received(lines, [line.at - 0.001 for line in lines]), CONFIG)
+    result = budget(DriveMessages(lines, [line.at - 0.001 for line in lines]), CONFIG)
     assert result.still

@@ -7,7 +7,7 @@ import math
 import pytest
 from msgspec.structs import replace
 
-from acsard.calibration.error_budget.daemon_messages import Feed
+from acsard.calibration.error_budget.daemon_messages import MessageCollector
 from acsard.core.config.settings import Config, McuConfig, RatesConfig
 from acsard.core.messages.schema import (
     DiagnosticArray,
@@ -59,7 +59,7 @@ def odom(seconds: float, yaw: float = 0.5) -> Odometry:
 
 
 def test_wheel_states_with_another_number_of_wheels_are_ignored() -> None:
-    feed = Feed(Config(), state(10))
+    feed = MessageCollector(Config(), state(10))
     message = wheels(0.01)
     message.velocity.pop()
     for part in (odom(0.01), message, odom(0.02), wheels(0.02)):
@@ -69,7 +69,7 @@ def test_wheel_states_with_another_number_of_wheels_are_ignored() -> None:
 
 
 def test_two_messages_of_one_stamp_make_a_line_in_any_order() -> None:
-    feed = Feed(Config(), state(10))
+    feed = MessageCollector(Config(), state(10))
     for message in (wheels(0.01), odom(0.01), odom(0.02, 1.5), wheels(0.02)):
         feed.add(message)
     first, other = feed.received(state(12), diagnostics()).lines
@@ -84,7 +84,7 @@ def test_two_messages_of_one_stamp_make_a_line_in_any_order() -> None:
 
 
 def test_half_a_line_is_not_a_line_and_is_dropped_in_time() -> None:
-    feed = Feed(Config(), state(0))
+    feed = MessageCollector(Config(), state(0))
     for n in range(1000):
         feed.add(wheels(n / 100))
     assert feed.received(state(0), diagnostics()).lines == []
@@ -93,7 +93,7 @@ def test_half_a_line_is_not_a_line_and_is_dropped_in_time() -> None:
 
 
 def test_the_times_of_the_sent_lines_are_the_stamps_of_the_applied_commands() -> None:
-    feed = Feed(Config(), state(0))
+    feed = MessageCollector(Config(), state(0))
     feed.add(TwistStamped(wheels(0.25).header, ZERO))
     assert feed.received(state(0), diagnostics()).sent == [0.25]
 
@@ -104,7 +104,7 @@ def test_the_times_of_the_sent_lines_are_the_stamps_of_the_applied_commands() ->
 def test_lines_that_the_daemon_counted_but_did_not_arrive_here_are_noticed(
     lines: int, impossible: int, complete: bool
 ) -> None:
-    feed = Feed(Config(), state(0))
+    feed = MessageCollector(Config(), state(0))
     for n in range(100):
         feed.add(wheels(n / 100))
         feed.add(odom(n / 100))
@@ -117,18 +117,21 @@ def test_coarse_encoders_are_noticed_by_the_lines_that_state_counts(
 ) -> None:
     last = state(1000)
     last.counters["coarse_encoder_lines"] = lines
-    assert Feed(Config(), state(0)).received(last, diagnostics()).coarse is coarse
+    assert MessageCollector(Config(), state(0)).received(last, diagnostics()).coarse is coarse
 
 
 def test_a_daemon_with_a_limited_rate_does_not_send_all_lines() -> None:
     slow = replace(Config(), rates=RatesConfig(odom=10.0))
-    assert not Feed(slow, state(0)).received(state(0), diagnostics()).complete
+    assert not MessageCollector(slow, state(0)).received(state(0), diagnostics()).complete
 
 
 def test_counts_are_in_force_only_if_the_link_check_has_samples() -> None:
     asked = replace(Config(), mcu=McuConfig(link_check="auto", encoder_counts=400))
     for check, counted in (("checked with samples", True), ("plain", False)):
-        assert Feed(asked, state(0)).received(state(0), diagnostics(check=check)).counted is counted
+        assert (
+            MessageCollector(asked, state(0)).received(state(0), diagnostics(check=check)).counted
+            is counted
+        )
 
 
 @pytest.mark.parametrize(
@@ -136,7 +139,7 @@ def test_counts_are_in_force_only_if_the_link_check_has_samples() -> None:
     [("used", True), ("disagrees", True), ("silent", False), ("waiting for turn", False)],
 )
 def test_the_heading_is_the_gyros_where_it_is_used(does: str, used: bool) -> None:
-    assert Feed(Config(), state(0)).received(state(0, does), diagnostics()).gyro is used
+    assert MessageCollector(Config(), state(0)).received(state(0, does), diagnostics()).gyro is used
 
 
 def test_a_learned_track_is_relative_to_the_configured_one() -> None:
@@ -144,7 +147,7 @@ def test_a_learned_track_is_relative_to_the_configured_one() -> None:
     both["learned_multiplier_std"] = "0.033"
     for in_use, used in (("1.500", False), ("1.650", True)):
         learned = diagnostics(**both, multiplier_in_use=in_use)
-        received = Feed(Config(), state(0)).received(state(0), learned)
+        received = MessageCollector(Config(), state(0)).received(state(0), learned)
         assert (received.learned, received.deviation) == pytest.approx((1.1, 0.02))
         assert received.used is used
-    assert Feed(Config(), state(0)).received(state(0), diagnostics()).learned is None
+    assert MessageCollector(Config(), state(0)).received(state(0), diagnostics()).learned is None

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from acsard.calibration.error_budget.measured_errors import (
+    DriveSteps,
     Driving,
     Line,
-    Steps,
     line_times,
     motion,
     rounding,
@@ -252,4 +252,4 @@ def test_if_a_gyro_gives_the_heading_rounding_changes_only_the_distance(
 def test_a_step_to_the_right_is_mirrored_into_a_step_to_the_left() -> None:
     right = [0.1, -0.2, 1.0, 2.0, 0.3, 0.4, 5.0, 6.0, 7.0]
     left = [0.1, 0.2, 1.0, 2.0, 0.3, -0.4, 5.0, 6.0, 7.0]
-    assert Steps(np.array([right, left])).to_the_left().rows.tolist() == [left, left]
+    assert DriveSteps(np.array([right, left])).to_the_left().rows.tolist() == [left, left]

@@ -21,7 +21,7 @@ from acsard.calibration.guided.drive_plan import (
 )
 from acsard.calibration.guided.methods import METHODS, side_of_square
 from acsard.calibration.guided.runner import guide
-from acsard.calibration.log_table import LogError, RefusedError
+from acsard.calibration.log_table import LogError, NoCalibrationError
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config, DriveConfig
 from acsard.terminal.prompt import NumberQuestion
@@ -287,7 +287,7 @@ def test_without_a_tape_the_mean_wheel_radius_stays_as_configured() -> None:
 
 def test_a_gyro_with_a_constant_value_is_refused() -> None:
     robot = replace(anyone(3), gyro_noise=0.0, gyro_hz=0.001)
-    with pytest.raises((LogError, RefusedError), match=r"gyro|record"):
+    with pytest.raises((LogError, NoCalibrationError), match=r"gyro|record"):
         play("gyro", Blind(robot, gyro=True))
 
 

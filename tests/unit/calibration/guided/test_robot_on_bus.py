@@ -10,7 +10,7 @@ import pytest
 from acsard.calibration.guided import robot_on_bus
 from acsard.calibration.guided.drive_plan import DisturbedError, GuideError, Leg, Move
 from acsard.calibration.guided.leg_driver import STALL_REASON
-from acsard.calibration.guided.robot_on_bus import Recorder, RobotOnBus, Sample, times
+from acsard.calibration.guided.robot_on_bus import LegRecorder, RobotOnBus, Sample, times
 from acsard.calibration.log_table import LogError
 from acsard.core.config.settings import Config, JointsConfig
 from acsard.core.messages.schema import (
@@ -46,13 +46,13 @@ def wheels(seconds: float, right: float, left: float) -> JointState:
     return JointState(stamped(seconds), list(JOINTS), [0.0] * 4, [right, left, left, right])
 
 
-def recorded() -> Recorder:
+def recorded() -> LegRecorder:
     """Record wheel messages and gyro messages through the bus.
 
     The wheel messages have stamps of another clock and arrive at least 0.1 s late. The gyro
     messages have no stamps.
     """
-    recorder = Recorder(JOINTS)
+    recorder = LegRecorder(JOINTS)
     for k in range(100):
         at = 10.0 + 0.02 * k
         recorder.wheels(wheels(at + 5000.0, 3.0, 1.0), at + 0.1 + 0.05 * (k % 3))
@@ -86,7 +86,7 @@ def test_positions_are_taken_from_a_pose_and_from_odometry_alike() -> None:
         PoseStamped(stamped(1.0), pose),
         Odometry(stamped(1.0), "base", PoseWithCovariance(pose, unknown), twist),
     ):
-        recorder = Recorder(JOINTS)
+        recorder = LegRecorder(JOINTS)
         recorder.place(message, 5.0)
         assert recorder.samples["places"] == [Sample(5.0, 1.0, (1.0, 2.0))]
 
@@ -102,24 +102,24 @@ def test_the_applied_commands_are_part_of_the_run() -> None:
 
 
 def test_the_speed_of_the_fastest_wheel_is_returned_for_either_direction() -> None:
-    assert Recorder(JOINTS).wheels(wheels(1.0, 1.0, -4.0), 1.0) == 4.0
+    assert LegRecorder(JOINTS).wheels(wheels(1.0, 1.0, -4.0), 1.0) == 4.0
 
 
 def test_wheel_states_without_a_joint_of_the_robot_are_refused() -> None:
     message = wheels(1.0, 1.0, 1.0)
     message.name[0] = "arm_joint"
     with pytest.raises(GuideError, match=f"no speed of {JOINTS[0]}"):
-        Recorder(JOINTS).wheels(message, 1.0)
+        LegRecorder(JOINTS).wheels(message, 1.0)
 
 
 def test_a_recording_without_wheels_is_refused() -> None:
     with pytest.raises(LogError):
-        Recorder(JOINTS).log()
+        LegRecorder(JOINTS).log()
 
 
 def test_a_wheel_that_contradicts_the_other_of_its_side_is_noted_or_refused() -> None:
-    def with_rear_left(speed: float) -> Recorder:
-        recorder = Recorder(JOINTS)
+    def with_rear_left(speed: float) -> LegRecorder:
+        recorder = LegRecorder(JOINTS)
         for k in range(100):
             message = wheels(0.02 * k + 1.0, 6.0, 6.0)
             message.velocity[2] = speed
@@ -133,7 +133,7 @@ def test_a_wheel_that_contradicts_the_other_of_its_side_is_noted_or_refused() ->
 
 
 def test_a_leg_without_wheel_speeds_for_a_minute_is_disturbed() -> None:
-    recorder = Recorder(JOINTS)
+    recorder = LegRecorder(JOINTS)
     for k in range(200):
         at = 10.0 + 0.02 * k + (61.0 if k >= 100 else 0.0)
         recorder.wheels(wheels(at, 3.0, 1.0), at)

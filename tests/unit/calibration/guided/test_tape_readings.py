@@ -24,7 +24,7 @@ from acsard.calibration.guided.tape_readings import (
     slant,
     track_ratio,
 )  # fmt: skip
-from acsard.calibration.log_table import RefusedError
+from acsard.calibration.log_table import NoCalibrationError
 from acsard.calibration.runs import Run
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import DriveConfig, OdometryConfig
@@ -121,14 +121,14 @@ def test_readings_that_contradict_each_other_widen_the_deviation() -> None:
 
 
 def test_readings_without_a_turn_are_refused() -> None:
-    with pytest.raises(RefusedError, match="hardly turned"):
+    with pytest.raises(NoCalibrationError, match="hardly turned"):
         fit_readings([reading for reading in readings() if reading.quantity == "distance"], BASE)
 
 
 def test_a_turn_to_the_other_side_than_that_of_the_wheels_is_refused() -> None:
     samples = readings()
     samples[0] = Reading(samples[0].rides, "turned", -samples[0].value, 0.01)
-    with pytest.raises(RefusedError, match="to the left"):
+    with pytest.raises(NoCalibrationError, match="to the left"):
         fit_readings(samples, BASE)
 
 
@@ -140,7 +140,7 @@ def test_two_distances_from_a_line_give_the_angle_to_it(angle: float, apart: flo
 
 
 def test_impossible_distances_from_a_line_are_refused() -> None:
-    with pytest.raises(RefusedError, match="measure again"):
+    with pytest.raises(NoCalibrationError, match="measure again"):
         slant(0.1, 0.5, 0.25)
 
 
@@ -206,5 +206,5 @@ def test_inaccurate_readings_are_refused() -> None:
         Reading(reading.rides, reading.quantity, reading.value, 100 * reading.deviation)
         for reading in readings()
     ]
-    with pytest.raises(RefusedError, match="too inaccurate"):
+    with pytest.raises(NoCalibrationError, match="too inaccurate"):
         calibrated("a tape", vague, DRIVE, OdometryConfig())

@@ -13,10 +13,10 @@ import pytest
 
 from acsard.core.values import ROLES
 from acsard.daemon.bus import identity as rooms
-from acsard.daemon.bus.identity import Identity, identity
+from acsard.daemon.bus.identity import ClientIdentity, identity
 
 
-def of(*answering: str) -> Identity:
+def of(*answering: str) -> ClientIdentity:
     def ask(name: str, take: Any) -> None:
         asked.append(name)
         if len(asked) == len(ROLES):  # every key is queried before the first reply is awaited
@@ -44,28 +44,28 @@ def test_neither_silence_nor_an_unknown_answer_gives_a_role() -> None:
 
 
 def test_a_missing_permission_is_reported_with_the_role_that_it_needs() -> None:
-    viewer = Identity("viewer", "anna", "joe/1/aa")
+    viewer = ClientIdentity("viewer", "anna", "joe/1/aa")
     assert viewer.lacks("srv/clear") == (
         "your certificate anna has the role viewer: this role may read data and stop the robot, "
         "but not drive it; srv/clear needs at least the role operator"
     )
     assert viewer.lacks("srv/stop") == viewer.lacks("state") == ""
-    assert Identity("maintainer", "", "x").lacks("config") == ""
-    assert Identity("", "", "x").lacks("config") == ""
+    assert ClientIdentity("maintainer", "", "x").lacks("config") == ""
+    assert ClientIdentity("", "", "x").lacks("config") == ""
 
 
 def test_a_silent_robot_leads_to_questions_first_about_the_id_and_to_no_claim() -> None:
-    nobody = Identity("", "anna", "joe/1/aa", "robot1", "tls/a.local:7449")
+    nobody = ClientIdentity("", "anna", "joe/1/aa", "robot1", "tls/a.local:7449")
     for text in (nobody.describe(), nobody.lacks("state"), nobody.lacks("srv/stop")):
         assert text.startswith("no daemon answers as 'robot1' at tls/a.local:7449")
         assert "queried key: acsard/robot1/whoami/viewer" in text
         assert text.index("is --id right") < text.index("daemon run") < text.index("role's list")
         assert "your certificate, anna," in text
         assert "add" not in text
-    stranger = Identity("", "", "joe/1/aa", "robot1", "tcp/127.0.0.1:7448")
+    stranger = ClientIdentity("", "", "joe/1/aa", "robot1", "tcp/127.0.0.1:7448")
     assert stranger.describe().startswith("no daemon answers as 'robot1' at tcp/127.0.0.1:7448")
     assert "certificate" not in stranger.describe()
-    assert Identity("viewer", "anna", "x").silence == stranger.silence == ""
+    assert ClientIdentity("viewer", "anna", "x").silence == stranger.silence == ""
 
 
 def test_the_message_names_the_robot_and_the_endpoint_that_were_queried() -> None:
