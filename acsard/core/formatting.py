@@ -130,7 +130,7 @@ def rough(seconds: float | None, finest: float = 1.0) -> str:
     return f"{value:.{int(value < 9.95)}f} {unit}"
 
 
-# The daemon publishes the time of a latch in every step, so the text is cached.
+# The daemon publishes the times of up to 36 causes of latches in every step, so they are cached.
 @lru_cache(64)
 def utc(wall_ns: int) -> str:
     """Return a time, ns since 1970, in the form `2026-11-22 13:05:07 UTC` (Gregorian calendar)."""

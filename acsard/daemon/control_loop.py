@@ -559,7 +559,10 @@ class ControlLoop:
 
 
 def _stops(batch: BusInput) -> list[str]:
-    """Return the name of the sender of each stop. A call of `srv/stop` is an arrival, too."""
+    """Return the name of the sender of each stop.
+
+    The inbox adds an arrival for each call of `srv/stop`.
+    """
     return [
         caller_name(arrival.via, arrival.attachment, arrival.sender)
         for arrival in batch.arrivals

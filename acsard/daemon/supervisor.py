@@ -62,16 +62,16 @@ again. At a later restart a person may be changing the files, so the router is s
 PAGE = Kind(
     "the robot's page",
     "page_ended",
-    frozenset({Exit.OK}),
+    frozenset({Exit.OK, Exit.IN_USE}),
     LONG_RESTART_PAUSE_S,
-    frozenset({Exit.USAGE, Exit.IN_USE, Exit.NO_PERMISSION, Exit.BAD_CONFIG}),
+    frozenset({Exit.USAGE, Exit.NO_PERMISSION, Exit.BAD_CONFIG}),
     "to serve the page again, run `acsard web` or restart the daemon",
 )
 """The process of the web page, which itself reports why it ends.
 
-If a person ends the page, or if its files are unusable at the first start, the page is not started
-again. The pause before its restart is longer, because a page that fails again and again must not
-take processor time from the robot."""
+The page is not started again if a person ends it, if another program uses its port, or if its files
+are unusable at the first start. The pause before its restart is longer, because a page that fails
+again and again must not take processor time from the robot."""
 
 
 async def keep_running(

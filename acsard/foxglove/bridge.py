@@ -102,7 +102,7 @@ class Bridge:
         """Receives the robot's `state` while a viewer drives; None while no viewer drives."""
         self._retry_s = 0.0
         """Earliest time of the next query of the facts about the robot, s."""
-        self._refresh: Future[dict[str, Any]] | None = None
+        self._pending_refresh: Future[dict[str, Any]] | None = None
         """The changed settings, which a separate thread receives from the daemon; None if no such
         thread runs."""
 
@@ -170,13 +170,15 @@ class Bridge:
         The refresh may wait for the daemon for several seconds. It runs in a separate thread, so
         that it does not delay the topics. `here` says whether the daemon is present.
         """
-        if self._refresh is not None and self._refresh.done():
-            news, self._refresh = self._refresh.result(), None
+        if self._pending_refresh is not None and self._pending_refresh.done():
+            news, self._pending_refresh = self._pending_refresh.result(), None
             if news:
                 self._server.publish_parameter_values(as_parameters(news))
-        if self._refresh is None and self._settings.is_due(here):
+        if self._pending_refresh is None and self._settings.is_due(here):
             with suppress(NoThreadError):  # a later round tries again
-                self._refresh = future_of(partial(self._settings.refresh, here), self._wake.set)
+                self._pending_refresh = future_of(
+                    partial(self._settings.refresh, here), self._wake.set
+                )
 
     def _went(self) -> None:
         words = f"the daemon of robot {self._id} is gone; `acsard foxglove` waits for it"

@@ -93,6 +93,8 @@ class Settings:
         self._asked = False
         self._followed: set[str] = set()
         self._readable = tables is not None
+        self._learned = 0
+        """Number of times that the configuration was stored."""
         self.learn(tables)
 
     def learn(self, tables: object) -> dict[str, Any]:
@@ -100,8 +102,20 @@ class Settings:
 
         `tables` is the configuration as nested dicts, or None if this program may not read it.
         """
+        return self._store(tables, None)
+
+    def _query(self) -> dict[str, Any]:
+        learned = self._learned
+        return self._store(self._robot.get("config"), learned)
+
+    def _store(self, tables: object, learned: int | None) -> dict[str, Any]:
         now = {} if tables is None else live_settings(tables)
         with self._lock:
+            if learned not in (None, self._learned):
+                # The daemon has restarted during this query, and the main thread has already
+                # learned its newer settings.
+                return {}
+            self._learned += 1
             news = changes(self._known, now)
             self._known, self._read_ns = now, clock.mono_ns()
             self._asked, self._readable = False, tables is not None
@@ -158,7 +172,7 @@ class Settings:
             reply = self._robot.set(wishes)
             text, done = reply.message, reply.success
             if self._readable:
-                news = self.learn(self._robot.get("config"))
+                news = self._query()
         except AcsardError as error:
             text, done = str(error), False
         self._notices.enqueue(
@@ -192,7 +206,7 @@ class Settings:
         if not (here and self._is_query_due()):
             return {}
         try:
-            return self.learn(self._robot.get("config"))
+            return self._query()
         except AcsardError:
             with self._lock:
                 self._read_ns = clock.mono_ns()

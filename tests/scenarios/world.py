@@ -381,6 +381,10 @@ class World:
         self._queries += 1
         name = key if asked is None else asked
         at_ns = self.now_ns
+        if name == "srv/stop":
+            # The real bus adds an arrival for each call of this service.
+            stop = Arrival("stop", True, b"", "", at_ns, None, "", attachment=attachment)
+            self.bus.arrivals.append(stop)
         query = Query(self._queries, key, name, fmt, payload, "", at_ns, attachment=attachment)
         self.bus.queries.append(query)
         self.run(2 / self.config.rate_hz)

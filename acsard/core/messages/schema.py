@@ -292,7 +292,7 @@ class SourceState(Message, frozen=True):
 
     It is empty while the source drives the robot. It is a text for people; programs use `wait`.
     """
-    wait: Annotated[str, one_of(get_args(WaitKind))] = "nothing"
+    wait: Annotated[str, one_of(get_args(WaitKind))]
     """Kind of the condition `waits_for`.
 
     - nothing: the source need not wait.

@@ -96,6 +96,23 @@ def test_a_change_waits_for_the_daemon_outside_the_threads_that_carry_stops() ->
     assert words() == ["set"]
 
 
+def test_a_late_reply_does_not_replace_the_settings_of_a_restarted_daemon() -> None:
+    robot = Robot()
+    made, _ = of_robot(robot)
+    reply, newest = robot.get("config"), effective(Config())
+    newest["rates"]["odom"] = 3.0  # type: ignore[index]
+
+    def restarted(key: str) -> Any:
+        # The main thread reads the settings of the new daemon before the late reply arrives.
+        made.learn(newest)
+        return reply
+
+    robot.get = restarted  # type: ignore[method-assign]
+    made.set({KEY: 7.0})
+    made.refresh(here=True)
+    assert made.get([KEY]) == {KEY: 3.0}
+
+
 def test_a_change_that_fails_gives_the_viewers_the_present_value_and_the_reason() -> None:
     made, words = of_robot(Robot())
     made.set({KEY: 999.0})

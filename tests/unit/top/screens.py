@@ -40,8 +40,8 @@ STATE = RobotState(
     source="app",
     sources=[
         SourceState("teleop", 100, None, "a command", "command"),
-        SourceState("app", 50, 0.02, ""),
-        SourceState("nav", 10, 3.0, "app has priority: wait until it is silent"),
+        SourceState("app", 50, 0.02, "", "nothing"),
+        SourceState("nav", 10, 3.0, "app has priority: wait until it is silent", "higher"),
     ],
     refused="",
     counters={"lines": 1300, "lines_sent": 1301, "commands": 220, "missed_periods": 3},

@@ -163,7 +163,7 @@ def test_a_larger_screen_has_empty_lines_between_its_parts() -> None:
 
 
 def test_a_hostile_text_changes_only_its_own_field() -> None:
-    source = SourceState(ENOUGH, 1, 0.0, ENOUGH)
+    source = SourceState(ENOUGH, 1, 0.0, ENOUGH, "late")
     hostile = ScreenData(
         ENOUGH,
         ENOUGH,

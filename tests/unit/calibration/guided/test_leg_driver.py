@@ -35,8 +35,8 @@ def telling(twist: Twist) -> RobotState:
     return RobotState(
         stamp=Time(), mode="driving", reason="commanded by app", x=0.0, y=0.0, yaw=0.0,
         linear=twist.linear, angular=twist.angular, wheels=[right, left, left, right], link="up",
-        source="app", sources=[SourceState("app", 50, 0.01, "")], refused="", counters={},
-        sender=US,
+        source="app", sources=[SourceState("app", 50, 0.01, "", "nothing")], refused="",
+        counters={}, sender=US,
     )  # fmt: skip
 
 
@@ -117,9 +117,11 @@ STOPS: dict[str, Late] = {
         sources=[SourceState("app", 50, 3.0, "a command", "command")]
     ),
     "the daemon has received no command of source app for 0.4 s": changed(
-        sources=[SourceState("app", 50, 3.0, "")]
+        sources=[SourceState("app", 50, 3.0, "", "nothing")]
     ),
-    "app is not one of commands.sources": changed(sources=[SourceState("nav", 50, 0.01, "")]),
+    "app is not one of commands.sources": changed(
+        sources=[SourceState("nav", 50, 0.01, "", "nothing")]
+    ),
     "although 0.30 is commanded": changed(wheels=[0.0] * 4),
     "sends no feedback": changed(wheels=[]),
 }
@@ -153,6 +155,7 @@ TWO = [
         50,
         0.01,
         "1 other sender of this source must wait until the sender that drives falls silent",
+        "senders",
     )
 ]
 
@@ -247,7 +250,7 @@ def test_a_key_pressed_while_the_calibration_was_held_up_does_not_end_a_turn_wel
 
 def test_a_leg_continues_after_a_brief_interruption_of_its_commands() -> None:
     world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
-    world.tells = changed(sources=[SourceState("app", 50, 0.4, "")], wheels=[0.0] * 4)
+    world.tells = changed(sources=[SourceState("app", 50, 0.4, "", "nothing")], wheels=[0.0] * 4)
     world.run(0.3)
     world.tells = lambda state: state
     assert not world.run(3.0).driver.halted

@@ -346,7 +346,7 @@ def test_state_is_the_summary_of_outputs_and_snapshot() -> None:
         link="up",
         source="app",
         sources=[
-            SourceState("app", 50, 0.01, ""),
+            SourceState("app", 50, 0.01, "", "nothing"),
             SourceState("nav", 10, None, "a command", "command"),
         ],
         refused="source nav: held up",

@@ -30,7 +30,10 @@ STATE = RobotState(
     wheels=[1.0, 2.0, 3.0, 4.0],
     link="up",
     source="app",
-    sources=[SourceState("app", 50, 0.1, ""), SourceState("nav", 10, None, "a command", "command")],
+    sources=[
+        SourceState("app", 50, 0.1, "", "nothing"),
+        SourceState("nav", 10, None, "a command", "command"),
+    ],
     refused="",
     counters={"lines": 7, "commands": 2},
     sender="joystick",
