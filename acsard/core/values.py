@@ -573,11 +573,13 @@ class Outputs(Struct, frozen=True):
     line: bytes | None
     """The line for the board; None if no line was due."""
     speeds: WheelSpeeds
-    """The wheel speeds in `line`. If no line was due, those in the last computed line."""
+    """Wheel speeds of the last computed line, which is `line` if a line was due. They are 0 if the
+    robot has cut its speed to zero since then, for example because the link was lost."""
     applied: Twist
-    """The twist of `speeds`, after all limits."""
+    """Twist of the last computed line, after all limits; zero after such a cut."""
     linked: bool
-    """True if the link to the board is up. Otherwise the guard lets only the stop line pass."""
+    """True if the link to the board is up. Otherwise the guard replaces each line that moves a
+    wheel by the stop line."""
     estimates: tuple[Estimate, ...]
     mode: str
     reason: str

@@ -292,7 +292,8 @@ class SourceState(Message, frozen=True):
 
     It is empty while the source drives the robot. It is a text for people; programs use `wait`.
     """
-    wait: Annotated[str, one_of(get_args(WaitKind))]
+    # Only `RobotState.reason` says that zeros keep the robot at rest. No source waits for "zeros".
+    wait: Annotated[str, one_of(kind for kind in get_args(WaitKind) if kind != "zeros")]
     """Kind of the condition `waits_for`.
 
     - nothing: the source need not wait.
@@ -301,7 +302,6 @@ class SourceState(Message, frozen=True):
     - proof: the sender is new, and its delays are not proved yet.
     - late: the commands arrive too late.
     - stalled: the daemon stalled, and waits for the next command.
-    - zeros: another sender keeps the robot at rest with zeros.
     - higher, equal: a source of higher or of the same priority controls the robot.
     - senders: other senders of this source wait until the sender that drives falls silent.
     """
