@@ -173,7 +173,7 @@ class ControlLoop:
         the write of the line, ns, or 0 if the delay is below `MIN_WRITE_DELAY_NS`."""
         # Use the longest line of both directions, because answers must not queue in the MCU either.
         period_ns = int(NS_PER_S / config.rate_hz)
-        self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
+        self.pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
         self._stopwatch, self._late_watch = Stopwatch(), late_watch
 
     @property
@@ -201,16 +201,7 @@ class ControlLoop:
         A command waits if it arrived too soon after the last line to the board. The value is None
         if no command waits.
         """
-        return self._pace.retry_ns(self._port.sent_ns) if self._pace.command_waits else None
-
-    @property
-    def accepts_early_command(self) -> bool:
-        """Whether the next command gets an extra step immediately.
-
-        If this is False, the command waits for a step that another event runs, such as the end of
-        the control period.
-        """
-        return self._pace.accepts_early_command
+        return self.pace.retry_ns(self._port.sent_ns) if self.pace.command_waits else None
 
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
         """Run one control step at the time `now`, and return the robot's outputs.
@@ -242,11 +233,12 @@ class ControlLoop:
                 # states only the number of periods, and would hide the cause.
                 if not missed:
                     self._others += self._late_watch.take_events()
+            self._others += self._handover.take_events()
         commands, refusals, requests = self._from_bus(now)
-        requests += self._keepable(now)
+        if self._settings_file is not None and self._settings_file.pending:
+            requests += self._keepable(self._settings_file, now)
         requests, refused_sets = self._speed.requests(requests, now.mono_ns)
-        self._others += self._handover.take_events()
-        port, pace = self._port, self._pace
+        port, pace = self._port, self.pace
         # Call `take` before reading `is_open`. After a suspend of the computer, `take` closes the
         # port.
         received = port.take(now if missed else None)
@@ -285,7 +277,7 @@ class ControlLoop:
         # `adopted` may change the log's level, so call it after logging this step's events.
         if self._config is not before and self._adopted:
             self._adopted(self._config)
-        self._stopwatch.step(now.mono_ns, self._mono_ns())
+        self._stopwatch.figures["step_time"].add(now.mono_ns, self._mono_ns() - now.mono_ns)
         # Flush last, because the sending thread needs Python's interpreter lock, which is free only
         # while this loop waits.
         self._bus.flush()
@@ -461,17 +453,15 @@ class ControlLoop:
         if refusal is not None:
             self._answers.append((now.mono_ns, refusal))
 
-    def _keepable(self, now: Instant) -> tuple[Request, ...]:
+    def _keepable(self, file: SettingsFile, now: Instant) -> tuple[Request, ...]:
         """Return the `set` requests with the field `keep` that the robot must process now.
 
         The thread of the settings file has checked that it can write the settings of these requests
         to the file. This method also queues the answers to `set` requests that failed or are
         complete.
         """
-        if self._settings_file is None:
-            return ()
         requests: list[Request] = []
-        for result in self._settings_file.results(now.mono_ns, self._others):
+        for result in file.results(now.mono_ns, self._others):
             if isinstance(result, Answer):
                 self._answers.append((now.mono_ns, result))
             else:

@@ -288,7 +288,9 @@ async def _control(
             if control.shutting_down and departure.over(now.mono_ns, control.at_rest):
                 return None
             return Next(
-                control.accepts_early_command, control.retry_ns, period_ended=period.expired > 0
+                control.pace.accepts_early_command,
+                control.retry_ns,
+                period_ended=period.expired > 0,
             )
 
         ticker.start(clock.now().mono_ns)

@@ -291,7 +291,7 @@ class LatchFile:
                 self._news.put(Event("latch_file", text, "warning"))
             elif not self._failed:
                 self._news.put(self._again)
-        return self._news.take()
+        return self._news.take() if self._news.waiting else []
 
     @property
     def trouble(self) -> str:
@@ -307,8 +307,11 @@ class LatchFile:
             return False
         # A write does not matter if the file already contains the newest latches.
         busy_ns = None if self._written_latches is self._newest_latches else self._busy_ns
-        begun_ns = [start_ns for start_ns in (busy_ns, self._syncing_ns) if start_ns is not None]
-        return any(clock.mono_ns() - start_ns > HANG_TIMEOUT_S * NS_PER_S for start_ns in begun_ns)
+        syncing_ns = self._syncing_ns
+        if busy_ns is None and syncing_ns is None:
+            return False
+        begun_ns = min(start_ns for start_ns in (busy_ns, syncing_ns) if start_ns is not None)
+        return clock.mono_ns() - begun_ns > HANG_TIMEOUT_S * NS_PER_S
 
     @property
     def _again(self) -> Event:

@@ -15,7 +15,6 @@ import os
 import threading
 import time
 from collections import deque
-from contextlib import suppress
 from typing import Self
 
 from msgspec import Struct
@@ -155,10 +154,11 @@ class LateWatch:
             self._box.put(Late(now_ns, late_ns, before, self._times))
 
     def _read_times(self) -> bytes:
-        # Without these times, the thread still finds some of the causes.
-        with suppress(OSError):
+        try:
             return os.pread(self._file, 64, 0) if self._file >= 0 else b""
-        return b""
+        except OSError:
+            # Without these times, the thread still finds some of the causes.
+            return b""
 
     def take_events(self) -> list[Event]:
         """Return the events about causes of late periods since the last call."""

@@ -218,6 +218,3 @@ class Stopwatch:
             self.figures["mcu_round_trip"].add(at_ns, at_ns - asked_ns)
         if queued_ns is not None:
             self.figures["feedback_to_bus"].add(queued_ns, queued_ns - at_ns)
-
-    def step(self, began_ns: int, ended_ns: int) -> None:
-        self.figures["step_time"].add(began_ns, ended_ns - began_ns)

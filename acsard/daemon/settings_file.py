@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from acsard.core.config.live import changed, differences
 from acsard.core.config.lowered import LIMITS_PREFIX
 from acsard.core.config.parsing import ConfigError
-from acsard.core.config.settings import Config, LimitsConfig
+from acsard.core.config.settings import Config
 from acsard.core.formatting import listed, printable
 from acsard.core.messages.encodings import Decoder
 from acsard.core.messages.schema import Settings
@@ -122,11 +122,14 @@ class SettingsFile:
         """The changes that the thread must write to the file before it checks another request. Each
         change is paired with the robot's answer to the client."""
         self._results = Mailbox[_Checked | Answer](MAX_JOBS)
-        self._pending: dict[int, _Pending] = {}
-        self._started = self._limits = started.limits
-        """`_started` contains the limits at the start of the daemon. `_limits` contains the limits
-        in the file: those in `_started`, except that each limit that the daemon has written to the
-        file since its start has the new value."""
+        self.pending: dict[int, _Pending] = {}
+        """The requests that `keep` has queued and that are not settled yet, by their ids. Unless it
+        is empty, each control step must call `results`."""
+        self.limits = started.limits
+        """The limits in the configuration file, as far as the daemon has read or written them: each
+        limit has the value that the daemon last wrote to the file or, if it has not written the
+        limit, the value at the start of the daemon. Changes of the file by other programs are not
+        included."""
         self._no_thread = ""
         """The reason why the thread could not be started, or "" if it runs."""
 
@@ -167,13 +170,13 @@ class SettingsFile:
                 "the daemon could not start the thread that changes the file "
                 f"({self._no_thread}); restart acsard, or send the request without `keep`"
             )
-        elif len(self._pending) >= MAX_JOBS:
+        elif len(self.pending) >= MAX_JOBS:
             why = (
                 f"more than {MAX_JOBS} changes of the file wait for the disk; try again in some "
                 "seconds"
             )
         else:
-            self._pending[request.id] = _Pending(request, now_ns + REPLY_TIMEOUT_NS)
+            self.pending[request.id] = _Pending(request, now_ns + REPLY_TIMEOUT_NS)
             self._box.put(request)
             return None
         return Answer(request.id, False, f"no setting was changed: {why}")
@@ -193,11 +196,11 @@ class SettingsFile:
 
         For any other answer, return False. The caller must send this answer now.
         """
-        pending = self._pending.get(answer.id)
+        pending = self.pending.get(answer.id)
         if pending is None or pending.edit is None:
             return False
         if not answer.success:
-            del self._pending[answer.id]
+            del self.pending[answer.id]
             return False
         pending.answer = answer
         self._changes.append((pending.edit, answer))
@@ -212,12 +215,10 @@ class SettingsFile:
         append an event too, because the client gets no further answer. `now_ns` is the present
         monotonic time, ns.
         """
-        if not self._pending:
-            return []
         results: list[Request | Answer] = []
         for result in self._results.take():
             number = result.id if isinstance(result, Answer) else result.request.id
-            pending = self._pending.get(number)
+            pending = self.pending.get(number)
             if pending is None:
                 continue  # the request was overdue and has been answered
             if isinstance(result, _Checked):
@@ -228,7 +229,7 @@ class SettingsFile:
                 continue
             if not pending.overdue:
                 results.append(result)
-            del self._pending[number]
+            del self.pending[number]
             keys, by = ", ".join(pending.request.settings), pending.request.by
             # The log puts the kind in front of the text: `written: KEY to FILE`.
             if result.success:
@@ -240,7 +241,7 @@ class SettingsFile:
         # answer must not say that no setting was changed.
         overdue = [
             waits
-            for waits in self._pending.values()
+            for waits in self.pending.values()
             if now_ns > waits.due_ns
             and (waits.edit is None or waits.answer is not None)
             and not waits.overdue
@@ -248,18 +249,8 @@ class SettingsFile:
         for waits in overdue:
             waits.overdue = True
             if waits.answer is None:
-                del self._pending[waits.request.id]
+                del self.pending[waits.request.id]
         return [*results, *map(_overdue, overdue)]
-
-    @property
-    def limits(self) -> LimitsConfig:
-        """The limits in the configuration file, as far as the daemon has read or written them.
-
-        Each limit has the value that the daemon last wrote to the file or, if the daemon has not
-        written it, the value at the start of the daemon. Changes of the file by other programs are
-        not included.
-        """
-        return self._limits
 
     def close(self) -> None:
         """Let the thread end. Do not wait for it."""
@@ -273,7 +264,7 @@ class SettingsFile:
             for job in self._box.take():
                 self._write()
                 # A request that is overdue has its answer already.
-                if isinstance(job, Request) and job.id in self._pending:
+                if isinstance(job, Request) and job.id in self.pending:
                     self._results.put(self._checked(job))
             self._write()
             self.differ = printable(self._difference())[:MAX_TEXT_LENGTH]
@@ -307,7 +298,7 @@ class SettingsFile:
             if key.startswith(LIMITS_PREFIX)
         }
         if limits:
-            self._limits = replace(self._limits, **limits)
+            self.limits = replace(self.limits, **limits)
         return Answer(answer.id, True, f"{text}; written to {edit.file}")
 
     def _difference(self) -> str:

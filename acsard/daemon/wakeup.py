@@ -41,10 +41,12 @@ class _Timer:
         # If the timer was set again after it had expired, it reports no expiration. Then there is
         # nothing to do.
         if self._timer.expirations():
-            self._ring()
+            self._expired()
+            self._wake()
 
-    def _ring(self) -> None:
-        self._wake()
+    def _expired(self) -> None:
+        """Note the expiration, before `wake` is called."""
+        raise NotImplementedError
 
 
 class Alarm(_Timer):
@@ -63,10 +65,9 @@ class Alarm(_Timer):
             self._timer.set(at_ns)
         self._at_ns = at_ns
 
-    def _ring(self) -> None:
+    def _expired(self) -> None:
         # The timer may have expired early. Then `set` must accept the same time again.
         self._at_ns = None
-        super()._ring()
 
 
 class Ticker(_Timer):
@@ -105,9 +106,8 @@ class Ticker(_Timer):
         self._rang = False
         return Period(expired, due_ns)
 
-    def _ring(self) -> None:
+    def _expired(self) -> None:
         self._rang = True
-        super()._ring()
 
 
 class Next(Struct, frozen=True):
@@ -139,10 +139,26 @@ class Wakeup:
         self._accepts_early_command = self._command_arrived = self._stop_pending = False
 
     def __call__(self) -> None:
+        step, over = self._step, self._over
         if self._stepping:
             self._again = True
-        elif self._step is not None and self._over is not None and not self._over.done():
-            self._run(self._step, self._over)
+            return
+        if step is None or over is None or over.done():
+            return
+        self._stepping, self._again, self._command_arrived = True, False, False
+        try:
+            then = step()
+            if then is None:
+                over.set_result(None)
+            else:
+                self._arm(then)
+        except BaseException as error:  # noqa: BLE001
+            # The event loop would only log the exception, but a bug in a step must end the process.
+            over.set_exception(error)
+        finally:
+            self._stepping = False
+        if self._again:
+            self._loop.call_soon(self)
 
     def command(self) -> None:
         """Report that the bus has a sample that may be a command. Any thread may call this method.
@@ -184,22 +200,6 @@ class Wakeup:
                 await self._over
             finally:
                 self._step = None
-
-    def _run(self, step: Callable[[], Next | None], over: asyncio.Future[None]) -> None:
-        self._stepping, self._again, self._command_arrived = True, False, False
-        try:
-            then = step()
-            if then is None:
-                over.set_result(None)
-            else:
-                self._arm(then)
-        except BaseException as error:  # noqa: BLE001
-            # The event loop would only log the exception, but a bug in a step must end the process.
-            over.set_exception(error)
-        finally:
-            self._stepping = False
-        if self._again:
-            self._loop.call_soon(self)
 
     def _arm(self, then: Next) -> None:
         self._alarm.set(then.retry_ns)

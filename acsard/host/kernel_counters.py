@@ -239,6 +239,7 @@ class Kernel:
         self._root, self._proc = root, root / "proc"
         # The first thread of a process has the same id as the process.
         self._io = root / f"proc/self/task/{os.getpid()}/io"
+        self._stat, self._own_stat = self._proc / "stat", self._proc / "self/stat"
         self._tick_ns = NS_PER_S // os.sysconf("SC_CLK_TCK")
         cpu, hwmon = root / "sys/devices/system/cpu", root / "sys/class/hwmon"
         self._alarms = [
@@ -264,8 +265,8 @@ class Kernel:
         The result contains `conditions`. If `conditions` is None, read the present conditions of
         the processors too.
         """
-        stat = _text(self._proc / "stat")
-        own = fields(_text(self._proc / "self/stat"))
+        stat = _text(self._stat)
+        own = fields(_text(self._own_stat))
         pressure = "" if self._pressure is None else _text(self._pressure)
         disk_ns = stalled(pressure) if pressure else iowait(stat, self._tick_ns)
         return Reading(
@@ -305,7 +306,7 @@ class Kernel:
         before, began_ns = list(self.programs()), clock.mono_ns()
         time.sleep(seconds)
         passed_ns = clock.mono_ns() - began_ns
-        own = fields(_text(self._proc / "self/stat"))
+        own = fields(_text(self._own_stat))
         priority = int(own[15]) if len(own) > 15 else 20
         return busiest(before, self.programs(), passed_ns, priority)
 
@@ -353,8 +354,14 @@ def _number(path: Path, base: int = 10) -> int:
 
 
 def _text(path: Path) -> str:
+    # A file object would take longer to make than the kernel takes to write the text.
     try:
-        with open(path, "rb", buffering=0) as file:
-            return (file.read(16384) or b"").decode(errors="replace")
+        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
         return ""
+    try:
+        return os.read(file, 16384).decode(errors="replace")
+    except OSError:
+        return ""
+    finally:
+        os.close(file)

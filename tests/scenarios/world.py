@@ -223,7 +223,7 @@ class World:
     @property
     def _listens(self) -> bool:
         """Whether the daemon handles a command that arrives now immediately, in an extra step."""
-        return self.steps > 0 and self.loop.accepts_early_command
+        return self.steps > 0 and self.loop.pace.accepts_early_command
 
     @property
     def instant(self) -> Instant:

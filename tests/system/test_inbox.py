@@ -23,7 +23,7 @@ class Deaf:
 def test_a_stop_query_counts_even_if_too_many_queries_are_open_to_answer_it() -> None:
     prefix, endpoint = "acsard/acsar/", free_endpoint()
     # The input is never started, so no query is answered, as with clients that read no reply.
-    inbox = Inbox(prefix, Replies(prefix), (), Deaf())
+    inbox = Inbox(prefix, Replies(prefix, []), (), Deaf())
     with zenoh.open(client_config(endpoint, "router")) as robot, Bus(endpoint) as bus:
         topics = ("info", "srv/stop")
         queryables = [
@@ -42,7 +42,7 @@ def test_a_stop_query_counts_even_if_too_many_queries_are_open_to_answer_it() ->
 
 def test_a_step_takes_at_most_one_query_for_settings() -> None:
     prefix, endpoint = "acsard/acsar/", free_endpoint()
-    inbox = Inbox(prefix, Replies(prefix), (), Deaf())
+    inbox = Inbox(prefix, Replies(prefix, []), (), Deaf())
     with zenoh.open(client_config(endpoint, "router")) as robot, Bus(endpoint) as bus:
         topics = ("srv/set", "srv/clear")
         queryables = [
@@ -64,7 +64,7 @@ def test_a_step_takes_at_most_one_query_for_settings() -> None:
 
 def test_a_flood_under_two_certificates_displaces_no_command_of_other_senders() -> None:
     prefix, endpoint = "acsard/acsar/", free_endpoint()
-    inbox = Inbox(prefix, Replies(prefix), ("app", "nav"), Deaf())
+    inbox = Inbox(prefix, Replies(prefix, []), ("app", "nav"), Deaf())
     with zenoh.open(client_config(endpoint, "router")) as robot, Bus(endpoint) as bus:
         keys: list[str] = []
 

@@ -148,6 +148,8 @@ class SpeedLimiter:
         The argument `requests` contains the requests of the clients, and `now_ns` is the monotonic
         time of the step. The caller must call `settle` after the step.
         """
+        if self._limit is NO_LIMIT and not self._held and self._waiting is None:
+            return requests, []
         own = self._limit_request(now_ns)
         if self._limit is NO_LIMIT and not self._held:
             return (*own, *requests), []

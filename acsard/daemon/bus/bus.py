@@ -53,10 +53,13 @@ class ZenohBus:
         self._config, self._id = config, config.robot.id
         self._alive = full_key(self._id, "alive")
         prefix = full_key(self._id, "")
-        self._replies = Replies(prefix)
+        self._thread_errors: list[BaseException] = []
+        """The exceptions that have ended threads of the bus."""
+        self._replies = Replies(prefix, self._thread_errors)
         sources = tuple(source.name for source in config.commands.sources)
         self._inbox = Inbox(prefix, self._replies, sources, waker, config.rate_hz)
-        self._outlets, self._links = Outlets(), RouterLinks(config.bus)
+        self._outlets = Outlets(self._thread_errors)
+        self._links = RouterLinks(config.bus, self._thread_errors)
         self._session: zenoh.Session
         self._entities: list[object] = []
         """References to the declared Zenoh entities. Zenoh undeclares an entity when nothing refers
@@ -82,9 +85,9 @@ class ZenohBus:
         whether the bus has begun to block.
         """
         batch = self._inbox.take(queries)
-        routers = self._links.changed()
-        if routers is not None:
-            batch = replace(batch, routers=routers)
+        changes = self._links.changes
+        if changes.waiting:
+            batch = replace(batch, routers=changes.pop())
         if not self._outlets.behind:
             return batch
         dropped, stuck = self._outlets.losses(clock.mono_ns())
@@ -102,9 +105,9 @@ class ZenohBus:
 
         If an exception has ended a thread of the bus, raise this exception.
         """
+        if self._thread_errors:
+            raise self._thread_errors[0]
         self._outlets.flush()
-        self._replies.check()
-        self._links.check()
 
     def reply(self, reply: Reply) -> None:
         self._replies.send(reply)

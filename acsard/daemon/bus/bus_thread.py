@@ -1,4 +1,4 @@
-"""A thread of the bus that passes its exception to the control loop, so that the daemon ends too.
+"""A thread of the bus that leaves its exception for the control loop, so that the daemon ends too.
 
 If the daemon went on without the thread, it would drive the robot, but would no longer publish or
 answer.
@@ -11,20 +11,17 @@ from threading import Thread
 
 
 class BusThread(Thread):
-    """A thread of the bus. If an exception ends the thread, `check` raises this exception."""
+    """A thread of the bus. If an exception ends the thread, it is appended to the list `errors`.
 
-    def __init__(self, name: str, work: Callable[[], None]) -> None:
+    All threads of the bus share one list, so that each control step checks only this list.
+    """
+
+    def __init__(self, name: str, work: Callable[[], None], errors: list[BaseException]) -> None:
         super().__init__(name=name, daemon=True)
-        self._work = work
-        self._error: BaseException | None = None
+        self._work, self._errors = work, errors
 
     def run(self) -> None:
         try:
             self._work()
-        except BaseException as error:  # noqa: BLE001 - `check` raises it again
-            self._error = error
-
-    def check(self) -> None:
-        """Raise the exception that has ended this thread, if any."""
-        if self._error is not None:
-            raise self._error
+        except BaseException as error:  # noqa: BLE001 - the control loop raises it again
+            self._errors.append(error)

@@ -42,14 +42,18 @@ answer."""
 class Replies:
     """The queries that are not ended yet, and the thread that sends the replies to them."""
 
-    def __init__(self, prefix: str) -> None:
-        self._prefix = prefix
+    def __init__(self, prefix: str, errors: list[BaseException]) -> None:
+        """Start without queries.
+
+        `prefix` is the beginning of the robot's keys. An exception that ends the thread is appended
+        to `errors`.
+        """
+        self._prefix, self._errors = prefix, errors
         self._queries: dict[int, tuple[zenoh.Query, str]] = {}
         self._tickets = count(1)
         self._queue: queue.SimpleQueue[Reply | int | None] = queue.SimpleQueue()
         """Items for the thread, in the order of their arrival. A `Reply` is sent, a ticket (number)
         ends its query, and None ends the thread."""
-        self._thread: BusThread | None = None
 
     def issue(self, query: zenoh.Query, key: str) -> int | None:
         """Store a query, and return its ticket, which is a number.
@@ -73,13 +77,7 @@ class Replies:
 
     def start(self, session: zenoh.Session) -> None:
         """Start the thread that sends the replies. Replies may be queued already."""
-        self._thread = BusThread("replies", partial(self._run, session))
-        self._thread.start()
-
-    def check(self) -> None:
-        """Raise the exception that has ended the sending thread, if any."""
-        if self._thread is not None:
-            self._thread.check()
+        BusThread("replies", partial(self._run, session), self._errors).start()
 
     def stop(self) -> None:
         """Let the sending thread end after it has sent the queued replies. Do not wait for it."""

@@ -70,7 +70,8 @@ class _Outlet:
 class Outlets:
     """The publishers of the daemon's session, and the thread that sends their messages."""
 
-    def __init__(self) -> None:
+    def __init__(self, errors: list[BaseException]) -> None:
+        """Start without publishers. An exception that ends the thread is appended to `errors`."""
         self._outlets: dict[str, list[_Outlet]] = {}
         """Maps the native key of each topic to its outlets."""
         self._listeners: list[object] = []
@@ -88,7 +89,7 @@ class Outlets:
         self._began_ns: int | None = None
         """Monotonic time at which the sending thread began to send the waiting messages, ns. None
         while this thread waits for messages."""
-        self._thread = BusThread("outlets", self._run)
+        self._thread = BusThread("outlets", self._run, errors)
 
     def _count(self, outlet: _Outlet, wanted: bool) -> None:
         # Several threads of Zenoh call this method, so it takes a lock. It replaces the set
@@ -113,11 +114,7 @@ class Outlets:
         self._waiting = True
 
     def flush(self) -> None:
-        """Wake the thread that sends the messages.
-
-        If an exception has ended this thread, raise the exception.
-        """
-        self._thread.check()
+        """Wake the thread that sends the messages."""
         if self._waiting:
             self._waiting = False
             self._bell.ring()

@@ -26,24 +26,15 @@ class RouterLinks:
     separate thread polls Zenoh, because the call may block.
     """
 
-    def __init__(self, bus: BusConfig) -> None:
+    def __init__(self, bus: BusConfig, errors: list[BaseException]) -> None:
+        """Prepare the polling thread. If an exception ends it, it is appended to `errors`."""
         self._bus = bus
         self._status: RoutersStatus | None = None
-        self._changes = Mailbox[RoutersStatus](1, lambda: None)
+        self.changes = Mailbox[RoutersStatus](1, lambda: None)
+        """The newest state of the connections, if it has changed since the last `pop`."""
         self._over = Event()
-        self._thread = BusThread("links", self._run)
+        self._thread = BusThread("links", self._run, errors)
         self._session: zenoh.Session
-
-    def changed(self) -> RoutersStatus | None:
-        """Return the state of the connections if it has changed since the last call, else None.
-
-        This method never waits.
-        """
-        return self._changes.pop()
-
-    def check(self) -> None:
-        """Raise the exception that has ended the polling thread, if any."""
-        self._thread.check()
 
     def start(self, session: zenoh.Session) -> None:
         """Start the polling thread, unless `bus.connect` is empty."""
@@ -67,7 +58,7 @@ class RouterLinks:
             status = self._poll()
             if status != self._status:
                 self._status = status
-                self._changes.put(status)
+                self.changes.put(status)
 
     def _poll(self) -> RoutersStatus:
         endpoints = self._bus.connect

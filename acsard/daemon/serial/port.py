@@ -228,10 +228,6 @@ class SerialPort:
 
     # The reader calls the methods below.
 
-    def _data(self, data: bytes) -> None:
-        self._received.append(Received(clock.now(), data))
-        self._wake()
-
     def _leave(self, error: BaseException | None) -> None:
         """Close the port and discard unsent bytes. `error` is None at the end of the daemon."""
         if not self.is_open:
@@ -278,7 +274,8 @@ class _Reader(asyncio.Protocol):
         self._transport = transport
 
     def data_received(self, data: bytes) -> None:
-        self._port._data(data)
+        self._port._received.append(Received(clock.now(), data))
+        self._port._wake()
 
     def connection_lost(self, exc: Exception | None) -> None:
         # Ignore the end of an old transport, because the port may have been reopened since.

@@ -13,7 +13,9 @@ import msgspec
 import pytest
 import zenoh
 
+from acsard.core.config.settings import Config
 from acsard.core.messages.schema import Twist, Vector3
+from acsard.daemon.bus.bus import ZenohBus
 from acsard.daemon.bus.outlets import BLOCKED_AFTER_NS, SLOT_MESSAGES, Outlets
 from acsard.host import clock
 
@@ -45,8 +47,18 @@ class Publisher:
         return self
 
 
+class Waker:
+    """A control loop that nothing wakes."""
+
+    def command(self) -> None:
+        """Ignore the command."""
+
+    def stop(self) -> None:
+        """Ignore the stop."""
+
+
 def started(publisher: Publisher) -> Outlets:
-    outlets = Outlets()
+    outlets = Outlets([])
     outlets.declare(cast(zenoh.Session, publisher), TOPIC, KEY, "msgpack", "")
     outlets.start()
     return outlets
@@ -100,8 +112,11 @@ def test_a_blocked_bus_is_reported_once_for_each_time_that_it_blocks() -> None:
 def test_an_error_of_the_thread_ends_the_control_loop() -> None:
     publisher = Publisher(ValueError("a bug"))
     publisher.free.set()
-    outlets = started(publisher)
-    publish(outlets, 0)
-    outlets.stop(WAIT_S)
+    bus = ZenohBus(Config(), Waker())
+    bus._outlets.declare(cast(zenoh.Session, publisher), TOPIC, KEY, "msgpack", "")
+    bus._outlets.start()
+    bus.publish(TOPIC, Twist(Vector3(), Vector3()))
+    bus.flush()
+    bus._outlets.stop(WAIT_S)
     with pytest.raises(ValueError, match="a bug"):
-        outlets.flush()
+        bus.flush()
