@@ -32,10 +32,12 @@ Where to look: each package may import only the packages below it in this list.
     daemon/          the daemon's process: control loop, shutdown, and the file that keeps a stop
                      or a fault latched over a restart
     daemon/gateway/  `acsard gateway`: the process that terminates TLS connections
-    daemon/bus/      the Zenoh sessions: subscriptions, publications, replies, access rules
+    daemon/bus/      the robot's keys: subscriptions, publications, replies to queries
     daemon/serial/   the serial port
     recording/       the black box: writes the steps to MCAP files, deletes old files, reads the
                      files, and replays them
+    bus/             Zenoh for every process: addresses, sessions, access rules, certificates,
+                     subscriptions, discovery of robots
     terminal/        prints tables and output of all tools with the library rich; asks the person
                      near the robot questions, at a terminal or through a program that uses JSON
     host/            the parts that every process uses: clock, timers, threads and the mailboxes

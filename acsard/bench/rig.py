@@ -27,6 +27,8 @@ import zenoh
 
 from acsard.bench.far_end import Part
 from acsard.bench.matching import Record, RecordedTraffic, Sample, SentCommand
+from acsard.bus.subscription import direct, encoded
+from acsard.bus.zenoh_sessions import client_session
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.link.codec import Codec
@@ -36,9 +38,6 @@ from acsard.core.messages.schema import Odometry, RobotState, Twist, Vector3
 from acsard.core.messages.signature import Signature
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
-from acsard.daemon.bus.outlets import direct
-from acsard.daemon.bus.subscription import encoded
-from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host import clock
 from acsard.host.child import end, end_with_parent, environment, how_it_ended
 from acsard.host.errors import Exit, ExitError, MendableError, NoAnswerError, UnreachableError

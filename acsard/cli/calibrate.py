@@ -40,6 +40,8 @@ from pathlib import Path
 
 import msgspec
 
+from acsard.bus.address import address_of
+from acsard.bus.zenoh_sessions import client_session
 from acsard.calibration.calibration_report import CalibrationRefusal, keys, parts, report
 from acsard.calibration.guided.drive_plan import NEEDS, GuideError, setup
 from acsard.calibration.guided.robot_on_bus import SOURCE, RobotOnBus
@@ -54,8 +56,6 @@ from acsard.cli.connection import add_bus, require_one
 from acsard.client import connect
 from acsard.core.config.settings import Config
 from acsard.core.messages.keys_and_roles import IMU, full_key
-from acsard.daemon.bus.address import address_of
-from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.terminal_modes import single_key_mode

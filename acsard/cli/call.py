@@ -8,6 +8,8 @@ import argparse
 import math
 from collections.abc import Sequence
 
+from acsard.bus import robot_discovery
+from acsard.bus.robot_discovery import parse_ids
 from acsard.cli.common import options_text
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
 from acsard.cli.replies import of_each, print_each
@@ -17,8 +19,6 @@ from acsard.core.messages.encodings import encode
 from acsard.core.messages.keys_and_roles import PLAIN_SERVICES, SERVICES
 from acsard.core.messages.schema import MESSAGES
 from acsard.core.values import Verb
-from acsard.daemon.bus import robot_discovery
-from acsard.daemon.bus.robot_discovery import parse_ids
 from acsard.host.errors import UsageError
 
 CALLABLE_SERVICES = tuple(service for service in SERVICES if service != "set")

@@ -16,15 +16,15 @@ from threading import Event, Thread
 
 import zenoh
 
+from acsard.bus.address import Address, address_of
+from acsard.bus.robot_discovery import Presence, explain_silence, parse_ids, presence
+from acsard.bus.tls import trouble
 from acsard.cli.common import add_config, load
 from acsard.client import Client, connect
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S
 from acsard.core.config.settings import TLS_PREFIX
 from acsard.core.formatting import printable
 from acsard.core.messages.keys_and_roles import key_hint, row_of, unknown
-from acsard.daemon.bus.address import Address, address_of
-from acsard.daemon.bus.robot_discovery import Presence, explain_silence, parse_ids, presence
-from acsard.daemon.bus.tls import trouble
 from acsard.host.errors import UsageError
 
 SEVERAL_IDS = "; several ids separated by commas, or '*' for all robots"

@@ -13,10 +13,10 @@ from functools import partial
 import msgspec
 from rich.text import Text
 
+from acsard.bus.address import address_of
 from acsard.cli.common import by_environment
 from acsard.cli.connection import add_bus, require_one
 from acsard.core.formatting import json_line, lines, printable
-from acsard.daemon.bus.address import address_of
 from acsard.host.config_file import find
 from acsard.machine.examination import examine
 from acsard.terminal.output import show_whole

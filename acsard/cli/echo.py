@@ -15,6 +15,14 @@ from typing import Any
 
 import zenoh
 
+from acsard.bus.robot_discovery import (
+    ALL_ROBOTS,
+    follow,
+    parse_ids,
+    robot_of,
+    running_robots,
+)
+from acsard.bus.subscription import encoded
 from acsard.calibration.log_table import HEADER, KEYS, row
 from acsard.cli.common import between, count
 from acsard.cli.connection import (
@@ -33,14 +41,6 @@ from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import TOPICS, by_key
 from acsard.core.messages.schema import MESSAGES
 from acsard.core.messages.short_texts import SHORT_TEXTS, short
-from acsard.daemon.bus.robot_discovery import (
-    ALL_ROBOTS,
-    follow,
-    parse_ids,
-    robot_of,
-    running_robots,
-)
-from acsard.daemon.bus.subscription import encoded
 from acsard.host import clock
 from acsard.host.errors import Exit, NoAnswerError, UsageError
 

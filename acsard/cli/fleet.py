@@ -15,9 +15,9 @@ import sys
 
 import msgspec
 
+from acsard.bus.robot_discovery import ALL_ROBOTS
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
 from acsard.core.formatting import json_line
-from acsard.daemon.bus.robot_discovery import ALL_ROBOTS
 from acsard.host.errors import Exit, UnreachableError
 from acsard.terminal.output import has_screen
 from acsard.top import terminal

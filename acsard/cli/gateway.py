@@ -9,8 +9,8 @@ import argparse
 import os
 import sys
 
+from acsard.bus.zenoh_sessions import log_from_environment
 from acsard.cli.common import add_config, load
-from acsard.daemon.bus.zenoh_sessions import log_from_environment
 from acsard.daemon.gateway.listener_process import ListenerProcess
 from acsard.daemon.gateway.tls_gateway import Gateway
 from acsard.host.errors import UsageError

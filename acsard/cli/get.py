@@ -11,12 +11,12 @@ import sys
 
 import msgspec
 
+from acsard.bus.robot_discovery import ALL_ROBOTS, running_robots
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, require_asked
 from acsard.cli.replies import json_line, of_robot
 from acsard.core import formatting
 from acsard.core.formatting import printable
 from acsard.core.values import AcsardError
-from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, running_robots
 from acsard.host.errors import Exit
 
 

@@ -8,13 +8,13 @@ from concurrent.futures import ThreadPoolExecutor
 
 import msgspec
 
+from acsard.bus.robot_discovery import ALL_ROBOTS, count_text, running_robots
 from acsard.client import Client
 from acsard.core import formatting
 from acsard.core.formatting import printable
 from acsard.core.messages.encodings import DecodeError, detect, encode
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import AcsardError
-from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, count_text, running_robots
 from acsard.host.errors import Exit
 
 

@@ -12,8 +12,8 @@ import signal
 import sys
 from pathlib import Path
 
+from acsard.bus.zenoh_sessions import log_from_environment
 from acsard.core.config.settings import LogConfig
-from acsard.daemon.bus.zenoh_sessions import log_from_environment
 from acsard.daemon.gateway.fleet_router import Router
 from acsard.daemon.gateway.listener_process import ListenerProcess
 from acsard.daemon.supervisor import ROUTER, keep_running

@@ -12,6 +12,7 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
+from acsard.bus.zenoh_sessions import reachable
 from acsard.cli.common import (
     add_config,
     by_environment,
@@ -25,7 +26,6 @@ from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
 from acsard.core.values import ROOT_KEY, Event
 from acsard.daemon import daemon
-from acsard.daemon.bus.zenoh_sessions import reachable
 from acsard.daemon.settings_file import SettingsFile
 from acsard.host.logs import Log, Writer
 from acsard.host.version import version

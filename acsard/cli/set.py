@@ -21,6 +21,7 @@ from pathlib import Path
 
 import msgspec
 
+from acsard.bus.robot_discovery import parse_ids
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
 from acsard.cli.replies import of_each, print_each
 from acsard.client import Client
@@ -33,7 +34,6 @@ from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.ros.parameters import described
 from acsard.core.values import Plain
-from acsard.daemon.bus.robot_discovery import parse_ids
 from acsard.host.config_file import change, require_changeable, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install

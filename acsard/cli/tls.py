@@ -11,12 +11,12 @@ import socket
 from collections.abc import Mapping
 from pathlib import Path
 
+from acsard.bus.address import require_id
+from acsard.bus.tls import CA, CERTIFICATE, KEY
 from acsard.cli.common import add_config, load, whole
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import write
 from acsard.core.values import ROLES
-from acsard.daemon.bus.address import require_id
-from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY
 from acsard.daemon.gateway.fleet_router import router_file
 from acsard.host.config_file import change, require_changeable, require_tomlkit
 from acsard.host.errors import UsageError

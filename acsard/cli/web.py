@@ -13,13 +13,13 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from acsard.bus.address import address_of
+from acsard.bus.zenoh_sessions import log_from_environment
 from acsard.cli.common import load, whole, with_record_directory
 from acsard.cli.connection import add_bus
 from acsard.core.config.settings import Config
 from acsard.core.formatting import lasting
 from acsard.core.values import ROLES
-from acsard.daemon.bus.address import address_of
-from acsard.daemon.bus.zenoh_sessions import log_from_environment
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install
 from acsard.host.logs import Log, output_in_threads

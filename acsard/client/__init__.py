@@ -38,12 +38,12 @@ text of an error says what to do:
     DecodeError                         a payload is not a message of acsard
 """
 
+from acsard.bus.subscription import Subscription
 from acsard.client.asynchronous import AsyncClient, connect_async
+from acsard.client.identity import ClientIdentity
 from acsard.client.synchronous import Client, connect
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.values import AcsardError, Pose
-from acsard.daemon.bus.identity import ClientIdentity
-from acsard.daemon.bus.subscription import Subscription
 from acsard.host.errors import (
     CertificateError,
     NoAnswerError,

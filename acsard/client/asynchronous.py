@@ -12,15 +12,15 @@ from contextlib import aclosing, asynccontextmanager, closing, suppress
 from functools import partial
 from typing import Any, TypeVar
 
+from acsard.bus.address import address_by_environment
+from acsard.bus.subscription import encoded
+from acsard.bus.zenoh_sessions import client_session
 from acsard.client.commander import REPEAT_ZERO_S
 from acsard.client.driving import UnheardError, drive
+from acsard.client.identity import ClientIdentity
 from acsard.client.synchronous import REPLY_TIMEOUT_S, Client, close, decoder
 from acsard.core.messages import schema
 from acsard.core.values import AcsardError, Plain, Pose
-from acsard.daemon.bus.address import address_by_environment
-from acsard.daemon.bus.identity import ClientIdentity
-from acsard.daemon.bus.subscription import encoded
-from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import NoAnswerError
 from acsard.host.threads import in_thread
 

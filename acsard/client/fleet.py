@@ -16,13 +16,13 @@ from typing import Any
 import zenoh
 from msgspec import Struct
 
+from acsard.bus.robot_discovery import ALL_ROBOTS, robot_of
+from acsard.bus.subscription import encoded
 from acsard.client.follower import FLEET_QUERY_PERIOD_S, Follower
 from acsard.client.synchronous import Client
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import full_key
 from acsard.core.messages.schema import Info, RobotState
-from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, robot_of
-from acsard.daemon.bus.subscription import encoded
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 

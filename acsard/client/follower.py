@@ -16,10 +16,10 @@ from typing import Protocol
 
 import zenoh
 
+from acsard.bus.subscription import MAX_QUEUED_SAMPLES, Subscription, encoded
 from acsard.client.commander import objection
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import RobotState
-from acsard.daemon.bus.subscription import MAX_QUEUED_SAMPLES, Subscription, encoded
 from acsard.host.mailbox import Mailbox
 
 QUERY_PERIOD_S = 0.3

@@ -15,6 +15,11 @@ import msgspec
 import zenoh
 from msgspec import field
 
+from acsard.bus.address import Address, address_by_environment
+from acsard.bus.robot_discovery import NO_BATTERY, explain_silence, presence
+from acsard.bus.subscription import Subscription, encoded, queue_on
+from acsard.bus.tls import shown_at
+from acsard.bus.zenoh_sessions import client_session
 from acsard.client.commander import (
     MAX_SOURCE_TIMEOUT_S,
     MIN_SPACING_S,
@@ -23,6 +28,7 @@ from acsard.client.commander import (
     no_command,
 )
 from acsard.client.driving import UnheardError, drive
+from acsard.client.identity import ClientIdentity, identity
 from acsard.core.incoming.commands import require_size
 from acsard.core.incoming.imu import UNKNOWN_COVARIANCE
 from acsard.core.incoming.queries import BUSY, invalid_call
@@ -47,12 +53,6 @@ from acsard.core.messages.keys_and_roles import (
 from acsard.core.messages.permissions import COMMAND_ROLE, has
 from acsard.core.messages.signature import Signature, public_name
 from acsard.core.values import Plain, Pose
-from acsard.daemon.bus.address import Address, address_by_environment
-from acsard.daemon.bus.identity import ClientIdentity, identity
-from acsard.daemon.bus.robot_discovery import NO_BATTERY, explain_silence, presence
-from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
-from acsard.daemon.bus.tls import shown_at
-from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host import clock
 from acsard.host.errors import (
     MendableError,
@@ -291,11 +291,14 @@ class Client:
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call a service, such as "stop", and return its reply.
 
-        `fields` are the fields of the payload. `clear` releases the stop or fault that `state`
-        shows at the time of the call, and `activate` switches on a robot that is inactive at that
-        time. If a person decided to make the call after looking at an earlier state, pass
-        `latch=state.latch` of that earlier state. The daemon then refuses the call if the robot was
-        stopped or switched off again in between.
+        `fields` are the fields of the payload.
+
+        The service "clear" releases a stop or a fault, and "activate" switches on an inactive
+        robot. Both need the number of the stop, the fault or the switch-off, which is `latch` in
+        the key `state`. Without the field `latch`, this method reads the present number. If a
+        person decided to make the call because of an earlier state, pass `latch=state.latch` of
+        that state. The daemon then refuses the call if the robot was stopped or switched off again
+        in between.
         """
         if service in ("clear", "activate") and "latch" not in fields:
             fields["latch"] = self.get("state").latch
@@ -316,8 +319,9 @@ class Client:
     def request(self, service: str, fields: Mapping[str, object]) -> schema.ServiceReply:
         """Call the service `service` with `fields` as its payload, and return its reply.
 
-        Unlike `call`, this does not add the field `latch`. A payload that is too large for the
-        daemon is not sent, because the bus may drop it. The reply is then the daemon's refusal.
+        Unlike `call`, this method does not add the field `latch`. It does not send a payload that
+        is too large for the daemon, because the bus may drop it. It then returns the same refusal
+        that the daemon would send.
         """
         payload, key = msgspec.json.encode(fields) if fields else None, service_key(service)
         if payload is not None and (verb := VERBS.get(key)) is not None:

@@ -17,15 +17,15 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Sequen
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
 from typing import Any, Self
 
+from acsard.bus.certificate_watch import watch_certificates
+from acsard.bus.tls import expiry_times, require_usable
+from acsard.bus.zenoh_sessions import log_from_environment
 from acsard.core.config.settings import TLS_PREFIX, Config
 from acsard.core.link.codec import Codec
 from acsard.core.messages.keys_and_roles import DESCRIPTION
 from acsard.core.messages.schema import Info
 from acsard.core.values import NS_PER_S, Event, Latches
 from acsard.daemon.bus.bus import ZenohBus
-from acsard.daemon.bus.certificate_watch import watch_certificates
-from acsard.daemon.bus.tls import expiry_times, require_usable
-from acsard.daemon.bus.zenoh_sessions import log_from_environment
 from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_file import LatchFile
 from acsard.daemon.late_watch import LateWatch

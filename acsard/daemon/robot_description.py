@@ -9,9 +9,9 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+from acsard.bus.zenoh_sessions import MAX_MESSAGE_BYTES
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import String
-from acsard.daemon.bus.zenoh_sessions import MAX_MESSAGE_BYTES
 from acsard.host.errors import Exit, ExitError
 
 MAX_BYTES = 50_000

@@ -14,6 +14,7 @@ import msgspec
 import zenoh
 from msgspec import Struct
 
+from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.client import Client
 from acsard.client.synchronous import decoder
 from acsard.core.config.settings import Config, RosConfig
@@ -25,7 +26,6 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.ros.channels import CMD_VEL_IN, ENCODING, LOG_CHANNEL, SCHEMA_ENCODING, Channel
 from acsard.core.ros.shapes import Log, command_message, log
 from acsard.core.ros.transports import endpoints
-from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
 from acsard.foxglove.robot_facts import Facts, key_of
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox

@@ -9,10 +9,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from acsard.core.config.settings import TLS_PREFIX, Config
-from acsard.core.messages.certificate_expiry import expiry, first_expiry
-from acsard.daemon.bus.certificate_watch import router_expiry_times
-from acsard.daemon.bus.tls import (
+from acsard.bus.certificate_watch import router_expiry_times
+from acsard.bus.tls import (
     AUTHORITY,
     CA,
     CERTIFICATE,
@@ -23,7 +21,9 @@ from acsard.daemon.bus.tls import (
     host_of,
     require_usable,
 )
-from acsard.daemon.bus.zenoh_sessions import certificate_trouble
+from acsard.bus.zenoh_sessions import certificate_trouble
+from acsard.core.config.settings import TLS_PREFIX, Config
+from acsard.core.messages.certificate_expiry import expiry, first_expiry
 from acsard.host.clock import now
 from acsard.host.errors import MendableError
 from acsard.host.extras import install

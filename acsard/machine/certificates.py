@@ -16,9 +16,9 @@ from getpass import getpass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from acsard.bus.tls import CA, CERTIFICATE
 from acsard.core.config.settings import Config
 from acsard.core.values import ROLES
-from acsard.daemon.bus.tls import CA, CERTIFICATE
 from acsard.host.errors import MendableError, NotPermittedError, UsageError
 from acsard.host.extras import missing
 from acsard.host.own_identity import own_addresses

@@ -15,6 +15,8 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
+from acsard.bus.address import Address
+from acsard.bus.zenoh_sessions import no_endpoint, reachable
 from acsard.client import Client, connect
 from acsard.core.config.live import Difference, differences, find_live_setting
 from acsard.core.config.parsing import from_builtins
@@ -43,8 +45,6 @@ from acsard.core.motion.emergency_stop import (
 )
 from acsard.core.motion.gyro import STATUS_TEXTS
 from acsard.core.values import NS_PER_S, AcsardError, BatteryLevel, BatteryStatus, GyroDoes
-from acsard.daemon.bus.address import Address
-from acsard.daemon.bus.zenoh_sessions import no_endpoint, reachable
 from acsard.daemon.late_causes import cause_in
 from acsard.host import clock
 from acsard.host.errors import MendableError, NoAnswerError

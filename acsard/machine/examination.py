@@ -17,11 +17,11 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from acsard.bus.address import Address, address_of
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.config.settings import Config
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.address import Address, address_of
 from acsard.daemon.late_causes import present
 from acsard.host import clock, real_time
 from acsard.host.kernel_counters import Kernel

@@ -140,7 +140,8 @@ class JsonPrompt:
         self._pressed = False
         self._found = 0
         self._moves = False
-        """True while something may move that a person has started and must be able to stop."""
+        """True while the robot may move because of this subcommand. A person must be able to stop it
+        during that time."""
         self._reader = threading.Thread(target=self._listen, name="standard input", daemon=True)
 
     def __enter__(self) -> Self:

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
+from acsard.bus.robot_discovery import ALL_ROBOTS, count_text, no_robot_text
 from acsard.client.fleet import Fleet, Row
 from acsard.core.formatting import printable, rough, signed
 from acsard.core.messages.schema import RobotState
 from acsard.core.messages.state_warnings import brief, charge, warnings
-from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, count_text, no_robot_text
 from acsard.top.drive_screen import reason
 
 COLUMN_HEADS = ("ROBOT", "MODE", "M/S", "LINK", "BATTERY", "PLACE", "VERSION", "SEEN", "WHY")

@@ -11,14 +11,14 @@ import asyncio
 from collections.abc import Awaitable, Callable, Hashable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
+from acsard.bus import robot_discovery
+from acsard.bus.address import require_id
 from acsard.client import Client
 from acsard.core.incoming.queries import BUSY
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.keys_and_roles import SERVICES
 from acsard.core.messages.permissions import SERVICE_ROLES
 from acsard.core.messages.schema import ServiceReply
-from acsard.daemon.bus import robot_discovery
-from acsard.daemon.bus.address import require_id
 from acsard.host import clock
 from acsard.host.errors import MendableError, UsageError
 from acsard.host.rate_limits import Buckets, Places

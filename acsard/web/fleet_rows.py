@@ -8,9 +8,9 @@ from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from typing import Any
 
+from acsard.bus.robot_discovery import ALL_ROBOTS
 from acsard.client import Client, fleet
 from acsard.core.messages.state_warnings import charge, warnings
-from acsard.daemon.bus.robot_discovery import ALL_ROBOTS
 from acsard.host.threads import in_thread
 from acsard.web.robots import Robots
 from acsard.web.socket_messages import Row

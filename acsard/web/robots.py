@@ -11,14 +11,14 @@ import msgspec
 import zenoh
 from msgspec import Struct
 
+from acsard.bus.address import Address
+from acsard.bus.tls import shown_at
 from acsard.client import Client
 from acsard.client.follower import Watch, restarted
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import Info, PoseStamped, RobotState, Twist, TwistStamped
 from acsard.core.thinning import Place, Track
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.address import Address
-from acsard.daemon.bus.tls import shown_at
 from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
 from acsard.host.threads import NoThreadError, in_thread

@@ -16,13 +16,13 @@ from typing import Any
 from aiohttp import web
 from msgspec import Struct
 
+from acsard.bus.address import Address
+from acsard.bus.certificate_watch import CertificateFiles
+from acsard.bus.tls import CERTIFICATE, KEY, files_in, names_in
+from acsard.bus.zenoh_sessions import client_session
 from acsard.client import Client
 from acsard.core.config.settings import Config
 from acsard.core.values import Event
-from acsard.daemon.bus.address import Address
-from acsard.daemon.bus.certificate_watch import CertificateFiles
-from acsard.daemon.bus.tls import CERTIFICATE, KEY, files_in, names_in
-from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.child import HEARTBEAT_S, Parent, end_with_parent
 from acsard.host.logs import Log
 from acsard.host.threads import NoThreadError, in_thread

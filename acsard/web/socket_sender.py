@@ -15,7 +15,7 @@ import aiohttp
 import msgspec
 from aiohttp import web
 
-from acsard.daemon.bus.address import require_id
+from acsard.bus.address import require_id
 from acsard.host import clock
 from acsard.host.errors import UsageError
 from acsard.host.rate_limits import Buckets, Rate

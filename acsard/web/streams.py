@@ -15,10 +15,10 @@ from typing import Any
 import msgspec
 import zenoh
 
+from acsard.bus.subscription import encoded, has_exact_key
 from acsard.client import Client
 from acsard.core.messages.encodings import DecodeError, detect
 from acsard.core.messages.keys_and_roles import FOLLOWED
-from acsard.daemon.bus.subscription import encoded, has_exact_key
 from acsard.host import clock
 from acsard.host.errors import UsageError
 from acsard.host.threads import in_thread

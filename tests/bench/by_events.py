@@ -28,8 +28,8 @@ import serial
 import serial_asyncio
 import zenoh
 
+from acsard.bus.subscription import direct
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.outlets import direct
 from acsard.daemon.daemon import SWITCH_INTERVAL_S
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd

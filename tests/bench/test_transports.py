@@ -21,14 +21,14 @@ from statistics import median
 import pytest
 
 from acsard.bench.rig import Rig, processor_ns
+from acsard.bus.subscription import direct
+from acsard.bus.zenoh_sessions import client_session
 from acsard.core.config.settings import SIMULATOR, Config
 from acsard.core.messages import encodings
 from acsard.core.messages.keys_and_roles import full_key
 from acsard.core.messages.schema import Message
 from acsard.daemon.bus import outlets
 from acsard.daemon.bus.bus import ZenohBus
-from acsard.daemon.bus.outlets import direct
-from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host import clock
 from tests.bench.rigs import config, in_turns, rig, sibling
 from tests.unit.core.messages.test_cdr import odometry

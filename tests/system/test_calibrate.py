@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import zenoh
 
+from acsard.bus.zenoh_sessions import client_session
 from acsard.calibration.guided import robot_on_bus
 from acsard.calibration.guided.drive_plan import GuideError, Leg, Move
 from acsard.calibration.guided.leg_driver import STALL_REASON
@@ -34,7 +35,6 @@ from acsard.core.config.settings import Config, JointsConfig
 from acsard.core.link.link_diagnosis import blames_host
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
-from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.terminal.prompt import NumberQuestion
 from acsard.terminal.terminal_prompt import NoPrompt
 from tests.system.bystander import lost

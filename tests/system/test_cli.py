@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
+from acsard.bus.robot_discovery import Presence, presence
 from acsard.client import connect
-from acsard.daemon.bus.robot_discovery import Presence, presence
 from acsard.host.errors import Exit
 from tests.each import each
 from tests.system.bystander import lost

@@ -17,11 +17,11 @@ from typing import Any, NamedTuple
 import pytest
 import zenoh
 
+from acsard.bus.subscription import Subscription
 from acsard.client import Client, asynchronous, connect, connect_async, synchronous
 from acsard.client.commander import GRACE_S
 from acsard.core.incoming.queries import BUSY
 from acsard.core.messages import schema
-from acsard.daemon.bus.subscription import Subscription
 from acsard.host.errors import (
     NoAnswerError,
     NotDrivenError,

@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
+from acsard.bus import robot_discovery
 from acsard.client import connect
 from acsard.core.messages.signature import public_name
-from acsard.daemon.bus import robot_discovery
 from acsard.host.own_identity import own_name
 from acsard.host.version import version
 from tests.system.harness import Bus, Daemon, Peer, acsard, running, until

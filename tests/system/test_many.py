@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 import zenoh
 
+from acsard.bus.robot_discovery import ALL_ROBOTS, stop
 from acsard.cli import main
 from acsard.client import synchronous
-from acsard.daemon.bus.robot_discovery import ALL_ROBOTS, stop
 from acsard.host.version import version
 from acsard.machine.authority import Authority
 from tests.pages import blocks

@@ -11,7 +11,7 @@ from unittest import mock
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from acsard.daemon.bus.tls import peer_ends_ns
+from acsard.bus.tls import peer_ends_ns
 from acsard.machine.authority import Authority
 from tests.system.fleet_router import ITS_NAME, certified, watched_router
 from tests.system.harness import (

@@ -16,9 +16,9 @@ import zenoh
 from cryptography.hazmat.primitives.asymmetric import ec
 from msgspec.structs import replace
 
+from acsard.bus.tls import trouble
+from acsard.bus.zenoh_sessions import client_session, daemon_session
 from acsard.core.config.settings import BusConfig, Config
-from acsard.daemon.bus.tls import trouble
-from acsard.daemon.bus.zenoh_sessions import client_session, daemon_session
 from acsard.host.errors import CertificateError, MendableError, UnreachableError
 from acsard.machine import authority as making
 from acsard.machine.authority import Authority

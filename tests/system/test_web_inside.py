@@ -12,11 +12,11 @@ import aiohttp
 import pytest
 from aiohttp.test_utils import TestServer
 
+from acsard.bus.address import Address
+from acsard.bus.zenoh_sessions import client_session
 from acsard.client import Client
 from acsard.core.config.settings import Config, WebConfig
 from acsard.core.messages.signature import MAX_INT64
-from acsard.daemon.bus.address import Address
-from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import UnreachableError
 from acsard.web.acceptor import Acceptor
 from acsard.web.app import DEFAULT_CONFIG, Page

@@ -20,8 +20,8 @@ import aiohttp
 import pytest
 import websockets
 
+from acsard.bus.tls import peer_ends_ns
 from acsard.core.values import ROLES, Role
-from acsard.daemon.bus.tls import peer_ends_ns
 from acsard.machine.authority import Authority
 from acsard.web.limits import (
     MAX_LOCAL_WEBSOCKETS,

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping
 
+from acsard.bus.subscription import encoded
 from acsard.calibration.error_budget.budget import Budget, DriveMessages, budget
 from acsard.calibration.error_budget.measured_errors import Line
 from acsard.client import Client, Subscription
@@ -23,7 +24,6 @@ from acsard.core.messages.schema import (
     TwistStamped,
 )
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.subscription import encoded
 from acsard.host.errors import ReplyError
 
 KEYS = ("odom", "wheel_states", "cmd_vel_out")

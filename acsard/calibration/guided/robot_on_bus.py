@@ -16,6 +16,7 @@ import numpy as np
 import zenoh
 from msgspec import Struct
 
+from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.calibration.guided.drive_plan import DisturbedError, GuideError, Leg
 from acsard.calibration.guided.leg_driver import LegDriver
 from acsard.calibration.log_table import APPLIED, FOUR, Floats, Table
@@ -28,7 +29,6 @@ from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import by_key
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, Time, TwistStamped
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
 from acsard.host import clock
 from acsard.terminal.prompt import Prompt
 

@@ -305,8 +305,8 @@ class Identity(Struct, frozen=True):
     steady: bool = False
     """Whether the sender states that the clock of its stamps is never adjusted."""
     signed: str = ""
-    """The public name of the sender id, without the name of the TLS certificate. It is "" for a
-    sample without a sender id, and for a sample that is not a command on a native key."""
+    """The public name of the sender id, without the name of the TLS certificate. It is "" if the
+    sample has no sender id, if it is not a command, or if it arrived on a ROS key."""
 
 
 # The results are cached, because each command needs the parts of its key twice, and commands arrive

@@ -120,8 +120,7 @@ PROCESSING_NS = 30_000_000
 ns."""
 
 MAX_REPLIES_WITHOUT_SAMPLE = 5
-"""Number of correct replies in a row without a sample after which the daemon no longer asks for
-samples."""
+"""If this many correct replies in a row contain no sample, the daemon stops asking for samples."""
 
 
 class Throttle:

@@ -142,9 +142,9 @@ class FreeRunningTimes:
     """
 
     def __init__(self, known: tuple[float, ...]) -> None:
-        """Start without a clock.
+        """Start before the period T and the time c of the board's slots are known.
 
-        `known` are the periods that the configuration suggests, s.
+        `known` contains the values of T that the configuration suggests, s.
         """
         self._known = known
         self.usual = 0.0

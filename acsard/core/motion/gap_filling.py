@@ -146,7 +146,11 @@ class Rolling:
             self._turned = plus(self._turned, line.turned)
 
     def _driven_in(self, line: Feedback) -> float:
-        """Return how much of the gaps before `line` passed before the daemon commanded rest, s."""
+        """Return the part of the gaps before `line` in which the daemon still commanded motion, s.
+
+        A gap is a time without plausible feedback lines. The rest of it comes after the daemon
+        commanded rest.
+        """
         return self._bridged + line.driven if line.bridged else self._driven
 
     def take(self, line: Feedback, before: WheelSpeeds) -> Rolled:

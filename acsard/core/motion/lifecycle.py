@@ -31,9 +31,10 @@ from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError, mode_o
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
 LATCH_REQUIRED_S = 2.0
-"""Time in which a call `clear` or `activate` must name the number of the latch, s. The time begins
-with a stop, a fault, the `clear` of a fault, a `deactivate`, and the start of the daemon. The
-network seldom takes longer to deliver a packet."""
+"""Time after a change of the latches in which a `clear` or `activate` must contain the number of
+the latch, s. Such changes are a stop, a fault, the `clear` of a fault, a `deactivate` and the start
+of the daemon. In this time, a call that was sent before the change may still arrive: the network
+seldom delays a packet for longer."""
 
 MAX_CLIENTS = 4
 """Largest number of clients among the earlier causes of a stop. If more clients stop the robot, the

@@ -47,10 +47,11 @@ class Sender:
         self._neutral_first = neutral_first
         self._armed = self._proven_armed = not neutral_first
         self._zero_ns: int | None = None
-        """Monotonic time of arrival of the zero after which `commands.neutral_pause` runs, ns.
+        """Monotonic time of arrival of the zero command that will arm the sender, ns.
 
-        None if there is no such zero, or if `cancel_zero` was called after it. Only a shared
-        identity needs this value.
+        Only a sender with a shared identity uses it: this sender is armed when the pause
+        `commands.neutral_pause` has passed since the zero. None if no zero has arrived, or if
+        `cancel_zero` was called since.
         """
         self._proven_zero_ns: int | None = None
         self.name = ""

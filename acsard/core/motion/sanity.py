@@ -94,9 +94,11 @@ class Sanity:
         """For each wheel, the number of successive lines, up to the last line, in which the wheel
         was over `feedback.wheel_speed`."""
         self._totals = AT_REST
-        """For each wheel, the sum of the magnitudes of its speeds in the lines of `_fast`, rad/s. A
-        speed that exceeds the bound by more than one quantization step comes from a damaged line.
-        It counts as the bound plus one step."""
+        """For each wheel, the sum of the magnitudes of its speeds in the lines of `_fast`, rad/s.
+
+        A speed far above `feedback.wheel_speed` comes from a damaged line. Therefore each speed
+        adds at most `feedback.wheel_speed` plus one quantization step.
+        """
         self._lines = self._dropped = 0
         """Numbers of feedback lines in the present window: all lines (`_lines`), and impossible
         lines (`_dropped`)."""

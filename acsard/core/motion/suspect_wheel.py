@@ -27,10 +27,9 @@ FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
 called faulty: `FAULT_COUNTS` encoder counts plus `FAULT_ANGLE` rad."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
-"""Smallest effect of a new command on the angle of a healthy wheel, after which a wheel that still
-repeats its old speed can be called stuck. The effect is the angle that a healthy wheel would have
-rolled minus the angle at the old speed. It must be at least `FOLLOWED_COUNTS` encoder counts plus
-`FOLLOWED_ANGLE` rad."""
+"""A wheel that repeats its old speed after a new command counts as stuck only if a healthy wheel
+would have rolled a clearly different angle by then. The difference between this angle and the angle
+at the old speed must be at least `FOLLOWED_COUNTS` encoder counts plus `FOLLOWED_ANGLE` rad."""
 
 MIN_COMMAND_CHANGE = 0.05
 """Smallest change of the command, rad/s, after which a healthy wheel must report a different

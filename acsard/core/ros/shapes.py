@@ -85,10 +85,10 @@ class Counter(Struct, frozen=True):
 class Source(Struct, frozen=True):
     """A command source.
 
-    `age` is the time since the last accepted command of the source, s. Some events, such as a
-    `clear`, require each sender to send a zero before it may drive. `age` is None if no command was
-    accepted since the last of these events. `waits_for` is the condition that must be met before
-    the source can drive, in words, or "".
+    `age` is the time since the last accepted command of the source, s. A stop, a `clear` and some
+    other events discard the earlier commands; `age` is then None until the next accepted command.
+    `waits_for` says in words what must happen before the source can drive. It is "" while the
+    source drives.
     """
 
     name: str

@@ -12,6 +12,8 @@ from functools import partial
 import zenoh
 from msgspec.structs import replace
 
+from acsard.bus.subscription import direct
+from acsard.bus.zenoh_sessions import daemon_session
 from acsard.core.config.settings import Config
 from acsard.core.incoming.bus_interface import BusInput, Waker
 from acsard.core.incoming.imu import SIMULATOR_SENDER
@@ -24,9 +26,8 @@ from acsard.core.ros.names import gid
 from acsard.core.ros.transports import Endpoint, claims, endpoints, left_out, node_tokens
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.inbox import Inbox, Replies
-from acsard.daemon.bus.outlets import Outlets, direct
+from acsard.daemon.bus.outlets import Outlets
 from acsard.daemon.bus.router_links import RouterLinks
-from acsard.daemon.bus.zenoh_sessions import daemon_session
 from acsard.host import clock
 from acsard.host.errors import InUseError, MendableError
 from acsard.host.threads import NoThreadError, in_thread

@@ -11,13 +11,13 @@ no period.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from threading import Lock
 from typing import Any
 
 import zenoh
 import zenoh.ext
 
+from acsard.bus.subscription import direct
 from acsard.core.messages.encodings import Format, encode
 from acsard.core.messages.schema import Message
 from acsard.core.ros.attachments import Attachment
@@ -43,11 +43,6 @@ messages. Usually this thread needs 0.1 ms."""
 
 HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
 """Heartbeat of the publishers of latched ROS topics. The settings are those of rmw_zenoh."""
-
-
-def direct(callback: Callable[[Any], None]) -> Any:
-    """Return a handler that runs `callback` in Zenoh's receiving thread, not in a new thread."""
-    return zenoh.handlers.Callback(callback, indirect=False)
 
 
 class _Outlet:

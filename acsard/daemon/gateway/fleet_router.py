@@ -19,9 +19,9 @@ from pathlib import Path
 
 import zenoh
 
+from acsard.bus.certificate_watch import CertificateFiles
+from acsard.bus.zenoh_sessions import first_line
 from acsard.core.values import ROLES, Role
-from acsard.daemon.bus.certificate_watch import CertificateFiles
-from acsard.daemon.bus.zenoh_sessions import first_line
 from acsard.daemon.gateway.listener_process import Events, Listener, Observation
 from acsard.host import clock
 from acsard.host.errors import InUseError, RouterFileError, UsageError

@@ -21,8 +21,8 @@ from typing import Literal
 import zenoh
 from msgspec import Struct
 
+from acsard.bus.certificate_watch import CertificateFiles
 from acsard.core.values import NS_PER_S, Event, EventName
-from acsard.daemon.bus.certificate_watch import CertificateFiles
 from acsard.host import clock
 from acsard.host.child import Parent, Silence, end_with_parent
 from acsard.host.errors import Exit

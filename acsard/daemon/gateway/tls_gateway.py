@@ -14,14 +14,14 @@ from typing import Any
 import zenoh
 from zenoh.handlers import Callback
 
+from acsard.bus.certificate_watch import CertificateFiles
+from acsard.bus.tls import expiry_times, files_in, require_usable
+from acsard.bus.zenoh_sessions import MAX_SESSIONS, gateway_session, reachable
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.keys_and_roles import full_key
 from acsard.core.messages.schema import GatewayState
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.certificate_watch import CertificateFiles
-from acsard.daemon.bus.tls import expiry_times, files_in, require_usable
-from acsard.daemon.bus.zenoh_sessions import MAX_SESSIONS, gateway_session, reachable
 from acsard.daemon.gateway.listener_process import (
     GATEWAY_EVENTS,
     Listener,

@@ -26,9 +26,9 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from acsard.bus import tls as bus_tls
 from acsard.cli import main
 from acsard.core.config.parsing import parse
-from acsard.daemon.bus import tls as bus_tls
 from acsard.host.errors import Exit
 from acsard.host.own_identity import own_addresses
 from tests.each import each

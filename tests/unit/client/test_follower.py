@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from acsard.bus.subscription import MAX_QUEUED_SAMPLES
 from acsard.client.follower import (
     FIRST_STATE_TIMEOUT_S,
     FLEET_QUERY_PERIOD_S,
@@ -19,7 +20,6 @@ from acsard.client.follower import (
     restarted,
 )
 from acsard.core.messages.schema import RobotState, Time
-from acsard.daemon.bus.subscription import MAX_QUEUED_SAMPLES
 from tests.unit.top.screens import BEFORE, STATE, raw_sample, sample_of
 
 TICK = 0.01

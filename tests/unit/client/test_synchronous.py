@@ -17,6 +17,7 @@ from acsard.client import AcsardError, Client, NoAnswerError, asynchronous
 from acsard.client.asynchronous import AsyncClient
 from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, MIN_SPACING_S, no_command
 from acsard.client.driving import UnheardError
+from acsard.client.identity import ClientIdentity
 from acsard.client.synchronous import decoder
 from acsard.core.config.settings import Config, DriveConfig, JointsConfig
 from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Receiver
@@ -27,7 +28,6 @@ from acsard.core.messages.encodings import FORMATS, DecodeError, Decoder, Format
 from acsard.core.messages.schema import Header, Imu, Quaternion, Time, Vector3
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import NS_PER_S, REST, Command
-from acsard.daemon.bus.identity import ClientIdentity
 from acsard.host import clock
 from tests.each import each
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from acsard.bus.zenoh_sessions import MAX_MESSAGE_BYTES
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import String
-from acsard.daemon.bus.zenoh_sessions import MAX_MESSAGE_BYTES
 from acsard.daemon.robot_description import MAX_BYTES, robot_description
 from acsard.host.errors import Exit, ExitError
 from tests.each import each

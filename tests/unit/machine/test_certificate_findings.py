@@ -13,11 +13,11 @@ from tempfile import TemporaryDirectory
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
+from acsard.bus import certificate_watch
+from acsard.bus.tls import AUTHORITY, expiry_times, require_usable
 from acsard.cli import main
 from acsard.core.config.settings import BusConfig, Config
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus import certificate_watch
-from acsard.daemon.bus.tls import AUTHORITY, expiry_times, require_usable
 from acsard.host import clock
 from acsard.host.errors import NotPermittedError
 from acsard.machine.authority import Authority

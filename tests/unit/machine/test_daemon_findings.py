@@ -9,6 +9,7 @@ from typing import get_args
 import pytest
 from msgspec.structs import replace
 
+from acsard.bus.address import Address
 from acsard.core.config.live import differences
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import (
@@ -30,7 +31,6 @@ from acsard.core.messages.schema import (
     Time,
 )
 from acsard.core.values import GyroDoes
-from acsard.daemon.bus.address import Address
 from acsard.host.errors import CertificateError, NoAnswerError, UsageError
 from acsard.machine import daemon_findings
 from acsard.machine.daemon_findings import (

@@ -9,11 +9,11 @@ from typing import Any, cast
 import pytest
 from msgspec.structs import replace
 
+from acsard.bus.address import Address
 from acsard.client import Client, Subscription
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S, ROBOT_SILENCE_TIMEOUT_S
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState, Time
-from acsard.daemon.bus.address import Address
 from acsard.host.errors import ReplyError
 from acsard.top import feed as top_feed
 from acsard.top.feed import Feed

@@ -13,12 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from acsard.bus.address import Address
 from acsard.client import fleet as fleets
 from acsard.client.fleet import Row
 from acsard.client.follower import FLEET_QUERY_PERIOD_S
 from acsard.core.messages.schema import BatterySummary, Info, Time
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.address import Address
 from acsard.host import clock as clocks
 from acsard.top.fleet_table import COLUMN_HEADS, Roster, table
 from tests.each import each

@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from acsard.bus.address import Address
 from acsard.client.commander import GRACE_S, RELEASE_TIMEOUT_NS, ZEROS
 from acsard.client.follower import ROBOT_SILENCE_TIMEOUT_S
 from acsard.core.messages.schema import RobotState, SourceState
 from acsard.core.values import NS_PER_S, REST, Twist
-from acsard.daemon.bus.address import Address
 from acsard.host import clock
 from acsard.top.keyboard import KEY_HOLD_S, RELEASE_REASON, REPEAT_S, Keyboard, KeyboardDrive, split
 from tests.each import each

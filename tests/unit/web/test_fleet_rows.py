@@ -14,10 +14,10 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
+from acsard.bus.address import Address
 from acsard.client import Client
 from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.schema import Info
-from acsard.daemon.bus.address import Address
 from acsard.web.fleet_rows import FleetTracker
 from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots

@@ -15,6 +15,7 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
+from acsard.bus.address import Address
 from acsard.client.follower import (
     FIRST_STATE_TIMEOUT_S,
     QUERY_PERIOD_S,
@@ -24,7 +25,6 @@ from acsard.client.follower import (
 from acsard.core.config.settings import Config
 from acsard.core.messages.schema import Time
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.address import Address
 from acsard.host import clock
 from acsard.host.threads import NoThreadError
 from acsard.web import robots

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from acsard.bus import certificate_watch
+from acsard.bus.certificate_watch import CertificateFiles
+from acsard.bus.tls import KEY, files_in
 from acsard.core.config.settings import LogConfig
-from acsard.daemon.bus import certificate_watch
-from acsard.daemon.bus.certificate_watch import CertificateFiles
-from acsard.daemon.bus.tls import KEY, files_in
 from acsard.host.logs import Log
 from acsard.machine.authority import Authority
 from acsard.web import server

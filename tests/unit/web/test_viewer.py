@@ -9,11 +9,11 @@ from typing import Any
 import aiohttp
 import pytest
 
+from acsard.bus.address import Address
 from acsard.client import Client
 from acsard.client.commander import Commander, CommandSigner, Wish
 from acsard.core.messages.signature import unpack
 from acsard.core.values import NS_PER_S, Twist
-from acsard.daemon.bus.address import Address
 from acsard.host import clock
 from acsard.web.callers import AdmittedClient
 from acsard.web.guide import Guide, Reach

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import zenoh
 
+from acsard.bus.access import gateway_access
 from acsard.core.config.settings import (
     Config,
     McuConfig,
@@ -23,7 +24,6 @@ from acsard.core.config.settings import (
 )
 from acsard.core.messages.keys_and_roles import JSON_TREE, TOPICS, source_keys
 from acsard.core.values import ROLES, Role
-from acsard.daemon.bus.access import gateway_access
 from acsard.daemon.gateway.fleet_router import Router, router_file
 from acsard.host.errors import InUseError, RouterFileError, UsageError
 from tests.each import each

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from acsard.bus.address import Address, address_by_environment
 from acsard.client import connect
-from acsard.daemon.bus.address import Address, address_by_environment
 from acsard.host.errors import UnreachableError, UsageError
 
 HERE = Address("tcp/127.0.0.1:7448", "acsar", "")

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from acsard.daemon.bus.subscription import MAX_QUEUED_SAMPLES, Subscription, queue_on
+from acsard.bus.subscription import MAX_QUEUED_SAMPLES, Subscription, queue_on
 
 KEY, WILDCARD = "acsard/acsar/state", "acsard/**"
 

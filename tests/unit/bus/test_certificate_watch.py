@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from acsard.core.config.settings import BusConfig
-from acsard.daemon.bus import certificate_watch as module
-from acsard.daemon.bus.certificate_watch import (
+from acsard.bus import certificate_watch as module
+from acsard.bus.certificate_watch import (
     FILES_CHECK_PERIOD_NS,
     CertificateFiles,
     watch_certificates,
 )
-from acsard.daemon.bus.tls import expiry_times, files_in
+from acsard.bus.tls import expiry_times, files_in
+from acsard.core.config.settings import BusConfig
 from acsard.host import clock
 from acsard.machine.authority import Authority
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from acsard.bus.zenoh_sessions import daemon_session
 from acsard.core.config.settings import BusConfig, Config
-from acsard.daemon.bus.zenoh_sessions import daemon_session
 from acsard.host.errors import InUseError, MendableError
 
 

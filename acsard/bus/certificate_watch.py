@@ -12,10 +12,10 @@ import asyncio
 from collections.abc import Iterable, MutableMapping
 from pathlib import Path
 
+from acsard.bus.tls import expiry_times, peer_ends_ns, unusable
+from acsard.bus.zenoh_sessions import certificate_trouble
 from acsard.core.config.settings import TLS_PREFIX, BusConfig
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.tls import expiry_times, peer_ends_ns, unusable
-from acsard.daemon.bus.zenoh_sessions import certificate_trouble
 from acsard.host import clock
 from acsard.host.threads import NoThreadError, in_thread
 

@@ -19,6 +19,11 @@ MAX_QUEUED_SAMPLES = 1000
 one."""
 
 
+def direct(callback: Callable[[Any], None]) -> Any:
+    """Return a handler that runs `callback` in Zenoh's receiving thread, not in a new thread."""
+    return zenoh.handlers.Callback(callback, indirect=False)
+
+
 class Arrivals(Mailbox[zenoh.Sample]):
     """The queue of a subscription. Zenoh's thread adds the samples, and a reader takes them."""
 

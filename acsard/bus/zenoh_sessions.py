@@ -13,11 +13,8 @@ from pathlib import Path
 
 import zenoh
 
-from acsard.core.config.settings import TLS_PREFIX, Config
-from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT, full_key, source_keys
-from acsard.core.ros.transports import command_keys
-from acsard.daemon.bus.access import access_control, gateway_access
-from acsard.daemon.bus.tls import (
+from acsard.bus.access import access_control, gateway_access
+from acsard.bus.tls import (
     CA,
     CERTIFICATE,
     KEY,
@@ -26,6 +23,9 @@ from acsard.daemon.bus.tls import (
     require_usable,
     trouble,
 )
+from acsard.core.config.settings import TLS_PREFIX, Config
+from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT, full_key, source_keys
+from acsard.core.ros.transports import command_keys
 from acsard.host.errors import (
     CertificateError,
     InUseError,

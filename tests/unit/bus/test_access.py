@@ -17,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
+from acsard.bus.access import GRANTS, _Keys, access_control, gateway_access
 from acsard.core.config.settings import (
     AccessConfig,
     CommandsConfig,
@@ -38,7 +39,6 @@ from acsard.core.messages.keys_and_roles import (
 from acsard.core.messages.permissions import SERVICE_ROLES, least_role
 from acsard.core.ros.transports import PARAMETERS_PREFIX, claims, endpoints
 from acsard.core.values import Role
-from acsard.daemon.bus.access import GRANTS, _Keys, access_control, gateway_access
 from tests.each import each
 
 ROLES: tuple[Role, ...] = ("viewer", "operator", "maintainer")
@@ -493,7 +493,7 @@ def test_the_gateway_grants_each_role_its_permissions_and_the_daemon_everything(
 
 @each("role", ROLES)
 def test_the_page_about_access_names_the_services_of_a_role(role: Role) -> None:
-    text = (Path(__file__).parents[4] / "deploy" / "systemd" / "README.md").read_text()
+    text = (Path(__file__).parents[3] / "deploy" / "systemd" / "README.md").read_text()
     (row,) = re.findall(rf"^\| {role} \| .*$", text, re.M)
     named = {verb for verb in SERVICES if re.search(rf"[`*]{verb}[`*]", row)}
     assert named == {verb for verb, least in SERVICE_ROLES.items() if least == role}

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 from msgspec import ValidationError, convert
 
+from acsard.bus.zenoh_sessions import reachable
 from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.config.settings import TLS_PREFIX, Config, Name
-from acsard.daemon.bus.zenoh_sessions import reachable
 from acsard.host.errors import UsageError
 
 

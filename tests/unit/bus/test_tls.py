@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives import serialization
 
+from acsard.bus import tls
+from acsard.bus.tls import AUTHORITY, common_name, expiry_times, require_usable, trouble
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus import tls
-from acsard.daemon.bus.tls import AUTHORITY, common_name, expiry_times, require_usable, trouble
 from acsard.host.errors import CertificateError, NotPermittedError
 from acsard.machine.authority import Authority
 

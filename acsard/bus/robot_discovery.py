@@ -13,12 +13,12 @@ import msgspec
 import zenoh
 from msgspec import Struct
 
+from acsard.bus.address import require_id
+from acsard.bus.subscription import Subscription, queue_on
 from acsard.core.config.settings import TLS_PREFIX
 from acsard.core.formatting import many
 from acsard.core.messages.keys_and_roles import JSON_TREE, Topic, by_key, full_key, key_hint, row_of
 from acsard.core.values import ROOT_KEY
-from acsard.daemon.bus.address import require_id
-from acsard.daemon.bus.subscription import Subscription, queue_on
 from acsard.host.errors import NoAnswerError, UsageError
 
 ALL_ROBOTS = "*"

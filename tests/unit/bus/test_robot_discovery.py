@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.core.messages.keys_and_roles import PUBLISHED
-from acsard.daemon.bus.robot_discovery import (
+from acsard.bus.robot_discovery import (
     MAX_NAMED,
     Presence,
     explain_silence,
@@ -13,6 +12,7 @@ from acsard.daemon.bus.robot_discovery import (
     parse_ids,
     robot_of,
 )
+from acsard.core.messages.keys_and_roles import PUBLISHED
 from acsard.host.errors import UsageError
 from tests.each import each
 

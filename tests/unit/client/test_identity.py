@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
+from acsard.client import identity as rooms
+from acsard.client.identity import ClientIdentity, identity
 from acsard.core.values import ROLES
-from acsard.daemon.bus import identity as rooms
-from acsard.daemon.bus.identity import ClientIdentity, identity
 
 
 def of(*answering: str) -> ClientIdentity:
