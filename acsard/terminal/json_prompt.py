@@ -140,8 +140,8 @@ class JsonPrompt:
         self._pressed = False
         self._found = 0
         self._moves = False
-        """True while the robot may move because of this subcommand. A person must be able to stop it
-        during that time."""
+        """True while the robot may move because of this subcommand. During this time, a person must be
+        able to stop it."""
         self._reader = threading.Thread(target=self._listen, name="standard input", daemon=True)
 
     def __enter__(self) -> Self:
