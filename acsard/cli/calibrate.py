@@ -35,17 +35,16 @@ import argparse
 import math
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
 
 from acsard.bus.address import address_of
-from acsard.bus.zenoh_sessions import client_session
 from acsard.calibration.calibration_report import CalibrationRefusal, keys, parts, report
-from acsard.calibration.guided.drive_plan import NEEDS, GuideError, setup
-from acsard.calibration.guided.robot_on_bus import SOURCE, RobotOnBus
-from acsard.calibration.guided.runner import guide
+from acsard.calibration.guided.drive_plan import NEEDS, GuideError
+from acsard.calibration.guided.guided_drive import DriveOptions, guided_drive, other_robot
+from acsard.calibration.guided.robot_on_bus import SOURCE
 from acsard.calibration.log_table import LogError, NoCalibrationError
 from acsard.calibration.multipliers import Tape
 from acsard.calibration.recorded_drive import calibrated
@@ -55,7 +54,7 @@ from acsard.cli.common import add_outcome, load, require_asking
 from acsard.cli.connection import add_bus, require_one
 from acsard.client import connect
 from acsard.core.config.settings import Config
-from acsard.core.messages.keys_and_roles import IMU, full_key
+from acsard.core.messages.keys_and_roles import full_key
 from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.terminal_modes import single_key_mode
@@ -63,9 +62,6 @@ from acsard.terminal.json_prompt import JsonPrompt
 from acsard.terminal.output import MAX_TEXT_WIDTH, plain, show
 from acsard.terminal.prompt import NobodyError, Prompt, ended_by_signals
 from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
-
-TRUE_POSE = "sim/pose"
-"""Key of the true pose, without the robot's id. Only the built-in simulator publishes it."""
 
 DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_lines")
 """Names of the options for a guided drive. They cannot be used together with `--log`."""
@@ -129,7 +125,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
             calibration = calibrated(args.log, local_config, args.distance, _choice(args))
             config = local_config
         else:
-            calibration, config = _guided(args, local_config, where, lines)
+            calibration, config = _guided(args, where, local_config, lines)
     except (LogError, NoCalibrationError, GuideError, NobodyError) as error:
         notes = tuple(getattr(error, "__notes__", ()))
         if args.json:
@@ -156,7 +152,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
             show(*words, most=MAX_TEXT_WIDTH)
     else:
         lines.result(plain(*words, width=MAX_TEXT_WIDTH))
-        differing = _differing(config, local_config, where)
+        differing = other_robot(config, local_config, where)
         if not args.write and lines.offer(args.config, keys(calibration), differing):
             written = where
     if trouble is not None:
@@ -234,51 +230,16 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _guided(
-    args: argparse.Namespace, config: Config, where: str, lines: JsonPrompt | None
+    args: argparse.Namespace, file: str, file_config: Config, lines: JsonPrompt | None
 ) -> tuple[Calibration, Config]:
-    """Guide a person through a drive. Return its calibration and the daemon's configuration."""
     require_one(args)
-    endpoint, robot_id, tls = address_of(config, args.connect, args.id, args.tls)
+    endpoint, robot_id, tls = address_of(file_config, args.connect, args.id, args.tls)
     _usable(args, full_key(robot_id, "odom"))
-    with ExitStack() as stack:
-        client = stack.enter_context(connect(endpoint, robot_id=robot_id, source=SOURCE, tls=tls))
-        info = client.get("info")
-        if args.yes and not info.simulated:
-            raise UsageError(
-                "--yes is only for the built-in simulator: this robot is real, and a person "
-                "must stand near it and start each leg. Leave --yes out"
-            )
-        local_config = config
-        try:
-            config = msgspec.convert(client.get("config"), Config)
-        except msgspec.ValidationError as error:
-            raise GuideError(
-                f"this version of acsard cannot read the daemon's configuration ({error}): use the "
-                f"daemon's version, {info.version}"
-            ) from None
-        if args.write and (trouble := _differing(config, local_config, where)):
-            raise GuideError(trouble)
-        name = _method(args, config)
-        made = setup(config)
-        prompt = stack.enter_context(_prompt(args, lines))
-        prompt.begin(f"robot {robot_id} at {endpoint}", simulated=info.simulated)
-        robot = RobotOnBus(client, config, prompt)
-        if name == "gyro":
-            robot.gyro(args.imu or IMU)
-        elif name == "positions":
-            elsewhere = None
-            if args.positions_at:
-                elsewhere = client_session(args.positions_at, tls)
-                stack.callback(elsewhere.close)
-            robot.positions(args.positions, elsewhere)
-        true = info.simulated and args.positions in (TRUE_POSE, full_key(robot_id, TRUE_POSE))
-        try:
-            calibration = guide(
-                name, made, prompt, robot.ride, simulated=info.simulated, true_positions=true
-            )
-            return calibration, config
-        except KeyboardInterrupt:
-            raise GuideError("the operator ended the drive. No file was written") from None
+    options = DriveOptions(args.method, args.positions, args.positions_at, args.imu, args.yes)
+    with connect(endpoint, robot_id=robot_id, source=SOURCE, tls=tls) as client:
+        return guided_drive(
+            client, options, file, file_config, _prompt(args, lines), must_write=args.write
+        )
 
 
 def _usable(args: argparse.Namespace, odometry: str) -> None:
@@ -307,30 +268,6 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
             "each leg: run `acsard calibrate` in a terminal. Without a terminal, use --yes (only "
             "with the built-in simulator), or --log with a recorded drive"
         )
-
-
-def _differing(config: Config, local_config: Config, where: str) -> str:
-    same = config.drive.wheel_radius, config.drive.wheel_separation
-    if same == (local_config.drive.wheel_radius, local_config.drive.wheel_separation):
-        return ""
-    return (
-        f"the daemon runs with drive.wheel_radius = {same[0]:g} and drive.wheel_separation "
-        f"= {same[1]:g}, but {where} has other values: name the daemon's configuration "
-        "file with --config"
-    )
-
-
-def _method(args: argparse.Namespace, config: Config) -> str:
-    if args.positions:
-        return "positions"
-    gyro = args.method == "gyro" or args.imu
-    if gyro and args.imu in (None, IMU) and not config.odometry.gyro:
-        raise UsageError(
-            "this robot's daemon does not read a gyro: set odometry.gyro = true and restart "
-            "the daemon, or use --method tape, wall or umbmark"
-        )
-    method: str = args.method or ("gyro" if gyro or config.odometry.gyro else "tape")
-    return method
 
 
 @contextmanager

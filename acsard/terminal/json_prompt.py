@@ -140,7 +140,7 @@ class JsonPrompt:
         self._pressed = False
         self._found = 0
         self._moves = False
-        """True while the robot may move because of this subcommand. During this time, a person must be
+        """True while the robot may move because of this subcommand. In this time, a person must be
         able to stop it."""
         self._reader = threading.Thread(target=self._listen, name="standard input", daemon=True)
 

@@ -1,0 +1,134 @@
+"""Chooses the method of a guided drive, connects its sensors, and runs the drive on a robot."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, ExitStack
+
+import msgspec
+from msgspec import Struct
+
+from acsard.bus.zenoh_sessions import client_session
+from acsard.calibration.guided.drive_plan import GuideError, setup
+from acsard.calibration.guided.robot_on_bus import RobotOnBus
+from acsard.calibration.guided.runner import guide
+from acsard.calibration.solve import Calibration
+from acsard.client.synchronous import Client
+from acsard.core.config.settings import Config
+from acsard.core.messages.keys_and_roles import IMU, full_key
+from acsard.host.errors import UsageError
+from acsard.terminal.prompt import Prompt
+
+TRUE_POSE = "sim/pose"
+"""Key of the true pose, without the robot's id. Only the built-in simulator publishes it."""
+
+
+class DriveOptions(Struct, frozen=True):
+    """The options of a guided drive. Each option is None if the user did not choose."""
+
+    method: str | None = None
+    """Name of the method, as in `METHODS`."""
+    positions: str | None = None
+    """Zenoh key of the robot's positions, with or without the robot's id."""
+    positions_at: str | None = None
+    """Endpoint at which the positions are published, if it is not the daemon's own."""
+    imu: str | None = None
+    """Zenoh key of the gyro, with or without the robot's id."""
+    without_person: bool = False
+    """Start every leg without a person. Only the built-in simulator permits this."""
+
+
+def guided_drive(
+    client: Client,
+    options: DriveOptions,
+    file: str,
+    file_config: Config,
+    prompt: AbstractContextManager[Prompt],
+    *,
+    must_write: bool = False,
+) -> tuple[Calibration, Config]:
+    """Guide a person through a drive. Return its calibration and the daemon's configuration.
+
+    Args:
+        client: the connection to the robot.
+        options: the method and the sensors.
+        file: the path of the configuration file into which the result may be written.
+        file_config: the configuration in that file.
+        prompt: the context manager that opens the prompt. It is entered when the drive can begin.
+        must_write: whether to refuse the drive if the file does not belong to the daemon.
+
+    Raises:
+        UsageError: the options do not suit this robot.
+        GuideError: the drive cannot begin or continue, or the operator has ended it.
+        LogError, NobodyError, RefusedError: as `guide`.
+    """
+    info, robot_id = client.get("info"), client.where.robot_id
+    if options.without_person and not info.simulated:
+        raise UsageError(
+            "--yes is only for the built-in simulator: this robot is real, and a person "
+            "must stand near it and start each leg. Leave --yes out"
+        )
+    try:
+        config = msgspec.convert(client.get("config"), Config)
+    except msgspec.ValidationError as error:
+        raise GuideError(
+            f"this version of acsard cannot read the daemon's configuration ({error}): use the "
+            f"daemon's version, {info.version}"
+        ) from None
+    if must_write and (trouble := other_robot(config, file_config, file)):
+        raise GuideError(trouble)
+    method, plan = choose_method(options, config), setup(config)
+    true = info.simulated and options.positions in (TRUE_POSE, full_key(robot_id, TRUE_POSE))
+    with ExitStack() as stack:
+        asker = stack.enter_context(prompt)
+        asker.begin(f"robot {robot_id} at {client.where.endpoint}", simulated=info.simulated)
+        robot = RobotOnBus(client, config, asker)
+        if method == "gyro":
+            robot.gyro(options.imu or IMU)
+        elif method == "positions":
+            elsewhere = None
+            if options.positions_at:
+                elsewhere = client_session(options.positions_at, client.where.tls)
+                stack.callback(elsewhere.close)
+            robot.positions(options.positions or "", elsewhere)
+        try:
+            calibration = guide(
+                method, plan, asker, robot.ride, simulated=info.simulated, true_positions=true
+            )
+        except KeyboardInterrupt:
+            raise GuideError("the operator ended the drive. No file was written") from None
+        return calibration, config
+
+
+def choose_method(options: DriveOptions, config: Config) -> str:
+    """Return the method that the options name or need.
+
+    Without such an option, it is the gyro if the daemon reads one, else a tape measure. Raises
+    `UsageError` if the options need a gyro that the daemon does not read.
+    """
+    if options.positions:
+        return "positions"
+    gyro = options.method == "gyro" or options.imu
+    if gyro and options.imu in (None, IMU) and not config.odometry.gyro:
+        raise UsageError(
+            "this robot's daemon does not read a gyro: set odometry.gyro = true and restart "
+            "the daemon, or use --method tape, wall or umbmark"
+        )
+    return options.method or ("gyro" if gyro or config.odometry.gyro else "tape")
+
+
+def other_robot(config: Config, file_config: Config, file: str) -> str:
+    """Return an error message if the file configures another vehicle than the daemon's, else "".
+
+    Args:
+        config: the daemon's configuration.
+        file_config: the configuration in the file.
+        file: the path of the file, for the message.
+    """
+    ours, theirs = config.drive, file_config.drive
+    if (ours.wheel_radius, ours.wheel_separation) == (theirs.wheel_radius, theirs.wheel_separation):
+        return ""
+    return (
+        f"the daemon runs with drive.wheel_radius = {ours.wheel_radius:g} and "
+        f"drive.wheel_separation = {ours.wheel_separation:g}, but {file} has other values: name "
+        "the daemon's configuration file with --config"
+    )
