@@ -42,6 +42,7 @@ from acsard.host.atomic_file import replace, sync
 from acsard.host.errors import InUseError
 from acsard.host.mailbox import Mailbox
 from acsard.host.threads import NoThreadError, in_thread
+from acsard.host.wait_timer import WaitTimer
 
 HANG_TIMEOUT_S = 2.0
 """Time limit for the disk, s. If a write or a sync of the latch file takes longer, the daemon
@@ -140,13 +141,9 @@ class LatchFile:
         self._failed = ""
         self._newest_latches: Latches | None = None
         """The latches of the last call of `keep`."""
-        self._busy_ns: int | None = None
-        """Monotonic time at which the present write began, ns; None between two writes."""
-        self._syncing_ns: int | None = None
-        """Monotonic time at which the present sync began, ns; None between two syncs."""
-        self._hung = False
-        """True if `take_events` has reported that the disk hangs, and has not yet reported that it
-        works again."""
+        self._write_timer, self._sync_timer = WaitTimer(), WaitTimer()
+        self._hangs = False
+        """True if the last call of `take_events` found that the disk hangs."""
         self._renamed = Mailbox[Latches](1)
         """Passes the newest latches in the file to the syncing thread."""
         self._threads: tuple[threading.Thread, ...] = ()
@@ -284,9 +281,15 @@ class LatchFile:
             time.sleep(0.001)
 
     def take_events(self) -> list[Event]:
-        if self._hangs is not self._hung:
-            self._hung = not self._hung
-            if self._hung:
+        now_ns = clock.mono_ns()
+        write_ns, sync_ns = self._write_timer.wait_ns(now_ns), self._sync_timer.wait_ns(now_ns)
+        if self._written_latches is self._newest_latches:
+            # A write does not matter if the file already contains the newest latches.
+            write_ns = 0
+        hangs = not self._failed and max(write_ns, sync_ns) > HANG_TIMEOUT_S * NS_PER_S
+        if hangs is not self._hangs:
+            self._hangs = hangs
+            if hangs:
                 text = unwritable(self.where, DISK_HANGS)
                 self._news.put(Event("latch_file", text, "warning"))
             elif not self._failed:
@@ -300,18 +303,6 @@ class LatchFile:
             return "the thread that writes stops to the latch file has ended; restart the daemon"
         failed = self._failed or (DISK_HANGS if self._hangs else "")
         return unwritable(self.where, failed) if failed else ""
-
-    @property
-    def _hangs(self) -> bool:
-        if self._failed:
-            return False
-        # A write does not matter if the file already contains the newest latches.
-        busy_ns = None if self._written_latches is self._newest_latches else self._busy_ns
-        syncing_ns = self._syncing_ns
-        if busy_ns is None and syncing_ns is None:
-            return False
-        begun_ns = min(start_ns for start_ns in (busy_ns, syncing_ns) if start_ns is not None)
-        return clock.mono_ns() - begun_ns > HANG_TIMEOUT_S * NS_PER_S
 
     @property
     def _again(self) -> Event:
@@ -351,14 +342,14 @@ class LatchFile:
 
         `now` is the time at which the daemon started.
         """
-        self._busy_ns = clock.mono_ns()
+        self._write_timer.begin()
         with self._disk:
             if self._blind:
                 self._read_late(now)
             trouble = self._replace(latches)
         if trouble:
             self._fail(trouble)
-        self._busy_ns = None
+        self._write_timer.end()
         return trouble
 
     def _read_late(self, now: Instant) -> None:
@@ -404,9 +395,9 @@ class LatchFile:
                     assert self._written_latches is not None
                     self._replace(self._written_latches)
             if self._renamed.pop() is not None:
-                self._syncing_ns = clock.mono_ns()
+                self._sync_timer.begin()
                 trouble = self._sync()
-                self._syncing_ns = None
+                self._sync_timer.end()
                 failed = bool(trouble)
                 if failed:
                     self._fail(trouble)

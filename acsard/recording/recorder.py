@@ -31,13 +31,6 @@ hangs."""
 
 SLOW_DISK = "the disk has accepted no data for 3 s"
 
-MAX_DISK_WAIT_NS = NS_PER_S // 4
-"""Largest amount by which the time between two steps extends the measured duration of a sync, ns.
-
-If more time passes between two steps, the process itself was stopped, so the disk is not the cause
-of the rest of that time.
-"""
-
 SYNC_PAUSE_S = 0.98
 """Pause between two syncs of the file to the disk, s. The pause and one sync together take about a
 second."""
@@ -85,10 +78,8 @@ class Recorder:
         """Number of steps that were lost because the queue was full."""
         self._full = False
         """True after the queue was full, until half of the queue is free again."""
-        self._syncs = 0
-        """Value of `StepWriter.syncs` at the last step."""
-        self._waited_ns = self._now_ns = 0
-        """Duration of the present sync so far, and monotonic time of the last step, both in ns."""
+        self._sync_ns = 0
+        """Duration of the present sync up to the last step, ns."""
         self._slow = False
         """True after the log has reported a slow disk, until it reports a fast disk again."""
         self._lost_before = 0
@@ -153,26 +144,21 @@ class Recorder:
 
     def _watch_disk(self, now_ns: int) -> None:
         """Report when the disk begins to hang, and when it is fast enough again."""
-        before, self._syncs = self._syncs, self._writer.syncs
-        passed = self._syncs - before
-        if passed:
-            ended = before % 2 == 1 or passed > 1
-            if self._slow and ended and self._waited_ns <= SLOW_SYNC_NS:
-                self._slow = False
-                missing = many(self._lost - self._lost_before, "step is", "steps are")
-                self._report(
-                    Event(
-                        "recording",
-                        f"the disk is fast enough again; {missing} missing in the recording",
-                    )
+        timer = self._writer.sync_timer
+        ended, last_ns = timer.ended, self._sync_ns
+        self._sync_ns = timer.wait_ns(now_ns)
+        if self._slow and timer.ended != ended and last_ns <= SLOW_SYNC_NS:
+            self._slow = False
+            missing = many(self._lost - self._lost_before, "step is", "steps are")
+            self._report(
+                Event(
+                    "recording",
+                    f"the disk is fast enough again; {missing} missing in the recording",
                 )
-            self._waited_ns = 0
-        elif before % 2:
-            self._waited_ns += min(now_ns - self._now_ns, MAX_DISK_WAIT_NS)
-            if self._waited_ns > SLOW_SYNC_NS and not self._slow:
-                self._hangs()
-                self._report(Event("recording", f"{SLOW_DISK}; driving goes on", "warning"))
-        self._now_ns = now_ns
+            )
+        elif self._sync_ns > SLOW_SYNC_NS and not self._slow:
+            self._hangs()
+            self._report(Event("recording", f"{SLOW_DISK}; driving goes on", "warning"))
 
     def _hangs(self) -> None:
         if not self._slow:

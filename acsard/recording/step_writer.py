@@ -19,6 +19,7 @@ from acsard.core.config.toml_text import document
 from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S, Event, Instant
 from acsard.host.version import version
+from acsard.host.wait_timer import WaitTimer
 from acsard.recording.directory import RecordingDirectory, Run, mark_cut
 from acsard.recording.file import About, RecordingWriter
 from acsard.recording.mcap_records import MAX_DATA_BYTES
@@ -93,9 +94,8 @@ class StepWriter:
         """The present error of the disk, in words for the user; "" if the disk accepts data."""
         self.lost = 0
         """Number of steps that were not written because of errors of the disk."""
-        self.syncs = 0
-        """Number of syncs that have begun, plus number of syncs that have ended. The number is odd
-        during a sync. If the recorder reads the same odd number for too long, the disk hangs."""
+        self.sync_timer = WaitTimer()
+        """Measures the syncs of the file to the disk, for the control loop."""
         self._lost_before = 0
         """Value of `lost` when the present error of the disk began."""
         self._safe_ns: int | None = None
@@ -291,11 +291,11 @@ class StepWriter:
             directory.close()
         if self._writing is None:
             return
-        self.syncs += 1
+        self.sync_timer.begin()
         try:
             self._writing.flush()
         finally:
-            self.syncs += 1
+            self.sync_timer.end()
         self._safe, self._run.freed = self._handed, 0
         directory.maintain(self._last)
         if self.trouble or not self._reported:

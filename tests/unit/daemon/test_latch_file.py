@@ -15,10 +15,11 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
-from acsard.core.values import Event, Instant, Latch, Latches
+from acsard.core.values import NS_PER_S, Event, Instant, Latch, Latches
 from acsard.daemon import latch_file as module
 from acsard.daemon.latch_file import LatchFile, place
 from acsard.daemon.latch_rules import MAX_BYTES, encode
+from acsard.host import clock
 from acsard.host.atomic_file import replace as replace_file
 from acsard.host.atomic_file import sync as sync_file
 from acsard.host.errors import InUseError
@@ -283,6 +284,13 @@ def full(*words: object, **more: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+def take(file: LatchFile, events: list[Event]) -> list[Event]:
+    """Append the new events of the file to `events`, as a control step takes them."""
+    new = file.take_events()
+    events += new
+    return new
+
+
 class Stuck:
     """A disk that hangs: no write ends until `goes` is set."""
 
@@ -513,10 +521,31 @@ def test_a_sync_that_hangs_is_reported_until_it_ends(
     try:
         file.keep(STOP)
         until(lambda: file.holds(STOP))
-        until(lambda: module.DISK_HANGS in file.trouble)
+        until(lambda: file.take_events() and module.DISK_HANGS in file.trouble)
     finally:
         goes.set()
-    until(lambda: file.trouble == "")
+    until(lambda: file.take_events() and file.trouble == "")
+
+
+def test_a_process_that_was_stopped_during_a_sync_does_not_report_the_disk(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    syncing, goes = threading.Event(), threading.Event()
+
+    def sync_late(path: Path) -> None:
+        syncing.set()
+        assert goes.wait(10.0)
+
+    monkeypatch.setattr(module, "sync", sync_late)
+    file, _ = started(tmp_path)
+    assert syncing.wait(10.0)
+    file.take_events()
+    later_ns = clock.mono_ns() + int(10 * module.HANG_TIMEOUT_S * NS_PER_S)
+    monkeypatch.setattr(clock, "mono_ns", lambda: later_ns)
+    try:
+        assert (file.take_events(), file.trouble) == ([], "")
+    finally:
+        goes.set()
 
 
 def fails_to_sync(path: Path) -> None:
@@ -654,17 +683,19 @@ def test_a_disk_that_hangs_later_is_reported_once_and_so_is_its_recovery(
     monkeypatch.setattr(module, "HANG_TIMEOUT_S", 0.05)
     monkeypatch.setattr(module, "replace", stuck.replace)
     file.keep(STOP)
-    until(lambda: file.trouble)
+    events: list[Event] = []
+    until(lambda: take(file, events))
     path = tmp_path / NAME
     where = f"the latch file ({path}) cannot be written"
     assert file.trouble == f"a stop would not survive a restart: {where}: {module.DISK_HANGS}"
-    (event,) = file.take_events()
+    (event,) = events
     assert (event.name, event.level) == ("latch_file", "warning")
     assert module.DISK_HANGS in event.text
     assert file.take_events() == []
     stuck.goes.set()
-    until(lambda: file.trouble == "")
-    assert file.take_events() == [
+    until(lambda: take(file, events))
+    assert file.trouble == ""
+    assert events[1:] == [
         Event(
             "latch_file",
             f"the daemon can write {path} again, so stops survive a restart of the daemon",
@@ -686,8 +717,9 @@ def test_a_disk_that_hangs_and_then_fails_is_not_reported_as_recovered(
     monkeypatch.setattr(module, "HANG_TIMEOUT_S", 0.05)
     monkeypatch.setattr(module, "replace", fails_late)
     file.keep(STOP)
-    until(lambda: file.trouble)
-    assert [event.level for event in file.take_events()] == ["warning"]
+    events: list[Event] = []
+    until(lambda: take(file, events))
+    assert [event.level for event in events] == ["warning"]
     goes.set()
     until(lambda: "No space left" in file.trouble)
     (event,) = file.take_events()
