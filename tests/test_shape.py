@@ -7,6 +7,7 @@ other one, and that `acsard/core/` imports no clock, socket, thread, asyncio or 
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -125,6 +126,34 @@ def test_only_the_clock_reads_a_clock(module: str) -> None:
     else:
         assert not read & CLOCKS
         assert "datetime" not in roots
+
+
+def documented(docstring: str) -> list[str]:
+    """Return the names of the arguments in the section `Args:` of a docstring."""
+    section = re.split(r"\n(?=\S)", docstring.partition("\nArgs:\n")[2])[0]
+    lines = (re.match(r"    ([*\w]+(?:, [*\w]+)*):", line) for line in section.splitlines())
+    return [name.strip().lstrip("*") for line in lines if line for name in line[1].split(",")]
+
+
+def parameters(node: ast.AST) -> list[str]:
+    """Return the parameters of a function, or of the `__init__` of a class."""
+    if isinstance(node, ast.ClassDef):
+        made = [item for item in node.body if getattr(item, "name", "") == "__init__"]
+        return parameters(made[0]) if made else []
+    assert isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    args = node.args
+    found = [*args.posonlyargs, *args.args, args.vararg, *args.kwonlyargs, args.kwarg]
+    return [arg.arg for arg in found if arg is not None]
+
+
+@each("path", [str(path.relative_to(ROOT)) for path in sorted(PACKAGE.rglob("*.py"))])
+def test_a_docstring_lists_the_arguments_that_the_function_has(path: str) -> None:
+    for node in ast.walk(ast.parse((ROOT / path).read_text(encoding="utf-8"))):
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            continue
+        if names := documented(ast.get_docstring(node) or ""):
+            wanted = [name for name in parameters(node) if name not in ("self", "cls")]
+            assert [name for name in names if name != "cls"] == wanted, (path, node.name)
 
 
 def test_the_daemon_does_not_load_numpy() -> None:

@@ -87,6 +87,7 @@ def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
     """Send a stop to each of these robots, without waiting for an answer.
 
     Args:
+        session: the Zenoh session of the caller.
         ids: the ids of the robots; "*" stands for all robots.
         sender: the caller's sender id, `NAME/SECRET`.
     """
@@ -121,6 +122,7 @@ def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscriptio
     published the sample. Raises `UsageError` if `name` is not a key.
 
     Args:
+        session: the Zenoh session of the caller.
         ids: the ids of the robots; "*" stands for all robots.
         name: the part of the key after the robot's id, such as `state`.
     """

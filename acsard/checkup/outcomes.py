@@ -415,7 +415,7 @@ def find(outcome: str, keys: dict[str, object] | None = None, **values: object) 
     Args:
         outcome: a key of `OUTCOMES_BY_NAME`. The part before the colon is the name of the finding.
         keys: the configuration values that the finding suggests, by dotted key.
-        seen: the measured values by name. The value `name` replaces the name of the finding. The
+        values: the measured values by name. The value `name` replaces the name of the finding. The
             value `margin_s` is stored in the finding if the outcome is unsure (see
             `TimingFinding`).
     """

@@ -122,8 +122,8 @@ class Commander:
         self,
         *,
         sends_leading_zero: bool = False,
-        detects_bursts: bool = False,
         connected_ns: int | None = None,
+        detects_bursts: bool = False,
     ) -> None:
         self.replaced = self.stale = 0
         """Two counters of commands that were not sent. `replaced` counts the commands that a newer

@@ -148,7 +148,7 @@ def test_a_stall_in_a_gap_does_not_end_the_motion_in_the_pose_before_rest_is_com
     not stop earlier.
 
     Args:
-        kept: Time in the gap during which commands continue, s.
+        commanded: Time in the gap during which commands continue, s.
         stall: Length of the stall, s.
         waiting: Length of a stall before the gap, s. A reply then waits in the buffer.
         mute: Whether the board is mute in the gap. Its first speeds then are means over the gap.

@@ -143,6 +143,8 @@ def damage(world: World, silence: float, number: int, place: int, bits: int) -> 
     """Lose all replies for `silence` seconds, and damage one later reply.
 
     Args:
+        world: The robot with its board.
+        silence: The time in which all replies are lost, s.
         number: The number of the damaged reply after the silence, from 1.
         place: The index of the damaged byte.
         bits: A mask of the bits to invert.
