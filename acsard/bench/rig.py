@@ -221,11 +221,11 @@ class Rig:
         except UnreachableError:
             return None
 
-    def _wait(self, look: Callable[[], T | None], what: str) -> T:
+    def _wait(self, get: Callable[[], T | None], what: str) -> T:
         deadline_ns = clock.mono_ns() + int(START_TIMEOUT_S * NS_PER_S)
         while True:
             self._alive()
-            result = look()
+            result = get()
             if result is not None:
                 return result
             if clock.mono_ns() > deadline_ns:

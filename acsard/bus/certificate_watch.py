@@ -118,13 +118,13 @@ async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) ->
             the dict keys of `tls.expiry_times` and `router_expiry_times`.
     """
     routers = [endpoint for endpoint in bus.connect if endpoint.startswith(TLS_PREFIX)]
-    answered, look = 0, 0
+    answered, reading = 0, 0
     while True:
         expiries: dict[str, int] = {}
         try:
             # Wait without a time limit. With a limit, each attempt to read from a disk that hangs
             # would leave one more blocked thread.
-            if answered < len(routers) or look % ROUTER_CHECK_EVERY == 0:
+            if answered < len(routers) or reading % ROUTER_CHECK_EVERY == 0:
                 expiries |= await in_thread(lambda: router_expiry_times(routers, bus.tls), None)
                 answered = len(expiries)
             expiries |= await in_thread(lambda: expiry_times(bus.tls), None)
@@ -134,5 +134,5 @@ async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) ->
             # The TLS gateway reports the certificate that it uses.
             expiries.pop("", None)
         known.update(expiries)
-        look += 1
+        reading += 1
         await asyncio.sleep(EXPIRY_CHECK_PERIOD_S)

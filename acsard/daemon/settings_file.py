@@ -115,8 +115,8 @@ class SettingsFile:
         self._signature: Signature | None = None
         self._compared = started, started, ""
         """The two configurations that the thread compared last, and their differences in words."""
-        self._box = Mailbox[Request | Literal["look"]](MAX_JOBS)
-        """Queue of the thread: the requests that it must check. The item "look" only wakes the
+        self._box = Mailbox[Request | Literal["compare"]](MAX_JOBS)
+        """Queue of the thread: the requests that it must check. The item "compare" only wakes the
         thread, which then writes the changes and compares the file."""
         self._changes = deque[tuple[Edit, Answer]]()
         """The changes that the thread must write to the file before it checks another request. Each
@@ -182,9 +182,10 @@ class SettingsFile:
         return Answer(request.id, False, f"no setting was changed: {why}")
 
     def _wake_thread(self) -> None:
-        # If requests wait, the thread is awake. In a full queue, "look" would displace a request.
+        # If requests wait, the thread is awake. In a full queue, "compare" would displace a
+        # request.
         if not self._box.waiting:
-            self._box.put("look")
+            self._box.put("compare")
 
     def defers_answer(self, answer: Answer) -> bool:
         """Process the robot's answer to a client's request; return whether the answer must wait.

@@ -253,10 +253,10 @@ def _events(name: str, marks: Marks, dot: dict[str, Any]) -> Trace | None:
     return trace | {"hovertext": [sentence(mark) for mark, _ in placed], "hoverinfo": "text"}
 
 
-def _places(name: str, places: list[Place], mode: str, **look: object) -> Trace:
+def _places(name: str, places: list[Place], mode: str, **attributes: object) -> Trace:
     hover = f"{name}: x %{{x:.3f}} m, y %{{y:.3f}} m<extra></extra>"
     x, y = [place.x for place in places], [place.y for place in places]
-    return scatter(name, x, y, mode=mode, hovertemplate=hover, **look)
+    return scatter(name, x, y, mode=mode, hovertemplate=hover, **attributes)
 
 
 def _with_gaps(places: list[Place]) -> list[Place]:

@@ -87,7 +87,7 @@ body.paper { width: 180mm; padding: 0 }
 PROGRAM = """
 "use strict";
 const boxes = [], timed = [];
-const look = { responsive: true, displaylogo: false, plotlyServerURL: "",
+const layoutOptions = { responsive: true, displaylogo: false, plotlyServerURL: "",
   modeBarButtons: [["zoom2d", "pan2d", "zoomIn2d", "zoomOut2d", "resetScale2d"]] };
 const MAX_LABEL_PX = 90;  // includes the gap to the next label
 const labels = box => ({ "xaxis.nticks": Math.max(2, Math.floor(box.clientWidth / MAX_LABEL_PX)) });
@@ -95,7 +95,7 @@ for (const one of JSON.parse(document.getElementById("pictures").textContent)) {
   const box = document.getElementById(one.name);
   // A finger that scrolls the page must not draw a frame in the picture.
   if (matchMedia("(pointer: coarse)").matches) one.layout.dragmode = false;
-  Plotly.newPlot(box, one.data, one.layout, look);
+  Plotly.newPlot(box, one.data, one.layout, layoutOptions);
   boxes.push(box);
   if (one.timed) timed.push(box);
 }
@@ -302,8 +302,8 @@ def _settings(data: ReportData) -> str:
 
 
 def _cell(text: str, kind: str = "") -> str:
-    look = f' class="{escaped(kind)}"' if kind else ""
-    return f"<td{look}>{escaped(text)}</td>"
+    attribute = f' class="{escaped(kind)}"' if kind else ""
+    return f"<td{attribute}>{escaped(text)}</td>"
 
 
 def _table(names: list[str], cells: Sequence[tuple[str, ...]], kind: str = "rows") -> str:

@@ -106,12 +106,12 @@ def numbers(values: Iterable[float]) -> dict[str, str]:
     return {"dtype": "f8", "bdata": binascii.b2a_base64(data, newline=False).decode()}
 
 
-def scatter(name: str, x: Iterable[float], y: Iterable[float], **look: object) -> Trace:
+def scatter(name: str, x: Iterable[float], y: Iterable[float], **attributes: object) -> Trace:
     """Return a curve, or a set of marks, through points with the coordinates `x` and `y`.
 
-    `name` is the name of the curve. `look` contains further attributes of plotly's trace `scatter`.
+    `name` is the name of the curve. `attributes` are further attributes of plotly's `scatter`.
     """
-    return {"type": "scatter", "name": name, "x": numbers(x), "y": numbers(y), **look}
+    return {"type": "scatter", "name": name, "x": numbers(x), "y": numbers(y), **attributes}
 
 
 def sentence(mark: Mark) -> str:

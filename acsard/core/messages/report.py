@@ -111,7 +111,7 @@ class Report:
         self._covariances = Covariances(config.odometry)
 
     def due(
-        self, outputs: Outputs, wanted: Collection[str], look: GetSnapshot
+        self, outputs: Outputs, wanted: Collection[str], get_snapshot: GetSnapshot
     ) -> Iterator[tuple[str, Message]]:
         """Return an iterator over the pairs of key and message to publish after this step.
 
@@ -121,8 +121,8 @@ class Report:
         Args:
             outputs: the outputs of the step.
             wanted: the keys that have a subscriber.
-            look: function that returns the robot's `Snapshot`. It is called only if a message
-                needs it.
+            get_snapshot: function that returns the robot's `Snapshot`. It is called only if a
+                message needs it.
         """
         self._outputs = outputs
         if outputs.events:
@@ -137,12 +137,12 @@ class Report:
             or (outputs.due and "cmd_vel_out" in wanted)
             or (outputs.events and "events" in wanted)
         ):
-            return self._due(outputs, wanted, look)
+            return self._due(outputs, wanted, get_snapshot)
         # Most steps end here, because no message with a subscriber is due.
         return iter(())
 
     def _due(
-        self, outputs: Outputs, wanted: Collection[str], look: GetSnapshot
+        self, outputs: Outputs, wanted: Collection[str], get_snapshot: GetSnapshot
     ) -> Iterator[tuple[str, Message]]:
         for estimate in outputs.estimates:
             if ("odom" in wanted or "tf" in wanted) and self._rates["odom"].due(
@@ -165,15 +165,15 @@ class Report:
             ("battery", self._battery),
         ):
             if key in wanted and self._rates[key].due(now_ns, outputs.status_changed):
-                message = build(outputs, look())
+                message = build(outputs, get_snapshot())
                 if message is not None:
                     yield key, message
 
-    def current(self, key: str, look: GetSnapshot) -> Message | None:
+    def current(self, key: str, get_snapshot: GetSnapshot) -> Message | None:
         """Return the present message of a published key, or None if there is none.
 
-        `look` is a function that returns the robot's `Snapshot`. It is called only if the message
-        needs it.
+        `get_snapshot` is a function that returns the robot's `Snapshot`. It is called only if the
+        message needs it.
         """
         estimate, outputs = self._estimate, self._outputs
         match key:
@@ -182,19 +182,25 @@ class Report:
             case "robot_description":
                 return self.robot_description()
             case "odom":
-                return self._odom(estimate, look().measured is not None) if estimate else None
+                return (
+                    self._odom(estimate, get_snapshot().measured is not None) if estimate else None
+                )
             case "tf":
                 return self._tf(estimate) if estimate and self._config.odometry.publish_tf else None
             case "wheel_states":
-                return self._wheel_states(estimate, look().speeds is not None) if estimate else None
+                return (
+                    self._wheel_states(estimate, get_snapshot().speeds is not None)
+                    if estimate
+                    else None
+                )
             case "cmd_vel_out":
                 return self._cmd_vel_out(outputs) if outputs else None
             case "state":
-                return self._state(outputs, look()) if outputs else None
+                return self._state(outputs, get_snapshot()) if outputs else None
             case "diagnostics":
-                return self._diagnostics(outputs, look()) if outputs else None
+                return self._diagnostics(outputs, get_snapshot()) if outputs else None
             case "battery":
-                return self._battery(outputs, look()) if outputs else None
+                return self._battery(outputs, get_snapshot()) if outputs else None
             case "events":
                 return self._happened.message()
             case _:
