@@ -237,7 +237,7 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/lint-imports": Elsewhere(
         "tests/test_shape.py", "test_the_import_contracts_are_kept"
     ),
-    ".venv/bin/pytest tests/unit tests/scenarios": PYTEST,
+    ".venv/bin/pytest tests/unit tests/scenarios tests/test_*.py": PYTEST,
     ".venv/bin/pre-commit install": Elsewhere(
         "tests/test_pre_commit.py", "test_a_commit_of_code_or_of_the_contract_runs_every_check"
     ),

@@ -1,4 +1,4 @@
-"""Writes parts of the pages and of the router's file from the table of keys and roles.
+"""Writes parts of the pages, of the router's and of the bridge's file from the table of keys.
 
 `python -m tests.tables` writes them, and `tests/test_tables.py` compares them.
 """
@@ -8,8 +8,9 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import get_args
 
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, RosConfig
 from acsard.core.messages.keys_and_roles import (
     PUBLISHED,
     TOPICS,
@@ -26,7 +27,8 @@ from acsard.core.messages.permissions import (
     has,
     keys_for,
 )
-from acsard.core.values import ROLES, Role
+from acsard.core.ros.transports import TRIGGERS, ros_names
+from acsard.core.values import ROLES, Role, Verb
 from acsard.daemon.gateway.fleet_router import EXAMPLE_ROBOT
 
 ROOT = Path(__file__).parent.parent
@@ -138,6 +140,36 @@ def _rule_keys() -> dict[str, list[str]]:
     return {rule: list(dict.fromkeys(keys)) for rule, keys in rules.items()}
 
 
+# the file of the bridge, and further rows of the pages
+
+
+def bridge_file(text: str) -> str:
+    """Return the bridge's configuration with the ROS names of the daemon."""
+    names = ros_names(RosConfig())
+    lists = {
+        "publishers": [row.name for row in names if row.direction == "in"],
+        "subscribers": [row.name for row in names if row.direction == "out"],
+        "service_clients": [row.name for row in names if row.direction in ("service", "query")],
+    }
+    for kind, rows in lists.items():
+        lines = "".join(f'          "/{name}",\n' for name in dict.fromkeys(rows))
+        text = _replaced(rf'(^ *{kind}: \[\n)(?: *"[^"\n]*",\n)*', lines, text)
+    return text
+
+
+def ros_page(text: str) -> str:
+    """Return the page about ROS with the services that ROS can call."""
+    verbs = ", ".join(f"`acsard/{verb}`" for verb in TRIGGERS)
+    return _replaced(r"(^\| )(?:`acsard/\w+`(?:, )?)+(?= \| std_srvs/Trigger \|)", verbs, text)
+
+
+def service_page(text: str) -> str:
+    """Return the page about the service with the table of roles and the events of the verbs."""
+    verbs = " ".join(f"`{verb}`" for verb in get_args(Verb))
+    text = _replaced(r"(^\| A service call was executed.*? \| )(?:`\w+` ?)+(?= \|)", verbs, text)
+    return _marked("roles", role_table())(text)
+
+
 # all files
 
 
@@ -155,7 +187,9 @@ def _replaced(pattern: str, part: str, text: str) -> str:
 
 FILES: dict[str, Callable[[str], str]] = {
     "README.md": _marked("keys", key_table()),
-    "deploy/systemd/README.md": _marked("roles", role_table()),
+    "deploy/ros2/README.md": ros_page,
+    "deploy/ros2/zenoh-bridge-ros2dds.json5": bridge_file,
+    "deploy/systemd/README.md": service_page,
     "deploy/zenoh/router.json5": router_file,
 }
 """Maps each file to the function that writes its generated parts again."""

@@ -1,4 +1,4 @@
-"""The tables of the pages and the rules of the router's file equal the table of keys and roles."""
+"""The generated parts of the pages and of the deployment files follow the table of keys."""
 
 from __future__ import annotations
 

@@ -25,6 +25,7 @@ import zenoh
 import zenoh.ext
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from tests.promised import TRIGGERS
 from tests.system.harness import (
     ROOT,
     Bus,
@@ -87,8 +88,6 @@ PUBLISHED = {
 
 TWISTS = ("cmd_vel", "cmd_vel_dock", "cmd_vel_teleop")
 """The topics that take both types of twists."""
-
-TRIGGERS = ("stop", "clear", "activate", "deactivate", "reset_odometry")
 
 PARAMETER_SERVICES = {
     "describe_parameters": "rcl_interfaces/srv/DescribeParameters",

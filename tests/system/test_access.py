@@ -21,6 +21,8 @@ import pytest
 import zenoh
 import zenoh.ext
 
+from acsard.core.values import Role
+from tests import promised
 from tests.system import ros_clients as ros
 from tests.system.harness import ZERO, Bus, Daemon, free_endpoint, until
 from tests.system.identities import ADMITTED, Certificates, Identity, free_tls_endpoint
@@ -39,10 +41,11 @@ HERE: Who = frozenset({"local"})
 KEEPERS: Who = HERE | {"maintainer"}
 DRIVERS: Who = KEEPERS | {"operator"}
 ANYBODY: Who = DRIVERS | {"viewer"}
+ALLOWED: dict[Role | None, Who] = {"viewer": ANYBODY, "operator": DRIVERS, "maintainer": KEEPERS}
 
 ME, OTHER = "acsard/acsar", "acsard/other"
 SOURCES = ("teleop", "app", "ros2_control", "dock", "nav")
-PLAIN = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "state", "diagnostics", "events")
+PLAIN = tuple(row.key for row in promised.PUBLISHED if row.always and row.key != "battery")
 VALUES = (*PLAIN, *(f"json/{key}" for key in PLAIN))
 
 TWIST_JSON = json.dumps(ZERO).encode()
@@ -167,8 +170,8 @@ def _questions() -> Iterator[Try]:
 
 
 def _services() -> Iterator[Try]:
-    least = dict.fromkeys(ros.TRIGGERS, DRIVERS) | {"stop": ANYBODY}
-    for verb, identities in least.items():
+    for verb in promised.TRIGGERS:
+        identities = ALLOWED[promised.SERVICES[verb].role]
         yield Try(f"{ME}/srv/{verb}", identities)
         yield Try(f"acsard/{verb}", identities, ros.EMPTY_REQUEST)
         yield Try(ros.rmw_key(f"acsard/{verb}", ros.TRIGGER), identities, ros.EMPTY_REQUEST)

@@ -17,6 +17,7 @@ import pytest
 import zenoh
 import zenoh.ext
 
+from tests import promised
 from tests.each import each
 from tests.system.bystander import lost
 from tests.system.harness import (
@@ -34,19 +35,9 @@ from tests.system.harness import (
 )
 from tests.system.strangers import DELETES, command_line
 
-PUBLISHED = {
-    "odom": "Odometry",
-    "tf": "TFMessage",
-    "tf_static": "TFMessage",
-    "wheel_states": "JointState",
-    "cmd_vel_out": "TwistStamped",
-    "state": "RobotState",
-    "diagnostics": "DiagnosticArray",
-    "battery": "Battery",
-    "events": "Events",
-    "sim/pose": "PoseStamped",
-}
-SERVICES = ("stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set")
+PUBLISHED = {row.key: row.type for row in promised.PUBLISHED if row.key != "robot_description"}
+"""The type of each key that a simulated robot publishes without a URDF file."""
+
 FIELDS = {
     "odom": {"header", "child_frame_id", "pose", "twist"},
     "tf": {"transforms"},

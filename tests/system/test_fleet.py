@@ -410,7 +410,7 @@ class Visitor:
         # Last values are sent again every 5 s, for clients that cannot ask for them.
         mine = [row for row in rows if self._name in row.who]
         late = any(row.how == "late" for row in mine)
-        done = self._fleet.comes_true(event.is_set, 700 if late else 50 if mine else 5)
+        done = self._fleet.comes_true(event.is_set, 700 if late else 200 if mine else 5)
         for subscriber in subscribers:
             subscriber.undeclare()
         return done

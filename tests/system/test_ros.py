@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from acsard.core.motion.lifecycle import LATCH_REQUIRED_S
+from tests.promised import TRIGGERS
 from tests.system.builds import BUILD_S
 from tests.system.harness import Bus, Daemon, until
 from tests.system.ros_clients import (
@@ -34,7 +35,6 @@ from tests.system.ros_clients import (
     STRING,
     TF,
     TRIGGER,
-    TRIGGERS,
     TWIST,
     WHEELS,
     BridgeHalf,

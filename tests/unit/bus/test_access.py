@@ -40,6 +40,7 @@ from acsard.core.messages.permissions import SERVICE_ROLES, least_role
 from acsard.core.ros.transports import PARAMETERS_PREFIX, claims, endpoints
 from acsard.core.values import Role
 from tests.each import each
+from tests.promised import PROMISED
 
 ROLES: tuple[Role, ...] = ("viewer", "operator", "maintainer")
 EVERYBODY = ("local", *ROLES)
@@ -188,26 +189,7 @@ def test_a_router_forwards_the_commands_of_any_certificate_and_no_command_withou
     assert not DEFAULT.lets("viewer", "put", DEFAULT.key("cmd/app/anna"))
 
 
-LEAST: dict[str, Role] = {
-    "cmd/<source>/<certificate>": "operator",
-    "wheel_cmd/<source>/<certificate>": "operator",
-    "imu": "maintainer",
-    "speed_limit": "operator",
-    "stop": "viewer",
-    "info": "viewer",
-    "topics": "viewer",
-    "interfaces": "viewer",
-    "schema/<Type>": "viewer",
-    "whoami/<role>": "operator",
-    "config": "maintainer",
-    "srv/stop": "viewer",
-    "srv/clear": "operator",
-    "srv/activate": "operator",
-    "srv/deactivate": "operator",
-    "srv/reset_odometry": "operator",
-    "srv/set_pose": "maintainer",
-    "srv/set": "maintainer",
-}
+LEAST = {row.key: row.role for row in PROMISED if row.direction != "out" and row.role}
 
 
 @each("topic", [t for t in TOPICS if t.direction != "out"])

@@ -21,49 +21,14 @@ from acsard.core.messages.keys_and_roles import (
     source_keys,
 )
 from acsard.core.messages.schema import MESSAGES
+from tests import promised
 from tests.each import each
-
-PROMISED = [
-    ("odom", "out", "Odometry"),
-    ("tf", "out", "TFMessage"),
-    ("tf_static", "out", "TFMessage"),
-    ("robot_description", "out", "String"),
-    ("wheel_states", "out", "JointState"),
-    ("battery", "out", "Battery"),
-    ("cmd_vel_out", "out", "TwistStamped"),
-    ("state", "out", "RobotState"),
-    ("diagnostics", "out", "DiagnosticArray"),
-    ("events", "out", "Events"),
-    ("sim/pose", "out", "PoseStamped"),
-    ("json/<key>", "out", "JSON"),
-    ("cmd/<source>", "in", "Twist or TwistStamped"),
-    ("wheel_cmd/<source>", "in", "JointState"),
-    ("cmd/<source>/<certificate>", "in", "Twist or TwistStamped"),
-    ("wheel_cmd/<source>/<certificate>", "in", "JointState"),
-    ("imu", "in", "Imu"),
-    ("speed_limit", "in", "SpeedLimit"),
-    ("stop", "in", "anything"),
-    ("gateway", "in", "GatewayState"),
-    ("srv/stop", "service", "ServiceReply"),
-    ("srv/clear", "service", "ServiceReply"),
-    ("srv/activate", "service", "ServiceReply"),
-    ("srv/deactivate", "service", "ServiceReply"),
-    ("srv/reset_odometry", "service", "ServiceReply"),
-    ("srv/set_pose", "service", "ServiceReply"),
-    ("srv/set", "service", "ServiceReply"),
-    ("info", "query", "Info"),
-    ("config", "query", "Config"),
-    ("interfaces", "query", "Interfaces"),
-    ("topics", "query", "Topics"),
-    ("schema/<Type>", "query", "JSON Schema"),
-    ("whoami/<role>", "query", "WhoAmI"),
-    ("alive", "out", "liveliness token"),
-]
-"""Keys of DESIGN section 3, and the key on which the TLS gateway reports to the daemon."""
+from tests.promised import PROMISED
 
 
 def test_the_topic_table_is_that_of_the_design() -> None:
-    assert sorted((t.key, t.direction, t.type) for t in TOPICS) == sorted(PROMISED)
+    rows = [(row.key, row.direction, row.type) for row in PROMISED]
+    assert sorted((t.key, t.direction, t.type) for t in TOPICS) == sorted(rows)
 
 
 def test_no_key_appears_twice() -> None:
@@ -75,9 +40,7 @@ def test_every_row_has_a_description() -> None:
 
 
 def test_the_published_topics_are_all_outgoing_ones_except_token_and_json_copies() -> None:
-    apart = ("alive", "json/<key>")
-    names = [key for key, direction, _ in PROMISED if direction == "out" and key not in apart]
-    assert [topic.key for topic in PUBLISHED] == names
+    assert [topic.key for topic in PUBLISHED] == [row.key for row in promised.PUBLISHED]
     assert all(topic.type in MESSAGES for topic in PUBLISHED)
 
 

@@ -25,6 +25,7 @@ from acsard.core.ros.transports import (
     node_tokens,
     ros_names,
 )
+from tests.promised import PROMISED
 
 ZID = "abc"
 REAL = McuConfig(port="/dev/ttyACM0")
@@ -46,25 +47,11 @@ def test_both_trees_have_the_same_names() -> None:
 
 def test_the_keys_of_the_bridge_are_the_bare_names() -> None:
     assert keys(RosConfig(), "bridge") == {
-        "odom": "odom",
-        "tf": "tf",
-        "tf_static": "tf_static",
-        "robot_description": "robot_description",
-        "wheel_states": "joint_states",
-        "diagnostics": "diagnostics",
-        "battery": "battery_state",
-        "cmd_vel_out": "cmd_vel_out",
+        **{row.key: row.ros for row in PROMISED if row.ros},
         "cmd/nav": "cmd_vel",
         "cmd/dock": "cmd_vel_dock",
         "cmd/teleop": "cmd_vel_teleop",
         "wheel_cmd/ros2_control": "joint_commands",
-        "speed_limit": "speed_limit",
-        "imu": "imu/data",
-        "srv/stop": "acsard/stop",
-        "srv/clear": "acsard/clear",
-        "srv/activate": "acsard/activate",
-        "srv/deactivate": "acsard/deactivate",
-        "srv/reset_odometry": "acsard/reset_odometry",
         "parameters/describe_parameters": "acsard/describe_parameters",
         "parameters/get_parameter_types": "acsard/get_parameter_types",
         "parameters/get_parameters": "acsard/get_parameters",
