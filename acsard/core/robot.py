@@ -235,7 +235,7 @@ class Robot:
         The decisions include the line for the board, the odometry and the events to log.
         """
         events = list(inputs.events)
-        self._life.begin(inputs.now)
+        self._life.begin(inputs.now, stalled=self._arbiter.stalled(inputs.now.mono_ns))
         if self._first_events:
             events += self._first_events
             self._first_events = []

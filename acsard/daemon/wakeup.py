@@ -96,10 +96,13 @@ class Ticker(_Timer):
         """
         if not self._rang and now_ns < self._due_ns:
             return NO_PERIOD
-        # `now_ns` is from the daemon's clock. NTP may slew the timer's clock, and the timer then
-        # expires up to a tenth of a period early.
-        early_ns = self._period_ns // 10 if self._rang else 0
-        expired = max(0, (now_ns - self._due_ns + early_ns) // self._period_ns + 1)
+        late_ns = now_ns - self._due_ns
+        if late_ns >= 0:
+            expired = late_ns // self._period_ns + 1
+        else:
+            # `now_ns` is from the daemon's clock. NTP may slew the timer's clock, and the timer
+            # then expires up to a tenth of a period early.
+            expired = int(-late_ns <= self._period_ns // 10)
         due_ns = self._due_ns
         self._due_ns += expired * self._period_ns
         self._timer.set(self._due_ns)

@@ -335,9 +335,45 @@ def test_a_zero_from_before_the_clear_does_not_count_as_neutral(world: World) ->
     named = msgspec.json.encode({"latch": world.state.latch})
     world.bus.queries.append(Query(99, "srv/clear", "srv/clear", "", named, "", world.now_ns))
     world.send(0.5)
-    world.run(0.2)
+    world.hold(0.5, seconds=0.2)
     assert world.state.mode == "ready"
     assert "send a zero first" in world.state.reason
+
+
+def test_after_a_stall_a_waiting_command_without_a_stamp_does_not_drive(world: World) -> None:
+    """Its sender may have ended during the stall. A sender that still runs drives again."""
+    world.drive(0.5, seconds=1.0)
+    world.stall(0.9)
+    before = world.mcu.vehicle.pose.x
+    world.send(0.5)
+    world.run(0.5)
+    assert world.mcu.vehicle.pose.x == pytest.approx(before, abs=0.01)
+    assert world.state.mode == "ready"
+    world.hold(0.5, seconds=0.5)
+    assert world.state.mode == "driving"
+
+
+def test_after_a_stall_a_waiting_zero_without_a_stamp_counts(world: World) -> None:
+    world.drive(0.5, seconds=1.0)
+    world.stall(0.2)
+    world.send(0.0)
+    assert world.state.mode == "driving"
+    world.run(1.0)
+    assert world.state.linear == 0.0
+    assert world.state.counters.get("command_stale", 0) == 0
+
+
+def test_a_clear_that_waited_during_a_stall_must_name_the_latch(world: World) -> None:
+    """A client may have called it right after the stop, which it had not seen yet."""
+    world.call("stop")
+    world.stall(2.5)
+    (early,) = world.ask("srv/clear")
+    assert b"the daemon started or resumed 0.1 s ago" in early.payload
+    assert world.state.mode == "stopped"
+    world.run(2.1)
+    (later,) = world.ask("srv/clear")
+    assert b'"success":true' in later.payload
+    assert world.state.mode == "ready"
 
 
 def test_shutting_down_ramps_to_rest_and_obeys_no_client(world: World) -> None:

@@ -24,7 +24,7 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.core.config.settings import CommandsConfig, Source
-from acsard.core.motion.emergency_stop import LATE_STEP_NS
+from acsard.core.motion.emergency_stop import CATCH_UP_NS, LATE_STEP_NS
 from acsard.core.motion.freshness import MAX_PROOF_NS, Freshness
 from acsard.core.motion.neutral import Sender, is_zero
 from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
@@ -242,17 +242,23 @@ class Arbiter:
             source.require_neutral()
         self._holder = self._followed = None
 
+    def stalled(self, now_ns: int) -> bool:
+        """Return whether the daemon stood still between the last step and `now_ns` (monotonic,
+        ns)."""
+        return now_ns - self._begun_ns > LATE_STEP_NS
+
     def begin(self, now_ns: int) -> None:
         """Begin a control step at the monotonic time `now_ns`, ns. Call this before `accept`.
 
-        If the previous step was more than `LATE_STEP_NS` ago, the daemon stood still, and the bus
-        may not have delivered the commands of that time yet. Therefore each sender takes part in
-        the choice for a short additional time. The time of the stall does not count toward a
-        running `commands.neutral_pause` (see `Sender.resume`).
+        If the previous step was more than `LATE_STEP_NS` ago, the daemon stood still (`stalled`),
+        and the bus may not have delivered the commands of that time yet. Therefore each sender
+        takes part in the choice for a short additional time. The time of the stall does not count
+        toward a running `commands.neutral_pause` (see `Sender.resume`).
         """
-        before_ns, self._begun_ns = self._begun_ns, now_ns
-        if now_ns - before_ns > LATE_STEP_NS:
-            self._watched_ns = now_ns
+        stalled, before_ns, self._begun_ns = self.stalled(now_ns), self._begun_ns, now_ns
+        if stalled:
+            # Before the first step, no command can have waited.
+            self._watched_ns = now_ns if before_ns else now_ns - CATCH_UP_NS
             for source in self._ranking:
                 for sender in source.senders.values():
                     sender.resume(before_ns, now_ns)
@@ -269,6 +275,13 @@ class Arbiter:
             self.notice(command.source, command.sender, command.arrived_ns, command.shared)
             return "not_finite"
         verdict = self._freshness.judge(command, source.timeout_ns)
+        if (
+            command.stamp_ns is None
+            and not is_zero(command)
+            and command.arrived_ns - self._watched_ns < CATCH_UP_NS
+        ):
+            # The command may have waited during the whole stall, and only a stamp would show that.
+            verdict = "stale"
         if verdict == "stale":
             if known is not None:
                 known.refuse(command, verdict)

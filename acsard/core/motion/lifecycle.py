@@ -82,18 +82,20 @@ class Lifecycle:
         """Monotonic time of the last step in which the cause of a latch ended or came again, ns. A
         call `clear` that arrived before that step is refused."""
         self._began_ns: int | None = None
-        """Monotonic time of the first step, ns; None before that step."""
+        """Monotonic time of the first step, or of the first step after the last stall of the
+        daemon, ns; None before the first step."""
         self._derive()
 
     # facts
 
-    def begin(self, now: Instant) -> None:
-        """Record `now` as the time of the first step. A later call changes nothing.
+    def begin(self, now: Instant, *, stalled: bool = False) -> None:
+        """Begin a step at the time `now`. `stalled` is true if the daemon stood still before it.
 
-        For `LATCH_REQUIRED_S` after this time, `clear` and `activate` must name the number of the
-        latch.
+        For `LATCH_REQUIRED_S` after the first step, and after each step with `stalled`, `clear` and
+        `activate` must name the number of the latch. A client may have sent a call before or during
+        the stall, when it could not see the present latch.
         """
-        if self._began_ns is None:
+        if stalled or self._began_ns is None:
             self._began_ns = now.mono_ns
 
     def link(self, up: bool) -> None:
@@ -375,9 +377,12 @@ class Lifecycle:
         age_s = max(0.1, math.floor(since / NS_PER_S * 10) / 10)
         age_text = f"{was} {age_s:.1f} s ago"
         if set_ns < began_ns:
-            # An earlier run set the latch. Its age is unknown, because the monotonic clock may have
-            # restarted and the wall clock may have been set since.
-            age_text = f"the daemon started {age_s:.1f} s ago and the robot is still {still}"
+            # An earlier run set the latch, or the daemon stood still after it. The age in an
+            # earlier run is unknown, because the monotonic clock may have restarted and the wall
+            # clock may have been set since.
+            age_text = (
+                f"the daemon started or resumed {age_s:.1f} s ago and the robot is still {still}"
+            )
         raise RefusedError(
             f"{age_text}: look at the robot, then call {call} again when {LATCH_REQUIRED_S:g} s "
             "have passed since then, or name the number of the latch that you have seen"

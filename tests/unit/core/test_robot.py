@@ -1726,7 +1726,8 @@ def test_after_too_long_without_a_sent_line_the_speed_starts_from_zero() -> None
     bench = Bench().driving()
     assert bench.step(GO, ms=250).applied == GO
     assert bench.step(GO, ms=260).applied == REST
-    assert bench.step(GO).applied.linear == pytest.approx(0.01)
+    speeds = [bench.step(GO).applied.linear for _ in range(11)]
+    assert next(speed for speed in speeds if speed) == pytest.approx(0.01)
 
 
 def test_after_lines_were_superseded_for_too_long_the_speed_is_zero() -> None:
@@ -1751,7 +1752,8 @@ def test_at_a_slow_rate_a_stall_adds_at_most_1_5_periods_of_acceleration() -> No
     )
     bench = Bench(slow).linked()
     bench.step(REST)
-    assert bench.step(GO, ms=240).applied.linear == pytest.approx(0.15)
+    assert bench.step(GO, ms=100).applied.linear == pytest.approx(0.1)
+    assert bench.step(GO, ms=240).applied.linear == pytest.approx(0.25)
 
 
 def test_after_a_stall_the_robot_brakes_for_the_whole_elapsed_time() -> None:

@@ -59,6 +59,15 @@ def test_periods_that_were_missed_are_counted_from_the_first(kernel: Kernel) -> 
     assert goes_off(kernel, ticker) == Period(1, start_ns + 5 * PERIOD_NS)
 
 
+def test_a_late_step_does_not_count_the_period_that_ends_after_it(kernel: Kernel) -> None:
+    ticker = Ticker(PERIOD_NS, lambda: None)
+    start_ns = kernel.now_ns
+    ticker.start(start_ns)
+    late_ns = PERIOD_NS - PERIOD_NS // 20
+    assert goes_off(kernel, ticker, late_ns) == Period(1, start_ns + PERIOD_NS)
+    assert goes_off(kernel, ticker) == Period(1, start_ns + 2 * PERIOD_NS)
+
+
 def test_a_timer_that_expires_again_before_it_is_read_ends_no_period_twice(
     kernel: Kernel,
 ) -> None:

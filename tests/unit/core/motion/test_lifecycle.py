@@ -424,9 +424,9 @@ def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
         with pytest.raises(RefusedError) as caught:
             life.clear(None, ns(asked_s), Instant(ns(11.5), WALL_NS + ns(wall_s)))
         assert str(caught.value) == (
-            f"the daemon started {age} s ago and the robot is still stopped by ann: look at the "
-            "robot, then call srv/clear again when 2 s have passed since then, or name the number "
-            "of the latch that you have seen"
+            f"the daemon started or resumed {age} s ago and the robot is still stopped by ann: "
+            "look at the robot, then call srv/clear again when 2 s have passed since then, or name "
+            "the number of the latch that you have seen"
         )
     assert life.clear(None, ns(12.0), Instant(ns(12.0), WALL_NS + ns(wall_s)))
 

@@ -13,7 +13,7 @@ from acsard.core.config.settings import CommandsConfig, Source
 from acsard.core.motion.arbiter import Arbiter
 from acsard.core.motion.freshness import Verdict
 from acsard.core.motion.neutral import Sender
-from acsard.core.values import REST, Command, Twist, Wait
+from acsard.core.values import NS_PER_S, REST, Command, Twist, Wait
 from tests.each import each
 from tests.unit.core.motion.commanders import GO, HIGH, HOUR_NS, LEFT, LOW, MS, RIGHT, Bench
 
@@ -406,8 +406,8 @@ def test_a_command_counts_until_its_timeout_unless_its_stamp_is_in_doubt() -> No
 
 def test_a_new_arbiter_requires_a_zero_first() -> None:
     arbiter = Arbiter(CommandsConfig(sources=(HIGH,)))
-    assert arbiter.accept(Command("high", GO, 0)) == ""
-    assert arbiter.choose(0).twist is None
+    assert arbiter.accept(Command("high", GO, NS_PER_S)) == ""
+    assert arbiter.choose(NS_PER_S).twist is None
 
 
 def test_a_negative_zero_is_neutral() -> None:
