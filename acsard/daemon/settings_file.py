@@ -26,7 +26,7 @@ from acsard.core.formatting import listed, printable
 from acsard.core.messages.encodings import Decoder
 from acsard.core.messages.schema import Settings
 from acsard.core.values import NS_PER_S, Answer, Event, Request
-from acsard.host.config_file import Edit, apply_edit, prepare_edit
+from acsard.host.config_file import Edit, apply_edit, prepare_edit, read
 from acsard.host.errors import MendableError
 from acsard.host.mailbox import Mailbox
 
@@ -331,7 +331,7 @@ class SettingsFile:
             raise OSError(errno.EINVAL, "it is not a regular file")
         signature = about.st_ino, about.st_size, about.st_mtime_ns
         if signature != self._signature:
-            self._written = self._parse(self._file.read_bytes())
+            self._written = self._parse(read(self._file))
             self._signature = signature
 
 

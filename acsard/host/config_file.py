@@ -10,7 +10,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from acsard.core.config.parsing import ConfigError, parse
+from acsard.core.config.parsing import MAX_BYTES, ConfigError, parse
 from acsard.core.config.settings import Config
 from acsard.core.config.toml_editing import edited
 from acsard.core.values import AcsardError
@@ -20,6 +20,17 @@ from acsard.host.errors import Exit, ExitError, MendableError
 from acsard.host.extras import install
 
 SEARCH_PATHS = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
+
+
+def read(file: Path) -> bytes:
+    """Return the content of a configuration file, but at most one byte more than it may have.
+
+    `parse` refuses this one byte more. The daemon reads its file while it controls the robot, so a
+    huge file must take neither its memory nor its time. Raises `OSError` if the file cannot be
+    read.
+    """
+    with file.open("rb") as opened:
+        return opened.read(MAX_BYTES + 1)
 
 
 def find(path: str | None) -> tuple[str, bytes]:
@@ -32,7 +43,7 @@ def find(path: str | None) -> tuple[str, bytes]:
     named = path or os.environ.get("ACSARD_CONFIG")
     if named:
         try:
-            return named, Path(named).read_bytes()
+            return named, read(Path(named))
         except OSError as error:
             raise ExitError(
                 Exit.BAD_CONFIG,
@@ -41,7 +52,7 @@ def find(path: str | None) -> tuple[str, bytes]:
             ) from None
     for place in SEARCH_PATHS:
         try:
-            return str(place), place.read_bytes()
+            return str(place), read(place)
         except FileNotFoundError:
             continue
         except OSError as error:
@@ -120,8 +131,8 @@ def prepare_edit(file: Path | None, keys: Keys) -> Edit:
                 "git tracks it, and a changed file hinders the next `git pull`; start the daemon "
                 "with a copy of it (--config)"
             )
-        before = place.read_bytes()
-        return Edit(file, keys, before, edited_in_process(before.decode(), keys))
+        before = read(place)
+        return Edit(file, keys, before, edited_in_process(_decoded(before), keys))
     except (OSError, ValueError, MendableError) as error:
         raise _not_changed(file, error) from None
 
@@ -138,7 +149,7 @@ def apply_edit(edit: Edit) -> None:
         for _ in range(3):
             place = edit.file.resolve(strict=True)
             _require_writable(place)
-            if place.read_bytes() == edit.before:
+            if read(place) == edit.before:
                 replace(place, edit.after.encode())
                 # Without this sync, a power cut may bring the old file back after the daemon has
                 # reported success. Some file systems refuse the sync.
@@ -242,9 +253,15 @@ def _changed(
 ) -> tuple[Path, str, Keys]:
     place = file.resolve(strict=not new)
     # `read_text` would lose CRLF line ends.
-    text = "" if new and not place.exists() else place.read_bytes().decode()
+    text = "" if new and not place.exists() else _decoded(read(place))
     changes = keys(parse(text.encode())) if callable(keys) else keys
     return place, edited(text, changes), changes
+
+
+def _decoded(content: bytes) -> str:
+    # `read` may cut a character of a file that is too large. That is not the mistake to report, so
+    # replace the character. The text stays too large, and `parse` reports that.
+    return content.decode(errors="replace" if len(content) > MAX_BYTES else "strict")
 
 
 def _not_changed(file: Path, error: Exception) -> MendableError:

@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 import threading
+import tracemalloc
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
@@ -439,6 +440,20 @@ def test_a_pipe_in_place_of_the_file_is_not_read(file: Path, made: SettingsFile)
     answer = result(made)
     assert isinstance(answer, Answer)
     assert "it is not a regular file" in answer.message
+
+
+def test_a_huge_file_is_reported_without_being_read_to_its_end(
+    file: Path, made: SettingsFile
+) -> None:
+    tracemalloc.start()
+    try:
+        os.truncate(file, 1 << 26)
+        until(lambda: "too large for a configuration" in made.differ)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 23
+    finally:
+        tracemalloc.stop()
+    file.write_text(TEXT)
+    until(lambda: made.differ == "")
 
 
 @pytest.mark.slow
