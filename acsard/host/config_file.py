@@ -124,7 +124,7 @@ def prepare_edit(file: Path | None, keys: Keys) -> Edit:
     try:
         if any(key.startswith("commands.sources.") for key in keys):
             raise ValueError("the daemon cannot write a timeout of [[commands.sources]] to a file")
-        place = file.resolve(strict=True)
+        place = _target(file)
         _require_writable(place)
         if is_tracked(place):
             raise MendableError(
@@ -147,7 +147,7 @@ def apply_edit(edit: Edit) -> None:
     try:
         # A change takes 0.2 s to compute, and a person's editor may write the file meanwhile.
         for _ in range(3):
-            place = edit.file.resolve(strict=True)
+            place = _target(edit.file)
             _require_writable(place)
             if read(place) == edit.before:
                 replace(place, edit.after.encode())
@@ -160,6 +160,20 @@ def apply_edit(edit: Edit) -> None:
         raise ValueError("another program changes it again and again")
     except (OSError, ValueError) as error:
         raise _not_changed(edit.file, error) from None
+
+
+def _target(file: Path, new: bool = False) -> Path:
+    """Return the path of `file` without symbolic links. If `new` is true, the file may be missing.
+
+    Raises `OSError` if the links form a loop, or if the file is missing and `new` is false.
+    """
+    # `Path.resolve` of Python 3.11 raises RuntimeError for a loop.
+    try:
+        return Path(os.path.realpath(file, strict=True))
+    except FileNotFoundError:
+        if not new:
+            raise
+        return Path(os.path.realpath(file))
 
 
 def _require_writable(place: Path) -> None:
@@ -198,7 +212,7 @@ def is_tracked(place: Path) -> bool:
 
 
 def _is_reference(file: Path) -> bool:
-    place = file.resolve()
+    place = Path(os.path.realpath(file))
     top = place.parent
     in_clone = (top / ".git").exists() and (top / "acsard" / "__init__.py").is_file()
     return in_clone and place.name == "acsard.toml"
@@ -251,7 +265,7 @@ def require_changeable(
 def _changed(
     file: Path, keys: Keys | Callable[[Config], Keys], new: bool
 ) -> tuple[Path, str, Keys]:
-    place = file.resolve(strict=not new)
+    place = _target(file, new)
     # `read_text` would lose CRLF line ends.
     text = "" if new and not place.exists() else _decoded(read(place))
     changes = keys(parse(text.encode())) if callable(keys) else keys

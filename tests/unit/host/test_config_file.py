@@ -12,7 +12,7 @@ from tomlkit.exceptions import NonExistentKey
 
 from acsard.bus.address import address_by_environment
 from acsard.core.config.parsing import ConfigError, parse
-from acsard.host.config_file import change, find, prepare_edit
+from acsard.host.config_file import change, find, prepare_edit, require_changeable
 from acsard.host.errors import MendableError, UsageError
 
 REFERENCE = Path(__file__).parents[3] / "acsard.toml"
@@ -136,3 +136,32 @@ def test_a_huge_file_is_refused_without_being_read_to_its_end(
         assert tracemalloc.get_traced_memory()[1] < 1 << 23
     finally:
         tracemalloc.stop()
+
+
+def make_new(file: Path) -> None:
+    change(file, KEYS, new=True)
+
+
+def require(file: Path) -> None:
+    require_changeable(file, KEYS)
+
+
+@pytest.mark.parametrize("use", [edit, edit_by_command, make_new, require])
+def test_a_loop_of_symbolic_links_is_refused_and_kept(
+    tmp_path: Path, use: Callable[[Path], None]
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.symlink_to(file)
+    with pytest.raises(
+        MendableError, match=r"was not changed: .*Too many levels of symbolic links"
+    ):
+        use(file)
+    assert file.is_symlink()
+
+
+def test_a_link_to_a_missing_file_creates_the_target(tmp_path: Path) -> None:
+    link = tmp_path / "acsard.toml"
+    link.symlink_to("real.toml")
+    change(link, KEYS, new=True)
+    assert link.is_symlink()
+    assert parse((tmp_path / "real.toml").read_bytes()).mcu.baud_rate == 57600
