@@ -11,6 +11,7 @@ from msgspec import ValidationError, convert
 from acsard.bus.zenoh_sessions import reachable
 from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.config.settings import TLS_PREFIX, Config, Name
+from acsard.host.config_file import read
 from acsard.host.errors import UsageError
 
 
@@ -80,7 +81,7 @@ def _config_of_environment() -> Config:
     tls = os.environ.get("ACSARD_TLS")
     overrides: dict[str, dict[str, object]] = {} if tls is None else {"bus": {"tls": tls}}
     try:
-        return parse(Path(file).read_bytes() if file else b"", overrides)
+        return parse(read(Path(file)) if file else b"", overrides)
     except OSError as error:
         raise UsageError(
             f"cannot read {file}, which ACSARD_CONFIG names: {error.strerror}; set ACSARD_CONFIG "

@@ -109,6 +109,7 @@ class LatchFile:
         self.where = NO_DIRECTORY
         """Path of the file as messages show it, or `NO_DIRECTORY`."""
         self._path: Path | None = None
+        """Path of the file. If it is a link to a file, `_read` replaces it by the link's target."""
         self._robot = config.robot.id
         self._barred = ""
         """Reason why the daemon must never write the file; "" if the daemon may write it."""
@@ -210,6 +211,14 @@ class LatchFile:
         path = self._path
         if path is None:
             return Latches()
+        # A write replaces the file. It must replace the target of a link and not the link, because
+        # the link may lead out of a directory that loses its changes at a reboot. The target must
+        # be a regular file: a write must not replace /dev/null. If the link cannot be followed, the
+        # code below reports the error.
+        with suppress(OSError):
+            if path.is_symlink() and path.is_file():
+                path = self._path = Path(os.path.realpath(path, strict=True))
+                self.where = str(path)
         self._take_lock(path)
         try:
             # Only an absent file means that there is no stop. A symbolic link whose target is

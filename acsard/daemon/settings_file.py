@@ -26,7 +26,7 @@ from acsard.core.formatting import listed, printable
 from acsard.core.messages.encodings import Decoder
 from acsard.core.messages.schema import Settings
 from acsard.core.values import NS_PER_S, Answer, Event, Request
-from acsard.host.config_file import Edit, apply_edit, prepare_edit
+from acsard.host.config_file import Edit, apply_edit, prepare_edit, read
 from acsard.host.errors import MendableError
 from acsard.host.mailbox import Mailbox
 
@@ -107,9 +107,8 @@ class SettingsFile:
                 which the daemon would start with this content.
             started: the configuration with which the daemon has started.
         """
-        self.differ = ""
-        """The settings in force that differ from the file, in words, or the reason why the file
-        cannot be compared. The text is "" if no setting differs."""
+        self._differ = ""
+        """Result of the thread's last comparison, as `differ` describes it."""
         self._file, self._parse = file, parse
         self._in_force = self._written = started
         self._signature: Signature | None = None
@@ -130,22 +129,47 @@ class SettingsFile:
         limit has the value that the daemon last wrote to the file or, if it has not written the
         limit, the value at the start of the daemon. Changes of the file by other programs are not
         included."""
-        self._no_thread = ""
-        """The reason why the thread could not be started, or "" if it runs."""
+        self._thread: threading.Thread | None = None
+        """The thread that compares and changes the file. It is None until it has started."""
+        self._not_started = ""
+        """The reason why the thread could not be started, or ""."""
 
     # The control loop calls the methods below.
 
     def start(self) -> None:
         """Start the thread. If no thread can be started, the file is neither compared nor changed.
 
-        The attribute `differ` then contains the reason.
+        The property `differ` then gives the reason.
         """
         thread = threading.Thread(target=self._work, name="settings file", daemon=True)
         try:
             thread.start()
         except RuntimeError as error:
-            self._no_thread = str(error)
-            self.differ = f"the daemon cannot compare its settings with its file ({error})"
+            self._not_started = str(error)
+        else:
+            self._thread = thread
+
+    @property
+    def differ(self) -> str:
+        """Settings in force that differ from the file, in words, or "" if no setting differs.
+
+        If the file cannot be compared, the text gives the reason.
+        """
+        trouble = self._trouble
+        return f"{trouble}; restart acsard" if trouble else self._differ
+
+    @property
+    def _trouble(self) -> str:
+        """Reason why no thread compares and changes the file, or "" if the thread runs."""
+        if self._not_started:
+            return (
+                "the daemon could not start the thread that compares and changes the file "
+                f"({self._not_started})"
+            )
+        # The thread ends by itself only because of a defect. Its traceback is in the daemon's log.
+        if self._thread is None or self._thread.is_alive() or self._box.closed:
+            return ""
+        return "the thread that compares and changes the file has ended"
 
     def use(self, config: Config) -> None:
         """Compare the file with `config` now, and again whenever the file changes.
@@ -165,11 +189,8 @@ class SettingsFile:
         cannot be queued, return the answer for the client now, else None. `now_ns` is the present
         monotonic time, ns.
         """
-        if self._no_thread:
-            why = (
-                "the daemon could not start the thread that changes the file "
-                f"({self._no_thread}); restart acsard, or send the request without `keep`"
-            )
+        if trouble := self._trouble:
+            why = f"{trouble}; restart acsard, or send the request without `keep`"
         elif len(self.pending) >= MAX_JOBS:
             why = (
                 f"more than {MAX_JOBS} changes of the file wait for the disk; try again in some "
@@ -251,7 +272,7 @@ class SettingsFile:
             waits.overdue = True
             if waits.answer is None:
                 del self.pending[waits.request.id]
-        return [*results, *map(_overdue, overdue)]
+        return [*results, *(_overdue(pending, self._trouble) for pending in overdue)]
 
     def close(self) -> None:
         """Let the thread end. Do not wait for it."""
@@ -268,7 +289,7 @@ class SettingsFile:
                 if isinstance(job, Request) and job.id in self.pending:
                     self._results.put(self._checked(job))
             self._write()
-            self.differ = printable(self._difference())[:MAX_TEXT_LENGTH]
+            self._differ = printable(self._difference())[:MAX_TEXT_LENGTH]
 
     def _write(self) -> None:
         while self._changes:
@@ -331,16 +352,20 @@ class SettingsFile:
             raise OSError(errno.EINVAL, "it is not a regular file")
         signature = about.st_ino, about.st_size, about.st_mtime_ns
         if signature != self._signature:
-            self._written = self._parse(self._file.read_bytes())
+            self._written = self._parse(read(self._file))
             self._signature = signature
 
 
-def _overdue(pending: _Pending) -> Answer:
-    """Return the answer to a request that took too long."""
+def _overdue(pending: _Pending, trouble: str) -> Answer:
+    """Return the answer to a request that took too long.
+
+    `trouble` is the reason why no thread changes the file, or "" if the thread waits for the disk.
+    """
     answer = pending.answer
-    why = f"the disk did not answer within {REPLY_TIMEOUT_NS / NS_PER_S:g} s"
+    why = trouble or f"the disk did not answer within {REPLY_TIMEOUT_NS / NS_PER_S:g} s"
+    mend = "restart acsard" if trouble else "check the disk (`dmesg`)"
     if answer is not None:
         text = f"{answer.message}, but {why}: check whether the file has the new value"
     else:
-        text = f"no setting was changed: {why}; check the disk (`dmesg`), then try again"
+        text = f"no setting was changed: {why}; {mend}, then try again"
     return Answer(pending.request.id, False, text)

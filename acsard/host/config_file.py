@@ -10,7 +10,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from acsard.core.config.parsing import ConfigError, parse
+from acsard.core.config.parsing import MAX_BYTES, ConfigError, parse
 from acsard.core.config.settings import Config
 from acsard.core.config.toml_editing import edited
 from acsard.core.values import AcsardError
@@ -20,6 +20,17 @@ from acsard.host.errors import Exit, ExitError, MendableError
 from acsard.host.extras import install
 
 SEARCH_PATHS = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
+
+
+def read(file: Path) -> bytes:
+    """Return the content of a configuration file, but at most one byte more than it may have.
+
+    `parse` refuses this one byte more. The daemon reads its file while it controls the robot, so a
+    huge file must take neither its memory nor its time. Raises `OSError` if the file cannot be
+    read.
+    """
+    with file.open("rb") as opened:
+        return opened.read(MAX_BYTES + 1)
 
 
 def find(path: str | None) -> tuple[str, bytes]:
@@ -32,7 +43,7 @@ def find(path: str | None) -> tuple[str, bytes]:
     named = path or os.environ.get("ACSARD_CONFIG")
     if named:
         try:
-            return named, Path(named).read_bytes()
+            return named, read(Path(named))
         except OSError as error:
             raise ExitError(
                 Exit.BAD_CONFIG,
@@ -41,7 +52,7 @@ def find(path: str | None) -> tuple[str, bytes]:
             ) from None
     for place in SEARCH_PATHS:
         try:
-            return str(place), place.read_bytes()
+            return str(place), read(place)
         except FileNotFoundError:
             continue
         except OSError as error:
@@ -113,15 +124,15 @@ def prepare_edit(file: Path | None, keys: Keys) -> Edit:
     try:
         if any(key.startswith("commands.sources.") for key in keys):
             raise ValueError("the daemon cannot write a timeout of [[commands.sources]] to a file")
-        place = file.resolve(strict=True)
+        place = _target(file)
         _require_writable(place)
         if is_tracked(place):
             raise MendableError(
                 "git tracks it, and a changed file hinders the next `git pull`; start the daemon "
                 "with a copy of it (--config)"
             )
-        before = place.read_bytes()
-        return Edit(file, keys, before, edited_in_process(before.decode(), keys))
+        before = read(place)
+        return Edit(file, keys, before, edited_in_process(_decoded(before), keys))
     except (OSError, ValueError, MendableError) as error:
         raise _not_changed(file, error) from None
 
@@ -136,9 +147,9 @@ def apply_edit(edit: Edit) -> None:
     try:
         # A change takes 0.2 s to compute, and a person's editor may write the file meanwhile.
         for _ in range(3):
-            place = edit.file.resolve(strict=True)
+            place = _target(edit.file)
             _require_writable(place)
-            if place.read_bytes() == edit.before:
+            if read(place) == edit.before:
                 replace(place, edit.after.encode())
                 # Without this sync, a power cut may bring the old file back after the daemon has
                 # reported success. Some file systems refuse the sync.
@@ -149,6 +160,20 @@ def apply_edit(edit: Edit) -> None:
         raise ValueError("another program changes it again and again")
     except (OSError, ValueError) as error:
         raise _not_changed(edit.file, error) from None
+
+
+def _target(file: Path, new: bool = False) -> Path:
+    """Return the path of `file` without symbolic links. If `new` is true, the file may be missing.
+
+    Raises `OSError` if the links form a loop, or if the file is missing and `new` is false.
+    """
+    # `Path.resolve` of Python 3.11 raises RuntimeError for a loop.
+    try:
+        return Path(os.path.realpath(file, strict=True))
+    except FileNotFoundError:
+        if not new:
+            raise
+        return Path(os.path.realpath(file))
 
 
 def _require_writable(place: Path) -> None:
@@ -187,7 +212,7 @@ def is_tracked(place: Path) -> bool:
 
 
 def _is_reference(file: Path) -> bool:
-    place = file.resolve()
+    place = Path(os.path.realpath(file))
     top = place.parent
     in_clone = (top / ".git").exists() and (top / "acsard" / "__init__.py").is_file()
     return in_clone and place.name == "acsard.toml"
@@ -240,11 +265,17 @@ def require_changeable(
 def _changed(
     file: Path, keys: Keys | Callable[[Config], Keys], new: bool
 ) -> tuple[Path, str, Keys]:
-    place = file.resolve(strict=not new)
+    place = _target(file, new)
     # `read_text` would lose CRLF line ends.
-    text = "" if new and not place.exists() else place.read_bytes().decode()
+    text = "" if new and not place.exists() else _decoded(read(place))
     changes = keys(parse(text.encode())) if callable(keys) else keys
     return place, edited(text, changes), changes
+
+
+def _decoded(content: bytes) -> str:
+    # `read` may cut a character of a file that is too large. That is not the mistake to report, so
+    # replace the character. The text stays too large, and `parse` reports that.
+    return content.decode(errors="replace" if len(content) > MAX_BYTES else "strict")
 
 
 def _not_changed(file: Path, error: Exception) -> MendableError:

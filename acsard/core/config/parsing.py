@@ -38,7 +38,7 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
     """
     if len(text) > MAX_BYTES:
         raise ConfigError(
-            [f"{len(text)} bytes: too large for a configuration; at most {MAX_BYTES}"]
+            [f"more than {MAX_BYTES} bytes: too large for a configuration; shorten the file"]
         )
     try:
         table = tomllib.loads(text.decode("utf-8"))

@@ -6,6 +6,7 @@ import asyncio
 import errno
 import fcntl
 import os
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -135,6 +136,90 @@ def test_a_file_that_cannot_be_read_starts_the_robot_stopped(
     assert latches.stop.why.startswith(begins)
     assert reason in latches.stop.why
     assert latches.stop.why.endswith("; a stop may have been lost")
+
+
+def linked(directory: Path) -> tuple[Path, Path]:
+    """Make a state directory whose latch file links to a file on another partition.
+
+    Return the state directory and the file. The file contains no latches.
+    """
+    state, file = directory / "state", directory / "persistent" / "robot.json"
+    state.mkdir()
+    file.parent.mkdir()
+    file.write_bytes(encode("acsar", Latches()))
+    (state / NAME).symlink_to("../persistent/robot.json")
+    return state, file
+
+
+def test_a_stop_is_written_to_the_target_of_a_link_and_synced_there(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The state directory may be volatile, and the link may lead to a partition that is not."""
+    state, target = linked(tmp_path)
+    killed = target.with_name(".robot.json.k1ll3d")
+    killed.touch()
+    synced: list[Path] = []
+    monkeypatch.setattr(module, "sync", synced.append)
+    file, latches = started(state)
+    assert latches == Latches()
+    file.keep(STOP)
+    end(file)
+    assert (state / NAME).is_symlink()
+    assert target.read_bytes() == encode("acsar", STOP)
+    assert set(synced) == {target, target.parent}
+    assert os.listdir(state) == [NAME]
+    assert sorted(os.listdir(target.parent)) == ["robot.json", "robot.lock"]
+    assert started(state)[1] == STOP.after_restart()
+
+
+def test_two_links_to_one_file_do_not_let_two_daemons_write_it(
+    tmp_path: Path, started: Started
+) -> None:
+    state, target = linked(tmp_path)
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / NAME).symlink_to(target)
+    started(state)
+    with pytest.raises(InUseError, match=re.escape(f"of robot acsar in {target}; end that daemon")):
+        started(other)
+
+
+def test_a_disk_that_fails_is_reported_with_the_target_of_the_link(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, target = linked(tmp_path)
+    monkeypatch.setattr(module, "replace", full)
+    file, latches = started(state)
+    assert latches.stop
+    assert f"the latch file ({target}) cannot be written: No space left" in file.trouble
+
+
+@pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo])
+def test_a_link_to_a_special_file_does_not_replace_that_file(
+    tmp_path: Path, started: Started, make: Callable[[Path], None]
+) -> None:
+    """A link to /dev/null must not make the daemon of root replace /dev/null."""
+    target = tmp_path / "special"
+    make(target)
+    (tmp_path / NAME).symlink_to(target)
+    _, latches = started(tmp_path)
+    assert latches.stop
+    assert not target.is_file()
+
+
+def test_the_write_after_a_late_start_goes_to_the_target_of_a_link(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, target = linked(tmp_path)
+
+    async def never(work: Callable[[], object], seconds: float) -> None:
+        raise TimeoutError
+
+    monkeypatch.setattr(module, "in_thread", never)
+    file, latches = started(state)
+    until(lambda: file.holds(latches))
+    assert (state / NAME).is_symlink()
+    assert target.read_bytes() == encode("acsar", latches)
 
 
 def test_the_stop_for_a_lost_file_is_itself_kept(tmp_path: Path, started: Started) -> None:

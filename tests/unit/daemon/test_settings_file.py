@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 import threading
+import tracemalloc
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
@@ -360,8 +361,9 @@ def test_a_thread_that_cannot_be_started_is_named_in_the_answer_at_once(
     assert made.keep(REQUEST, 0) == Answer(
         REQUEST.id,
         False,
-        "no setting was changed: the daemon could not start the thread that changes the file "
-        "(can't start new thread); restart acsard, or send the request without `keep`",
+        "no setting was changed: the daemon could not start the thread that compares "
+        "and changes the file (can't start new thread); restart acsard, or send the request "
+        "without `keep`",
     )
     assert made.results(module.REPLY_TIMEOUT_NS + 1, []) == []
 
@@ -439,6 +441,55 @@ def test_a_pipe_in_place_of_the_file_is_not_read(file: Path, made: SettingsFile)
     answer = result(made)
     assert isinstance(answer, Answer)
     assert "it is not a regular file" in answer.message
+
+
+def test_a_huge_file_is_reported_without_being_read_to_its_end(
+    file: Path, made: SettingsFile
+) -> None:
+    tracemalloc.start()
+    try:
+        os.truncate(file, 1 << 26)
+        until(lambda: "too large for a configuration" in made.differ)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 23
+    finally:
+        tracemalloc.stop()
+    file.write_text(TEXT)
+    until(lambda: made.differ == "")
+
+
+def test_a_loop_of_symbolic_links_in_place_of_the_file_is_reported_until_it_is_gone(
+    file: Path, made: SettingsFile
+) -> None:
+    file.unlink()
+    file.symlink_to(file)
+    made.keep(REQUEST, 0)
+    assert "Too many levels of symbolic links" in refusal(made)
+    until(lambda: "Too many levels of symbolic links" in made.differ)
+    file.unlink()
+    file.write_text(TEXT)
+    until(lambda: made.differ == "")
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_thread_that_has_ended_is_reported_and_named_in_the_answer_at_once(
+    made: SettingsFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> Edit:
+        raise RuntimeError("a defect")
+
+    monkeypatch.setattr(module, "prepare_edit", fails)
+    made.keep(REQUEST, 0)
+    ended = "the thread that compares and changes the file has ended"
+    until(lambda: ended in made.differ)
+    assert made.differ.endswith("; restart acsard")
+    (answer,) = made.results(module.REPLY_TIMEOUT_NS + 1, [])
+    assert isinstance(answer, Answer)
+    assert answer.message.startswith(f"no setting was changed: {ended}; restart acsard")
+    assert made.keep(replace(REQUEST, id=8), 0) == Answer(
+        8,
+        False,
+        f"no setting was changed: {ended}; restart acsard, or send the request without `keep`",
+    )
 
 
 @pytest.mark.slow

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from tomlkit.exceptions import NonExistentKey
 
-from acsard.core.config.parsing import parse
-from acsard.host.config_file import change
-from acsard.host.errors import MendableError
+from acsard.bus.address import address_by_environment
+from acsard.core.config.parsing import ConfigError, parse
+from acsard.host.config_file import change, find, prepare_edit, require_changeable
+from acsard.host.errors import MendableError, UsageError
 
 REFERENCE = Path(__file__).parents[3] / "acsard.toml"
 
@@ -94,3 +97,71 @@ def test_new_values_may_be_calculated_from_the_present_configuration(tmp_path: P
     file.write_bytes(b"# mine\r\n[mcu]\r\nencoder_counts = 5\r\n")
     change(file, lambda config: {"mcu.encoder_counts": 2 * config.mcu.encoder_counts})
     assert file.read_bytes() == b"# mine\r\n[mcu]\r\nencoder_counts = 10\r\n"
+
+
+def start_with(file: Path) -> None:
+    parse(find(str(file))[1])
+
+
+def connect_with(file: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ACSARD_CONFIG", str(file))
+        address_by_environment(None, None, None)
+
+
+def edit(file: Path) -> None:
+    prepare_edit(file, KEYS)
+
+
+def edit_by_command(file: Path) -> None:
+    change(file, KEYS)
+
+
+@pytest.mark.parametrize("use", [start_with, connect_with, edit, edit_by_command])
+def test_a_huge_file_is_refused_without_being_read_to_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, use: Callable[[Path], None]
+) -> None:
+    """`truncate -s 1G acsard.toml` must not take the memory or the time of a running daemon."""
+    monkeypatch.setattr("acsard.host.config_edit_process.EDIT_TIMEOUT_S", 30.0)
+    file = tmp_path / "acsard.toml"
+    # The limit lies within a character, which must not hide the cause.
+    file.write_text("é" * 40_000)
+    os.truncate(file, 1 << 26)
+    tracemalloc.start()
+    try:
+        with pytest.raises(
+            (ConfigError, MendableError, UsageError), match="too large for a configuration"
+        ):
+            use(file)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 23
+    finally:
+        tracemalloc.stop()
+
+
+def make_new(file: Path) -> None:
+    change(file, KEYS, new=True)
+
+
+def require(file: Path) -> None:
+    require_changeable(file, KEYS)
+
+
+@pytest.mark.parametrize("use", [edit, edit_by_command, make_new, require])
+def test_a_loop_of_symbolic_links_is_refused_and_kept(
+    tmp_path: Path, use: Callable[[Path], None]
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.symlink_to(file)
+    with pytest.raises(
+        MendableError, match=r"was not changed: .*Too many levels of symbolic links"
+    ):
+        use(file)
+    assert file.is_symlink()
+
+
+def test_a_link_to_a_missing_file_creates_the_target(tmp_path: Path) -> None:
+    link = tmp_path / "acsard.toml"
+    link.symlink_to("real.toml")
+    change(link, KEYS, new=True)
+    assert link.is_symlink()
+    assert parse((tmp_path / "real.toml").read_bytes()).mcu.baud_rate == 57600
