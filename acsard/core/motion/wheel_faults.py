@@ -239,6 +239,15 @@ class _Side:
         speeds = before.as_tuple()
         return was_faulty(self._fault, speeds[own], speeds[other], now.as_tuple()[own])
 
+    @property
+    def may_slip(self) -> bool:
+        """Whether the wheels of this side contradict each other, so that one of them may slip.
+
+        A wheel that is ignored because it reports no motion may have a dead encoder, or it may be
+        blocked. If it is blocked, the side moves more slowly than its other wheel.
+        """
+        return self.slip_s > 0.0 or (self.out is not None and self._fault == "dead")
+
     def _pass(self, dt: float) -> None:
         self.slip_s = max(0.0, self.slip_s - dt)
         if not self.slip_s:
@@ -270,8 +279,8 @@ class WheelFaults:
         self._last = STILL
         self._busy = self._leaves_out = self._stands = False
         self.slips = False
-        """Whether a side slips, which means that its wheels contradicted each other in the last
-        `SLIP_HOLD_S`."""
+        """Whether a side may slip: its wheels contradicted each other in the last `SLIP_HOLD_S`, or
+        one of them is ignored because it reports no motion."""
         self._rolled, self._unreported = 0.0, REPEATED_S
         self.pushed = ""
         """Message that wheels turn without a command, for example by hand; "" unless the last line
@@ -493,7 +502,7 @@ class WheelFaults:
         self.events += [side.event for side in self._sides if side.event]
         left.event = right.event = None
         self._leaves_out = left.out is not None or right.out is not None
-        self.slips = left.slip_s > 0.0 or right.slip_s > 0.0
+        self.slips = left.may_slip or right.may_slip
         self._busy = self.slips or self._leaves_out or left.suspected or right.suspected
 
 

@@ -228,6 +228,20 @@ def test_a_push_by_hand_with_a_stuck_encoder_is_reported_as_slip_of_one_side() -
     assert not made.state.wheel_fault
 
 
+def test_a_wheel_that_is_ignored_as_dead_leaves_the_turn_rate_uncertain() -> None:
+    """The wheel may be blocked instead, and then the robot turns, but its odometry does not."""
+    made = world()
+    made.drive(0.8, seconds=1.0)
+    with made.mcu.dead_motor(0):
+        made.hold(0.8, seconds=0.4)
+        before = made.mcu.vehicle.pose.yaw
+        made.hold(0.8, seconds=0.1)
+    assert made.state.wheel_fault
+    truth = (made.mcu.vehicle.pose.yaw - before) / 0.1
+    assert abs(truth) > 0.5
+    assert made.odom.twist.covariance[35] > (truth / 3) ** 2
+
+
 def test_slip_makes_the_covariance_a_hundred_times_as_large() -> None:
     made = world()
     made.drive(0.5, seconds=1.5)
