@@ -50,9 +50,10 @@ from acsard.core.motion.se2 import (
 from acsard.core.values import PoseCovariance
 
 MAX_HEADING_VARIANCE = 1.0
-"""Largest variance of the heading for which the second-order terms are computed, rad2. With a
-larger variance, the series does not converge, and a stretch of the path adds nothing to the
-terms."""
+"""Largest variance of the heading for which the second-order terms are computed, rad2. The limit
+applies before and after a stretch of the path. With a larger variance, the series does not
+converge, and its terms could make the covariance of the pose indefinite. The stretch then adds
+nothing to the terms."""
 
 NO_TERMS = PoseCovariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -112,7 +113,8 @@ class SecondOrder:
         xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
         for x, y, yaw in j:
             xyaw, yyaw, yawyaw = xyaw + x * yaw, yyaw + y * yaw, yawyaw + yaw * yaw
-        if yawyaw > MAX_HEADING_VARIANCE:
+        after = p.yawyaw + q.yawyaw + sum((a[2] + b[2]) ** 2 for a, b in zip(j, w, strict=True))
+        if max(yawyaw, after) > MAX_HEADING_VARIANCE:
             return NO_TERMS
         of_noise = bracket_covariance(p, q)
         self._noise = plus(self._noise, (of_noise[0] / 4, of_noise[1] / 4, of_noise[2] / 4))

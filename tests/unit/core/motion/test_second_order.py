@@ -71,6 +71,18 @@ def test_an_unknown_heading_adds_no_second_order_term() -> None:
     assert (second.xx, second.xy, second.yy) == (0.0, 0.0, 0.0)
 
 
+@pytest.mark.parametrize("column", [0.0, 3.0])
+@pytest.mark.parametrize("yaw", [1.1, 10.0])
+def test_a_stretch_that_makes_the_heading_unknown_adds_no_second_order_term(
+    yaw: float, column: float
+) -> None:
+    second, p = straight(20, 1e-4, 0.001)
+    before = (second.xx, second.xy, second.yy)
+    j, noise = (0.0, 0.0, 0.02), 0.0 if column else yaw
+    assert second.compose(p, heading(noise), [j], [(0.0, 0.0, column)]) == NONE
+    assert (second.xx, second.xy, second.yy) == before
+
+
 def test_an_additional_column_does_not_change_the_existing_terms() -> None:
     second, p = straight(5, 1e-3, 0.01)
     before = second.xx
