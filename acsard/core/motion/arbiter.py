@@ -281,7 +281,10 @@ class Arbiter:
             and command.arrived_ns - self._watched_ns < CATCH_UP_NS
         ):
             # The command may have waited during the whole stall, and only a stamp would show that.
+            # The command before the stall does not show either what the sender wants now.
             verdict = "stale"
+            if known is not None:
+                known.outdate(command.arrived_ns)
         if verdict == "stale":
             if known is not None:
                 known.refuse(command, verdict)

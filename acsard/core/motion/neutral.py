@@ -210,6 +210,14 @@ class Sender:
         self._settle(at_ns)
         self._zero_ns = self._proven_zero_ns = None
 
+    def outdate(self, now_ns: int) -> None:
+        """Treat the last accepted command as older than the timeout, so that it moves nothing.
+
+        `now_ns` is the monotonic time, ns.
+        """
+        if self.arrived_ns is not None:
+            self.arrived_ns = min(self.arrived_ns, now_ns - self._timeout_ns - 1)
+
     def refuse(self, command: Command, why: Verdict) -> None:
         """Record a command that was refused because of its stamp.
 
