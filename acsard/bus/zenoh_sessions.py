@@ -189,7 +189,11 @@ def _listening() -> dict[str, object]:
         # With a limit of 512 they do not. 512 pending connections take 3 MB.
         "transport/unicast/accept_pending": 512,
         "transport/unicast/max_sessions": MAX_SESSIONS,
-        "transport/link/tx/lease": 2000,
+        # Zenoh's default. A session announces its lease, and the other side closes the link if it
+        # receives nothing for that time. A daemon that stood still for longer than the lease of the
+        # gateway or of a router closes the link without reading the stop that waits in its socket.
+        # With a lease of 2 s, a stop was lost after 1.9 s.
+        "transport/link/tx/lease": 10_000,
         # A subscriber that does not read must not delay a put. By default each put waits 1 ms.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,

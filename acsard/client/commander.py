@@ -40,7 +40,8 @@ drive fails. If the source has a long timeout, the daemon checks the delay of a 
 2 s. In the rest of the time, another sender can finish its drive."""
 
 ZEROS = 3
-"""Number of zeros that a sender sends at the end of a drive, in case the network loses some."""
+"""Smallest number of zeros that a sender sends at the end of a drive. A hiccup of the network may
+lose all of them. A sender that follows the robot's state therefore uses `FinalZeros`."""
 
 GRACE_S = 0.5
 """Longest time for which commands may have no effect, s. After this time, the program informs the

@@ -2,9 +2,10 @@
 
 A terminal reports a key press but never its release. Each press therefore drives the robot for
 `KEY_HOLD_S`. From the third repeat (`REPEATS`) of a held key on, each repeat drives the robot
-for `REPEAT_S` only. When this time is over, `acsard drive` sends three zero commands and then
-nothing. If this program was paused for more than 0.5 s, the keys that the operator typed during the
-pause do not drive the robot.
+for `REPEAT_S` only. When this time is over, `acsard drive` sends at least three zero commands. It
+goes on until the robot's state shows that the robot has stopped, and then sends nothing. If this
+program was paused for more than 0.5 s, the keys that the operator typed during the pause do not
+drive the robot.
 
 A key that was pressed before a stop must not drive the robot after the `clear`, even if an SSH
 connection pauses and the key seems to be released. So if the robot stops following while a key is
@@ -15,12 +16,14 @@ presses a key that stops the robot and arrives without delay, or no driving key 
 from __future__ import annotations
 
 import math
+import time
 
 from acsard.client import Client
 from acsard.client.commander import (
     GRACE_S,
     NEVER_DRIVING_MODES,
     RELEASE_TIMEOUT_NS,
+    SEND_PERIOD_S,
     ZEROS,
     Commander,
     Wish,
@@ -28,6 +31,7 @@ from acsard.client.commander import (
     objection,
 )
 from acsard.client.driving import SETTLED_S
+from acsard.client.final_zeros import FinalZeros
 from acsard.client.follower import Watch, restarted
 from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.host import clock
@@ -57,6 +61,10 @@ operator may have released the key long ago.
 BURST_S = 0.2
 """Time after the arrival of delayed keys, s, in which all further keys count as delayed too. One
 read from the terminal may not return all delayed keys."""
+
+MAX_END_S = 0.5
+"""Longest time for which a drive that ends waits for the robot to stop, s. The operator wants the
+program to end promptly."""
 
 RELEASE_REASON = (
     "the robot did not follow this program while you held the key, so the key is ignored: press "
@@ -189,6 +197,7 @@ class KeyboardDrive:
         # After a silence the robot may require a return to neutral, for example because it was
         # stopped and cleared during the silence.
         self._commander = Commander(sends_leading_zero=True)
+        self._final_zeros = FinalZeros(robot.source, robot.sender)
         self._watch = Watch(robot, clock.steady_s())
         # Subscribing may take long. The terminal discards the keys that are typed until it is done.
         self._fine = self._stepped = clock.steady_s()
@@ -203,6 +212,8 @@ class KeyboardDrive:
         waited, self._stepped = now - self._stepped, now
         self._keyboard.take(typed, now, waited)
         wish = self._keyboard.wish(now)
+        if wish is None and self._final_zeros.wanted(now):
+            wish = REST
         if wish is not None:
             self._commander.take(Wish(wish), now_ns)
         # Send only one command per step. If a nonzero command followed a zero immediately, the
@@ -210,6 +221,8 @@ class KeyboardDrive:
         sent = self._commander.send(now_ns)
         if sent is not None:
             self._robot.send(sent.twist.linear, sent.twist.angular)
+            if sent.twist != REST:
+                self._final_zeros.drove(now)
         if (sent is None or sent.twist == REST) and not self._keyboard.ignores(now):
             self._fine = now
         self.take()
@@ -218,14 +231,21 @@ class KeyboardDrive:
         """Process the states that have arrived. If no state has arrived for some time, query it."""
         now, before = clock.steady_s(), self._watch.state
         for state in self._watch.poll(now):
+            self._final_zeros.received(state, now)
             if must_release_key(state, self._robot.source) or restarted(before, state):
                 self._keyboard.end_hold(now)
             before = state
 
     def end(self) -> None:
-        """Send the final zero commands, which stop the robot."""
+        """Send zero commands until the robot has stopped, but for at most `MAX_END_S`."""
         for _ in range(ZEROS):
             self._robot.send(0.0, 0.0)
+        for _ in range(round(MAX_END_S / SEND_PERIOD_S)):
+            if not self._final_zeros.wanted(clock.steady_s()):
+                return
+            time.sleep(SEND_PERIOD_S)
+            self._robot.send(0.0, 0.0)
+            self.take()
 
     def screen_data(self) -> Teleop:
         now, robot, watch = clock.steady_s(), self._robot, self._watch

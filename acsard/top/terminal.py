@@ -186,6 +186,7 @@ def _steer(ride: KeyboardDrive, console: Console, suspend: list[bool]) -> bool:
                 display.update(Group(*lines(ride.screen_data(), *console.size)), refresh=True)
     for letter in ("k", "", ""):
         ride.step(letter)  # stop the robot, because a suspended program sends no commands
+    ride.end()
     return True
 
 

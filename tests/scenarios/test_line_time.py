@@ -136,9 +136,8 @@ class Gap:
 
 
 @pytest.mark.parametrize("mute", [False, True], ids=["lost replies", "mute"])
-@pytest.mark.parametrize("waiting", [0.0, 0.2])
+@pytest.mark.parametrize(("commanded", "waiting"), [(0.0, 0.0), (0.05, 0.0), (0.0, 0.2)])
 @pytest.mark.parametrize("stall", [0.2, 0.3, 0.5])
-@pytest.mark.parametrize("commanded", [0.0, 0.05])
 def test_a_stall_in_a_gap_does_not_end_the_motion_in_the_pose_before_rest_is_commanded(
     commanded: float, stall: float, waiting: float, mute: bool
 ) -> None:
@@ -161,7 +160,7 @@ def test_a_stall_in_a_gap_does_not_end_the_motion_in_the_pose_before_rest_is_com
         gap.world.stall(stall)
         gap.world.run(0.6 - commanded - stall)
     off, deviation = gap.end()
-    assert abs(off) < 0.12
+    assert abs(off) < 0.1
     assert abs(off) < 3 * deviation
 
 

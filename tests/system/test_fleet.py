@@ -8,7 +8,9 @@ happens, a test sends a request after each attempt and waits for its answer.
 from __future__ import annotations
 
 import json
+import signal
 import threading
+import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -479,6 +481,26 @@ def test_an_operator_drives_one_robot_and_a_viewer_stops_it(fleet: Fleet) -> Non
         assert not viewer.ask("srv/clear")
         assert operator.get("srv/clear")["success"]
     first.at_rest()
+
+
+def test_a_stop_that_a_stalled_robot_reads_after_more_than_two_seconds_stops_it(
+    fleet: Fleet,
+) -> None:
+    with fleet.member("viewer") as viewer, fleet.member("maintainer") as maintainer:
+        until(lambda: viewer.ask("info"), 5.0, "the viewer reaches the robot")
+        robot = fleet.daemons[0]
+        robot.signal(signal.SIGSTOP)
+        try:
+            viewer.put("stop", True)
+            time.sleep(4.0)
+        finally:
+            robot.signal(signal.SIGCONT)
+
+        def stopped() -> bool:
+            return any(b'"mode":"stopped"' in answer.payload for answer in maintainer.ask("state"))
+
+        until(stopped, 5.0, "the stop arrives")
+        assert maintainer.get("srv/clear")["success"]
 
 
 @pytest.mark.parametrize("name", ["operator", "maintainer", "robot1"])

@@ -55,10 +55,13 @@ class Open:
         (pid,) = until(lambda: children(self.daemon.pid, "acsard gateway"), 5.0, "a gateway")
         return pid
 
+    def connect(self) -> zenoh.Session:
+        """Open a session of a viewer to the gateway."""
+        return zenoh.open(self._certificates.config("viewer", self._plain, self.tls))
+
     def lets_in(self) -> bool:
         try:
-            config = self._certificates.config("viewer", self._plain, self.tls)
-            with zenoh.open(config) as session:
+            with self.connect() as session:
                 return any(r.ok for r in session.get("acsard/acsar/state", timeout=1.0))
         except zenoh.ZError:
             return False
@@ -170,6 +173,26 @@ def test_a_gateway_that_was_suspended_for_two_seconds_is_not_restarted(robot: Op
     os.kill(gateway, signal.SIGCONT)
     until(robot.lets_in, 5.0, "it goes on")
     assert robot.gateway() == gateway
+
+
+@pytest.mark.parametrize("paused", ["daemon", "gateway"])
+def test_a_stop_over_tls_that_waits_for_longer_than_two_seconds_stops_the_robot(
+    robot: Open, paused: str
+) -> None:
+    until(robot.lets_in, 5.0, "it is open")
+    with robot.connect() as viewer, Bus(robot.daemon.endpoint) as bus:
+        assert any(reply.ok for reply in viewer.get("acsard/acsar/state", timeout=3.0))
+        assert bus.state()["mode"] != "stopped"
+        pid = robot.daemon.pid if paused == "daemon" else robot.gateway()
+        os.kill(pid, signal.SIGSTOP)
+        try:
+            viewer.put("acsard/acsar/stop", b"")
+            # The supervisor of the gateway ends a gateway that is paused for 3 s.
+            time.sleep(2.4)
+        finally:
+            os.kill(pid, signal.SIGCONT)
+        with Bus(robot.daemon.endpoint) as other:
+            until(lambda: other.state()["mode"] == "stopped", 5.0, "the stop arrives")
 
 
 def test_forged_gateway_reports_are_ignored(robot: Open) -> None:

@@ -1724,8 +1724,8 @@ def test_after_a_superseded_line_a_ramp_brakes_for_the_whole_elapsed_time() -> N
 
 def test_after_too_long_without_a_sent_line_the_speed_starts_from_zero() -> None:
     bench = Bench().driving()
-    assert bench.step(GO, ms=250).applied == GO
-    assert bench.step(GO, ms=260).applied == REST
+    assert bench.step(ms=250).applied == GO
+    assert bench.step(ms=260).applied == REST
     speeds = [bench.step(GO).applied.linear for _ in range(11)]
     assert next(speed for speed in speeds if speed) == pytest.approx(0.01)
 
@@ -1742,7 +1742,7 @@ def test_after_a_stall_the_speed_grows_by_at_most_50_ms_of_acceleration() -> Non
     bench = Bench().linked()
     bench.step(REST)
     bench.step(GO)
-    assert bench.step(GO, ms=200).applied.linear == pytest.approx(0.01 + 0.05)
+    assert bench.step(ms=200).applied.linear == pytest.approx(0.01 + 0.05)
 
 
 def test_at_a_slow_rate_a_stall_adds_at_most_1_5_periods_of_acceleration() -> None:
@@ -1753,7 +1753,7 @@ def test_at_a_slow_rate_a_stall_adds_at_most_1_5_periods_of_acceleration() -> No
     bench = Bench(slow).linked()
     bench.step(REST)
     assert bench.step(GO, ms=100).applied.linear == pytest.approx(0.1)
-    assert bench.step(GO, ms=240).applied.linear == pytest.approx(0.25)
+    assert bench.step(ms=240).applied.linear == pytest.approx(0.25)
 
 
 def test_after_a_stall_the_robot_brakes_for_the_whole_elapsed_time() -> None:

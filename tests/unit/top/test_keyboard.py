@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from types import SimpleNamespace
 from typing import Any
@@ -12,12 +13,20 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.bus.address import Address
-from acsard.client.commander import GRACE_S, RELEASE_TIMEOUT_NS, ZEROS
+from acsard.client.commander import GRACE_S, MAX_SOURCE_TIMEOUT_S, RELEASE_TIMEOUT_NS, ZEROS
 from acsard.client.follower import ROBOT_SILENCE_TIMEOUT_S
 from acsard.core.messages.schema import RobotState, SourceState
 from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.host import clock
-from acsard.top.keyboard import KEY_HOLD_S, RELEASE_REASON, REPEAT_S, Keyboard, KeyboardDrive, split
+from acsard.top.keyboard import (
+    KEY_HOLD_S,
+    MAX_END_S,
+    RELEASE_REASON,
+    REPEAT_S,
+    Keyboard,
+    KeyboardDrive,
+    split,
+)
 from tests.each import each
 from tests.unit.top.screens import STATE, sample_of
 
@@ -219,19 +228,70 @@ def test_only_a_drive_after_a_silence_is_led_by_a_zero(monkeypatch: pytest.Monke
     assert robot.sent[-1] == -0.5
 
 
-def test_the_last_commands_are_zeros_and_then_nothing_is_sent(
+MOVING = replace(
+    STATE,
+    source="teleop",
+    sender=Robot.sender,
+    sources=[SourceState("teleop", 100, 0.02, "", "nothing")],
+)
+RESTING = replace(MOVING, linear=0.0, angular=0.0)
+
+
+def test_a_zero_is_repeated_until_the_state_shows_that_the_robot_rests(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     robot = Robot()
     drive = Drive(robot, monkeypatch)
-    drive.step("i")
-    drive.step(times=40)
-    assert robot.sent[-ZEROS - 1 :] == [0.5] + [0.0] * ZEROS
+    drive.step("i", times=5)
+    for _ in range(40):
+        robot.said.append(sample_of(MOVING))
+        drive.step()
+    assert robot.sent[-20:] == [0.0] * 20
+    for _ in range(10):
+        robot.said.append(sample_of(RESTING))
+        drive.step()
     sent = len(robot.sent)
     drive.step(times=100)
     assert len(robot.sent) == sent
     drive.ride.end()
     assert robot.sent[sent:] == [0.0] * ZEROS
+
+
+def test_a_zero_is_not_repeated_for_longer_than_the_longest_timeout(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robot = Robot()
+    drive = Drive(robot, monkeypatch)
+    drive.step("i", times=2)
+    drive.step(times=round(MAX_SOURCE_TIMEOUT_S / 0.05) - 20)
+    sent = len(robot.sent)
+    drive.step(times=10)
+    assert robot.sent[sent:] == [0.0] * 10
+    drive.step(times=40)
+    sent = len(robot.sent)
+    drive.step(times=100)
+    assert len(robot.sent) == sent
+
+
+def test_a_key_drives_while_the_zero_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Robot()
+    drive = Drive(robot, monkeypatch)
+    drive.step("i", times=2)
+    drive.step(times=40)
+    drive.step("m", times=2)
+    assert robot.sent[-3:] == [0.0, -0.5, -0.5]
+
+
+def test_a_drive_that_ends_waits_for_half_a_second_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Robot()
+    drive = Drive(robot, monkeypatch)
+    waits: list[float] = []
+    monkeypatch.setattr(time, "sleep", waits.append)
+    drive.step("i", times=2)
+    sent = len(robot.sent)
+    drive.ride.end()
+    assert sum(waits) == pytest.approx(MAX_END_S)
+    assert robot.sent[sent:] == [0.0] * (ZEROS + len(waits))
 
 
 @each("key", ["i", UP])
@@ -285,7 +345,7 @@ def test_a_press_does_not_drive_for_the_rest_of_its_hold_after_a_stall(
     sent = len(robot.sent)
     drive.now += (GRACE_S + KEY_HOLD_S) / 2
     drive.step(times=10)
-    assert robot.sent[sent:] == [0.0] * ZEROS
+    assert robot.sent[sent:] == [0.0] * 10
 
 
 def test_a_stall_without_a_key_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -442,7 +502,7 @@ def test_a_key_that_no_longer_drives_does_so_after_its_release(
     keyboard.step(times=round(RELEASE_TIMEOUT_NS / NS_PER_S / 0.05) + 2)
     keyboard.robot.sent.clear()
     keyboard.step("i", times=3)
-    assert keyboard.robot.sent == [0.0, 0.5, 0.5]
+    assert keyboard.robot.sent[-2:] == [0.5, 0.5]
 
 
 def test_a_state_from_before_a_press_does_not_end_the_hold(
