@@ -275,16 +275,6 @@ class Arbiter:
             self.notice(command.source, command.sender, command.arrived_ns, command.shared)
             return "not_finite"
         verdict = self._freshness.judge(command, source.timeout_ns)
-        if (
-            command.stamp_ns is None
-            and not is_zero(command)
-            and command.arrived_ns - self._watched_ns < CATCH_UP_NS
-        ):
-            # The command may have waited during the whole stall, and only a stamp would show that.
-            # The command before the stall does not show either what the sender wants now.
-            verdict = "stale"
-            if known is not None:
-                known.outdate(command.arrived_ns)
         if verdict == "stale":
             if known is not None:
                 known.refuse(command, verdict)
@@ -292,6 +282,11 @@ class Arbiter:
         sender = known or source.add(command.sender, command.arrived_ns)
         if sender is None:
             return "too_many_senders"
+        waited = command.stamp_ns is None and not is_zero(command)
+        if waited and command.arrived_ns - self._watched_ns < CATCH_UP_NS:
+            # The command may have waited during the whole stall, and only a stamp would show that.
+            sender.outdate(command)
+            return "stale"
         if verdict in ("set", "first"):
             # The doubt about a clock concerns its stamps on all sources.
             for other in self._ranking:

@@ -210,13 +210,18 @@ class Sender:
         self._settle(at_ns)
         self._zero_ns = self._proven_zero_ns = None
 
-    def outdate(self, now_ns: int) -> None:
-        """Treat the last accepted command as older than the timeout, so that it moves nothing.
+    def outdate(self, command: Command) -> None:
+        """Process a speed without a stamp that may have waited during a stall of the daemon.
 
-        `now_ns` is the monotonic time, ns.
+        It does not show what the sender wants now, and neither does the command before the stall.
+        So none of them moves the robot, but the sender takes part in the choice of the arbiter.
         """
-        if self.arrived_ns is not None:
-            self.arrived_ns = min(self.arrived_ns, now_ns - self._timeout_ns - 1)
+        now_ns = command.arrived_ns
+        if not self.present(now_ns):
+            self.came_ns = now_ns
+        self.arrived_ns = now_ns - min(self._timeout_ns + 1, CANDIDATE_NS)
+        self.twist, self._present_ns = REST, now_ns
+        self.refuse(command, "stale")
 
     def refuse(self, command: Command, why: Verdict) -> None:
         """Record a command that was refused because of its stamp.
