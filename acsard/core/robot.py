@@ -235,7 +235,7 @@ class Robot:
         The decisions include the line for the board, the odometry and the events to log.
         """
         events = list(inputs.events)
-        self._life.begin(inputs.now, stalled=self._arbiter.stalled(inputs.now.mono_ns))
+        self._life.begin(inputs.now, stalled=self._arbiter.begin(inputs.now.mono_ns))
         if self._first_events:
             events += self._first_events
             self._first_events = []
@@ -245,7 +245,6 @@ class Robot:
         self._settle(inputs)
         estimates = self._fold(inputs, events)
         answers = self._serve(inputs, events)
-        self._arbiter.begin(inputs.now.mono_ns)
         if inputs.commands or inputs.refusals:
             self._accept_commands(inputs, events)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)

@@ -311,8 +311,8 @@ FAULTS = (
         "neutral stall",
         "a stall of the daemon counts as the pause after a zero",
         ARBITER,
-        "                    sender.resume(before_ns, now_ns)",
-        "                    pass",
+        "                sender.resume(before_ns, now_ns)",
+        "                pass",
     ),
     fault(
         "neutral place",

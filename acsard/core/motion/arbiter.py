@@ -242,26 +242,24 @@ class Arbiter:
             source.require_neutral()
         self._holder = self._followed = None
 
-    def stalled(self, now_ns: int) -> bool:
-        """Return whether the daemon stood still between the last step and `now_ns` (monotonic,
-        ns)."""
-        return now_ns - self._begun_ns > LATE_STEP_NS
-
-    def begin(self, now_ns: int) -> None:
+    def begin(self, now_ns: int) -> bool:
         """Begin a control step at the monotonic time `now_ns`, ns. Call this before `accept`.
 
-        If the previous step was more than `LATE_STEP_NS` ago, the daemon stood still (`stalled`),
-        and the bus may not have delivered the commands of that time yet. Therefore each sender
-        takes part in the choice for a short additional time. The time of the stall does not count
-        toward a running `commands.neutral_pause` (see `Sender.resume`).
+        If the previous step was more than `LATE_STEP_NS` ago, the daemon stood still, and the bus
+        may not have delivered the commands of that time yet. Therefore each sender takes part in
+        the choice for a short additional time. The time of the stall does not count toward a
+        running `commands.neutral_pause` (see `Sender.resume`). Return whether the daemon stood
+        still; the result is also True in the first step.
         """
-        stalled, before_ns, self._begun_ns = self.stalled(now_ns), self._begun_ns, now_ns
-        if stalled:
-            # Before the first step, no command can have waited.
-            self._watched_ns = now_ns if before_ns else now_ns - CATCH_UP_NS
-            for source in self._ranking:
-                for sender in source.senders.values():
-                    sender.resume(before_ns, now_ns)
+        before_ns, self._begun_ns = self._begun_ns, now_ns
+        if now_ns - before_ns <= LATE_STEP_NS:
+            return False
+        # The first step follows no stall, so no command has waited.
+        self._watched_ns = now_ns if before_ns else now_ns - CATCH_UP_NS
+        for source in self._ranking:
+            for sender in source.senders.values():
+                sender.resume(before_ns, now_ns)
+        return True
 
     def accept(self, command: Command) -> Objection:
         """Process a command. Return "" if it is accepted, otherwise the reason to refuse it."""
@@ -282,8 +280,8 @@ class Arbiter:
         sender = known or source.add(command.sender, command.arrived_ns)
         if sender is None:
             return "too_many_senders"
-        waited = command.stamp_ns is None and not is_zero(command)
-        if waited and command.arrived_ns - self._watched_ns < CATCH_UP_NS:
+        since_stall_ns = command.arrived_ns - self._watched_ns
+        if since_stall_ns < CATCH_UP_NS and command.stamp_ns is None and not is_zero(command):
             # The command may have waited during the whole stall, and only a stamp would show that.
             sender.outdate(command)
             return "stale"

@@ -6,8 +6,8 @@ that its sender has not seen, even if the network delivers the request late:
 
 - A request that names a number releases the latch with exactly this number.
 - A request without a number is refused if less than `LATCH_REQUIRED_S` has passed since the last
-  stop, the last fault, the last `clear` of a fault or the start of the daemon. For `activate`, the
-  time runs from the last `deactivate` or the start of the daemon.
+  stop, the last fault, the last `clear` of a fault, the start of the daemon or its last stall. For
+  `activate`, the time runs from the last `deactivate`, the start of the daemon or its last stall.
 - A request that arrived before the latch was set never releases it.
 
 A pressed emergency stop at the robot, a pressed bumper (with `safety.bumper = "stop"`) and an empty
@@ -31,10 +31,10 @@ from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError, mode_o
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
 LATCH_REQUIRED_S = 2.0
-"""Time after a change of the latches in which a `clear` or `activate` must contain the number of
-the latch, s. Such changes are a stop, a fault, the `clear` of a fault, a `deactivate` and the start
-of the daemon. In this time, a call that was sent before the change may still arrive: the network
-seldom delays a packet for longer."""
+"""Time in which a `clear` or `activate` must contain the number of the latch, s. The time begins
+with a stop, a fault, the `clear` of a fault, a `deactivate`, the start of the daemon and the end of
+a stall of the daemon. In this time, a call that was sent before that event may still arrive: the
+network seldom delays a packet for longer."""
 
 MAX_CLIENTS = 4
 """Largest number of clients among the earlier causes of a stop. If more clients stop the robot, the
@@ -91,9 +91,9 @@ class Lifecycle:
     def begin(self, now: Instant, *, stalled: bool = False) -> None:
         """Begin a step at the time `now`. `stalled` is true if the daemon stood still before it.
 
-        For `LATCH_REQUIRED_S` after the first step, and after each step with `stalled`, `clear` and
-        `activate` must name the number of the latch. A client may have sent a call before or during
-        the stall, when it could not see the present latch.
+        For `LATCH_REQUIRED_S` after the first step and after each stall, `clear` and `activate`
+        must name the number of the latch. A client may have sent its call before or during the
+        stall, when it could not see the present latch.
         """
         if stalled or self._began_ns is None:
             self._began_ns = now.mono_ns
