@@ -10,7 +10,10 @@ heading is corrected by the gyro's turn minus the wheels' turn up to then. A gyr
 opposite sign, degrees or zero is reported and not used (`gyro_trial.py`). If a gyro is silent, or
 if its rate does not match the wheels at all, the heading comes from the wheels.
 
-A sample that arrives late is included in the turn of the next line, so no turn is lost.
+A sample that arrives up to `SILENCE_TIMEOUT_NS` late is included in the turn of the next line, so
+no turn is lost. While the samples are later than that, the wheels provide the turn, and a backlog
+of samples changes nothing. Only stamps show how late samples are: without stamps, the daemon takes
+a backlog for the present motion. If samples are missing, the turn in between becomes uncertain.
 
 A sample whose rate jumps counts only if the next sample confirms the jump. A gyro that repeats one
 rate exactly while the wheels stand still is assumed to hang. The wheels' turn then replaces the
@@ -43,11 +46,25 @@ is assumed to continue turning at the rate of this sample."""
 
 MAX_EXTRA_DELAY_NS = NS_PER_S // 4
 """Difference of a sample's delay from the smallest delay of earlier samples, ns. If it is larger
-than this, the clock of the sender is assumed to have been set."""
+than this, the network held the sample back, or the clock of the sender was set."""
+
+STEADY_DELAY_NS, MAX_DELAY_FALL_NS = NS_PER_S, NS_PER_S // 50
+"""A delay above `MAX_EXTRA_DELAY_NS` shows that the clock of the sender was set if it is steady:
+samples arrive for `STEADY_DELAY_NS`, and the delay of none falls by more than `MAX_DELAY_FALL_NS`.
+While the network delivers a backlog, the delay falls."""
 
 MIN_SET_BACK_NS = NS_PER_S // 50
 """Largest step back of the stamps that is not taken for a clock that was set, ns. A small step may
 have another cause: a driver may swap two samples or measure their times with some jitter."""
+
+HOLE_PERIODS, PERIOD_GAIN = 1.5, 0.02
+"""Number of sample periods after which a sample is assumed to be missing, and weight of a new
+sample in the estimate of the period. About the last fifty samples count."""
+
+CATCH_UP_SPEED = 1.5
+"""Time between the samples that arrive with a feedback line, divided by the time of this line. From
+this value on, the network delivers a backlog of samples, which is at an end when the last sample is
+less than `HOLE_PERIODS` sample periods old."""
 
 DELAY_RANGE_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
 """Range of the gyro's delay relative to the wheels, ns. The delay is negative if the gyro reports a
@@ -147,6 +164,18 @@ class Gyro:
     The caller passes samples to `add_samples`, and calls `turn` for each feedback line.
     """
 
+    _late_since: tuple[int, float] | None = None
+    """Arrival of the first sample with the present delay above `MAX_EXTRA_DELAY_NS`, and its delay,
+    both in ns. It is None if the delay is smaller. The default on the class serves recordings of
+    versions without this attribute."""
+    _period_s = 0.0
+    """Mean time between two samples, s; 0 before the second sample."""
+    _guessed = 0.0
+    """The gyro's turn minus the wheels' turn in the lines since the last sample that was used, rad.
+    In these lines, the robot is assumed to continue turning at the rate of this sample."""
+    _slipped_before = False
+    """Whether gyro and wheels contradicted each other when this sample arrived."""
+
     def __init__(self) -> None:
         self._rest_s = self._since_rest_s = 0.0
         self._learned: Track | None = None
@@ -167,6 +196,7 @@ class Gyro:
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
         """Samples that `turn` has not used yet, each with its monotonic time, ns (`_time_of`)."""
         self._promptest = MinimumDelay()
+        self._late_since, self._period_s, self._guessed = None, 0.0, 0.0
         self._last: GyroSample | None = None
         self._delay_ns = 0
         self._told_ns: int | None = None
@@ -259,14 +289,21 @@ class Gyro:
         self.events, self.owes = [], False
         self._rest_s = self._rest_s + dt if still else 0.0
         resting = self._rest_s > REST_S
+        told_ns = self._told_ns
         self._take(at_ns, resting)
+        if self._told_ns != told_ns and not self._hole:
+            self._guessed, self._slipped_before = 0.0, self._slip_s > 0.0
         ahead = SILENCE_TIMEOUT_NS if self._told_ns is None else at_ns - self._told_ns
         age_ns = ahead - max(0, self._delay_ns)
         if self._heard and self._told_ns is not None:
             # A sample that waits for the confirmation of its jump is not used yet, but the gyro is
             # not silent.
             age_ns = min(age_ns, at_ns - self._heard[0][0] + min(0, self._delay_ns))
-        silent = age_ns >= SILENCE_TIMEOUT_NS
+        # Samples that catch up after a silence have the rates of an earlier motion.
+        passed_ns = 0 if told_ns is None or self._told_ns is None else self._told_ns - told_ns
+        catches_up = self._does == "silent" and passed_ns > CATCH_UP_SPEED * dt * NS_PER_S
+        limit_ns = HOLE_PERIODS * self._period_s * NS_PER_S if catches_up else SILENCE_TIMEOUT_NS
+        silent = age_ns >= min(limit_ns, SILENCE_TIMEOUT_NS)
         prediction = 0.0 if resting or silent else self._rate * max(0, ahead) / NS_PER_S
         angle, variance = self._angle + prediction - self._given, self._variance
         self._given, self._variance = self._angle + prediction, 0.0
@@ -305,7 +342,7 @@ class Gyro:
 
         This includes the uncertainty that the next turn would add to the heading.
         """
-        self._contradicted = self._doubt = 0.0
+        self._contradicted = self._doubt = self._guessed = 0.0
         self._forget_owed()
         self._forget_repeated()
 
@@ -346,15 +383,34 @@ class Gyro:
     # Samples.
 
     def _time_of(self, sample: GyroSample) -> int:
-        """Return the monotonic time at which `sample` would have arrived without jitter, ns."""
+        """Return the monotonic time at which `sample` would have arrived without jitter, ns.
+
+        The samples of a backlog get the times at which they were measured. The last of them is
+        still late, so the wheels provide the turn.
+        """
         last, self._last = self._last, sample
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
             return sample.at_ns
         late = self._promptest.add(sample.at_ns - last.at_ns, sample.stamp_ns - last.stamp_ns)
-        if late > MAX_EXTRA_DELAY_NS or last.stamp_ns - sample.stamp_ns > MIN_SET_BACK_NS:
-            self._promptest = MinimumDelay()
+        was_set = self._is_late_for_good(late, sample.at_ns, last.at_ns)
+        if was_set or last.stamp_ns - sample.stamp_ns > MIN_SET_BACK_NS:
+            self._promptest, self._late_since = MinimumDelay(), None
             return sample.at_ns
         return sample.at_ns - max(0, int(late))
+
+    def _is_late_for_good(self, late: float, at_ns: int, last_at_ns: int) -> bool:
+        """Return whether the extra delay `late`, ns, is large and steady: a clock was set.
+
+        `at_ns` and `last_at_ns` are the arrival times of this sample and of the one before it, ns.
+        """
+        if late <= MAX_EXTRA_DELAY_NS:
+            self._late_since = None
+            return False
+        since_ns, first = self._late_since or (at_ns, late)
+        if late < first - MAX_DELAY_FALL_NS or at_ns - last_at_ns >= SILENCE_TIMEOUT_NS:
+            since_ns, first = at_ns, late
+        self._late_since = since_ns, first
+        return at_ns - since_ns >= STEADY_DELAY_NS
 
     def _take(self, until_ns: int, resting: bool) -> None:
         """Process the samples until `until_ns`: learn the bias at rest, else add their turn."""
@@ -378,6 +434,7 @@ class Gyro:
             span = passed if span_ns < SILENCE_TIMEOUT_NS else 0.0
             self._repeated_s += span
             same = sample.rate == self._reading
+            step = 0.0 if self._reading is None else sample.rate - self._reading
             if not same:
                 self._end_repetition()
                 self._reading = sample.rate
@@ -397,6 +454,10 @@ class Gyro:
             self._angle += self._rate * span
             if not stands:
                 self._variance += self._noise * span * span
+                if span > HOLE_PERIODS * self._period_s > 0.0:
+                    # Samples are missing, so the rate may have changed at any time in this span.
+                    self._variance += step * step / 3.0 * span * span
+            self._period_s += PERIOD_GAIN * (span - self._period_s) if self._period_s else span
 
     @property
     def _hangs(self) -> bool:
@@ -481,6 +542,7 @@ class Gyro:
         self._repeated_gaps += 0.0 if dt > 0.0 else angle * angle
         self._repeated += off
         self._repeated_wheels += wheels
+        self._guessed += off
         self._contradicted = self._contradicted + off if self._slip_s > 0.0 else 0.0
 
     def _end_contradiction(self) -> None:
@@ -514,6 +576,14 @@ class Gyro:
                 self._end_contradiction()
             return None
         angle = 0.0
+        if lost:
+            # Samples are missing, so the wheels also give the turn since the sample before them,
+            # unless they slipped already then.
+            if self._slipped_before:
+                self._doubt += self._guessed * self._guessed
+            else:
+                angle, self._contradicted, self._slip_s = -self._guessed, 0.0, 0.0
+            self._guessed = 0.0
         if self._frozen:
             # The wheels give the turn since the gyro hangs, except in a gap of the feedback.
             angle, self._contradicted = -self._repeated, 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable
 
 import pytest
@@ -62,6 +63,9 @@ class Bench:
         self._way: list[GyroSample] = []
         self.held_back_ns = 0
         """Time before which no sample arrives; the waiting samples then arrive together."""
+        self.per_line: int | None = None
+        """Number of samples that the network delivers in each line, or None for all."""
+        self._backlog: list[GyroSample] = []
 
     def run(
         self,
@@ -86,6 +90,12 @@ class Bench:
                     for sample in samples
                 )
                 self._way = [sample for sample in self._way if sample.at_ns > self.now_ns]
+            if self.per_line is not None:
+                self._backlog += samples
+                samples = tuple(
+                    replace(sample, at_ns=self.now_ns) for sample in self._backlog[: self.per_line]
+                )
+                self._backlog = self._backlog[self.per_line :]
             self.gyro.add_samples(samples)
             wheels = now * (self.skid if skid is None else skid) * DT
             stands = now == 0.0 if still is None else still
@@ -315,6 +325,85 @@ def test_the_last_turn_rate_continues_for_a_moment_without_samples() -> None:
     bench.run(SILENCE_TIMEOUT_NS / NS_PER_S - DT, 0.5)
     assert bench.says() == "used"
     assert bench.told == pytest.approx(bench.true, abs=1e-6)
+
+
+@pytest.mark.parametrize("missing_ms", [100, 150, 190, 250])
+@pytest.mark.parametrize(("before", "after"), [(2.0, -2.0), (2.0, 0.0), (0.0, 2.0)])
+@pytest.mark.parametrize("stamped", [False, True])
+def test_the_variance_contains_the_turn_while_samples_are_missing(
+    missing_ms: int, before: float, after: float, stamped: bool
+) -> None:
+    bench = Bench(skid=1.0, noise=0.002, stamped=stamped)
+    bench.run(REST_FIRST)
+    bench.run(3.0, 1.0)
+    bench.run(1.0, before)
+    bench.told = bench.true = bench.variance = 0.0
+    bench.silent = True
+    seconds = missing_ms / 1000
+    bench.run(seconds, lambda t: before + (after - before) * t / seconds)
+    bench.silent = False
+    bench.run(1.0, after)
+    assert abs(bench.told - bench.true) < 0.02 + 2.0 * math.sqrt(bench.variance)
+
+
+def test_the_wheels_also_give_the_turn_since_the_last_sample_of_a_gyro_that_falls_silent() -> None:
+    bench = Bench(skid=1.0, noise=0.002)
+    bench.run(REST_FIRST)
+    bench.run(3.0, 1.0)
+    bench.told = bench.true = 0.0
+    bench.silent = True
+    bench.run(0.1, lambda t: 1.0 - 10.0 * t)
+    bench.run(0.4, still=False)
+    assert bench.says() == "silent"
+    assert bench.told == pytest.approx(bench.true, abs=0.02)
+
+
+@pytest.mark.parametrize("held_s", [0.4, 0.5, 1.0, 3.0])
+@pytest.mark.parametrize("per_line", [2, 3, 10])
+def test_a_backlog_of_samples_does_not_turn_a_robot_that_stands(
+    held_s: float, per_line: int
+) -> None:
+    bench = Bench(skid=1.0, noise=0.002, stamped=True)
+    bench.run(REST_FIRST)
+    bench.run(3.0, 1.0)
+    bench.told = bench.true = 0.0
+    bench.per_line = 0
+    bench.run(held_s - 0.3, 2.0)
+    bench.run(0.3, lambda t: 2.0 - t / 0.15)
+    bench.per_line = per_line
+    bench.run(1.0 + held_s / (per_line - 1))
+    assert bench.told == pytest.approx(bench.true, abs=0.03)
+    assert bench.says() == "used"
+    bench.run(2.0, 0.5)
+    assert bench.told == pytest.approx(bench.true, abs=0.03)
+
+
+@pytest.mark.parametrize("jitter_ms", [0, 60])
+def test_a_clock_that_was_set_back_in_a_silence_is_believed_after_a_second(jitter_ms: int) -> None:
+    bench = Bench(skid=1.0, stamped=True)
+    bench.run(REST_FIRST)
+    bench.run(3.0, 1.0)
+    bench.silent = True
+    bench.run(1.0, 1.0)
+    bench.silent = False
+    bench.clock_ns -= 900 * MS
+    chance = random.Random(1)
+    for _ in range(20):
+        bench.held_back_ns = bench.now_ns + chance.randrange(0, jitter_ms + 1) * MS
+        bench.run(0.1, 1.0)
+    assert bench.says() == "used"
+    assert bench.does[-2:] == ["silent", "used"]
+    assert bench.told == pytest.approx(bench.true, abs=0.03)
+
+
+def test_a_gyro_from_a_recording_of_an_older_version_continues() -> None:
+    bench = Bench(stamped=True)
+    bench.run(REST_FIRST)
+    bench.run(1.0, 0.5)
+    for name in ("_late_since", "_period_s", "_guessed"):
+        delattr(bench.gyro, name)
+    bench.run(1.0, 0.5)
+    assert bench.told == pytest.approx(bench.true)
 
 
 def test_wheels_that_slip_are_reported_and_the_gyro_is_believed() -> None:
