@@ -101,6 +101,14 @@ class Report:
         self._estimate: Estimate | None = None
         self._outputs: Outputs | None = None
         self._happened = RecentEvents()
+        self._summaries: dict[str, Callable[[Outputs, Snapshot], Message | None]] = {
+            "state": self._state,
+            "diagnostics": self._diagnostics,
+            "battery": self._battery,
+        }
+        """The methods that build a message from a `Snapshot`, by key. These messages are published
+        at their own rate, and immediately when the status changes (`Outputs.status_changed`). A
+        method returns None if there is no message now."""
         self.use(config)
 
     def use(self, config: Config) -> None:
@@ -131,9 +139,7 @@ class Report:
             self._estimate = outputs.estimates[-1]
         if (
             (outputs.estimates and wanted)
-            or "state" in wanted
-            or "diagnostics" in wanted
-            or "battery" in wanted
+            or not self._summaries.keys().isdisjoint(wanted)
             or (outputs.due and "cmd_vel_out" in wanted)
             or (outputs.events and "events" in wanted)
         ):
@@ -159,11 +165,7 @@ class Report:
             yield "cmd_vel_out", self._cmd_vel_out(outputs)
         if outputs.events and "events" in wanted and (events_message := self._happened.message()):
             yield "events", events_message
-        for key, build in (
-            ("state", self._state),
-            ("diagnostics", self._diagnostics),
-            ("battery", self._battery),
-        ):
+        for key, build in self._summaries.items():
             if key in wanted and self._rates[key].due(now_ns, outputs.status_changed):
                 message = build(outputs, get_snapshot())
                 if message is not None:
@@ -195,16 +197,11 @@ class Report:
                 )
             case "cmd_vel_out":
                 return self._cmd_vel_out(outputs) if outputs else None
-            case "state":
-                return self._state(outputs, get_snapshot()) if outputs else None
-            case "diagnostics":
-                return self._diagnostics(outputs, get_snapshot()) if outputs else None
-            case "battery":
-                return self._battery(outputs, get_snapshot()) if outputs else None
             case "events":
                 return self._happened.message()
             case _:
-                return None
+                build = self._summaries.get(key)
+                return build(outputs, get_snapshot()) if build and outputs else None
 
     def tf_static(self) -> TFMessage:
         """Return one message with all static transforms that the configuration switches on."""

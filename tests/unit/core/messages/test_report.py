@@ -69,6 +69,10 @@ ALL = {topic.key for topic in PUBLISHED if not (topic.simulated or topic.urdf)}
 
 The simulator publishes the true values of a simulated robot itself.
 """
+SUMMARIES = ALL - {
+    "odom", "tf", "tf_static", "robot_description", "wheel_states", "cmd_vel_out", "events",
+}  # fmt: skip
+"""Keys with their own rate, which are built from a `Snapshot`."""
 FRAMES = OdometryConfig(
     odom_frame="r7/odom",
     base_frame="r7/base",
@@ -428,8 +432,7 @@ def test_feedback_is_published_before_the_summary_is_built() -> None:
 
 
 def test_no_snapshot_is_taken_for_a_summary_without_subscribers() -> None:
-    wanted = ALL - {"state", "diagnostics", "battery"}
-    assert len(list(Report(CONFIG, START).due(OUTPUTS, wanted, never))) == 5
+    assert len(list(Report(CONFIG, START).due(OUTPUTS, ALL - SUMMARIES, never))) == 5
 
 
 def test_no_snapshot_is_taken_for_a_summary_that_is_not_due() -> None:
@@ -478,7 +481,7 @@ def test_every_sample_of_a_step_is_published_in_order() -> None:
 
 
 def test_a_step_without_feedback_publishes_no_odometry() -> None:
-    left = {"cmd_vel_out", "events", "state", "diagnostics", "battery"}
+    left = {"cmd_vel_out", "events"} | SUMMARIES
     assert set(published(replace(OUTPUTS, estimates=()))) == left
 
 
@@ -539,7 +542,7 @@ def test_state_has_10_hz_and_diagnostics_have_1_hz_by_default() -> None:
     assert abs(len(times_of("diagnostics", CONFIG)) - 10) <= 1
 
 
-@pytest.mark.parametrize("key", ["state", "diagnostics", "battery"])
+@pytest.mark.parametrize("key", sorted(SUMMARIES))
 def test_a_change_of_the_status_is_published_immediately(key: str) -> None:
     report = Report(CONFIG, START)
     list(report.due(at(later(0)), {key}, get_snapshot))
