@@ -324,9 +324,17 @@ def must_release_key(state: RobotState, source: str) -> bool:
     `NEVER_DRIVING_MODES`, or "waiting"), or if `source` must first send a zero. When the robot can
     drive again, an operator who still holds the key may not expect the robot to move.
     """
-    ours = next((entry for entry in state.sources if entry.name == source), None)
-    zero_first = ours is not None and ours.wait == "neutral"
-    return state.mode in NEVER_DRIVING_MODES or state.mode == "waiting" or zero_first
+    return not _can_drive(state) or only_needs_zero(state, source)
+
+
+def only_needs_zero(state: RobotState, source: str) -> bool:
+    """Return whether the robot can drive, and `source` can drive it after a zero."""
+    waits = any(entry.name == source and entry.wait == "neutral" for entry in state.sources)
+    return waits and _can_drive(state)
+
+
+def _can_drive(state: RobotState) -> bool:
+    return state.mode not in NEVER_DRIVING_MODES and state.mode != "waiting"
 
 
 def receives_commands(state: RobotState, source: str) -> bool:

@@ -15,7 +15,7 @@ import foxglove
 import zenoh
 
 from acsard.client import Client
-from acsard.client.commander import MAX_SOURCE_TIMEOUT_S
+from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, only_needs_zero
 from acsard.client.follower import Watch
 from acsard.core.ros.names import full_name
 from acsard.core.values import NS_PER_S, AcsardError
@@ -231,13 +231,14 @@ class Bridge:
         for client in driving.keys() - self._objections.keys():
             self._objections[client] = Objections()
         for client, objections in list(self._objections.items()):
-            robot, why = driving.get(client), ""
+            robot, why, zero_first = driving.get(client), "", False
             if robot is not None and self._watch is not None:
                 why = self._watch.objection(robot.source, robot.sender, now_ns / NS_PER_S)
+                state = self._watch.state
+                zero_first = state is not None and only_needs_zero(state, robot.source)
             if objections.update(why, now_ns):
                 status_id = f"drive {client}"
                 if objections.reported:
-                    zero_first = "must send a zero" in objections.reported
                     mend = f" ({RELEASE_ADVICE})" if zero_first else ""
                     words = f"your commands do not drive the robot: {objections.reported}{mend}"
                     self._notices.enqueue("warning", "drive", words, status_id=status_id)

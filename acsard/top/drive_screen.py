@@ -11,6 +11,7 @@ from textwrap import wrap
 from msgspec import Struct
 from rich.text import Text
 
+from acsard.client.commander import only_needs_zero
 from acsard.core.formatting import printable
 from acsard.core.messages.schema import RobotState
 from acsard.core.messages.short_texts import place, speeds
@@ -64,7 +65,7 @@ def lines(teleop: Teleop, width: int, height: int | None = None) -> list[Text]:
             first.stylize(MODE_STYLES.get(state.mode, "reverse"), 0, len(mode))
         rows += mode_lines
         if teleop.objection:
-            rows += _wrapped(refused(teleop.objection), width, "bold red")
+            rows += _wrapped(refused(teleop), width, "bold red")
         rows += flow(measured(state), width)
     rows.append(Text(f"keys ask for {selected_speeds(teleop)}"))
     below = [Text(line, "dim") for line in HELP]
@@ -87,7 +88,7 @@ def report_lines(teleop: Teleop, width: int) -> list[str]:
     if teleop.state is None or teleop.silent:
         return _wrap_parts([silence(teleop), *parts], width)
     if teleop.objection:
-        parts.insert(0, refused(teleop.objection))
+        parts.insert(0, refused(teleop))
     why = f"{printable(teleop.state.mode)}: {reason(teleop.state)}"
     return _wrap_parts([why, *parts], width, measured(teleop.state))
 
@@ -134,14 +135,15 @@ def reason(state: RobotState) -> str:
     return printable(state.reason.removeprefix(f"{state.mode}: "))
 
 
-def refused(objection: str) -> str:
+def refused(teleop: Teleop) -> str:
     """Return a sentence which says that the keys do not drive the robot, and why.
 
-    `objection` is the reason. If the robot requires a zero command first, the sentence also says
-    which key sends a zero command.
+    If the robot requires a zero command first, the sentence also says which key sends a zero
+    command.
     """
-    mend = " (press space, then press the key again)" if "must send a zero" in objection else ""
-    return f"your keys do not drive the robot: {printable(objection)}{mend}"
+    zero_first = teleop.state is not None and only_needs_zero(teleop.state, teleop.source)
+    mend = " (press space, then press the key again)" if zero_first else ""
+    return f"your keys do not drive the robot: {printable(teleop.objection)}{mend}"
 
 
 def selected_speeds(teleop: Teleop) -> str:
