@@ -76,8 +76,8 @@ old."""
 S_PER_DAY = 86400
 
 BEING_RECORDED_S = 10.0
-"""Time after the last write to a `.part` file, s. When it has passed, the file no longer counts as
-being recorded. A daemon writes once a second."""
+"""If no daemon has written to a `.part` file for this time, s, the file no longer counts as being
+recorded. A daemon writes once a second."""
 
 NAME_TIME_FORMAT = "%Y%m%dT%H%M%SZ"
 """Format of the time in a file's name: the time at which the file began, in UTC."""
@@ -152,20 +152,19 @@ def _marked(part: Path) -> tuple[Kind, str] | None:
 
 
 class Run(Struct):
-    """Facts about the recordings of one run of the daemon, which outlast a disk error.
+    """State that all `RecordingDirectory` objects of one run of the daemon share.
 
-    After a disk error, the daemon makes a new `RecordingDirectory`. All `RecordingDirectory`
-    objects of one run of the daemon share the same `Run`.
+    After a disk error, the daemon makes a new `RecordingDirectory` with the same `Run`.
     """
 
     numbers: set[int] = field(default_factory=set)
     """Numbers of the files that ended in this run. The number of a file is in its name."""
     cut: dict[str, Kind] = field(default_factory=dict)
-    """Maps the name of each file that a disk error cut off in this run to its retention class. Any
-    other `.part` file without a marker file was cut off by a crash before this run."""
+    """Retention class of each file that a disk error cut off in this run, by file name. Any other
+    `.part` file without a marker file was cut off by a crash before this run."""
     freed: int = 0
-    """Total size of the recordings that were deleted since the disk first refused to write, bytes.
-    It restarts from 0 after each successful write."""
+    """Total size of the recordings that were deleted because the disk was full, bytes. It counts
+    the deletions since the last successful write."""
     clock: ClockWatch = field(default_factory=ClockWatch)
 
 
@@ -186,8 +185,8 @@ class RecordingDirectory:
 
         Args:
             settings: the configuration of the recordings.
-            run: the state that the previous `RecordingDirectory` of this run of the daemon left
-                after a disk error; None for the first `RecordingDirectory`.
+            run: the `Run` of the `RecordingDirectory` before the last disk error; None for the
+                first `RecordingDirectory` in a run of the daemon.
             refused: true if the last write failed because the disk was full.
         """
         self._directory = Path(settings.directory)

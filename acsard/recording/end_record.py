@@ -29,8 +29,8 @@ TAIL_BYTES = 1 << 16
 record typically begins 1960 bytes before the end of the file."""
 
 _NAMED = struct.pack("<I", len(END_RECORD_NAME)) + END_RECORD_NAME.encode()
-"""First bytes after the header of the end record in a file: the length of the record's name, and
-the name."""
+"""Bytes that follow the MCAP header of the end record: the length of the record's name, and the
+name."""
 
 _FOOTER = RECORD_HEAD.pack(Opcode.FOOTER, 20)
 """Header of the MCAP footer record, whose content has 20 bytes."""

@@ -212,8 +212,8 @@ class ExportResult(Struct, frozen=True):
     count: int
     """Number of exported messages, or number of exported rows of a CSV table."""
     gaps: list[Gap]
-    """Gaps of the recording that overlap the exported part. The export contains no outputs of the
-    steps in these gaps."""
+    """Parts of the recording that cannot be replayed and that overlap the exported part. The export
+    does not contain the outputs of their steps."""
 
 
 class _Writer:
@@ -281,7 +281,7 @@ class _MessageWriter(_Writer):
             number = self._channels.get((message.channel.name, message.source))
             if number is None:
                 number = self._open(message.channel, message.source)
-            # MCAP has no times before 1970.
+            # MCAP cannot store times before 1970.
             wall_ns = max(0, message.wall_ns)
             self._counts[number] += 1
             with self._run.state_errors():
@@ -431,9 +431,9 @@ def _gaps(run: RecordedRun, span: Span, about: About) -> list[Gap]:
 def calibration_csv(recording: Recording) -> bytes:
     """Return the measured data of a recording as the CSV table that `acsard calibrate` reads.
 
-    The table begins with the first step that can be replayed, and ends at the next gap of the
-    recording. Raises `RecordingError` if the table has no gyro samples, or if the recording cannot
-    be replayed.
+    The table begins with the first step that can be replayed, and ends before the next step that is
+    missing or cannot be replayed. Raises `RecordingError` if the table has no gyro samples, or if
+    the recording cannot be replayed.
     """
     run = RecordedRun(recording)
     lines, has_gyro = [MEASURED_CSV_HEADER], False

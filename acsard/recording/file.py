@@ -244,7 +244,7 @@ class RecordingWriter:
         self._index = Index()
         self._chunk: GrowingChunk | None = None
         self._chunk_at: int | None = None
-        """Offset in the file at which the header of the growing chunk begins, bytes. None if this
+        """Offset in the file of the header of the chunk that is being written, bytes. None if this
         header is not written yet."""
         self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb")
         try:
@@ -562,7 +562,7 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
 def is_part(part: Recording, recording: Recording) -> bool:
     """Return whether `recording` has the metadata and all the messages of `part`.
 
-    No data is lost if `recording` then replaces `part`.
+    If it has, the file of `recording` can replace the file of `part` without loss of data.
     """
     if part.about != recording.about:
         return False

@@ -138,8 +138,8 @@ def _items(
 # A genuine file stays below this limit. Without the limit, the replay of a forged file of 5 kB took
 # 4 s.
 STATE_BYTES_PER_FILE_BYTE = 8
-"""Factor in the limit on the total size of the robot states that are decoded after gaps. The limit
-is this factor times the size of the file, plus `MAX_BYTES`."""
+"""Limit on the size of the robot states that a replay decodes after gaps, in bytes for each byte of
+the file. A replay may decode `MAX_BYTES` in addition."""
 
 
 class _Source:
@@ -189,8 +189,8 @@ class _Source:
         """Return the robot's state before step `number`, decoded from `saved`.
 
         Return None if `saved` is None, if it is the state before another step, or if it cannot be
-        used. If the replay uses another configuration, `tried` is the function that returns this
-        configuration for the recorded one.
+        used. `tried` takes the configuration in `saved`, and returns the configuration of the
+        replay. If `tried` is None, the replay uses the configuration in `saved`.
         """
         if saved is None or saved.number != number:
             return None
@@ -242,7 +242,7 @@ class RecordedRun(_Source):
         self.number: int | None = None
         """Number of the last step that `steps()` yielded; None before the first step."""
         self.on_skipped: Callable[[RecordedStep], None] = lambda step: None
-        """Function that is called with each step that can be read, but not replayed."""
+        """Function that `steps()` calls with each step that can be read, but not replayed."""
         self._next, self._state = _first_state(recording)
         """`_next` is the number of the step that `robot` can replay next. `_state` is the recorded
         state from which `robot` was rebuilt, or None for a new robot."""

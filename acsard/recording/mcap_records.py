@@ -48,7 +48,8 @@ MAX_CHUNK_BYTES = 1 << 23
 message."""
 
 MAX_MESSAGE_BYTES = 1 << 22
-"""Largest message that is read, bytes. One second of steps and 20 commands take 16 000 bytes."""
+"""Largest size of a message that is read, bytes. A message with one second of steps and 20 commands
+has 16 000 bytes."""
 
 _HEAD = struct.Struct("<BQQQQII4sQ")
 """Layout of the header of an MCAP chunk record.
@@ -280,9 +281,9 @@ def _messages(data: bytearray) -> tuple[list[Message], int, int]:
     """Decode the complete messages at the beginning of `data`.
 
     Returns:
-        A triple: the messages, their total size in `data`, and the size of the next message, both
-        in bytes. While the header of the next message is incomplete, the last number is the size
-        of a header. If the next message is damaged, it is greater than `MAX_MESSAGE_BYTES`.
+        A triple: the messages, their total size in bytes, and the size of the next message in
+        bytes. The third value is the size of a header if the header of the next message is
+        incomplete, and greater than `MAX_MESSAGE_BYTES` if the next message is damaged.
     """
     messages: list[Message] = []
     at = 0
@@ -312,8 +313,8 @@ MAGIC = b"\x89MCAP0\r\n"
 # In the test recordings, each byte of a chunk unpacks to 5 to 13 bytes. The limit is larger,
 # because a damaged chunk is read up to three times, and a damaged block counts as 128 KiB.
 MAX_EFFORT = 256
-"""Limit on the work for damaged chunks, in unpacked bytes for each byte of the file. In addition,
-every file may cost `MAX_CHUNK_BYTES`."""
+"""Limit on the work for damaged chunks, in unpacked bytes for each byte of the file. The reader may
+unpack `MAX_CHUNK_BYTES` in addition."""
 
 RECORD_HEAD = struct.Struct("<BQ")
 """Layout of the header of an MCAP record: opcode, and number of bytes that follow the header."""
@@ -445,7 +446,7 @@ class _Chunks:
         self._searched = 0
         """Offset up to which the file was searched for complete chunks, bytes."""
         self._last_complete: int | None = None
-        """Offset of the complete chunk that was found last, bytes, or None."""
+        """Offset of the complete chunk that the last search found, bytes, or None."""
 
     @property
     def spent(self) -> bool:

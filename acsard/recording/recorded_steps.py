@@ -152,7 +152,7 @@ class UnfinishedError(AcsardError):
 class Unfinished(Struct, frozen=True):
     """Inputs of the control step in which the daemon failed.
 
-    There are no outputs, because the daemon did not finish this step.
+    The outputs are missing, because the daemon did not finish this step.
     """
 
     number: int

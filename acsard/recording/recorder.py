@@ -26,7 +26,7 @@ MAX_QUEUED_STEPS = 4096
 """Largest number of queued steps. At 400 steps a second, the queue is full after 10 s."""
 
 SLOW_SYNC_NS = 3 * NS_PER_S
-"""Duration of a sync of the file to the disk, ns, above which the log reports that the disk
+"""If a sync of the file to the disk takes longer than this time, ns, the log reports that the disk
 hangs."""
 
 SLOW_DISK = "the disk has accepted no data for 3 s"
@@ -79,9 +79,9 @@ class Recorder:
         self._full = False
         """True after the queue was full, until half of the queue is free again."""
         self._sync_ns = 0
-        """Duration of the present sync up to the last step, ns."""
+        """Time that the present sync had taken at the last call of `step`, ns; 0 without a sync."""
         self._slow = False
-        """True after the log has reported a slow disk, until it reports a fast disk again."""
+        """True from the event that reports a slow disk to the event that reports a fast disk."""
         self._lost_before = 0
         """Value of `_lost` when `_slow` became true."""
         self._failed_inputs: Inputs | None = None

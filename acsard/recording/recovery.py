@@ -25,9 +25,9 @@ from acsard.recording.mcap_records import LAST_BLOCK, MAGIC, chunk_places, encod
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 MAX_DELETED_BYTES = 64 << 10
-"""Largest size of a file without any data that recovery deletes, bytes.
+"""Recovery deletes a file without readable data only if the file has at most this size, bytes.
 
-A larger file contains more than a header and one second of steps. Recovery never deletes it.
+A larger file contains more than a header and one second of steps.
 """
 
 
@@ -181,7 +181,8 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
                 index.message(message.channel, message.wall_ns)
             if chunk.complete and not before.startswith(head := chunk.head(before), chunk.begin):
                 heads.append((chunk.begin, head))
-    # The file had a chunk when it was read. If it has none now, another process has changed it.
+    # The file had a chunk when it was read. If the chunk is missing now, another process has
+    # changed the file.
     if chunk is None:
         raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
     before_end = b""
@@ -193,7 +194,7 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
 
 
 def _write_at(stream: FileIO, at: int, data: bytes) -> None:
-    """Write `data` at the offset `at`, and sync it. An `OSError` may leave a part of it written."""
+    """Write `data` at the offset `at`, and sync the file. An `OSError` may leave a part written."""
     stream.seek(at)
     while data:
         data = data[stream.write(data) :]

@@ -115,8 +115,8 @@ class Comparison(Struct):
     """Pair: the highest wheel speed in the recorded lines, and the highest wheel speed in the
     replayed lines, both in 0.01 rad/s."""
     end: tuple[Micropose, Micropose] | None = None
-    """Pair: the last recorded pose, and the replayed pose after that step. None before the first
-    pose."""
+    """Pair: the last recorded pose, and the pose of the replayed robot after the step with this
+    recorded pose. None before the first recorded pose."""
 
     @property
     def same(self) -> bool:

@@ -31,16 +31,16 @@ Kind = Literal["plain", "near", "kept"]
 """
 
 INCIDENT_MARGIN_NS = 60 * NS_PER_S
-"""Time before and after an incident, ns. Recordings that ended or began in this time are
-protected."""
+"""A recording is protected if it ended less than this time before an incident, or began less than
+this time after the incident, ns."""
 
 MAX_KEPT_FILES = 50
 """Largest number of `kept` recordings that are protected. If there are more, only the newest
 recordings are protected."""
 
 FILES_PER_LIMIT = 100
-"""Divisor that gives the size limit of one file from the limit on the total size. With this number,
-50 protected files take about half of the total size."""
+"""The size limit of one file is the space for all recordings, divided by this number. 50 protected
+files then take about half of that space."""
 
 MIN_FILE_BYTES = 100_000
 """Size to which a recording file may always grow, even if the disk is nearly full, bytes."""

@@ -25,14 +25,14 @@ TIME_TOLERANCE_S = 60.0
 """Tolerance of a search, s.
 
 - A file is read if the times in its end record are at most this far from the searched range. The
-  end record contains the time of the first step in the last message. If the disk is slow, this
-  message may contain many seconds of steps.
+  tolerance is needed because the end record has the time of the first step in the last message. If
+  the disk is slow, this message may contain many seconds of steps.
 - In a series, the first step of a file comes less than this time after the last step of the
   previous file.
 """
 
 MIN_GAP_S = 2.0
-"""Duration of a time without a recording, s, above which this time counts as a gap."""
+"""A time without a recording counts as a gap if it is longer than this, s."""
 
 
 class Series(Recording):

@@ -46,7 +46,7 @@ CHECKPOINT_NS = 18 * NS_PER_S + NS_PER_S // 2
 state in a file, at which a replay can begin."""
 
 MAX_FILE_NS = 3600 * NS_PER_S
-"""Duration of a file, ns, after which the recording goes on in a new file."""
+"""When a file covers this time, ns, the recording goes on in a new file."""
 
 INCIDENTS = frozenset({
     "fault", "stop", "emergency_stop", "bumper_pressed", "battery_stop", "link_down", "link_stale",
@@ -111,7 +111,7 @@ class StepWriter:
         self._number = self._began_ns = self._state_ns = 0
         self._last = Instant(0, 0)
         self._reported = False
-        """True once this object has reported an event that says that the daemon records."""
+        """True once this object has reported that the daemon records."""
         self._refused = False
         """True if the last write failed because the disk was full."""
         self._looked_back = False

@@ -69,8 +69,8 @@ When = Offset | TimeOfDay | Moment
 TIME_EXAMPLES = (
     '14:05, 14:05:30, today, "yesterday 14:05", "2026-11-21 14:05", 2026-11-21 or "2 h ago"'
 )
-"""Examples of times, for messages to the user. A number of seconds after the beginning of a
-recording is not included."""
+"""Examples of the times that a user may type, without the form "seconds after the beginning of a
+recording". Messages to the user contain this text."""
 
 ALL_EXAMPLES = f"{TIME_EXAMPLES}; for one recording also a number of seconds after its beginning"
 

@@ -38,15 +38,15 @@ sources that alternate in every step would fill the timeline.
 """
 
 MAX_POSE_WAIT_NS = NS_PER_S
-"""Longest delay of the timeline entry `continues`, ns. The entry is delayed until the first pose,
-because it contains this pose. Without a link to the board there is no pose."""
+"""Longest time for which the timeline entry `continues` waits for the first pose, ns. The entry
+contains this pose. Without a link to the board, poses do not arrive."""
 
 MIN_CLOCK_CHANGE_NS = 5 * NS_PER_S
 """Smallest change of the wall clock that gives a timeline entry `clock`, ns. The change is measured
 against the monotonic clock."""
 
 MIN_WAIT_NS = NS_PER_S
-"""Time for which a sender must send speeds without effect to get a timeline entry `waits`, ns.
+"""If a sender sends speeds without effect for this time, ns, it gets a timeline entry `waits`.
 
 While an operator changes from one sender to another, both senders may send, but for less than this
 time.
@@ -60,8 +60,9 @@ MAX_IDENTITY_BYTES = 256
 reference firmware has 150 bytes."""
 
 MAX_WAITING = 16
-"""Largest number of senders that are watched at a time because they send speeds that the robot does
-not follow. A hostile client may use many names."""
+"""Largest number of waiting senders that are tracked at a time. A waiting sender sends speeds while
+the robot follows another sender. The number is limited, because a hostile client may use many
+names."""
 
 NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
 """Pattern for a number in a reason, but not for a digit in a name. Reasons that differ only in
@@ -135,15 +136,15 @@ class LinkLosses:
 
 
 class ReasonChanges:
-    """Makes an entry `reason` when the reason of the robot's mode changes without the mode."""
+    """Makes an entry `reason` when the reason of the robot's mode changes, but not the mode."""
 
     def __init__(self) -> None:
         self._mode = self._reason = ""
         """The last mode and reason that the timeline shows. A `#` replaces each number in the
         reason."""
         self._reported_ns = -MIN_REASON_NS
-        """Monotonic time of the last entry `reason`, ns. An event that reports the mode `waiting`
-        counts like an entry."""
+        """Monotonic time of the last entry `reason`, or of the last event that reports the mode
+        `waiting` if this event is later, ns."""
         self._sender = ("", "")
         """Pair: the source that the robot followed last, and the sender of that source's last
         command."""
@@ -318,8 +319,8 @@ class TimelineWriter:
     def __init__(self, config: Config | None = None) -> None:
         """Prepare for the first step.
 
-        `config` is the configuration of the recorded robot. Without it, the timeline has no `waits`
-        entries.
+        `config` is the configuration of the recorded robot. If it is None, the timeline does not
+        contain `waits` entries.
         """
         sources = config.commands.sources if config is not None else ()
         self._number: int | None = None
