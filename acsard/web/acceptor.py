@@ -45,9 +45,9 @@ HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
 run at the same time (`HANDSHAKES_AT_ONCE`)."""
 
 MIN_ABORT_AGE_S = 0.3
-"""Minimum age, s, of a running TLS handshake that may be aborted to make room for a waiting one.
-This happens only while `HANDSHAKES_AT_ONCE` handshakes run. Without this rule, clients that stop
-sending during their handshakes would delay the handshake of a phone by up to `HANDSHAKE_S`."""
+"""While `HANDSHAKES_AT_ONCE` TLS handshakes run and another one waits, the server may abort a
+running handshake that is at least this old, s. Otherwise, clients that stop sending during their
+handshakes would delay the handshake of a phone by up to `HANDSHAKE_S`."""
 
 REQUEST_TIMEOUT_S = 10.0
 """Time limit, s, from accepting a connection to the end of the headers of its first request."""
@@ -61,8 +61,8 @@ READ_BYTES = 16384
 asyncio's default is 256 KiB."""
 
 NO_FILES_PAUSE_S = 0.05
-"""Time, s, for which the server accepts no connections after the process has run out of file
-descriptors."""
+"""When the process runs out of file descriptors, the server accepts no connections for this time,
+s."""
 
 Factory = Callable[[], "Reader"]
 
@@ -137,9 +137,9 @@ class Acceptor:
     def tidy(self, valid: Collection[str]) -> None:
         """Close the connections whose token is not valid any more.
 
-        Call this method once a second. It closes a connection if `valid` lacks its token in two
-        calls in a row. In the second between them, the server can tell a WebSocket client why its
-        connection ends.
+        Call this method once a second. A connection is closed if two successive calls find that its
+        token is not in `valid`. Between these calls, the server has time to tell a WebSocket client
+        why the connection ends.
 
         Args:
             valid: the digests of all valid tokens.
@@ -245,9 +245,9 @@ class Acceptor:
     def _has_room(self, now: float) -> bool:
         """Return whether a TLS handshake may start now. `now` is in s on the event loop's clock.
 
-        If `HANDSHAKES_AT_ONCE` handshakes are running, first abort the oldest handshake of the
-        network that has the most. If this handshake is younger than `MIN_ABORT_AGE_S`, do not abort
-        it, and return False.
+        If `HANDSHAKES_AT_ONCE` handshakes are running, first abort one of them: the oldest
+        handshake of the network with the most running handshakes. If this handshake is younger than
+        `MIN_ABORT_AGE_S`, do not abort it, and return False.
         """
         if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True
@@ -284,8 +284,8 @@ class _Connection(asyncio.Protocol):
         self._task: asyncio.Task[None] | None = None
         self._transport: asyncio.BaseTransport | None = None
         self._head = 0
-        """Number of bytes received so far of the request head that is arriving (request line and
-        headers)."""
+        """Number of bytes of the present request's head (request line and headers) that have
+        arrived so far."""
         self._body: StreamReader | None = None
         self._inner: Reader | None = None
 

@@ -36,7 +36,8 @@ STATUS_CODES: dict[Reason, int] = {
     "path": 404,
     "malformed": 400,
 }
-"""Maps the reason of a refusal to the HTTP status of the answer: 403 for any other reason."""
+"""HTTP status of the answer to a refused request, by the reason of the refusal. The status is 403
+for any other reason."""
 
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -210,10 +211,11 @@ INLINED = {
         "style.css": (b'<link rel="stylesheet" href="page/style.css">', "style"),
     }
 }
-"""Page files that contain the text of other files when they are sent, by name.
+"""Maps the name of a page file to the files whose text the server inserts into it.
 
-The value maps the name of each included file to a pair: the HTML element that loads the included
-file, and the name of the HTML element that replaces it and contains the text of the included file.
+The inner dict maps the name of each inserted file to a pair: the HTML element that loads the file,
+and the tag of the HTML element with the text of the file. The server replaces the first element
+with the second.
 """
 
 

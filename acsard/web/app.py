@@ -115,11 +115,12 @@ class Page:
         self._websocket_limits, self._camera = WebSocketLimits(), Camera(rules.camera)
         self._has_camera = bool(rules.camera)
         self._sent: dict[str, tuple[File, float]] = {}
-        """Maps the name of each page file to a pair: the file, and the time of the last check
-        whether the file has changed on the disk, s on the event loop's clock."""
+        """Maps the name of each page file to a pair: the file, and the time of the server's last
+        check whether the file has changed on the disk, s on the event loop's clock."""
         self._viewers: set[Viewer] = set()
         self._token_read: asyncio.Future[frozenset[str]] | None = None
-        """The newest read of the digests of all valid tokens. It has no time limit."""
+        """Task that last read, or still reads, the digests of all valid tokens from the disk. Its
+        duration is not limited."""
         self._admission = Admission(parts.robots.id, names, vault, acceptor, parts.counts, rules)
         self.app = self._admission.application(ROUTES, self)
 

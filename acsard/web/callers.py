@@ -64,7 +64,7 @@ class AdmittedClient(Struct, frozen=True):
 
     @property
     def origin(self) -> str:
-        """Address and name of the client for the log."""
+        """The client's address, followed by the name if the client has a token, for the log."""
         return f"{self.address} ({self.name})" if self.token else self.address
 
     def may(self, least: Role) -> bool:
@@ -173,7 +173,8 @@ def _own_origin(facts: RequestFacts) -> str:
 def tokens_offered(protocols: str) -> list[str]:
     """Return the tokens in `protocols`, the value of the header `Sec-WebSocket-Protocol`.
 
-    A script in a browser can set no other header when it opens a WebSocket.
+    A script in a browser sends its token in this header, because it cannot set any other header
+    when it opens a WebSocket.
     """
     offered = (name.strip() for name in protocols.split(","))
     return [name.removeprefix(TOKEN) for name in offered if name.startswith(TOKEN)][:MAX_TOKENS]

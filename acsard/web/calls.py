@@ -2,7 +2,8 @@
 
 Each call blocks a thread of its own. Calls of the service `stop` ("stops") have their own limits,
 so a stop never waits for other calls. If clients request several stops in quick succession, the
-server may send one stop for all of them, after the last request has arrived.
+server sends the first stop immediately. Later requests may share one stop, which the server sends
+after the last of these requests has arrived.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ from acsard.web.limits import REMOTE_STOP_RATE
 from acsard.web.robots import Robots
 
 MAX_CALLS, MAX_STOPS = 16, 32
-"""`MAX_CALLS` is the maximum number of simultaneous service calls and queries, without stops.
+"""`MAX_CALLS` is the maximum number of simultaneous queries and service calls; stops do not count.
 `MAX_STOPS` is the maximum number of simultaneous stops of the page's own robot."""
 
 MAX_REMOTE_STOPS = 8
-"""Maximum number of stops of other robots for whose replies the server waits at the same time.
-Beyond this number, the server sends a stop without waiting for the reply."""
+"""The server waits for the replies to at most this many stops of other robots at the same time. It
+sends any further stop without waiting for the reply."""
 
 MIN_STOP_INTERVAL_S = 0.02
 """Shortest interval between two stops that the server sends to one robot for one client, s."""
@@ -96,8 +97,8 @@ class Calls:
                 for another robot.
 
         Raises:
-            RefusedError: the client may not make this call, or sends too many stops to robots that
-                may not exist.
+            RequestRefusedError: the client may not make this call, or sends too many stops to
+                robots that may not exist.
         """
         require(identity, verb)
         other = "" if robot == self._robots.id else robot
@@ -145,7 +146,7 @@ class Calls:
     async def get(self, robot: str, name: str) -> tuple[str, bytes]:
         """Query the last value of a robot's key as JSON, and return the pair (encoding, payload).
 
-        `robot` is the robot's id, and `name` is the key without this id. Raises `MendableError` if
+        `robot` is the robot's id, and `name` is the key without the id. Raises `MendableError` if
         there is no connection to the bus, if no answer arrives, or if `MAX_CALLS` calls and queries
         are running already. Raises `TimeoutError` if the bus is stuck for `ANSWER_TIMEOUT_S`.
         """
@@ -205,8 +206,8 @@ class Calls:
 class StopMerger:
     """Merges the stops that one client requests for one robot in quick succession.
 
-    At most one stop per `MIN_STOP_INTERVAL_S` is sent for each client and robot. No stop is lost:
-    all stops that the client requests within that time after a sent stop share the next stop.
+    The server sends the first stop immediately. All stops that the client requests within
+    `MIN_STOP_INTERVAL_S` after a sent stop share the next stop. So none of them is lost.
     """
 
     def __init__(self) -> None:

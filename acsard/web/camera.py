@@ -24,8 +24,8 @@ from acsard.host.rate_limits import Places
 from acsard.web.answers import TroubleError
 
 PICTURE_TIMEOUT_S = 1.0
-"""Time limit, s, of two waits: for a new picture from the camera, and for the permission to send
-the picture (see `SENDS`)."""
+"""Time limit, s, for each of two waits: until the camera sends a new picture, and until the limit
+`SENDS` lets the server send the picture to the client."""
 
 CONNECT_S, SILENT_S = 3.0, 3.0
 """Time limits, s: for connecting to the camera's server (`CONNECT_S`), and for each wait for data

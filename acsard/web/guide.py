@@ -33,14 +33,14 @@ from acsard.web.socket_messages import Begin, Ended, FrameError, Guided, Press, 
 SLOW_PORTS = "listing the serial ports took too long: try again"
 
 MAX_ERROR_BYTES = 4000
-"""Largest number of bytes from the end of the child's standard error that the error text shows."""
+"""The error text shows at most this many bytes from the end of the child's standard error."""
 
 CONTINUATION_BYTES = bytes(range(0x80, 0xC0))
 """All byte values that may follow the first byte of a UTF-8 character."""
 
 END_TIMEOUT_S = 6.0
-"""Time, s, after which an interrupted child process is killed if it has not exited. Until then it
-can send zero speeds."""
+"""An interrupted child process is killed if it has not exited after this time, s. Until then the
+child can send zero speeds."""
 
 NO_DEVICE = (
     "The page's server sees no serial port. Is the board plugged in? If the server runs as a "
@@ -60,7 +60,7 @@ Say = Callable[[Guided], None]
 class Reach(Struct, frozen=True):
     """The options with which a child process connects to the daemon of this server's robot.
 
-    If a value is empty, the child gets no such option.
+    If a value is empty, the server leaves out the option with this value.
     """
 
     config: str
@@ -319,7 +319,7 @@ class _Job:
         self.left = False
         self._process: Process | None = None
         self._question = 0
-        """Number of the question for whose answer the child waits; 0 if it does not wait."""
+        """Number of the child's unanswered question; 0 if every question is answered."""
         self._leg = self._drive_running = False
         # The browser sends signs of life at about half this rate (page/guide.js), so none is lost.
         self._relayed = Bucket(Rate(20.0))
@@ -365,7 +365,7 @@ class _Job:
             self._write({"key": True})
 
     def relay(self) -> None:
-        """Send the child a sign of life: the user's browser can still interrupt the child."""
+        """Tell the child that the user's browser can still interrupt it (a sign of life)."""
         if self._relayed.take(clock.mono_ns()):
             self._write({})
 

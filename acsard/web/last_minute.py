@@ -22,8 +22,7 @@ STEP_NS = NS_PER_S // 5
 pixel wide."""
 
 MAX_EARLY_NS = STEP_NS // 4
-"""Longest time, ns, by which a state may arrive too early for the next row and still become that
-row."""
+"""A state becomes the next row even if it arrives up to this time before the row is due, ns."""
 
 MAX_ROWS = MINUTE_NS // (STEP_NS - MAX_EARLY_NS)
 """Maximum number of rows in a minute."""
@@ -53,11 +52,11 @@ class Plotted(Struct, frozen=True):
     angular: Column
     """Measured turn rate, rad/s, positive to the left."""
     wished_linear: Column
-    """Commanded forward speed after the limits, m/s; None unless a viewer was subscribed to
-    `cmd_vel_out` at this server."""
+    """Commanded forward speed after the limits, m/s. The server knows it only while a viewer is
+    subscribed to `cmd_vel_out`; otherwise the value is None."""
     wished_angular: Column
-    """Commanded turn rate after the limits, rad/s; None unless a viewer was subscribed to
-    `cmd_vel_out` at this server."""
+    """Commanded turn rate after the limits, rad/s. The server knows it only while a viewer is
+    subscribed to `cmd_vel_out`; otherwise the value is None."""
     wheels: Sequence[Column]
     """Measured wheel speeds in rad/s: front right, front left, rear left, rear right."""
     late_p99: Column

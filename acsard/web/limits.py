@@ -18,10 +18,9 @@ itself (`MAX_LOCAL_TCP_CONNECTIONS`). A browser opens six connections in additio
 WebSocket."""
 
 MAX_TCP_OF_NETWORK, MAX_TCP_OF_TOKEN = 64, 64
-"""Maximum number of TCP connections from one network that have shown no valid token
-(`MAX_TCP_OF_NETWORK`), and maximum number that have shown the same valid token
-(`MAX_TCP_OF_TOKEN`). Any further connection with this token counts as a connection without a valid
-token."""
+"""`MAX_TCP_OF_NETWORK` is the maximum number of TCP connections without a valid token from one
+network. `MAX_TCP_OF_TOKEN` is the maximum number of TCP connections with the same valid token. Any
+further connection with this token counts as a connection without a valid token."""
 
 RESERVED_TCP_OF_TOKEN = 7
 """Number of TCP connections that each token keeps even if the limit on all connections is reached.
@@ -41,7 +40,7 @@ the client's next request waits, and the client's WebSocket gets no new values. 
 for TLS is 512 KiB."""
 
 MAX_OVERRUNS = 600
-"""Number of messages beyond the rate limit `MESSAGE_RATE` after which a WebSocket is closed."""
+"""The server closes a WebSocket after this number of messages beyond the limit `MESSAGE_RATE`."""
 
 MAX_WEBSOCKETS, MAX_WEBSOCKETS_OF_NETWORK, MAX_WEBSOCKETS_OF_TOKEN = 100, 20, 30
 """Maximum numbers of WebSockets from other machines: in total, per network, and per token."""
@@ -92,9 +91,9 @@ from this server. Before this limit existed, 24 WebSockets with 180 commands a s
 daemon drop half of the commands of a client that was driving."""
 
 REMOTE_STOP_RATE = Rate(4.0, 16.0)
-"""Limit on the stops that a client with one token may send to robots that may not exist, as a rate
-per second and a largest burst. A robot certainly exists if this server has found it on the bus, or
-has received its answer to a stop."""
+"""Limit on stops of robots that may not exist, per token, as a rate per second and a largest burst.
+A robot certainly exists if this server has found it on the bus, or has received its answer to a
+stop."""
 
 GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
 """Limits on wrong tokens, from one network and in total, as rates per second and largest bursts."""

@@ -133,10 +133,10 @@ def open_sockets(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen
 
 
 def _ipv4_ports(listen: Sequence[Listen]) -> set[int]:
-    """Return the ports at which a socket at `::` must not accept IPv4 connections.
+    """Return the ports of the addresses in `listen` whose host is an IPv4 address or a name.
 
-    Another socket accepts the IPv4 connections there. These are the ports of the addresses in
-    `listen` whose host is an IPv4 address or a name.
+    At these ports, a socket at `::` must not accept IPv4 connections, because another socket
+    accepts them.
     """
     return {address.port for address in listen if ":" not in address.host}
 
@@ -162,8 +162,8 @@ def _open_socket(addr: Listen, next_port: bool, both: bool) -> tuple[Listen, soc
         opened.setblocking(False)
         return Listen(addr.secure, addr.host, port), opened
     assert trouble is not None
-    # The text of `create_server` repeats the address as a Python tuple. Errors of names have
-    # negative numbers.
+    # The text of `create_server` repeats the address as a Python tuple. Errors of the name
+    # resolution have negative numbers.
     number = trouble.errno or 0
     why = os.strerror(number) if number > 0 else trouble.strerror
     raise InUseError(

@@ -47,7 +47,7 @@ GUIDE_MESSAGES = (
 """Types of the field `guide` of a WebSocket message, which reports on a check or calibration."""
 
 KEYS = {topic.key: topic.type for topic in FOLLOWED}
-"""Maps each key to which a client can subscribe to the name of its message type."""
+"""Name of the message type of each key to which clients can subscribe, by key."""
 
 
 def _ref(name: str) -> Described:
@@ -200,8 +200,8 @@ def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
 
     The schemas also describe the types that are nested in these types.
     """
-    # Pass all types to msgspec in one call: it then gives different names to two types that have
-    # the same name.
+    # Pass all types to msgspec in one call. Only then does msgspec give different schema names to
+    # two types with equal names.
     unique = list(dict.fromkeys(kinds))
     refs, parts = msgspec.json.schema_components(
         unique,

@@ -45,8 +45,8 @@ headers in a request (`FIELDS`). A browser sends the cookies for all ports of a 
 so a lower limit on the size could lock out a browser."""
 
 SHUTDOWN_S = 0.3
-"""Longest time, s, for which the server at its shutdown sends zero velocities for viewers that
-drive a robot. aiohttp also waits at most this long for running requests."""
+"""At its shutdown, the server sends zero velocities for viewers that drive a robot. This may take at
+most this time, s. aiohttp also waits at most this long for running requests."""
 
 
 class ServerOptions(Struct, frozen=True):
@@ -56,7 +56,7 @@ class ServerOptions(Struct, frozen=True):
     address: Address
     listen: tuple[Listen, ...]
     tls: str
-    """Directory of the robot's certificate, for HTTPS; "" if the robot has no certificate."""
+    """Directory of the robot's certificate, for HTTPS; "" without a certificate."""
     state: Path
     """Directory that contains the file with the access tokens."""
     file: str = ""

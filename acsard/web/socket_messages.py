@@ -1,8 +1,8 @@
 """The messages of `/ws`, in both directions. This module is pure.
 
-Each message is one JSON object. A message from a client is called a frame. Exactly one of the
-fields in `MESSAGE_TYPES` (`subscribe`, `cmd`, `call`, ...) must be in a frame, and gives its kind.
-A frame with none or several of these fields, or with an unknown field, is refused as a whole.
+Each message is one JSON object. A message from a client is called a frame. A frame must contain
+exactly one of the fields in `MESSAGE_TYPES` (`subscribe`, `cmd`, `call`, ...), which gives its
+kind. The server refuses a frame with none or several of these fields, or with an unknown field.
 
 The first field of a message to a client gives its kind. The messages with the values of subscribed
 keys are built in `socket_sender.py`, because these values are JSON already.
@@ -29,9 +29,9 @@ MAX_RATE, USUAL_RATE = 50.0, 10.0
 the default (`USUAL_RATE`)."""
 
 MAX_STAMP_MS = MAX_INT64 // 1_000_000 - 86_400_000.0
-"""Limit below which the stamp of a command must be, ms since 1970: one day before the largest stamp
-that the daemon accepts. When a client disconnects, the server sends a zero velocity whose stamp is
-later than that of the client's last command, and the daemon must accept this stamp too."""
+"""Every stamp of a command must be below this limit, ms since 1970. The limit is one day before the
+largest stamp that the daemon accepts. This margin is needed because, when a client disconnects, the
+server sends a zero velocity with a later stamp than the client's last command."""
 
 DEFAULT_SOURCE = "app"
 """Command source of a command that names no source. The page in the browser names `teleop`."""

@@ -65,8 +65,8 @@ MAX_OPEN_CALLS = 8
 
 FLEET, FLEET_S, FLEET_FIRST_S = "fleet", 1.0, 0.2
 """`FLEET` is the name to which a client subscribes for the list of all robots. The server sends the
-list every `FLEET_S` s, and for the first time after `FLEET_FIRST_S` s. Without this delay, the
-first list would be empty."""
+list every `FLEET_S` s, and for the first time `FLEET_FIRST_S` s after the subscription. Without
+this delay, the first list would be empty."""
 
 
 class ViewerCommands:
@@ -82,7 +82,7 @@ class ViewerCommands:
         self._rates = Buckets(COMMAND_RATE)
         self.outbox = Outbox(partial(counts.add, "commands_dropped"))
         """Queue of commands, with the thread that sends them. If an error ends the thread, the
-        server must exit. Otherwise it could not stop the robot when a viewer disconnects."""
+        server must exit, because it could not stop the robot when a viewer disconnects."""
 
     def give(
         self, owner: str, source: str, commander: Commander, sender: CommandSigner, wish: Wish
@@ -90,7 +90,7 @@ class ViewerCommands:
         """Queue a command and return True. It replaces an unsent command of the same commander.
 
         If the owner exceeds the rate limit `COMMAND_RATE`, queue nothing and return False. However,
-        a zero after a nonzero command is always queued.
+        a zero command after a nonzero command is always queued.
 
         Args:
             owner: the client's token, or the public name of a viewer on the robot itself.
