@@ -48,7 +48,7 @@ CUT_TEXTS = {
     "late": "cut: the daemon was asked to end, and the disk was too slow to write the last steps",
     "open": "cut off, or still being recorded, when `acsard recording recover` read it",
 }
-"""Maps each cause that cuts off a recording to its description. After the cause `bug`, the failing
+"""Description of each cause that cuts off a recording, by cause. After the cause `bug`, the failing
 daemon still finishes its file. After any other cause, the file has no end record until it is
 recovered."""
 

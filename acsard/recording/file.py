@@ -12,8 +12,8 @@ A file has four channels:
 - `unfinished`: the inputs of the step in which the daemon failed.
 
 A metadata record names the robot and the version of acsard, and an attachment contains the
-`acsard.toml`. No step can be replayed without this record and this attachment, so a finished file
-has a copy of each at its beginning and another copy before its end.
+`acsard.toml`. No step can be replayed without them, so a finished file has a copy of both at its
+beginning and another copy before its end.
 
 A file that was cut off has no end record, but all data that was synced to the disk can still be
 read. `rewrite` copies the messages of such a file to a new, finished file.
@@ -105,7 +105,7 @@ CHANNEL_DESCRIPTIONS: dict[Topic, str] = {
     "unfinished": "the inputs of the step in which the daemon failed, in MessagePack: a map of "
     f"{', '.join(Unfinished.__struct_fields__)}",
 }
-"""Maps each channel to the text in the file that describes the messages of this channel."""
+"""Text in the file that describes the messages of a channel, by channel."""
 
 UNFINISHED = "the file has no end: it was cut off, or is still being recorded"
 """Text of `Recording.ending` for a file without an end record."""

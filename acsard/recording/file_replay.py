@@ -138,8 +138,8 @@ def _items(
 # A genuine file stays below this limit. Without the limit, the replay of a forged file of 5 kB took
 # 4 s.
 STATE_BYTES_PER_FILE_BYTE = 8
-"""Limit on the size of the robot states that a replay decodes after gaps, in bytes for each byte of
-the file. A replay may decode `MAX_BYTES` in addition."""
+"""Limit on the total size of the robot states that a replay decodes after gaps, in bytes for each
+byte of the file. A replay may decode `MAX_BYTES` in addition."""
 
 
 class _Source:

@@ -32,7 +32,6 @@ from zstandard import COMPRESSOBJ_FLUSH_BLOCK, ZstdCompressionParameters
 # At this level, ten seconds of steps are compressed in 2 to 8 ms. The result is 13 to 16 % smaller
 # than at level 3.
 ZSTD_LEVEL = 9
-"""Compression level of zstd."""
 
 ZSTD_PARAMETERS = ZstdCompressionParameters.from_level(
     ZSTD_LEVEL, source_size=1 << 18, write_content_size=False
@@ -282,8 +281,8 @@ def _messages(data: bytearray) -> tuple[list[Message], int, int]:
 
     Returns:
         A triple: the messages, their total size in bytes, and the size of the next message in
-        bytes. The third value is the size of a header if the header of the next message is
-        incomplete, and greater than `MAX_MESSAGE_BYTES` if the next message is damaged.
+        bytes. If the header of the next message is incomplete, the third value is the size of a
+        header. If the next message is damaged, the third value exceeds `MAX_MESSAGE_BYTES`.
     """
     messages: list[Message] = []
     at = 0
@@ -326,8 +325,8 @@ READ_RECORDS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.HEADER: Header.read,
     Opcode.METADATA: Metadata.read,
 }
-"""Maps the opcodes of the MCAP records that are read to their decoders. Chunks have a decoder of
-their own, `read_chunk`."""
+"""Decoder of each kind of MCAP record that the reader decodes, by opcode. Chunks are an exception:
+the function `read_chunk` decodes them."""
 
 SKIPPED_RECORDS = frozenset(Opcode) - READ_RECORDS.keys() - {Opcode.CHUNK}
 """Opcodes of the MCAP records that the reader skips."""

@@ -105,7 +105,7 @@ class Comparison(Struct):
     first: Difference | None = None
     """First step in which any output differs, or None."""
     first_by_output: dict[Output, Difference] = {}
-    """Maps the name of each output that differs to the first step in which the output differs."""
+    """First step in which an output differs, by the name of the output."""
     fault: Difference | None = None
     """First step in which the replayed robot is in the mode `fault` and the recorded robot is not,
     or None."""

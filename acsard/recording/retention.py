@@ -7,8 +7,8 @@ than `MAX_KEPT_FILES` recordings contain an incident, only the newest of them st
 - An unprotected recording is deleted when it is too old.
 - Recordings leave some free space to other programs (`Disk.spare`). If less space is free,
   unprotected recordings are deleted, the oldest first, but not the newest recording.
-- If less than a fifth of that space is free, or if the recordings exceed the limit on their total
-  size, protected recordings and the newest recording are deleted too.
+- Protected recordings and the newest recording are deleted too if less than a fifth of `Disk.spare`
+  is free, or if the recordings exceed the limit on their total size.
 """
 
 from __future__ import annotations
@@ -87,7 +87,6 @@ class FinishedFile(NamedTuple):
     """A recording file that is finished."""
 
     name: str
-    """Name of the file."""
     number: int
     """Number at the beginning of the file's name. Newer files have larger numbers."""
     kind: Kind

@@ -51,7 +51,7 @@ MAX_ERROR_LENGTH = 200
 DISPATCH_TABLE = copyreg.dispatch_table | {
     Mode: lambda mode: (Mode, (mode.value,)),
 }
-"""Dispatch table with which pickle encodes a mode as a call of `Mode` with the mode's value."""
+"""Dispatch table for pickle. It encodes a mode as a call of `Mode` with the mode's value."""
 
 
 class StateError(AcsardError):

@@ -35,15 +35,15 @@ RETRY_ROUNDS = 5
 about one call each second."""
 
 MAX_BATCH_STEPS = 256
-"""Largest number of steps in one message of the channel `steps`. Usually all steps of a second fit
-in one message, unless many commands arrive."""
+"""Largest number of steps in one message of the channel `steps`. If few commands arrive, all steps
+of a second fit in one message."""
 
 # After damage to a chunk, a replay lacks at most 20 s. The control loop needs 0.6 ms for a
 # checkpoint, after it has written its line. A checkpoint has 6 kB while the robot stands still, and
 # 13 kB while it drives.
 CHECKPOINT_NS = 18 * NS_PER_S + NS_PER_S // 2
-"""Time from one checkpoint to the request for the next checkpoint, ns. A checkpoint is the robot's
-state in a file, at which a replay can begin."""
+"""Time from one checkpoint to the request for the next checkpoint, ns. A checkpoint is a state of
+the robot in a file. A replay can begin there."""
 
 MAX_FILE_NS = 3600 * NS_PER_S
 """When a file covers this time, ns, the recording goes on in a new file."""

@@ -472,8 +472,8 @@ INCIDENT_WORDS = {
     "wheel_fault": "wheel fault",
     "link_up": "",
 }
-"""Maps the name of each event in a summary to the word for this event in the summary, singular. The
-event `link_up` has no word: it is not counted, but shows where a loss of the link ends."""
+"""Word for an event in a summary, singular, by the name of the event. The event `link_up` has no
+word: a summary does not count it, but it shows where a loss of the link ends."""
 
 
 SERIOUS_SUMMARY = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|battery stop|stop|fault)s?\b")

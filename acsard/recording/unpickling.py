@@ -12,9 +12,9 @@ it makes the part:
                              hides an attribute of the class
 
 A list of allowed classes in `Unpickler.find_class` is not enough. When only the classes of
-`state.py` were allowed, forged bytes still took more than 3 s of processor time (nested tuples as
-keys, keys with equal hashes, copies of one dict), allocated more than 2 GB, or changed the class of
-the robot for the whole process.
+`state.py` were allowed, forged bytes still did harm. They took more than 3 s of processor time
+(nested tuples as keys, keys with equal hashes, copies of one dict), allocated more than 2 GB, or
+changed the class of the robot for the whole process.
 
 Once the bytes refer to an earlier part, that part cannot grow any more. Therefore no part contains
 itself, and the computed depth and size of every part are exact.
@@ -83,14 +83,13 @@ ARGUMENTS = {
 """Opcodes that push their argument onto the stack."""
 
 VALUES = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
-"""Maps each opcode that pushes a constant onto the stack to this constant."""
+"""Constant that an opcode pushes onto the stack, by opcode."""
 
 CONTAINERS: dict[str, type] = {"EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_SET": set}
-"""Maps each opcode that pushes an empty container onto the stack to the type of the container."""
+"""Type of the empty container that an opcode pushes onto the stack, by opcode."""
 
 TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
-"""Maps each opcode that makes a tuple of the top values of the stack to the number of these
-values."""
+"""Number of values from the top of the stack that an opcode joins to a tuple, by opcode."""
 
 KEY_TYPES = (str, int, float, bool, bytes, type(None))
 """Allowed types of dict keys and set elements. Members of an Enum are allowed too, and also short

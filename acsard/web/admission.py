@@ -48,8 +48,8 @@ HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?
 the content security policy of an answer."""
 
 STATUS_REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
-"""Maps the HTTP status of an error that aiohttp raises to the reason under which the server counts
-the error. An error with any other status counts as `malformed`."""
+"""Reason under which the server counts an error that aiohttp raises, by HTTP status of the error.
+An error with any other status counts as `malformed`."""
 
 STATUS_TEXTS = {
     404: "this address does not exist; GET /api lists all addresses",

@@ -189,8 +189,8 @@ class Page:
     async def token(self, request: web.Request) -> web.StreamResponse:
         """Check the token in the request's body, and return it in a cookie that no script can read.
 
-        Raises `TroubleError` if the browser already has a cookie with more permissions, unless the
-        field `replace` of the body is true.
+        Raises `TroubleError` if the browser already has a cookie with more permissions and the
+        field `replace` of the body is false.
         """
         form = await _token_posted(request)
         if not request.secure:

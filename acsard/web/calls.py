@@ -279,7 +279,7 @@ class Stops:
 
 
 def require(caller: AdmittedClient, verb: str) -> None:
-    """Raise `RequestRefusedError` unless `verb` exists and the client may call it."""
+    """Raise `RequestRefusedError` if the service does not exist, or the client may not call it."""
     if verb not in SERVICES:
         raise RequestRefusedError(
             "malformed", f"{verb!r} is not a service; choose one of {', '.join(SERVICES)}"

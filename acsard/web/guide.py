@@ -277,8 +277,7 @@ def arguments(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
 
     A text from the browser becomes only the value of an option, so a browser cannot add options.
     `reach` contains the options that connect a calibration to the daemon. `ports` are the ports
-    that a check may use. Raises `FrameError` if a value in `begin` is not in the set of permitted
-    values, or is not a plain Zenoh key.
+    that a check may use. Raises `FrameError` if a value in `begin` is not permitted.
     """
     config = [f"--config={reach.config}"] if reach.config else []
     if begin.begin == "check":

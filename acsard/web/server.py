@@ -45,8 +45,8 @@ headers in a request (`FIELDS`). A browser sends the cookies for all ports of a 
 so a lower limit on the size could lock out a browser."""
 
 SHUTDOWN_S = 0.3
-"""At its shutdown, the server sends zero velocities for viewers that drive a robot. This may take at
-most this time, s. aiohttp also waits at most this long for running requests."""
+"""Time limit for two tasks at the server's shutdown, s: sending zero velocities for viewers that
+drive a robot, and waiting for running requests."""
 
 
 class ServerOptions(Struct, frozen=True):

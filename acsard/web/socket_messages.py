@@ -160,8 +160,7 @@ Frame = Subscribe | Unsubscribe | Command | Call | Ping | Begin | Reply | Press
 MESSAGE_TYPES: dict[str, type[Frame]] = {
     kind.__struct_fields__[0]: kind for kind in get_args(Frame)
 }
-"""Maps each kind of message from a client to the type of the message. The kind is the name of the
-first field."""
+"""Type of a message from a client, by kind. The kind is the name of the first field."""
 
 _heads = msgspec.json.Decoder(dict[str, msgspec.Raw])
 _decoders: dict[str, msgspec.json.Decoder[Frame]] = {
@@ -221,8 +220,8 @@ class Greeting(Struct, frozen=True):
     state_rate: float
     """Rate of the key `state`, Hz."""
     barred: Mapping[str, str]
-    """Maps each action that the client's role does not allow to the reason in words. An action is
-    the name of a service, "drive", "recordings" or "begin" (a check or calibration)."""
+    """The actions that the client's role does not allow, each with the reason in words. An action
+    is the name of a service, "drive", "recordings" or "begin" (a check or calibration)."""
     camera: bool
     """True if a camera is configured. The path `/api/camera` then returns its pictures."""
 

@@ -28,8 +28,8 @@ from acsard.web.socket_messages import Refused, Subscribe, Unsubscribe
 from acsard.web.streams import NOT_READY_ERRORS, VIEWER_KEYS, Stream
 
 REPORT_RATE = Rate(1.0)
-"""Limit on the rate at which one client gets reports about its refused messages. The limit applies
-to each kind of message and each reason separately."""
+"""Limit on the rate (per second) at which one client gets reports about its refused messages. The
+limit applies to each kind of message and each reason separately."""
 
 
 class Following:

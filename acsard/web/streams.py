@@ -32,7 +32,6 @@ VIEWER_KEYS = frozenset(topic.key for topic in FOLLOWED)
 DECLARE_TIMEOUT_S = 3.0
 
 STATE_KEY = "state"
-"""Key of a robot's state."""
 
 STORED_KEYS = (STATE_KEY, "odom")
 """Keys that the server queries only for the page's own robot. For another robot, a router's storage

@@ -164,8 +164,8 @@ class Vault:
     def _changing(self) -> Iterator[list[Token]]:
         """Lock the token file, and yield the list of all robots' tokens.
 
-        The `with` block may change the list. At its end, write the list to the file, unless the
-        block has raised an exception.
+        The `with` block may change the list. If the block ends without an exception, write the list
+        to the file.
         """
         directory = self.path.parent
         try:

@@ -82,7 +82,7 @@ class ViewerCommands:
         self._rates = Buckets(COMMAND_RATE)
         self.outbox = Outbox(partial(counts.add, "commands_dropped"))
         """Queue of commands, with the thread that sends them. If an error ends the thread, the
-        server must exit, because it could not stop the robot when a viewer disconnects."""
+        server must exit, because it cannot stop the robot any more when a viewer disconnects."""
 
     def give(
         self, owner: str, source: str, commander: Commander, sender: CommandSigner, wish: Wish
