@@ -87,8 +87,8 @@ MIN_WAIT_S = 0.001
 """Shortest remaining time in which `Board.drive` sends one more line, s."""
 
 BEAT_NS = int(motion.LINE_PERIOD_S * NS_PER_S)
-"""Longest uninterrupted wait of `Board.listen`, ns. After each such wait, `listen` measures by how
-much this computer runs the check too late."""
+"""Longest wait of `Board.listen` without a break, ns. After each such wait, `listen` measures how
+late this computer runs the check."""
 
 FINAL_ZEROS = 5
 """Number of times that the check sends zero speeds at its end."""
@@ -97,7 +97,7 @@ FINAL_ZEROS = 5
 RESULT_FIELDS = ("comma", "latched", "sealed", "sampled", "own_clock", "gap_s", "paced", "lost")
 """Names of the attributes of `Board` that are restored before a step is repeated.
 
-They contain results of earlier steps, which later steps use.
+These attributes contain results of earlier steps, which later steps use.
 """
 
 
@@ -127,7 +127,8 @@ class Board:
         self.comma = mcu.trailing_comma
         """Whether the lines to the board end with a comma."""
         self.latched = False
-        """Whether motor d stops only at lines with the ending that `comma` selects."""
+        """Whether motor d stops only if the line of zeros has the right ending: a comma if `comma`
+        is true, else no comma."""
         self.sealed = self.sampled = False
         """`sealed`: whether each line has a checksum. `sampled`: whether each line to the board
         requests a sample, that is the board's clock and encoder counts."""
@@ -135,7 +136,7 @@ class Board:
         self.own_clock = False
         """Whether the board sends its replies by its own clock, and not as answers to lines."""
         self.gap_s = mcu.reply_period
-        """Mean time between two replies while lines are sent, s."""
+        """Mean time from one reply to the next while lines are sent, s."""
         self.paced = False
         """Whether the reply rate has been measured, so that `own_clock` and `gap_s` are known."""
         self.lost = 0.0
@@ -163,8 +164,8 @@ class Board:
 
         self._commanded = ZERO
         self._unanswered_s = 0.0
-        """Time for which `drive` has sent lines since the last reply, s. A delay of this computer
-        adds at most the time between two lines."""
+        """Time for which `drive` has sent lines since the last reply, s. If this computer is late,
+        only one line period of its delay counts, because the board is not silent then."""
         self._listened_s = 0.0
         self._sequence = 0
         self._lines = LineReader()
@@ -446,9 +447,9 @@ class Board:
     def silent_s(self) -> float:
         """Time since the board's last reply, s.
 
-        It is 0 before the first reply. It is also 0 after a motor has run away (`runaway_seen`):
-        the check sends lines to a silent board until it answers, but after a runaway it must send
-        nothing.
+        It is 0 before the first reply. It is also 0 after a motor has run away (`runaway_seen`).
+        Otherwise the check would send lines until the board answers, but after a runaway the check
+        must send nothing.
         """
         return self.now_s - self.replies[-1].at_s if self.replies and not self.runaway_seen else 0.0
 
@@ -481,9 +482,9 @@ class Board:
 
         Raises `StoppedError` if a motor keeps turning, or if the board falls silent.
 
-        Some firmware stops motor d only at lines with one of the two endings: a comma or none. So
-        if a motor does not stop in time, also send zeros with the other ending. If motor d alone
-        kept its speed before, and stops now, all later lines have this ending (`comma`).
+        Some firmware stops motor d only if the line has the right ending: a comma or none. So if a
+        motor does not stop in time, also send zeros with the other ending. If motor d alone had
+        kept its speed, and stops now, use the other ending for all later lines (`comma`).
         """
         began_s = self.now_s
         if self.settles(self.comma):

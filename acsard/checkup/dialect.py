@@ -208,9 +208,9 @@ def rate(board: Board) -> Finding:
 def trip(board: Board) -> Finding:
     """Measure the time from the sending of a line to the arrival of the board's reply.
 
-    A free-running board does not reply to single lines, so its finding says that the step was
-    skipped. If an earlier step could not measure the rate of the replies, the finding says that the
-    step was not judged.
+    A free-running board does not reply to single lines, so for such a board the finding says that
+    the step was skipped. If an earlier step could not measure the rate of the replies, the finding
+    says that the step was not judged.
     """
     if not board.paced:
         return lateness.finding("round trip", board.lateness.since(0.0))

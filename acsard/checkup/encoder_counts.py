@@ -13,32 +13,33 @@ from acsard.checkup.motion import SHORT_MEASUREMENT_S, BoardReply, steps
 from acsard.core.link.codec import LETTERS
 
 MAX_COUNT_DIFFERENCE = 0.02
-"""Largest tolerated difference between the measured counts per turn and the expected number.
+"""Largest tolerated relative difference between the measured and the expected counts per turn.
 
-It is relative to the expected number, which the configuration or the firmware states.
+The configuration or the firmware states the expected number.
 """
 
 MIN_COUNT_RATIO = 0.75
-"""Smallest tolerated ratio of the smallest to the largest counts per turn of the motors.
+"""Smallest tolerated ratio of the smallest to the largest counts per turn of the encoders.
 
 The limit is low, because a coarse encoder allows only a rough measurement.
 """
 
 COARSE_ANGLE = 0.015
-"""Mean variation of the angle by which a wheel turns between two replies, rad.
+"""Limit from which on encoders count as coarse, rad.
 
-From this value on, the encoders are considered coarse. The daemon must know the counts per turn of
-a coarse encoder.
+The limit applies to the mean variation of the angle by which a wheel turns from one reply to the
+next. The daemon must know the counts per turn of a coarse encoder.
 """
 
 MAX_REPLY_GAP_S = 0.05
-"""Longest time between two replies at which jumps of the speed reveal a coarse encoder, s.
+"""Longest time from one reply to the next in a search for coarse encoders, s.
 
-With a longer time, an accelerating motor causes similar jumps.
+A coarse encoder makes the reported speed jump. If replies are rarer, the acceleration of a motor
+causes similar jumps.
 """
 
 MIN_READINGS = 20
-"""Smallest number of reported speeds other than 0 from which a coarse encoder is recognized."""
+"""Smallest number of nonzero reported speeds that can show a coarse encoder."""
 
 MAX_COUNTS = 100_000
 """Largest value that `mcu.encoder_counts` accepts."""

@@ -23,7 +23,7 @@ MAX_LATENESS_S = motion.LINE_PERIOD_S
 lines of the check. For a finding with the verdict PASS, the limit is `MAX_PAUSE_S`."""
 
 MAX_PAUSE_S = motion.MIN_WATCHDOG_S
-"""Shortest delay that can make even a finding with the verdict PASS doubtful, s.
+"""Shortest delay of this computer that can make even a finding with the verdict PASS doubtful, s.
 
 During such a delay the board's watchdog may have stopped the motors.
 """
@@ -47,9 +47,9 @@ class HostDelays:
             self._delays.append((now_s, late_s))
 
     def since(self, began_s: float) -> float:
-        """Return the longest delay, s, of those that ended at or after the time `began_s`.
+        """Return the longest delay that ended at or after the monotonic time `began_s`, s.
 
-        `began_s` is a monotonic time, s. Return 0 if no delay is recorded from then on.
+        Return 0 if no such delay is recorded.
         """
         return max((late_s for at_s, late_s in self._delays if at_s >= began_s), default=0.0)
 
@@ -57,9 +57,9 @@ class HostDelays:
 def is_doubtful(result: TimingFinding, late_s: float) -> bool:
     """Return whether the finding may be wrong because this computer ran the check too late.
 
-    `late_s` is the longest delay of this computer during the step, s. The result is True if the
-    delay reaches both half of `result.margin_s` and a minimum. The minimum is `MAX_PAUSE_S` for a
-    finding with the verdict PASS, else `MAX_LATENESS_S`.
+    `late_s` is the longest delay of this computer during the step, s. The finding is doubtful if
+    this delay reaches half of `result.margin_s`, the time by which the measurement exceeds its
+    limit. The delay must also reach `MAX_PAUSE_S` for the verdict PASS, else `MAX_LATENESS_S`.
     """
     # Half of the margin is enough, because this computer may have been late by the same time at the
     # start and at the end of the measurement.

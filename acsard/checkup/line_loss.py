@@ -159,10 +159,10 @@ had no reply, or until `MAX_PULSES_S` s have passed.
 """
 
 SPREAD, STRIDE = 12, 5
-"""Numbers from which the pauses between pulses are computed, in periods of the check's lines.
+"""Numbers that make the pauses between pulses unequal (pulses are single lines with speeds).
 
-The pause after pulse n is the shortest pause plus (n * `STRIDE`) % `SPREAD` periods. If all pauses
-were equal, a link that loses every n-th line might never lose a pulse.
+The pause after pulse n is the shortest pause plus (n * `STRIDE`) % `SPREAD` line periods. If all
+pauses were equal, a link that loses, for example, every tenth line might never lose a pulse.
 """
 
 OBEYED_FRACTION = 0.5

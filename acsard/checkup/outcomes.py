@@ -371,8 +371,8 @@ FAIL serial line: lost | lost
 class TimingFinding(Finding, frozen=True):
     """A finding that may be wrong if this computer ran the check too late.
 
-    `margin_s` is the time by which the measurement exceeds its limit, s. A delay that is shorter
-    than half of this time cannot have caused the finding.
+    `margin_s` is the time by which the measurement exceeds its limit, s. If this computer was late
+    by less than half of this time, its delay cannot have caused the finding.
     """
 
     margin_s: float = 0.0

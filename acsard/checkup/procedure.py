@@ -50,8 +50,8 @@ STEPS = (
     "damaged lines", "inputs",
 )  # fmt: skip
 """Names of all steps. After an early end of the check, the finding `SKIPPED_STEPS` lists the steps
-without a result. If some motors have a result, the finding lists each motor without one instead of
-"motors"."""
+without a result. If only some motors have a result, the finding names the other motors instead of
+the step "motors"."""
 
 SILENT_STEPS: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("listening for 3 s at the configured baud rate, then at other baud rates", dialect.baud),
@@ -73,7 +73,7 @@ Tell = Callable[[Finding], None]
 Step = Callable[[], Finding | None]
 
 LATE_AGAIN, LATE_MOST = 2, 8
-"""Largest numbers of repetitions because this computer ran the check too late.
+"""Limits for the repetition of steps that this computer ran too late.
 
 A step is repeated up to `LATE_AGAIN` times. All steps together are repeated up to `LATE_MOST`
 times, because a check could otherwise take four minutes.

@@ -28,10 +28,9 @@ If an identification arrives later, the board sent it without a request, because
 """
 
 RESTART_UNANSWERED_LINES = 5
-"""Smallest number of successive lines without a reply after which a text from the board shows a
-restart.
+"""Number of successive lines without a reply that makes a text from the board a sign of a restart.
 
-If the board has left fewer lines without a reply, the text may be a debug print of the firmware.
+After fewer lines without a reply, the text may be a debug print of the firmware.
 """
 
 CLOCK_TOLERANCE_S = 2.0
@@ -49,9 +48,9 @@ MIN_SILENCE_S = 0.25
 """Shortest time without a line to the board that can make its watchdog restart the board, s."""
 
 CAUSES = {"power": "supply", "brown-out": "supply", "watchdog": "watchdog", "pin": "pin"}
-"""Maps each cause of a restart that the reference firmware reports to an outcome in `outcomes.py`.
+"""Maps causes of restarts, as the reference firmware reports them, to outcomes in `outcomes.py`.
 
-The value is the part of the outcome's name after "restarts: ".
+Each value is the part of the outcome's name after "restarts: ".
 """
 
 _WORD = re.compile(rb"[a-z]{3}|[G-Z]{3}")

@@ -22,12 +22,12 @@ from acsard.core.link.codec import LETTERS, Motors
 from acsard.core.values import WHEELS
 
 FAIL_TOLERANCE = 0.25
-"""Relative error of an encoder's speed, compared with the commanded speed, above which the check
-fails."""
+"""Largest relative difference between an encoder's speed and the commanded speed. If the difference
+is larger, the check fails."""
 
 WARN_TOLERANCE = 0.05
-"""Relative error of an encoder's speed, compared with the commanded speed, above which the check
-warns."""
+"""Largest usual relative difference between an encoder's speed and the commanded speed. If the
+difference is larger, the check warns."""
 
 Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size", "off", "late"]
 """Kind of the result for one motor.
@@ -191,10 +191,10 @@ def wheel_map(mcu: McuConfig, channels: Sequence[Channel]) -> Finding:
 
 
 REPEAT_FRACTION = 0.8
-"""Fraction of `WARN_TOLERANCE` above which the relative error of a speed causes a second
-measurement.
+"""Limit for the relative error of a measured speed, as a fraction of `WARN_TOLERANCE`.
 
-The first measurement is then too inaccurate to decide. The second one takes longer.
+If the error is larger, a second, longer measurement follows, because a heavy wheel may not have
+reached its speed in the first one.
 """
 
 LONG_MEASUREMENT_S = 0.75 * motion.MOTOR_TIMEOUT_S
@@ -364,7 +364,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
 
 
 def _with_other_comma(board: Board, dead: Channel) -> Channel:
-    """Test motor d again with the other line ending. Keep the ending if the motor moves now."""
+    """Test motor d again with the other line ending. If the motor moves now, keep that ending."""
     configured, board.comma = board.comma, not board.comma
     channel = _both_ways(board, dead.motor)
     if channel.probed or dead.motor not in moving(channel.forth):
