@@ -41,11 +41,11 @@ DAEMON_GONE_ID = "daemon"
 """Id of the status message that tells the viewers that the daemon is gone."""
 
 LEARN_RETRY_S = 1.0
-"""Shortest time between a failed query of the facts about the robot and the next one, s."""
+"""Shortest time from a failed query of the robot's configuration to the next query, s."""
 
 RELEASE_ADVICE = "release the button for two seconds, and press it again"
-"""Advice to an operator whose panel must send a zero command. See
-`commander.RELEASE_TIMEOUT_NS`."""
+"""Advice to an operator if the daemon waits for a zero command. After a panel has paused for longer
+than `commander.RELEASE_TIMEOUT_NS`, the bridge sends a zero before the panel's next command."""
 
 
 class Bridge:
@@ -73,9 +73,8 @@ class Bridge:
         self._notices = Notices(tell, self._wake.set)
         self._here = self._was_here = True
         self._outdated = False
-        """Whether the daemon has ended since the last query of the facts about the robot. It is not
-        enough to compare `_here` with `_was_here`: if the daemon restarts during one round, both
-        are true."""
+        """Whether the daemon has ended since the last query of its configuration. `_here` and
+        `_was_here` do not show this if the daemon ends and starts again within one round."""
         # Subscribe before the query. Otherwise a restart of the daemon between the two would leave
         # outdated facts.
         key = robot.key("alive")
@@ -101,7 +100,7 @@ class Bridge:
         self._watch: Watch | None = None
         """Receives the robot's `state` while a viewer drives; None while no viewer drives."""
         self._retry_s = 0.0
-        """Earliest time of the next query of the facts about the robot, s."""
+        """Earliest monotonic time of the next query of the robot's configuration, s."""
         self._pending_refresh: Future[dict[str, Any]] | None = None
         """The changed settings, which a separate thread receives from the daemon; None if no such
         thread runs."""

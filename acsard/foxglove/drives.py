@@ -4,8 +4,8 @@ A panel repeats its command while a button is held, and sends nothing after the 
 But the daemon lets a sender drive only after a zero command. So this module sends a zero command
 before the first command after each silence of more than 1.5 s. A shorter silence may be a pause of
 the network while the button is held. A viewer may also have connected again while the button was
-held. So before the first command of a viewer, the silence begins when the viewer announces its
-channel, and not earlier.
+held. So the silence before a viewer's first command is measured from the moment at which the
+viewer announced its channel.
 
 If a burst of commands follows a silence, the network has delayed these commands, so this module
 drops them. The daemon could detect the delay only from stamps, which few panels send.

@@ -33,8 +33,8 @@ MAX_WAITING = 100
 class Notice(Struct, frozen=True):
     """A message to the viewers.
 
-    If `status_id` is not "", it is the id of a message that remains visible until a later notice
-    has the same id and an empty `text`.
+    If `status_id` is not "", the message remains visible until a later notice has the same
+    `status_id` and an empty `text`.
     """
 
     level: Level

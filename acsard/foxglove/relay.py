@@ -82,10 +82,10 @@ class CommandForm(Struct, frozen=True):
     """The encoding and the transport of the commands on one key of the bus."""
 
     native: str
-    """The native key of acsard for these commands, without the robot's id. "*" stands for the name
-    of a certificate."""
+    """acsard's own key for these commands (not the ROS key), without the robot's id. A "*" in it
+    stands for the name of a certificate."""
     encoding: str = ""
-    """Encoding of all commands on the key; "" if each command names its own encoding."""
+    """Zenoh encoding of all commands on the key; "" if each command names its own encoding."""
     via: Via = "native"
 
 

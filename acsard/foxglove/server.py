@@ -64,9 +64,9 @@ class ShownTopics:
         self._wake()
 
     def take(self) -> tuple[set[str], set[str]]:
-        """Return two sets of topics: those with a viewer, and those with a new viewer.
+        """Return two sets: the topics with any viewer, and the topics with a new viewer.
 
-        A viewer is new if it has subscribed since the last call.
+        A viewer of a topic is new if it has subscribed to the topic since the last call.
         """
         with self._lock:
             fresh, self._fresh = self._fresh, set()

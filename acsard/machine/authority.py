@@ -1,9 +1,9 @@
 """Creates the certificate authority of a robot, and the certificates that the authority signs.
 
 All certificates and keys are files. The keys are P-256 keys, in files that only their owner can
-read. Users make their phones trust the authority, so the authority's certificate limits the hosts
-for which it may sign. So a thief of the authority's key can pose as a robot or as a host of a
-private network, but not as a web site on the Internet.
+read. Users make their phones trust the authority. So the authority's certificate limits the hosts
+for which the authority may sign: a thief of the authority's key can pose as a robot or as a host of
+a private network, but not as a web site on the Internet.
 """
 
 from __future__ import annotations
@@ -99,8 +99,9 @@ class Authority:
         """Return whether this authority may sign a certificate for a host name or IP address.
 
         The authority's certificate may list permitted and excluded host names and networks. If it
-        lists no permitted names, all names are permitted that it does not exclude. The same holds
-        for networks. An authority that acsard has made lists permitted names and networks.
+        lists no permitted names, it permits all names that it does not exclude. The same holds for
+        networks. The certificate of an authority that acsard has made lists permitted names and
+        networks.
         """
         try:
             constraints = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)
@@ -116,7 +117,7 @@ class Authority:
     def names_in(self, directory: Path) -> list[str]:
         """Return the host names and IP addresses in the certificate in `directory`.
 
-        Return [] if the certificate cannot be read or contains none.
+        Return [] if the certificate cannot be read, or if it does not contain any.
         """
         try:
             certificate = x509.load_pem_x509_certificate((directory / CERTIFICATE).read_bytes())

@@ -45,7 +45,7 @@ as `10.0.0.5`."""
 def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -> list[str]:
     """Create an authority, the robot's certificate and a client certificate for each role.
 
-    Returns the host names and addresses in the robot's certificate.
+    Return the host names and addresses in the robot's certificate.
 
     Args:
         directory: directory for all files.
@@ -180,7 +180,7 @@ def keys(config: Config, directory: Path) -> dict[str, object]:
 
 
 def port(config: Config) -> str:
-    """Return the TCP port of the first TLS endpoint in `config`, or `PORT` if it has none.
+    """Return the TCP port of the first TLS endpoint in `config`, or `PORT` without an endpoint.
 
     The settings that `keys` returns let the robot listen on this port.
     """

@@ -52,8 +52,8 @@ from acsard.host.processes import name_of
 from acsard.machine.finding import LEVELS, Finding, Level
 
 MIN_JUDGED_LINES = 40
-"""Smallest number of lines from which the share of lost lines is judged. The share of fewer lines
-is not significant."""
+"""If the daemon sends fewer lines than this between the two queries, the doctor does not judge the
+share of lost lines, because the share is not significant."""
 
 MAX_KEYS = 6
 """Maximum number of configuration keys that one finding of `compared` names."""
@@ -659,8 +659,8 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
 def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
     """Yield a finding about the daemon's connection to routers.
 
-    `rows` contains the rows of the daemon's diagnostics, by name. Yield nothing if there is no row
-    about routers.
+    `rows` contains the rows of the daemon's diagnostics, by name. Yield nothing if the row about
+    routers is missing.
     """
     row = rows.get("acsard: router")
     if row is not None:

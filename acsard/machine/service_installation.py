@@ -26,8 +26,8 @@ from acsard.host.errors import MendableError, NotPermittedError
 from acsard.host.processes import run_command
 
 HOME = "/opt/acsard/venv"
-"""Path of the venv in the unit files of `deploy/`. The installation replaces this path by the path
-of the venv that runs the installation."""
+"""Path of the venv in the unit files of `deploy/`. The installed unit files contain the path of the
+venv that runs the installation instead."""
 
 GROUP, SETPRIV = "dialout", "/usr/bin/setpriv"
 """`GROUP` is the group of the service in the unit files. `SETPRIV` is the program with which the
@@ -292,7 +292,7 @@ UNIT_DIRECTORY = Path("/etc/systemd/system")
 CONFIG_DIRECTORY = Path("/etc/acsard")
 LAN_DROP_IN = "lan.conf"
 TLS_DIRECTORY = "/etc/acsard/tls"
-"""Directory of the certificates in the drop-in file `lan.conf`."""
+"""Directory of the certificates, as the drop-in file `lan.conf` names it."""
 STATE_DIRECTORIES = {
     UNIT: (
         Path("/var/lib/acsard"),
@@ -310,7 +310,7 @@ RELOAD_COMMANDS = (
     Run(("udevadm", "control", "--reload"), may_fail=True),
 )
 TRIGGERED_SUBSYSTEMS = ("tty", "usb-serial", "misc")
-"""Kernel subsystems with the devices to which `udevadm trigger` applies the new udev rules."""
+"""Kernel subsystems to whose devices `udevadm trigger` applies the new udev rules."""
 
 INSTALL_COMMANDS = (
     *RELOAD_COMMANDS,
