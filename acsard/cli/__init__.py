@@ -84,8 +84,8 @@ try:  acsard run                (start the robot on the built-in simulator)
 
 class _Parser(argparse.ArgumentParser):
     _intermixed = False
-    """Whether `parse_known_intermixed_args` is running. That method may call `parse_known_args`.
-    `parse_known_args` must then not call `parse_known_intermixed_args` again."""
+    """Whether `parse_known_intermixed_args` is running. That method may call `parse_known_args`,
+    which must then not call `parse_known_intermixed_args` again."""
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
@@ -186,8 +186,8 @@ def _decimal(word: str) -> str:
 def _unusable(words: Sequence[str]) -> str:
     """Return why acsard cannot use these arguments or its environment, or "" if it can.
 
-    Paths and names appear in messages, which are UTF-8. The environment and the current directory
-    matter to the daemon only: a tool such as `acsard call stop` must work everywhere.
+    Paths and names must be UTF-8, because they appear in messages. The environment and the current
+    directory are checked only for the daemon, because `acsard call stop` must work everywhere.
     """
     for word in words:
         if len(word) > MAX_ARGUMENT_LENGTH:

@@ -99,8 +99,8 @@ def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[
 def require_followed(key: str) -> None:
     """Raise `UsageError` if `key` is a known key on which no messages are published.
 
-    The text of the error contains the command to type instead. If `key` is unknown, only print a
-    warning. Without this warning, a misspelt key would look like a robot that sends nothing.
+    The text of the error contains the command to type instead. If `key` is unknown, print a
+    warning, because a misspelt key would otherwise look like a robot that sends nothing.
     """
     if unknown(key):
         words = f"{key} is not in the topic table ({key_hint(key)}); waiting for messages anyway"
@@ -207,9 +207,9 @@ def silence_explained(
     """Return a context that prints why no message arrives on a key, or that the connection is lost.
 
     The context yields a function, which the caller must call for each message. Texts go to standard
-    error. If `key` is "", only a lost connection is reported. `timeout_s` is the time without a
-    message after which the caller leaves the context, s; None means no time limit. If no message
-    has arrived by then, the reason is printed before the context ends.
+    error. If `key` is "", only a lost connection is reported. If no message arrives for `timeout_s`
+    s, the caller leaves the context; None means no time limit. If no message has arrived at all by
+    then, the reason is printed before the context ends.
     """
     return explained(
         lambda: _none_yet(robot, key) if key else "",

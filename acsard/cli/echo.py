@@ -112,7 +112,7 @@ class Quota:
         """Allow `most` messages of each robot, or any number if `most` is None.
 
         `used_up` is true when each robot in `robots` has reached this number. If `robots` is empty,
-        the robots of the printed messages are used instead.
+        only the robots with printed messages must have reached it.
         """
         self._most, self._robots, self._counts = most, robots, dict[str, int]()
 

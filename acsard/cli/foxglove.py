@@ -58,9 +58,9 @@ def main(args: argparse.Namespace) -> int:
 
 
 def loopback(text: str) -> tuple[str, int]:
-    """Return the host and the port in the text HOST:PORT. The host must be a loopback address.
+    """Return the host and the port in the text HOST:PORT.
 
-    Raises `UsageError` if it is not a loopback address, or if the text has another form.
+    Raises `UsageError` if the host is not a loopback address, or if the text has another form.
     """
     host, _, digits = text.rpartition(":")
     try:

@@ -16,7 +16,7 @@ from acsard.cli.common import count
 from acsard.cli.connection import add_bus, connected, require_followed, silence_explained
 
 SPAN_S = 10.0
-"""Duration, up to the present, that each line of output describes, s."""
+"""Largest age of the messages that a line of output describes, s."""
 
 MAX_TIMES = 1_000_000
 """Largest number of arrival times in memory (32 MB).

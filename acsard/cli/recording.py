@@ -62,7 +62,7 @@ from acsard.report.page import make_report
 from acsard.terminal.output import show, table
 
 MAX_NAMES = 10
-"""Largest number of recordings, and of times without a recording, that a search prints."""
+"""Largest number of recordings, and of gaps between recordings, that a search prints."""
 
 SERVICE_DIRECTORY = Path("/var/lib/acsard/record")
 """The directory in which the systemd service stores its recordings."""
@@ -564,9 +564,9 @@ def _when(text: str) -> When:
 
 @contextmanager
 def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
-    """Yield a function that shows on a terminal which part of a recording has been read.
+    """Yield a function that shows on a terminal how much of a recording has been read.
 
-    The function takes the time of the last step that was read.
+    The function takes the time of the last step that was read, ns since 1970.
     """
     if not sys.stderr.isatty():
         yield lambda wall_ns: None

@@ -137,7 +137,7 @@ def _with_duration(message: str) -> str:
 
 
 def _duration_of_changes(message: str) -> str:
-    """Return a text that says how long the changes stay in force, or "" if there is no change.
+    """Return a text that says how long the changes stay in force, or "" without any change.
 
     `message` is the daemon's answer, with text such as "KEY = NEW (was OLD)" for each change.
     """

@@ -140,8 +140,8 @@ class JsonPrompt:
         self._pressed = False
         self._found = 0
         self._moves = False
-        """True while the robot may move because of this subcommand. In this time, a person must be
-        able to stop it."""
+        """True while the robot may move because of this subcommand. In this time, the person must
+        be able to stop the robot."""
         self._reader = threading.Thread(target=self._listen, name="standard input", daemon=True)
 
     def __enter__(self) -> Self:
@@ -284,8 +284,8 @@ class JsonPrompt:
     def _heard_out(self) -> str:
         """Read lines from standard input until the end of the `with` block, then return "".
 
-        Return a reason to interrupt the subcommand if the input ends before, if a line is too long,
-        or if no line arrives in time.
+        Return a reason to interrupt the subcommand if the input ends earlier, if a line is too
+        long, or if no line arrives in time.
         """
         buffer, heard_s = b"", time.monotonic()
         while not self._left:

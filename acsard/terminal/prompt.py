@@ -121,9 +121,9 @@ turning.
 def ended_by_signals(notice: str = "", *, exits: bool = False) -> Iterator[None]:
     """Raise `KeyboardInterrupt` in the `with` block when one of `PROMPT_END_SIGNALS` arrives.
 
-    Further signals are then ignored until the end of the block, so that its cleanup can send zero
-    speeds. `notice` is printed when the signal arrives. If `exits` is true, a signal other than
-    SIGINT raises `SystemExit` instead, with 128 plus the number of the signal.
+    Further signals are then ignored until the end of the block, so that the block's cleanup can
+    send zero speeds. `notice` is printed when the signal arrives. If `exits` is true, a signal
+    other than SIGINT raises `SystemExit` instead, with 128 plus the number of the signal.
     """
     before = [signal.getsignal(number) for number in PROMPT_END_SIGNALS]
 

@@ -148,7 +148,7 @@ class Roster(Fleet):
     def rows(self) -> list[Row]:
         """Send the queries that are due, and return one row per robot.
 
-        Unlike in the rows of `Fleet`, `here` is False for a robot that was never present, not None.
+        If a robot was never present, `here` is False in its row. (`Fleet` sets it to None.)
         """
         self.send_queries(self.due())
         return [replace(row, here=bool(row.here)) for row in super().rows()]
@@ -156,9 +156,9 @@ class Roster(Fleet):
     def gather(self) -> list[Row]:
         """Wait for the first reports of the robots, and return one row per robot.
 
-        The wait ends when all robots that the user named have reported, and after 1.5 s at the
-        latest. If no robot is present after 1.5 s, the wait continues for up to 3 s, because the
-        first answer can be late on a busy computer. If no robot is present after 3 s, return [].
+        The wait ends when all robots that the user named have reported, or after 1.5 s. If no robot
+        is present then, the wait goes on until a robot is present, because the first answer can be
+        late on a busy computer. If no robot is present after 3 s in all, return [].
         """
         began, rows = time.monotonic(), self.rows()
         while not self.all_reported:
@@ -181,7 +181,7 @@ class Roster(Fleet):
 
     @property
     def presence_text(self) -> str:
-        """A sentence with the number of robots that are present; "" if the user named them."""
+        """A sentence with the number of present robots; "" if the user named robots."""
         with self._lock:
             here = sum(bool(robot.here) for robot in self._known.values())
         return count_text(self._robot.where.endpoint, here) if ALL_ROBOTS in self._ids else ""

@@ -2,15 +2,15 @@
 
 A terminal reports a key press but never its release. Each press therefore drives the robot for
 `KEY_HOLD_S`. From the third repeat (`REPEATS`) of a held key on, each repeat drives the robot
-for `REPEAT_S` only. When this time is over, `acsard drive` sends at least three zero commands. It
-goes on until the robot's state shows that the robot has stopped, and then sends nothing. If this
+for `REPEAT_S` only. When this time is over, `acsard drive` sends at least three zero commands, and
+more until the robot's state shows that the robot has stopped. Then it sends nothing. If this
 program was paused for more than 0.5 s, the keys that the operator typed during the pause do not
 drive the robot.
 
-A key that was pressed before a stop must not drive the robot after the `clear`, even if an SSH
-connection pauses and the key seems to be released. So if the robot stops following while a key is
-held, this key no longer drives the robot. Driving keys work again in two cases: the operator
-presses a key that stops the robot and arrives without delay, or no driving key arrives for 1.5 s.
+A key that was held when the robot was stopped must not drive the robot after `acsard call clear`.
+This also holds if an SSH connection pauses, so that the key seems to be released. So if the robot
+stops following while a key is held, this key no longer drives the robot. Driving keys work again
+in two cases: a key that stops the robot arrives without delay, or no driving key arrives for 1.5 s.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ operator may have released the key long ago.
 """
 
 BURST_S = 0.2
-"""Time after the arrival of delayed keys, s, in which all further keys count as delayed too. One
-read from the terminal may not return all delayed keys."""
+"""Time after the arrival of delayed keys, s, in which all further keys count as delayed too,
+because one read from the terminal may not return all delayed keys."""
 
 MAX_END_S = 0.5
 """Longest time for which a drive that ends waits for the robot to stop, s. The operator wants the
@@ -148,8 +148,7 @@ class Keyboard:
     def end_hold(self, now: float) -> None:
         """Stop the robot, and ignore the key that is held at `now` (monotonic clock, s).
 
-        Call this when a state arrives that shows that the robot does not follow. There are two
-        special cases:
+        Call this when a state shows that the robot does not follow. There are two special cases:
 
         - The operator began to hold the key less than `SETTLED_S` ago. Then do nothing, because the
           state may be older than the key press.

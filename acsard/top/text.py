@@ -75,8 +75,8 @@ def count(number: int) -> str:
 def rate(later: int, earlier: int, seconds: float) -> str:
     """Return a counter's increase per second as text, at least 7 characters long.
 
-    If the rate is not known, the text is "-/s". `seconds` is the time in which the counter rose
-    from `earlier` to `later`.
+    `seconds` is the time in which the counter rose from `earlier` to `later`. The text is "-/s" if
+    the time or the increase is not plausible.
     """
     # After a clock change or a restart of the daemon, a wrong rate must not be shown.
     if not 0.05 <= seconds <= 60.0 or not 0 <= later - earlier < 10**6:
