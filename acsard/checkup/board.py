@@ -70,7 +70,7 @@ class Operator(Protocol):
         """Show the current activity. `text` remains visible until the next call of this method."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """Ask a question. Return one of `answers`, or None if there is no operator to answer."""
+        """Ask a question. Return one of `answers`, or None if no operator can answer."""
 
     def keys(self, wait_s: float) -> str:
         """Return the keys that the operator has typed, or "" if no key was typed.
@@ -165,7 +165,7 @@ class Board:
         self._commanded = ZERO
         self._unanswered_s = 0.0
         """Time for which `drive` has sent lines since the last reply, s. If this computer is late,
-        only one line period of its delay counts, because the board is not silent then."""
+        only one line period of its delay counts, because a delay does not show a silent board."""
         self._listened_s = 0.0
         self._sequence = 0
         self._lines = LineReader()
@@ -382,8 +382,8 @@ class Board:
         """
         end_ns = self.wire.now_ns() + ceil(seconds * NS_PER_S)
         if self.now_s - self._listened_s > BEAT_NS / NS_PER_S:
-            # Discard the delay of a simulated board before this call, because nothing was measured
-            # then.
+            # A delay of a simulated board before this call does not count, because nothing was
+            # measured then.
             self.wire.late_ns()
         replies: list[BoardReply] = []
         self.abort_check()

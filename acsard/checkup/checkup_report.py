@@ -35,8 +35,8 @@ def answered(findings: Iterable[Finding]) -> bool:
 def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Changes:
     """Return the suggested values that differ from the configuration `config`.
 
-    They come from the findings. If a board answered, `mcu.port` gets the value `port`, unless
-    `port` is "".
+    The findings contain the suggested values. If a board answered and `port` is not "", `port` is
+    the suggested value of `mcu.port`.
 
     Suggested values can contradict each other. For example, lines with a checksum may be too long
     for the control rate. Then the function tries two remedies, one after the other:

@@ -102,7 +102,7 @@ def finding(board: Board) -> Finding:
 
 
 def _period_s(board: Board) -> float:
-    """Return the time from one line to the next in the count of lost lines, s.
+    """Return the time from one sent line to the next while lost lines are counted, s.
 
     It is the daemon's control period, or longer if the wire or the board is too slow for this.
     """
@@ -168,7 +168,7 @@ pauses were equal, a link that loses, for example, every tenth line might never 
 OBEYED_FRACTION = 0.5
 """Smallest angle that shows that the motors obeyed a pulse (a single line that turns them).
 
-It is a fraction of the median angle by which all pulses turned the motors.
+It is a fraction of the median of the angles by which the pulses turned the motors.
 """
 
 MIN_PULSE_ANGLE, MIN_PULSE_STEPS = 0.02, 4

@@ -43,7 +43,7 @@ SLOWING_TIMEOUT_S = 3 * MOTOR_TIMEOUT_S
 BOOT_S = 3.0  # a restarted board answers by then; many bootloaders wait two seconds
 # If no line is sent for this time, a correct watchdog has switched the motors off.
 WATCHDOG_SILENCE_S = MAX_WATCHDOG_S + SHORT_MEASUREMENT_S
-# If no line is sent for this time, the motors stand still, unless the MCU has no watchdog.
+# If no line is sent for this time, the motors stand still, unless the MCU lacks a watchdog.
 STANDSTILL_TIMEOUT_S = MAX_WATCHDOG_S + MOTOR_TIMEOUT_S
 
 
@@ -154,8 +154,8 @@ def turning(replies: Sequence[BoardReply], now_s: float) -> list[int]:
     A coarse encoder reports a speed of 0 in most replies, even while its motor turns. After a reply
     that reports a movement, the motor therefore counts as turning for some time.
     """
-    # The motor counts as turning for the time in which it would turn by the same angle at the speed
-    # `STANDING_SPEED`.
+    # The motor counts as turning for the time that it would need to turn by the reported angle at
+    # the speed `STANDING_SPEED`.
     motors: set[int] = set()
     for reply, earlier in pairwise(reversed([BoardReply(-math.inf, ZERO, b""), *replies])):
         ago_s = now_s - reply.at_s

@@ -91,7 +91,7 @@ AGAIN, MOST = 1, 5
 """Limits for restarts of the board: `AGAIN` for one step, and `MOST` for all steps together.
 
 If the board restarts during a step, the step is repeated up to `AGAIN` times. One more restart in
-the same step ends the check. The restart number `MOST` ends the check too.
+the same step ends the check. The check also ends with restart number `MOST` in all.
 """
 
 

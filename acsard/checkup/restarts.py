@@ -37,8 +37,8 @@ CLOCK_TOLERANCE_S = 2.0
 """Tolerated difference between the board's clock and this computer's clock, s.
 
 Between two replies, the board's clock may advance by this time more than this computer's clock, for
-example because a reply was delayed. If it advances by more, the board has restarted: the jump of
-its clock back to 0 looks like a large advance modulo `CLOCK_RANGE_MS`.
+example because a reply was delayed. If it advances by more, the board has restarted, because a
+clock that jumps back to 0 seems to advance by a large time modulo `CLOCK_RANGE_MS`.
 """
 
 CLOCK_RANGE_MS = 65536
@@ -68,7 +68,7 @@ class Restart(Struct, frozen=True):
     turned: Motors = ZERO
     """Speeds that were commanded shortly before the restart, rad/s; zeros if no motor turned."""
     silent_s: float = 0.0
-    """Longest time without a line to the board, between its last reply and the restart, s."""
+    """Longest time without a line to the board, from the board's last reply to the restart, s."""
     cause: str = ""
     """Cause of the restart as the board reports it, or "" if the board does not report a cause."""
 
@@ -86,7 +86,7 @@ class Restarts:
 
     def __init__(self) -> None:
         self.watched = True
-        """Whether `check_line` reports restarts. If false, it always returns None."""
+        """Whether `check_line` reports restarts. If false, `check_line` always returns None."""
         self._asked_s = self._turned_s = float("-inf")
         self._turned: Motors = ZERO
         """The last commanded speeds, rad/s, that were not all zero."""

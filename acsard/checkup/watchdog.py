@@ -44,8 +44,7 @@ Bounds = tuple[float, float]
 class Run(Struct, frozen=True):
     """Behavior of the motors during and after a silence, in which no valid line is sent.
 
-    The silence begins after the last line that turned the motors, and ends with zeros. Full speed
-    is the speed of the motors before the silence.
+    The silence begins after the last line that turned the motors, and ends with zeros.
     """
 
     silent_s: float

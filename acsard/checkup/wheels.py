@@ -167,9 +167,9 @@ def _fault_suffix(mcu: McuConfig, channel: Channel) -> str:
 def wheel_map(mcu: McuConfig, channels: Sequence[Channel]) -> Finding:
     """Return the finding that compares `[mcu.wheels]` with the wheels that the operator saw turn.
 
-    The finding suggests an entry (sign and motor, such as "-d") for each wheel. If the motor does
-    not work correctly, or if the operator saw no wheel turn, this is the configured entry. If no
-    operator answered, the finding has no entries.
+    The finding suggests an entry (sign and motor, such as "-d") for each wheel. If a motor does not
+    work correctly, or if the operator did not see its wheel turn, the finding suggests the
+    configured entry. If no operator answered, the finding does not suggest any entries.
     """
     if any(channel.wheel is None for channel in channels):
         return outcomes.find("wheel map: not seen")
@@ -310,8 +310,8 @@ def _both_ways(board: Board, motor: int) -> Channel:
 def probe(board: Board, motor: int) -> Motors | None:
     """Turn a motor slowly and briefly, to find out whether its own encoder moves with it.
 
-    If so, return None; the motor may still turn then. Otherwise stop the motor, and return the
-    speeds of the four encoders in the probe, rad/s.
+    If it moves, return None; the motor may still turn then. Otherwise stop the motor, and return
+    the speeds of the four encoders in the probe, rad/s.
     """
     # The firmware may drive a motor without a working encoder to full speed, but the probe is too
     # short for that. If the encoder does not follow, repeat the probe, because a coarse encoder may

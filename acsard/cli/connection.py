@@ -156,7 +156,7 @@ def explained(
     after_s: float = FIRST_STATE_TIMEOUT_S,
     timeout_s: float = math.inf,
 ) -> Iterator[Callable[[], None]]:
-    """Print why no messages arrive, during a `with` block that receives messages.
+    """Print the reason if the `with` block receives no messages.
 
     Yield a function, which the block must call for each message. A separate thread finds the reason
     and prints it on standard error, so the block can go on receiving.

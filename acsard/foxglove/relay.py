@@ -92,7 +92,7 @@ class CommandForm(Struct, frozen=True):
 def command_forms(
     key_of: Callable[[str], str], ros: RosConfig, source: str
 ) -> dict[str, CommandForm]:
-    """Map each full key on which commands of a source may arrive to its `CommandForm`.
+    """Return the `CommandForm` of each full key on which commands of a source may arrive, by key.
 
     The keys are those of acsard and those of ROS.
 

@@ -180,7 +180,7 @@ def keys(config: Config, directory: Path) -> dict[str, object]:
 
 
 def port(config: Config) -> str:
-    """Return the TCP port of the first TLS endpoint in `config`, or `PORT` without an endpoint.
+    """Return the TCP port of the first TLS endpoint in `config`, or `PORT` if no endpoint uses TLS.
 
     The settings that `keys` returns let the robot listen on this port.
     """

@@ -111,7 +111,7 @@ def _hidden(path: Path, hidden: Sequence[str]) -> bool:
 
 
 def _inaccessible_part(path: Path) -> Path | None:
-    """Return the outermost part of `path` that the service's user has no permission to enter."""
+    """Return the outermost part of `path` that the service's user may not enter, or None."""
     for place in (*reversed(path.parents), path):
         try:
             mode = place.stat().st_mode

@@ -17,10 +17,11 @@ from rich.table import Table
 from rich.text import Text
 
 UNLIMITED_WIDTH = 10_000
-"""Width that is larger than any row of a table, characters. No row is wrapped at this width."""
+"""Width that is larger than any row of a table, characters. At this width no row is wrapped, so a
+person can copy a row from the terminal."""
 
 MAX_TEXT_WIDTH = 100
-"""Largest width of the lines of output that contains sentences, characters."""
+"""Largest line width of output that contains sentences, characters."""
 
 
 def table(

@@ -1,4 +1,4 @@
-"""Defines the interface through which a subcommand asks a person, and the signals that end it.
+"""Defines how a subcommand asks a person, and which signals end a subcommand.
 
 `TerminalPrompt`, `NoPrompt` and `JsonPrompt` implement the interface `Prompt`. Change all of them
 together.
@@ -43,8 +43,8 @@ class NumberQuestion(Struct, frozen=True):
     def number(self, text: str) -> float:
         """Return the number in the answer `text`, or the default if `text` is empty.
 
-        The number may have a decimal comma. If the number is not valid, or if `text` is empty and
-        there is no default, raise `ValueError` with a description of valid numbers.
+        The number may have a decimal comma. Raises `ValueError` with a description of valid numbers
+        if the number is not valid, or if `text` is empty and a default is missing.
         """
         try:
             number = self.usual if not text else float(text.replace(",", "."))
@@ -64,7 +64,7 @@ class Prompt(Protocol):
     def begin(self, subject: str, *, simulated: bool) -> None:
         """Show `subject`, the name of the robot or board that is checked or calibrated.
 
-        `simulated` says whether it is simulated.
+        `simulated` says whether this robot or board is simulated.
         """
 
     def show_text(self, text: str) -> None:

@@ -124,7 +124,7 @@ def moves(state: RobotState) -> bool:
 
 
 def silence(teleop: Teleop) -> str:
-    """Return a sentence which says that the first state, or a new state, has not arrived."""
+    """Return a sentence which says that the first state, or a newer state, has not arrived yet."""
     if teleop.state is None and not teleop.silent:
         return "waiting for the first state message of the daemon"
     return f"nothing received from the daemon for {teleop.age:.0f} s: is the daemon running?"

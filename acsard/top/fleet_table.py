@@ -171,7 +171,7 @@ class Roster(Fleet):
 
     @property
     def all_reported(self) -> bool:
-        """Whether all robots that the user named have reported; False if the user named none."""
+        """Whether all robots that the user named have reported; False without named robots."""
         with self._lock:
             known = list(self._known.values())
         named = ALL_ROBOTS not in self._ids

@@ -109,8 +109,8 @@ class Keyboard:
         together. Delayed keys do not show what the operator wants now, so they only stop the robot.
         If `waited` is above `GRACE_S`, an earlier press does not drive the robot any more either.
         """
-        # A delayed key that stops the robot does not let a held key drive again. A connection that
-        # stalled may deliver this key alone, and the keys that followed it in the stall later.
+        # A delayed key that stops the robot does not let a held key drive again, because a stalled
+        # connection may deliver this key first, and the keys that were typed after it only later.
         keys = split(text)
         if len(keys) > MAX_BURST_KEYS or waited > GRACE_S:
             self._old_until = now + BURST_S
