@@ -33,10 +33,8 @@ class Part(msgspec.Struct, frozen=True):
     """Period at which the simulated board reports by its own clock, s; 0 for a board that answers
     lines."""
     baud_rate: int = 0
-    """Baud rate of the simulated board; 0 means the configured rate.
-
-    Unlike in a configuration file, any rate is accepted.
-    """
+    """Baud rate of the simulated board; 0 means the configured rate. Unlike in a configuration
+    file, any rate is accepted."""
 
 
 class NumberedMcu(FakeMcu):
@@ -104,11 +102,7 @@ class FarEnd:
 
 
 def main(part: Part) -> None:
-    """Simulate the board until standard input ends.
-
-    Then write a `RecordedTraffic` to standard output, with all data that the board received and
-    sent.
-    """
+    """Simulate the board until standard input ends, then write a `RecordedTraffic` to stdout."""
     try:
         # Other processes must not delay the simulated board: a real one has its own processor.
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(80))

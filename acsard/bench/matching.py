@@ -18,16 +18,12 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import Instant
 
 CYCLE_LENGTH = 1000
-"""Number of commands, or of feedback lines, after which the speeds repeat.
-
-Two lines with equal speeds are distinguished by their times.
-"""
+"""Number of commands, or of feedback lines, after which the speeds repeat. Two lines with equal
+speeds are distinguished by their times."""
 
 LOWEST, STEP = 5.0, 0.02
-"""Lowest wheel speed, and the step between successive speeds, rad/s.
-
-The step is so small that the limits on acceleration do not change the speeds.
-"""
+"""Lowest wheel speed, and the step between successive speeds, rad/s. The step is so small that the
+limits on acceleration do not change the speeds."""
 
 LOSS_TIMEOUT_NS = 1_000_000_000
 """Time after which a command without a line on the wire counts as lost, ns."""
@@ -59,7 +55,7 @@ def staircase(number: int) -> float:
     """Return the speed of all wheels in the command or feedback line with this number, rad/s.
 
     The speeds rise and then fall, and repeat after `CYCLE_LENGTH` lines. The falling speeds lie
-    between the rising speeds, so all speeds of a period differ.
+    between the rising speeds, so all speeds of a cycle differ.
     """
     half = CYCLE_LENGTH // 2
     place = number % CYCLE_LENGTH

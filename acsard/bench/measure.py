@@ -45,7 +45,8 @@ def bench_config(config: Config, *, simulated: bool) -> Config:
     The rates, the log and the state directory have their default values. If `simulated` is true,
     further settings change:
 
-    - The limits are so high that the next line to the board has the speeds of a command unchanged.
+    - The limits are so high that the line after a command contains exactly the speeds of the
+      command.
     - Feedback that contradicts the commands does not count as a fault.
     - Lines have no sequence number, because the benchmark recognizes a line by its text.
     - The robot becomes active by itself, and drive, simulator and encoders have default values.

@@ -89,10 +89,8 @@ T = TypeVar("T")
 ACSARD = (sys.executable, "-m", "acsard", "run")
 
 START_TIMEOUT_S = 15.0
-"""Time limit for each step of the daemon's start, s.
-
-A start takes 0.3 s, or 2.3 s if opening the port resets the board.
-"""
+"""Time limit for each step of the daemon's start, s. A start takes 0.3 s, or 2.3 s if opening the
+port resets the board."""
 
 START_SAMPLES = 10
 """Number of odometry samples that must arrive before the daemon's start counts as complete."""

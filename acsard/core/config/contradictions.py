@@ -29,9 +29,9 @@ from acsard.core.config.wire_time import (
 from acsard.core.values import ROOT_KEY, WHEELS
 
 MIN_WRAP_PERIODS = 2
-"""Shortest time in which the encoder count of a wheel at full speed may change by half of the
-count's range, in control periods. A larger change between two lines would look like a turn in the
-other direction. The value 2 allows for one lost line."""
+"""Shortest allowed time for a wheel at full speed to change its encoder count by half of the
+count's range, in control periods. If the count changes by more than that between two lines, the
+wheel seems to turn in the other direction. The value 2 allows for one lost line."""
 
 FEW_COUNTS, FASTEST_HZ = 200, 100.0
 """Limits for a warning about coarse encoders: encoder counts per wheel turn, and the control rate

@@ -107,9 +107,10 @@ SECTIONS: dict[str, type[Struct]] = {field.name: field.type for field in fields(
 
 
 def find_live_setting(key: str) -> Live | None:
-    """Return the entry of `LIVE` for the setting with the dotted key `key`.
+    """Return the entry of a setting in `LIVE`, the table of settings that may change at run time.
 
-    The result is None if the setting takes effect only at the next start of the daemon.
+    `key` is the dotted key of the setting. The result is None if the setting takes effect only at
+    the next start of the daemon.
     """
     parts = key.split(".")
     if parts[:2] == ["commands", "sources"] and len(parts) == 4:

@@ -43,10 +43,10 @@ def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
 def with_lowered(config: Config, saved_limits: Mapping[str, float]) -> tuple[Config, list[Event]]:
     """Return a pair: `config` with the lowered limits, and events that report the changes.
 
-    A lowered limit is applied only if it is below the value in `config`. The configuration file
-    may have changed since the limits were lowered, so they may contradict its other settings. In
-    this case, the limits are applied one after another. A limit that causes a contradiction is
-    dropped, and an event reports this.
+    A lowered limit is applied only if it is below the value in `config`. The configuration file may
+    have changed since the limits were lowered. So the lowered limits may contradict other settings
+    of the file. In this case, the limits are applied one after another. A limit that causes a
+    contradiction is dropped, and an event reports this.
 
     Args:
         config: the content of the configuration file.

@@ -1,7 +1,7 @@
 """Runs the rules that relate several keys of `acsard.toml` to each other.
 
-A rule is skipped if it reads a key that has no valid value. Another error line already reports this
-key.
+A rule is skipped if it reads a key whose value is not valid. Another error line already reports
+this key.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def view_without(config: Config, invalid: Set[str]) -> Config:
 def mistakes(rules: Iterable[Rule], config: Config) -> list[str]:
     """Return the error lines of all `rules` for `config`.
 
-    A rule is skipped if it reads a key that has no valid value.
+    A rule is skipped if it reads a key whose value is not valid.
     """
     errors: list[str] = []
     for rule in rules:

@@ -51,7 +51,7 @@ class Bus(Protocol):
 
     @property
     def wanted_keys(self) -> AbstractSet[str]:
-        """The native keys of the topics that are latched or have a subscriber at present."""
+        """The keys, such as "odom", of the topics that are latched or have a subscriber now."""
 
     def take(self, queries: int) -> BusInput:
         """Return the input from the bus since the last call.
@@ -82,9 +82,9 @@ _decoder = Decoder(GatewayState)
 class GatewayFollower:
     """Counts the starts of the TLS gateway, and how often all its connections were in use.
 
-    The gateway checks its connections four times a second, and reports the number of checks since
-    its own start in which all of them were in use. A gateway that already runs when the daemon
-    starts counts as one start, and its earlier checks are counted too.
+    The gateway checks its connections four times a second, and reports in how many checks since its
+    start all connections were in use. A gateway that already runs when the daemon starts counts as
+    one start, and its earlier checks are counted too.
     """
 
     def __init__(self) -> None:

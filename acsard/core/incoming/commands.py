@@ -101,7 +101,8 @@ class Arrival(Struct, frozen=True):
     """A sample as Zenoh delivered it to the daemon."""
 
     key: str
-    """The key below `acsard/<id>/`, or the equivalent native key of a ROS key."""
+    """The key below `acsard/<id>/`. For a sample on a ROS key, it is acsard's own key for the same
+    data."""
     put: bool
     """True for a PUT, false for a DELETE."""
     payload: bytes
@@ -429,7 +430,8 @@ def caller_name(via: Via, attachment: bytes, stamped_by: str = "") -> str:
         return "unnamed (bridge)"
     signed = signature.unpack(attachment)
     if signed is not None:
-        # With the session, one program would have two names: only samples have such a stamp.
+        # The session is left out, because only samples have its stamp. With the session, a program
+        # would have one name for its samples and another name for its calls.
         return f"{public_name(signed.sender)} (native)"
     session = f", session {public_name(stamped_by)}" if stamped_by else ""
     return f"unnamed (native{session})"

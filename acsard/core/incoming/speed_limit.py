@@ -111,7 +111,7 @@ class SpeedLimiter:
 
     @property
     def lowers(self) -> bool:
-        """Whether the robot's highest speed is below the setting because of a speed limit.
+        """Whether a speed limit keeps the robot's highest speed below its setting.
 
         After the limit is lifted, this stays True until the robot has the higher value again.
         """

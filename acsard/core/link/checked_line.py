@@ -41,7 +41,7 @@ class Reading(Struct, frozen=True):
     """The sample fields of a reply: the board's clock and its encoder counts at the same moment.
 
     `mcu_ms` is the board's clock, ms. `counts` are the encoder counts of the motors a to d. A count
-    rises when its motor turns in the `p` direction. All five numbers are modulo 65536.
+    rises when its motor turns in the positive (`p`) direction. All five numbers are modulo 65536.
     """
 
     mcu_ms: int

@@ -96,14 +96,15 @@ class EchoDetector:
     def forget(self) -> None:
         """Forget all lines and reports, because the port has been opened."""
         self._sent: deque[bytes] = deque(maxlen=COMPARED_LINES + 1)
-        """The last `COMPARED_LINES` sent lines, and the line before them. A run in `_runs` may end
-        with that line, and the next reply may make the run longer."""
+        """The last `COMPARED_LINES` sent lines, and the line before them. The older line is needed
+        because a series of lines that came back may end with it, and the next reply may continue
+        this series."""
         self._runs: deque[_Run | None] = deque(maxlen=COMPARED_LINES + 1)
         """For each line in `_sent`, the run that ends with this line: the series of successive sent
         lines that came back. None if this line did not come back."""
         self._reports = 0
         self._last: deque[_Wheels] = deque(maxlen=MAX_OTHER_REPORTS + 1)
-        """Wheel speeds in the last reports, rad/s."""
+        """Wheel speeds in the last received replies, rad/s."""
 
     def written(self, line: bytes) -> None:
         """Record that `line`, with its line end, was written to the port."""
@@ -141,10 +142,7 @@ class EchoDetector:
         return is_echo
 
     def _continued(self, run: _Run | None, wheels: _Wheels) -> _Run:
-        """Return `run` extended by the present reply, or a new run if the reply cannot continue it.
-
-        `wheels` are the wheel speeds in the present reply, rad/s.
-        """
+        """Return `run` extended by the present reply, or a new run if the reply does not fit."""
         others = MAX_OTHER_REPORTS + 1 if run is None else self._reports - run.report - 1
         if run is None or others > MAX_OTHER_REPORTS:
             return _Run(self._reports, wheels)

@@ -22,17 +22,18 @@ from acsard.core.link.minimum_delay import MinimumDelay
 from acsard.core.values import NS_PER_S
 
 SLACK_COUNTS = 4
-"""Number of counts that a wheel may make between two readings in addition to the counts that its
-highest speed allows. This margin covers one count at each end of the interval, and play in the
-gears."""
+"""Margin on the largest plausible number of counts between two readings, in counts. This largest
+number follows from the highest speed of a wheel. The margin covers one count at each end of the
+interval, and play in the gears."""
 
 ROUNDING_MS = 2
 """Largest error of the time between two readings, ms. The time of each reading is in whole ms, so
 it is wrong by up to 1 ms."""
 
 MAX_DELAY_MS = 1000.0
-"""Largest delay of a reading that `Encoders` distinguishes, ms. A longer delay is treated as this
-delay. A larger limit is not needed, because the session restarts after a gap of one second."""
+"""Largest excess of a reading's delay over the least delay so far, ms. The delay is the arrival
+time of the reading minus its time by the board's clock. If the excess is larger, the least delay
+rises. A larger limit is not needed, because the session restarts after a gap of one second."""
 
 Unknown = Literal["unknown", "leap", "restarted"]
 """The reason why the angles since the previous reading of the encoders are unknown.

@@ -39,9 +39,9 @@ FULL_READ_BYTES = 1024
 data."""
 
 EVALUATION_START = 1.5
-"""Least difference between two numbers: the reply periods that have passed since the previous read
-of the port, and the commands that were written since then. At a read that reaches this difference,
-`ReplyStyle` begins to evaluate reads. Scheduling alone causes a smaller difference."""
+"""Least difference between the number of reply periods and the number of written commands since the
+previous read of the port. If a read reaches this difference, `ReplyStyle` begins to evaluate reads,
+because scheduling alone causes a smaller difference."""
 
 DECISION_DIFFERENCE = 2.5
 """Least difference between the number of reply periods and the number of commands at which
@@ -49,12 +49,12 @@ DECISION_DIFFERENCE = 2.5
 reads of the port that `ReplyStyle` evaluates."""
 
 MAX_READ_PERIODS = 100.0
-"""Longest time between two reads of the port after which `ReplyStyle` still evaluates the later
-read, in reply periods."""
+"""If more reply periods than this lie between two reads of the port, `ReplyStyle` does not evaluate
+the later read."""
 
 CLEAR_FRACTION = 0.5
-"""Limit of how clearly the lines must favor one kind of board before `ReplyStyle` decides. Let n be
-the number of received lines, p the number of reply periods, and c the number of commands, summed
+"""Limit for how clearly the lines must favor one kind of board before `ReplyStyle` decides. Let n
+be the number of received lines, p the number of reply periods, and c the number of commands, summed
 over the reads of the port that `ReplyStyle` evaluates. Then |p - n| and |c - n| must differ by at
 least `CLEAR_FRACTION` times |p - c|. This means that n is clearly nearer to p or to c."""
 
@@ -63,11 +63,10 @@ EXTRA_READS = 3
 `EVALUATION_START`."""
 
 NEAR_FRACTION = 0.35
-"""Largest distance of the number n of received lines from the nearer of two sums at which
-`ReplyStyle` decides, as a fraction of n. The sums are the number of reply periods that passed, and
-the number of commands that were written. A distance of up to 1.5 is always allowed. The limit is
-not 0, because some lines get lost. All numbers cover the reads of the port that `ReplyStyle`
-evaluates."""
+"""Limit for the number of lines that may be missing when `ReplyStyle` decides. Let n be the number
+of received lines, p the number of reply periods, and c the number of commands, summed over the
+reads of the port that `ReplyStyle` evaluates. The smaller of |p - n| and |c - n| must be at most
+`NEAR_FRACTION` times n, or at most 1.5. The limit is not 0, because some lines get lost."""
 
 
 class Feedback(Struct, frozen=True, gc=False):
@@ -88,9 +87,9 @@ class Feedback(Struct, frozen=True, gc=False):
     gap: float = 0.0
     turned: Motors | None = None
     bridged: float = 0.0
-    """Duration of the first part of `dt`, in which lines were lost, s; 0 if no line was lost. The
-    odometry fills this part with the speeds of the last line before it and of the first line after
-    it."""
+    """The part of the time since the previous sample in which lines were lost, s; 0 if no line was
+    lost. This part comes first. The odometry fills it with the speeds of the last line before it
+    and of the first line after it."""
     asked_ns: int | None = None
     """Monotonic time at which the daemon wrote the command that this line answers, ns. None if
     unknown."""
@@ -101,9 +100,10 @@ class Feedback(Struct, frozen=True, gc=False):
     heard_ns: int = 0
     """Monotonic time at which the host had received the complete line, ns."""
     counted: Motors | None = None
-    """Angle that each wheel turned in the last `dt - bridged` seconds, rad, in `WHEELS` order, as
-    `whole_counts.py` recovers it from the speeds. None if the counts per turn are not configured,
-    or if the firmware does not report whole counts."""
+    """Angle that each wheel turned since the previous sample, rad, in `WHEELS` order, without the
+    time in which lines were lost (`bridged`). `whole_counts.py` recovers the angle from the speeds.
+    None if the counts per turn are not configured, or if the firmware does not report whole
+    counts."""
     steps: Motors = (0.0, 0.0, 0.0, 0.0)
     """Quantization step of each wheel's reported speed, rad/s, `math.inf` if unknown."""
     count: float = 0.0

@@ -20,9 +20,9 @@ from acsard.core.values import NS_PER_S, Event
 
 LATE_STEP_FRACTION = 0.5
 """Least time between two control steps that makes the second step late, as a share of
-`Link.quiet_ns`, the duration of silence after which the link is stale. The daemon reads the lines
-of the board only in its control steps. So if a silence ends with a late step, this computer has
-caused the silence by not running the daemon, and the board is not to blame."""
+`Link.quiet_ns`. `Link.quiet_ns` is the duration of silence after which the link is stale. If a
+silence ends with a late step, this computer has caused the silence, because it did not run the
+daemon."""
 
 BUSY_ADVICE = (
     "the Linux command `top` shows which other program uses the processor; acsard has priority if "
@@ -94,9 +94,8 @@ def blames_host(words: str) -> bool:
 class Lateness:
     """Detector of control steps that come too late.
 
-    The daemon reads the lines of the board only in its control steps. If a control step comes late,
-    the daemon could not read any line for a while. This computer has then caused the silence on the
-    serial line, and the board is not to blame.
+    The daemon reads the lines of the board only in its control steps. So if a silence ends with a
+    late step, this computer has caused the silence, and the board is not to blame.
     """
 
     def __init__(self, simulated: bool, quiet_ns: int) -> None:
@@ -243,10 +242,10 @@ class SilenceDiagnosis:
     def judge(self, now_ns: int, late_s: float = 0.0) -> bool:
         """Process a control step without a link, and return whether the diagnosis is new.
 
-        A new diagnosis is made every 3 s (`FIRST_DIAGNOSIS_NS`), from the bytes received in these 3
-        s. The result is True if this step makes the first diagnosis, or a diagnosis whose class of
-        received bytes (`ReceivedClass`) differs from that of the previous diagnosis. `late_s` is
-        the time since the previous step, s, if this step is late; otherwise 0.
+        Every 3 s (`FIRST_DIAGNOSIS_NS`), the received bytes give a new diagnosis. The result is
+        True if this step makes the first diagnosis, or a diagnosis whose class of received bytes
+        (`ReceivedClass`) differs from that of the previous diagnosis. `late_s` is the time since
+        the previous step, s, if this step is late; otherwise 0.
         """
         if self._since_ns is None:
             # The interval begins with this step, so the time before it does not belong to it.

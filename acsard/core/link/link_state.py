@@ -10,7 +10,7 @@ The inputs are received lines, silences and changes of the port. The states are:
 
   - No good line came for `Link.quiet_ns`.
   - BAD_LINES bad lines came in a row on a checked link.
-  - The open port could not write a line for the board's watchdog time.
+  - The open port wrote no line for `WATCHDOG_S`, the watchdog time of the board.
   - The received lines were the daemon's own lines (an echo).
 """
 
@@ -53,7 +53,6 @@ WATCHDOG_S = 0.3
 """Time without a valid line from the daemon after which the board stops the motors, s."""
 
 WATCHDOG_NS = int(WATCHDOG_S * NS_PER_S)
-"""`WATCHDOG_S` in ns."""
 
 GOOD_LINES = 3
 """Number of good lines in a row after which the link comes up. Fewer good lines prove little,

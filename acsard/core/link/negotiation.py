@@ -39,7 +39,8 @@ from acsard.core.values import NS_PER_S, WheelSpeeds
 
 State = Literal["off", "waking", "asking", "plain", "checked", "sampled"]
 Input = Literal["gap", "heard", "answer", "sample", "refusal", "samples_end"]
-"""The inputs of the state machine that negotiates the check.
+"""The inputs of the state machine that negotiates the check: a sequence number and a CRC in each
+line. A question is a stop line that asks for the check.
 
 - gap: the negotiation starts again, because the port was opened or lines were missing or damaged
 - heard: a plain line came while the daemon was asking for the check
@@ -76,12 +77,12 @@ IN_FORCE: dict[State, str] = {
 }
 
 Trouble = Literal["", "echo", "forgotten", "unknown"]
-"""The reason why the daemon accepts no reply at all, so that the robot cannot drive. "" means that
-there is no such reason.
+"""The reason why the daemon accepts no reply, so that the robot cannot drive; "" if there is no
+trouble.
 
 - echo: the lines that the daemon sends come back
-- forgotten: the board has answered with the check since the port was opened, but no longer does
-- unknown: the board does not support the check, and the configuration requires it
+- forgotten: the board has answered with a checksum since the port was opened, but no longer does
+- unknown: the board does not support checksums, and the configuration requires them
 """
 
 ADVICE: dict[Trouble, str] = {
@@ -98,9 +99,9 @@ ADVICE: dict[Trouble, str] = {
 }
 
 MAX_UNANSWERED_QUESTIONS = 3
-"""Number of unanswered questions of one kind after which the daemon concludes that the board does
-not support this kind. A question is a stop line with a sequence number and a checksum. Questions of
-the first kind ask for a sample, and those of the second kind have no request letters. If the daemon
+"""Number of questions of one kind after which the daemon gives this kind up, if the board has
+answered none of them. A question is a stop line with a sequence number and a checksum. Questions of
+the first kind ask for a sample of the encoders, and those of the second kind do not. If the daemon
 wants no samples, it sends a single question with `ECHO_MARK` instead of the first kind."""
 
 MAX_OPEN_LINES = 64
@@ -109,7 +110,7 @@ sequence numbers (256), so a reply cannot match the wrong line."""
 
 ANSWER_TIMEOUT_NS = round(WATCHDOG_S * NS_PER_S)
 """Longest time from the writing of a command to its answer, ns. Later answers are rejected. If the
-board receives no line for this time, its watchdog stops the motors."""
+board receives no line for the same time, it stops the motors."""
 
 SILENT_BOARD_PERIOD_NS = NS_PER_S // 10
 """Least time between two stop lines while the board sends nothing, ns. A rate of 10 Hz is enough to
@@ -167,8 +168,9 @@ class Negotiation:
         first = (SAMPLE_REQUEST,) * MAX_UNANSWERED_QUESTIONS if mcu.wants_samples else (ECHO_MARK,)
         self._letters = (*first, *(b"",) * MAX_UNANSWERED_QUESTIONS)
         self._question = b""
-        """The last question without its line end, to detect its echo; b"" if the question has no
-        request letters, because a genuine reply may equal such a question."""
+        """The last question (a stop line that asks for the check) without its line end, to detect
+        its echo. b"" if the question has no request letters, because a genuine reply may equal such
+        a question."""
         longest = line_bytes(mcu.trailing_comma, check=True, sample=mcu.wants_samples)
         self._answer_ns = PROCESSING_NS + 4 * wire_ns(longest, mcu.baud_rate)
         self._sequence = 0
@@ -185,12 +187,12 @@ class Negotiation:
 
     @property
     def asking(self) -> bool:
-        """Whether the daemon is still asking for the check, so that it sends nothing but stops."""
+        """Whether the daemon still asks for checksums. Meanwhile it sends only stops."""
         return self.state in ("waking", "asking")
 
     @property
     def checked(self) -> bool:
-        """Whether only replies with a correct check are accepted."""
+        """Whether the daemon accepts only replies with a correct checksum."""
         return self.state in ("checked", "sampled")
 
     @property
@@ -280,7 +282,7 @@ class Negotiation:
     # Lines from the board.
 
     def check_question_echo(self, line: bytes) -> bool:
-        """Test a received line, and return whether this line or an earlier one is an echo.
+        """Return whether this line or an earlier one is an echo of a line of the daemon.
 
         `line` has no line end. After an echo, the caller rejects every received line until the port
         is reopened.
@@ -304,9 +306,9 @@ class Negotiation:
         return self.echoes
 
     def record_plain_reply(self) -> None:
-        """Record that a valid plain line came while the daemon was asking for the check.
+        """Record that a valid plain line came while the daemon was asking for checked lines.
 
-        This line shows that the board is awake, so unanswered questions are counted from now on.
+        This line shows that the board is awake, so unanswered requests are counted from now on.
         """
         self._apply("heard")
 
@@ -339,8 +341,8 @@ class Negotiation:
     def judge(self, now_ns: int) -> None:
         """Count the last question as unanswered if its answer is overdue.
 
-        The daemon first sends questions with request letters, and then questions without them. If
-        all of these questions are unanswered, there are two cases:
+        A question is a stop line that asks for the check: a sequence number and a CRC. If the board
+        has answered none of the questions, there are two cases:
 
         - `mcu.link_check` is "auto", and the board has never answered with the check: the daemon
           accepts plain lines.

@@ -3,9 +3,10 @@
 A coarse encoder quantizes the reported speed of its wheel. If the counts per turn are configured,
 `whole_counts.py` recovers the counts from the speeds. Otherwise the pose uses speed times time.
 
-The module does not try to find unknown counts per turn from the speeds, because they would not
-help. They can be found only if the firmware divides its counts by a fixed period. In this case, the
-time between the lines is known, and speed times time is wrong only by the rounding of the speeds.
+If the counts per turn are not configured, the module does not try to find them from the speeds.
+They can be found only if the firmware divides its counts by a fixed period. In this case they would
+not help: the time between the lines is known, so speed times time is wrong only by the rounding of
+the speeds.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ FIRST_STEPS = 24
 Until the end of the block, this value may still grow."""
 
 STEP_RANK = 3
-"""`Steps.size` is the third largest step of a block. The largest step would be wrong, because a
-single damaged line causes two large steps."""
+"""Rank of the change of a reported speed that becomes `Steps.size`: the third largest change of a
+block. The largest change would be wrong, because a single damaged line causes two large changes."""
 
 MAX_STEP_RATIO = 3.0
 """Upper bound on the quantization step of a wheel, as a multiple of the second largest step among
@@ -40,8 +41,9 @@ the four wheels. The bound is needed because random jumps of a speed look like q
 
 COARSE, JUMP_GAIN = 0.015, 0.06
 """`COARSE` is the mean jump of a wheel's speed above which its encoder is treated as coarse, rad
-per line. `Coarseness` defines a jump. An encoder with about 200 counts a turn reaches this value.
-`JUMP_GAIN` is the gain of the filter for the mean jump."""
+per line. A jump is half of the difference between two successive speed changes, times the time
+between the lines. An encoder with about 200 counts a turn reaches this value. `JUMP_GAIN` is the
+gain of the filter for the mean jump."""
 
 MAX_INTERVAL_S = 0.03
 """Longest time between two lines whose speeds `Coarseness` compares, s. Over a longer time, the

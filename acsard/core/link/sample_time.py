@@ -41,10 +41,10 @@ class Placed(Struct, frozen=True, gc=False):
     clock: Literal["slots", "prompts", "reads"]
     due_ns: int
     dt: float | None = None
-    """Time since the previous line by this clock, s. None for the first line of the clock and for
-    "reads"."""
+    """Time since the previous line by this clock, s. None for the first line of the clock, and if
+    the times of the host's reads serve as the clock."""
     bridged: float = 0.0
-    """The part of `dt` in which lines were lost, s."""
+    """The part of the time since the previous line in which lines were lost, s."""
     early: bool = False
     """Whether the line came before the clock expected it. If so, `due_ns` is the time at which the
     line arrived, and the clock gives a wrong `dt` for the next line. The caller therefore computes
@@ -71,15 +71,15 @@ change would be larger, the period is not rounded. The limit covers the error of
 measurement."""
 
 SINGLE_READ_FRACTION = 0.7
-"""Least share of the reads of the port with a single line at which `FreeRunningTimes` tries clocks
-for lines that are read one by one. Below this share, it tries only clocks for lines that an adapter
+"""If at least this share of the reads of the port has a single line, `FreeRunningTimes` also tries
+clocks for lines that are read one by one. Otherwise it tries only clocks for lines that an adapter
 batches."""
 
 LATE_ALONE, LATE_BATCHED = 0.6, 1.3
-"""Largest time by which a line may come after its slot for `FreeRunningTimes` to accept a clock, in
-periods of the board. A slot is the period in which a line is due. `LATE_ALONE` is for lines that
-are read one by one, and `LATE_BATCHED` for lines that an adapter batches. `MAX_ADAPTER_DELAY_NS`
-limits both."""
+"""Largest time by which a line may come after its slot, in periods of the board. A slot is the
+period in which a line is due. If a line comes later, `FreeRunningTimes` does not accept the clock.
+`LATE_ALONE` is for lines that are read one by one, and `LATE_BATCHED` for lines that an adapter
+batches. `MAX_ADAPTER_DELAY_NS` limits both."""
 
 MAX_ADAPTER_DELAY_NS = 25_000_000
 """Longest time for which an adapter is assumed to hold a line back, ns. An FTDI chip holds a line
@@ -88,15 +88,15 @@ answers a command that was sent between two periods, or comes from a slow board 
 more than this time."""
 
 MAX_CONFIRMING_LATENESS, READS_PER_CONFIRMATION = 0.55, 12
-"""Limits for the reads that confirm a clock. A read confirms a clock if it comes at most
-`MAX_CONFIRMING_LATENESS` periods after its slot. The earliest read always confirms the clock.
+"""Limits for the reads that confirm a clock of the board. A read confirms a clock if it comes at
+most `MAX_CONFIRMING_LATENESS` periods after its slot. The earliest read always confirms the clock.
 `FreeRunningTimes` accepts the clock only if, in addition to the earliest read, more than one in
 `READS_PER_CONFIRMATION` reads confirm it. If fewer reads do, these reads probably contain answers
 to commands that were sent between two periods, and the clock is too early for all other lines."""
 
 COMPLETE_PERIODS = 1.4
-"""Time between two reads with a single line each, in periods of the board, below which no line is
-missing between the two lines."""
+"""If the time between two reads with a single line each is below this limit, no line is missing
+between them. The unit is the period of the board."""
 
 LATENESS_MARGIN = 0.15
 """Margin on the lateness of a line, in periods. An adapter delays a line only up to a limit. If the
@@ -107,8 +107,8 @@ MAX_EARLY_PERIODS = 0.25
 even earlier, `FreeRunningTimes` gives up its clock as wrong."""
 
 LOSSY_READ_FRACTION = 0.45
-"""Largest share of the reads that may follow missing lines, as a mean over two successive windows.
-If the share is larger, the period of the clock is wrong."""
+"""If a larger share of the reads of the port follows missing lines, the period of the clock is
+wrong. The share is a mean over two successive windows."""
 
 
 class FreeRunningTimes:
@@ -150,7 +150,8 @@ class FreeRunningTimes:
         self.usual = 0.0
         """The last measured period T of the board, ns. 0 until a clock has been found."""
         self._stretch = 1.0
-        """Number of slots per line of the last read: 1, or more if lines before it are missing."""
+        """Number of slots per line of the last read: 1, or more if lines are missing before the
+        read."""
         self._before = 0
         self._first, self._slot = 0.0, 0
         """The time c of slot 0, ns, and the number k of the slot of the last line."""
@@ -158,9 +159,9 @@ class FreeRunningTimes:
         """Number of slots that recent reads counted as slots of missing lines. If later lines show
         that no line was missing, these slots are taken back."""
         self._lag = self._batch = self._gain = self._share = 0.0
-        """`_lag` is the usual lateness x of a read, and `_batch` the usual time between two reads,
-        both in slots. `_gain` is the gain g. `_share` is the share of the reads in the last window
-        that follow missing lines."""
+        """`_lag` is the usual lateness of a read after its slot, and `_batch` the usual time
+        between two reads, both in slots. `_gain` is the gain of the loop that corrects the clock.
+        `_share` is the share of the reads in the last window that follow missing lines."""
         self._batched: bool = False
         self._alone: bool = False
         self._least: float
@@ -170,7 +171,8 @@ class FreeRunningTimes:
     def forget(self) -> None:
         """Give up the clock, because the lines contradict it or may come from another board."""
         self.period: float | None = None
-        """Nominal period by which the firmware divides its counts, s. None without a clock."""
+        """Nominal period by which the firmware divides its counts, s. None while no clock of the
+        board is known."""
         self._reads: list[Read] = []
         self._last: float | None = None
         """Slot of the last line that the present clock has placed. None before the first line."""
@@ -216,7 +218,8 @@ class FreeRunningTimes:
 
     @property
     def late_ns(self) -> float:
-        """Mean time from the beginning of a line's slot to the read of the line, ns."""
+        """Mean time from the beginning of the period in which a line is due to the read of the
+        line, ns."""
         return self._lag * self.usual
 
     def place(self, behind: int) -> Placed | None:
@@ -355,7 +358,7 @@ class FreeRunningTimes:
 
 
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
-    """Return the slot of the last line of each read.
+    """Return the slot (the number of the board's period) of the last line of each read.
 
     The last line of the first read has the slot 0. By default, only received lines have slots. If
     `period`, ns, is finite, missing lines have slots too: a time of several periods between two
@@ -412,9 +415,9 @@ previous read counts as at least 1 and at most `MAX_RISE_PERIODS` times the usua
 commands. The upper limit is for a board that stalls and then answers all lines."""
 
 LOST_REPLY_PERIODS = 1.25
-"""Largest excess of the least delay of the last replies over the long-term least delay, in usual
-times between two commands. A larger excess means that replies were lost. A limit of 1 is too low,
-because the delay may permanently rise by almost the time between two commands."""
+"""Largest excess of the least delay of the last replies over the long-term least delay. The unit is
+the usual time between two commands. A larger excess means that replies were lost. A limit of 1 is
+too low, because the delay may permanently rise by almost the time between two commands."""
 
 RARE_LOSS_FRACTION = 0.002
 """Share of lost replies below which a late reply after a host stall does not prove that a reply was
@@ -543,7 +546,7 @@ class PromptedTimes:
 
     @property
     def lossy(self) -> bool:
-        """Whether an adapter batches the replies, and more than `LOSSY_FRACTION` are lost."""
+        """Whether an adapter batches the replies, and more than 3 % (`LOSSY_FRACTION`) are lost."""
         return self._batched and self._losses > LOSSY_FRACTION
 
     @property

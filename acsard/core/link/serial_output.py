@@ -45,10 +45,7 @@ class Port(Protocol):
 
 
 class SerialOutput:
-    """The output of a serial port while it is open. Each opening of the port needs a new object.
-
-    A line is written immediately or dropped. It is never queued.
-    """
+    """The output of a serial port while it is open. Each opening of the port needs a new object."""
 
     def __init__(self, baud_rate: int, stop: bytes, period_ns: int) -> None:
         """Start for a port that was just opened.

@@ -94,9 +94,10 @@ class McuSession:
         """The values of `status` and `status_ns`, but only from status lines received since the
         last opening of the port."""
         self._awaiting, self._settled_ns, self._judged_ns = True, 0, 0
-        """`_awaiting` is true until the fields that were reported only before the last opening of
-        the port are forgotten. `_settled_ns` is the time for which the link has been up, ns,
-        without the late steps. `_judged_ns` is the monotonic time of the last update, ns."""
+        """`_awaiting` is true from the opening of the port until the session forgets the fields
+        that the board has not reported since. `_settled_ns` is the time for which the link has been
+        up, ns, without the late steps. `_judged_ns` is the monotonic time of the last update,
+        ns."""
         self.reopened = self.forgot = False
         """`reopened` is true if the last `update` found that the port was opened. `forgot` is true
         if the last `update` forgot the fields that the board has not reported since the opening of
@@ -247,10 +248,6 @@ class McuSession:
     # sessions
 
     def _settle(self, was_written: bool, port_open: bool, late_ns: int) -> None:
-        """Record whether the port wrote the line that `line()` returned last.
-
-        `late_ns` is the time from the making to the writing of the line, ns.
-        """
         made = self._made
         if made is None:
             return

@@ -48,37 +48,40 @@ that look like whole counts prove nothing."""
 
 MAX_COUNT_ERROR = 0.3
 """Largest accepted difference between a whole number of counts and the number of counts that
-follows from the speed and the host's estimate of the time. This limit applies if the speeds alone
-prove nothing, as with fine encoders. It also helps to decide whether the counts of a line include
-those of the missing line before it."""
+follows from the speed and the host's estimate of the time between two samples. This limit applies
+if the speeds alone prove nothing, as with fine encoders. It also helps to decide whether a line
+includes the counts of the missing line before it."""
 
 MAX_TIME_ERROR, MAX_TIME_ERROR_S = 0.6, 0.005
 """Largest assumed error of the host's estimate of the time between two samples: the estimate times
 `MAX_TIME_ERROR`, plus `MAX_TIME_ERROR_S` s."""
 
 MAX_CARRIED_ERROR = 0.95
-"""Largest share of the error of the host's estimate that is added to the estimate for the next
-line. The share must be below 1. If the share were 1 and the clocks of the host and the board
-differed by 0.5 %, the sum of the errors would grow forever."""
+"""Largest share of an error that is added to the estimate for the next line. The error is that of
+the host's estimate of the time between two samples. The share must be below 1. If the share were 1
+and the clocks of the host and the board differed by 0.5 %, the sum of the errors would grow
+forever."""
 
 REPEATED_FRACTION = 0.65
-"""Longest time after the previous line at which a line with unchanged speeds can be a repetition,
-divided by the time over which the firmware last counted. Firmware that is asked again very soon has
-no new counts, and repeats the speeds of the previous line."""
+"""Limit from which on a line with unchanged speeds is not a repetition of the previous line. The
+limit applies to the time since the previous line, divided by the time over which the firmware last
+counted. Firmware that is asked again very soon has no new counts, so it repeats the speeds of the
+previous line."""
 
 REPEATED_LIMIT, REPEATED_COUNT_ERROR = 0.45, 0.25
 """Limits for a line with unchanged speeds. Let q be the time since the previous line, divided by
 the time over which the firmware last counted. If q is less than `REPEATED_LIMIT`, the line is a
 repetition of the previous line. If q lies between `REPEATED_LIMIT` and `REPEATED_FRACTION`, the
 line is a repetition in two cases. Either its speeds are not whole counts, or its counts and the
-host's estimate of the time differ by more than `REPEATED_COUNT_ERROR` counts of the fastest
+host's estimate of that time differ by more than `REPEATED_COUNT_ERROR` counts of the fastest
 wheel."""
 
 MAX_MEAN_ERROR, MEAN_GAIN = 0.2, 0.025
-"""`MAX_MEAN_ERROR` is a limit for the mean error of the host's estimate of the time, in counts of
-the fastest wheel. Above this limit, the nearest whole number of counts is often wrong. A random
-time has a mean error of 0.25. An encoder with 96 counts a turn reaches `MAX_MEAN_ERROR` behind a
-USB adapter that batches lines for 16 ms. `MEAN_GAIN` is the gain of the filter for the mean."""
+"""`MAX_MEAN_ERROR` is a limit for the mean error of the host's estimate of the time between two
+samples, in counts of the fastest wheel. Above this limit, the nearest whole number of counts is
+often wrong. A random time has a mean error of 0.25. An encoder with 96 counts a turn reaches
+`MAX_MEAN_ERROR` behind a USB adapter that batches lines for 16 ms. `MEAN_GAIN` is the gain of the
+filter for the mean."""
 
 SHARE_GAIN, MAX_BAD_SHARE = 0.1, 0.3
 """`SHARE_GAIN` is the gain of the filters for two shares: the share of lines whose speeds are not
@@ -108,7 +111,7 @@ class WholeCounts:
         """Number of lines with recovered counts since the last line without recovered counts."""
         self._before: Motors = (0.0, 0.0, 0.0, 0.0)
         self.covers_gap = False
-        """Whether the counts of the last line include those of the missing line before it."""
+        """Whether the last line includes the counts of the missing line before it."""
         self._cover = 0.0
         """Filtered share of lines that include the counts of the missing line before them, 0 to 1.
         It is computed only from lines that follow a missing line and show whether they include its
@@ -118,8 +121,7 @@ class WholeCounts:
         is the filtered error of the host's estimate of the time, in counts of the fastest wheel."""
 
     def pause(self) -> None:
-        """Forget the error of the host's estimate, so that it is not added to the next estimate.
-
+        """Do not add the error of the last estimated time between two samples to the next estimate.
         The caller does this if the last line does not show the time over which the firmware
         counted.
         """

@@ -44,7 +44,8 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
 
 
 def _effect(ends: Mapping[str, int], now_ns: int) -> str:
-    # Zenoh ignores the dates of an authority, so only the robot's own certificate has this effect.
+    # Zenoh ignores the dates of an authority, so TLS refuses clients only if the robot's own
+    # certificate has expired.
     own_ns, others = ends.get("", now_ns), [ends_ns for owner, ends_ns in ends.items() if owner]
     if own_ns >= now_ns or own_ns in others:
         return ""
@@ -59,7 +60,7 @@ def first_expiry(ends: Mapping[str, int]) -> tuple[str, int]:
 
     `ends` maps owners to expiry times, wall-clock ns since 1970. The owner "" stands for the
     robot's own certificate, or for the report of the TLS gateway, which does not name the owner. If
-    another owner has the same expiry time, the report is about the certificate of that owner.
-    Therefore the result names that owner.
+    a certificate with a named owner expires at the same time, the report is about that certificate.
+    Therefore the result then names this owner.
     """
     return min(ends.items(), key=lambda pair: (pair[1], pair[0] == ""))

@@ -7,7 +7,7 @@
 Each message has the same rows, because rqt_robot_monitor shows a missing row as stale. There are
 two exceptions: the row of the board's inputs and the row of its battery. Each appears when the
 board first reports a value for it, or from the start if the configuration requires such values. It
-stays until another board is connected that does not report the values.
+stays until a board without these values is connected.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class Topic(Struct, frozen=True):
     local: bool = False
     """True for a key that only programs on the robot's own machine may use."""
     latched: bool = False
-    """True for a key whose last message each new subscriber receives immediately."""
+    """True if each new subscriber immediately receives the last message on the key."""
     simulated: bool = False
     """True for a key that exists only with the built-in simulator."""
     gyro: bool = False

@@ -40,7 +40,7 @@ LatchNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
 """Number of a latch. It is below 2^53, so JavaScript represents it exactly."""
 
 MAX_64_ITEMS = Meta(max_length=64)
-"""Limit of a list or a map to 64 items, with which a huge message is refused quickly. No robot has
+"""Limit of 64 items for a list or a map, so that a huge message is refused quickly. No robot has
 more than 64 joints."""
 
 
@@ -441,9 +441,9 @@ class GatewayState(Message, frozen=True):
     connections: Annotated[int, Meta(ge=0, lt=1 << 16)]
     """Number of connections from the network at present."""
     full: Annotated[int, Meta(ge=0, lt=1 << 31)]
-    """Number of times since its start that the gateway found all its connections in use.
+    """Number of checks since the start of the gateway in which all its connections were in use.
 
-    The gateway checks this four times a second.
+    The gateway makes four checks per second.
     """
     certificate_ends: Annotated[int, Meta(ge=0, lt=1 << 62)] = 0
     """Earliest time at which one of the TLS certificates expires, wall-clock ns since 1970. It is 0

@@ -49,10 +49,8 @@ class Signature(Struct, frozen=True, omit_defaults=True):
     """Number of the command, which grows by 1 with each command of this sender. None if the sender
     does not number its commands."""
     steady: bool = False
-    """True if the clock that gives `stamp` is never adjusted while the sender runs.
-
-    An old stamp then proves that the command was delayed.
-    """
+    """True if the clock that gives `stamp` is never adjusted while the sender runs. An old stamp
+    then proves that the command was delayed."""
 
     def pack(self) -> bytes:
         """Encode the attachment in msgpack."""

@@ -60,7 +60,7 @@ class Faults:
         self.samples = True
         self.latency_ns = 0
         """Interval of the USB adapter's timer, ns. When the timer expires, the adapter sends its
-        packet even if the packet is not full. 0 means that there is no adapter."""
+        packet even if the packet is not full. 0 means no adapter."""
         self.stall_every_ns = self.stall_ns = 0
         self.lose_reply = self.lose_command = self.bit_error = 0
         """Each of these three faults affects every n-th line. The value is n, or 0 if the fault is
