@@ -134,7 +134,7 @@ def _key(speed: float) -> int:
 
 
 def summary(durations_ns: Sequence[int]) -> Summary | None:
-    """Return the summary of the durations, or None if there are none.
+    """Return the summary of the durations, or None for an empty list.
 
     Each percentile is one of the durations, not an interpolation between two of them.
     """

@@ -335,8 +335,8 @@ def identify(arrival: Arrival) -> Identity:
     - a key of a bridge: the session that stamped the sample, or else the key.
 
     A sender id or a GID belongs to one program. Several programs may share a session or a key: a
-    router or a bridge stamps the samples of all programs that connect through it, and the daemon
-    cannot tell the session of a router from the session of a program.
+    router or a bridge stamps the samples of all programs that connect through it. The daemon cannot
+    tell the session of a router from the session of a program.
 
     A GID does not prove the identity. ROS discovery publishes the GIDs, so a program that may put
     on a key of rmw_zenoh can claim any GID.
@@ -417,8 +417,8 @@ def caller_name(via: Via, attachment: bytes, stamped_by: str = "") -> str:
     The name has a suffix in brackets, which begins with the transport `via`:
 
     - native: the public name of the sender id in `attachment`. Without a sender id the name is
-      "unnamed", and the brackets also contain the public name of the Zenoh session `stamped_by`,
-      which stamped the sample, unless `stamped_by` is "".
+      "unnamed". The brackets then also contain the public name of `stamped_by`, the Zenoh session
+      that stamped the sample, if `stamped_by` is not "".
     - rmw: "unnamed". The brackets also contain the GID of the client.
     - bridge: "unnamed".
 

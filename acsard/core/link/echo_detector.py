@@ -2,8 +2,8 @@
 
 Lines come back if TX and RX are connected to each other, or if a device at the far end sends all
 bytes back. A board may be connected behind such a device. The daemon then receives both the echo
-and the replies of the board. This module detects the echo of plain lines, and of checked lines
-(lines with a checksum) that do not ask for a sample of the encoders.
+and the replies of the board. This module detects the echo of plain lines. It also detects the echo
+of checked lines (lines with a checksum), if they do not ask for a sample of the encoders.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MIN_BEND = 0.025
 wheel's speed, as at the start or the end of a ramp. An echo needs at least one bend above this
 limit. Speeds in lines are rounded to 0.01 rad/s, so on a straight ramp two speed changes differ by
 up to 0.02 rad/s. Therefore an echo may stay undetected while all ramps are gentler than 0.025 rad/s
-per line, which is 0.125 m/s2 for a wheel radius of 0.05 m at 100 Hz."""
+per line. For a wheel radius of 0.05 m, this is 0.125 m/s2 at 100 Hz."""
 
 COMPARED_LINES = 8
 """Number of the newest sent lines with which `EchoDetector` compares each received reply. At 100

@@ -3,9 +3,9 @@
 The counts are cumulative, so no distance is missing after a lost line. The board sends the time of
 its own clock with the counts. The time between two readings therefore does not depend on when the
 host read the lines. Counts and milliseconds are modulo 65536. The difference between two counts is
-used only if the counts cannot have wrapped, and if a wheel at its highest speed can make that many
-counts. Otherwise the caller computes the angle as speed times time. The module also detects a
-probable restart of the board.
+used only in this case: the counts cannot have wrapped, and a wheel at its highest speed can make
+that many counts. Otherwise the caller computes the angle as speed times time. The module also
+detects a probable restart of the board.
 """
 
 from __future__ import annotations

@@ -45,8 +45,8 @@ because scheduling alone causes a smaller difference."""
 
 DECISION_DIFFERENCE = 2.5
 """Least difference between the number of reply periods and the number of commands at which
-`ReplyStyle` decides whether the board reports by its own clock. Both numbers are sums over the
-reads of the port that `ReplyStyle` evaluates."""
+`ReplyStyle` decides. It decides whether the board reports by its own clock. Both numbers are sums
+over the reads of the port that `ReplyStyle` evaluates."""
 
 MAX_READ_PERIODS = 100.0
 """If more reply periods than this lie between two reads of the port, `ReplyStyle` does not evaluate

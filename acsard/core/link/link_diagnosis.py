@@ -243,9 +243,9 @@ class SilenceDiagnosis:
         """Process a control step without a link, and return whether the diagnosis is new.
 
         Every 3 s (`FIRST_DIAGNOSIS_NS`), the received bytes give a new diagnosis. The result is
-        True if this step makes the first diagnosis, or a diagnosis whose class of received bytes
-        (`ReceivedClass`) differs from that of the previous diagnosis. `late_s` is the time since
-        the previous step, s, if this step is late; otherwise 0.
+        True for the first diagnosis. It is also True if the class of the received bytes
+        (`ReceivedClass`) differs from the class in the previous diagnosis. `late_s` is the time
+        since the previous step, s, if this step is late; otherwise 0.
         """
         if self._since_ns is None:
             # The interval begins with this step, so the time before it does not belong to it.
@@ -267,8 +267,8 @@ class UnansweredLines:
     repeat the warning until the board has answered enough of a later series of `WINDOW_LINES`
     lines, or the link was lost.
 
-    A healthy board that reports by its own clock also causes the warning if it sends fewer lines
-    than the daemon and `mcu.reply_period` is not set.
+    A healthy board also causes the warning if it reports by its own clock, sends fewer lines than
+    the daemon, and `mcu.reply_period` is not set.
     """
 
     def __init__(self, reply_period: float) -> None:

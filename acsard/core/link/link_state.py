@@ -59,13 +59,13 @@ GOOD_LINES = 3
 because a board may print anything after a reset."""
 
 BAD_LINES = 5
-"""Number of bad lines in a row on a checked link (a link whose lines have checksums) after which
-the daemon negotiates the checksum again."""
+"""If this many lines in a row are bad on a checked link (a link whose lines have checksums), the
+daemon negotiates the checksum again."""
 
 SPARSE_SILENCES = 2
-"""Number of silences in a row after which the lines of the board count as too sparse. Silences are
-in a row if only one good line comes between two of them. A single silence only means that the link
-was lost for a moment."""
+"""After this many silences in a row, the lines of the board count as too sparse. Silences are in a
+row if only one good line comes between two of them. A single silence only means that the link was
+lost for a moment."""
 
 
 class Link:

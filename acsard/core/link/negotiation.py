@@ -77,8 +77,7 @@ IN_FORCE: dict[State, str] = {
 }
 
 Trouble = Literal["", "echo", "forgotten", "unknown"]
-"""The reason why the daemon accepts no reply, so that the robot cannot drive; "" if there is no
-trouble.
+"""The reason why the daemon accepts no reply, so that the robot cannot drive; else "".
 
 - echo: the lines that the daemon sends come back
 - forgotten: the board has answered with a checksum since the port was opened, but no longer does
@@ -284,8 +283,8 @@ class Negotiation:
     def check_question_echo(self, line: bytes) -> bool:
         """Return whether this line or an earlier one is an echo of a line of the daemon.
 
-        `line` has no line end. After an echo, the caller rejects every received line until the port
-        is reopened.
+        `line` is without its line end. After an echo, the caller rejects every received line until
+        the port is reopened.
         """
         if self._question and line == self._question:
             self.trouble = "echo"

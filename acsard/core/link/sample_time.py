@@ -1,11 +1,11 @@
 """Estimates when the board read its encoders (the sample time), for two kinds of boards.
 
 The host reads a line later than its sample time, because an adapter, the scheduler or a stall of
-the host may have delayed the line. `FreeRunningTimes` finds the period of a board that reports by
-its own clock. For a board that answers each command, `PromptedTimes` uses the times at which the
-commands were written. Each class serves as a clock: after every read of the port, call
-`process_read` on both objects, and then `place` to get the time of each line of the read.
-`feedback.py` chooses the better clock for each line.
+the host may delay the line. `FreeRunningTimes` finds the period of a board that reports by its own
+clock. For a board that answers each command, `PromptedTimes` uses the times at which the commands
+were written. Each class serves as a clock: after every read of the port, call `process_read` on
+both objects, and then `place` to get the time of each line of the read. `feedback.py` chooses the
+better clock for each line.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ batches. `MAX_ADAPTER_DELAY_NS` limits both."""
 MAX_ADAPTER_DELAY_NS = 25_000_000
 """Longest time for which an adapter is assumed to hold a line back, ns. An FTDI chip holds a line
 for 16 ms. If a line comes later than this, `FreeRunningTimes` finds no clock. Such a line probably
-answers a command that was sent between two periods, or comes from a slow board whose lines vary by
+answers a command that was sent between two periods, or its board is slow and its delay varies by
 more than this time."""
 
 MAX_CONFIRMING_LATENESS, READS_PER_CONFIRMATION = 0.55, 12
@@ -471,8 +471,8 @@ class PromptedTimes:
     commands were written, plus a usual delay. The time between two samples is the time between the
     two commands that the board answered, even if the host reads the replies late.
 
-    Replies come in the order of the commands. If a reply seems later than usual by more than half
-    of the time to the next command, then it answers the next command, and the reply to the earlier
+    Replies come in the order of the commands. A reply may seem later than usual by more than half
+    of the time to the next command. Then it answers the next command, and the reply to the earlier
     command was lost.
     """
 

@@ -57,9 +57,9 @@ booting."""
 class McuSession:
     """The exchange of lines with the MCU on one serial port.
 
-    A new session with the MCU begins when the port is opened, when the MCU restarts, and when a gap
-    of at least `LONG_GAP_NS` in the lines ends. One object of this class handles all of these
-    sessions.
+    A new session with the MCU begins when the port is opened and when the MCU restarts. It also
+    begins at the end of a gap of at least `LONG_GAP_NS` in the lines. One object of this class
+    handles all of these sessions.
     """
 
     def __init__(
@@ -118,8 +118,8 @@ class McuSession:
         self.good_lines = 0
         self._heard_ns: int | None = None
         self.restarted = False
-        """True if the last `update` began a new session with the MCU, because the port was opened,
-        the MCU has restarted, or a long gap in the lines has ended."""
+        """True if the last `update` began a new session with the MCU. The reason is that the port
+        was opened, the MCU has restarted, or a long gap in the lines has ended."""
         self.events: list[Event] = []
         """Events of the last `update`, for the log."""
         self._starting_over = False

@@ -47,10 +47,10 @@ with each number of counts that is tried for a line. If the probability exceeds 
 that look like whole counts prove nothing."""
 
 MAX_COUNT_ERROR = 0.3
-"""Largest accepted difference between a whole number of counts and the number of counts that
-follows from the speed and the host's estimate of the time between two samples. This limit applies
-if the speeds alone prove nothing, as with fine encoders. It also helps to decide whether a line
-includes the counts of the missing line before it."""
+"""Largest accepted difference between a whole number of counts and a computed number. The computed
+number follows from the speed and the host's estimate of the time between two samples. This limit
+applies if the speeds alone prove nothing, as with fine encoders. It also helps to decide whether a
+line includes the counts of the missing line before it."""
 
 MAX_TIME_ERROR, MAX_TIME_ERROR_S = 0.6, 0.005
 """Largest assumed error of the host's estimate of the time between two samples: the estimate times
@@ -72,9 +72,9 @@ REPEATED_LIMIT, REPEATED_COUNT_ERROR = 0.45, 0.25
 """Limits for a line with unchanged speeds. Let q be the time since the previous line, divided by
 the time over which the firmware last counted. If q is less than `REPEATED_LIMIT`, the line is a
 repetition of the previous line. If q lies between `REPEATED_LIMIT` and `REPEATED_FRACTION`, the
-line is a repetition in two cases. Either its speeds are not whole counts, or its counts and the
-host's estimate of that time differ by more than `REPEATED_COUNT_ERROR` counts of the fastest
-wheel."""
+line is a repetition in two cases. Either its speeds are not whole counts. Or the time that its
+counts imply differs from the host's estimate by more than the time of `REPEATED_COUNT_ERROR` counts
+of the fastest wheel."""
 
 MAX_MEAN_ERROR, MEAN_GAIN = 0.2, 0.025
 """`MAX_MEAN_ERROR` is a limit for the mean error of the host's estimate of the time between two

@@ -345,9 +345,10 @@ def by_key(key: str) -> Topic | None:
 
 
 def row_of(key: str) -> Topic | None:
-    """Return the row of `TOPICS` that describes a key, or None. `key` has no robot id in front.
+    """Return the row of `TOPICS` that describes a key, or None.
 
-    For example, the result for `cmd/app` is the row of `cmd/<source>`.
+    `key` is the part after the robot's id. For example, the result for `cmd/app` is the row of
+    `cmd/<source>`.
     """
     return next((topic for topic in TOPICS if _pattern(topic.key).fullmatch(key)), None)
 

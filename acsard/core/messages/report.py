@@ -64,7 +64,7 @@ UNKNOWN_STATUS, CHARGING, DISCHARGING, NOT_CHARGING = range(4)
 
 
 class _Rate:
-    """Limits how often messages of one key are published. 0 Hz means that there is no limit."""
+    """Limits how often messages of one key are published. 0 Hz means no limit."""
 
     def __init__(self, hz: float) -> None:
         self._period_ns = int(NS_PER_S / hz) if hz else 0

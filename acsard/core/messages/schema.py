@@ -271,8 +271,8 @@ class BatterySummary(Message, frozen=True):
     level: Annotated[str, one_of(get_args(BatteryLevel))]
     """Level according to the thresholds in `[battery]`; `ok` if no threshold is set.
 
-    `unknown` means that the board does not report the quantity (V or %) that the thresholds use,
-    or has reported it only for a few seconds so far.
+    `unknown` means that the board does not report the quantity of the thresholds (V or %), or has
+    reported it only for a few seconds so far.
     """
 
 

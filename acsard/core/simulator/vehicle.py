@@ -6,8 +6,8 @@ the true radii and the true track differ from the values in `[drive]`. Wheels ar
 `values.WHEELS`.
 
 The true effective track depends on the turn rate. Let L be the configured effective track, m the
-setting `track_multiplier`, k the setting `track_rate_dependence`, and w the turn rate in rad/s
-that the wheels would give with the track m L. The base turns at the rate
+setting `track_multiplier`, and k the setting `track_rate_dependence`. With the track m L, the
+wheels would give the turn rate w, rad/s. The base turns at the rate
 
     w / (1 + 2 k |w| / (1 + |w|))
 
