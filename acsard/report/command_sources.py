@@ -70,8 +70,8 @@ class CommandSources:
         """Maps each reason for a refusal to the number of commands that `_robot` has refused so far
         for this reason."""
         self._refused: dict[str, tuple[float, str]] = {}
-        """Maps the name of each refused source to a pair: the time until which the source counts as
-        refused, s, and the reason in words."""
+        """Maps the name of each refused source to a pair: the time at which the refusal ends, s
+        since the first step of the report, and the reason in words."""
 
     def name(self, source: str) -> str:
         """Return the name of a source, or `OTHER_SOURCES` if the source is not configured."""
@@ -101,12 +101,12 @@ class CommandSources:
         return before != self._refused
 
     def _find_refused(self, step: RecordedStep, t: float, robot: Robot) -> None:
-        # The robot's counters show the reasons, but not the sources. A source counts as refused if
-        # the last command that the robot accepted from it is older than its command in this step.
+        # The robot counts refusals by reason, but not by source. A source with a command in this
+        # step counts as refused if the last command that the robot accepted from it is older.
         counted = Counter(self._reader.refused(robot))
         new, self._counted = counted - self._counted, counted
         same, self._robot = robot is self._robot, robot
-        # A robot from a recorded state has also counted the refusals before this step.
+        # The counters of a robot from a recorded state include refusals before this step.
         if not (new and same):
             return
         words = "; ".join(REFUSED[reason] for reason in new)

@@ -57,8 +57,8 @@ GAP_PX = 30
 """Height of the gap above each diagram of a picture, px. The gap holds the diagram's title."""
 
 LEAST_LINEAR, LEAST_ANGULAR = 0.1, 0.2
-"""Smallest spans of the scales in the diagrams of the forward speed, m/s, and of the turn rate,
-rad/s. Without them the scale would be empty if the robot never moves."""
+"""Smallest range of the axis for the forward speed, m/s, and of that for the turn rate, rad/s.
+Without these limits, the range would be empty if the robot never moves."""
 
 UNDER_CURVE_PX = 3.4
 """Width of a curve that is drawn under another curve, px.
@@ -88,8 +88,8 @@ MIN_MARK_DISTANCE = 0.02
 Excursions beyond the same edge that are closer count as a single excursion with one triangle.
 """
 
-# The space shows a commanded speed that the robot reaches only after a ramp. It is limited, so that
-# a command of 99 m/s does not flatten the other curves.
+# Leave space for a commanded speed that the robot reaches only after a ramp. Limit this space, so
+# that a command of 99 m/s does not flatten the other curves.
 HEADROOM = 0.5
 """Space in a diagram above and below the limited and measured speeds, as a fraction of the span of
 these speeds."""
@@ -106,8 +106,8 @@ def clipped(
         points: the points of the curve. The value NaN makes a gap.
         others: the other curves in the diagram, which determine the scale. `HEADROOM` is added
             above and below them.
-        least: a lower limit on the span of the other curves. If their span is smaller, the scale is
-            computed for this span.
+        least: a range of values. If the values of the other curves have a smaller range, the scale
+            is computed for the range `least`.
         gap: a time, s. Excursions beyond the same edge that are at most this time apart count as a
             single excursion.
     """
@@ -491,7 +491,7 @@ class TimeFigures:
         return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 44}}
 
     def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
-        """Return a picture of diagrams below each other with one time axis.
+        """Return a picture of diagrams one below the other, with one time axis.
 
         Each diagram is `px` px high.
         """

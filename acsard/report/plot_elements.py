@@ -115,7 +115,7 @@ def scatter(name: str, x: Iterable[float], y: Iterable[float], **attributes: obj
 
 
 def sentence(mark: Mark) -> str:
-    """Return the text that the page shows when the user points at an event. It is escaped."""
+    """Return the escaped text that the page shows when the user points at an event."""
     head = f"<b>{label(mark.name.replace('_', ' '))}</b>"
     by = [label(f"by {mark.by}")] if mark.by else []
     return "<br>".join([head, label(mark.text_with_count), *by])

@@ -139,7 +139,7 @@ class StepLateness:
         self._number = 0
         """Number of the last period. The period of the first step has the number 0."""
         self._ahead = 0
-        """Number of calls of `at_once` since the last step of a control period."""
+        """Number of early lines (`at_once`) since the last step of a control period."""
         self._began_ns: int | None = None
         """Monotonic time of the first step of a control period, ns; None before this step."""
         self._earliest = math.inf
@@ -236,9 +236,9 @@ class SerialCounts:
         """Pair: the numbers of accepted and of dropped lines at the last step, counted from the
         daemon's start."""
         self._outstanding: int | None = None
-        """Smallest number of sent lines without an answer at any step of the present second.
+        """Smallest number of unanswered lines in the present second; None before its first step.
 
-        At other steps of the second, the number is larger, because the answer to the newest line
+        In other steps of the second, the number is larger, because the answer to the newest line
         has not arrived yet.
         """
         self._lost: int | None = None
@@ -369,7 +369,7 @@ class ReportData:
         """True if the next pose does not continue the path: it is the first pose, or a request has
         set the pose."""
         self._sampled = self._sent = -math.inf
-        """Time of the last sample of the status, and time of the last sent line, both in s."""
+        """Times of the last sample of the status and of the last sent line, s since `began`."""
         self._status: tuple[str, ...] = ()
         """Status of the robot at the last sample."""
 

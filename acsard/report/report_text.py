@@ -30,10 +30,11 @@ MAX_REASONS = 8
 """Maximum number of rows in the table of the reasons why command sources did not drive."""
 
 NUMBER = re.compile(r"\d+(\.\d+)?")
-"""Pattern for a number in a reason. Reasons that differ only in numbers share a row."""
+"""Pattern for a number in a reason. In the table, reasons that differ only in numbers share a row.
+"""
 
 MAX_POINT_S = 0.05
-"""Longest time that one point of a picture may cover without a note in the report, s."""
+"""If a point of a picture covers more than this time, s, the report has a note about it."""
 
 MAX_NAMES = 5
 """Maximum number of names or texts that are listed in one sentence."""
@@ -66,13 +67,14 @@ BOARD_INPUTS = {
     "bumper_pressed": "bumper hit",
     "battery_stop": "battery stop",
 }
-"""Maps the name of each event in which the board caused a stop to words for this event."""
+"""Words for each event in which the board stopped the robot, by the name of the event."""
 
 
 def differences(config: Config) -> list[Setting]:
     """Return the settings in a configuration that differ from their defaults.
 
-    If a command source was added or removed, the result includes all settings of this source.
+    If only the configuration or only the default has a command source, the result includes all
+    settings of this source.
     """
     here, default = (dict(flat(effective(each))) for each in (config, Config()))
     return [

@@ -1,9 +1,9 @@
 """Reads the values that a report needs from the replayed robot, an object of the class `Robot`.
 
-The robot may come from a forged or damaged recorded state, so each of its parts may be wrong. Every
-use of the robot is in this module, in a `with` block that reports the errors of such a robot. Each
-value that leaves the module has the declared type. So an error in the rest of the report is a
-defect of the report, and must not be reported as an error of the recording.
+The robot may come from a forged or damaged recorded state, so each of its parts may be wrong. Only
+this module reads the robot, in `with` blocks that report an exception as an error of the recording.
+Each value that leaves the module has the declared type. Therefore an exception in the rest of the
+report is a defect of the report, and not an error of the recording.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from acsard.core.robot import Robot
 from acsard.core.values import Outputs, SourceStatus
 
 RobotErrors = Callable[[], AbstractContextManager[None]]
-"""Function that returns a context manager, in which errors of a robot with a wrong recorded state
-become `RecordingError`."""
+"""Function that returns a context manager, which raises `RecordingError` instead of the errors that
+a wrong recorded state of the robot causes."""
 
 
 class RobotReader:
