@@ -169,7 +169,7 @@ def huber(residuals: Floats | Complexes, least: float) -> Floats:
 
 
 Source = Callable[[Floats], Evidence]
-"""Function that returns the evidence of one sensor for given parameters."""
+"""Function that returns the `Evidence` of one sensor, computed with given parameters."""
 
 MAX_STEPS = 30
 SMALL, SETTLED = 1e-5, 0.02
@@ -202,9 +202,9 @@ CONSTRAINT_WEIGHT = 1e9
 """Weight of a constraint (`Held`) in the normal equations, large enough to enforce it."""
 
 Held = tuple[Floats, float]
-"""Constraint on the parameters: a pair of weights, shape (PARAMETER_COUNT,), and a value.
+"""Constraint on the parameters: a weighted sum of the parameters must have a certain value.
 
-The weighted sum of the parameters must be equal to the value.
+The first element contains the weights, shape (PARAMETER_COUNT,). The second element is the value.
 """
 
 MIN_PAIR_BLOCKS = 16
@@ -248,7 +248,7 @@ class Fit(Struct, frozen=True):
     """Prior standard deviation of each parameter that has one."""
 
     def without(self, blocks: Mask) -> Floats:
-        """Return approximately the parameters that fit the log without the blocks in a mask.
+        """Return approximate parameters of a fit that leaves out some blocks of the log.
 
         A block is a few seconds of driving. The mask `blocks` is True for each block to leave out.
         The result is one linear step away from `parameters`, so no new fit is needed.
@@ -304,7 +304,7 @@ class Fit(Struct, frozen=True):
         )
 
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Return how the parameters change if a group of blocks is left out, for each group.
+        """Return, for each group of blocks, how the parameters change without this group.
 
         `group` contains the number of the group of each block. The second result contains the
         variances of the parameters, from a jackknife over the groups. If there are few groups,

@@ -6,7 +6,7 @@ least-squares technique, 2005):
 
     turn = g_r phi_r - g_l phi_l,    g_r = R_r / L,    g_l = R_l / L
 
-Here, phi_r and phi_l are the angles by which the right and the left wheels rolled, R_r and R_l are
+Here, phi_r and phi_l are the angles by which the right and the left wheels rolled. R_r and R_l are
 their radii, and L is the effective track. The equation is linear in g_r and g_l.
 """
 
@@ -37,10 +37,10 @@ stops or starts. The remaining time must be at least `REST_S`.
 """
 
 MAX_RATE_AT_REST = 0.05
-"""Largest accepted deviation of the gyro's mean rate in a standstill from its usual rate, rad/s.
+"""Limit for the difference between the gyro's mean rate in a standstill and its usual rate, rad/s.
 
-The usual rate is the median over all standstills. If the deviation is larger, a person turned the
-robot during this standstill, so the standstill is not used.
+The usual rate is the median over all standstills. Above the limit, a person turned the robot during
+the standstill, so the standstill is not used.
 """
 
 MIN_SAMPLES = 5
@@ -94,7 +94,6 @@ class Headings(Struct, frozen=True):
     source: str
     """Column of the log from which the headings come: "yaw_rate" or "yaw"."""
     per_run: tuple[Heading, ...]
-    """Heading of each run."""
     delay: float
     """Delay of the sensor's recorded times relative to those of the wheels, s.
 
@@ -106,7 +105,7 @@ class Headings(Struct, frozen=True):
     It is 0 if there is no gyro or no standstill.
     """
     bias_unknown: bool
-    """True if the sensor is a gyro whose bias no standstill of the robot shows.
+    """True if the sensor is a gyro, and its bias was not measured in any standstill of the robot.
 
     The bias must then be found by a comparison with the wheels.
     """
@@ -469,9 +468,9 @@ def side_factors(rows: Rows, base: Base, *, in_place: bool = False) -> Floats:
     """Return a factor for the left wheels, and a factor for the right wheels.
 
     With these factors, the robot's turns according to the wheels (`by_sides`) fit the heading
-    sensor best. A factor is wheel radius / effective track, divided by the configured wheel radius
-    / wheel separation (`base.radius_per_separation`). It is negative if the wheel speeds of this
-    side, or the sensor, have the wrong sign.
+    sensor best. A factor is the ratio of wheel radius to effective track, divided by the configured
+    ratio of wheel radius to wheel separation. It is negative if the wheel speeds of this side, or
+    the sensor, have the wrong sign.
 
     If the robot only turns in place (`in_place`), the log does not show the ratio of the two
     factors. Both factors are then equal.

@@ -68,9 +68,9 @@ real.
 NEAR, FAR = 2.0, 3.0
 """Limits for the distance between new and configured multipliers, in standard deviations.
 
-Up to `NEAR`, the configured multipliers are kept. Above `FAR`, the `Improvement.log_improvement`
-that is needed to accept the new multipliers becomes smaller: at twice `FAR`, half of it is enough.
-By chance alone, the distance exceeds `FAR` in one log of thirty.
+Up to `NEAR`, the configured multipliers are kept. Above `FAR`, a smaller
+`Improvement.log_improvement` is enough to accept the new multipliers: half of it at twice `FAR`. By
+chance alone, the distance exceeds `FAR` in one log of thirty.
 """
 
 MIN_SQUARE = 1e-9
@@ -124,7 +124,8 @@ class Fold(Struct, frozen=True):
 
     drive: Block
     blocks: Mask
-    """Mask of the blocks that the fit leaves out, because they overlap the drive."""
+    """Mask of the blocks (a few seconds each) that the fit leaves out, because they overlap the
+    drive."""
     parameters: Floats
 
 
@@ -245,9 +246,9 @@ def per_amount(sums: Floats, unit: float) -> BeforeAfter:
     """Return the errors before and after the calibration, per driven angle or distance.
 
     `sums` contains three numbers: the sum of the errors before the calibration, the sum after it,
-    and the driven angle or distance. The quotients are multiplied by `unit`. For example, if
-    errors and angle are in rad, a `unit` of 360 gives the error for a full turn in deg. If the
-    driven angle or distance is 0, the errors are None.
+    and the driven angle or distance. A result is a sum of errors, divided by the driven angle or
+    distance, times `unit`. For example, if errors and angle are in rad, a `unit` of 360 gives the
+    error for a full turn in deg. If the driven angle or distance is 0, the errors are None.
     """
     before, after, amount = sums.tolist()
     if not amount:

@@ -35,10 +35,10 @@ APPLIED = "applied_linear", "applied_angular"
 """Columns with the twist that the daemon commands to the wheels, in m/s and rad/s."""
 
 UNITS = {"t": TIME, "x": LENGTH, "y": LENGTH, "yaw": ANGLE, APPLIED[0]: SPEED}
-"""Units that each column can have.
+"""Units that each column can have, by the name of the column.
 
-Each column is mapped to a table that maps the name of a unit to the factor that converts it to SI.
-The columns that are not listed here have the units of `RATE`.
+The table of a column maps the name of a unit to the factor that converts this unit to SI. Columns
+that are not listed here have the units of `RATE`.
 """
 
 SI = {"t": "s", "x": "m", "y": "m", "yaw": "rad", APPLIED[0]: "m/s"}
@@ -85,9 +85,9 @@ SPIKE_COLUMNS = frozenset((*WHEEL_COLUMNS, "yaw_rate"))
 SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
 """Definition of a spike, which is a rate that was recorded wrongly.
 
-A spike is more than `SPIKE` times as large as each of the two neighboring samples, and more than
-`SPIKE` times as large as the usual rate. The usual rate is the quantile 1 - `FEW_VALUES` of all
-rates above `SLOW` rad/s.
+A spike is more than `SPIKE` times as large as each of the two neighboring samples. It is also more
+than `SPIKE` times as large as the usual rate. The usual rate is the quantile 1 - `FEW_VALUES` of
+all rates above `SLOW` rad/s.
 """
 
 
@@ -199,7 +199,7 @@ class Table(Struct, frozen=True):
     columns: dict[str, Floats]
     """Columns by name, in SI units, with NaN for an empty cell."""
     runs: npt.NDArray[np.int64]
-    """Index in `names` of the run of each row."""
+    """For each row, the index of its run in `names`."""
     names: tuple[str, ...]
     notes: tuple[str, ...]
     """Sentences about data that was left out."""

@@ -71,8 +71,8 @@ class Multipliers(Struct, frozen=True):
     def apart(self, base: Base) -> float:
         """Return how far these multipliers are from those of `base`, in standard deviations.
 
-        Chance alone hardly explains a large distance. Combinations of multipliers that no sensor
-        measures stay as configured, so they do not add to the distance.
+        Chance alone hardly explains a large distance. A combination of multipliers that no sensor
+        measures, such as their common scale, stays as configured. It adds nothing to the distance.
         """
         off = self.values - (base.track, base.left, base.right)
         return math.sqrt(off @ np.linalg.solve(self.covariance + TOLERANCE**2 * np.eye(3), off))
@@ -193,8 +193,8 @@ def scaled(
         A pair: the corrected multipliers, and the name of the run whose distance was measured.
 
     Raises:
-        RefusedError: the log has no such run, the run is too short or not straight enough, or the
-            distance contradicts the positions.
+        NoCalibrationError: the log has no such run, the run is too short or not straight enough,
+            or the distance contradicts the positions.
     """
     if tape.run and tape.run not in names:
         raise NoCalibrationError(

@@ -104,7 +104,7 @@ Errors from other sources are independent from step to step.
 MAX_FOLDS = 10
 """Maximum number of groups into which the drives are divided for the cross-validation.
 
-Each group is left out once, which takes two searches.
+Each group is left out once, which takes two searches for the noise.
 """
 
 STEPS, FEWER_STEPS = 150, 60
@@ -114,7 +114,8 @@ STEPS, FEWER_STEPS = 150, 60
 """
 
 OUTLIER_LIMIT = 9.0
-"""Mean square of a window's normalized residuals, above which the window weighs less."""
+"""If the mean square of a window's normalized residuals exceeds this limit, the window weighs less.
+"""
 
 MIN_VARIANCE = 1e-12
 """Variance added to each residual, so that even a perfect sensor's covariance can be inverted."""
@@ -149,13 +150,13 @@ The configuration accepts this value.
 """
 
 # A perfect simulated robot gave deviations of 1e-5 to 1e-25, and each deviation above 0 costs the
-# daemon a column of the covariance in each control period. The multipliers are written with five
-# decimals, so a smaller deviation is less than their rounding.
+# daemon a column of the covariance in each control period. A variance costs no column. The
+# multipliers are written with five decimals, so a smaller deviation is less than their rounding.
 MIN_STD = 1e-5
 """Smallest standard deviation that is proposed. Smaller ones are replaced by 0.0.
 
-The variances per metre and per radian have no such limit. They cost no column, and without them the
-odometry would state that the pose is exact.
+The variances per metre and per radian have no such limit, because without them the odometry would
+state that the pose is exact.
 """
 
 REPORT_DISTANCE_M = 10.0
@@ -293,14 +294,14 @@ class LogNoise(Struct, frozen=True):
         return self.log_likelihood_gain > min(SURE_DEVIATIONS * self.gain_std, CERTAIN_GAIN)
 
     def heading(self) -> tuple[float, float]:
-        """Return two standard deviations of the heading after `REPORT_DISTANCE_M` m, rad.
+        """Return the standard deviation of the heading after `REPORT_DISTANCE_M` m, rad, as a pair.
 
         The first number is due to the configured noise, the second number to the found noise.
         """
         return self._after(Source.YAW, Source.RATIO, Source.SKID)
 
     def distance(self) -> tuple[float, float]:
-        """Return two standard deviations of the driven distance after `REPORT_DISTANCE_M` m, m.
+        """Return the standard deviation of the distance after `REPORT_DISTANCE_M` m, m, as a pair.
 
         The first number is due to the configured noise, the second number to the found noise.
         """
@@ -452,12 +453,12 @@ class _Window(Struct, frozen=True):
 
     residual: Floats
     start: Floats
-    """Change of each residual with each coordinate of the start pose: (residuals, unknowns)."""
+    """Derivatives of the residuals with respect to the start pose, shape (residuals, unknowns)."""
     motion: _Motion
     along: Floats
-    """Change of each residual if the distance of a step is wrong by 1 m: (residuals, steps)."""
+    """Change of each residual per m of error in a step's distance, shape (residuals, steps)."""
     yaw: Floats
-    """Change of each residual if the turn of a step is wrong by 1 rad: (residuals, steps)."""
+    """Change of each residual per rad of error in a step's turn, shape (residuals, steps)."""
     sensor: dict[Source, Floats]
     """Maps each source of sensor noise to the covariance of the residuals if this noise is 1."""
     bias: Floats | float = 0.0

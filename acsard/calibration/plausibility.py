@@ -25,8 +25,8 @@ MIN_TOTAL_TURN = 2 * np.pi
 MIN_ROLL = 3.0
 """Minimum angle that the wheels must roll in a log, rad.
 
-The limit applies to the mean of the left and the right angle, and also to half of their
-difference. The absolute values of all intervals are added.
+The limit applies to two angles: the mean of the left and the right angle, and half of their
+difference. Each of the two is the sum of the absolute values in all intervals of the log.
 """
 
 MAX_CORRELATION = 0.98
@@ -94,10 +94,10 @@ Below this limit, a remark says that nearly all turns are to one side.
 """
 
 REPORTED_SIZE_RATIO = 1.25
-"""Factor between measured and configured wheel radius above which a remark states this factor."""
+"""If measured and configured wheel radius differ by more than this factor, a remark says so."""
 
 REPORTED_RADIUS_RATIO = 1.1
-"""Ratio of the larger to the smaller wheel radius above which a remark calls it unusual."""
+"""If left and right wheel radius differ by more than this factor, a remark says so."""
 
 LEAST_TRACK, MOST_TRACK = 0.85, 3.0
 """Usual range of the ratio of effective track to wheel separation.

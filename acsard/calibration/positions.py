@@ -34,8 +34,8 @@ STEP_S = 0.02
 JUMP, JUMP_M = 6.0, 0.05
 """Limits above which the distance between two successive positions is a jump.
 
-The distance may exceed the distance that the wheels rolled by `JUMP` standard deviations plus
-`JUMP_M` m. At a jump, the source of the positions was wrong, or it corrected itself.
+The distance may exceed the distance that the wheels rolled by `JUMP_M` m plus `JUMP` standard
+deviations of this excess. At a jump, the source of the positions was wrong, or it corrected itself.
 """
 
 SPEED_HALF_INTERVAL_S = 0.05

@@ -30,7 +30,7 @@ MAX_FILE_BYTES = 1 << 30
 """Maximum size of a CSV file or a black-box recording, bytes. The file is read into memory."""
 
 MAX_RECORD_BYTES = 1 << 28
-"""Maximum size of a record in a bag, bytes. It is ample: a chunk of rosbag2 is below 1 MiB."""
+"""Maximum size of a record in a bag, bytes. A chunk of rosbag2 is below 1 MiB."""
 
 MAX_LOG_TIME_NS = (1 << 63) - 1
 """Largest time of a message that the table can contain, ns."""
@@ -66,7 +66,7 @@ def calibrated(log: Path, config: Config, tape: Tape | None, choice: Choice) -> 
         LogError: the content of the log is unreadable, incomplete or wrong, or `choice` is not the
             default although the log is not a ROS 2 bag.
         MendableError: the file cannot be opened, or is too large.
-        RefusedError: the log is valid, but it gives no useful calibration.
+        NoCalibrationError: the log is valid, but it gives no useful calibration.
     """
     try:
         table = _table(log, config, choice)

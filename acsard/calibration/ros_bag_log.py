@@ -6,7 +6,7 @@ user can name the topics to use instead.
 
 An `Odometry` is usually computed from the wheels, so it cannot calibrate them. It is used only if
 the user names its topic, or if the bag has neither turn rates nor other positions. In the second
-case it is refused if it shows exactly the same turns as the wheels.
+case, an `Odometry` that shows exactly the same turns as the wheels is refused.
 """
 
 from __future__ import annotations
@@ -44,10 +44,11 @@ AXES = ("z", "-z", "x", "-x", "y", "-y")
 """Axes of an IMU that may point up. `-x` means that x points down."""
 
 MIN_MESSAGES = 20
-"""Minimum number of messages with a value in a topic. A topic with fewer of them is not used."""
+"""A topic is used only if it has at least this number of messages with a value."""
 
 MAX_DELAY_DIFFERENCE_S = 1.0
-"""Largest difference between the delays of two topics whose stamps come from the same clock, s.
+"""If the delays of two topics differ by more than this time, s, their stamps come from different
+clocks.
 
 The delay of a topic is the median time from the stamp of a message to its recording.
 """
@@ -478,9 +479,9 @@ def speeds_of(t: Floats, angles: Floats) -> tuple[Floats, Floats]:
     """Return wheel speeds that are computed from recorded angles.
 
     The result is a pair: the times of the speeds, s, and the speeds, rad/s. A speed is the mean
-    over one sample period, so the integral of the speeds is exactly the angle that the wheel
-    rolled, even if the sample times are uneven. No speed is computed across a gap in the samples,
-    or across a jump of an angle, for example to 0 after a restart of the motor driver.
+    over one sample period. The integral of the speeds is therefore exactly the angle that the wheel
+    rolled, even if the sample times are uneven. Gaps in the samples give no speed. Jumps of an
+    angle, for example to 0 after a restart of the motor driver, give no speed either.
 
     Args:
         t: the times of the samples, s.

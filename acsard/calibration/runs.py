@@ -27,7 +27,7 @@ Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
 
 MIN_BACKWARD_STEP_S = 1.0
-"""Smallest backward step of the times in a log that may be a restart of the recording, s."""
+"""If the times in a log jump back by more than this time, s, the recording may have restarted."""
 
 MAX_RESTARTS = 100
 """Maximum number of restarts in a log.
@@ -557,8 +557,8 @@ def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> 
 def on_arrival_clock(arrivals: Floats, stamps: Floats) -> Floats:
     """Return the times at which a sender made its samples, s, on the receiver's clock.
 
-    The times are the stamps plus the smallest delay from stamp to arrival. If this delay varies by
-    more than `MAX_JITTER_S`, the times are the times of arrival.
+    The times are the stamps plus the smallest delay from stamp to arrival. If the delays of the
+    samples vary by more than `MAX_JITTER_S`, the times are the times of arrival.
 
     Args:
         arrivals: the times of arrival on the receiver's clock, s.

@@ -177,7 +177,7 @@ def calibrate(
 
     Raises:
         LogError: a sensor of the log cannot be used. The error includes the notes of the log.
-        RefusedError: the log gives no calibration. The error includes the notes of the log.
+        NoCalibrationError: the log gives no calibration. The error includes the notes of the log.
     """
     follows = response(log.runs, drive, feedback or FeedbackConfig())
     if follows is not None:
@@ -210,7 +210,7 @@ class Prepared(Struct, frozen=True):
     steps: list[WheelSteps]
     """Rolling of the wheels in each run; empty if the log has no positions."""
     sources: list[Source]
-    """One function for each sensor, which returns the sensor's evidence for given parameters."""
+    """One function for each sensor, which returns the sensor's `Evidence` for given parameters."""
     start: Floats
     """Parameters from which the fit starts, shape (PARAMETER_COUNT,)."""
 
@@ -297,11 +297,10 @@ class Candidate(Struct, frozen=True):
     result: Multipliers
     improvement: Improvement
     stays_configured: dict[str, float]
-    """Quantities that stay as configured, with the uncertainty that they have in this log.
+    """Maps each quantity that stays as configured to its relative standard deviation in this log.
 
-    The names of the quantities, `plausibility.TRACK` and `RATIO`, are mapped to the relative
-    standard deviation with which the log determines the quantity. The deviation is inf if it is
-    unknown.
+    The possible names are `plausibility.TRACK` and `plausibility.RATIO`. A deviation is inf if it
+    is unknown.
     """
 
 

@@ -51,7 +51,7 @@ the last `STEADY_S` s, the speed changes by less than the fraction `CONSTANT`.
 """
 
 AGREEMENT_FACTOR = 1.5
-"""Largest factor between the fitted and the configured response time at which they agree."""
+"""If the fitted and the configured response time differ by at most this factor, they agree."""
 
 
 class WheelResponse(Struct, frozen=True):
@@ -228,9 +228,9 @@ def _evidence(
 
 
 def _fastest(parts: Sequence[tuple[Floats, Floats, Floats]]) -> float:
-    """Return the highest steady speed of a wheel that stays below its command, rad/s.
+    """Return the highest speed, rad/s, that a wheel keeps although its command is higher.
 
-    Return infinity if no wheel stays below its command at a steady speed.
+    Return infinity if the log shows no such speed.
     """
     speeds: list[float] = []
     for steps, wanted, actual in parts:

@@ -61,10 +61,10 @@ If there are fewer lines, the robot is assumed to stand still.
 """
 
 LEAST_SHARE = 0.2
-"""Smallest fraction of the distance and of the turns that must remain in the steps of the drive.
+"""Smallest fraction of distance and turns that must remain after motion to and fro has cancelled.
 
-Motion to and fro within a step cancels. If too little distance remains, the drive gives no position
-errors. If too little of the turns remains, the drive gives no heading errors.
+Such motion cancels within each step of the drive. If too little distance remains, the drive gives
+no position errors. If too little of the turns remains, the drive gives no heading errors.
 """
 
 STEP_S = 0.1

@@ -36,7 +36,7 @@ Older lines are dropped.
 """
 
 MAX_COARSE_FRACTION = 0.1
-"""Fraction of feedback lines that show coarse encoders, above which the report mentions them."""
+"""If more than this fraction of the feedback lines shows coarse encoders, the report says so."""
 
 LEAST_LOST, SHARE_LOST = 3, 0.01
 """Limits for the number of feedback lines that this program missed.

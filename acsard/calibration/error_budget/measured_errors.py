@@ -31,10 +31,8 @@ At 100 Hz, these lines take 0.3 s. A busy host delays the daemon for less than t
 """
 
 LOST_LINE_PERIODS = 0.6
-"""Limit for the growth of the smallest delay among `UNDELAYED_LINES` lines, in line periods.
-
-From this limit on, a line counts as lost.
-"""
+"""If the smallest delay among `UNDELAYED_LINES` lines grows by this number of line periods or more,
+a line counts as lost."""
 
 DELAY_GAIN = 0.05
 """Gain of the low-pass filter that follows the smallest delay among `UNDELAYED_LINES` lines.
@@ -105,8 +103,8 @@ def _even(t: Floats) -> LineTimes:
 def _prompted_delays(t: Floats, sent: Floats) -> LineTimes | None:
     """Estimate how late the replies arrived, for a board that answers each line of the daemon.
 
-    `sent` contains the times of the daemon's lines. Return None if it does not contain the line
-    that belongs to each reply.
+    `sent` contains the times of the daemon's lines. Return None if the line of any reply is not in
+    `sent`.
     """
     if len(sent) < 3 or sent[0] > t[0] or len(sent) < len(t) / 2:
         return None
@@ -124,7 +122,7 @@ def _prompted_delays(t: Floats, sent: Floats) -> LineTimes | None:
 def _missing(at: Floats) -> Counts:
     """Return the number of lines that were lost just before each feedback line.
 
-    `at` contains the time of each line, as a number of line periods since any moment.
+    `at` contains the time of each line, as a number of line periods since an arbitrary moment.
     """
     count = len(at)
     ahead = at - np.arange(count)
@@ -203,7 +201,7 @@ class Motion(Struct, frozen=True):
     filled: Floats
     """Errors of the motion that the odometry assumed for lost lines: variances (m2, rad2).
 
-    The rows of all other lines are 0.
+    The rows without lost lines are 0.
     """
     unfilled: Floats
     """Motion that the pose missed in each gap, and its variances: rows of (m, rad, m2, rad2).
@@ -335,10 +333,8 @@ def _gaps(
 
 
 EQUAL_SPEEDS_FRACTION = 0.8
-"""Fraction of lines in which two wheels must report equal speeds.
-
-From this fraction on, the two wheels are assumed to have equal rounding errors.
-"""
+"""If two wheels report equal speeds in at least this fraction of the lines, their rounding errors
+are assumed to be equal."""
 
 MIN_VALUES = 3
 """Minimum number of different speeds from which a quantization step is computed."""

@@ -1,9 +1,9 @@
 """Finds the quantization step of reported wheel speeds.
 
 A firmware may compute speeds from the encoder counts in each period T, s. It then reports only
-multiples of the step q = 2 pi / (N T), rounded to two decimals, where N is the number of counts
-per wheel turn. If the firmware reports means over M periods, q is M times smaller. If the firmware
-smooths the speeds with a filter, the speeds are not multiples of any step.
+multiples of the step q = 2 pi / (N T), rounded to two decimals. N is the number of counts per wheel
+turn. If the firmware reports means over M periods, q is M times smaller. If the firmware smooths
+the speeds with a filter, the speeds are not multiples of any step.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ROUNDING_STD = 0.01 / math.sqrt(12)
 """Standard deviation of the error of rounding to two decimals, rad/s."""
 
 MAX_OUTLIER_FRACTION = 0.005
-"""Fraction of the speeds that need not be multiples of the step, because lines were damaged."""
+"""Fraction of the speeds that may differ from multiples of the step, because a line was damaged."""
 
 MAX_CHANCE = 1e-5
 """Largest accepted probability that a quantization step fits all speeds only by chance."""

@@ -101,9 +101,9 @@ class Mean(Struct, frozen=True):
 
 
 class Slant(Struct, frozen=True):
-    """A measurement of the robot's turn, computed from its distances to a line on the floor.
+    """A measurement of the robot's turn by the distances of two points of the robot to a line.
 
-    The person measures the distances of two points of the robot. The line may also be a wall.
+    The person measures the distances. The line is on the floor, or it is a wall.
     """
 
     quantity: Quantity
@@ -276,7 +276,7 @@ class Setup(Struct, frozen=True):
 
     @property
     def rate_per_command(self) -> float:
-        """Turn rate, rad/s, for a commanded turn rate of 1 rad/s, of a robot that does not skid.
+        """Turn rate of a robot that does not skid, rad/s, if the command is 1 rad/s.
 
         The rate differs from 1 because the configured multipliers compensate for skidding.
         """

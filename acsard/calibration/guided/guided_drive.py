@@ -23,14 +23,14 @@ TRUE_POSE = "sim/pose"
 
 
 class DriveOptions(Struct, frozen=True):
-    """The options of a guided drive. Each option is None if the user did not choose."""
+    """The options of a guided drive. None means that the user chose nothing."""
 
     method: str | None = None
     """Name of the method, as in `METHODS`."""
     positions: str | None = None
     """Zenoh key of the robot's positions, with or without the robot's id."""
     positions_at: str | None = None
-    """Endpoint at which the positions are published, if it is not the daemon's own."""
+    """Endpoint at which the positions are published; None means the daemon's endpoint."""
     imu: str | None = None
     """Zenoh key of the gyro, with or without the robot's id."""
     without_person: bool = False
@@ -59,7 +59,7 @@ def guided_drive(
     Raises:
         UsageError: the options do not suit this robot.
         GuideError: the drive cannot begin or continue, or the operator has ended it.
-        LogError, NobodyError, RefusedError: as `guide`.
+        LogError, NobodyError, NoCalibrationError: for the reasons that `guide` lists.
     """
     info, robot_id = client.get("info"), client.where.robot_id
     if options.without_person and not info.simulated:
@@ -100,10 +100,10 @@ def guided_drive(
 
 
 def choose_method(options: DriveOptions, config: Config) -> str:
-    """Return the method that the options name or need.
+    """Return the name of the method that the options name or need.
 
-    Without such an option, it is the gyro if the daemon reads one, else a tape measure. Raises
-    `UsageError` if the options need a gyro that the daemon does not read.
+    Without such an option, the method is "gyro" if the daemon reads a gyro, and "tape" otherwise.
+    Raises `UsageError` if the options need a gyro that the daemon does not read.
     """
     if options.positions:
         return "positions"
@@ -117,7 +117,7 @@ def choose_method(options: DriveOptions, config: Config) -> str:
 
 
 def other_robot(config: Config, file_config: Config, file: str) -> str:
-    """Return an error message if the file configures another vehicle than the daemon's, else "".
+    """Return an error message if the file is for a robot with another geometry, else "".
 
     Args:
         config: the daemon's configuration.

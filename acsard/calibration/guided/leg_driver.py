@@ -93,8 +93,8 @@ class LegDriver:
         self._waits = "no message with the daemon's state has arrived"
         """The reason why the daemon does not accept the commands yet; "" if it accepts them."""
         self._starved = f"the daemon has received no command of source {source} for {OPENING_S:g} s"
-        """Reason to halt the leg if the daemon receives no commands, because this computer is too
-        busy."""
+        """Reason to halt the leg if this computer is so busy that the daemon receives no commands.
+        """
         self._still_since: float | None = None
         self._deviates_since: float | None = None
 

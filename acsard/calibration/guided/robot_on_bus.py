@@ -44,7 +44,7 @@ DISPLAY_PERIOD_S = 0.2
 """Interval between updates of the progress display of a leg, s."""
 
 RECONNECT_TIMEOUT_S = 3.0
-"""Time within which a silent daemon must send its state again, s, so that the leg is repeated."""
+"""If a silent daemon sends its state again within this time, s, the leg is repeated."""
 
 POSITION_TYPES = (Odometry, PoseStamped)
 """Message types with positions, in the order in which `Sensor` tries to decode the first message.

@@ -80,8 +80,8 @@ def guide(
         GuideError: the drive cannot continue.
         LogError: a recording has too few samples.
         NobodyError: no person answers the questions.
-        RefusedError: the measurements are impossible or contradict each other, or the drive gives
-            no useful calibration.
+        NoCalibrationError: the measurements are impossible or contradict each other, or the drive
+            gives no useful calibration.
     """
     method = METHODS[name]
     longest = method.longest_s(setup)

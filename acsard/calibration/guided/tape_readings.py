@@ -65,7 +65,8 @@ PRIOR_DEGREES_OF_FREEDOM = 4.0
 """Weight of the assumed noise of the readings, in degrees of freedom.
 
 The fit averages two estimates of the noise: the assumed noise, and the noise that the scatter of
-the readings shows. The weight of the second estimate is the number of surplus readings.
+the readings shows. The weight of the second estimate is the number of readings that the fit would
+not need.
 """
 
 MAX_STEPS = 50
@@ -316,7 +317,7 @@ def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answe
         answers: the answers so far.
 
     Raises:
-        RefusedError: the answers are impossible.
+        NoCalibrationError: the answers are impossible.
     """
     driven = tuple(rides[name] for name in measure.over or (leg,))
     if isinstance(measure, Mean):
