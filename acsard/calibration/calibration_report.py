@@ -299,8 +299,8 @@ def _row(name: str, old: float, value: float, std: float | None) -> tuple[str, s
     """Return a row of the table of multipliers.
 
     `old` is the configured value, and `value` the new one. `std` is the standard deviation of the
-    new value, or None if the log does not determine the value. A tape may change such a value too,
-    because it shows the size of the wheels.
+    new value, or None if the log does not determine the value. A distance by tape may change such a
+    value too, because the distance shows the size of the wheels.
     """
     now, found = f"{old:.4f}", f"{value:.4f}"
     if std is not None:
@@ -378,8 +378,9 @@ def _remains(report: CalibrationReport, calibration: Calibration, *, guided: boo
 def _growth(report: CalibrationReport, fastest: float) -> tuple[str, str]:
     """Return a verb and a sentence that say how skidding changes the track in fast turns.
 
-    The sentence is "" if the log shows no change and also no uncertainty of the change. That is so
-    if the fit kept the track as configured. `fastest` is the turn rate of fast turns, rad/s.
+    The sentence is "" if the log shows neither a change nor an uncertainty of the change, for
+    example because the fit kept the track as configured. `fastest` is the turn rate of fast turns,
+    rad/s.
     """
     growth, std = report.effective_track_growth * fastest, report.effective_track_growth_std
     limit = SURE_DEVIATIONS * std * fastest

@@ -55,7 +55,7 @@ class Parameter(IntEnum):
 PARAMETER_COUNT = len(Parameter)
 
 HUBER_LIMIT = 2.0
-"""Size of a residual, in standard deviations, above which its weight is less than 1 (Huber)."""
+"""If a residual exceeds this number of standard deviations, its weight is less than 1 (Huber)."""
 
 
 class Base(Struct, frozen=True):
@@ -308,7 +308,7 @@ class Fit(Struct, frozen=True):
 
         `group` contains the number of the group of each block. The second result contains the
         variances of the parameters, from a jackknife over the groups. If there are few groups,
-        `student_factor()` makes the variances larger. Its degrees of freedom are those of
+        `student_factor()` makes the variances larger. The degrees of freedom are those of
         Satterthwaite (An approximate distribution of estimates of variance components, 1946).
         """
         change = np.array(

@@ -74,7 +74,7 @@ chance alone, the distance exceeds `FAR` in one log of thirty.
 """
 
 MIN_SQUARE = 1e-9
-"""Constant, m2 or deg2, that is added to sums of squared errors so that their logarithm exists."""
+"""Constant, m2 or deg2, added to each sum of squared errors because 0 does not have a logarithm."""
 
 
 class Improvement(Struct, frozen=True):

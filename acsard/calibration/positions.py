@@ -251,8 +251,8 @@ class Aligned(Struct, frozen=True):
     """Derivatives of the aligned path with respect to the parameters, shape (positions,
     PARAMETER_COUNT).
 
-    They are multiplied by the square root of the position's weight. They include the change of the
-    aligning shift and rotation.
+    They are multiplied by the square root of the position's weight. They include the effect of
+    the parameters on the shift and the rotation that align the path.
     """
 
 

@@ -188,7 +188,7 @@ class Run(Struct, frozen=True, dict=True):
     def speed_difference(self, t: Floats) -> Floats:
         """Return the speed of the right minus that of the left wheels at the times `t`, rad/s.
 
-        The speed is averaged over `SMOOTH_S`.
+        The difference is averaged over `SMOOTH_S`.
         """
         begin, end = (np.clip(t + s / 2, self.t[0], self.t[-1]) for s in (-SMOOTH_S, SMOOTH_S))
         (left, right), (far_left, far_right) = self.angles(begin), self.angles(end)

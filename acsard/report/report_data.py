@@ -150,8 +150,7 @@ class StepLateness:
     def at_once(self) -> None:
         """Process an early line, which the daemon sent between two control periods.
 
-        The daemon sends it, for example, for a fresh command. It replaces the line of the next
-        control period.
+        Such a line, for example for a fresh command, replaces the line of the next control period.
         """
         self._ahead += 1
 
@@ -345,8 +344,7 @@ class ReportData:
         self.seconds = self.metres = 0.0
         """Duration of the report, s, and distance that the robot drove in this time, m."""
         self.driven: dict[str, Driven] = {}
-        """Maps the name of each source to the total time and distance for which it drove the
-        robot."""
+        """Maps the name of each source to the total time and distance of its drives."""
         self.fastest = Twist()
         """Maximum absolute values of the measured forward speed, m/s, and of the measured turn
         rate, rad/s."""

@@ -112,7 +112,7 @@ class LegDriver:
         return min(0.99, max(0.0, (planned_s - self._ends + now) / self._leg.seconds))
 
     def key(self, pressed: str, now: float) -> None:
-        """Process a key press. It halts the leg, with two exceptions.
+        """Process a key press. A key halts the leg, with two exceptions.
 
         In the last move of a leg with `Leg.by_key`, a key ends this move as planned, and further
         keys are ignored. In the phase OPENING, Enter is ignored, because the person may still hold
