@@ -6,6 +6,7 @@ unexpected condition ends the leg early. `LegDriver.halted` then contains the re
 
 from __future__ import annotations
 
+from collections import deque
 from enum import StrEnum
 
 from acsard.calibration.guided.drive_plan import Leg
@@ -23,17 +24,18 @@ STALL_REASON = (
 )
 
 RESPONSE_TIMEOUT_S = 1.5
-"""Time that the robot may take to follow a changed command, including the ramp, s."""
+"""Time that the robot may take to follow a changed command, including the ramp, s. The path of the
+wheels may lag behind the commanded path by this time."""
 
 DEVIATION_TIMEOUT_S = 1.0
-"""Time for which the robot may deviate from the command, s, before the leg is halted."""
+"""Time for which the daemon may not follow the commands, or may report no wheel speeds, s, before
+the leg is halted."""
 
-LINEAR_OFF, ANGULAR_OFF, OFF_SHARE = 0.05, 0.15, 0.3
-"""Limits for the deviation of the measured twist from the commanded twist.
+DISTANCE_OFF, TURN_OFF = (0.1, 0.05), (0.15, 0.1)
+"""Limits for the difference between the path that the wheels rolled and the commanded path.
 
-The measured twist is computed from the wheel speeds. The linear speed may deviate by `LINEAR_OFF`
-m/s plus the fraction `OFF_SHARE` of the commanded linear speed. The turn rate may deviate by
-`ANGULAR_OFF` rad/s plus `OFF_SHARE` of the commanded turn rate.
+The rolled distance may differ by 0.1 m plus 5 % of the commanded distance, and the turn by 0.15 rad
+plus 10 % of the commanded turn. With a larger difference, the robot could leave the free floor.
 """
 
 STANDSTILL_SPEED = 0.02
@@ -45,6 +47,8 @@ STANDING_S, STANDS_S = 0.5, 6.0
 The leg is done when the wheels have stood still for `STANDING_S`. If the leg is not done
 `STANDS_S` after the last move, it is halted.
 """
+
+NO_FEEDBACK = "the microcontroller sends no feedback: check its cable and its power supply"
 
 ENTER = "\r\n"
 KEY_PRESSED = "a key was pressed"
@@ -63,6 +67,65 @@ class Phase(StrEnum):
     HALTED = "halted"
 
 
+class CommandedPath:
+    """Compares the path that the wheels rolled in a leg with the commanded path.
+
+    The robot follows each command with a delay and a ramp. Therefore the rolled distance must be
+    equal to one of the commanded distances of the last `RESPONSE_TIMEOUT_S`, within the limits.
+    The same is required of the turn. The turn of the wheels is compared, and not that of a gyro,
+    because a robot that skids turns less than commanded.
+
+    Every argument `now` is the present time on one monotonic clock, s.
+    """
+
+    def __init__(self, drive: DriveConfig, now: float) -> None:
+        self._kinematics = Kinematics(drive)
+        self._stepped = self._rolled_until = now
+        self._lengths = [0.0, 0.0]
+        """Length of the commanded path, m, and sum of the magnitudes of the commanded turns, rad."""
+        self._commanded, self._rolled = (0.0, 0.0), (0.0, 0.0)
+        """Commanded and rolled distance, m, forward is positive, and turn, rad, left is positive."""
+        self._recent: deque[tuple[float, tuple[float, float]]] = deque([(now, self._commanded)])
+        """The values of `_commanded` in the last `RESPONSE_TIMEOUT_S`, each with its time, s."""
+
+    def command(self, twist: Twist, now: float) -> None:
+        """Add the path of the command `twist`, which was in force since the last call."""
+        passed, self._stepped = now - self._stepped, now
+        x, turn = twist.linear * passed, twist.angular * passed
+        self._commanded = self._commanded[0] + x, self._commanded[1] + turn
+        self._lengths[0] += abs(x)
+        self._lengths[1] += abs(turn)
+        self._recent.append((now, self._commanded))
+        while len(self._recent) > 1 and self._recent[1][0] < now - RESPONSE_TIMEOUT_S:
+            self._recent.popleft()
+
+    def wheels(self, speeds: WheelSpeeds, now: float) -> None:
+        """Add the path that the wheels rolled at `speeds` since the last call."""
+        # If this process was paused, the robot has braked in the meantime.
+        passed = min(now - self._rolled_until, MAX_STATE_AGE_S / 2)
+        self._rolled_until = now
+        twist = self._kinematics.twist(speeds)
+        x, turn = self._rolled
+        self._rolled = x + twist.linear * passed, turn + twist.angular * passed
+
+    @property
+    def error(self) -> str:
+        """The difference that is too large, as a text; "" if there is none."""
+        for i, ((off, share), unit, name) in enumerate(
+            ((DISTANCE_OFF, "m", "rolled"), (TURN_OFF, "rad", "turned"))
+        ):
+            recent = [path[i] for _, path in self._recent]
+            rolled, limit = self._rolled[i], off + share * self._lengths[i]
+            if not min(recent) - limit <= rolled <= max(recent) + limit:
+                return (
+                    f"the robot {name} {rolled:.2f} {unit} by its wheels although "
+                    f"{self._commanded[i]:.2f} {unit} was commanded: is there a speed limit or an "
+                    "obstacle, does another program send commands, or does the board not reach the "
+                    "commanded speeds (`acsard mcu check`)?"
+                )
+        return ""
+
+
 class LegDriver:
     """Decides the commands of one leg, which is one drive of a guided calibration.
 
@@ -76,7 +139,7 @@ class LegDriver:
         The daemon recognizes the commands of this leg by their `source` and `sender`.
         """
         self._leg, self._source, self._sender = leg, source, sender
-        self._kinematics = Kinematics(drive)
+        self._path = CommandedPath(drive, now)
         self.phase = Phase.OPENING
         self.halted = ""
         """The reason why the leg ended early; "" if it did not end early."""
@@ -87,7 +150,7 @@ class LegDriver:
 
         If messages arrive again, the leg can be repeated.
         """
-        self._begun = self._received = self._stepped = self._changed = now
+        self._begun = self._received = self._stepped = now
         self._number, self._ends = -1, now
         self._command = REST
         self._waits = "no message with the daemon's state has arrived"
@@ -147,17 +210,19 @@ class LegDriver:
         elif state.sender not in ("", self._sender):
             self._halt(why)
         elif self.phase is Phase.MOVING:
-            deviation = self._deviation(state, now)
-            disturbed = why == self._starved if why else bool(deviation)
-            self._tolerate_briefly(why or deviation, now, disturbed=disturbed)
+            silent = "" if state.wheels or why else NO_FEEDBACK
+            disturbed = bool(silent) or why == self._starved
+            self._tolerate_briefly(why or silent, now, disturbed=disturbed)
 
-    def wheels(self, fastest: float, now: float) -> None:
-        """Process wheel speeds from the daemon, to detect the standstill at the end of the leg.
+    def wheels(self, speeds: WheelSpeeds, now: float) -> None:
+        """Process wheel speeds from the daemon, rad/s.
 
-        `fastest` is the absolute speed of the fastest wheel, rad/s.
+        They show whether the robot follows the commanded path, and whether it stands still at the
+        end of the leg.
         """
         self._received = now
-        if fastest > STANDSTILL_SPEED:
+        self._path.wheels(speeds, now)
+        if max(map(abs, speeds.as_tuple())) > STANDSTILL_SPEED:
             self._still_since = None
         elif self._still_since is None:
             self._still_since = now
@@ -165,6 +230,7 @@ class LegDriver:
     def step(self, now: float) -> Twist:
         """Return the command to send now."""
         held_up, self._stepped = now - self._stepped, now
+        self._path.command(self._command, now)
         # If this process was paused, the robot has braked, and the time of the move may be over.
         # The next move would then begin at the wrong place. The pause also hides whether the daemon
         # was silent. If the pause came before the first move, the person who started the leg may
@@ -176,6 +242,8 @@ class LegDriver:
             self.silent = self.silent or not (late or self.over)
             silence = "no messages of the daemon arrive: does the daemon run (`acsard doctor`)?"
             self._halt(STALL_REASON if late else silence, disturbed=late)
+        elif self.phase in (Phase.MOVING, Phase.SETTLING) and (error := self._path.error):
+            self._halt(error, disturbed=True)
         if self.phase is Phase.OPENING:
             self._open(now)
         if self.phase is Phase.MOVING and now >= self._ends:
@@ -206,7 +274,7 @@ class LegDriver:
         self._command = Twist(move.linear, move.angular)
         # Add the duration to the planned end of the previous move, not to `now`. A late step then
         # does not lengthen the drive.
-        self._ends, self._changed = self._ends + move.seconds, now
+        self._ends += move.seconds
 
     def _settle(self, now: float) -> None:
         self.phase, self._command = Phase.SETTLING, REST
@@ -244,26 +312,6 @@ class LegDriver:
         (age,) = [source.age for source in state.sources if source.name == self._source]
         if age is None or age >= OPENING_S:
             return self._starved
-        return ""
-
-    def _deviation(self, state: RobotState, now: float) -> str:
-        if now - self._changed < RESPONSE_TIMEOUT_S:
-            return ""
-        if not state.wheels:
-            return "the microcontroller sends no feedback: check its cable and its power supply"
-        # Compare the command with the wheel speeds, and not with the turn rate of a gyro, because a
-        # robot that skids turns less than commanded.
-        twist = self._kinematics.twist(WheelSpeeds(*state.wheels))
-        for commanded, actual, off, unit in (
-            (self._command.linear, twist.linear, LINEAR_OFF, "m/s"),
-            (self._command.angular, twist.angular, ANGULAR_OFF, "rad/s"),
-        ):
-            if abs(actual - commanded) > off + OFF_SHARE * abs(commanded):
-                return (
-                    f"the wheels turn at {actual:.2f} {unit} although {commanded:.2f} is "
-                    "commanded: does another program send commands, or is there a limit or an "
-                    "obstacle?"
-                )
         return ""
 
     def _halt(self, why: str, *, disturbed: bool = False) -> None:

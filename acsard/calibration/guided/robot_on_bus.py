@@ -28,7 +28,7 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import by_key
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, Time, TwistStamped
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, WheelSpeeds
 from acsard.host import clock
 from acsard.terminal.prompt import Prompt
 
@@ -140,8 +140,8 @@ class LegRecorder:
         self._joints = joints
         self.samples: dict[str, list[Sample]] = {name: [] for name in COLUMNS_BY_STREAM}
 
-    def wheels(self, message: JointState, arrival: float) -> float:
-        """Add a sample of the wheel speeds, and return the speed of the fastest wheel, rad/s.
+    def wheels(self, message: JointState, arrival: float) -> WheelSpeeds:
+        """Add a sample of the wheel speeds, and return these speeds, rad/s.
 
         Raises `GuideError` if the speed of a wheel is missing.
         """
@@ -152,8 +152,9 @@ class LegRecorder:
                     f"wheel_states has no speed of {joint}: if another program publishes on this "
                     "key, stop it"
                 )
-        self._add("wheels", message.header.stamp, arrival, tuple(speeds[j] for j in self._joints))
-        return max(map(abs, speeds.values()))
+        values = tuple(speeds[joint] for joint in self._joints)
+        self._add("wheels", message.header.stamp, arrival, values)
+        return WheelSpeeds(*values)
 
     def gyro(self, message: Imu, arrival: float) -> None:
         self._add("gyro", message.header.stamp, arrival, (message.angular_velocity.z,))

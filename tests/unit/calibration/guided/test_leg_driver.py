@@ -14,7 +14,7 @@ from acsard.client.follower import MAX_STATE_AGE_S
 from acsard.core.config.settings import DriveConfig
 from acsard.core.link.link_diagnosis import HOST_STALL
 from acsard.core.messages.schema import RobotState, SourceState, Time
-from acsard.core.values import REST, Twist
+from acsard.core.values import REST, Twist, WheelSpeeds
 from tests.each import each
 
 US, OTHER = "joe/1/aa", "joe/2/bb"
@@ -55,8 +55,10 @@ class World:
             self.now += TICK
             done = self.said[-1] if self.said else REST
             if self.speaks:
-                self.driver.state(self.tells(telling(done)), self.now)
-                self.driver.wheels(abs(done.linear) + abs(done.angular), self.now)
+                state = self.tells(telling(done))
+                self.driver.state(state, self.now)
+                if state.wheels:
+                    self.driver.wheels(WheelSpeeds(*state.wheels), self.now)
             self.said.append(self.driver.step(self.now))
         return self
 
@@ -122,13 +124,13 @@ STOPS: dict[str, Late] = {
     "app is not one of commands.sources": changed(
         sources=[SourceState("nav", 50, 0.01, "", "nothing")]
     ),
-    "although 0.30 is commanded": changed(wheels=[0.0] * 4),
+    "by its wheels although": changed(wheels=[0.0] * 4),
     "sends no feedback": changed(wheels=[]),
 }
 
 
 PASSING = {
-    "the daemon has received no command of source app for 0.4 s", "although 0.30 is commanded",
+    "the daemon has received no command of source app for 0.4 s", "by its wheels although",
     "sends no feedback",
 }  # fmt: skip
 """The stops of `STOPS` that may not happen again."""
@@ -256,6 +258,57 @@ def test_a_leg_continues_after_a_brief_interruption_of_its_commands() -> None:
     assert not world.run(3.0).driver.halted
 
 
+def limited(linear: float, angular: float) -> Late:
+    """Return a function that lowers the speeds of a state, as a limit of the daemon does."""
+
+    def lower(state: RobotState) -> RobotState:
+        twist = Twist(
+            min(linear, max(-linear, state.linear or 0.0)),
+            min(angular, max(-angular, state.angular or 0.0)),
+        )
+        return msgspec.structs.replace(state, wheels=telling(twist).wheels)
+
+    return lower
+
+
+SQUARE = Leg("", "", (Move(4.0, 0.3), Move(0.6), Move(1.75, 0.0, 0.9), Move(0.6)) * 4)
+
+
+@each(
+    ("moves", "tells"),
+    [
+        ((Move(6.7, 0.3), Move(0.6)), limited(0.165, 9.0)),
+        (SQUARE.moves, limited(9.0, 0.52)),
+        (SQUARE.moves, limited(9.0, 0.001)),
+    ],
+)
+def test_a_leg_halts_if_a_limit_keeps_the_robot_from_the_planned_path(
+    moves: tuple[Move, ...], tells: Late
+) -> None:
+    world = World(Leg("", "", moves))
+    world.tells = tells
+    world.run(40.0)
+    assert world.driver.phase is Phase.HALTED
+    assert "is there a speed limit" in world.driver.halted
+    # The second side of a square has begun at most.
+    assert world.said.count(Twist(0.3)) * TICK < 6.7 + TICK
+
+
+def test_a_robot_that_follows_late_and_with_ramps_finishes_a_square() -> None:
+    world, rolling = World(SQUARE), [0.0, 0.0]
+
+    def ramp(state: RobotState) -> RobotState:
+        for i, (goal, step) in enumerate(
+            ((state.linear or 0.0, 0.4 * TICK), (state.angular or 0.0, 1.2 * TICK))
+        ):
+            rolling[i] += max(-step, min(step, 0.97 * goal - rolling[i]))
+        return msgspec.structs.replace(state, wheels=telling(Twist(*rolling)).wheels)
+
+    world.tells = ramp
+    world.run(40.0)
+    assert (world.driver.phase, world.driver.halted) == (Phase.DONE, "")
+
+
 def test_progress_is_the_elapsed_share_of_the_time() -> None:
     world = World(LEG).until_moving()
     shares = [world.run(0.5).driver.progress(world.now) for _ in range(5)]
@@ -306,10 +359,10 @@ def test_a_gyro_that_shows_less_turn_than_the_wheels_does_not_halt_the_leg() -> 
 
 
 def test_wheels_that_never_come_to_rest_are_reported() -> None:
-    world = World(Leg("", "", (Move(0.5, 0.3),))).until_moving()
+    world = World(Leg("", "", (Move(0.5, 0.3),))).until_moving().run(0.6)
     for _ in range(500):
         world.now += TICK
         world.driver.state(telling(REST), world.now)
-        world.driver.wheels(1.0, world.now)
+        world.driver.wheels(WheelSpeeds(0.1, -0.1, 0.1, -0.1), world.now)
         world.driver.step(world.now)
     assert "come to rest" in world.driver.halted
