@@ -111,8 +111,8 @@ _ROUGH = (
     ("µs", 1e-6, 999.5e-6), ("ms", 1e-3, 0.9995), ("s", 1.0, 99.5), ("min", 60.0, 99.5 * 60),
     ("h", 3600.0, 99.5 * 3600), ("d", 86400.0, math.inf),
 )  # fmt: skip
-"""Units for `rough`. Each row contains a unit, its size in s, and the duration in s from which on
-the next row applies."""
+"""Units for `rough`. Each row contains a unit, its size in s, and the duration in s at which the
+next row begins."""
 
 
 def rough(seconds: float | None, finest: float = 1.0) -> str:

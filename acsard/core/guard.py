@@ -41,9 +41,9 @@ HALTED = ("stopped", "fault", "shutdown")
 """Modes in which the robot brakes at the stop deceleration."""
 
 RAMP_MARGIN_NS = 300_000_000
-"""Extra time after the computed end of a ramp to rest, ns. During this time, the guard still passes
-lines that move a wheel. The time equals the watchdog time of the board: a board that receives no
-line for longer stops the motors by itself."""
+"""Extra time after the computed end of a ramp to rest, ns, in which the guard still passes lines
+that move a wheel. It equals the watchdog time of the board, after which a board without lines stops
+the motors by itself."""
 
 
 class Memory(Struct, frozen=True):
@@ -59,10 +59,10 @@ class Memory(Struct, frozen=True):
     if the mode is not one of `HALTED`."""
     ramp_ns: int = 0
     """Duration of a ramp from full speed to rest, ns. If the limits have changed since the robot
-    was last at rest, this is the longest duration under the old and the new limits."""
+    was last at rest, this is the longest duration under any of these limits."""
     stop_ramp_ns: int = 0
     """Duration of a stop from full speed, ns. If the limits have changed since the robot was last
-    at rest, this is the longest duration under the old and the new limits."""
+    at rest, this is the longest duration under any of these limits."""
 
 
 class Guard:
@@ -85,9 +85,8 @@ class Guard:
     def use(self, config: Config) -> None:
         """Use the configuration `config` from now on.
 
-        A moving robot may still brake by the old limits. Until the robot is at rest, the guard
-        therefore allows the longer of two braking times: the time by the old limits and the time by
-        the new limits.
+        A moving robot may still brake by the old limits. Therefore the guard allows the longer one
+        of the old and the new braking time until the robot is at rest.
         """
         self._require_check = config.mcu.link_check == "require"
         self._most = int(config.limits.wheel_speed * 100 + 1)

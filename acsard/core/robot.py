@@ -64,14 +64,14 @@ from acsard.core.values import (
 )
 
 MAX_DT = 0.05
-"""Longest time between two lines to the board for which the robot accelerates, s. If the process
+"""Largest time step with which the limiter moves the speed towards a command, s. If the process
 stalls for longer, the rest of the time is ignored, so that the speed does not jump. If 1.5 control
 periods are longer than this constant, they are the limit instead."""
 
 WRITE_PAUSE_S = WATCHDOG_S - 0.05
-"""Time without a line written to the port, s, after which the next acceleration starts from rest.
-The board stops the motors if it receives no line for `WATCHDOG_S`. The margin of 0.05 s allows for
-a board whose clock is slightly fast."""
+"""If no line was written to the port for this time, s, the next acceleration starts from rest,
+because the board may have stopped the motors. The board stops them after `WATCHDOG_S` without a
+line. The margin of 0.05 s allows for a board whose clock is slightly fast."""
 
 INPUT_NAMES = {
     "estop": "its emergency stop",
@@ -143,11 +143,11 @@ class Robot:
         """Monotonic times, ns: of the last computed line, and of the last press of the emergency
         stop or a bumper."""
         self._made = self._said = (self._limiter.state, 0)
-        """Two pairs of a limiter state and the monotonic time of this state, ns. `_made` is the
-        pair of the last computed line. `_said` is the pair of the last line that was written to
-        the port. If a line was not written, `_settle` sets `_made` back to `_said`. Both are the
-        state of a robot at rest after a press of the emergency stop or a bumper, and while the
-        link is not up."""
+        """Two pairs: a limiter state, and its monotonic time, ns. `_made` is the pair of the last
+        computed line, and `_said` is the pair of the last line that was written to the port. If a
+        line was not written, `_settle` sets `_made` back to `_said`. After a press of the emergency
+        stop or a bumper, and while the link is not up, both contain the state of a robot at
+        rest."""
         self._status = ("", "", "", "")
         self._battery_level = ""
         """Level of the battery in the previous step; "" before the board's first report."""
@@ -165,8 +165,8 @@ class Robot:
         self._bumpers = Bumpers(config.safety)
         self._battery = Battery(config.battery, any(why.startswith(EMPTY_REASON) for why in causes))
         self._unreported = {name: why for why in causes if (name := _input(why))}
-        """Inputs of the board that have caused a latch in an earlier run of the daemon and that
-        the board has not reported since. The keys are those of `INPUT_NAMES`, and the values are
+        """The inputs of the board that caused a latch in an earlier run of the daemon, if the board
+        has not reported them in this run. The keys are those of `INPUT_NAMES`, and the values are
         the causes in words. While the map is not empty, a `clear` is refused."""
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
@@ -293,7 +293,7 @@ class Robot:
     # The outcome of the previous line.
 
     def _settle(self, inputs: Inputs) -> None:
-        """Bring the state of the limiter into line with the last line that was written.
+        """Set the limiter to the state of the last line that was written to the port.
 
         If the guard replaced the last line by zeros, the limiter continues from zero. If the last
         line was not written, the limiter continues from the line before it.
@@ -415,8 +415,8 @@ class Robot:
     def _awaited_report(self) -> tuple[str, str]:
         """Return the cause of a latch from an earlier run of the daemon, and advice about it.
 
-        An input of the board caused this latch, and the board has not reported the input since.
-        Until it does, `clear` is refused. If there is no such latch, both texts are "".
+        An input of the board caused this latch. Until the board reports this input again, `clear`
+        is refused. If there is no such latch, both texts are "".
         """
         reported = {
             "estop": self._estop.use == "off" or bool(self._estop.state),

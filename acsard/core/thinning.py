@@ -14,8 +14,7 @@ from itertools import islice
 from typing import NamedTuple
 
 MAX_BINS = 1500
-"""Largest number of bins of a curve. A bin is a time interval. The number is twice the width of a
-picture in pixels."""
+"""Largest number of time intervals (bins) of a curve: twice the width of a picture in pixels."""
 
 FIRST_WIDTH = 0.001
 """Width of a bin in a new curve, s. It is shorter than the interval between the robot's steps, so
@@ -44,9 +43,9 @@ class _Bin(NamedTuple):
 
 
 class Curve:
-    """A value over time, divided into bins.
+    """A value over time, divided into time intervals (bins).
 
-    A bin is a time interval of which only the lowest and the highest value are kept.
+    Each bin keeps only the lowest and the highest value.
     """
 
     def __init__(self, most: int = MAX_BINS) -> None:
@@ -188,8 +187,8 @@ class Place(NamedTuple):
 class Track:
     """A path that keeps only some of the places that are added to it.
 
-    Each place that is not kept is less than `2 * self.stride` m away from a kept place. This does
-    not apply to places that are too old, nor to places before a jump: the path drops all of them.
+    Each dropped place is less than `2 * self.stride` m away from a kept place. There are two
+    exceptions: the path drops all places that are too old, and all places before a jump.
     """
 
     def __init__(

@@ -264,8 +264,8 @@ class Estimate(Struct, frozen=True, gc=False):
     angle is not wrapped: each full turn forward adds 2 pi."""
     speeds: WheelSpeeds
     asked_ns: int | None = None
-    """Monotonic time at which the daemon wrote the line that the board answered with the feedback
-    line, ns. None if the daemon cannot tell which of its lines the board answered."""
+    """Monotonic time at which the daemon wrote the line to which the feedback line is the reply,
+    ns. None if the daemon cannot tell which of its lines the board answered."""
     heard_ns: int = 0
     """Monotonic time at which the daemon had received the complete feedback line, ns."""
 
@@ -311,21 +311,22 @@ class Wait(Struct, frozen=True):
     seconds: float = 0.0
     """A duration in s, whose meaning depends on `what`.
 
-    - neutral: A sender with a shared identity must send no speed for this time after its zero.
+    - neutral: If several programs may share the identity of a sender, it must send no speed for
+      this time after its zero.
     - proof: The delays of the commands must be steady for this time.
     - late: The delay of the commands is longer than this time.
     """
     senders: int = 0
     """Number of senders that wait while the robot follows another sender of the same source."""
     lasts: float = 0.0
-    """Time for which the source has sent speeds without a zero (if `what` is `neutral`), or only
-    zeros (if `what` is `zeros`), s. It is rounded down to one of a few values, so that the text
-    about the condition seldom changes. It is 0 if the time is shorter than these values, and for
-    all other conditions."""
+    """If `what` is `neutral`: the time, s, for which the source has sent speeds without a zero. If
+    `what` is `zeros`: the time, s, for which it has sent only zeros. The time is rounded down to
+    one of a few values, so that the text about the condition seldom changes. It is 0 below the
+    smallest of these values, and for all other conditions."""
     kept: str = ""
     """Name of a source that sends speeds without effect, because `self.source` controls the robot
     and sends only zeros. It is "another sender of NAME" if the speeds come from another sender of
-    the same source NAME. It is "" if no source sends speeds without effect for this reason."""
+    the same source NAME. It is "" if there is no such source."""
     ros: bool = False
     """True if the sender that must send a zero uses ROS."""
     shared: bool = False
@@ -335,9 +336,9 @@ class Wait(Struct, frozen=True):
 class SourceStatus(Struct, frozen=True):
     """The state of a command source.
 
-    `age_s` is the time since the last accepted command of the source, s. Some events, such as the
-    start or a `clear`, require a zero from each sender. After such an event, the age is None until
-    the next command is accepted.
+    `age_s` is the time since the last accepted command of the source, s. It is None after the
+    start, a `clear` or another event that requires a zero from each sender, until the next command
+    is accepted.
     """
 
     name: str
@@ -359,8 +360,8 @@ class WheelsStatus(Struct, frozen=True):
     slipping: tuple[str, ...] = ()
     """The sides, `left` or `right`, whose wheels have slipped in the last half second."""
     differ: tuple[float, float] = (0.0, 0.0)
-    """Learned difference between the front and the rear wheel of the left side, and of the right
-    side. 0.01 means that the front wheel rolls 1 % farther than the rear wheel."""
+    """Learned relative difference between the front and the rear wheel: on the left side, and on
+    the right side. 0.01 means that the front wheel rolls 1 % farther than the rear wheel."""
     slow: tuple[str, ...] = ()
     """A text for each wheel that turns slower than commanded. For example, "front_left 60%" means
     that the wheel reaches 60 % of the expected speed."""
@@ -400,10 +401,10 @@ GyroDoes = Literal[
     "off", "waiting for rest", "waiting for turn", "used", "silent", "disagrees",
     "reversed", "in degrees", "dead", "not believed",
 ]  # fmt: skip
-"""State of the gyro. The odometry takes the heading from the gyro only in the states `used` and
-`disagrees`. In the state `disagrees`, the wheels slip. In the state `waiting for turn`, the wheels
-provide the turns until the gyro has agreed with the wheels in one turn. While the wheels stand
-still in this state, the gyro provides the turn."""
+"""State of the gyro. In the states `used` and `disagrees` (the wheels slip), the odometry takes the
+heading from the gyro. In the state `waiting for turn`, the gyro has not agreed with the wheels in a
+turn yet, and provides the heading only while the wheels stand still. In all other states, the
+heading comes from the wheels."""
 
 TrackUse = Literal["shown", "uncertain", "too far off", "used"]
 """Whether the odometry uses the effective track that it has learned with a gyro: `used`, or the
@@ -436,9 +437,9 @@ that the board has stopped reporting the input, which counts as pressed."""
 
 
 BatteryLevel = Literal["ok", "warning", "return", "stop", "unknown"]
-"""Level of the battery by the thresholds in `[battery]`; `ok` if no threshold is set. `unknown`
-means that the board does not report the quantity (voltage or charge) that the thresholds use, or
-has reported it only for a few seconds so far."""
+"""Level of the battery by the thresholds in `[battery]`, for the voltage or the charge; `ok` if no
+threshold is set. `unknown` means that the board does not report this quantity, or has reported it
+only for a few seconds so far."""
 
 
 class BatteryStatus(Struct, frozen=True, gc=False):
@@ -462,9 +463,9 @@ class Latch(Struct, frozen=True):
     """A stop, a fault or a deactivation of the robot, which lasts until a person releases it."""
 
     number: int
-    """Number that identifies the latch, even after a restart. It is the time at which the latch
-    was set, ms since 1970. If this time is not later than the number of an earlier latch, a larger
-    number is used, so that numbers always grow. JavaScript represents the number exactly."""
+    """Number that identifies the latch, even after a restart: the time at which the latch was set,
+    ms since 1970. If this time is not later than the number of an earlier latch, a larger number is
+    used, so that numbers always grow. JavaScript represents the number exactly."""
     at_ns: int
     """Wall-clock time at which the latch was set, ns since 1970."""
     by: str
@@ -485,10 +486,7 @@ class Latch(Struct, frozen=True):
         return (self, *self.earlier)
 
     def each(self, change: Callable[[Latch], Latch]) -> Latch:
-        """Return a copy in which `change` has replaced this latch and each latch in `earlier`.
-
-        The function `change` gets one latch and returns its replacement.
-        """
+        """Return a copy with `change` applied to this latch and to each latch in `earlier`."""
         return replace(change(self), earlier=tuple([change(cause) for cause in self.earlier]))
 
 
@@ -576,7 +574,8 @@ class Outputs(Struct, frozen=True):
     """Wheel speeds of the last computed line, which is `line` if a line was due. They are 0 if the
     robot has cut its speed to zero since then, for example because the link was lost."""
     applied: Twist
-    """Twist of the last computed line, after all limits; zero after such a cut."""
+    """Twist of the last computed line, after all limits. It is zero if the robot has cut its speed
+    to zero since then, for example because the link was lost."""
     linked: bool
     """True if the link to the board is up. Otherwise the guard replaces each line that moves a
     wheel by the stop line."""
@@ -597,10 +596,9 @@ class Outputs(Struct, frozen=True):
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False
-    """True if the board should get a new line without delay. This is the case if the command or the
-    mode has changed since the previously computed line, or if the emergency stop or a bumper was
-    pressed. The value is true even if this step has computed the new line, so `due` tells
-    whether the change still waits for a line."""
+    """True if the board should get a new line without delay, because the command or the mode has
+    changed since the previously computed line, or because the emergency stop or a bumper was
+    pressed. If this step has already computed the new line, `due` is true too."""
     latches: Latches = Latches()
     """The latches and lowered limits after the step. A latch or a lowered limit has changed if
     this is not the same object as in the previous step."""
@@ -670,8 +668,8 @@ class Snapshot(Struct, frozen=True):
     """Whether the serial lines have a checksum, in words, such as "plain" or "checked"."""
     encoders: tuple[int, ...] = ()
     """Configured encoder counts per wheel turn, in `WHEELS` order. All are 0 if no counts are
-    configured. They are also 0 if the reported speeds do not match the configured counts: each
-    speed should be an integer number of counts divided by a time."""
+    configured, or if the reported speeds contradict the configured counts: each speed should be an
+    integer number of counts divided by a time."""
     sender: str = ""
     """Sender that the arbiter has selected; "" if no sender is selected."""
     routers: RoutersStatus = RoutersStatus()

@@ -121,8 +121,8 @@ ParameterList = Annotated[list[T], Meta(max_length=128)]
 """List with at most 128 items, for the parameters that a request sets. A longer request is refused,
 because its decoding would take too much of the time of a control step."""
 NameList = Annotated[list[T], Meta(max_length=256)]
-"""List with at most 256 items, for names of parameters. The limit is higher than the limit of
-`ParameterList`, because a name is decoded faster than a parameter with its value."""
+"""List with at most 256 items, for names of parameters. It may be longer than a list of parameters
+to set, because a name is decoded faster than a parameter with its value."""
 
 MAX_REQUEST_BYTES = 16384
 """Largest size of a request, bytes. A request with the names of all parameters is smaller."""

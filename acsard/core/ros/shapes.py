@@ -85,8 +85,8 @@ class Counter(Struct, frozen=True):
 class Source(Struct, frozen=True):
     """A command source.
 
-    `age` is the time since the last accepted command of the source, s. A stop, a `clear` and some
-    other events discard the earlier commands; `age` is then None until the next accepted command.
+    `age` is the time since the last accepted command of the source, s. It is None after a fault, a
+    `clear` or another event that discards the earlier commands, until the next accepted command.
     `waits_for` says in words what must happen before the source can drive. It is "" while the
     source drives.
     """

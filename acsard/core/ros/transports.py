@@ -233,8 +233,8 @@ def claims(ros: RosConfig) -> tuple[str, ...]:
 
     Two daemons with the same token would follow the same `cmd_vel`, so the second daemon does not
     start. The tokens begin with `acsard/@ros/`. The tokens that announce endpoints to ROS cannot
-    serve as claims, because not every daemon announces itself, and other ROS nodes may use the
-    same names.
+    serve as claims: not every daemon announces its endpoints, and other ROS nodes may use the same
+    names.
     """
     name = full_name(ros.namespace, "cmd_vel")
     trees = (("bridge", ros.bridge), (f"rmw/{ros.domain}", ros.rmw))
@@ -246,9 +246,9 @@ def _node(ros: RosConfig, zid: str) -> Node:
 
 
 def _bridge(ros: RosConfig, zid: str, names: tuple[RosName, ...]) -> Iterator[Endpoint]:
-    """Yield an endpoint for each name. A name with two types is not announced to ROS.
+    """Yield an endpoint for each name.
 
-    The reason is that a DDS reader has only one type.
+    A name with two types is not announced to ROS, because a DDS reader has only one type.
     """
     for row in names:
         twins = [other for other in names if other.name == row.name]
