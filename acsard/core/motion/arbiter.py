@@ -31,8 +31,8 @@ from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wai
 
 MAX_SENDERS = 16
 """Largest number of senders that one source remembers. If the source is full, a new sender replaces
-a known sender, but never a sender that may keep control of the robot (`Sender.holds`), such as a
-live, armed sender."""
+a known sender. A sender that may keep control of the robot (`Sender.holds`), such as a live, armed
+sender, is never replaced."""
 
 Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
 """The reason for which the arbiter refuses a command; "" if the command is accepted."""
@@ -60,9 +60,8 @@ class Choice(Struct, frozen=True):
 
 
 IDLE = Choice()
-"""The choice if no source has sent a command within its timeout. If a known sender has sent a
-command that was not accepted because of its stamp, the arbiter returns another choice, in which
-`Choice.wait` gives this reason."""
+"""The choice if no source has sent a command within its timeout. If a command of a known sender was
+not accepted because of its stamp, the arbiter instead returns a choice whose `wait` says so."""
 
 
 class _Source:
@@ -107,10 +106,11 @@ class _Source:
         return holds, holds or sender.armed(now_ns), sender.noticed_ns
 
     def cancel_zeros(self, at_ns: int) -> None:
-        """Cancel the zeros of all shared identities, because one of them may have sent a speed.
+        """Cancel the zeros of all senders whose identity several programs may share.
 
-        A canceled zero does not arm its sender. A zero is not canceled if its
-        `commands.neutral_pause` was already over at the monotonic time `at_ns`, ns.
+        One of these programs may have sent a speed. A canceled zero does not arm its sender. A zero
+        is not canceled if its `commands.neutral_pause` was already over at the monotonic time
+        `at_ns`, ns.
         """
         for sender in self.senders.values():
             sender.cancel_zero(at_ns)
@@ -175,9 +175,9 @@ class _Source:
     def doubt_wait(self, now_ns: int) -> Wait | None:
         """Return why a sender with doubtful stamps does not drive the robot.
 
-        The arbiter did not accept the recent commands of such a sender because of their stamps. If
-        the source has several such senders, the result is about the sender with the newest message.
-        Return None if the source has no such sender.
+        The arbiter did not accept the recent commands of this sender because of their stamps. If
+        the source has several such senders, the result is about the one with the newest message;
+        without any, None.
         """
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
         if not doubtful:
@@ -295,14 +295,15 @@ class Arbiter:
     def notice(self, source: str, sender: str, arrived_ns: int, shared: bool = False) -> None:
         """Record that a message to `source` was lost or unusable.
 
-        The message may have been a speed. If `shared` is true or `sender` is "" (unknown), a
-        program with any shared identity may have sent the message. In this case, the method cancels
-        the zeros of all shared identities of the source, so that these zeros do not arm their
-        senders. A zero is not canceled if its `commands.neutral_pause` was already over at the
-        monotonic time `arrived_ns`, ns.
+        The message may have been a speed. If `shared` is true or `sender` is "" (unknown), any
+        program that shares its identity with others may have sent it. The method then cancels the
+        zeros of all shared identities of the source, so that these zeros do not arm their senders.
+        A zero is not canceled if its `commands.neutral_pause` was already over at the monotonic
+        time `arrived_ns`, ns.
 
         The sender and the time of a lost message are unknown: pass "" as `sender` and 0 as
-        `arrived_ns`. Then each zero that has not armed its sender yet is canceled.
+        `arrived_ns`. Then the method cancels each zero of a shared identity that has not armed its
+        sender yet.
         """
         known = self._sources.get(source)
         if known is None:
@@ -369,11 +370,11 @@ class Arbiter:
 
     @property
     def clock_adjustment_ns(self) -> int:
-        """Total rise of command delays that the daemon accepted as adjustments of clocks, ns.
+        """Sum of the increases of command delays that the daemon has trusted, ns.
 
-        The total contains only rises for which the stamps of the sender do not show an adjustment,
-        so the daemon had to assume one. A budget in `freshness.py` limits these rises, except for a
-        rise after a pause of the sender.
+        The daemon trusts a larger delay if the clock of the sender may have been set. The part of
+        an increase that the stamps show to be an adjustment of the clock does not count. A budget
+        in `freshness.py` limits the rest, except after a pause of the sender.
         """
         return self._freshness.forgiven_ns
 

@@ -112,9 +112,9 @@ class CommandEvents:
     def changes(self, mode: Mode, choice: Choice, why: str) -> list[Event]:
         """Return the log events for the changes since the last call.
 
-        There is an event for a new mode, for a new commander (the source and the sender that drive
-        the robot), and for a source whose speeds have no effect. A commander that drives again
-        after a pause is not new. `why` is the reason of the mode, as text.
+        The events report a new mode, a new commander (the source and the sender that drive the
+        robot), and a source whose speeds have no effect. A commander that drives again after a
+        pause is not new. `why` is the reason of the mode, as text.
         """
         drives, before, last = mode is Mode.DRIVING, self._mode, self._commander
         if drives:

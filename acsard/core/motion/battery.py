@@ -34,10 +34,10 @@ SILENCE_TIMEOUT_S = 5.0
 one report a second, four consecutive reports may be lost without an effect."""
 
 MAX_WEIGHT_NS = 300_000_000
-"""Largest weight of one report in the running mean, ns. The weight of a report is the time since
-the previous report, but at most this limit, which is the duration of a motor start. Without the
-limit, a report during a motor start would weigh too much after a gap. If the board sends only one
-report a second, the limit slows the mean down to a third of its speed."""
+"""Largest weight of one report in the running mean, ns: the duration of a motor start. The weight
+of a report is the time since the previous report, up to this limit. Without the limit, a report
+during a motor start would weigh too much after a gap. If the board sends only one report a second,
+the limit slows the mean down to a third of its speed."""
 
 EMPTY_REASON = "battery below "
 """First words of the text `Battery.why`, the reason for a stop by an empty battery."""

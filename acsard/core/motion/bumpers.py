@@ -119,10 +119,10 @@ class Bumpers(BoardInput):
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
         """Return whether each bumper is pressed; None if this status line cannot be used.
 
-        A line is not used if it reports no bumpers, or an unexpected number of bumpers, because a
-        pressed bumper may then be missing from the line. The expected number is the number of
-        places in `safety.bumpers`. Without places, it is the number in the previous report, but a
-        line that reports a press is used with any number of bumpers.
+        A line cannot be used if it reports no bumpers. If a line reports an unexpected number of
+        bumpers, a pressed bumper may be missing, so the line is not used either. The expected
+        number is the number of places in `safety.bumpers`. Without places, it is the number in the
+        previous report, and a line that reports a press is used with any number of bumpers.
         """
         bumpers = status.bumpers
         if bumpers is None:

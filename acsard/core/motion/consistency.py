@@ -56,8 +56,8 @@ class ConsistencyChecks:
         If it is None, the odometry must use the turn according to the wheels.
         """
         self.on_trial = False
-        """Whether the wheels provided the turn of the last line because the gyro is not proven: it
-        has not agreed with the wheels in a turn yet."""
+        """Whether the wheels provided the turn of the last line because the gyro was not proven. A
+        gyro is proven when it has agreed with the wheels in a turn."""
         self.slips = False
         """Whether the wheels slip, which means that they contradict each other or the gyro."""
         self.events: list[Event] = []
@@ -104,13 +104,13 @@ class ConsistencyChecks:
     def undo_recomputation(self, turn: float) -> float:
         """Return the angle that the caller must subtract from the heading, rad.
 
-        Call this after the pose was recomputed over earlier feedback lines without a faulty wheel.
-        `turn` is the angle, rad, by which the recomputation changed the robot's turn in the lines
-        for which `on_trial` was true, because the gyro was not proven at that time.
+        Call this after a faulty wheel was found, and the pose was recomputed without it over
+        earlier feedback lines. `turn` is the change of the robot's turn by this recomputation, rad.
+        Only the lines with `on_trial` count, in which the gyro was not proven.
 
-        If the gyro is proven by now, the heading already agrees with the gyro. The change must
-        therefore be undone, and the result is `turn`. Otherwise the result is 0. If the gyro has
-        no verdict yet, the method changes the pending correction of the heading by -`turn`.
+        If the gyro is proven by now, the heading already agrees with the gyro. The caller must then
+        undo the change, so the result is `turn`. Otherwise the result is 0. If the test of the gyro
+        goes on, the method changes the pending correction of the heading by -`turn`.
         """
         return 0.0 if self.gyro is None else self.gyro.undo_recomputation(turn)
 

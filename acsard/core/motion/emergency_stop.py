@@ -147,8 +147,8 @@ class BoardInput(ABC):
                 events += self._take("pressed" if any(pressed) else "ok", pressed)
         late, self._looked_ns = now_ns - self._looked_ns > LATE_STEP_NS, now_ns
         if self.pressed is not None and now_ns - self._reported_ns > _SILENT_NS:
-            # Only once between two reports of the board: otherwise a control loop that is always
-            # late would delay the stop forever.
+            # Excuse a late step only once between two reports of the board. Otherwise a control
+            # loop that is always late would delay the stop forever.
             if late and not self._excused:
                 self._reported_ns, self._excused = now_ns - _SILENT_NS + CATCH_UP_NS, True
             else:
@@ -195,10 +195,10 @@ class EmergencyStop(BoardInput):
     def __init__(self, use: EstopUse, unpowered: bool = False) -> None:
         super().__init__(use)
         self.driver_fault = False
-        """Whether the status lines in the last call of `process_reports` reported a motor-driver
-        fault that counts.
+        """Whether a status line in the last call of `process_reports` reported a fault of a motor
+        driver.
 
-        A fault does not count while the drivers may have no power (`_unpowered`).
+        Faults do not count while the drivers may be without power (`_unpowered`).
         """
         self._unpowered = unpowered
         """Whether the emergency stop was pressed and its stop is still latched.

@@ -62,11 +62,11 @@ MAX_RISE_NS = NS_PER_S
 held commands back."""
 
 EVEN_DIVISOR, CREEP_DIVISOR = 200, 20
-"""Divisors for a proof (a test whether the delay is constant), which compares the minimum delays of
-its two halves. The two minima may differ by the duration of the proof divided by `EVEN_DIVISOR`, or
-divided by `CREEP_DIVISOR` if the delay creeps (see `CREEP`). The centers of the halves are half the
-duration apart, so the delay may change by 10 ms per second, or by 100 ms per second if it creeps.
-NTP slews a clock by up to 83 ms per second."""
+"""Divisors for a proof, which is a test whether the delay is constant. A proof compares the minimum
+delays of its two halves. The minima may differ by the duration of the proof divided by
+`EVEN_DIVISOR`, or divided by `CREEP_DIVISOR` if the delay creeps (see `CREEP`). The centers of the
+halves are half the duration apart, so the delay may change by 10 ms per second, or by 100 ms per
+second if it creeps. NTP slews a clock by up to 83 ms per second."""
 
 CREEP, JITTER_NS = 10, NS_PER_S // 200
 """A delay creeps if it changes little between two commands: by at most the time between the two
@@ -81,16 +81,16 @@ JUMP_PROOF_NS = 3 * NS_PER_S // 2
 cause of a jump is more likely a backlog that arrives in bursts than a clock that was set."""
 
 MAX_PAUSE_NS = 2 * NS_PER_S
-"""Limit for the silence of a sender, ns. A longer silence counts as a pause. If the timeout of the
-sender's source is longer, this timeout is the limit, because the sender need not send more often. A
-pause ends a test of the sender's delay. If the stamps show the pause as well as the arrival times
-do, a foreign clock (one that may be adjusted) may have been set by any amount in the pause."""
+"""Silence of a sender that counts as a pause, ns. If the timeout of the sender's source is longer,
+this timeout applies instead, because the sender need not send more often. A pause ends a test of
+the sender's delay. If the stamps show the pause too, a foreign clock (one that may be adjusted) may
+have been set by any amount in the pause."""
 
 MAX_STOPPED_STAMP_NS = 10_000
-"""Largest difference between the stamps of two successive commands, ns, that shows that the clock
-was set back. It shows this only if the commands arrived more than `SEPARATE_NS` apart. The limit is
-not 0, because Zenoh's own clock never goes back. If the wall clock was set back, Zenoh's clock
-advances by a fraction of a microsecond for each message until the wall clock has caught up."""
+"""If two successive commands arrive more than `SEPARATE_NS` apart, but their stamps differ by at
+most this, ns, the clock was set back. The limit is not 0, because Zenoh's own clock never goes
+back. If the wall clock was set back, Zenoh's clock advances by a fraction of a microsecond for each
+message until the wall clock has caught up."""
 
 SEPARATE_NS = NS_PER_S // 500
 """Commands that arrive within this time of each other, ns, may have been sent together."""
@@ -215,8 +215,8 @@ class _Clock:
         self._least = 0
         """Minimum of the trusted delays, ns. It rises with time by the largest possible drift."""
         self._early = 0
-        """Sum of the recent decreases of `_least`, ns. It falls by 1 ns for each 10 ns that
-        pass."""
+        """Sum of the recent decreases of `_least`, ns, minus 1 ns for each 10 ns that pass; at
+        least 0."""
         self._floor: int | None = None
         """Lowest delay of a steady clock (one that is never adjusted), ns. It rises with time by
         the largest possible drift. It is None before the first command, and always None for a clock
@@ -286,9 +286,9 @@ class _Clock:
     def _repeats(self, stamp_ns: int, number: int, silence: int) -> bool:
         """Return whether the network repeated this command, or delivered it after a later one.
 
-        A low number may also mean that the sender has restarted. This is assumed if the sender has
-        paused, or if the stamp is later than those of the previous and of the last accepted
-        command.
+        If the number is low, the sender may also have restarted. The method assumes a restart after
+        a pause of the sender, or if the stamp is later than both the previous and the last accepted
+        stamp.
         """
         if not 0 <= number <= self._number or silence > self.gap_ns:
             return False

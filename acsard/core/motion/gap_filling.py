@@ -3,7 +3,7 @@
 `Rolling` computes the angles that the wheels rolled since the last plausible feedback line. A line
 is implausible if `sanity.py` or `Confirmation` rejects it. `Rolling` uses the first of these
 sources that exists: the encoder counts in the line, whole counts that are recovered from the speeds
-in the line, or these speeds times the time. No time and no encoder count is used twice or left out.
+in the line, or these speeds times the time. Each time and each encoder count is used once.
 
 In a gap that no line covers, `Rolling` assumes two speeds: the speed before the gap for the first
 half, and the speed after the gap for the second half. If the motors were commanded to rest in the
@@ -148,8 +148,8 @@ class Rolling:
     def _driven_in(self, line: Feedback) -> float:
         """Return the part of the gaps before `line` in which the daemon still commanded motion, s.
 
-        A gap is a time without plausible feedback lines. The rest of it comes after the daemon
-        commanded rest.
+        A gap is a time without plausible feedback lines. Later in the gap, the daemon commands
+        rest.
         """
         return self._bridged + line.driven if line.bridged else self._driven
 
@@ -423,7 +423,7 @@ class Gaps:
         """Return the variances of the distance (m2) and the turn (rad2) in a gap of `seconds` s.
 
         `before` and `after` are the twists before and after the gap. `commanded` contains the
-        highest speeds that were commanded in it, m/s and rad/s, both without sign. The default
+        highest speeds that were commanded in the gap, m/s and rad/s, both without sign. The default
         is for callers that do not know the commands.
         """
         scale = (seconds / ACCELERATION_SPAN_S) ** VARIANCE_POWER

@@ -45,26 +45,29 @@ SILENCE_TIMEOUT_NS = NS_PER_S // 5
 is assumed to continue turning at the rate of this sample."""
 
 MAX_EXTRA_DELAY_NS = NS_PER_S // 4
-"""Difference of a sample's delay from the smallest delay of earlier samples, ns. If it is larger
-than this, the network held the sample back, or the clock of the sender was set."""
+"""Largest normal excess of a sample's delay over the smallest delay of earlier samples, ns. A
+larger excess shows that the network held the sample back, or that the clock of the sender was
+set."""
 
 STEADY_DELAY_NS, MAX_DELAY_FALL_NS = NS_PER_S, NS_PER_S // 50
-"""A delay above `MAX_EXTRA_DELAY_NS` shows that the clock of the sender was set if it is steady:
-samples arrive for `STEADY_DELAY_NS`, and the delay of none falls by more than `MAX_DELAY_FALL_NS`.
-While the network delivers a backlog, the delay falls."""
+"""If samples arrive for `STEADY_DELAY_NS` with an excess of the delay over `MAX_EXTRA_DELAY_NS`,
+and this excess never falls by more than `MAX_DELAY_FALL_NS`, the clock of the sender was set. While
+the network delivers a backlog instead, the delay falls."""
 
 MIN_SET_BACK_NS = NS_PER_S // 50
-"""Largest step back of the stamps that is not taken for a clock that was set, ns. A small step may
-have another cause: a driver may swap two samples or measure their times with some jitter."""
+"""If a stamp is earlier than the previous stamp by more than this, ns, the clock of the sender was
+set back. A smaller step may have another cause: a driver may swap two samples or measure their
+times with some jitter."""
 
 HOLE_PERIODS, PERIOD_GAIN = 1.5, 0.02
-"""Number of sample periods after which a sample is assumed to be missing, and weight of a new
-sample in the estimate of the period. About the last fifty samples count."""
+"""If the time between two samples exceeds `HOLE_PERIODS` sample periods, samples are assumed to be
+missing. `PERIOD_GAIN` is the weight of a new sample in the mean sample period, so about the last
+fifty samples count."""
 
 CATCH_UP_SPEED = 1.5
-"""Time between the samples that arrive with a feedback line, divided by the time of this line. From
-this value on, the network delivers a backlog of samples, which is at an end when the last sample is
-less than `HOLE_PERIODS` sample periods old."""
+"""Ratio that shows a backlog of samples after a silence of the gyro: the time that the new samples
+cover, divided by the time of the feedback line. At a larger ratio, the gyro counts as silent until
+its last sample is less than `HOLE_PERIODS` sample periods old."""
 
 DELAY_RANGE_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
 """Range of the gyro's delay relative to the wheels, ns. The delay is negative if the gyro reports a
@@ -93,12 +96,13 @@ unresolved. The daemon can then no longer find out whether gyro or wheels were r
 MAX_BIAS_STEP = 0.06
 """Largest change of the bias that is learned while a gyro at rest repeats one rate exactly, rad/s.
 The limit applies to gyros that also repeat rates without a defect: coarse gyros, and simulated
-gyros without noise. If such a gyro hangs at a rate that differs less from the bias, it looks like a
-gyro whose bias has changed."""
+gyros without noise. If such a gyro hangs at a rate that differs from the bias by less than this, it
+looks like a gyro whose bias has changed."""
 
 MAX_REPEATING, MIN_CHANCE = 0.6, 1e-6
-"""A gyro certainly hangs if it usually repeats a smaller fraction of its samples at rest than
-`MAX_REPEATING`, and if the chance of the present repetition is smaller than `MIN_CHANCE`."""
+"""A gyro that repeats one rate certainly hangs if two conditions hold. At rest, it usually repeats
+less than the fraction `MAX_REPEATING` of its samples. The probability of the present series of
+repetitions is below `MIN_CHANCE`."""
 
 CONFIRMED_FRACTION = 0.5
 """Fraction of a jump of the rate that must remain in the next sample. After a push, friction slows
@@ -165,25 +169,26 @@ class Gyro:
     """
 
     _late_since: tuple[int, float] | None = None
-    """Arrival of the first sample with the present delay above `MAX_EXTRA_DELAY_NS`, and its delay,
-    both in ns. It is None if the delay is smaller. The default on the class serves recordings of
-    versions without this attribute."""
+    """Arrival time and excess delay of the first sample of a steady, large delay, both in ns. A
+    delay is large if it exceeds the smallest delay by more than `MAX_EXTRA_DELAY_NS`. The value is
+    None without a large delay. The default on the class is for recordings of versions without this
+    attribute."""
     _period_s = 0.0
     """Mean time between two samples, s; 0 before the second sample."""
     _guessed = 0.0
     """The gyro's turn minus the wheels' turn in the lines since the last sample that was used, rad.
     In these lines, the robot is assumed to continue turning at the rate of this sample."""
     _slipped_before = False
-    """Whether gyro and wheels contradicted each other when this sample arrived."""
+    """Whether gyro and wheels contradicted each other at the last sample that was used."""
 
     def __init__(self) -> None:
         self._rest_s = self._since_rest_s = 0.0
         self._learned: Track | None = None
         """The effective track that was learned with an earlier gyro, or None."""
         self.owes = False
-        """Whether the wheels provided the turn of the last line because the gyro is not proven: it
-        has not agreed with the wheels in a turn yet. When it is proven, the heading is corrected by
-        the gyro's turn minus the wheels' turn."""
+        """Whether the wheels provided the turn of the last line because the gyro is not proven. A
+        gyro is proven when it has agreed with the wheels in a turn. Then the heading is corrected
+        by the gyro's turn minus the wheels' turn."""
         self._does: GyroDoes = "silent"
         self.events: list[Event] = []
         """Log events of the last call of `turn`."""
@@ -213,8 +218,8 @@ class Gyro:
         sample."""
         self._repeated_s = self._rested_s = 0.0
         """`_repeated_s` is the time for which the gyro has repeated the rate `_reading` exactly, s.
-        `_rested_s` is the part of this time in which the robot was at rest, although this rate is
-        not the bias, s."""
+        `_rested_s` is the part of this time in which the robot was at rest and the rate was not the
+        bias, s."""
         self._frozen = False
         """Whether the gyro is assumed to hang, until its rate changes or becomes the bias."""
         self._repeats = 0
@@ -226,7 +231,7 @@ class Gyro:
         self._suspect: float | None = None
         """A rate that the gyro repeated at rest and that may be its new bias, rad/s, or None."""
         self._unsure = 0.0
-        """Variance that the bias has because of `_suspect`, rad2/s2."""
+        """Additional variance of the bias, rad2/s2, because `_suspect` may be the new bias."""
         self._noise = 0.0
         """Variance of the present turn rate, rad2/s2."""
         self._hole = False
@@ -259,9 +264,10 @@ class Gyro:
     def add_samples(self, samples: tuple[GyroSample, ...]) -> None:
         """Store the `samples` that arrived since the last control step, in the order of arrival.
 
-        A sample whose field `anew` is true is the first one of another gyro. The values that were
-        learned from the earlier gyro are then forgotten, except the effective track. If that gyro
-        contradicted the wheels, the difference is added to the uncertainty of the heading.
+        A sample whose field `anew` is true is the first one of another gyro. The method then
+        forgets all values that were learned from the earlier gyro, except the effective track. If
+        the earlier gyro contradicted the wheels, the difference of their turns makes the heading
+        more uncertain.
         """
         for sample in samples:
             if sample.anew:
@@ -365,14 +371,14 @@ class Gyro:
     def undo_recomputation(self, turn: float) -> float:
         """Return the angle that the caller must subtract from the heading, rad.
 
-        Call this after the pose was recomputed over earlier feedback lines. `turn` is the angle,
-        rad, by which the recomputation changed the robot's turn in the lines in which the gyro was
-        not proven yet (`owes`).
+        Call this after the pose was recomputed over earlier feedback lines. `turn` is the change of
+        the robot's turn by this recomputation, rad. Only the lines in which the gyro was not proven
+        yet count (`owes`).
 
         - If the gyro is proven now, the heading was already corrected to the gyro's turn. The
           result is `turn`, so that the caller undoes the change.
-        - If the gyro has no verdict yet, the result is 0, and the pending correction of the heading
-          changes by -`turn`.
+        - If the test of the gyro goes on, the result is 0, and the pending correction of the
+          heading changes by -`turn`.
         - If the gyro was refuted, the result is 0, and no correction is pending.
         """
         verdict = self._trial.verdict
@@ -385,8 +391,8 @@ class Gyro:
     def _time_of(self, sample: GyroSample) -> int:
         """Return the monotonic time at which `sample` would have arrived without jitter, ns.
 
-        The samples of a backlog get the times at which they were measured. The last of them is
-        still late, so the wheels provide the turn.
+        The samples of a backlog get the times at which they were measured. Even the last of them is
+        then old, so the wheels provide the present turn.
         """
         last, self._last = self._last, sample
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
@@ -399,7 +405,7 @@ class Gyro:
         return sample.at_ns - max(0, int(late))
 
     def _is_late_for_good(self, late: float, at_ns: int, last_at_ns: int) -> bool:
-        """Return whether the extra delay `late`, ns, is large and steady: a clock was set.
+        """Return whether the extra delay `late`, ns, is large and steady, because a clock was set.
 
         `at_ns` and `last_at_ns` are the arrival times of this sample and of the one before it, ns.
         """
@@ -546,9 +552,9 @@ class Gyro:
         self._contradicted = self._contradicted + off if self._slip_s > 0.0 else 0.0
 
     def _end_contradiction(self) -> None:
-        """Add the difference between gyro and wheels to the uncertainty of the heading.
+        """Make the heading more uncertain by the difference between gyro and wheels.
 
-        The difference is that of their turns since they began to contradict each other. Call this
+        This is the difference of their turns since they began to contradict each other. Call this
         if the daemon can no longer find out whether the gyro or the wheels were right, for example
         because the gyro has been silent for `LOST_NS`.
         """
@@ -560,8 +566,8 @@ class Gyro:
 
         Return None if no earlier turn is in doubt, or if `dt` is 0. Call this for a feedback line
         in which the wheels provide the turn. If the gyro hangs, the result contains a correction
-        that replaces its earlier turns by those of the wheels. In any case, the variance of the
-        result contains the uncertainty of the earlier turns.
+        that replaces the gyro's earlier turns by the wheels' turns. In any case, the variance of
+        the result contains the uncertainty of the earlier turns.
 
         Args:
             wheels: the turn according to the wheels, rad.

@@ -32,8 +32,8 @@ MIN_NOISE = 1e-5
 its measured standard deviation may be 0."""
 
 NEW_BIAS_TIME_S = 1.0
-"""Time for which a reading at rest that differs from the known bias must stay constant before it
-becomes the new bias, s. The gyro may have restarted or warmed up, or the robot may have turned
+"""If a reading at rest differs from the known bias, it becomes the new bias after it has been
+constant for this time, s. The gyro may have restarted or warmed up, or the robot may have turned
 while the first bias was learned."""
 
 NOISE_GAIN = 0.02

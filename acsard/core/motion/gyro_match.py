@@ -33,8 +33,8 @@ MIN_RATE_CHANGE = 0.3
 gyro's rate changes more slowly, the change of the wheels' rate counts as 0."""
 
 FORGETTING_FACTOR = 0.995
-"""Factor by which the weight of all earlier blocks is multiplied in each block of turning, so that
-the fit remembers 200 blocks (20 s of turning)."""
+"""Factor that reduces the weight of all earlier blocks (`BLOCK_S`) with each block in which the
+robot turns. The fit thus remembers 200 blocks (20 s of turning)."""
 
 INITIAL_RATIO_STD, MIN_RATIO_STD = 0.5, 0.1
 """Standard deviations of the ratio of the gyro's turn to the wheels' turn. `INITIAL_RATIO_STD` is
@@ -63,8 +63,8 @@ BLOCKS_BEFORE, BLOCKS_AFTER = 2, 3
 `gyro.DELAY_RANGE_NS`."""
 
 BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
-"""The standard deviation of a block's mean rate is `BLOCK_NOISE` rad/s plus `BLOCK_SHARE` times the
-rate."""
+"""The mean turn rate over a block (`BLOCK_S`) has a standard deviation of `BLOCK_NOISE` rad/s plus
+`BLOCK_SHARE` times the rate."""
 
 ASSUMED_DELAY_STD_S = 0.05
 """Standard deviation of the gyro's delay that `contradiction` assumes before the delay is known,

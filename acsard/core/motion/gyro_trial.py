@@ -2,7 +2,7 @@
 
 A gyro that is mounted upside down, reads degrees or is disconnected disagrees with the wheels in
 every turn. A good gyro disagrees with them only in a turn in which the wheels slip. So a gyro is
-used after it has agreed with the wheels in one turn. The bounds for this agreement are wide,
+used after it has agreed with the wheels in one turn. The limits for this agreement are wide,
 because skidding wheels roll further than the robot turns.
 """
 
@@ -11,10 +11,10 @@ from __future__ import annotations
 from typing import Literal
 
 MIN_TURN_RATE = 0.1
-"""Smallest turn rate according to the wheels, rad/s, at which a feedback line in the opposite
-direction begins a new turn. A lower rate may come from a single encoder count. It is also the
-smallest rate at which a gyro that reads zero is called dead, because wheels with unequal tires
-report a lower rate while the robot drives straight."""
+"""Turn rate according to the wheels, rad/s, with two uses. A feedback line in the opposite
+direction begins a new turn only from this rate on, because a lower rate may come from a single
+encoder count. A gyro that reads zero is called dead only from this rate on, because wheels with
+unequal tires report a lower rate while the robot drives straight."""
 
 MIN_MEAN_RATE, STRETCH_S = 0.05, 0.5
 """`MIN_MEAN_RATE` is the smallest mean turn rate according to the wheels that counts as a turn,

@@ -5,9 +5,10 @@ time, and only `activate` releases the latch of a `deactivate`. Neither request 
 that its sender has not seen, even if the network delivers the request late:
 
 - A request that names a number releases the latch with exactly this number.
-- A request without a number is refused if less than `LATCH_REQUIRED_S` has passed since the last
-  stop, the last fault, the last `clear` of a fault, the start of the daemon or its last stall. For
-  `activate`, the time runs from the last `deactivate`, the start of the daemon or its last stall.
+- A `clear` without a number is refused if less than `LATCH_REQUIRED_S` has passed since the last
+  stop, the last fault, the last `clear` of a fault, the start of the daemon or its last stall. An
+  `activate` without a number is refused if less than this time has passed since the last
+  `deactivate`, the start of the daemon or its last stall.
 - A request that arrived before the latch was set never releases it.
 
 A pressed emergency stop at the robot, a pressed bumper (with `safety.bumper = "stop"`) and an empty
@@ -31,10 +32,10 @@ from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError, mode_o
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
 LATCH_REQUIRED_S = 2.0
-"""Time in which a `clear` or `activate` must contain the number of the latch, s. The time begins
-with a stop, a fault, the `clear` of a fault, a `deactivate`, the start of the daemon and the end of
-a stall of the daemon. In this time, a call that was sent before that event may still arrive: the
-network seldom delays a packet for longer."""
+"""Time after an event in which a `clear` or `activate` must name the number of the latch, s. The
+events are a stop, a fault, the `clear` of a fault, a `deactivate`, the start of the daemon and the
+end of a stall of the daemon. In this time, a call that was sent before the event may still arrive,
+because the network delays some packets. It seldom delays a packet for longer."""
 
 MAX_CLIENTS = 4
 """Largest number of clients among the earlier causes of a stop. If more clients stop the robot, the

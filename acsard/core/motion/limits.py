@@ -102,7 +102,7 @@ class Limiter:
         return twist
 
     def _fitted(self, twist: Twist) -> Twist:
-        """Return the next twist, changed so that no wheel exceeds its speed limit.
+        """Return the intended next twist `twist`, changed so that no wheel exceeds its speed limit.
 
         On each axis, the result is between the present twist and `twist`.
         """
@@ -124,7 +124,7 @@ class Limiter:
         fitted = now
         for change in changes:
             fitted = _sum(fitted, change, kinematics.room(fitted, change, most))
-        # Remove what rounding has added.
+        # Remove the error that rounding has added.
         return kinematics.saturate(fitted, most)
 
     def coast(self, dt: float, stop: bool = False) -> Twist:

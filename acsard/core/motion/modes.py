@@ -9,8 +9,8 @@
     driving   the robot follows a fresh command
     ready     the robot could drive, but there is no command to follow
 
-The first mode of this list whose condition holds is the robot's mode. The mode depends on nothing
-else, not even on the previous mode, so no transition can be forgotten.
+The first mode of this list whose condition holds is the robot's mode. The mode depends only on
+these conditions and not on the previous mode, so no transition can be forgotten.
 """
 
 from __future__ import annotations

@@ -8,9 +8,9 @@ cancels the zero.
 
 A sender is live while its last accepted command is not older than the timeout of its source. A
 sender is present while the arbiter may choose it. Every live sender is present. After a stall of
-the daemon, or while its stamps are doubtful, a sender stays present for at most `CANDIDATE_NS`
-after its last accepted command. Without this extra time, a sender that keeps the robot at rest with
-zeros would lose control to another sender that sends speeds.
+the daemon, or while the stamps of a sender are doubtful, the sender stays present for at most
+`CANDIDATE_NS` after its last accepted command. Without this extra time, a sender that keeps the
+robot at rest with zeros would lose control to another sender that sends speeds.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from acsard.core.values import REST, Command
 #   cancels the zeros of all shared identities of the source.
 
 CANDIDATE_NS = 2 * MAX_PROOF_NS
-"""Longest time after its last accepted command for which a sender takes part in the choice of the
-arbiter, ns. It is also the longest time for which an unarmed sender keeps control of the robot
-after its clock was set. A proof of the clock (see `freshness.py`) ends within this time, even if
-the proof has the longest duration and restarts with its second half."""
+"""Longest time for which a sender that is not live still takes part in the choice of the arbiter,
+ns. The time starts with the sender's last accepted command. An unarmed sender keeps control of the
+robot for at most this time after its clock was set. A proof of the clock (see `freshness.py`) ends
+within this time, even if the proof has the longest duration and restarts with its second half."""
 
 
 class Sender:
@@ -49,9 +49,8 @@ class Sender:
         self._zero_ns: int | None = None
         """Monotonic time of arrival of the zero command that will arm the sender, ns.
 
-        Only a sender with a shared identity uses it: this sender is armed when the pause
-        `commands.neutral_pause` has passed since the zero. None if no zero has arrived, or if
-        `cancel_zero` was called since.
+        Only a sender whose identity several programs may share uses it: this sender is armed when
+        `commands.neutral_pause` has passed since the zero. None without such a zero.
         """
         self._proven_zero_ns: int | None = None
         self.name = ""
@@ -60,9 +59,9 @@ class Sender:
         self._number: int | None = None
         """Sequence number of the last accepted command, or None."""
         self._ended: Command | None = None
-        """The last zero, or None if a later command has arrived. An older speed that arrives after
-        this zero must not move the robot again. If the zero was accepted, its stamp is left
-        out."""
+        """The last zero; None if a command that was sent after it has arrived. A speed that was
+        sent before this zero but arrives after it must not move the robot again. If the zero was
+        accepted, its stamp is left out."""
         self.clock = ""
         """Name of the clock that stamped the last command passed to `take`."""
         self.twist = REST
@@ -70,8 +69,9 @@ class Sender:
         """Monotonic time of arrival of the last accepted command, ns; None if no command was
         accepted since `require_neutral`."""
         self._present_ns = 0
-        """Monotonic time of arrival of the last command, accepted or not, that keeps the sender
-        present, ns. A stall of the daemon moves this time to the end of the stall."""
+        """Monotonic time of arrival, ns, of the last command that keeps the sender in the choice of
+        the arbiter (`present`), even if this command was not accepted. A stall of the daemon moves
+        this time to the end of the stall."""
         self.came_ns = 0
         """Monotonic time of arrival of the first accepted command after the sender's last silence,
         ns."""
@@ -179,7 +179,10 @@ class Sender:
         return self.present(now_ns) and (waits or self.armed(now_ns))
 
     def unlearn(self) -> None:
-        """Undo the effect of zeros whose stamps are unproven: the network may have delayed them."""
+        """Undo the arming by zeros with unproven stamps.
+
+        The network may have delayed these zeros.
+        """
         self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
 
     def resume(self, before_ns: int, now_ns: int) -> None:
@@ -200,12 +203,11 @@ class Sender:
             self._proven_zero_ns = self._zero_ns if proven else None
 
     def cancel_zero(self, at_ns: int) -> None:
-        """Cancel the zero of a shared identity, because one of its programs may have sent a speed.
+        """Cancel the sender's zero, because another program may have sent a speed.
 
-        That program may have sent the speed at `at_ns`, a monotonic time, ns. A canceled zero does
-        not arm the sender. If `commands.neutral_pause` was already over at `at_ns`, the zero has
-        armed the sender, and the sender stays armed. The call has no effect on a sender with its
-        own identity.
+        `at_ns` is the monotonic time at which the speed may have been sent, ns. Only a zero of an
+        identity that several programs may share is canceled. A canceled zero does not arm the
+        sender. If `commands.neutral_pause` was already over at `at_ns`, the sender stays armed.
         """
         self._settle(at_ns)
         self._zero_ns = self._proven_zero_ns = None
@@ -213,8 +215,9 @@ class Sender:
     def outdate(self, command: Command) -> None:
         """Process a speed without a stamp that may have waited during a stall of the daemon.
 
-        It does not show what the sender wants now, and neither does the command before the stall.
-        So none of them moves the robot, but the sender takes part in the choice of the arbiter.
+        This speed does not show what the sender wants now, and neither does the last command before
+        the stall. Therefore neither command moves the robot, but the sender takes part in the
+        choice of the arbiter.
         """
         now_ns = command.arrived_ns
         if not self.present(now_ns):
@@ -236,10 +239,10 @@ class Sender:
     ) -> None:
         """Process a command that was not refused.
 
-        If `verdict` is "first" or "unproven", the delays of the sender are not proved yet. Such a
-        command does not drive the robot, but a zero already counts for arming. `unlearn` undoes
-        this effect. If the command is a speed of a shared identity, the caller must first call
-        `cancel_zero` of each sender of the source.
+        If `verdict` is "first" or "unproven", the delays of the sender are not proved yet. The
+        command then does not drive the robot, but a zero already arms the sender. `unlearn` undoes
+        this arming. If the command is a speed, and several programs may share the sender's
+        identity, the caller must first call `cancel_zero` of each sender of the source.
 
         Args:
             command: the command.
@@ -326,8 +329,8 @@ class Sender:
     def _settle(self, now_ns: int) -> None:
         """Arm the sender if `commands.neutral_pause` has passed since its zero.
 
-        Only a sender with a shared identity must wait for this pause. `now_ns` is the monotonic
-        time, ns.
+        Only a sender whose identity several programs may share must wait for this pause. `now_ns`
+        is the monotonic time, ns.
         """
         if self._zero_ns is not None and now_ns - self._zero_ns >= self._pause_ns:
             self._armed = True

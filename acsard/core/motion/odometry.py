@@ -71,8 +71,8 @@ class Step(Struct, frozen=True, gc=False):
     turn: float
     """Change of the heading that this line caused, rad."""
     on_trial: bool
-    """Whether the turn was computed from the wheels because the gyro was not proven: it had not
-    agreed with the wheels in a turn yet."""
+    """Whether the wheels provided the turn because the gyro was not proven. A gyro is proven when
+    it has agreed with the wheels in a turn."""
     share: float = 1.0
     """Effective track that was used for this feedback line, divided by the configured track."""
 
@@ -205,8 +205,8 @@ class Odometry:
         """Return the feedback lines to pass to `fold`, and the number of lines that were dropped.
 
         `feedback` is the next plausible line. It is held back for a later call if it covers a long
-        time with a speed that no other wheel and no other line confirms yet. The returned lines are
-        in the order of time. The time of a dropped line counts as a gap.
+        time and reports a speed that neither another wheel nor another line confirms yet. The
+        returned lines are in the order of time. The time of a dropped line counts as a gap.
         """
         rolling, believed = self._rolling, self.checks.wheels.believed
         lines, dropped = self._confirmation.confirm(
@@ -291,7 +291,7 @@ class Odometry:
     def _take_back(self) -> None:
         """Recompute the pose over the recent lines in which the newly faulty wheel was wrong.
 
-        If a gyro has corrected the heading at the end of its trial, the heading does not change.
+        If a gyro was proven meanwhile and has corrected the heading, the heading does not change.
         """
         was_faulty = self.checks.wheels.was_faulty
         wrong = list(takewhile(lambda step: was_faulty(step.speeds), reversed(self._steps)))

@@ -3,8 +3,8 @@
 Let an arc have the length d and the angle a, and start from a pose with the heading yaw. Its chord
 then has the length d sin(a / 2) / (a / 2) and the direction yaw + a / 2. The rounding error of each
 sum is kept and added to the next sum (Kahan, Further Remarks on Reducing Truncation Errors, 1965).
-When yaw is wrapped, exactly 2 pi is subtracted and not the double nearest to 2 pi (`TAU_REST`), so
-even many revolutions cause no error.
+When yaw is wrapped, the exact value of 2 pi is subtracted and not the nearest double (see
+`TAU_REST`). Therefore even many revolutions cause no error.
 """
 
 from __future__ import annotations

@@ -2,15 +2,16 @@
 
 `Sanity` rejects a feedback line in which a wheel turns, or changes its speed, faster than any wheel
 can. The daemon does not use such a line, and several in a row are a fault. If more than one line in
-a hundred is impossible, the daemon logs a warning. Either the wire damages lines, or a bound is too
-low and true lines are rejected. `wheel_faults.py` checks whether the wheels follow their commands.
+a hundred is impossible, the daemon logs a warning. Either the wire damages lines, or a limit in
+`[feedback]` is too low, so that true lines are rejected. `wheel_faults.py` checks whether the
+wheels follow their commands.
 
 A plain line has no checksum, so a damaged line may look possible, and then the true lines after it
 look impossible. Therefore a possible line is trusted only if it agrees with the possible line
 before it. A line that is not trusted is outvoted by two later lines that agree with each other.
 
 An encoder quantizes the reported speed of its wheel: one count in a short time looks like a high
-speed. Therefore each bound is widened by the quantization step of the wheel.
+speed. Therefore each limit is widened by the quantization step of the wheel.
 """
 
 from __future__ import annotations
@@ -44,16 +45,17 @@ may be wrong by one count."""
 
 COARSEST_COUNT = math.tau / 16
 """Angle of one count of the coarsest encoder that is expected, rad. Until the quantization steps
-are learned, a speed over `feedback.wheel_speed` counts as possible only if one count of this size
-in the time that the line covers can cause it."""
+are learned, a speed over `feedback.wheel_speed` is possible only if one such count in the time of
+the line causes at least this speed."""
 
 MIN_COUNT_S = 0.005
 """Shortest time that is used to convert one `COARSEST_COUNT` to a speed, s. Firmware rarely counts
 for a shorter time."""
 
 MAX_STEP = COARSEST_COUNT / MIN_COUNT_S
-"""Highest speed that a learned quantization step may excuse: 78.5 rad/s. This is below the default
-bound of 80 rad/s, so steps that encoder counts do not prove never widen the default bound."""
+"""Highest speed that a learned quantization step may excuse: 78.5 rad/s. It is lower than the
+default of `feedback.wheel_speed` (80 rad/s). Above this default, only encoder counts excuse a
+speed."""
 
 MAX_REPORTS = 2
 """Largest number of successive lines that report the same encoder count. Firmware that is asked
@@ -71,17 +73,17 @@ NOT_FAST, AT_REST = (0, 0, 0, 0), (0.0, 0.0, 0.0, 0.0)
 class Sanity:
     """Checks whether the wheel speeds in each feedback line are physically possible.
 
-    The changes of the speeds are measured from the reference: the last line that was possible. A
-    line that contradicts the reference still counts as possible if the reference is not trusted,
-    and if the line agrees with one of the impossible lines since the reference.
+    The changes of the speeds are measured from the last possible line. If that line is not trusted,
+    a line that contradicts it may still be possible: the new line must agree with one of the
+    impossible lines that arrived in between.
     """
 
     def __init__(self, feedback: FeedbackConfig) -> None:
         self._settings = feedback
         self._last: WheelSpeeds | None = None
         self._trusted = False
-        """Whether the line `_last` is trusted. It is trusted if it differs from the possible line
-        before it by so little that the wheels can change back by the next line."""
+        """Whether the last possible line (`_last`) is trusted. It is trusted if it differs so
+        little from the possible line before it that the wheels can change back by the next line."""
         self._rejected: list[tuple[WheelSpeeds, float]] = []
         """The newest impossible lines since `_last`: pairs of the speeds and the time since
         `_last`, s. Lines with a speed over `feedback.wheel_speed` are not included."""
@@ -94,7 +96,8 @@ class Sanity:
         """For each wheel, the number of successive lines, up to the last line, in which the wheel
         was over `feedback.wheel_speed`."""
         self._totals = AT_REST
-        """For each wheel, the sum of the magnitudes of its speeds in the lines of `_fast`, rad/s.
+        """For each wheel, the sum of the magnitudes of its speeds, rad/s, over the last successive
+        lines in which it was over `feedback.wheel_speed` (`_fast`).
 
         A speed far above `feedback.wheel_speed` comes from a damaged line. Therefore each speed
         adds at most `feedback.wheel_speed` plus one quantization step.
@@ -228,7 +231,7 @@ class Sanity:
                 room = size * min(1.0, line.count / abs(angle)) if angle else size
             elif learned and size <= MAX_STEP:
                 # The sum of n reported speeds is wrong by at most one step, or by two steps if
-                # lines are repeated. So a lasting speed is soon evident.
+                # lines are repeated. Therefore a lasting speed is soon evident.
                 room = step
                 if total / lines > fastest + step * min(1.0, MAX_REPORTS / lines):
                     room = 0.0

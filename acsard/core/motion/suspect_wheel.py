@@ -41,8 +41,8 @@ nearer to one wheel. Its distances from the two wheels must differ by at least t
 difference between the wheels."""
 
 STUCK_TIME_S = 0.3
-"""Time for which a wheel must repeat one speed before it is called stuck, s, if neither a command
-nor a gyro shows which wheel is right. A person cannot turn a wheel so evenly by hand."""
+"""If neither a command nor a gyro shows which wheel is right, a wheel must repeat one speed for
+this time before it is called stuck, s. A person cannot turn a wheel so evenly by hand."""
 
 DEAD_FRACTION, REVERSED_FRACTION = 0.1, 0.3
 """Fractions of the angle that the other wheel of the side rolled. A wheel is dead if its angle is
@@ -50,9 +50,9 @@ at most the fraction `DEAD_FRACTION`. It is reversed if it rolled in the opposit
 the magnitudes of the two angles differ by at most the fraction `REVERSED_FRACTION`."""
 
 MIN_STUCK_FRACTION = 0.3
-"""Smallest difference between the two wheels of a side at which one wheel can be called stuck, as a
-fraction of the faster wheel's angle. If the difference is smaller, the wheel with the constant
-speed may be healthy while the other wheel slips."""
+"""A wheel can be called stuck only if the angles of the two wheels of its side differ by at least
+this fraction of the larger angle. Otherwise the wheel with the constant speed may be healthy while
+the other wheel slips."""
 
 WheelFault = Literal["dead", "reversed", "stuck"]
 

@@ -164,7 +164,8 @@ class PoseUncertainty:
     def doubt(self, along: float, yaw: float) -> None:
         """Increase the uncertainty of the last step, because it filled a gap in the feedback.
 
-        `along` is the additional variance of its distance, m2, and `yaw` that of its turn, rad2.
+        `along` is the additional variance of the step's distance, m2, and `yaw` that of the step's
+        turn, rad2.
         """
         if not self._lost:
             self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)

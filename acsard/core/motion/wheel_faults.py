@@ -2,14 +2,14 @@
 
 The two wheels of a side are compared with each other (`wheel_residual.py`). If they contradict each
 other, one of them may have a faulty encoder. A wheel is faulty if it shows the sign of such a fault
-and an independent reference contradicts it (`suspect_wheel.py`). The pose then ignores this wheel
-and uses the other one in its place.
+and its command or a gyro contradicts it (`suspect_wheel.py`). The pose then ignores this wheel and
+uses the other one in its place.
 
 - If both wheels agree again for `RECOVERY_S` of rolling, the pose uses the ignored wheel again.
 - If the ignored wheel contradicts both the other wheel and its command for `feedback.fault_time`,
   the robot latches a fault.
-- If any wheel contradicts its command for this time (`wheel_witness.py`), the robot also latches a
-  fault, because both wheels of a side may be wrong and agree with each other.
+- If any wheel contradicts its command for `feedback.fault_time` (`wheel_witness.py`), the robot
+  also latches a fault, because both wheels of a side may be wrong and agree with each other.
 
 Every other contradiction counts as slip. A faulty encoder also counts as slip until the fault is
 proven. At most one wheel of each side is ignored. A wheel that is blocked or dragged looks like a
@@ -124,8 +124,12 @@ class _Side:
     def watch(self, speeds: Motors, dt: float, most: float, count: float, still: bool) -> bool:
         """Check both wheels of this side, and return whether one of them may be faulty.
 
-        `speeds` contains the reported speeds of all four wheels, rad/s. The other arguments are as
-        in `Witness.check_speed`.
+        Args:
+            speeds: the reported speeds of all four wheels, rad/s.
+            dt: the time since the previous line, s.
+            most: the longest time that one line can add to the evidence of a fault, s.
+            count: the angle of an encoder count, rad.
+            still: whether all wheels are commanded to stand still.
         """
         i, j = self.wheels
         front, rear = self.witnesses

@@ -2,7 +2,7 @@
 
 `Expected` is the only model of a healthy wheel: its speed follows the command with a first-order
 lag. `suspect_wheel.py` uses it to decide which of two wheels is wrong, and `Witness` uses it to
-decide whether a wheel follows its command. The bounds around the expected speed leave room for
+decide whether a wheel follows its command. The limits around the expected speed leave room for
 load, slip and coarse encoders. Behavior is evidence only if no healthy wheel shows it, and evidence
 proves a fault only if it lasts.
 
@@ -154,11 +154,11 @@ class Witness:
         self._seconds = self._went = self._way = 0.0
 
     def coast(self, raw_speed: float, dt: float, count: float) -> None:
-        """Process a feedback line with the speed `raw_speed`, rad/s, while the motor may have no
-        power.
+        """Process a feedback line while the motor may have no power.
 
         When the wheel comes to rest, `driven` becomes false: until the next command, only a push
-        can turn the wheel. The arguments `dt` and `count` are as in `check_speed`.
+        can turn the wheel. `raw_speed` is the reported speed of the wheel, rad/s. `dt` is the time
+        since the previous line, s, and `count` the angle of an encoder count, rad.
         """
         self.driven = self.driven and not self._is_surely_slow(raw_speed, dt, count)
 

@@ -4,9 +4,10 @@ Each topic is encoded as CDR and comes with its message definition (`ros2msg` of
 Lichtblick and PlotJuggler can read it. No topic may have another encoding, because `ros2 bag play`
 refuses a file that contains such a topic.
 
-ROS has no type for `state`, so this topic has a type of the package `acsard` (`shapes.py`). `ros2
-bag play` reports that it skips this topic, but the viewers show it. The names and types of the
-topics in ROS come from `transports.py`. The definitions are those of ROS 2 Jazzy and later.
+ROS does not define a type for `state`, so this topic has a type of the package `acsard`
+(`shapes.py`). `ros2 bag play` reports that it skips this topic, but the viewers show it. The names
+and types of the topics in ROS come from `transports.py`. The definitions are those of ROS 2 Jazzy
+and later.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Converts events, commands and the native message `state` to ROS messages.
 
-CDR has no maps, so the counters of `state` become a list. Null becomes NaN (`cdr_types.py`).
+CDR cannot encode maps, so the counters of `state` become a list. Null becomes NaN (`cdr_types.py`).
 """
 
 from __future__ import annotations
