@@ -223,10 +223,7 @@ class Robot:
 
     @property
     def travelled(self) -> float:
-        """Distance that the robot has driven since the daemon started, m, by odometry.
-
-        Both forward and backward motion increase it.
-        """
+        """Distance driven since the daemon started, m, forwards plus backwards, by odometry."""
         return self._odometry.travelled
 
     def step(self, inputs: Inputs) -> Outputs:

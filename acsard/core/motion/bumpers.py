@@ -134,7 +134,6 @@ class Bumpers(BoardInput):
         return None
 
     def reason_text(self) -> str:
-        """Return a text that lists the pressed bumpers."""
         return pressed_words(self._places, self.pressed or ())
 
     def advice(self) -> str:
@@ -142,10 +141,6 @@ class Bumpers(BoardInput):
         return self.note().partition(": ")[2] if self.limiting else super().advice()
 
     def released(self, before: EstopState) -> str:
-        """Return the log text for bumpers that are not pressed any more.
-
-        `before` is the state before the release; "" if this is the first report of the bumpers.
-        """
         if not before:
             count = len(self.pressed or ())
             return f"the board reports {many(count, 'bumper')}, and none is pressed"

@@ -51,10 +51,8 @@ class ConsistencyChecks:
         self._by_wheels = 0.0
         """Turn of the robot in the last feedback line according to the wheels, rad."""
         self.turn: Turn | None = None
-        """Turn of the robot in the last feedback line according to the gyro.
-
-        If it is None, the odometry must use the turn according to the wheels.
-        """
+        """Turn of the robot in the last feedback line according to the gyro. If it is None, the
+        odometry must use the turn according to the wheels."""
         self.on_trial = False
         """Whether the wheels provided the turn of the last line because the gyro was not proven. A
         gyro is proven when it has agreed with the wheels in a turn."""

@@ -196,17 +196,12 @@ class EmergencyStop(BoardInput):
         super().__init__(use)
         self.driver_fault = False
         """Whether a status line in the last call of `process_reports` reported a fault of a motor
-        driver.
-
-        Faults do not count while the drivers may be without power (`_unpowered`).
-        """
+        driver. Faults do not count while the drivers may be without power (`_unpowered`)."""
         self._unpowered = unpowered
-        """Whether the emergency stop was pressed and its stop is still latched.
-
-        The emergency stop cuts the power of the motor drivers, and a driver without power reports a
-        fault. The power may come back some time after the button is released. Therefore no driver
-        fault counts until `clear` has released the stop.
-        """
+        """Whether the emergency stop was pressed and its stop is still latched. The emergency stop
+        cuts the power of the motor drivers, and a driver without power reports a fault. The power
+        may come back some time after the button is released. Therefore no driver fault counts until
+        `clear` has released the stop."""
 
     def process_reports(
         self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int
@@ -241,14 +236,9 @@ class EmergencyStop(BoardInput):
         return None if status.estop is None else (status.estop,)
 
     def reason_text(self) -> str:
-        """Return the text that names the pressed emergency stop as the reason of a stop."""
         return PRESSED_REASON
 
     def released(self, before: EstopState) -> str:
-        """Return the log text for an emergency stop that is not pressed any more.
-
-        `before` is the state before the release; "" if this is the first report of the input.
-        """
         if not before:
             return "the board reports an emergency-stop input, which is released"
         return "the emergency stop is released; the robot stays stopped until srv/clear is called"

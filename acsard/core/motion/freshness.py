@@ -87,10 +87,10 @@ the sender's delay. If the stamps show the pause too, a foreign clock (one that 
 have been set by any amount in the pause."""
 
 MAX_STOPPED_STAMP_NS = 10_000
-"""If two successive commands arrive more than `SEPARATE_NS` apart, but their stamps differ by at
-most this, ns, the clock was set back. The limit is not 0, because Zenoh's own clock never goes
-back. If the wall clock was set back, Zenoh's clock advances by a fraction of a microsecond for each
-message until the wall clock has caught up."""
+"""If two successive commands arrive more than `SEPARATE_NS` apart, but the second stamp is later
+than the first by at most this, ns, the clock was set back. The limit is not 0, because Zenoh's own
+clock never goes back: if the wall clock was set back, Zenoh's clock advances by a fraction of a
+microsecond for each message until the wall clock has caught up."""
 
 SEPARATE_NS = NS_PER_S // 500
 """Commands that arrive within this time of each other, ns, may have been sent together."""
@@ -215,8 +215,8 @@ class _Clock:
         self._least = 0
         """Minimum of the trusted delays, ns. It rises with time by the largest possible drift."""
         self._early = 0
-        """Sum of the recent decreases of `_least`, ns, minus 1 ns for each 10 ns that pass; at
-        least 0."""
+        """Sum of the recent decreases of `_least`, ns. It falls by 1 ns for each 10 ns that
+        pass."""
         self._floor: int | None = None
         """Lowest delay of a steady clock (one that is never adjusted), ns. It rises with time by
         the largest possible drift. It is None before the first command, and always None for a clock
@@ -286,7 +286,7 @@ class _Clock:
     def _repeats(self, stamp_ns: int, number: int, silence: int) -> bool:
         """Return whether the network repeated this command, or delivered it after a later one.
 
-        If the number is low, the sender may also have restarted. The method assumes a restart after
+        A low number may also come from a restart of the sender. The method assumes a restart after
         a pause of the sender, or if the stamp is later than both the previous and the last accepted
         stamp.
         """

@@ -451,8 +451,8 @@ class Rounding:
         """Speeds in the line before the last line, rad/s; None if a gap lies between the two
         lines."""
         self._step = 0.0
-        """Estimated quantization step, rad/s: the largest recent step, reduced by the fraction
-        `STEP_DECAY` with each line since."""
+        """Estimated quantization step, rad/s: the largest recent step, which loses the fraction
+        `STEP_DECAY` with each later line."""
         self._before = self._after = 0.0
         """Quantization steps of the line before the last one, and of the last one, rad/s. While the
         wheels stand still, they become smaller from line to line."""

@@ -50,9 +50,9 @@ larger excess shows that the network held the sample back, or that the clock of 
 set."""
 
 STEADY_DELAY_NS, MAX_DELAY_FALL_NS = NS_PER_S, NS_PER_S // 50
-"""If samples arrive for `STEADY_DELAY_NS` with an excess of the delay over `MAX_EXTRA_DELAY_NS`,
-and this excess never falls by more than `MAX_DELAY_FALL_NS`, the clock of the sender was set. While
-the network delivers a backlog instead, the delay falls."""
+"""A delay is large if it exceeds the smallest delay by more than `MAX_EXTRA_DELAY_NS`. If the
+delays are large for `STEADY_DELAY_NS` and do not fall by more than `MAX_DELAY_FALL_NS`, the clock
+of the sender was set. While the network delivers a backlog instead, the delays fall."""
 
 MIN_SET_BACK_NS = NS_PER_S // 50
 """If a stamp is earlier than the previous stamp by more than this, ns, the clock of the sender was
@@ -100,9 +100,9 @@ gyros without noise. If such a gyro hangs at a rate that differs from the bias b
 looks like a gyro whose bias has changed."""
 
 MAX_REPEATING, MIN_CHANCE = 0.6, 1e-6
-"""A gyro that repeats one rate certainly hangs if two conditions hold. At rest, it usually repeats
-less than the fraction `MAX_REPEATING` of its samples. The probability of the present series of
-repetitions is below `MIN_CHANCE`."""
+"""A gyro that repeats one rate certainly hangs if both of these conditions hold. At rest, it
+usually repeats less than the fraction `MAX_REPEATING` of its samples. The probability of the
+present series of repetitions is below `MIN_CHANCE`."""
 
 CONFIRMED_FRACTION = 0.5
 """Fraction of a jump of the rate that must remain in the next sample. After a push, friction slows
@@ -143,9 +143,10 @@ STATUS_TEXTS: dict[GyroDoes, str] = {
 class Turn(Struct, frozen=True, gc=False):
     """Turn of the robot since the previous feedback line, measured by a gyro.
 
-    If earlier turns of the gyro were in doubt, it may instead be the wheels' turn with a correction
-    of these earlier turns. `angle` is in rad, and `variance` is its variance, rad2. The variance
-    does not include the error of the gyro's scale, which does not average out (`uncertainty.py`).
+    If earlier turns of the gyro were in doubt, the value may instead be the wheels' turn with a
+    correction of these earlier turns. `angle` is in rad, and `variance` is its variance, rad2. The
+    variance does not include the error of the gyro's scale, which does not average out
+    (`uncertainty.py`).
     """
 
     angle: float
@@ -205,7 +206,7 @@ class Gyro:
         self._last: GyroSample | None = None
         self._delay_ns = 0
         self._told_ns: int | None = None
-        """Monotonic time of the last sample in `_angle`, ns; None before the first sample."""
+        """Monotonic time of the last sample that was used, ns; None before the first sample."""
         self._rate = 0.0
         self._angle = self._given = 0.0
         """`_angle` is the turn according to all samples that were used, rad. `_given` is the turn
@@ -214,8 +215,8 @@ class Gyro:
         """Variance of the part of `_angle` that `turn` has not returned yet, rad2."""
         self._slip_s = self._slipped_s = 0.0
         self._reading: float | None = None
-        """Rate in the last sample that was used, with the bias, rad/s; None before the first
-        sample."""
+        """Rate in the last sample that was used, rad/s, without a correction for the bias; None
+        before the first sample."""
         self._repeated_s = self._rested_s = 0.0
         """`_repeated_s` is the time for which the gyro has repeated the rate `_reading` exactly, s.
         `_rested_s` is the part of this time in which the robot was at rest and the rate was not the
@@ -223,11 +224,11 @@ class Gyro:
         self._frozen = False
         """Whether the gyro is assumed to hang, until its rate changes or becomes the bias."""
         self._repeats = 0
-        """Number of samples since the last change of the rate that repeat the rate `_reading`."""
+        """Number of successive samples that have repeated the rate of the sample before them."""
         self._usual = self._usual_repeats = 0
-        """Numbers of the samples that measured the bias at rest: all of them (`_usual`), and those
-        that repeated the rate of the sample before them. Samples of a gyro that hangs do not
-        count."""
+        """Numbers of samples that measured the bias at rest: all of them (`_usual`), and those that
+        repeated the rate of the sample before them (`_usual_repeats`). Samples of a gyro that hangs
+        do not count."""
         self._suspect: float | None = None
         """A rate that the gyro repeated at rest and that may be its new bias, rad/s, or None."""
         self._unsure = 0.0
@@ -283,8 +284,8 @@ class Gyro:
         """Return the turn of the robot since the previous feedback line, measured by the gyro.
 
         Return None if the wheels must provide the turn, for example because the gyro is silent or
-        not proven. There is one exception: if earlier turns of the gyro are in doubt, the result is
-        the wheels' turn, with a correction or an additional uncertainty for these earlier turns.
+        not proven. If earlier turns of the gyro are in doubt, the result is instead the wheels'
+        turn, with a correction or an additional uncertainty for these earlier turns.
 
         Args:
             at_ns: Monotonic time of this line, ns.
@@ -500,7 +501,7 @@ class Gyro:
         self._forget_repeated()
 
     def _drop_waiting_correction(self) -> None:
-        """Add a correction that waits for the next line to the uncertainty of the heading.
+        """Make the heading more uncertain by a correction that still waits for the next line.
 
         A correction waits if the gyro was found to hang in a line that covers no known time.
         """

@@ -52,7 +52,7 @@ each new stretch (a turn of `STRETCH_ANGLE`). `PRIOR_STRETCHES` is the initial w
 `INITIAL_RATIO_STD`, as a number of stretches."""
 
 PRIOR_DELAY_STD_S = 0.2
-"""Standard deviation of the gyro's delay before any data, s."""
+"""Assumed standard deviation of the gyro's delay before it is measured, s."""
 
 INITIAL_DELAY_SUMS = 0.0, 0.0, 1.0 / PRIOR_DELAY_STD_S**2
 """Initial values of the three least-squares sums from which the delay is computed."""
@@ -112,15 +112,14 @@ class Match:
         """Sums over the present stretch (a turn of `STRETCH_ANGLE`), rad. `_way` is the turn of the
         wheels. `_off` is the gyro's turn minus the turn that the fit predicts for the gyro."""
         self._ways = PRIOR_STRETCHES * STRETCH_ANGLE**2
-        """Weighted sum of `_way` squared over the completed stretches, rad2."""
+        """Weighted sum of the squares of the wheels' turns (`_way`) in the completed stretches,
+        rad2."""
         self._offs = INITIAL_RATIO_STD**2 * self._ways
-        """Weighted sum of `_off` squared over the completed stretches, rad2."""
+        """Weighted sum of the squares of the fit's errors (`_off`) in the completed stretches,
+        rad2."""
         self._lag = ASSUMED_DELAY_STD_S
         self.blocks = 0.0
-        """Number of blocks in which the robot turned.
-
-        Older blocks count less (`FORGETTING_FACTOR`).
-        """
+        """Number of blocks in which the robot turned; old ones count less (`FORGETTING_FACTOR`)."""
         self._solve()
         self._wheels = self._gyro = self._time = 0.0
         self._rate = self._began = 0.0

@@ -4,7 +4,7 @@ The effective track is the distance between left and right wheels that makes com
 While a gyro measures the heading, each turn shows the true effective track (`gyro_match.py`). When
 the gyro is silent, this learned track is better than the configured one, which may come from
 another floor. The learned track is used if `[odometry] learned_track` is true, and if the learned
-value is certain enough and within bounds. It affects only later turns, so the pose does not jump.
+value is certain enough and plausible. It affects only later turns, so the pose does not jump.
 """
 
 from __future__ import annotations

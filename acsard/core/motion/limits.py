@@ -37,11 +37,9 @@ class Limiter:
     def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
         self._kinematics = kinematics
         self.state = _State(REST, 0.0, 0.0)
-        """The allowed twist and the accelerations of the last step.
-
-        If a line with wheel speeds could not be written to the port, `Robot` resets `state` to its
-        value at the last line that was written.
-        """
+        """The allowed twist and the accelerations of the last step. If a line with wheel speeds
+        could not be written to the port, `Robot` resets `state` to its value at the last line that
+        was written."""
         self.use(limits)
 
     def use(self, limits: LimitsConfig) -> None:

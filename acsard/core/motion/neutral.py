@@ -47,11 +47,9 @@ class Sender:
         self._neutral_first = neutral_first
         self._armed = self._proven_armed = not neutral_first
         self._zero_ns: int | None = None
-        """Monotonic time of arrival of the zero command that will arm the sender, ns.
-
-        Only a sender whose identity several programs may share uses it: this sender is armed when
-        `commands.neutral_pause` has passed since the zero. None without such a zero.
-        """
+        """Monotonic time of arrival of the zero command that will arm the sender, ns; None without
+        such a zero. Only a sender whose identity several programs may share uses it: this sender is
+        armed when `commands.neutral_pause` has passed since the zero."""
         self._proven_zero_ns: int | None = None
         self.name = ""
         self._stamp_ns: int | None = None

@@ -45,8 +45,8 @@ may be wrong by one count."""
 
 COARSEST_COUNT = math.tau / 16
 """Angle of one count of the coarsest encoder that is expected, rad. Until the quantization steps
-are learned, a speed over `feedback.wheel_speed` is possible only if one such count in the time of
-the line causes at least this speed."""
+are learned, a speed over `feedback.wheel_speed` is impossible if it exceeds the speed of one such
+count in the time of the line."""
 
 MIN_COUNT_S = 0.005
 """Shortest time that is used to convert one `COARSEST_COUNT` to a speed, s. Firmware rarely counts
@@ -85,8 +85,8 @@ class Sanity:
         """Whether the last possible line (`_last`) is trusted. It is trusted if it differs so
         little from the possible line before it that the wheels can change back by the next line."""
         self._rejected: list[tuple[WheelSpeeds, float]] = []
-        """The newest impossible lines since `_last`: pairs of the speeds and the time since
-        `_last`, s. Lines with a speed over `feedback.wheel_speed` are not included."""
+        """The newest impossible lines since the last possible line: pairs of the speeds and the
+        time since that line, s. Lines with a speed over `feedback.wheel_speed` are not included."""
         self._since = 0.0
         self._longest = 0.0
         """Longest time that a recent feedback line covers, s. The speeds in a line are means over
@@ -97,11 +97,9 @@ class Sanity:
         was over `feedback.wheel_speed`."""
         self._totals = AT_REST
         """For each wheel, the sum of the magnitudes of its speeds, rad/s, over the last successive
-        lines in which it was over `feedback.wheel_speed` (`_fast`).
-
-        A speed far above `feedback.wheel_speed` comes from a damaged line. Therefore each speed
-        adds at most `feedback.wheel_speed` plus one quantization step.
-        """
+        lines in which it was over `feedback.wheel_speed` (`_fast`). A speed far above this limit
+        comes from a damaged line, so each speed adds at most the limit plus one quantization
+        step."""
         self._lines = self._dropped = 0
         """Numbers of feedback lines in the present window: all lines (`_lines`), and impossible
         lines (`_dropped`)."""
@@ -119,7 +117,7 @@ class Sanity:
 
     @property
     def doubtful(self) -> bool:
-        """Whether at least the last `FAULT_LINES` lines were impossible. This latches a fault."""
+        """Whether the last `FAULT_LINES` lines were impossible, which latches a fault."""
         return self._impossible >= FAULT_LINES
 
     def impossible(self, feedback: Feedback) -> str:

@@ -27,9 +27,9 @@ FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
 called faulty: `FAULT_COUNTS` encoder counts plus `FAULT_ANGLE` rad."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
-"""A wheel that repeats its old speed after a new command counts as stuck only if a healthy wheel
-would have rolled a clearly different angle by then. The difference between this angle and the angle
-at the old speed must be at least `FOLLOWED_COUNTS` encoder counts plus `FOLLOWED_ANGLE` rad."""
+"""After a new command, a wheel that repeats its old speed counts as stuck only if a healthy wheel
+would have rolled a clearly different angle by now. The difference from the angle at the old speed
+must be at least `FOLLOWED_COUNTS` encoder counts plus `FOLLOWED_ANGLE` rad."""
 
 MIN_COMMAND_CHANGE = 0.05
 """Smallest change of the command, rad/s, after which a healthy wheel must report a different
@@ -66,7 +66,7 @@ FAULT_TEXTS: dict[WheelFault, str] = {
 class _Ballot:
     """Sums of angles over feedback lines, rad, to decide which of two wheels is wrong.
 
-    `low` and `high` limit the angle of a healthy wheel according to a reference.
+    `low` and `high` limit the angle of a healthy wheel according to the command or a gyro.
     """
 
     def __init__(self) -> None:
@@ -110,7 +110,7 @@ class Suspect:
         self._begun: float | None = None
         """Magnitude of the angle that the wheel rolled in the first line of the test, rad."""
         self._known = False
-        """Whether the command served as a reference in at least one line of the test."""
+        """Whether at least one line of the test was compared with the command."""
 
     def looks(self, own: float, other: float, same: bool, dt: float, count: float) -> bool:
         """Add a feedback line, and return whether the wheel now shows a sign of a faulty encoder.
@@ -149,7 +149,7 @@ class Suspect:
         expected: Expected,
         gyro: float | None,
     ) -> None:
-        """Compare both wheels of the side with the references in a feedback line.
+        """Compare both wheels of the side with the command and the gyro in a feedback line.
 
         Args:
             own: the angle that this wheel rolled in the line, rad.
@@ -175,7 +175,7 @@ class Suspect:
             self._gyro.add(own, other, gyro, gyro)
 
     def is_faulty(self, count: float) -> bool:
-        """Return whether the references show that this wheel is faulty and the other one is not.
+        """Return whether the lines so far show that this wheel is faulty and the other one is not.
 
         `count` is the angle of an encoder count, rad.
         """

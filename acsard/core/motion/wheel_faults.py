@@ -124,12 +124,10 @@ class _Side:
     def watch(self, speeds: Motors, dt: float, most: float, count: float, still: bool) -> bool:
         """Check both wheels of this side, and return whether one of them may be faulty.
 
-        Args:
-            speeds: the reported speeds of all four wheels, rad/s.
-            dt: the time since the previous line, s.
-            most: the longest time that one line can add to the evidence of a fault, s.
-            count: the angle of an encoder count, rad.
-            still: whether all wheels are commanded to stand still.
+        `speeds` contains the reported speeds of all four wheels, rad/s. `dt` is the time since the
+        previous line, s. One line adds at most `most` s to the evidence of a fault. `count` is the
+        angle of an encoder count, rad, and `still` is true if all wheels are commanded to stand
+        still.
         """
         i, j = self.wheels
         front, rear = self.witnesses

@@ -168,12 +168,8 @@ def bridge_presence(zid: str) -> str:
 def bridge_token(zid: str, kind: Kind, name: str, type_name: str, qos: Qos) -> str:
     """Return the liveliness token with which a ros2dds bridge announces an endpoint.
 
-    Args:
-        zid: the id of the Zenoh session.
-        kind: the kind of the endpoint.
-        name: the fully qualified name of the topic or service.
-        type_name: the type in the form `pkg/msg/Name`.
-        qos: the QoS profile of the endpoint.
+    `zid` is the id of the Zenoh session. `name` is the fully qualified name of the topic or
+    service, and `type_name` is its type in the form `pkg/msg/Name`.
     """
     head = f"{bridge_presence(zid)}/{kind}/{_in_one_chunk(bridge_key(name))}"
     head += f"/{_in_one_chunk(type_name)}"

@@ -85,10 +85,10 @@ class Counter(Struct, frozen=True):
 class Source(Struct, frozen=True):
     """A command source.
 
-    `age` is the time since the last accepted command of the source, s. It is None after a fault, a
-    `clear` or another event that discards the earlier commands, until the next accepted command.
-    `waits_for` says in words what must happen before the source can drive. It is "" while the
-    source drives.
+    `age` is the time since the last accepted command of the source, s. It is None after the start,
+    a fault, a `clear` or another event that discards the earlier commands, until the next accepted
+    command. `waits_for` says in words what must happen before the source can drive. It is "" while
+    the source drives.
     """
 
     name: str
