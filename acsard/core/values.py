@@ -596,9 +596,9 @@ class Outputs(Struct, frozen=True):
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False
-    """True if the board should get a new line without delay, because the command or the mode has
-    changed since the previously computed line, or because the emergency stop or a bumper was
-    pressed. If this step has already computed the new line, `due` is true too."""
+    """True if the board should get a new line without delay: the command or the mode has changed
+    since the previously computed line, or the emergency stop or a bumper was pressed. If this step
+    has already computed the new line, `due` is true too."""
     latches: Latches = Latches()
     """The latches and lowered limits after the step. A latch or a lowered limit has changed if
     this is not the same object as in the previous step."""

@@ -45,12 +45,12 @@ SILENCE_TIMEOUT_S = 0.5
 """Time without a report after which an input counts as pressed, s: five status lines at 10 Hz."""
 
 LATE_STEP_NS = 150_000_000
-"""Time between two control steps above which the second step counts as late, ns. The longest
+"""If two control steps are farther apart than this, ns, the second step counts as late. The longest
 control period that can be configured is 100 ms."""
 
 CATCH_UP_NS = 100_000_000
-"""Extra time that a late control step gives the board before it counts as silent, ns. In this time,
-the daemon reads the lines and commands that arrived while no control step ran."""
+"""Extra time after a late control step before the board counts as silent, ns. In this time, the
+daemon reads the lines and commands that arrived while no control step ran."""
 
 PRESSED_REASON = "emergency stop pressed at the robot"
 SILENT_REASON = (

@@ -108,7 +108,7 @@ class ErrorModel:
         self.use_track(CONFIGURED if odometry.learned_track else None)
 
     def use(self, odometry: OdometryConfig) -> None:
-        """Use the noise settings in `odometry` from now on. Errors of parameters do not change."""
+        """Use the noise settings in `odometry` from now on, and keep the parameter errors."""
         self.settings = odometry
         self.noise = Noise(odometry, self.track)
 

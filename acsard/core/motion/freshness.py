@@ -143,7 +143,8 @@ class _Proof:
         self._length_ns, self._share, self._again = needed_ns // 2, share, again
         self._begun_ns = self.last_ns = at_ns
         self._halves: list[tuple[int, int]] = []
-        """Monotonic start, ns, and minimum delay, ns, of each of the latest halves."""
+        """Monotonic start and minimum delay of each of the latest halves of the test, both in
+        ns."""
 
     def add(self, delay: int, at_ns: int, timeout_ns: int) -> Literal["proven", "open", "failed"]:
         """Add a command of the clock, and return the state of the test.
@@ -203,11 +204,11 @@ class _Clock:
         """Monotonic time at which the last command of this clock arrived, ns. Repeated commands do
         not count."""
         self.gap_ns = MAX_PAUSE_NS
-        """Longest silence that is not a pause, ns: `MAX_PAUSE_NS`, or the longest timeout of the
-        sources to which the sender has sent commands, if that is longer."""
+        """Longest silence of the sender that is not a pause, ns: the longest timeout of the sources
+        that received the sender's commands, but at least `MAX_PAUSE_NS`."""
         self.forgiven_ns = 0
-        """Part of the last trusted increase of the delay for which no adjustment of the clock was
-        visible, ns."""
+        """The last trusted increase of the delay, ns, minus the part that visible adjustments of
+        the clock explain."""
         self._stamp_ns = 0
         self._delay = 0
         self._number = -1
@@ -382,10 +383,10 @@ class _Clock:
         return "stale"
 
     def _forgive(self, proof: _Proof, at_ns: int) -> bool:
-        """Return whether the new constant delay that `proof` has found is plausible.
+        """Return whether the new constant delay, which `proof` has found, is plausible.
 
-        If it is plausible, the clock uses it from now on. A smaller delay is always plausible. A
-        larger delay is plausible in two cases:
+        If so, the clock uses this delay from now on. A smaller delay is always plausible. A larger
+        delay is plausible in two cases:
 
         - The sender has paused, so its clock may have been set meanwhile.
         - The increase can be explained by visible adjustments of the clock, by the budget for
@@ -425,11 +426,11 @@ class Freshness:
         forgotten after a pause."""
         self._unproved: dict[str, _Clock] = {}
         """Clocks that are never adjusted and have not stamped an accepted command yet. They are
-        kept for `MEMORY_NS` of silence, because their lowest delay is valid from the first command
-        on."""
+        forgotten only after a silence of `MEMORY_NS`, because their lowest delay is valid from the
+        first command on."""
         self._numbers: dict[str, tuple[int, int]] = {}
-        """Last sequence number of each sender that numbers its commands but does not stamp them,
-        with its monotonic time of arrival, ns."""
+        """For each sender that numbers its commands but does not stamp them: the last sequence
+        number, and its monotonic time of arrival, ns."""
         self.forgiven_ns = 0
         """Total increase of delays that was trusted without a visible adjustment of a clock, ns."""
 

@@ -182,7 +182,7 @@ class Odometry:
         """Record the twist, m/s and rad/s, that the motors are commanded from now on.
 
         The daemon calls this in each control step, after the feedback lines of this step. In a gap
-        of the feedback, the robot may have driven as fast as the commands.
+        of the feedback, the robot may have driven as fast as the recorded twists.
         """
         if self._folded or twist != self._commanded:
             # The robot may still follow the previous command, because the board reacts late.
