@@ -61,21 +61,21 @@ FEEDBACK_TOPICS = ("odom", "tf", "wheel_states")
 """Topics whose messages are made from the feedback lines of the board."""
 
 QUERIES_PER_STEP = 8
-"""Largest number of queries that one control step takes from the bus. One slow query may be taken
-in addition. Further queries wait for the next step, so that a flood of queries does not make the
-control loop miss a period."""
+"""Largest number of queries that one control step takes from the bus. In addition, a step may take
+one slow query: a `set` request or a query for ROS parameters. Further queries wait for the next
+step, so that a flood of queries does not make the control loop miss a period."""
 
 MIN_WRITE_DELAY_NS = 1_000_000
-"""Shortest delay from the start of a step to the write of its line that is reported to the robot,
-ns. For a shorter delay the robot gets 0, because the estimated sample times are less accurate
-anyway."""
+"""Smallest write delay that the control loop reports to the robot, ns. The write delay is the time
+from the start of a step to the write of its line. A smaller delay is reported as 0, because the
+error of the estimated sample times is larger."""
 
 NOT_STORED = (
     "the new state is not on the disk yet; if the daemon restarts before the disk has this state, "
     "it may lose a stop"
 )
-"""Text that is added to a successful answer if the answer is sent before the newest latches are in
-the latch file. This happens if the disk is slow."""
+"""Text that the daemon adds to the answer to a successful request if a slow disk has not stored the
+newest latches yet."""
 
 BUS_STUCK = Event(
     "bus_stuck",
@@ -150,8 +150,8 @@ class ControlLoop:
         computation, and the result."""
         self._step_answers: tuple[Answer, ...] = ()
         self._answers: deque[tuple[int, Answer]] = deque()
-        """Answers that are not sent yet, because the latch file does not contain the newest
-        latches. Each answer is paired with the monotonic time at which it was queued, ns."""
+        """Answers that wait until the latch file contains the newest latches. Each answer is paired
+        with the monotonic time at which it was queued, ns."""
         self._bus_input = NO_INPUT
         """The input that the present step has taken from the bus."""
         stop = self.robot.session.codec.stop
@@ -169,8 +169,8 @@ class ControlLoop:
         self._superseded, self._trip, self._late_ns = False, "", 0
         """Three facts about the last line to the board. `_superseded` is true if the port did not
         send the line, so that a newer line must replace it. `_trip` is the reason why the guard
-        replaced the line with zeros, or "". `_late_ns` is the delay from the start of the step to
-        the write of the line, ns, or 0 if the delay is below `MIN_WRITE_DELAY_NS`."""
+        replaced the line with zeros, or "". `_late_ns` is the time from the start of the step to
+        the write of the line, ns. It is 0 if this time is below `MIN_WRITE_DELAY_NS`."""
         # Use the longest line of both directions, because answers must not queue in the MCU either.
         period_ns = int(NS_PER_S / config.rate_hz)
         self.pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
@@ -196,7 +196,7 @@ class ControlLoop:
 
     @property
     def retry_ns(self) -> int | None:
-        """Monotonic time at which an extra step can send a waiting command, ns.
+        """Monotonic time at which a step between two periods can send the waiting command, ns.
 
         A command waits if it arrived too soon after the last line to the board. The value is None
         if no command waits.
@@ -305,11 +305,12 @@ class ControlLoop:
         return outputs, line is not None
 
     def _to_keep(self, latches: Latches) -> Latches:
-        """Return `latches` in the form that the keeper must store for the next start of the daemon.
+        """Return `latches` in the form that must be stored for the next start of the daemon.
 
         The field `lowered` of the result contains the limits that `set` requests have lowered,
-        except decelerations. It does not contain the limit from the key `speed_limit`. The program
-        that sent this limit may have ended before the next start, so no program would lift it.
+        except decelerations. It leaves out the limit from the key `speed_limit`, because the
+        program that sent this limit may not run at the next start. Then no program would lift the
+        limit.
         """
         file = self._file_limits
         if file is not self._started or self._speed.lowers:
@@ -321,8 +322,8 @@ class ControlLoop:
                 cache = self._latches_cache = latches, now, file, result
             latches = cache[3]
         last = self._handover.latches
-        # Return the last object if nothing has changed, because the keeper writes its file again
-        # for each new object, even for one with equal content.
+        # If nothing has changed, return the last object. For a new object, the latch file would be
+        # written again, even with equal content.
         return last if latches == last else latches
 
     @property
@@ -456,9 +457,9 @@ class ControlLoop:
     def _keepable(self, file: SettingsFile, now: Instant) -> tuple[Request, ...]:
         """Return the `set` requests with the field `keep` that the robot must process now.
 
-        The thread of the settings file has checked that it can write the settings of these requests
-        to the file. This method also queues the answers to `set` requests that failed or are
-        complete.
+        For these requests, the thread of the settings file has checked that it can write the
+        settings to the file. This method also queues the answers to `set` requests that failed or
+        are complete.
         """
         requests: list[Request] = []
         for result in file.results(now.mono_ns, self._others):

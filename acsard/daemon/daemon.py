@@ -2,8 +2,9 @@
 
 The daemon opens the built-in simulator (if it is configured), the bus and the serial port, in this
 order. Then it runs the control loop. At the first signal, the robot ramps to zero speed, and a
-second signal cuts the ramp short. Then the port sends STOP and closes, and the bus closes last. If
-an exception ends a task of the daemon, the robot does not ramp, but the port still sends STOP.
+second signal cuts the ramp short. Then the port sends STOP (a line of zero speeds) and closes, and
+the bus closes last. If an exception ends a task of the daemon, the robot does not ramp, but the
+port still sends STOP.
 """
 
 from __future__ import annotations
@@ -110,8 +111,8 @@ SWITCH_INTERVAL_S = 0.0005
 5 ms is half a control period."""
 
 LATCHED_PERIOD_S = 5.0
-"""Interval at which the topic `tf_static` is published again, s. The topic is latched, but some
-subscribers cannot query the last sample of a latched topic."""
+"""Interval at which the daemon publishes the latched topic `tf_static` again, s. It does so because
+some subscribers cannot query the last sample of a latched topic."""
 
 Announce = Callable[[str, str], None]
 """Function that the daemon calls once, when its start is complete. The first argument is the path

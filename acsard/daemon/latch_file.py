@@ -6,8 +6,8 @@ with which latches the robot starts.
 
 The control loop hands the newest latches to a thread that writes the file, and never waits for the
 disk. Once this thread has renamed the new file, a kill of the process loses nothing. A second
-thread syncs the file; after that a power cut loses nothing. There are two threads, because a sync
-takes up to seconds on an SD card, and a stop must not wait for the sync of earlier latches.
+thread syncs the file; after that a power cut loses nothing. There are two threads, because a stop
+must not wait for the sync of earlier latches. On an SD card, a sync takes up to seconds.
 """
 
 from __future__ import annotations
@@ -109,7 +109,8 @@ class LatchFile:
         self.where = NO_DIRECTORY
         """Path of the file as messages show it, or `NO_DIRECTORY`."""
         self._path: Path | None = None
-        """Path of the file. If it is a link to a file, `_read` replaces it by the link's target."""
+        """Path of the file. If the path is a link to a file, `_read` replaces the path by that of
+        the link's target."""
         self._robot = config.robot.id
         self._barred = ""
         """Reason why the daemon must never write the file; "" if the daemon may write it."""
@@ -211,8 +212,8 @@ class LatchFile:
         path = self._path
         if path is None:
             return Latches()
-        # A write replaces the file. It must replace the target of a link and not the link, because
-        # the link may lead out of a directory that loses its changes at a reboot. The target must
+        # A write replaces the file. If the path is a link, the write must replace its target,
+        # because the link may be in a directory that loses its changes at a reboot. The target must
         # be a regular file: a write must not replace /dev/null. If the link cannot be followed, the
         # code below reports the error.
         with suppress(OSError):
@@ -273,7 +274,7 @@ class LatchFile:
         self._box.put(latches)
 
     def holds(self, latches: Latches) -> bool:
-        """Return whether the file contains these latches. A kill of the process then loses nothing.
+        """Return whether the file already contains these latches, so that a kill cannot lose them.
 
         `latches` must be the object that was passed to `keep`. An equal copy does not count.
         """
@@ -293,7 +294,7 @@ class LatchFile:
         now_ns = clock.mono_ns()
         write_ns, sync_ns = self._write_timer.wait_ns(now_ns), self._sync_timer.wait_ns(now_ns)
         if self._written_latches is self._newest_latches:
-            # A write does not matter if the file already contains the newest latches.
+            # A slow write does not matter if the file already contains the newest latches.
             write_ns = 0
         hangs = not self._failed and max(write_ns, sync_ns) > HANG_TIMEOUT_S * NS_PER_S
         if hangs is not self._hangs:
@@ -347,7 +348,7 @@ class LatchFile:
             self._box.wait(None if latches is None else RETRY_PAUSE_S)
 
     def _try(self, latches: Latches, now: Instant) -> str:
-        """Write these latches; return "" or the reason of the failure.
+        """Write these latches. Return the reason if that fails, else "".
 
         `now` is the time at which the daemon started.
         """

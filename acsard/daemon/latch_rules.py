@@ -26,8 +26,8 @@ MAX_BYTES = 65_536
 limits take about 1 kB."""
 
 MAX_NUMBER = 1 << 52
-"""Largest number of a latch in the file. It leaves room for later latches below 2^53, the limit of
-the numbers that a `clear` can name."""
+"""Largest latch number that is accepted in the file. Later latches get higher numbers, and a
+`clear` can name only numbers below 2^53."""
 
 MAX_TEXT_LENGTH = 500
 """Largest length of a name or a reason in the latch file, characters. The rest is cut off."""
@@ -74,8 +74,8 @@ def decode(robot: str, data: bytes) -> Latches:
     In each latch, `kept` is true, because the latch is from before the present run of the daemon.
     Raises `LatchFileError` for content that is damaged, of another version or of another robot. An
     incomplete file counts as damaged, because a power cut may leave only a part of the file. A file
-    with a missing or unknown field name counts as damaged too, because one wrong letter in a name
-    could otherwise make a stop disappear.
+    with a missing or unknown field name counts as damaged too. Otherwise one wrong letter in a name
+    could make a stop disappear.
     """
     if not data.strip(b"\0 \r\n"):
         raise LatchFileError("it is empty")
@@ -159,9 +159,9 @@ def stopped(
 def after_failed_write(latches: Latches, why: str, now: Instant) -> Latches:
     """Return the latches with which the robot starts if the latch file cannot be written.
 
-    The previous process may have set latches that are not in the file. So the robot starts stopped,
-    and each latch of the file gets a new number. A `clear` or `activate` with an old number then
-    has no effect, because its sender may not know of the lost latches.
+    The previous process may have set latches that are not in the file. So the robot starts stopped.
+    Each latch of the file gets a new number, so that a `clear` or `activate` with an old number has
+    no effect. Its sender may not know of the lost latches.
 
     Args:
         latches: the latches in the file.
@@ -184,10 +184,10 @@ class LatchKeeper(Protocol):
     """
 
     def keep(self, latches: Latches) -> None:
-        """Store the latches that are now in force. They replace all earlier ones in the storage."""
+        """Store the latches that are now in force, in place of all earlier ones."""
 
     def holds(self, latches: Latches) -> bool:
-        """Return whether these latches are stored. A kill of the process then loses nothing.
+        """Return whether these latches are stored, so that they survive a kill of the process.
 
         `latches` must be the object that was passed to `keep`. An equal copy does not count.
         """
@@ -204,7 +204,7 @@ class LatchKeeper(Protocol):
 
 
 class Handover:
-    """Hands the latches of the control loop to their keeper, and says whether they are stored.
+    """Passes the latches of the control loop to their storage, and says whether they are stored.
 
     The robot stops immediately, but the answer to a stop waits until the stop would survive a kill
     of the process. After `MAX_ANSWER_DELAY_NS` the answer is sent in any case. It then says that
@@ -212,22 +212,22 @@ class Handover:
     """
 
     def __init__(self, latches: Latches, keeper: LatchKeeper | None) -> None:
-        """Record `latches`, with which the robot starts. `keeper` must have stored them already.
+        """Record `latches`, with which the robot starts. They must be stored already.
 
-        If `keeper` is None, latches are never stored.
+        `keeper` is the storage of the latches. If it is None, latches are never stored.
         """
         self.latches = latches
         self._keeper = keeper
 
     def take(self, latches: Latches) -> None:
-        """Pass the latches in force to the keeper, unless the last call passed the same object."""
+        """Pass the latches in force to the storage, unless the last call passed the same object."""
         if latches is not self.latches:
             self.latches = latches
             if self._keeper is not None:
                 self._keeper.keep(latches)
 
     def take_stops(self, latches: Latches, by: list[str], now: Instant) -> None:
-        """Add unprocessed stops to `latches`, and pass the result to the keeper.
+        """Add unprocessed stops to `latches`, and pass the result to the storage.
 
         A stop is unprocessed if it arrived after the last control step, or if that step failed. The
         result contains one new stop, which names the clients in `by`, up to the limit
@@ -252,7 +252,7 @@ class Handover:
     def is_stored(self) -> bool:
         """Whether the latches are stored, so that they survive a kill of the process.
 
-        Without a keeper this is always True, because no latches need to be stored.
+        If this daemon stores no latches, this is always True.
         """
         return self._keeper is None or self._keeper.holds(self.latches)
 

@@ -1,9 +1,9 @@
 """Finds the causes of a late control period in the kernel's counters. This module is pure.
 
 The lateness is the time from the due time of the first missed period to the late step. Each cause
-in the table `CAUSES` has a rule, which compares the counters from before the lateness with the
-counters from after the lateness. A rule returns its cause in words, or "" if the counters do not
-show this cause. Several causes may apply to one lateness, or none.
+in the table `CAUSES` has a rule, which compares the counters from before and after the lateness. A
+rule returns its cause in words, or "" if the counters do not show this cause. Several causes may
+apply to one lateness, or none.
 
 A delay counts as a cause only if it lasted for at least a certain share of the lateness, usually
 `CAUSE_FRACTION`. Otherwise the small delays of normal load would count as causes.
@@ -28,19 +28,21 @@ CAUSE_FRACTION = 0.5
 the lateness. Some causes have another limit, such as `DISK_FRACTION`."""
 
 SLEPT_FRACTION = 0.3
-"""Limit for the disk as a cause: it counts only if the control loop's thread slept for at least
-this share of the lateness. The limit is low because of a test with a fast virtual disk: a thread
-that read pages from the disk ran on the processor for as long as it slept."""
+"""Limit for the disk as a cause: the disk counts only if the control loop's thread slept for at
+least this share of the lateness. The limit is low, because in a test with a fast virtual disk, a
+thread that read pages from the disk slept for only half of the time."""
 
 DISK_FRACTION = 0.25
-"""Limit for the time in which any program waited for a disk: it counts as a cause only if it is at
-least this share of the lateness. The limit is low because of a test in which a thread wrote to a
-disk all the time: the kernel counted only 0.28 to 0.45 of this time as waiting."""
+"""Limit for the time in which any program waited for a disk: this time counts as a cause only if it
+is at least this share of the lateness. The limit is low, because the kernel counts too little. In a
+test, a thread wrote to a disk all the time, but the kernel counted only 0.28 to 0.45 of the time as
+waiting."""
 
 MIN_STOLEN_NS = 3 * NS_PER_S // 100
 """Shortest steal time that counts as a cause, ns: three of the kernel's ticks. Steal time is time
-in which the host of a virtual machine took the processor away. In a test with 607 late periods that
-had another cause, the kernel counted one tick of steal time in 24 of them, and two ticks in one."""
+in which the host of a virtual machine took the processor away. In a test, 607 late periods had
+another cause. In 24 of these periods, the kernel still counted one tick of steal time, and in one
+period two ticks."""
 
 MIN_SUSPEND_NS = NS_PER_S // 10
 """Shortest time that counts as a suspend, ns. A suspend is measured as a change of the difference
@@ -120,8 +122,8 @@ def low_voltage(now: Conditions) -> str:
 def heat(late: LatenessEvidence) -> str:
     """Return the cause in words if a hot processor slowed the control loop down, else "".
 
-    Three signs show heat: a `thermal_throttle` count that has risen, a cooling device that slows
-    the processor, and on a Raspberry Pi one of the bits 1 to 3 of `get_throttled`. These bits do
+    Each of three signs shows heat: a `thermal_throttle` count has risen, a cooling device slows the
+    processor, or on a Raspberry Pi one of the bits 1 to 3 of `get_throttled` is set. The bits do
     not count at a low supply voltage, because the firmware then sets them too.
     """
     hotter = late.after.conditions.throttled > late.before.conditions.throttled
@@ -201,8 +203,8 @@ def disk(late: LatenessEvidence) -> str:
     waiting for a disk. One of two durations must be long enough:
 
     - the time for which the thread itself waited for a disk. Not every kernel measures this time.
-    - the time in which any program waited for a disk. It counts only if the thread itself read from
-      a disk or wrote to a disk, because other programs may wait for a disk at any time.
+    - the time in which any program waited for a disk. It counts only if the thread itself used a
+      disk, because other programs may wait for a disk at any time.
     """
     before, after = late.before, late.after
     own_ns, all_ns = after.own_disk_ns - before.own_disk_ns, after.disk_ns - before.disk_ns
@@ -269,8 +271,8 @@ BECAUSE = ", because "
 def event_of(late: LatenessEvidence, clause: str, *, immediate: bool) -> Event:
     """Return the log event that reports a lateness and its causes.
 
-    `clause` is the text from `causes`. `immediate` is False if a recent event had the same causes.
-    The log may then delay this event.
+    `clause` is the text from `causes`. If `immediate` is False, the log may delay this event,
+    because a recent event had the same causes.
     """
     text = f"by {late.late_ns / NS_PER_S:.2f} s{BECAUSE}{clause}"
     return Event("missed_periods", text, "warning", kind="late", news=immediate)

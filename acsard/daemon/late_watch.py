@@ -1,9 +1,9 @@
 """Detects late control periods, and reports the causes that the kernel's counters show.
 
 In each period the control loop reads only one small file, `schedstat`, with the processor times of
-its thread. The kernel's other files take longer to read, so a thread of this module reads these
-files four times a second, and once more after a late period. `late_causes.py` compares the reading
-from before the lateness with the reading from after the lateness.
+its thread. The kernel's other files take longer to read. So a thread of this module reads them four
+times a second, and once more after a late period. `late_causes.py` compares the reading from before
+the lateness with the reading from after the lateness.
 
 A late period leads to two events with the name `missed_periods`. The robot's own event comes first
 and states the number of missed periods. The event of this module follows when the cause is known.
@@ -42,8 +42,8 @@ SETTLE_S = 0.03
 counters only at its next tick, and ticks are at most 10 ms apart."""
 
 PAUSE_NS = NS_PER_S
-"""Shortest time between two reports of causes, ns. For each event name, the log shows at most one
-line a second."""
+"""Shortest time between two reports of causes, ns. A shorter time is useless, because the log shows
+at most one line a second for each event name."""
 
 CONDITIONS_PERIOD_NS = 10 * NS_PER_S
 """Time after which the conditions of the processor, such as its voltage, are read again, ns. They
@@ -58,8 +58,8 @@ MIN_SEARCH_INTERVAL_NS = 10 * NS_PER_S
 process."""
 
 REPEAT_EVENT_NS = 60 * NS_PER_S
-"""Time after an event, ns, in which a further event with the same causes is not logged immediately.
-The further event waits for the next log line about missed periods (`Event.news`)."""
+"""If an event with the same causes was logged less than this time ago, ns, a new event is not
+logged immediately. It waits for the next log line about missed periods (`Event.news`)."""
 
 MAX_QUEUED = 16
 """Size of two queues: the late periods that wait for the thread, and the events that wait for a
@@ -76,7 +76,8 @@ class Late(Struct, frozen=True):
     before: bytes
     """Content of `THREAD_TIMES_FILE` in the period before the late period; b"" if it is unknown.
 
-    If the first period is late, it is the content when the `LateWatch` was made."""
+    If the first period of the daemon is late, `before` is the content at the start of the
+    `LateWatch`."""
     after: bytes
     """Content of `THREAD_TIMES_FILE` in the late period; b"" if it is unknown."""
 
@@ -116,8 +117,8 @@ class LateWatch:
         self._readings: deque[tuple[int, Reading]] = deque(maxlen=MAX_READINGS)
         """The last readings, each with the monotonic time at which it was complete, ns."""
         self._reported: dict[tuple[str, ...], int] = {}
-        """Maps each combination of causes to the monotonic time of its last event that was logged
-        immediately (`Event.news`), ns."""
+        """Maps each combination of causes to the monotonic time at which an event with these causes
+        was last logged immediately (`Event.news`), ns."""
         self._busiest: Program | None = None
         self._searched_ns: int | None = None
 

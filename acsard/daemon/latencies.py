@@ -1,7 +1,7 @@
 """Measures the daemon's latencies, in us, in fixed memory. The control loop supplies all times.
 
-For each latency, the messages `state` and `diagnostics` contain the median, the 99th percentile and
-the maximum, both since the daemon's start and over the last minute.
+The messages `state` and `diagnostics` contain the median, the 99th percentile and the maximum of
+each latency, once since the daemon's start and once over the last minute.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ SLOT_NS = 10 * NS_PER_S
 SLOTS = 6
 
 FRESH_NS = NS_PER_S
-"""Age up to which `Stopwatch.measured` returns cached statistics, ns. The computation of new ones
-takes longer than a control step, because it adds up all time slots of the last minute."""
+"""Age up to which `Stopwatch.measured` returns cached statistics, ns. They are cached because
+computing them, over all time slots of the last minute, takes longer than a control step."""
 
 
 class Figure:

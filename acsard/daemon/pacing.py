@@ -31,9 +31,9 @@ REPLY_TIME_NS = 1_000_000
 a line between two control periods. The board can reply in this time."""
 
 MAX_IDLE_WAKES = 3
-"""Number of idle steps that one control period tolerates. A step is idle if it had input from the
-bus, but the input brought no new command or mode. After more idle steps, further input waits for
-the next period, so that a flood of messages takes little processor time."""
+"""Limit for the idle steps in one control period. A step is idle if it had input from the bus that
+brought no new command or mode. After more idle steps, further input waits for the next period, so
+that a flood of messages takes little processor time."""
 
 
 class Pace:
@@ -49,11 +49,11 @@ class Pace:
     def __init__(self, line_ns: int, period_ns: int) -> None:
         self._gap_ns = line_ns + REPLY_TIME_NS
         self._possible = self._gap_ns < period_ns
-        """Whether a period is long enough for an early line."""
+        """Whether a period is long enough for an early line (a line between two periods)."""
         self._ahead = False
         """Whether an early line was written in place of the next period's line."""
         self._tried = False
-        """Whether an attempt to write an early line has been made in this period."""
+        """Whether the control loop has tried to write an early line in this period."""
         self._waiting = False
         """Whether a new command has not been sent yet, because it came too soon after the last
         line."""
@@ -100,8 +100,8 @@ class Pace:
     def accepts_early_command(self) -> bool:
         """Whether the next command gets an extra step immediately.
 
-        If this is False, the command waits for a step that another event runs, such as the end of
-        the control period.
+        If False, the command waits for a step that another event runs, such as the end of the
+        period.
         """
         return self._possible and not (self._tried or self._waiting or self._idle > MAX_IDLE_WAKES)
 

@@ -1,8 +1,8 @@
 """Compares the configuration file with the settings in force, and writes settings to the file.
 
 A `set` request with the field `keep` changes the settings and the file, in two stages. First a
-thread checks that the file can be changed; otherwise no setting is changed. Then the robot uses the
-settings, and the thread changes the file. The control loop never waits for the disk.
+thread checks that the file can be changed. If it cannot, no setting is changed. Then the robot uses
+the settings, and the thread changes the file. The control loop never waits for the disk.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class _Checked(Struct, frozen=True):
 class _Pending(Struct):
     """A `set` request with the field `keep` that is not finished yet.
 
-    Its client has no answer yet, or the thread may still change the file.
+    Either its client has no answer yet, or the thread may still change the file.
     """
 
     request: Request
@@ -122,13 +122,12 @@ class SettingsFile:
         change is paired with the robot's answer to the client."""
         self._results = Mailbox[_Checked | Answer](MAX_JOBS)
         self.pending: dict[int, _Pending] = {}
-        """The requests that `keep` has queued and that are not settled yet, by their ids. Unless it
-        is empty, each control step must call `results`."""
+        """The requests that `keep` has queued and that are not settled yet, by their ids. While
+        there are such requests, each control step must call `results`."""
         self.limits = started.limits
-        """The limits in the configuration file, as far as the daemon has read or written them: each
-        limit has the value that the daemon last wrote to the file or, if it has not written the
-        limit, the value at the start of the daemon. Changes of the file by other programs are not
-        included."""
+        """The limits in the configuration file, as the daemon last knew them. If the daemon has
+        written a limit to the file, the limit has that value, else its value at the start of the
+        daemon. Changes of the file by other programs are not included."""
         self._thread: threading.Thread | None = None
         """The thread that compares and changes the file. It is None until it has started."""
         self._not_started = ""
@@ -233,9 +232,9 @@ class SettingsFile:
         """Return the requests whose settings the robot must use now, and the answers for clients.
 
         Append an event to `events` for each request whose settings were written to the file. If a
-        request took too long, its client already has an answer. If the file then cannot be changed,
-        append an event too, because the client gets no further answer. `now_ns` is the present
-        monotonic time, ns.
+        request took too long, its client already has an answer. If the change of the file then
+        fails, append an event too, because the client gets no further answer. `now_ns` is the
+        present monotonic time, ns.
         """
         results: list[Request | Answer] = []
         for result in self._results.take():

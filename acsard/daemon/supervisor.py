@@ -39,9 +39,8 @@ class Kind(Struct, frozen=True):
     After an exit code above 1 the pause is `LONG_RESTART_PAUSE_S` instead.
     """
     final_at_first: frozenset[int] = frozenset()
-    """Exit codes after which the process is not started again if no process of this kind has run
-    before. After an earlier run, a process may end with such a code because a person is changing
-    its files, so it is started again."""
+    """Exit codes after which the first process of this kind is not started again. A later process
+    is, because a person may be changing its files."""
     remedy: str = ""
     """Advice on how to start the process again after a final exit code, for the log event."""
 
@@ -69,9 +68,9 @@ PAGE = Kind(
 )
 """The process of the web page, which itself reports why it ends.
 
-The page is not started again if a person ends it, if another program uses its port, or if its files
-are unusable at the first start. The pause before its restart is longer, because a page that fails
-again and again must not take processor time from the robot."""
+The page is not started again in three cases: a person ends it, another program uses its port, or
+its files are unusable at the first start. The pause before a restart is longer, because repeated
+starts must not take processor time from the robot."""
 
 
 async def keep_running(

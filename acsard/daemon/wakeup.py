@@ -38,14 +38,13 @@ class _Timer:
         self._timer.close()
 
     def _expire(self) -> None:
-        # If the timer was set again after it had expired, it reports no expiration. Then there is
-        # nothing to do.
+        # A timer that was set again after it had expired reports no expiration.
         if self._timer.expirations():
             self._expired()
             self._wake()
 
     def _expired(self) -> None:
-        """Note the expiration, before `wake` is called."""
+        """Process the expiration before `wake` is called."""
         raise NotImplementedError
 
 
@@ -117,8 +116,8 @@ class Next(Struct, frozen=True):
     """Result of a step: the events that may run another step before the present period ends."""
 
     accepts_early_command: bool
-    """Whether the next command gets an extra step immediately. If this is False, the command waits
-    for a step that another event runs, such as the end of the control period."""
+    """Whether the next command gets an extra step immediately. If False, the command waits for a
+    step that another event runs, such as the end of the period."""
     retry_ns: int | None
     """Monotonic time at which a step can send the waiting command, ns; None if no command waits."""
     period_ended: bool = True
@@ -178,8 +177,8 @@ class Wakeup:
         """Report that the bus has a stop. Any thread may call this method.
 
         The first stop runs a step. Further stops wait for the next step, so that a flood of stops
-        does not run a flood of steps. A stop can run a step again after a step that ran at the end
-        of a period, or that returned `accepts_early_command` = True.
+        does not run a flood of steps. A stop runs a step again as soon as a period has ended, or a
+        step has returned `accepts_early_command` = True.
         """
         if not self._stop_pending:
             self._stop_pending = True

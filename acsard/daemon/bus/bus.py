@@ -81,8 +81,8 @@ class ZenohBus:
         """Return the samples and queries that have arrived since the last call.
 
         The result contains at most `queries` queries, plus one slow query: a `set` request or a
-        query for ROS parameters. Further queries wait for the next call. The result also contains
-        changes of the connections to routers, the number of messages that were dropped, and
+        query for ROS parameters. Further queries wait for the next call. It also contains the state
+        of the connections to routers if this state has changed, the number of dropped messages, and
         whether the bus has begun to block.
         """
         batch = self._inbox.take(queries)

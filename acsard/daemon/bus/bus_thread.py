@@ -11,7 +11,7 @@ from threading import Thread
 
 
 class BusThread(Thread):
-    """A thread of the bus. If an exception ends the thread, it is appended to the list `errors`.
+    """A thread of the bus. An exception that ends the thread is appended to the list `errors`.
 
     All threads of the bus share one list, so that each control step checks only this list.
     """

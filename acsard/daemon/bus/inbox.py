@@ -45,8 +45,8 @@ class Replies:
     def __init__(self, prefix: str, errors: list[BaseException]) -> None:
         """Start without queries.
 
-        `prefix` is the beginning of the robot's keys. An exception that ends the thread is appended
-        to `errors`.
+        `prefix` is the beginning of the robot's keys. An exception that ends the thread of this
+        object is appended to `errors`.
         """
         self._prefix, self._errors = prefix, errors
         self._queries: dict[int, tuple[zenoh.Query, str]] = {}
@@ -124,8 +124,8 @@ GYRO_BUFFER = 64
 samples for 160 ms."""
 
 OTHER_SOURCES = ""
-"""Name of the buffer that the keys of all unconfigured sources share, so that a flood on them
-cannot displace the command of a configured source."""
+"""Name of the buffer that all unconfigured sources share. They have a separate buffer, so that a
+flood of their commands cannot displace the command of a configured source."""
 
 ANY_CERTIFICATE = "*"
 """Placeholder in a command key for the name of any certificate."""
@@ -135,13 +135,13 @@ STOP_BUFFER = 16
 displaces a stop."""
 
 QUERY_QUEUE = 256
-"""Size of each of the three queues: services, other native queries, and slow queries. If a queue is
-full, further queries are refused with `BUSY`. One slow query is answered per step, so the last of
-256 waits 2.6 s at 100 Hz."""
+"""Size of each of the three queues: service calls, slow queries (`set` and ROS parameters), and
+other queries. If a queue is full, further queries are refused with `BUSY`. One slow query is
+answered per step, so the last of 256 waits 2.6 s at 100 Hz."""
 
 MAX_ATTACHMENT_BYTES = 256
 """Largest size of an attachment, bytes. An attachment of rmw_zenoh has 33 bytes, and an attachment
-of acsard has up to 140. A longer attachment is cut off. It then cannot be decoded, so it names no
+of acsard has up to 140. A longer attachment is cut off, so that it cannot be decoded and names no
 sender."""
 
 STOP, SET = service_key("stop"), service_key("set")
@@ -186,14 +186,14 @@ class Inbox:
         self._arrivals[IMU] = Mailbox(GYRO_BUFFER, self._note)
         self._arrivals[SPEED_LIMIT] = Mailbox(COMMAND_BUFFER, self._note)
         self._stops = Mailbox[Arrival](STOP_BUFFER, self._stopped)
-        # These queues are not mailboxes. In a mailbox a new query would displace the oldest one,
-        # but a new query that finds the queue full must be refused.
+        # These queues are not mailboxes. In a full mailbox, a new query would displace the oldest
+        # one. Here the new query must be refused.
         self._services: deque[Query] = deque()
         self._others: deque[Query] = deque()
         """Native queries that are neither services nor slow."""
         self._slow: deque[Query] = deque()
-        """Slow queries: ROS parameters and settings. The answer to one slow query takes about as
-        much time as the answers to all other queries of a step."""
+        """Slow queries: ROS parameters and `set`. The answer to one slow query takes about as much
+        time as the answers to all other queries of a step."""
         self._lost = dict.fromkeys(self._arrivals, 0)
         """For each buffer, the total number of displaced samples that `take` has already
         reported."""
@@ -300,14 +300,12 @@ class Inbox:
         """Queue a query that a queryable has received on the key `topic`, without the robot's id.
 
         A query with a wildcard is dropped if `topic` is a service, because a wildcard must not call
-        a service. It is also dropped on a JSON key, because the same topic answers it on its other
-        key.
+        a service. It is also dropped if `topic` is a JSON key (`json/...`), because a wildcard such
+        as `**` also matches the key without `json/`, which answers.
         """
         asked = str(query.key_expr).removeprefix(self._prefix)
         if asked != topic and (topic in VERBS or topic.startswith(JSON_TREE)):
-            # A query with a wildcard must not call a service. A JSON key does not answer such a
-            # query either, because the wildcard also matches the topic's key without `json/`, and
-            # that key answers. Returning without a ticket drops the query.
+            # Returning without a ticket drops the query.
             return
         self._queried(query, topic, asked, "", "native")
 

@@ -38,8 +38,8 @@ newer message displaces the oldest one. With odometry at 100 Hz, a slot covers 0
 machine, or a client that connects, usually blocks the thread for a shorter time."""
 
 BLOCKED_AFTER_NS = NS_PER_S // 4
-"""Time after which the bus counts as blocked, ns, if the sending thread has not sent all waiting
-messages. Usually this thread needs 0.1 ms."""
+"""If the sending thread has not sent all waiting messages after this time, ns, the bus counts as
+blocked. Usually the thread needs 0.1 ms."""
 
 HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
 """Heartbeat of the publishers of latched ROS topics. The settings are those of rmw_zenoh."""
@@ -66,7 +66,8 @@ class Outlets:
     """The publishers of the daemon's session, and the thread that sends their messages."""
 
     def __init__(self, errors: list[BaseException]) -> None:
-        """Start without publishers. An exception that ends the thread is appended to `errors`."""
+        """Start without publishers. An exception that ends the sending thread is appended to
+        `errors`."""
         self._outlets: dict[str, list[_Outlet]] = {}
         """Maps the native key of each topic to its outlets."""
         self._listeners: list[object] = []
@@ -76,8 +77,8 @@ class Outlets:
         """The native keys of the topics that have a subscriber or a latched publisher."""
         self._slots: dict[str, Mailbox[Message]] = {}
         self._bell = Bell()
-        """Signal that wakes the thread. All slots share it, because a control step fills several
-        slots."""
+        """Signal that wakes the sending thread. All slots share one signal, because a control step
+        fills several slots."""
         self._waiting = self._leaving = self._stuck = False
         self._dropped = 0
         """Number of messages that newer messages have displaced since the last call of `losses`."""

@@ -27,7 +27,8 @@ class RouterLinks:
     """
 
     def __init__(self, bus: BusConfig, errors: list[BaseException]) -> None:
-        """Prepare the polling thread. If an exception ends it, it is appended to `errors`."""
+        """Prepare the polling thread. An exception that ends this thread is appended to
+        `errors`."""
         self._bus = bus
         self._status: RoutersStatus | None = None
         self.changes = Mailbox[RoutersStatus](1, lambda: None)
@@ -84,8 +85,8 @@ def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[st
             endpoint counts as unreached.
         endpoints: the endpoints of `bus.connect`.
         ends: the address at the far end of each link, such as "tcp/192.168.0.2:7447". The link of a
-            program that connects to the daemon, such as the TLS gateway, does not count, because
-            its address has a random port that matches no endpoint.
+            program that connects to the daemon, such as the TLS gateway, does not count: its
+            address has a random port, which matches no endpoint.
     """
     if mode == "client":
         return () if ends else endpoints

@@ -37,8 +37,8 @@ _BLOCK = re.compile(r"^ *// ROBOT\n(.*?)^ *// END\n", re.M | re.S)
 _NAME = re.compile(rf"\b{EXAMPLE_ROBOT}\b")
 
 EXAMPLE_OPERATOR: Role = "operator"
-"""Example name in the template's lines between PERSON and END PERSON. It is
-replaced by the common name of each certificate that may command."""
+"""Example name in the template's lines between PERSON and END PERSON. The common name of each
+certificate that may command replaces this name."""
 
 _PERSONS = re.compile(r"^ *// PERSON\n(.*?)^ *// END PERSON\n", re.M | re.S)
 # Match a whole name or the last part of a key, but not the beginning of a robot's id "operator-1".

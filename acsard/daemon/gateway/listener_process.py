@@ -40,16 +40,15 @@ this time, this process restarts. The time is longer than `LOST_DAEMON_NS`, beca
 connect at the same moment after a restart."""
 
 LOST_DAEMON_NS = NS_PER_S
-"""Longest time for which the Zenoh session may be without its connection to the daemon after this
-connection was lost, ns. After this time, this process restarts."""
+"""If the Zenoh session has lost its connection to the daemon for longer than this, ns, this process
+restarts."""
 
 REPORT_RATE = Rate(1 / 60)
 """Largest rate of the log event that reports that all connections are in use: one a minute."""
 
 MAX_UNANSWERED = 4
-"""Limit for unanswered queries. If the daemon does not answer this number of consecutive queries
-within 1 s each, the gateway's connection to the daemon counts as dead: the connection is open, but
-its data does not reach the daemon."""
+"""If the daemon leaves this number of consecutive queries unanswered for 1 s each, the gateway's
+connection to the daemon counts as dead. Such a connection is open, but carries no data."""
 
 MAX_NAMED = 5
 """Largest number of clients that the event about used-up connections names: those with the most

@@ -107,8 +107,8 @@ class Gateway(Listener):
 class DaemonProbe:
     """Queries the daemon repeatedly to detect a connection that is open but carries no data.
 
-    In a test on an overloaded machine, a connection stayed open for minutes, although the daemon's
-    Zenoh did not read from the connection.
+    In a test on an overloaded machine, a connection stayed open for minutes, but the daemon's Zenoh
+    did not read from the connection.
     """
 
     def __init__(self, key: str) -> None:
@@ -117,7 +117,7 @@ class DaemonProbe:
         self._ended = threading.Event()
         """Set whenever a query ends, with or without a reply, and cleared before the next query is
         sent. A query that ends within `PROBE_TIMEOUT_NS` has reached the daemon. A query that ends
-        later also sets the event. The query that is open at that time then counts as answered."""
+        later also sets the event, so that the query after it counts as answered."""
 
     def unanswered(self, session: zenoh.Session, now_ns: int) -> int:
         """Send the next query if it is due, and return the number of consecutive failed queries.

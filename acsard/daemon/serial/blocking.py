@@ -79,8 +79,8 @@ class BlockingPort:
     def late_ns(self) -> int:
         """Return how long the simulator at the other end of a pty has waited for a processor, ns.
 
-        The caller must not count this delay as lateness of the board. Only the time since the last
-        call counts. The result is 0 for a real device.
+        This is the waiting time since the last call, or 0 for a real device. The caller must not
+        count it as lateness of the board.
         """
         if self._program is None:
             return 0

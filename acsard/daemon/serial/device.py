@@ -56,8 +56,8 @@ def open_raw(path: str, baud_rate: int) -> serial.Serial:
     with suppress(IndexError):
         while True:
             _end(_left_open.pop())
-    # An inter-byte timeout makes pyserial set VMIN = 1, so a read without data fails with EAGAIN
-    # and an empty read always means a hang-up.
+    # An inter-byte timeout makes pyserial set VMIN = 1. A read without data then fails with EAGAIN,
+    # so an empty read always means a hang-up.
     device = _Device(
         baudrate=baud_rate, timeout=0, write_timeout=0, inter_byte_timeout=0, exclusive=True
     )

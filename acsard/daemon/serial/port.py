@@ -1,9 +1,9 @@
 """The daemon's serial port: opens, reads and reopens the device, and sends STOP before closing it.
 
 The daemon uses pyserial-asyncio only to read. A transport of that library would queue the bytes
-that the kernel does not accept, and send an old line later, which the third rule in
-`acsard/README.md` forbids. So the daemon writes to the descriptor directly. Opening runs in a
-thread with a time limit, because drivers may block.
+that the kernel does not accept, and send an old line later. No line may be delayed, so the daemon
+writes to the descriptor directly. Opening runs in a thread with a time limit, because drivers may
+block.
 """
 
 from __future__ import annotations
