@@ -8,8 +8,8 @@ Zenoh denies every message that no rule allows.
   that connects through a router has the permissions of the router.
 - A rule allows a message only if one of the rule's key expressions includes the whole key
   expression of the message. A query with a wildcard therefore needs a rule with a wildcard.
-- A client over TLS may use exact keys only, unless `access.wildcards` is set. A few wildcards can
-  take all of Zenoh's processor time.
+- A client over TLS may use exact keys only, unless `access.wildcards` is set, because a few
+  wildcards can take all of Zenoh's processor time.
 - The daemon checks the exact key, the kind (PUT) and the source of each command again.
 
 Zenoh does not tell the daemon the certificate of a sample's sender. Therefore each certificate that
@@ -96,8 +96,8 @@ LOCAL_RULES = (
 
 They are the rules of a maintainer, and more. A local client may also subscribe with any wildcard,
 and receive the commands of other clients. It may put on any key except those on which the robot
-publishes. A command for an unknown source, or on a key with a wildcard, therefore reaches the
-daemon. The daemon counts and refuses this command, and gives the reason.
+publishes. So a command for an unknown source, or on a key with a wildcard, reaches the daemon. The
+daemon counts and refuses this command, and gives the reason.
 """
 
 Flow = Literal["ingress", "egress"]
@@ -127,8 +127,8 @@ class _Keys:
         topics, outgoing = offered(config), published(config)
         self._incoming = [topic for topic in topics if topic not in outgoing]
         """Rows of the table of keys that the daemon does not publish: inputs, queries and services.
-        With the simulator, the daemon publishes the gyro's key itself, so the gyro's row is missing
-        here."""
+        With the simulator, the gyro's row is missing here, because the daemon itself then publishes
+        the gyro's key."""
         self._readable = [*outgoing, *(t for t in self._incoming if t.direction != "in")]
         """Rows of the table of keys that clients may subscribe to or query."""
         self.all = full_key(robot, "**")
@@ -162,7 +162,7 @@ class _Keys:
         """Key expressions on which the daemon publishes, or whose queries it answers."""
 
     def of(self, role: Role, use: Use) -> list[str]:
-        """Return the keys that `role` may use, but no lower role.
+        """Return the keys that `role` may use and lower roles may not use.
 
         `use` is the kind of use: publish, subscribe or query. The result does not contain the
         command keys that end with a certificate's name. The method `commands_by` returns those.
@@ -306,8 +306,9 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
         _rule("command", "ingress", ["put"], keys.commands),
         _rule("hand_on", "ingress", ["put"], keys.commands_by("*")),
         # These rules allow wildcards. `roam`: subscribe to all robots and to the tokens of ROS.
-        # `recall`: query the samples for late subscribers, and the queries of viewers. `browse`:
-        # query all keys of the robot. `attend`: declare the tokens of late subscribers.
+        # `recall`: query the samples that are kept for late subscribers, and the keys that viewers
+        # may query. `browse`: query all keys of the robot. `attend`: declare the tokens of late
+        # subscribers.
         _rule("roam", "ingress", following, [f"{ROOT_KEY}/**", *tokens]),
         _rule("recall", "ingress", ["query"], [*keys.kept, *keys.viewer_queries]),
         _rule("browse", "ingress", ["query"], [keys.all]),

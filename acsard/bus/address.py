@@ -16,8 +16,7 @@ from acsard.host.errors import UsageError
 
 
 class Address(NamedTuple):
-    """The address of a robot for a client: its endpoint, its id, and the client's TLS
-    directory."""
+    """The address of a robot for a client: endpoint, robot id, and the client's TLS directory."""
 
     endpoint: str
     robot_id: str

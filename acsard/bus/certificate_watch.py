@@ -2,8 +2,8 @@
 
 Zenoh reads the files of a listening endpoint only when it opens the endpoint. So a process that
 listens must detect new files and restart (`CertificateFiles.renewed`). Three files cannot be
-replaced at the same moment, so new files are reported only when they belong together and no longer
-change. A thread reads the expiry times, because a disk or a router may not answer.
+replaced at the same moment, so new files are reported only when they belong together and stay
+unchanged. A thread reads the expiry times, because a disk or a router may not answer.
 """
 
 from __future__ import annotations
@@ -84,10 +84,10 @@ EXPIRY_CHECK_PERIOD_S = 60.0
 """Pause between two readings of the certificates' expiry times, s."""
 
 ROUTER_CHECK_EVERY = 60
-"""Number of readings of the robot's own certificates for each reading of the routers' certificates.
-The routers' certificates are read less often, because each reading takes one of a router's
-connections. If a router did not answer, all routers are tried again at the next reading of the
-robot's certificates."""
+"""The routers' certificates are read once for this number of readings of the robot's own
+certificates. The routers' certificates are read less often, because each reading takes one of a
+router's connections. If a router did not answer, all routers are tried again at the next reading of
+the robot's certificates."""
 
 
 def router_expiry_times(routers: Iterable[str], directory: str) -> dict[str, int]:
@@ -105,12 +105,11 @@ def router_expiry_times(routers: Iterable[str], directory: str) -> dict[str, int
 
 
 async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) -> None:
-    """Update the expiry times in `known` every `EXPIRY_CHECK_PERIOD_S`, until this task is
-    cancelled.
+    """Update the expiry times in `known` every `EXPIRY_CHECK_PERIOD_S` until cancelled.
 
     If a certificate cannot be read, its value stays unchanged. If `bus.outside` names endpoints,
-    the value of the robot's own certificate is not updated, because the TLS gateway reports
-    it.
+    the value of the robot's own certificate stays unchanged too, because the TLS gateway reports
+    this value.
 
     Args:
         bus: the settings with the certificate directory and the routers.

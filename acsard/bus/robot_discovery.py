@@ -49,10 +49,10 @@ def parse_ids(text: str) -> tuple[str, ...]:
 
 
 def running_robots(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[str]:
-    """Return the ids in `ids` of the robots whose daemon is running, sorted.
+    """Return the sorted ids of those robots in `ids` whose daemon is running.
 
     The id "*" stands for all robots. Raises `NoAnswerError` if `ids` contains "*" and no robot is
-    visible. The text of this error names `endpoint`, the client's endpoint.
+    visible. `endpoint` is the client's endpoint, for the text of this error.
     """
     running_ids = set()
     for robot_id in ids:
@@ -118,8 +118,8 @@ def no_robot_text(endpoint: str) -> str:
 def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscription:
     """Subscribe to a key of several robots, and return the subscription.
 
-    It receives the samples of all these robots. `robot_of` tells from a sample's key which robot
-    published the sample. Raises `UsageError` if `name` is not a key.
+    The subscription receives the samples of all these robots. `robot_of` returns the robot's id
+    from a sample's key. Raises `UsageError` if `name` is not a key.
 
     Args:
         session: the Zenoh session of the caller.
@@ -177,7 +177,7 @@ def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) 
     if presence.here:
         return f"robot {robot_id} is there, but {_silent(key)}"
     if presence.others:
-        # With a cutoff of 0.0 no robot is excluded, and the most similar ids come first.
+        # With a cutoff of 0.0, no robot is excluded, and the most similar ids come first.
         near = get_close_matches(robot_id, presence.others, MAX_NAMED, 0.0)
         more = len(presence.others) - len(near)
         named = ", ".join(near) + (f" and {more} more (`acsard fleet` lists them)" if more else "")

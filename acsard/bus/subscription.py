@@ -53,8 +53,8 @@ class Subscription:
     def __init__(self, queue: Any, key: str = "") -> None:
         """Read the samples from `queue`.
 
-        If `key` is not "", skip each sample that was not put on exactly this key. This includes
-        samples on a key with a wildcard.
+        If `key` is not "", skip each sample that was not put on exactly this key, for example a
+        sample on a key with a wildcard.
         """
         self._queue, self._key = queue, key
 
@@ -81,8 +81,7 @@ class Subscription:
     def until_silence(self, timeout: float | None) -> Iterator[zenoh.Sample]:
         """Yield samples until the session closes, or until no sample has arrived for `timeout` s.
 
-        If `timeout` is None, there is no time limit. When the iteration ends, the Zenoh subscribers
-        are undeclared.
+        None means no time limit. When the iteration ends, the Zenoh subscribers are undeclared.
         """
         quiet_since_ns = clock.mono_ns()
         try:

@@ -69,8 +69,7 @@ def require_usable(directory: str) -> None:
 
 
 def files_in(directory: str) -> tuple[Path, Path, Path]:
-    """Return the paths of the three files in a TLS directory: authority, certificate and
-    key."""
+    """Return the paths of the files in a TLS directory: authority, certificate and key."""
     return Path(directory, CA), Path(directory, CERTIFICATE), Path(directory, KEY)
 
 
@@ -80,8 +79,8 @@ def unusable(authority: Path, certificate: Path, key: Path) -> str:
     try:
         context.load_verify_locations(authority)
         # If no password is passed, OpenSSL asks on the terminal for the password of an encrypted
-        # key. With an empty password, OpenSSL refuses such a key, which is right, because Zenoh
-        # accepts no encrypted key.
+        # key. With an empty password, OpenSSL refuses such a key. That is right, because Zenoh does
+        # not accept an encrypted key.
         context.load_cert_chain(certificate, key, password="")
     except (OSError, ValueError) as error:
         # SSLError is an OSError.
@@ -229,16 +228,15 @@ HANDSHAKE_TIMEOUT_S = 2.0
 answer of the server in the TLS handshake."""
 
 REFUSAL_WAIT_S = 0.5
-"""Time for which this client waits after the TLS handshake, s. If the server rejects the
-client's certificate, it reports that within this time. If the server accepts it, the server sends
-nothing."""
+"""Time for which this client waits after the TLS handshake, s. A server that rejects the client's
+certificate reports that within this time. A server that accepts the certificate sends nothing."""
 
 UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
 """Error numbers of the operating system that mean that no machine answers at the address."""
 
 EXPIRED, NOT_YET, WRONG_NAME, WRONG_ADDRESS = 10, 9, 62, 64
-"""OpenSSL's error codes (X509_V_ERR_...) for a certificate that has expired, is not valid yet, is
-not for this host name, or is not for this IP address."""
+"""OpenSSL's error codes (X509_V_ERR_...) for a certificate that has expired, is not valid yet, or
+is not for this host name or this IP address."""
 
 UNSIGNED, BARRED, WRONG_PURPOSE = (2, 7, 18, 19, 20, 21), (47, 48), 26
 """Further error codes of OpenSSL: another authority signed the certificate, the authority may not
@@ -252,8 +250,7 @@ RENEW_ADVICE = (
 
 
 def trouble(endpoint: str, directory: str) -> str:
-    """Return the reason why this machine cannot connect to a TLS endpoint, and how to fix
-    that.
+    """Return why this machine cannot connect to a TLS endpoint, and how to fix that.
 
     Return "" if the connection succeeds. `directory` is the TLS directory of this machine. Blocks
     for a few seconds, or longer if the lookup of the host name is slow.
@@ -291,8 +288,7 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
     context.load_verify_locations(f"{directory}/{CA}")
     _load(context, directory)
     # Zenoh ignores the dates of an authority, but OpenSSL rejects each certificate of an expired
-    # authority before it looks at the rest. So ignore the dates, to find the reason for which Zenoh
-    # cannot connect.
+    # authority at once. So ignore the dates, to find the reason for which Zenoh cannot connect.
     outdated = any(map(_wrong_date, context.get_ca_certs()))
     if outdated:
         context.verify_flags |= NO_CHECK_TIME

@@ -38,13 +38,12 @@ from acsard.host.terminal_modes import may_use_color
 COMMAND_RATE_HZ = 1000.0
 """Largest number of commands per second that a session accepts on each key. The limit is high
 enough for a zero command 1 ms after another command. It is low enough that a flood of commands does
-not make the daemon miss a control period. The TLS gateway also applies this limit to stops.
-If it drops a stop, it has passed another stop less than a millisecond before, so the robot stops
+not make the daemon miss a control period. The TLS gateway also applies this limit to stops. If the
+gateway drops a stop, it has passed another stop less than a millisecond before, so the robot stops
 anyway."""
 
 MAX_SESSIONS = 256
-"""Largest number of connections of the daemon's session, and of the TLS gateway's
-session."""
+"""Largest number of connections of the daemon's session, and of the TLS gateway's session."""
 
 MAX_MESSAGE_BYTES = 65536
 """Largest size of a message that a link accepts, bytes. Commands have a far lower limit."""
@@ -186,15 +185,15 @@ def _listening() -> dict[str, object]:
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
         "transport/unicast/accept_timeout": 1000,
         # With a limit of 32 pending connections, 300 idle connections keep an operator out for 2 s.
-        # With a limit of 512 they do not. 512 pending connections take 3 MB.
+        # With a limit of 512, they do not. 512 pending connections take 3 MB.
         "transport/unicast/accept_pending": 512,
         "transport/unicast/max_sessions": MAX_SESSIONS,
         # Zenoh's default. A session announces its lease, and the other side closes the link if it
-        # receives nothing for that time. A daemon that stood still for longer than the lease of the
-        # gateway or of a router closes the link without reading the stop that waits in its socket.
-        # With a lease of 2 s, a stop was lost after 1.9 s.
+        # receives nothing for that time. If a daemon has stood still for longer than the lease of
+        # the gateway or of a router, it closes the link without reading the stop that waits in its
+        # socket. With a lease of 2 s, a stop was lost after 1.9 s.
         "transport/link/tx/lease": 10_000,
-        # A subscriber that does not read must not delay a put. By default each put waits 1 ms.
+        # A subscriber that does not read must not delay a put. By default, each put waits 1 ms.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
     }
@@ -220,7 +219,7 @@ def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Sessio
 def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
     """Open a session in Zenoh's client mode to the daemon or router at `endpoint`.
 
-    In peer mode, the session would reach no program behind a router.
+    Peer mode would be wrong, because a peer reaches no program behind a router.
 
     Args:
         endpoint: the endpoint, such as "tcp/127.0.0.1:7448".

@@ -27,9 +27,9 @@ from acsard.host.threads import in_thread
 T = TypeVar("T")
 
 CALL_TIMEOUT_S = 6 * REPLY_TIMEOUT_S
-"""Time within which a call must end, s. The longest call is a `clear`, which takes up to 15 s: it
-queries the state, repeats this query for 3 s while the daemon is busy, calls the service, and finds
-out why no reply came."""
+"""Time within which a call must end, s. The longest call is a `clear`, which takes up to 15 s. It
+queries the state, and repeats this query for 3 s while the daemon is busy. Then it calls the
+service, and finds out why no reply came."""
 
 CLOSE_TIMEOUT_S = 5.0
 """Time within which a connection must close, s."""

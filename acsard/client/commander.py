@@ -46,8 +46,8 @@ lose all of them. A sender that follows the robot's state therefore uses `FinalZ
 GRACE_S = 0.5
 """Longest time for which commands may have no effect, s. After this time, the program informs the
 operator or ends the drive. A drive also ends if the program itself sends no command for longer than
-this. The commands of a new sender have no effect during the first 0.25 s, so this time must be
-longer. It must also be longer than a short delay of a known sender."""
+this. The time must be longer than 0.25 s, because the first commands of a new sender have no effect
+for that long. It must also be longer than a short delay of a known sender."""
 
 BRAKING_AFTER_NS = 3 * NS_PER_S // 10
 """Time without a command after which the robot is assumed to brake, ns. It is a little longer than
@@ -56,8 +56,8 @@ a source's default timeout of 0.25 s."""
 RELEASE_TIMEOUT_NS = 3 * NS_PER_S // 2
 """Time without input after which a button or a key that was held counts as released, ns. A shorter
 silence may be a pause of the network. A panel of Foxglove publishes once a second by default, and
-must not seem released between its messages. The time must be shorter than 2 s, because the daemon
-forgets the zero of a new sender that is silent for 2 s after the zero."""
+must not seem released between its messages. The time must be shorter than 2 s: if a new sender is
+silent for 2 s after its zero, the daemon forgets the zero."""
 
 BURST_WINDOW_NS = NS_PER_S // 25
 """Time for which the first command after a silence waits to be sent, ns. The wait shows whether a
@@ -66,7 +66,7 @@ more than `MAX_BURST_COMMANDS` commands, the next command waits too."""
 
 MAX_BURST_COMMANDS = 5
 """Largest number of commands that a panel is assumed to send within `BURST_WINDOW_NS` (125 Hz). If
-more commands arrive, they have waited in a queue. This queue may contain further commands."""
+more commands arrive, they have waited in a queue, which may contain further commands."""
 
 STALE_NS = NS_PER_S // 10
 """Largest age of a nonzero command that is still sent, ns. An older one is dropped, because the
@@ -214,9 +214,9 @@ class Commander:
 
         The command that waits to be sent is discarded. The result is a zero if the robot may still
         follow a nonzero command of this sender. The result is None if the last command was a zero,
-        or if the timeout has passed since the last nonzero command. A zero would then only stop the
-        next sender. `timeout_s` is the timeout of this sender's source, s, and `now_ns` is the
-        monotonic time, ns.
+        or if the timeout has passed since the last nonzero command, because a zero would then only
+        stop the next sender. `timeout_s` is the timeout of this sender's source, s, and `now_ns` is
+        the monotonic time, ns.
         """
         moved_ns, self._moved_ns = self._moved_ns, None
         self._wish = self._asked_ns = None
@@ -257,8 +257,8 @@ class CommandSigner:
     def sign(self, stamp_ns: int | None, *, steady: bool, zero: bool = False) -> Signature:
         """Return the signature of the next command, with its sequence number.
 
-        If this sender has already used a later stamp, a zero gets that later stamp. So the daemon
-        never refuses the zero because of an older stamp.
+        If this sender has already used a later stamp, a zero gets that later stamp, so that the
+        daemon does not refuse the zero because its stamp is older.
 
         Args:
             stamp_ns: the time of the command on the sender's clock, ns; None if the sender has no
@@ -320,9 +320,9 @@ def no_command(source: str) -> str:
 def must_release_key(state: RobotState, source: str) -> bool:
     """Return whether the operator must release a held key and press it again to drive.
 
-    The operator must do so if the robot cannot drive in its present mode (a mode in
-    `NEVER_DRIVING_MODES`, or "waiting"), or if `source` must first send a zero. When the robot can
-    drive again, an operator who still holds the key may not expect the robot to move.
+    The operator must do so in two cases: the robot cannot drive in its present mode (a mode in
+    `NEVER_DRIVING_MODES`, or "waiting"), or `source` must first send a zero. Otherwise, a held key
+    would move the robot as soon as the robot can drive again, which the operator may not expect.
     """
     return not _can_drive(state) or only_needs_zero(state, source)
 

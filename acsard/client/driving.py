@@ -31,15 +31,15 @@ from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 
 SETTLED_S = 0.2
-"""Longest time that a message on `state` takes to arrive, s. So a state that arrives later than
-this after an action shows the robot after the action."""
+"""Longest time that a message on `state` takes to arrive, s. So a state that arrives more than
+`SETTLED_S` after an action shows the robot after the action."""
 
 STANDSTILL = 0.01, 0.02
 """Linear speed, m/s, and turn rate, rad/s, below which the robot counts as standing still."""
 
 SLOWER, SLOWS_S = 0.97, 1.0
-"""A factor, and a time, s. After a drive, the robot counts as slowing down while its speed falls
-to less than `SLOWER` times its former value within each `SLOWS_S` s."""
+"""The test whether the robot slows down after a drive: every `SLOWS_S` s, its speed must fall below
+`SLOWER` times its lowest speed so far."""
 
 
 CONNECTION_CLOSED = "the connection to the daemon was closed while the robot was driving"

@@ -2,9 +2,9 @@
 
 A few zeros are not enough. If the network or the daemon stands still for a moment, all commands of
 this time arrive within 1 ms. The daemon accepts the oldest one, which may be a speed, and drops the
-others, which are too fast. So a sender repeats the zero until the robot's `state` shows that the
-robot has received it. The sender must then be silent, because repeated zeros keep other senders
-from driving.
+others, because they come too fast. So a sender repeats the zero until the robot's `state` shows
+that the robot has received it. The sender must then be silent, because repeated zeros keep other
+senders from driving.
 
 This module is pure: times and states come in as arguments.
 """
@@ -29,9 +29,9 @@ class FinalZeros:
     def __init__(self, source: str, sender: str) -> None:
         self._source, self._sender = source, sender
         self._drove, self._stopped_since = -math.inf, math.inf
-        """Time of the last nonzero command, and arrival of the first state that shows, like all
-        states after it, that this sender has stopped the robot. The second time is infinite if no
-        state shows this."""
+        """`_drove` is the time of the last nonzero command, s. `_stopped_since` is the time since
+        which all states have shown that this sender no longer drives the robot, s. It is infinite
+        if the newest state does not show that."""
 
     def drove(self, now: float) -> None:
         """Record that the sender sends a nonzero command at the time `now`, s."""
@@ -48,7 +48,7 @@ class FinalZeros:
             self._drove = -math.inf
 
     def wanted(self, now: float) -> bool:
-        """Return whether the sender must send a zero at the time `now`, s, unless it drives.
+        """Return whether a sender that does not drive must send a zero at the time `now`, s.
 
         The result is False after the longest timeout of a source, because the robot then follows
         no speed of this sender.

@@ -40,7 +40,7 @@ class Row(Struct, frozen=True):
     seen."""
     state: RobotState | None
     age: float
-    """Age of `state`, s; infinite until a state has proved that the daemon runs."""
+    """Age of `state`, s; infinite before the first state that proves that the daemon runs."""
     version: str
     silent: bool = False
     """Whether the robot counts as silent, because no new state has arrived (see `Follower`)."""

@@ -23,22 +23,22 @@ from acsard.core.messages.schema import RobotState
 from acsard.host.mailbox import Mailbox
 
 QUERY_PERIOD_S = 0.3
-"""Time without a new state after which the client queries `state`, s. Such queries are necessary if
-the robot is configured to publish its state seldom."""
+"""Time without a new state after which the client queries `state`, s. Without queries, the client
+could not follow a robot that is configured to publish its state seldom."""
 
 MAX_STATE_AGE_S = 0.5
-"""Age of a state above which a program must not base an action on it, s."""
+"""A program must not base an action on a state that is older than this, s."""
 
 ROBOT_SILENCE_TIMEOUT_S = 1.0
-"""Age of the last state above which the robot counts as silent and a drive ends, s."""
+"""If the last state is older than this, s, the robot counts as silent, and a drive ends."""
 
 FIRST_STATE_TIMEOUT_S = 2.0
 """Time within which the first message on a key arrives if the robot works normally, s."""
 
 FLEET_QUERY_PERIOD_S = 2.0
-"""Time without a new state of a robot after which a program that follows many robots queries the
-robot's `state`, s. It is longer than `QUERY_PERIOD_S`, because such a program sends many
-queries."""
+"""If a program follows many robots, and one of them has sent no new state for this time, s, the
+program queries the `state` of that robot. The time is longer than `QUERY_PERIOD_S`, because such a
+program sends many queries."""
 
 STATE_KEY = "state"
 
@@ -65,8 +65,8 @@ class Follower:
         self.is_confirmed = False
         """Whether a state has proved that the daemon runs (see `answered()`)."""
         self.last_seen = now
-        """Time at which the last state arrived that proved that the daemon runs. Before the first
-        such state, it is the time at which this object was created."""
+        """Arrival time of the last state that proved that the daemon runs, s. Before the first such
+        state, it is the time at which this object was created, s."""
         self.due = now + query_period_s
         """Time of the next query, unless a state arrives before this time."""
         self.unreadable = 0
@@ -83,8 +83,8 @@ class Follower:
         """Process an answer to a query of `state`. Return whether it proves that the daemon runs.
 
         `state` is the answer, which arrived at the time `now`, s. The answer may be an old state
-        from the storage of a router. So it is a proof only if its stamp is newer than the stamp of
-        `self.state` or of the previous answer.
+        from the storage of a router. Therefore, it is a proof only if its stamp is newer than the
+        stamp of `self.state` or of the previous answer.
         """
         # The previous answer is compared too, because the robot's clock may have been set back
         # since `self.state`.
@@ -121,7 +121,7 @@ class Follower:
 
     @property
     def silence_timeout_s(self) -> float:
-        """Age of the last state above which the robot counts as silent, s."""
+        """The robot counts as silent if its last state is older than this, s."""
         # If a robot publishes seldom, only answers arrive, at intervals of `query_period_s`.
         return (
             (ROBOT_SILENCE_TIMEOUT_S if self.is_confirmed else FIRST_STATE_TIMEOUT_S)
@@ -176,7 +176,7 @@ class Watch(Follower):
     def poll(self, now: float) -> list[RobotState]:
         """Process the states that have arrived, and return the new states.
 
-        If no state has arrived for some time, also send a query. A later call processes its reply.
+        If no state has arrived for some time, also send a query. A later call processes the reply.
         `now` is the present time, s. Raises `ZError` if the session was closed.
         """
         states = []
@@ -208,8 +208,7 @@ class Watch(Follower):
     def objection(self, source: str, sender: str, now: float) -> str:
         """Return why the robot does not follow the commands of a sender; "" if it follows them.
 
-        While the first state has not arrived yet, the result is "" until the robot counts as
-        silent.
+        Before the first state arrives, the result is "" until the robot counts as silent.
 
         Args:
             source: the command source of the sender's commands.

@@ -45,9 +45,9 @@ class ClientIdentity(Struct, frozen=True):
     def lacks(self, key: str) -> str:
         """Return the reason, in words, why this client may not use a Zenoh key of the robot.
 
-        Return "" if the client may use the key. If the robot answered no query for the client's
-        role, the role is unknown. In this case, return the likely reasons for the robot's silence
-        or, for a client without a certificate, "".
+        Return "" if the client may use the key. If the role is unknown, because the robot answered
+        no query for it, return the likely reasons for the robot's silence. For a client without a
+        certificate, return "" in this case.
 
         Args:
             key: the part of the Zenoh key after the robot's id, such as `state`.

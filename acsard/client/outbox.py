@@ -1,8 +1,8 @@
 """Sends the commands of several senders from one thread, so that no caller waits for the bus.
 
 Each sender has a `Commander`, which keeps only the newest command of that sender. When a sender
-leaves, the program must call `Outbox.release()`. If the robot may still follow the sender's last
-command, the thread then sends a zero, even if the bus was blocked for a long time.
+leaves, the program must call `Outbox.release()`. The thread then sends a zero if the robot may
+still follow the sender's last command. It does so even if the bus was blocked for a long time.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Outbox:
         self._news = Condition()
         self._busy = self._ended = False
         self.dead: Future[Never] = Future()
-        """Future that gets the exception that ended the thread. No command is sent after that. The
-        future stays pending while the thread runs, and also if `end` ends the thread."""
+        """If an exception ends the thread, this future gets the exception, and no further command
+        is sent. While the thread runs, and if `end` ends it, the future stays pending."""
         self._thread = Thread(target=self._run, name="outbox", daemon=True)
         self._thread.start()
 

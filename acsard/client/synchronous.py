@@ -167,8 +167,8 @@ class Client:
         # share it, although they may send commands under another name.
         self._secret = new_secret()
         self._sign_as(f"{platform.node()[:32]}/{os.getpid()}")
-        # Compute stamps from the steady clock. If stamps came from the wall clock and it were set
-        # during a drive, the daemon would mistake the jump for a delay.
+        # Compute stamps from the steady clock. If the stamps came from the wall clock, and a
+        # program set this clock during a drive, the daemon would mistake the jump for a delay.
         self._wall_offset_ns = clock.now().wall_ns - clock.steady_ns()
 
     def _sign_as(self, name: str) -> None:
@@ -229,7 +229,7 @@ class Client:
 
         Unlike `send`, this method never sends a zero in place of the command. `linear` is in m/s,
         and `angular` in rad/s (left is +). `stamp_ns` is the time of the command on the clock of
-        the panel, ns. If it is None, the command gets the present time of this computer.
+        the panel, ns. None means the present time of this computer.
         """
         with self._spacing.wait():
             self._put(linear, angular, stamp_ns)
@@ -238,10 +238,11 @@ class Client:
         """Close the connection. `connect` calls this at the end of its `with` block.
 
         First send zeros to each robot that may still follow a client of this connection. Without a
-        zero, the robot would drive on until the timeout of the source, which may be 10 s.
+        zero, the robot would drive on until the source's timeout, which may be 10 s.
         """
         begun_s = clock.steady_s()
-        # When the longest timeout has passed, a zero would only stop the next sender that drives.
+        # After the longest timeout, the robot no longer follows the client, so a zero would only
+        # stop the next sender.
         known = list(self._spacing.moving.items())
         moving = [client for client, at_s in known if begun_s - at_s < MAX_SOURCE_TIMEOUT_S]
         try:
@@ -319,9 +320,9 @@ class Client:
     def request(self, service: str, fields: Mapping[str, object]) -> schema.ServiceReply:
         """Call the service `service` with `fields` as its payload, and return its reply.
 
-        Unlike `call`, this method does not add the field `latch`. It does not send a payload that
-        is too large for the daemon, because the bus may drop it. It then returns the same refusal
-        that the daemon would send.
+        Unlike `call`, this method does not add the field `latch`. A payload that is too large for
+        the daemon is not sent, because the bus may drop it. Instead, this method returns the
+        refusal that the daemon would send.
         """
         payload, key = msgspec.json.encode(fields) if fields else None, service_key(service)
         if payload is not None and (verb := VERBS.get(key)) is not None:

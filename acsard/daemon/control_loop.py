@@ -124,13 +124,13 @@ class ControlLoop:
                 daemon, such as the simulator, publishes. It returns None for any other key.
             adopted: function that is called with each new configuration that comes into force after
                 the start.
-            recorder: the black box, which records each step. With None nothing is recorded.
+            recorder: the black box, which records each step. With None, nothing is recorded.
             latches: the latches (stop, fault, "inactive") with which the robot starts.
-            keeper: stores the latches, so that they survive a restart of the daemon. With None the
+            keeper: stores the latches, so that they survive a restart of the daemon. With None, the
                 latches are not stored.
             settings_file: writes settings to the configuration file. With None, a `set` request
                 with the field `keep` is refused.
-            late_watch: finds the causes of late periods. With None no causes are reported.
+            late_watch: finds the causes of late periods. With None, no causes are reported.
         """
         self.robot = Robot(config, latches)
         self.report = Report(config, start, certificate_ends)
@@ -198,8 +198,8 @@ class ControlLoop:
     def retry_ns(self) -> int | None:
         """Monotonic time at which a step between two periods can send the waiting command, ns.
 
-        A command waits if it arrived too soon after the last line to the board. The value is None
-        if no command waits.
+        A command waits if it arrived too soon after the last line to the board. None means that no
+        command waits.
         """
         return self.pace.retry_ns(self._port.sent_ns) if self.pace.command_waits else None
 
@@ -309,8 +309,8 @@ class ControlLoop:
 
         The field `lowered` of the result contains the limits that `set` requests have lowered,
         except decelerations. It leaves out the limit from the key `speed_limit`, because the
-        program that sent this limit may not run at the next start. Then no program would lift the
-        limit.
+        program that sent this limit may not run at the next start, and no other program would lift
+        the limit.
         """
         file = self._file_limits
         if file is not self._started or self._speed.lowers:

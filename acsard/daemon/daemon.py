@@ -140,7 +140,7 @@ async def run(
         page: command-line arguments with which the daemon starts `acsard web`. None for no web
             page.
         settings_file: the configuration file. The daemon compares the file with the settings in
-            force, and writes settings to it if a client requests that. With None the daemon does
+            force, and writes settings to it if a client requests that. With None, the daemon does
             neither.
     """
     wake = Wakeup()

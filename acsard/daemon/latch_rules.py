@@ -159,7 +159,7 @@ def stopped(
 def after_failed_write(latches: Latches, why: str, now: Instant) -> Latches:
     """Return the latches with which the robot starts if the latch file cannot be written.
 
-    The previous process may have set latches that are not in the file. So the robot starts stopped.
+    The previous process may have set latches that are not in the file, so the robot starts stopped.
     Each latch of the file gets a new number, so that a `clear` or `activate` with an old number has
     no effect. Its sender may not know of the lost latches.
 
@@ -271,7 +271,7 @@ class Handover:
     def trouble(self) -> str | None:
         """Reason why the latches would not survive a restart, in words, or "" if they would.
 
-        The value is None if this daemon has no latch file, because it then never stores latches.
+        None means that this daemon never stores latches, because it runs without a latch file.
         """
         return None if self._keeper is None else self._keeper.trouble
 

@@ -80,9 +80,9 @@ class _Pending(Struct):
     """Monotonic time after which the client is told that the request has failed, ns. This limit
     does not apply while the robot decides about the request."""
     edit: Edit | None = None
-    """The prepared change of the file. It is None until the thread has checked the request."""
+    """The prepared change of the file; None until the thread has checked the request."""
     answer: Answer | None = None
-    """The robot's answer. It is None until the robot has used the settings."""
+    """The robot's answer; None until the robot has used the settings."""
     overdue: bool = False
     """True if the client was told that the change of the file took too long. The thread may still
     change the file."""
@@ -129,7 +129,7 @@ class SettingsFile:
         written a limit to the file, the limit has that value, else its value at the start of the
         daemon. Changes of the file by other programs are not included."""
         self._thread: threading.Thread | None = None
-        """The thread that compares and changes the file. It is None until it has started."""
+        """The thread that compares and changes the file; None before it has started."""
         self._not_started = ""
         """The reason why the thread could not be started, or ""."""
 

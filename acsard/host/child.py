@@ -38,9 +38,8 @@ HEARTBEAT_S = 0.5
 """Longest pause, s, between two signs of life of a child, and between two checks by its parent."""
 
 SILENCE_TIMEOUT_NS = 3 * NS_PER_S
-"""Time without a sign of life after which a parent kills its child, ns. The TLS gateway already
-ends itself after 1 s without progress, so this limit is for a process that cannot even end
-itself."""
+"""Time without a sign of life after which a parent kills its child, ns. The TLS gateway ends itself
+after 1 s without progress, so this limit is for a process that cannot do even that."""
 
 START_TIMEOUT_NS = 15 * NS_PER_S
 """Longest time for which the parent waits for a child's first sign of life, ns. Python starts
@@ -52,8 +51,8 @@ class Silence:
 
     The silence is too long if it exceeds `timeout_ns`, ns.
 
-    If more than 0.5 s passes between two calls of `too_long`, only 0.5 s of this time counts as
-    silence, because the computer may have stopped both processes meanwhile.
+    If more than 0.5 s passes between two calls of `too_long`, only 0.5 s counts as silence, because
+    the computer may have stopped both processes meanwhile.
     """
 
     def __init__(self, timeout_ns: int) -> None:
@@ -166,8 +165,8 @@ async def running(
     finally:
         if child.returncode is None:
             child.kill()
-            # Read the rest of the output. asyncio sees the end of a child only after the end of
-            # its output, and asyncio stops reading a pipe while too much unread data waits.
+            # Read the rest of the output. asyncio sees the end of a child only after the end of its
+            # output. But asyncio stops reading a pipe while too much unread data waits.
             for output in (child.stdout, child.stderr):
                 with suppress(RuntimeError):  # another task reads this output
                     await output.read() if output else b""

@@ -23,10 +23,10 @@ SEARCH_PATHS = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
 
 
 def read(file: Path) -> bytes:
-    """Return the content of a configuration file, but at most one byte more than it may have.
+    """Return the content of a configuration file, but at most `MAX_BYTES` + 1 bytes.
 
-    `parse` refuses this one byte more. The daemon reads its file while it controls the robot, so a
-    huge file must take neither its memory nor its time. Raises `OSError` if the file cannot be
+    `parse` refuses more than `MAX_BYTES`. The daemon reads the file while it controls the robot, so
+    reading a huge file must not take much memory or time. Raises `OSError` if the file cannot be
     read.
     """
     with file.open("rb") as opened:
@@ -68,8 +68,8 @@ def writable(path: str | None) -> Path:
     """Return the path of the configuration file that the option --write changes.
 
     `path` is the value of the option --config, or None. Raises `MendableError` if there is no
-    configuration file, if it is the `acsard.toml` of a clone of acsard, if this user may not change
-    it, or if the library tomlkit is missing.
+    configuration file, if this user may not change the file, or if the library tomlkit is missing.
+    Raises `MendableError` too if the file is the `acsard.toml` of a clone of acsard.
     """
     require_tomlkit()
     where, text = find(path)
@@ -200,9 +200,8 @@ def is_tracked(place: Path) -> bool:
     """
     if not any((parent / ".git").exists() for parent in place.parents):
         return False
-    # git refuses to read a repository of another user, because the repository's configuration could
-    # make git run that user's programs with the rights of the daemon. A file in such a repository
-    # counts as not tracked.
+    # git refuses to read a repository of another user, because the configuration of that repository
+    # could make git run any program with the daemon's rights.
     words = ["git", "-C", str(place.parent), "ls-files", "--error-unmatch", "--", place.name]
     try:
         asked = subprocess.run(words, capture_output=True, timeout=2.0)

@@ -1,7 +1,7 @@
 """Reads the kernel's counters that can explain why a program was late.
 
-A counter is 0 if this computer does not have the file of this counter, or if this user may not read
-the file. A reading can take a few milliseconds, so the control loop never reads the counters.
+A counter is 0 if this computer does not have the counter's file, or if this user may not read it. A
+reading can take a few milliseconds, so the control loop never reads the counters.
 """
 
 from __future__ import annotations
@@ -118,9 +118,8 @@ def steal(text: str, tick_ns: int) -> tuple[int, ...]:
 def iowait(text: str, tick_ns: int) -> int:
     """Return the time for which a processor was idle while a program waited for I/O, ns.
 
-    Each processor has its own counter. Return the largest of these counters. `text` is
-    the content of `/proc/stat`, which counts clock ticks. `tick_ns` is the duration of a clock
-    tick, ns.
+    Of all processors, return the longest such time. `text` is the content of `/proc/stat`, which
+    counts clock ticks. `tick_ns` is the duration of a clock tick, ns.
     """
     return max((int(row[5]) * tick_ns for row in _processors(text)), default=0)
 

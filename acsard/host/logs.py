@@ -1,7 +1,7 @@
 """Logs events as lines on standard error or in the systemd journal, and never blocks the caller.
 
-A thread writes the lines from a bounded queue, because a full disk, a closed pipe or a stopped
-terminal must not delay the control loop. Lines that do not fit in the queue are dropped.
+A thread writes the lines from a bounded queue, so that a full disk, a closed pipe or a stopped
+terminal does not delay the control loop. Lines that do not fit in the queue are dropped.
 
 In the journal, each value of an event is also a separate field. For example, the command
 `journalctl ACSARD_EVENT=link_down` finds all events with the name `link_down`.
@@ -169,8 +169,8 @@ def write_through(stream: TextIO, text: str) -> None:
 def output_in_threads() -> Iterator[None]:
     """Let `sys.stdout` and `sys.stderr` never block during a `with` block.
 
-    A `Writer` replaces each of the two streams. The rule covers everything that Python code
-    writes: `print`, warnings, tracebacks, and the log records of libraries such as aiohttp.
+    A `Writer` replaces each of the two streams. This holds for everything that Python code writes:
+    `print`, warnings, tracebacks, and the log records of libraries such as aiohttp.
     """
     output, errors = Writer(sys.stdout), Writer(sys.stderr)
     try:
@@ -235,9 +235,8 @@ class Log:
         self._logger.info(name, **fields)
 
     def close(self) -> None:
-        """Wait for at most `CLOSE_TIMEOUT_S` until the queued lines are written.
-
-        Then the process may end.
+        """Wait for at most `CLOSE_TIMEOUT_S` until the queued lines are written. Call this before
+        the process ends.
         """
         self._writer.close(CLOSE_TIMEOUT_S)
 

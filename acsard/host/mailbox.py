@@ -2,10 +2,10 @@
 
 A writer never waits for the reader or for a lock. If the queue is full, each new item displaces the
 oldest item. A writer stores its item before it wakes the reader, and the reader looks for items
-after it wakes, so no wake-up is lost. The reader may also wake without an item.
+after it wakes. So no item is overlooked, but the reader may wake without an item.
 
-Do not use a mailbox if old items are worth more than new ones (the log, the recording), or if no
-item may be lost (replies to queries).
+Do not use a mailbox in two cases: old items are worth more than new ones (the log, the recording),
+or no item may be lost (replies to queries).
 """
 
 from __future__ import annotations

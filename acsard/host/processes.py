@@ -23,8 +23,8 @@ numbers."""
 
 
 OPTION_WITH_ARGUMENT = re.compile(r"-[^-cmWX]*(?P<letter>[cmWX])(?P<argument>.*)", re.DOTALL)
-"""A word of options for Python, such as "-Pm", that ends with an option which takes an argument.
-The argument may follow in the same word."""
+"""Matches a word of Python's command line with an option that takes an argument, such as "-Pm" or
+"-mNAME". If the argument is not in this word, it is the next word."""
 
 
 class Holder(Struct, frozen=True):

@@ -31,8 +31,8 @@ class Bucket:
         self._unit_ns = round(NS_PER_S / rate.hz)
         self._burst_ns = round((rate.burst - 1.0) * self._unit_ns)
         self._full_at_ns = 0
-        """Time at which the bucket is full again, ns. Each unit that is taken makes this time later
-        by `_unit_ns`."""
+        """Time at which the bucket is full again, ns. Taking a unit makes this time later by
+        `_unit_ns`."""
 
     def room(self, now_ns: int) -> bool:
         """Return whether the bucket contains at least one unit now."""

@@ -1,7 +1,7 @@
 """Asks the operating system for punctual scheduling, once, before any thread starts.
 
 Only the control loop's own thread gets real-time priority. The threads of the bus and child
-processes do not inherit it, so a flood on the bus does not compete with the loop.
+processes do not inherit this priority, so that a flood on the bus does not compete with the loop.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ has priority over them. A step takes a thousandth of this time. The systemd serv
 limit: systemd's watchdog ends a daemon that hangs."""
 
 MIN_SPIN_S = 0.5
-"""Smallest hard limit of this time, s. With a lower one, the kernel could end the daemon during its
-start, so the daemon then runs without real-time scheduling."""
+"""Smallest hard limit of RLIMIT_RTTIME with which the daemon uses real-time scheduling, s. With a
+lower limit, the kernel could end the daemon during its start."""
 
 WAKE_UP_LATENCY = "/dev/cpu_dma_latency"
 """Device file with which a process limits the time that a processor takes to wake up."""

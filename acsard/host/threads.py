@@ -25,9 +25,9 @@ async def in_thread(
 ) -> T:
     """Call `call` in a new thread, and return its result.
 
-    If the caller stops waiting before it has the result, the thread of `call` calls `late` with the
-    result, for example to close a file that `call` has opened. An error that `call` raises is
-    raised here too.
+    If the caller stops waiting before it has the result, the thread passes the result to `late`.
+    For example, `late` closes a file that `call` has opened. An error that `call` raises is raised
+    here too.
 
     Raises `TimeoutError` if `call` has not returned after `timeout` s; None means no time limit.
     Raises `NoThreadError` if no thread can be started.

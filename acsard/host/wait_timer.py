@@ -7,8 +7,8 @@ from acsard.core.values import NS_PER_S
 MAX_CALL_INTERVAL_NS = NS_PER_S // 4
 """Largest amount by which one call of `wait_ns` extends the measured time, ns.
 
-If more time passes between two calls, this process itself was stopped, so the disk is not the cause
-of the rest of that time.
+If more time passes between two calls, this process itself was stopped. The disk is not the cause of
+the rest of that time.
 """
 
 

@@ -45,8 +45,8 @@ class Replies:
     def __init__(self, prefix: str, errors: list[BaseException]) -> None:
         """Start without queries.
 
-        `prefix` is the beginning of the robot's keys. An exception that ends the thread of this
-        object is appended to `errors`.
+        `prefix` is the beginning of the robot's keys. `errors` gets an exception that ends the
+        thread of this object.
         """
         self._prefix, self._errors = prefix, errors
         self._queries: dict[int, tuple[zenoh.Query, str]] = {}

@@ -66,8 +66,7 @@ class Outlets:
     """The publishers of the daemon's session, and the thread that sends their messages."""
 
     def __init__(self, errors: list[BaseException]) -> None:
-        """Start without publishers. An exception that ends the sending thread is appended to
-        `errors`."""
+        """Start without publishers. `errors` gets an exception that ends the sending thread."""
         self._outlets: dict[str, list[_Outlet]] = {}
         """Maps the native key of each topic to its outlets."""
         self._listeners: list[object] = []

@@ -27,8 +27,7 @@ class RouterLinks:
     """
 
     def __init__(self, bus: BusConfig, errors: list[BaseException]) -> None:
-        """Prepare the polling thread. An exception that ends this thread is appended to
-        `errors`."""
+        """Prepare the polling thread. `errors` gets an exception that ends this thread."""
         self._bus = bus
         self._status: RoutersStatus | None = None
         self.changes = Mailbox[RoutersStatus](1, lambda: None)
