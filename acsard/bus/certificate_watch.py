@@ -46,7 +46,7 @@ class CertificateFiles:
     def renewed(self) -> bool:
         """Return whether the files have been replaced by new ones that can be used together.
 
-        Return True only once for each replacement. The files are checked at most every
+        Return True only once for each replacement. The files are checked at most once in
         `FILES_CHECK_PERIOD_NS`.
         """
         now_ns = clock.mono_ns()

@@ -37,7 +37,7 @@ jitter of a busy machine does not prolong the check."""
 OPEN_TIMEOUT_S = 4.0
 """Time within which the daemon must accept the zeros at the beginning of a drive, s. Otherwise the
 drive fails. If the source has a long timeout, the daemon checks the delay of a new sender for up to
-2 s. In the rest of the time, another sender can finish its drive."""
+2 s. The rest of the time is for another sender that must finish its drive first."""
 
 ZEROS = 3
 """Smallest number of zeros that a sender sends at the end of a drive. A hiccup of the network may

@@ -1,8 +1,8 @@
 """Finds out which role this client has at a robot, and which certificate the client uses.
 
-Zenoh does not tell the daemon over which link a query came. But each role has a key, and the access
-rules let a client query only the keys of its own role and of lower roles. So the client queries the
-keys of all roles, and its role is the highest one whose query is answered. The certificate's name
+Zenoh does not tell the daemon over which link a query came. Therefore, each role has a key, and the
+access rules let a client query only the keys of its own role and of lower roles. The client queries
+the keys of all roles. Its role is the highest one whose query is answered. The certificate's name
 comes from the client's own file.
 """
 

@@ -299,7 +299,7 @@ class Client:
         the key `state`. Without the field `latch`, this method reads the present number. If a
         person decided to make the call because of an earlier state, pass `latch=state.latch` of
         that state. The daemon then refuses the call if the robot was stopped or switched off again
-        in between.
+        after that state.
         """
         if service in ("clear", "activate") and "latch" not in fields:
             fields["latch"] = self.get("state").latch

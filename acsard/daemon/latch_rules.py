@@ -259,7 +259,7 @@ class Handover:
     def wait(self) -> None:
         """Block until the latches are stored, but at most `MAX_ANSWER_DELAY_NS`.
 
-        Call this method only after the last control step, because it would delay a step.
+        Call this method only after the last control step, because waiting would delay a step.
         """
         if self._keeper is not None:
             self._keeper.wait(self.latches, MAX_ANSWER_DELAY_NS / NS_PER_S)

@@ -38,8 +38,8 @@ MAX_READINGS = 12
 one is from before the lateness, unless the lateness was longer than 3 s."""
 
 SETTLE_S = 0.03
-"""Time from a late period to the next reading of the kernel's counters, s. The kernel updates some
-counters only at its next tick, and ticks are at most 10 ms apart."""
+"""Time from a late period to the next reading of the kernel's counters, s. The reading must wait,
+because the kernel updates some counters only at its next tick. Ticks are at most 10 ms apart."""
 
 PAUSE_NS = NS_PER_S
 """Shortest time between two reports of causes, ns. A shorter time is useless, because the log shows

@@ -58,7 +58,7 @@ class Alarm(_Timer):
     def set(self, at_ns: int | None) -> None:
         """Call `wake` once, at the monotonic time `at_ns`, ns.
 
-        A new time replaces the earlier one. With None, an earlier time is not cancelled.
+        A new time replaces the earlier one. None leaves an earlier time in force.
         """
         if at_ns is not None and at_ns != self._at_ns:
             self._timer.set(at_ns)

@@ -173,7 +173,7 @@ def fields(text: str) -> list[str]:
 
 
 def program(text: str, tick_ns: int) -> Program:
-    """Decode the text of `/proc/PID/stat`. A clock tick lasts `tick_ns` ns.
+    """Decode the text of `/proc/PID/stat`. `tick_ns` is the duration of a clock tick, ns.
 
     Raises `ValueError` or `IndexError` if the text has another form, for example because it is
     empty.

@@ -125,8 +125,8 @@ class Outlets:
     def losses(self, now_ns: int) -> tuple[int, bool]:
         """Return the number of dropped messages, and whether the bus has begun to block.
 
-        Both values cover the time since the last call, so a blocked bus is reported only once.
-        `now_ns` is the present monotonic time, ns.
+        Both values cover the time since the last call. The beginning of a block is therefore
+        returned only once. `now_ns` is the present monotonic time, ns.
         """
         dropped, self._dropped = self._dropped, 0
         began_ns, was_stuck = self._began_ns, self._stuck
