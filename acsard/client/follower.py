@@ -33,7 +33,7 @@ ROBOT_SILENCE_TIMEOUT_S = 1.0
 """If the last state is older than this, s, the robot counts as silent, and a drive ends."""
 
 FIRST_STATE_TIMEOUT_S = 2.0
-"""Time within which the first message on a key arrives if the robot works normally, s."""
+"""A robot that works normally sends its first message on a key within this time, s."""
 
 FLEET_QUERY_PERIOD_S = 2.0
 """If a program follows many robots, and one of them has sent no new state for this time, s, the

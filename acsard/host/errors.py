@@ -60,7 +60,7 @@ class UsageError(MendableError, ValueError):
 
 
 class UnreachableError(MendableError, ConnectionError):
-    """No process listens at this endpoint."""
+    """No daemon or router answers at the endpoint."""
 
     code = Exit.UNREACHABLE
 
@@ -95,7 +95,7 @@ class NoPortError(MendableError, FileNotFoundError):
 
 
 class NotPermittedError(MendableError, PermissionError):
-    """This process is not permitted to read or open the file or device."""
+    """This process may not open a file or device, or the client's role lacks a permission."""
 
     code = Exit.NO_PERMISSION
 
@@ -107,7 +107,7 @@ class RouterFileError(MendableError, ValueError):
 
 
 class CertificateError(MendableError, ValueError):
-    """The certificates that the configuration names cannot be used."""
+    """A TLS certificate is missing or cannot be used."""
 
     code = Exit.BAD_CONFIG
 

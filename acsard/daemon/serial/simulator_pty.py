@@ -56,7 +56,7 @@ class PtyEnd:
         return data
 
     def write(self, data: bytes) -> bool:
-        """Send data to the host. Drop what the pty's buffer cannot take, and then return False."""
+        """Send data to the host. If the pty's buffer is full, drop the rest and return False."""
         try:
             return os.write(self._master, data) == len(data)
         except BlockingIOError:
