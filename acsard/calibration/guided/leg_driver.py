@@ -82,9 +82,9 @@ class CommandedPath:
         self._kinematics = Kinematics(drive)
         self._stepped = self._rolled_until = now
         self._lengths = [0.0, 0.0]
-        """Length of the commanded path, m, and sum of the magnitudes of the commanded turns, rad."""
+        """Length of the commanded path, m, and sum of the commanded turns regardless of sign, rad."""
         self._commanded, self._rolled = (0.0, 0.0), (0.0, 0.0)
-        """Commanded and rolled distance, m, forward is positive, and turn, rad, left is positive."""
+        """Commanded and rolled distance, m (forward is +), and turn, rad (left is +)."""
         self._recent: deque[tuple[float, tuple[float, float]]] = deque([(now, self._commanded)])
         """The values of `_commanded` in the last `RESPONSE_TIMEOUT_S`, each with its time, s."""
 
