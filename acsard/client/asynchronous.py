@@ -15,8 +15,7 @@ from typing import Any, TypeVar
 from acsard.bus.address import address_by_environment
 from acsard.bus.subscription import encoded
 from acsard.bus.zenoh_sessions import client_session
-from acsard.client.commander import REPEAT_ZERO_S
-from acsard.client.driving import UnheardError, drive
+from acsard.client.driving import UnheardError, drive, repeat_zeros
 from acsard.client.identity import ClientIdentity
 from acsard.client.synchronous import REPLY_TIMEOUT_S, Client, close, decoder
 from acsard.core.messages import schema
@@ -104,11 +103,13 @@ class AsyncClient:
             with closing(drive(self._client, linear, angular, seconds)) as steps:
                 for pause in steps:
                     await asyncio.sleep(pause)
-        except (UnheardError, NoAnswerError) as error:
+        except UnheardError as error:
             raise await _in_thread(partial(self._client.explain_error, error)) from None
-        except BaseException:
-            await asyncio.sleep(REPEAT_ZERO_S)
-            self._client.zero_again()
+        except BaseException as error:
+            for pause in repeat_zeros(self._client):
+                await asyncio.sleep(pause)
+            if isinstance(error, NoAnswerError):
+                raise await _in_thread(partial(self._client.explain_error, error)) from None
             raise
 
     async def call(self, service: str, **fields: float) -> schema.ServiceReply:

@@ -25,10 +25,6 @@ MIN_SPACING_S = 0.003
 """Shortest pause between two commands on one connection, s. The daemon drops commands at rates
 above 1000 per second."""
 
-REPEAT_ZERO_S = 0.02
-"""Pause before a zero is sent a second time, s. The first zero may be lost: a busy daemon may
-receive several commands in a burst, and drops some because they seem to come too fast."""
-
 OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
 """Duration and period of the zeros that a client sends at the beginning of a drive, s. The daemon
 checks for 0.25 s whether the commands of a new sender are late. With many zeros in this time, the

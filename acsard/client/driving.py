@@ -26,16 +26,10 @@ from acsard.client.commander import (
     receives_commands,
     refuses_for_good,
 )
-from acsard.client.follower import MAX_STATE_AGE_S, Followed, Watch
+from acsard.client.final_zeros import MAX_END_S, STANDSTILL, FinalZeros
+from acsard.client.follower import MAX_STATE_AGE_S, SETTLED_S, Followed, Watch
 from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
-
-SETTLED_S = 0.2
-"""Longest time that a message on `state` takes to arrive, s. So a state that arrives more than
-`SETTLED_S` after an action shows the robot after the action."""
-
-STANDSTILL = 0.01, 0.02
-"""Linear speed, m/s, and turn rate, rad/s, below which the robot counts as standing still."""
 
 SLOWER, SLOWS_S = 0.97, 1.0
 """The test whether the robot slows down after a drive: every `SLOWS_S` s, its speed must fall below
@@ -105,6 +99,30 @@ def drive(
         with suppress(NoAnswerError):
             checks.send(0.0, 0.0)
         checks.watch.end()
+
+
+def repeat_zeros(robot: CommandClient) -> Generator[float, None, None]:
+    """Send zeros until the robot's `state` shows that the robot has stopped.
+
+    Call this when a drive ends early, and in place of the next speed. This generator yields the
+    time, s, for which the caller must wait before resuming the generator. It ends after `MAX_END_S`
+    at the latest, or when the connection is closed.
+    """
+    # If the connection is closed, sending raises one of these errors, and subscribing the other.
+    with suppress(zenoh.ZError, NoAnswerError):
+        robot.send(0.0, 0.0)
+        begun = now = clock.steady_s()
+        zeros, watch = FinalZeros(robot.source, robot.sender), Watch(robot, now)
+        zeros.drove(now)
+        try:
+            while zeros.wanted(now) and now - begun < MAX_END_S:
+                yield SEND_PERIOD_S
+                robot.send(0.0, 0.0)
+                now = clock.steady_s()
+                for state in watch.poll(now):
+                    zeros.received(state, now)
+        finally:
+            watch.end()
 
 
 def _require(**numbers: object) -> None:

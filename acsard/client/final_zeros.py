@@ -14,8 +14,16 @@ from __future__ import annotations
 import math
 
 from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, NEVER_DRIVING_MODES
-from acsard.client.driving import SETTLED_S, STANDSTILL
+from acsard.client.follower import SETTLED_S
 from acsard.core.messages.schema import RobotState
+
+STANDSTILL = 0.01, 0.02
+"""Linear speed, m/s, and turn rate, rad/s, below which the robot counts as standing still."""
+
+MAX_END_S = 2.0
+"""Longest time for which a program that ends repeats its zero, s. The robot usually shows within
+0.6 s that it has stopped. The rest of the time lets a hiccup of the network or a stall of the
+daemon end."""
 
 
 class FinalZeros:

@@ -26,6 +26,10 @@ QUERY_PERIOD_S = 0.3
 """Time without a new state after which the client queries `state`, s. Without queries, the client
 could not follow a robot that is configured to publish its state seldom."""
 
+SETTLED_S = 0.2
+"""Longest time that a message on `state` takes to arrive, s. So a state that arrives more than
+`SETTLED_S` after an action shows the robot after the action."""
+
 MAX_STATE_AGE_S = 0.5
 """A program must not base an action on a state that is older than this, s."""
 

@@ -7,7 +7,7 @@ import platform
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from functools import lru_cache
 from typing import Any
 
@@ -23,11 +23,11 @@ from acsard.bus.zenoh_sessions import client_session
 from acsard.client.commander import (
     MAX_SOURCE_TIMEOUT_S,
     MIN_SPACING_S,
-    REPEAT_ZERO_S,
+    SEND_PERIOD_S,
     CommandSigner,
     no_command,
 )
-from acsard.client.driving import UnheardError, drive
+from acsard.client.driving import UnheardError, drive, repeat_zeros
 from acsard.client.identity import ClientIdentity, identity
 from acsard.core.incoming.commands import require_size
 from acsard.core.incoming.imu import UNKNOWN_COVARIANCE
@@ -124,6 +124,8 @@ class _CommandSpacing:
         self.moving: dict[Client, float] = {}
         """The monotonic time of the last command, s, for each client whose last command was not
         zero."""
+        self.ending = False
+        """Whether the connection is being closed, so that only zeros may be sent."""
 
     @contextmanager
     def wait(self) -> Iterator[None]:
@@ -237,20 +239,18 @@ class Client:
     def end(self) -> None:
         """Close the connection. `connect` calls this at the end of its `with` block.
 
-        First send zeros to each robot that may still follow a client of this connection. Without a
-        zero, the robot would drive on until the source's timeout, which may be 10 s.
+        First stop each robot that may still follow a client of this connection (`repeat_zeros`).
+        Without a zero, the robot would drive on until the timeout of the source, which may be 10 s.
+        From this call on, other threads and tasks can send only zeros.
         """
-        begun_s = clock.steady_s()
+        begun_s, self._spacing.ending = clock.steady_s(), True
         # After the longest timeout, the robot no longer follows the client, so a zero would only
         # stop the next sender.
         known = list(self._spacing.moving.items())
-        moving = [client for client, at_s in known if begun_s - at_s < MAX_SOURCE_TIMEOUT_S]
+        ends = [repeat_zeros(client) for client, s in known if begun_s - s < MAX_SOURCE_TIMEOUT_S]
         try:
-            for pause_s in (REPEAT_ZERO_S, 0.0) if moving else ():
-                for client in moving:
-                    with suppress(zenoh.ZError):  # the program has closed the session itself
-                        client.send(0.0)
-                time.sleep(pause_s)
+            while ends := [zeros for zeros in ends if next(zeros, None) is not None]:
+                time.sleep(SEND_PERIOD_S)
         finally:
             close(self.session)
 
@@ -273,21 +273,14 @@ class Client:
             with closing(drive(self, linear, angular, seconds)) as steps:
                 for pause in steps:
                     time.sleep(pause)
-        except (UnheardError, NoAnswerError) as error:
+        except UnheardError as error:
             raise self.explain_error(error) from None
-        except BaseException:
-            time.sleep(REPEAT_ZERO_S)
-            self.zero_again()
+        except BaseException as error:
+            for pause in repeat_zeros(self):
+                time.sleep(pause)
+            if isinstance(error, NoAnswerError):
+                raise self.explain_error(error) from None
             raise
-
-    def zero_again(self) -> None:
-        """Send one more zero, because a busy daemon may have dropped the previous one.
-
-        If the connection is closed, do nothing, so that the caller can raise the error that ended
-        its drive.
-        """
-        with suppress(zenoh.ZError):
-            self.send(0.0)
 
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call a service, such as "stop", and return its reply.
@@ -437,6 +430,8 @@ class Client:
         )
 
     def _put(self, linear: float, angular: float, stamp_ns: int | None) -> None:
+        if self._spacing.ending and (linear or angular):
+            raise NoAnswerError("the connection to the daemon is being closed: connect again")
         steady = stamp_ns is None
         if stamp_ns is None:
             stamp_ns = clock.steady_ns() + self._wall_offset_ns

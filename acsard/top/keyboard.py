@@ -23,16 +23,15 @@ from acsard.client.commander import (
     GRACE_S,
     NEVER_DRIVING_MODES,
     RELEASE_TIMEOUT_NS,
-    SEND_PERIOD_S,
     ZEROS,
     Commander,
     Wish,
     must_release_key,
     objection,
 )
-from acsard.client.driving import SETTLED_S
+from acsard.client.driving import repeat_zeros
 from acsard.client.final_zeros import FinalZeros
-from acsard.client.follower import Watch, restarted
+from acsard.client.follower import SETTLED_S, Watch, restarted
 from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.host import clock
 from acsard.top.drive_screen import Teleop
@@ -61,10 +60,6 @@ operator may have released the key long ago.
 BURST_S = 0.2
 """Time after the arrival of delayed keys, s, in which all further keys count as delayed too,
 because one read from the terminal may not return all delayed keys."""
-
-MAX_END_S = 0.5
-"""Longest time for which a drive that ends waits for the robot to stop, s. The operator wants the
-program to end promptly."""
 
 RELEASE_REASON = (
     "the robot did not follow this program while you held the key, so the key is ignored: press "
@@ -236,14 +231,15 @@ class KeyboardDrive:
             before = state
 
     def end(self) -> None:
-        """Send zero commands until the robot has stopped, but for at most `MAX_END_S`."""
-        for _ in range(ZEROS):
-            self._robot.send(0.0, 0.0)
-        for _ in range(round(MAX_END_S / SEND_PERIOD_S)):
-            if not self._final_zeros.wanted(clock.steady_s()):
-                return
-            time.sleep(SEND_PERIOD_S)
-            self._robot.send(0.0, 0.0)
+        """Send zero commands until the robot has stopped, but for at most `MAX_END_S`.
+
+        The states that arrive meanwhile are processed, so that the last report shows the robot as
+        it is then.
+        """
+        if not self._final_zeros.wanted(clock.steady_s()):
+            return
+        for pause_s in repeat_zeros(self._robot):
+            time.sleep(pause_s)
             self.take()
 
     def screen_data(self) -> Teleop:

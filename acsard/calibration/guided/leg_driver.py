@@ -82,7 +82,7 @@ class CommandedPath:
         self._kinematics = Kinematics(drive)
         self._stepped = self._rolled_until = now
         self._lengths = [0.0, 0.0]
-        """Length of the commanded path, m, and sum of the commanded turns regardless of sign, rad."""
+        """Length of the commanded path, m, and sum of the sizes of the commanded turns, rad."""
         self._commanded, self._rolled = (0.0, 0.0), (0.0, 0.0)
         """Commanded and rolled distance, m (forward is +), and turn, rad (left is +)."""
         self._recent: deque[tuple[float, tuple[float, float]]] = deque([(now, self._commanded)])

@@ -21,7 +21,8 @@ from acsard.calibration.guided.drive_plan import DisturbedError, GuideError, Leg
 from acsard.calibration.guided.leg_driver import LegDriver
 from acsard.calibration.log_table import APPLIED, FOUR, Floats, Table
 from acsard.calibration.runs import NEW_RUN_AFTER_S, Log, Run, on_arrival_clock, runs
-from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S, ZEROS
+from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S
+from acsard.client.driving import repeat_zeros
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S, Watch
 from acsard.client.synchronous import Client, decoder_of
 from acsard.core.config.settings import Config
@@ -253,8 +254,8 @@ class RobotOnBus:
         try:
             self._drive(driver, recorder)
         finally:
-            for _ in range(ZEROS):
-                self._client.send(0.0, 0.0)
+            for pause_s in repeat_zeros(self._client):
+                time.sleep(pause_s)
         if driver.halted and self._watch.unreadable:
             raise GuideError(
                 "the messages with the daemon's state cannot be read: if the daemon has another "

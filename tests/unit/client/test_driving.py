@@ -14,8 +14,9 @@ import zenoh
 from msgspec.structs import replace
 
 from acsard.client.commander import GRACE_S, OPEN_TIMEOUT_S, objection
-from acsard.client.driving import SETTLED_S, UnheardError, drive
-from acsard.client.follower import FIRST_STATE_TIMEOUT_S, ROBOT_SILENCE_TIMEOUT_S
+from acsard.client.driving import UnheardError, drive, repeat_zeros
+from acsard.client.final_zeros import MAX_END_S
+from acsard.client.follower import FIRST_STATE_TIMEOUT_S, ROBOT_SILENCE_TIMEOUT_S, SETTLED_S
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
@@ -469,3 +470,43 @@ def test_the_error_has_the_reason_that_the_daemon_reports(state: RobotState, wor
         else (words in text)
     )
     assert bool(text) == bool(words)
+
+
+# the zeros at the end of a drive that was interrupted
+
+
+def zeros_of(world: World, monkeypatch: pytest.MonkeyPatch) -> float:
+    """Send the zeros of an interrupted drive, and return how long it took, s."""
+    world.set_clock(monkeypatch)
+    robot: Any = world
+    for pause in repeat_zeros(robot):
+        world.now += pause
+    return world.now - 100.0
+
+
+def test_zeros_are_repeated_until_the_state_shows_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(lambda t, last, sent: replace(FOLLOWED, linear=0.3 if t < 1.0 else 0.0))
+    assert 1.0 < zeros_of(world, monkeypatch) < 1.5
+    assert set(world.sent) == {0.0}
+    assert len(world.sent) > 20
+    assert not world.subscribed
+
+
+def test_zeros_end_early_for_a_robot_that_cannot_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(lambda t, last, sent: replace(STOPPED, linear=0.3))
+    assert zeros_of(world, monkeypatch) < 0.5
+
+
+def test_zeros_to_a_silent_daemon_end_after_two_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(lambda t, last, sent: None)
+    assert zeros_of(world, monkeypatch) == pytest.approx(MAX_END_S, abs=0.06)
+
+
+def test_a_closed_connection_gets_no_zeros(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(followed)
+
+    def closed(linear: float, angular: float = 0.0) -> None:
+        raise zenoh.ZError("closed")
+
+    monkeypatch.setattr(world, "send", closed)
+    assert zeros_of(world, monkeypatch) == 0.0

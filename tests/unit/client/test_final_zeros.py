@@ -5,8 +5,8 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from acsard.client.commander import MAX_SOURCE_TIMEOUT_S
-from acsard.client.driving import SETTLED_S
 from acsard.client.final_zeros import FinalZeros
+from acsard.client.follower import SETTLED_S
 from acsard.core.messages.schema import RobotState, SourceState
 from tests.each import each
 from tests.unit.top.screens import STATE

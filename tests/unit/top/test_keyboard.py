@@ -14,13 +14,13 @@ from msgspec.structs import replace
 
 from acsard.bus.address import Address
 from acsard.client.commander import GRACE_S, MAX_SOURCE_TIMEOUT_S, RELEASE_TIMEOUT_NS, ZEROS
+from acsard.client.final_zeros import MAX_END_S
 from acsard.client.follower import ROBOT_SILENCE_TIMEOUT_S
 from acsard.core.messages.schema import RobotState, SourceState
 from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.host import clock
 from acsard.top.keyboard import (
     KEY_HOLD_S,
-    MAX_END_S,
     RELEASE_REASON,
     REPEAT_S,
     Keyboard,
@@ -192,7 +192,9 @@ class Robot:
         self.sent: list[float] = []
 
     def subscribe(self, name: str) -> Any:
-        return SimpleNamespace(try_recv=lambda: self.said.popleft() if self.said else None)
+        return SimpleNamespace(
+            try_recv=lambda: self.said.popleft() if self.said else None, undeclare=lambda: None
+        )
 
     def start_query(self, name: str, take: Any) -> None:
         """Do nothing: the query of the follower gets no answer."""
@@ -254,7 +256,7 @@ def test_a_zero_is_repeated_until_the_state_shows_that_the_robot_rests(
     drive.step(times=100)
     assert len(robot.sent) == sent
     drive.ride.end()
-    assert robot.sent[sent:] == [0.0] * ZEROS
+    assert len(robot.sent) == sent
 
 
 def test_a_zero_is_not_repeated_for_longer_than_the_longest_timeout(
@@ -282,16 +284,22 @@ def test_a_key_drives_while_the_zero_is_repeated(monkeypatch: pytest.MonkeyPatch
     assert robot.sent[-3:] == [0.0, -0.5, -0.5]
 
 
-def test_a_drive_that_ends_waits_for_half_a_second_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_that_ends_repeats_its_zero_for_two_seconds_at_most(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     robot = Robot()
     drive = Drive(robot, monkeypatch)
-    waits: list[float] = []
-    monkeypatch.setattr(time, "sleep", waits.append)
+
+    def wait(seconds: float) -> None:
+        drive.now += seconds
+
+    monkeypatch.setattr(time, "sleep", wait)
     drive.step("i", times=2)
-    sent = len(robot.sent)
+    sent, begun = len(robot.sent), drive.now
     drive.ride.end()
-    assert sum(waits) == pytest.approx(MAX_END_S)
-    assert robot.sent[sent:] == [0.0] * (ZEROS + len(waits))
+    assert drive.now - begun == pytest.approx(MAX_END_S, abs=0.06)
+    assert robot.sent[sent:] == [0.0] * len(robot.sent[sent:])
+    assert len(robot.sent[sent:]) == pytest.approx(41, abs=1)
 
 
 @each("key", ["i", UP])
