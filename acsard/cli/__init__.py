@@ -64,6 +64,12 @@ VERBS = {
 The name of a subcommand is also the name of its module in this package.
 """
 
+MUST_FINISH = {
+    "call", "set", "bench", "doctor", "mcu", "accuracy", "calibrate", "tls", "service",
+}  # fmt: skip
+"""Subcommands that act or judge. If the reader of their output ends early, they have failed. The
+other subcommands only print."""
+
 MAX_ARGUMENT_LENGTH = 4096
 """Largest length of an argument, characters. Zenoh fails on keys above 65,535 bytes."""
 
@@ -150,7 +156,7 @@ def main(argv: list[str] | None = None) -> int:
     if trouble:
         print(f"acsard: {trouble}", file=sys.stderr)
         return int(Exit.USAGE)
-    code = int(Exit.OK)
+    code = int(Exit.FAILURE if words[0] in MUST_FINISH else Exit.OK)
     try:
         try:
             args = parser(words[:1]).parse_args(words)

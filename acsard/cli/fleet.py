@@ -19,6 +19,7 @@ from acsard.bus.robot_discovery import ALL_ROBOTS
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
 from acsard.core.formatting import json_line
 from acsard.host.errors import Exit, UnreachableError
+from acsard.host.logs import output_in_threads
 from acsard.terminal.output import has_screen
 from acsard.top import terminal
 from acsard.top.fleet_table import Roster, table
@@ -40,7 +41,8 @@ def main(args: argparse.Namespace) -> int:
         ids = (many or (robot.where.robot_id,)) if args.id else (ALL_ROBOTS,)
         fleet = Roster(robot, ids)
         if not (args.once or args.json) and has_screen():
-            terminal.roster(fleet)
+            with output_in_threads():
+                terminal.roster(fleet)
             return int(Exit.OK)
         rows = fleet.gather()
         if not rows:

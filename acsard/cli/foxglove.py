@@ -13,6 +13,7 @@ import sys
 
 from acsard.cli.connection import add_bus, connected
 from acsard.core.formatting import lines
+from acsard.host.child import end_signals
 from acsard.host.errors import Exit, UsageError
 from acsard.host.extras import missing
 
@@ -44,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
     address = loopback(args.address)
     with connected(args) as robot:
         bridge = Bridge(robot, address, _print_message, acts=args.drive)
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        for number in end_signals():
             signal.signal(number, lambda *_: bridge.end())
         try:
             may = "; Foxglove can show and stop the robot. To drive it from Foxglove, add --drive"

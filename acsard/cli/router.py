@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import os
-import signal
 import sys
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from acsard.core.config.settings import LogConfig
 from acsard.daemon.gateway.fleet_router import Router
 from acsard.daemon.gateway.listener_process import ListenerProcess
 from acsard.daemon.supervisor import ROUTER, keep_running
+from acsard.host.child import end_signals
 from acsard.host.logs import Log
 from acsard.host.systemd import Systemd
 
@@ -48,7 +48,7 @@ async def _keep_router(file: str, log: Log) -> int:
     If the router cannot use its configuration or its certificates, return its exit code.
     """
     keeper = asyncio.ensure_future(keep_running(["router", file], log.event, ROUTER))
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+    for number in end_signals():
         asyncio.get_running_loop().add_signal_handler(number, keeper.cancel)
     try:
         return await keeper

@@ -37,6 +37,7 @@ from acsard.daemon.settings_file import SettingsFile
 from acsard.daemon.supervisor import GATEWAY, PAGE, keep_running
 from acsard.daemon.wakeup import Next, Ticker, Wakeup
 from acsard.host import clock, real_time
+from acsard.host.child import end_signals
 from acsard.host.logs import Log
 from acsard.host.systemd import START_EXTENSION_S, Systemd
 from acsard.host.version import version
@@ -61,9 +62,9 @@ class Departure:
         self.hurried = False
 
     def __enter__(self) -> Self:
-        """Handle SIGTERM, SIGINT, SIGQUIT and SIGHUP. A terminal that is closed sends SIGHUP."""
+        """Begin to handle the signals that end the daemon."""
         loop = asyncio.get_running_loop()
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
+        for number in end_signals():
             loop.add_signal_handler(number, self._signal, number)
         return self
 

@@ -278,6 +278,17 @@ class Parent:
             return True  # the parent ended before it had read all signs of life
 
 
+def end_signals() -> tuple[signal.Signals, ...]:
+    """Return the signals that end a program that runs for a long time.
+
+    SIGHUP, which a closed terminal sends, is left out if it is ignored: `nohup` has started this
+    program so that it runs on.
+    """
+    signals = (signal.SIGTERM, signal.SIGINT, signal.SIGQUIT)
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return signals if ignored else (*signals, signal.SIGHUP)
+
+
 def end_with_parent(number: signal.Signals) -> None:
     """Let the kernel send the signal `number` to this process when its parent ends.
 

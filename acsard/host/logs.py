@@ -128,6 +128,18 @@ class Writer:
     def flush(self) -> None:
         """Do nothing: the thread flushes each line."""
 
+    def isatty(self) -> bool:
+        return self._stream.isatty()
+
+    @property
+    def encoding(self) -> str:
+        return self._stream.encoding
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether everything is written. It stays False while the reader of the stream stalls."""
+        return not self._lines.unfinished_tasks
+
     def close(self, timeout: float) -> None:
         """Wait for at most `timeout` s until the queued lines are written.
 
@@ -146,6 +158,7 @@ class Writer:
             except (OSError, ValueError):
                 # On a full disk or a closed stream the log loses lines, and control goes on.
                 pass
+            self._lines.task_done()
 
 
 def write_through(stream: TextIO, text: str) -> None:

@@ -36,6 +36,7 @@ def single_key_mode() -> Iterator[None]:
     try:
         yield
     finally:
-        # The terminal may have been closed.
+        # Do not wait for the output (TCSADRAIN), because a terminal may not read any more. It may
+        # also have been closed.
         with suppress(OSError, termios.error):
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+            termios.tcsetattr(sys.stdin, termios.TCSANOW, before)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import os
+import select
 import sys
 from collections.abc import Collection, Iterable, Sequence
 from typing import TextIO
@@ -51,6 +52,14 @@ def table(
 def has_screen() -> bool:
     """Return whether standard output is a terminal that can show a full screen."""
     return sys.stdout.isatty() and os.environ.get("TERM", "") not in ("", "dumb", "unknown")
+
+
+def has_room(stream: TextIO) -> bool:
+    """Return whether a short text can be written to a stream now, without a wait for its reader."""
+    try:
+        return bool(select.select([], [stream], [], 0.0)[1])
+    except (OSError, ValueError):
+        return False  # the stream is closed
 
 
 def show(*parts: RenderableType, most: int = UNLIMITED_WIDTH) -> None:

@@ -6,7 +6,6 @@ together.
 
 from __future__ import annotations
 
-import select
 import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,6 +17,7 @@ from msgspec import Struct
 
 from acsard.checkup.findings import Finding
 from acsard.core.values import AcsardError
+from acsard.terminal.output import has_room
 
 
 class NobodyError(AcsardError):
@@ -133,7 +133,7 @@ def ended_by_signals(notice: str = "", *, exits: bool = False) -> Iterator[None]
         # If the program that started this one is gone or does not read, printing would fail or
         # block. The zero speeds must not wait for that.
         with suppress(OSError, ValueError):
-            if notice and select.select([], [sys.stderr], [], 0.0)[1]:
+            if notice and has_room(sys.stderr):
                 print(f"\n{notice}", file=sys.stderr)
         if exits and number != signal.SIGINT:
             raise SystemExit(128 + number)

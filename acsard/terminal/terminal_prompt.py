@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from acsard.checkup.findings import Finding
-from acsard.terminal.output import MAX_TEXT_WIDTH, show, table
+from acsard.terminal.output import MAX_TEXT_WIDTH, has_room, show, table
 from acsard.terminal.prompt import NobodyError, NumberQuestion
 
 T = TypeVar("T")
@@ -59,7 +59,7 @@ class Screen:
         self._print(f"\n{_wrapped(text)}\n")
 
     def doing(self, text: str) -> None:
-        if self._on:
+        if self._on and has_room(sys.stderr):
             # Cut the line and never wrap it, because a wrapped line cannot be overwritten.
             self._print(f"\r\033[K{f'   ... {text}'[: _columns() - 1]}")
             self._visible = True
@@ -170,7 +170,9 @@ class TerminalPrompt(Screen):
         return _read() if select.select([sys.stdin], [], [], wait_s)[0] else ""
 
     def progress(self, share: float) -> None:
-        if sys.stderr.isatty():
+        # A terminal that does not read, for example over a connection that hangs, must not keep a
+        # key from stopping the robot.
+        if sys.stderr.isatty() and has_room(sys.stderr):
             done = round(BAR_WIDTH * share)
             bar = "#" * done + "." * (BAR_WIDTH - done)
             self._print(f"\r[{bar}] any key stops {'' if share < 1.0 else chr(10)}")

@@ -2,6 +2,9 @@
 
 A signal or the end of the input ends each screen. The key `q` also ends the screens of `top` and
 `fleet`. If the terminal cannot show a screen, `acsard drive` prints reports instead.
+
+These commands run within `output_in_threads`. A terminal that does not read, for example over a
+connection that hangs, delays neither the keys nor the zero commands at the end of a drive.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from rich.text import Text
 from acsard.core.messages.state_warnings import WARNING
 from acsard.core.values import AcsardError
 from acsard.host import clock
+from acsard.host.logs import CLOSE_TIMEOUT_S, Writer
 from acsard.host.terminal_modes import single_key_mode
 from acsard.terminal.output import has_screen, plain
 from acsard.top.drive_screen import (
@@ -136,11 +140,17 @@ def roster(fleet: Roster) -> None:
 def _watch(draw: Callable[[], RenderableType], console: Console, suspend: list[bool]) -> bool:
     with keys() as read, _screen(console) as display:
         while not suspend:
-            display.update(draw(), refresh=True)
+            if _terminal_reads():
+                display.update(draw(), refresh=True)
             typed = read(DRAW_PERIOD_S)
             if typed is None or "q" in typed.lower():
                 return False
     return True
+
+
+def _terminal_reads() -> bool:
+    """Return whether the terminal has accepted all earlier output."""
+    return not isinstance(sys.stdout, Writer) or sys.stdout.is_idle
 
 
 def _screen(console: Console) -> Live:
@@ -166,6 +176,9 @@ def _run_suspendable(shows: Callable[[list[bool]], bool]) -> None:
     with until_signal():
         while shows(suspend):
             suspend.clear()
+            end = time.monotonic() + CLOSE_TIMEOUT_S
+            while not _terminal_reads() and time.monotonic() < end:
+                time.sleep(0.01)
             os.kill(os.getpid(), signal.SIGSTOP)  # suspend as ^Z does; fg resumes here
 
 
@@ -181,7 +194,7 @@ def _steer(ride: KeyboardDrive, console: Console, suspend: list[bool]) -> bool:
             if typed is None:
                 return False
             ride.step(typed)
-            if typed or time.monotonic() >= due:
+            if (typed or time.monotonic() >= due) and _terminal_reads():
                 due = time.monotonic() + DRAW_PERIOD_S
                 display.update(Group(*lines(ride.screen_data(), *console.size)), refresh=True)
     for letter in ("k", "", ""):
@@ -260,7 +273,7 @@ def _drive_in_lines(ride: KeyboardDrive) -> None:
         while (typed := read(KEY_POLL_S)) is not None:
             ride.step(typed)
             teleop = ride.screen_data()
-            if due.should_print(teleop, time.monotonic()):
+            if _terminal_reads() and due.should_print(teleop, time.monotonic()):
                 width, height = output_size()
                 print("\n".join(page.with_help(report_lines(teleop, width), height)), flush=True)
 

@@ -23,7 +23,7 @@ from acsard.bus.zenoh_sessions import client_session
 from acsard.client import Client
 from acsard.core.config.settings import Config
 from acsard.core.values import Event
-from acsard.host.child import HEARTBEAT_S, Parent, end_with_parent
+from acsard.host.child import HEARTBEAT_S, Parent, end_signals, end_with_parent
 from acsard.host.logs import Log
 from acsard.host.threads import NoThreadError, in_thread
 from acsard.web.acceptor import READ_BYTES, Acceptor, Reader
@@ -77,7 +77,7 @@ async def serve(
     # While another thread holds the interpreter lock, a command or a stop waits for 0.5 ms at most.
     sys.setswitchinterval(0.0005)
     leaving = asyncio.Event()
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+    for number in end_signals():
         asyncio.get_running_loop().add_signal_handler(number, leaving.set)
     if options.supervised:
         end_with_parent(signal.SIGTERM)

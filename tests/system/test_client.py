@@ -578,7 +578,7 @@ async def test_an_async_drive_does_not_go_on_after_its_event_loop_was_blocked(
 async def test_a_zero_sent_right_after_a_command_is_not_lost(shared: Daemon, fresh: Bus) -> None:
     # A drive may be cancelled just after it sent a command. The bus drops commands of one key that
     # come faster than 1000 Hz, also because the receiver was busy and handles them in a row. Then
-    # the robot would drive on for its timeout, so the zero goes out a second time.
+    # the robot would drive on for its timeout, so the zero is repeated.
     sent: list[float] = []
     original = Client._put
 
@@ -597,7 +597,8 @@ async def test_a_zero_sent_right_after_a_command_is_not_lost(shared: Daemon, fre
             driving.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await driving
-            assert sent[-3:] == [0.2, 0.0, 0.0]
+            zeros = sent[::-1].index(0.2)
+            assert zeros >= 2
             await robot.get("info")
         fresh.get("info")  # after everything that was sent: the command itself may be dropped
         until(lambda: commands.seen[-1].value["twist"]["linear"]["x"] == 0.0, 1.0, "a last zero")

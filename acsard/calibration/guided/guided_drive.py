@@ -8,13 +8,15 @@ import msgspec
 from msgspec import Struct
 
 from acsard.bus.zenoh_sessions import client_session
-from acsard.calibration.guided.drive_plan import GuideError, setup
+from acsard.calibration.guided.drive_plan import GuideError, Leg, setup
 from acsard.calibration.guided.robot_on_bus import RobotOnBus
 from acsard.calibration.guided.runner import guide
+from acsard.calibration.runs import Run
 from acsard.calibration.solve import Calibration
 from acsard.client.synchronous import Client
 from acsard.core.config.settings import Config
 from acsard.core.messages.keys_and_roles import IMU, full_key
+from acsard.core.messages.schema import Info
 from acsard.host.errors import UsageError
 from acsard.terminal.prompt import Prompt
 
@@ -67,8 +69,9 @@ def guided_drive(
             "--yes is only for the built-in simulator: this robot is real, and a person "
             "must stand near it and start each leg. Leave --yes out"
         )
+    settings = client.get("config")
     try:
-        config = msgspec.convert(client.get("config"), Config)
+        config = msgspec.convert(settings, Config)
     except msgspec.ValidationError as error:
         raise GuideError(
             f"this version of acsard cannot read the daemon's configuration ({error}): use the "
@@ -90,13 +93,39 @@ def guided_drive(
                 elsewhere = client_session(options.positions_at, client.where.tls)
                 stack.callback(elsewhere.close)
             robot.positions(options.positions or "", elsewhere)
+
+        def ride(leg: Leg) -> Run:
+            require_same_robot(client, info, settings)
+            return robot.ride(leg)
+
         try:
             calibration = guide(
-                method, plan, asker, robot.ride, simulated=info.simulated, true_positions=true
+                method, plan, asker, ride, simulated=info.simulated, true_positions=true
             )
         except KeyboardInterrupt:
             raise GuideError("the operator ended the drive. No file was written") from None
         return calibration, config
+
+
+def require_same_robot(client: Client, info: Info, settings: object) -> None:
+    """Raise `GuideError` if another robot or other settings answer than before the first leg.
+
+    `info` and `settings` are the first answers on the keys `info` and `config`. A daemon that was
+    restarted meanwhile may drive a real robot instead of the simulator.
+    """
+    now = client.get("info")
+    # The simulator's port is a pty, whose name changes at each start.
+    was, port = (("the simulator" if x.simulated else x.port) for x in (info, now))
+    if port != was:
+        raise GuideError(
+            f"the daemon was restarted and now drives {port} instead of {was}: begin the "
+            "calibration again"
+        )
+    if client.get("config") != settings:
+        raise GuideError(
+            "the daemon's settings were changed during the calibration: begin it again, and change "
+            "no settings until it is finished"
+        )
 
 
 def choose_method(options: DriveOptions, config: Config) -> str:

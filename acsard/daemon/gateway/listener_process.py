@@ -24,7 +24,7 @@ from msgspec import Struct
 from acsard.bus.certificate_watch import CertificateFiles
 from acsard.core.values import NS_PER_S, Event, EventName
 from acsard.host import clock
-from acsard.host.child import Parent, Silence, end_with_parent
+from acsard.host.child import Parent, Silence, end_signals, end_with_parent
 from acsard.host.errors import Exit
 from acsard.host.logs import Log
 from acsard.host.rate_limits import Bucket, Rate
@@ -234,7 +234,7 @@ class ListenerProcess:
         The code is OK after a signal or the end of the parent, and FAILURE if a restart is needed.
         If the observing thread fails, raise its exception.
         """
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        for number in end_signals():
             signal.signal(number, self._leave)
         if self._parent is not None:
             end_with_parent(signal.SIGKILL)

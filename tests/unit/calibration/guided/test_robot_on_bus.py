@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -145,7 +146,7 @@ def test_a_leg_without_wheel_speeds_for_a_minute_is_disturbed() -> None:
 class Laptop(NoPrompt):
     """A computer that drives a robot. The computer is suspended 2 s after a leg has begun."""
 
-    sender, session, unreadable = US, None, 0
+    source, sender, session, unreadable = "app", US, None, 0
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         super().__init__()
@@ -155,6 +156,7 @@ class Laptop(NoPrompt):
         monkeypatch.setattr(clock, "mono_ns", lambda: round((self.now - self.asleep) * NS_PER_S))
         monkeypatch.setattr(clock, "asleep_ns", lambda: round(self.asleep * NS_PER_S))
         monkeypatch.setattr(robot_on_bus, "queue_on", lambda *_, **__: self)
+        monkeypatch.setattr(robot_on_bus, "time", SimpleNamespace(sleep=self.keys))
 
     def keys(self, wait_s: float) -> str:
         """Let the time `wait_s` pass. The simulated person presses no key."""
@@ -182,6 +184,9 @@ class States:
 
     def __init__(self, laptop: Laptop) -> None:
         self._laptop = laptop
+
+    def undeclare(self) -> None:
+        """Do nothing."""
 
     def try_recv(self) -> Any:
         laptop = self._laptop
