@@ -169,6 +169,31 @@ def expiry_times(directory: str) -> dict[str, int]:
     return {whose: _ends_ns(certificate) for whose, certificate in certificates.items()}
 
 
+def is_signed(directory: str) -> bool:
+    """Return whether an authority in `ca.pem` has signed `certificate.pem` or its chain.
+
+    Return True, too, if a file cannot be read, or if the library `cryptography` is missing.
+    """
+    try:
+        from cryptography import x509
+        from cryptography.exceptions import InvalidSignature
+    except ImportError:
+        return True
+    try:
+        authorities, chain = (
+            x509.load_pem_x509_certificates(Path(directory, name).read_bytes())
+            for name in (CA, CERTIFICATE)
+        )
+    except (OSError, ValueError, x509.InvalidVersion):
+        return True
+    for certificate in chain:
+        for authority in authorities:
+            with suppress(ValueError, TypeError, InvalidSignature):
+                certificate.verify_directly_issued_by(authority)
+                return True
+    return False
+
+
 def peer_ends_ns(endpoint: str, directory: str) -> int | None:
     """Return the expiry time of the certificate that a TLS endpoint uses, ns since 1970.
 

@@ -17,7 +17,7 @@ from acsard.bus.subscription import encoded
 from acsard.bus.zenoh_sessions import client_session
 from acsard.client.driving import UnheardError, drive, repeat_zeros
 from acsard.client.identity import ClientIdentity
-from acsard.client.synchronous import REPLY_TIMEOUT_S, Client, close, decoder
+from acsard.client.synchronous import REPLY_TIMEOUT_S, Client, close, decoder, end_at_exit
 from acsard.core.messages import schema
 from acsard.core.values import AcsardError, Plain, Pose
 from acsard.host.errors import NoAnswerError
@@ -49,6 +49,7 @@ async def connect_async(
     where = await _in_thread(lambda: address_by_environment(endpoint, robot_id, tls), 5.0)
     session = await _in_thread(lambda: client_session(where.endpoint, where.tls), 10.0, late=close)
     robot = Client(session, where.robot_id, source, where.tls, where.endpoint)
+    end_at_exit(robot)
     try:
         yield AsyncClient(robot)
     except BaseException:

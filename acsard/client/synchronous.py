@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import platform
 import threading
@@ -97,10 +98,35 @@ def connect(
     where = address_by_environment(endpoint, robot_id, tls)
     session = client_session(where.endpoint, where.tls)
     robot = Client(session, where.robot_id, source, where.tls, where.endpoint)
+    end_at_exit(robot)
     try:
         yield robot
     finally:
         robot.end()
+
+
+_open: dict[Client, int] = {}
+"""The clients whose connection is open, each with the id of the process that opened it."""
+
+
+def end_at_exit(client: Client) -> None:
+    """End a connection when the program ends, unless `Client.end` was called before.
+
+    If Python ended with an open connection, a thread of Zenoh or a thread that waits for messages
+    could block it or abort it.
+    """
+    _open[client] = os.getpid()
+
+
+def _end_all() -> None:
+    # The threads of a connection do not exist in a forked child.
+    for client in [client for client, pid in _open.items() if pid == os.getpid()]:
+        client.end()
+
+
+# Python waits for all threads before it calls the functions of `atexit`, and the threads of an open
+# subscription do not end. The functions of `threading._register_atexit` are called before the wait.
+getattr(threading, "_register_atexit", atexit.register)(_end_all)
 
 
 def close(session: zenoh.Session) -> None:
@@ -243,6 +269,7 @@ class Client:
         Without a zero, the robot would drive on until the timeout of the source, which may be 10 s.
         From this call on, other threads and tasks can send only zeros.
         """
+        _open.pop(self, None)
         begun_s, self._spacing.ending = clock.steady_s(), True
         # After the longest timeout, the robot no longer follows the client, so a zero would only
         # stop the next sender.

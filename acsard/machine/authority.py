@@ -93,7 +93,10 @@ class Authority:
             key = serialization.load_pem_private_key(data, password().encode())
         if not isinstance(key, ec.EllipticCurvePrivateKey):
             raise ValueError(f"{CA_KEY} is not a P-256 key")
-        return cls(x509.load_pem_x509_certificate((directory / CA).read_bytes()), key)
+        certificate = x509.load_pem_x509_certificate((directory / CA).read_bytes())
+        if certificate.public_key() != key.public_key():
+            raise ValueError(f"{CA_KEY} is the key of another authority than {CA}")
+        return cls(certificate, key)
 
     def permits(self, address: str) -> bool:
         """Return whether this authority may sign a certificate for a host name or IP address.

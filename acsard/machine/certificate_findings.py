@@ -19,6 +19,7 @@ from acsard.bus.tls import (
     expiry_times,
     files_in,
     host_of,
+    is_signed,
     require_usable,
 )
 from acsard.bus.zenoh_sessions import certificate_trouble
@@ -41,9 +42,11 @@ def certificates(tls: str) -> Iterator[Finding]:
     directory = Path(tls)
     for name in (CA, CERTIFICATE, KEY):
         file = directory / name
-        if not os.access(file, os.R_OK):
-            text = f"{file} is missing, or you have no permission to read it"
+        if not (os.path.isfile(file) and os.access(file, os.R_OK)):
+            text = f"{file} is missing or is not a file, or you have no permission to read it"
             yield Finding("certificates", "failure", text, _mend_of_absent(directory))
+            if os.path.exists(file) and not os.path.isfile(file):
+                return  # reading it might never end
         elif name == KEY and file.stat().st_mode & 0o077:
             text, mend = (
                 f"users other than the owner can read the private key {file}",
@@ -58,6 +61,13 @@ def certificates(tls: str) -> Iterator[Finding]:
     if why := certificate_trouble(*files_in(tls)):
         text = f"Zenoh refuses {directory / CERTIFICATE} with the key {directory / KEY} ({why})"
         yield Finding("certificates", "failure", text, renewal(tls, ""))
+        return
+    if not is_signed(tls):
+        text = (
+            f"{directory / CA} has not signed {directory / CERTIFICATE}: clients that trust only "
+            "this authority refuse this machine"
+        )
+        yield Finding("certificates", "warning", text, renewal(tls, ""))
         return
     expiries = expiry_times(tls)
     level, words = expiry(expiries, now().wall_ns)

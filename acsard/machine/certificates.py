@@ -16,7 +16,7 @@ from getpass import getpass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.bus.tls import CA, CERTIFICATE
+from acsard.bus.tls import CA, CERTIFICATE, KEY
 from acsard.core.config.settings import Config
 from acsard.core.values import ROLES
 from acsard.host.errors import MendableError, NotPermittedError, UsageError
@@ -53,17 +53,22 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
             this machine.
         days: validity of the robot's and the clients' certificates, days. The authority's
             certificate is valid for five times as long.
-        force: whether to replace an authority that `directory` already contains. If it is false,
-            raise `MendableError` for such a directory.
+        force: whether to replace an authority, a key or a certificate that `directory` already
+            contains. If it is false, raise `MendableError` for such a directory.
     """
-    if (directory / CA).exists() and not force:
-        raise MendableError(
-            f"{directory / CA} exists: to make one more client certificate with this authority, "
-            "use `acsard tls add`; --force makes a new authority, and then the daemon refuses all "
-            "certificates of the old authority",
-        )
+    for name in () if force else (CA, CA_KEY, CERTIFICATE, KEY):
+        if (directory / name).exists():
+            raise MendableError(
+                f"{directory / name} exists: to make one more client certificate with an "
+                "authority, use `acsard tls add`; --force makes a new authority, and then the "
+                "daemon refuses all certificates of the old authority",
+            )
     maker = _maker()
     _writable(directory)
+    try:
+        directory.mkdir(mode=0o755, parents=True, exist_ok=True)
+    except OSError as error:
+        raise MendableError(f"cannot make {directory}: {error.strerror}") from None
     names = _robot_names(addresses)
     authority = maker.make(directory, f"acsard at {socket.gethostname()}", days, names)
     authority.issue(directory, ROBOT_NAME, names, days)

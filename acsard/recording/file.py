@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -407,7 +408,14 @@ class Recording:
         self.paths = [path]
         """Paths of the files of the recording, in order. Only a `Series` has more than one file."""
         try:
+            if not stat.S_ISREG(path.stat().st_mode):
+                raise OSError(errno.EINVAL, "it is not a file")
             self._data = path.read_bytes()
+        except MemoryError:
+            raise RecordingError(
+                f"cannot read {path}: it is larger than the free memory; copy it to a computer "
+                "with more memory"
+            ) from None
         except OSError as error:
             raise RecordingError(
                 f"cannot read {path}: {error.strerror}; `acsard recording` lists the recordings"

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import pty
 import signal
+import struct
+import subprocess
+import termios
 import time
 import tomllib
 from collections.abc import Iterator
@@ -851,3 +856,38 @@ def test_drive_without_a_terminal_ends_with_2(shared: Daemon) -> None:
     ended = tool(shared, "drive")
     assert (ended.code, ended.out) == (2, "")
     assert "terminal" in ended.err
+
+
+@each("words", [["mcu", "check", "--port", "sim", "--yes"]])
+def test_a_judging_command_fails_if_the_reader_of_its_output_leaves(
+    tmp_path: Path, words: list[str]
+) -> None:
+    script = '{ "$@"; echo "code $?" >&2; } | head -n 1'
+    ended = finish(["sh", "-c", script, "sh", *acsard(*words)], tmp_path, 30.0)
+    assert ended.err.splitlines()[-1] == "code 1"
+
+
+def test_a_drive_ends_with_zeros_although_its_terminal_reads_nothing(shared: Daemon) -> None:
+    terminal, other = pty.openpty()
+    fcntl.ioctl(other, termios.TIOCSWINSZ, struct.pack("HHHH", 50, 250, 0, 0))
+    words = acsard("drive", "--config", str(shared.config))
+    env = environment() | {"TERM": "xterm"}
+    with (
+        connect(shared.endpoint) as robot,
+        subprocess.Popen(words, stdin=other, stdout=other, stderr=other, env=env) as process,
+    ):
+        os.close(other)
+        try:
+            until(lambda: len(os.read(terminal, 4096)) > 100, 10.0, "the first screen")
+            begun = time.monotonic()
+            # The screen is drawn four times a second, so it fills the terminal's buffer soon.
+            while time.monotonic() < begun + 5.0:
+                os.write(terminal, b"i")
+                time.sleep(0.05)
+            assert robot.get("state").linear > 0.1
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(10.0) == 0
+            assert not robot.get("state").linear
+        finally:
+            process.kill()
+            os.close(terminal)

@@ -7,6 +7,7 @@ import json
 import re
 import signal
 import socket
+import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +30,7 @@ from acsard.host.errors import (
     UnreachableError,
     UsageError,
 )
+from tests.each import each
 from tests.system.bystander import lost
 from tests.system.harness import (
     ROOT,
@@ -38,6 +40,7 @@ from tests.system.harness import (
     Program,
     Tables,
     client_config,
+    finish,
     free_endpoint,
     kept_waiting,
     silences,
@@ -642,3 +645,17 @@ def test_the_client_repeats_a_query_to_a_busy_daemon_and_never_a_service_call() 
 def test_no_client_request_raised_an_exception_in_the_daemon(shared: Daemon) -> None:
     assert "Traceback" not in shared.stderr
     assert shared.process.poll() is None
+
+
+@each("use", ["robot.messages('odom')", "robot.listen('odom', print)", "robot.send(0.3)"])
+def test_a_program_that_never_closes_its_connection_ends(
+    shared: Daemon, tmp_path: Path, use: str
+) -> None:
+    script = f"""
+from acsard.client import connect
+opened = connect({shared.endpoint!r})
+robot = opened.__enter__()
+kept = {use}
+if hasattr(kept, "__next__"): next(kept)
+"""
+    assert finish([sys.executable, "-c", script], tmp_path, 10.0).code == 0

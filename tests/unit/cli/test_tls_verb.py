@@ -31,6 +31,7 @@ from acsard.cli import main
 from acsard.core.config.parsing import parse
 from acsard.host.errors import Exit
 from acsard.host.own_identity import own_addresses
+from acsard.machine.authority import Authority
 from tests.each import each
 
 ROLES = ("viewer", "operator", "maintainer")
@@ -699,3 +700,33 @@ def test_init_prints_how_to_query_this_robot_by_its_id(
     output = capsys.readouterr().out
     assert "acsard echo state --id robot7 --connect tls/" in output
     assert 'robot_id="robot7"' in output
+
+
+# an authority that cannot sign
+
+
+def test_renew_refuses_the_key_of_another_authority(
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every client would refuse the new certificate, so nobody could stop the robot over TLS."""
+    Authority.make(tmp_path / "other", "other", 30, ["localhost"])
+    (own / "ca-key.pem").write_bytes((tmp_path / "other" / "ca-key.pem").read_bytes())
+    before = files(own)
+    assert tls("renew", "--directory", str(own)) == Exit.FAILURE
+    assert files(own) == before
+    assert "ca-key.pem is the key of another authority than ca.pem" in capsys.readouterr().err
+
+
+@each("kept", ["ca-key.pem", "key.pem", "certificate.pem"])
+def test_init_overwrites_no_key_and_no_certificate(tmp_path: Path, kept: str) -> None:
+    (directory := tmp_path / kept).mkdir()
+    (directory / kept).write_text("old")
+    assert tls("init", "--directory", str(directory)) == Exit.FAILURE
+    assert files(directory) == {kept: b"old"}
+
+
+def test_init_in_a_place_that_takes_no_directory_says_why(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert tls("init", "--directory", "/proc/x") == Exit.FAILURE
+    assert "cannot make /proc/x" in capsys.readouterr().err

@@ -216,3 +216,16 @@ def test_for_a_key_that_other_users_can_read_chmod_is_advised(fleet: Path) -> No
     (fleet / "key.pem").chmod(0o644)
     (result, _) = certificates(str(fleet))
     assert result.mend == f"chmod 600 {fleet}/key.pem"
+
+
+def test_the_certificate_of_another_authority_is_reported(fleet: Path, tmp_path: Path) -> None:
+    Authority.make(tmp_path / "other", "other", 30, ["localhost"])
+    (fleet / "ca.pem").write_bytes((tmp_path / "other" / "ca.pem").read_bytes())
+    result = finding(fleet)
+    assert (result.level, "has not signed" in result.text) == ("warning", True)
+
+
+def test_a_key_that_is_not_a_file_is_not_read(fleet: Path) -> None:
+    (fleet / "key.pem").unlink()
+    os.mkfifo(fleet / "key.pem")
+    assert "is not a file" in finding(fleet).text

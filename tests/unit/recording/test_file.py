@@ -430,3 +430,20 @@ def test_the_end_record_summarizes_the_recording(tape: Tape, whole: Path, tmp_pa
     rewrite(Recording(new), tmp_path / "again.mcap", "crash")
     assert read_end(tmp_path / "again.mcap") == read_end(new), "it was finished before"
     assert read_end(tmp_path / "none") is None
+
+
+def test_a_device_is_not_read_as_a_recording() -> None:
+    with pytest.raises(RecordingError, match="it is not a file"):
+        Recording(Path("/dev/zero"))
+
+
+def test_a_recording_that_does_not_fit_into_memory_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def too_large(self: Path) -> bytes:
+        raise MemoryError
+
+    (path := tmp_path / "large.mcap").touch()
+    monkeypatch.setattr(Path, "read_bytes", too_large)
+    with pytest.raises(RecordingError, match="larger than the free memory"):
+        Recording(path)

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 from msgspec.structs import replace
 
-from acsard.calibration.guided.guided_drive import DriveOptions, choose_method, other_robot
+from acsard.calibration.guided.drive_plan import GuideError
+from acsard.calibration.guided.guided_drive import (
+    DriveOptions,
+    choose_method,
+    other_robot,
+    require_same_robot,
+)
 from acsard.core.config.settings import Config, DriveConfig, OdometryConfig
+from acsard.core.messages.schema import Info
 from acsard.host.errors import UsageError
 
 WITH_GYRO = Config(odometry=OdometryConfig(gyro=True))
@@ -38,3 +48,33 @@ def test_a_file_with_other_wheels_belongs_to_another_robot() -> None:
     other = Config(drive=replace(DriveConfig(), wheel_radius=0.07))
     assert "drive.wheel_radius = 0.07" in other_robot(other, Config(), "acsard.toml")
     assert other_robot(Config(), Config(), "acsard.toml") == ""
+
+
+INFO = Info("acsar", "0.1.0", 7, "/dev/pts/1", True, 100.0, [], [])
+
+
+def answers(info: Info, settings: object) -> Any:
+    return SimpleNamespace(get={"info": info, "config": settings}.__getitem__)
+
+
+def test_a_simulator_that_was_restarted_may_be_calibrated_on() -> None:
+    now = replace(INFO, pid=8, port="/dev/pts/2")
+    require_same_robot(answers(now, {"a": 1}), INFO, {"a": 1})
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "text"),
+    [
+        (INFO, replace(INFO, port="/dev/ttyUSB0", simulated=False), "now drives /dev/ttyUSB0"),
+        (replace(INFO, port="/dev/a", simulated=False),
+         replace(INFO, port="/dev/b", simulated=False), "now drives /dev/b instead of /dev/a"),
+    ],
+)  # fmt: skip
+def test_a_daemon_with_another_board_ends_a_calibration(was: Info, now: Info, text: str) -> None:
+    with pytest.raises(GuideError, match=text):
+        require_same_robot(answers(now, {}), was, {})
+
+
+def test_settings_that_change_during_a_calibration_end_it() -> None:
+    with pytest.raises(GuideError, match="settings were changed"):
+        require_same_robot(answers(INFO, {"a": 2}), INFO, {"a": 1})
