@@ -34,6 +34,8 @@ contain no request letters, so a received line with this letter is an echo."""
 # bytes in front of a line.
 _REPLY = re.compile(rb"([a-dnp0-9., ]*)#([0-9A-F]{2})(?:@([0-9A-F]{20}))?\*([0-9A-F]{4})")
 
+_QUESTION = re.compile(rb"[a-dnp0-9., ]*#[0-9A-F]{2}[G-Z]+\*([0-9A-F]{4})")
+
 _SAMPLE = struct.Struct(">5H")
 
 
@@ -69,6 +71,15 @@ def seal(line: bytes, sequence: int, letters: bytes = b"") -> bytes:
     """
     body = b"%b#%02X%b" % (line.removesuffix(b"\r\n"), sequence, letters)
     return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
+
+
+def has_request(line: bytes) -> bool:
+    """Return whether a line without its line end is a correct checked line with request letters.
+
+    Only the daemon sends such lines, so a received one is an echo.
+    """
+    match = _QUESTION.fullmatch(line)
+    return match is not None and binascii.crc_hqx(line[:-5], 0) == int(match[1], 16)
 
 
 def unseal(line: bytes) -> Checked:

@@ -31,7 +31,14 @@ from typing import Literal
 
 from acsard.core.config.settings import McuConfig
 from acsard.core.config.wire_time import line_bytes, wire_ns
-from acsard.core.link.checked_line import ECHO_MARK, SAMPLE_REQUEST, SEQUENCES, Checked, seal
+from acsard.core.link.checked_line import (
+    ECHO_MARK,
+    SAMPLE_REQUEST,
+    SEQUENCES,
+    Checked,
+    has_request,
+    seal,
+)
 from acsard.core.link.codec import FrameError
 from acsard.core.link.echo_detector import EchoDetector
 from acsard.core.link.link_state import WATCHDOG_S
@@ -166,10 +173,6 @@ class Negotiation:
         """Monotonic time at which the last negotiation ended, ns."""
         first = (SAMPLE_REQUEST,) * MAX_UNANSWERED_QUESTIONS if mcu.wants_samples else (ECHO_MARK,)
         self._letters = (*first, *(b"",) * MAX_UNANSWERED_QUESTIONS)
-        self._question = b""
-        """The last question (a stop line that asks for the check) without its line end, to detect
-        its echo. b"" if the question has no request letters, because a genuine reply may equal such
-        a question."""
         longest = line_bytes(mcu.trailing_comma, check=True, sample=mcu.wants_samples)
         self._answer_ns = PROCESSING_NS + 4 * wire_ns(longest, mcu.baud_rate)
         self._sequence = 0
@@ -208,7 +211,7 @@ class Negotiation:
         self._apply("gap")
         self._begin(fresh)
         if fresh:
-            self.trouble, self._knows, self._question = "", False, b""
+            self.trouble, self._knows = "", False
             self._echo.forget()
 
     def _begin(self, fresh: bool) -> None:
@@ -250,9 +253,7 @@ class Negotiation:
         if waking and self._plain_turn % 2:
             return self._stop
         letters = self._letters[self._unanswered]
-        line = self._sealed(self._stop, letters, now_ns)
-        self._question = line.removesuffix(b"\r\n") if letters else b""
-        return line
+        return self._sealed(self._stop, letters, now_ns)
 
     def written(self, line: bytes) -> None:
         """Record that `line`, with its line end, was written to the port, to detect its echo."""
@@ -286,7 +287,7 @@ class Negotiation:
         `line` is without its line end. After an echo, the caller rejects every received line until
         the port is reopened.
         """
-        if self._question and line == self._question:
+        if has_request(line):
             self.trouble = "echo"
         return self.echoes
 

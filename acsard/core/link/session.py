@@ -409,7 +409,7 @@ class McuSession:
             return None
         check = self.negotiation
         asking = check.asking
-        if check.echoes or (asking and check.check_question_echo(line)):
+        if check.echoes or (b"#" in line and check.check_question_echo(line)):
             self._reject("echo")
             self._link.reset_good_lines()
             return None

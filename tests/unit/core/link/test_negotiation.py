@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.core.config.settings import McuConfig
-from acsard.core.link.checked_line import Checked, Reading
+from acsard.core.link.checked_line import Checked, Reading, has_request
 from acsard.core.link.codec import FrameError
 from acsard.core.link.negotiation import (
     ADVICE,
@@ -398,6 +398,17 @@ def test_an_echo_of_a_question_is_reported_and_ends_no_negotiation() -> None:
         assert "the daemon's own lines come back" in ADVICE[bench.check.trouble]
         bench.check.begin(fresh=True)
         assert not bench.check.trouble
+
+
+@pytest.mark.parametrize("mcu", [AUTO, REQUIRE, SAMPLES])
+def test_an_echo_that_comes_after_later_questions_is_reported(mcu: McuConfig) -> None:
+    """A radio link may return each line 0.2 s later, when the next questions are sent already."""
+    bench = Bench(mcu)
+    bench.check.record_plain_reply()
+    lines = [line[:-2] for line in bench.questions_within(1000)]
+    with_letters = next(line for line in lines if has_request(line))
+    assert len(lines) > 2
+    assert bench.check.check_question_echo(with_letters)
 
 
 def test_an_answer_is_not_an_echo() -> None:
