@@ -169,19 +169,6 @@ class Gyro:
     The caller passes samples to `add_samples`, and calls `turn` for each feedback line.
     """
 
-    _late_since: tuple[int, float] | None = None
-    """Arrival time and excess delay of the first sample of a steady, large delay, both in ns. A
-    delay is large if it exceeds the smallest delay by more than `MAX_EXTRA_DELAY_NS`. The value is
-    None without a large delay. The default on the class is for recordings of versions without this
-    attribute."""
-    _period_s = 0.0
-    """Mean time between two samples, s; 0 before the second sample."""
-    _guessed = 0.0
-    """The gyro's turn minus the wheels' turn in the lines since the last sample that was used, rad.
-    In these lines, the robot is assumed to continue turning at the rate of this sample."""
-    _slipped_before = False
-    """Whether gyro and wheels contradicted each other at the last sample that was used."""
-
     def __init__(self) -> None:
         self._rest_s = self._since_rest_s = 0.0
         self._learned: Track | None = None
@@ -202,7 +189,16 @@ class Gyro:
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
         """Samples that `turn` has not used yet, each with its monotonic time, ns (`_time_of`)."""
         self._promptest = MinimumDelay()
-        self._late_since, self._period_s, self._guessed = None, 0.0, 0.0
+        self._late_since: tuple[int, float] | None = None
+        """Arrival of the first sample with the present delay above `MAX_EXTRA_DELAY_NS`, and its
+        delay, both in ns. It is None if the delay is smaller."""
+        self._period_s = 0.0
+        """Mean time between two samples, s; 0 before the second sample."""
+        self._guessed = 0.0
+        """The gyro's turn minus the wheels' turn in the lines since the last sample that was used,
+        rad. In these lines, the robot is assumed to continue turning at the rate of this sample."""
+        self._slipped_before = False
+        """Whether gyro and wheels contradicted each other when the last used sample arrived."""
         self._last: GyroSample | None = None
         self._delay_ns = 0
         self._told_ns: int | None = None

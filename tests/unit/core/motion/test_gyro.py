@@ -396,16 +396,6 @@ def test_a_clock_that_was_set_back_in_a_silence_is_believed_after_a_second(jitte
     assert bench.told == pytest.approx(bench.true, abs=0.03)
 
 
-def test_a_gyro_from_a_recording_of_an_older_version_continues() -> None:
-    bench = Bench(stamped=True)
-    bench.run(REST_FIRST)
-    bench.run(1.0, 0.5)
-    for name in ("_late_since", "_period_s", "_guessed"):
-        delattr(bench.gyro, name)
-    bench.run(1.0, 0.5)
-    assert bench.told == pytest.approx(bench.true)
-
-
 def test_wheels_that_slip_are_reported_and_the_gyro_is_believed() -> None:
     bench = Bench()
     bench.run(REST_FIRST)
