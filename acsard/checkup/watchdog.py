@@ -50,9 +50,10 @@ class Run(Struct, frozen=True):
     silent_s: float
     """Duration of the silence, s. It is about 0 for an ordinary stop, without a silence."""
     ran_s: float
-    """Largest distance by which a motor ran on until it stood still, expressed as a time, s.
+    """How far the motors ran on before they stood still, as a time, s.
 
-    It is the time in which the motor would cover this distance at its speed before the silence.
+    It is the time in which a motor would run equally far at its speed before the silence; the
+    largest of all motors.
     """
     slow_s: float
     """Time from the last line that turned the motors until all motors are slower than `STOPPED`, s.
@@ -175,8 +176,9 @@ def _bisect_timeout(board: Board, motors: Sequence[int], stop: Run, bounds: Boun
 def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[bytes] = ()) -> Run:
     """Bring the motors to speed, send no valid line for `length_s` s, and stop them with zeros.
 
-    If `length_s` is 0, this is an ordinary stop. During the time `length_s`, the damaged lines
-    `instead` are sent. Raises `StoppedError` if no motor reaches half of the commanded speed.
+    If `length_s` is 0, this is an ordinary stop. The lines in `instead`, which are damaged, are
+    sent during the time `length_s`. Raises `StoppedError` if no motor reaches half of the commanded
+    speed.
     """
     began_s = board.now_s
     full = run_up(board, command(motors))

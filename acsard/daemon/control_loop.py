@@ -550,9 +550,9 @@ class ControlLoop:
 
 
 def _stops(batch: BusInput) -> list[str]:
-    """Return the name of the sender of each stop.
+    """Return the name of the sender of each stop in the inputs of a step.
 
-    The inbox adds an arrival for each call of `srv/stop`.
+    A call of `srv/stop` counts, too, because the inbox adds a stop for each such call.
     """
     return [
         caller_name(arrival.via, arrival.attachment, arrival.sender)

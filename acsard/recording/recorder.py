@@ -79,7 +79,8 @@ class Recorder:
         self._full = False
         """True after the queue was full, until half of the queue is free again."""
         self._sync_ns = 0
-        """Time that the present sync had taken at the last call of `step`, ns; 0 without a sync."""
+        """Duration of the running sync of the file, as of the last call of `step`, ns. It is 0 if
+        no sync runs."""
         self._slow = False
         """True from the event that reports a slow disk to the event that reports a fast disk."""
         self._lost_before = 0

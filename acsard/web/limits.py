@@ -138,7 +138,8 @@ class Sockets(Generic[C]):
         """The connections without a valid token, by network, oldest first."""
         self._networks: dict[C, str] = {}
         self._known: dict[C, str] = {}
-        """The token of each connection that is counted under a token (see `MAX_TCP_OF_TOKEN`)."""
+        """Maps each connection that counts toward the limit of its token (`MAX_TCP_OF_TOKEN`) to
+        this token."""
         self._shown: dict[C, str] = {}
         """The last valid token that each connection has shown. A connection beyond the limit
         `MAX_TCP_OF_TOKEN` is in this dict too."""

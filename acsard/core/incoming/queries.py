@@ -117,7 +117,8 @@ class _Waiting(Struct, frozen=True):
 
 
 class Queries:
-    """Answers queries with constants or present messages, and turns service calls into requests."""
+    """Answers queries with constants or with the newest messages, and turns service calls into
+    requests."""
 
     def __init__(self, config: Config, info: Info) -> None:
         self._config = config

@@ -143,8 +143,8 @@ class _Proof:
         self._length_ns, self._share, self._again = needed_ns // 2, share, again
         self._begun_ns = self.last_ns = at_ns
         self._halves: list[tuple[int, int]] = []
-        """Monotonic start and minimum delay of each of the latest halves of the test, both in
-        ns."""
+        """For each of the last half periods of the test: its start on the monotonic clock, and the
+        smallest delay in it, both in ns."""
 
     def add(self, delay: int, at_ns: int, timeout_ns: int) -> Literal["proven", "open", "failed"]:
         """Add a command of the clock, and return the state of the test.

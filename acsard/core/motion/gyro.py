@@ -497,9 +497,9 @@ class Gyro:
         self._forget_repeated()
 
     def _drop_waiting_correction(self) -> None:
-        """Make the heading more uncertain by a correction that still waits for the next line.
+        """Drop a correction that waits for the next line, and add it to the heading's uncertainty.
 
-        A correction waits if the gyro was found to hang in a line that covers no known time.
+        A correction waits if the line that showed that the gyro hangs covers no known time.
         """
         if self._frozen:
             self._doubt += self._repeated * self._repeated + self._repeated_gaps

@@ -14,9 +14,10 @@ from msgspec import Struct
 from acsard.core.values import Event, GyroStatus, Level, TrackUse
 
 MIN_TRACK_STD = 0.05
-"""Smallest relative standard deviation of a learned track. Floor and turn rate may change, so the
-track is never more certain. The value is half of `gyro_match.MIN_RATIO_STD`, because the mean error
-over a whole drive is smaller than the error at one moment."""
+"""Smallest relative standard deviation of a learned track. The real track changes with the floor
+and the turn rate, so no measurement makes it more certain than this. The value is half of
+`gyro_match.MIN_RATIO_STD`, because the mean error over a whole drive is smaller than the error at
+one moment."""
 
 CERTAIN, UNCERTAIN = 0.1, 0.2
 """Limits of the learned track's relative standard deviation. An uncertain track becomes certain

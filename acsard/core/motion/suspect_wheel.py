@@ -23,8 +23,8 @@ sign of a faulty encoder must last. At 100 Hz, `FAULT_S` takes three lines, so o
 not enough."""
 
 FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
-"""Smallest difference between the angles of the two wheels of a side at which one wheel can be
-called faulty: `FAULT_COUNTS` encoder counts plus `FAULT_ANGLE` rad."""
+"""A wheel can be called faulty only if the angles of the two wheels of its side differ by at least
+`FAULT_COUNTS` encoder counts plus `FAULT_ANGLE` rad."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
 """After a new command, a wheel that repeats its old speed counts as stuck only if a healthy wheel

@@ -110,8 +110,8 @@ class PoseUncertainty:
         """The columns of the matrix J (see the module). The columns for the gyro's scale and for
         gaps are added when needed."""
         self._of_gyro = self._of_gaps = -1
-        """Indices in `_columns`: of the column for the gyro's scale (`_of_gyro`), and of the column
-        for gaps (`_of_gaps`). An index is -1 before the column is added."""
+        """Two indices in `_columns`: `_of_gyro` is the column for the gyro's scale, and `_of_gaps`
+        the column for gaps. An index is -1 before its column is added."""
         self._columns_before = self._columns
         self._turned = self._middle = 0.0
         self._second = SecondOrder(len(self._effects))
