@@ -6,9 +6,11 @@ it.
 from __future__ import annotations
 
 import argparse
+import ipaddress
 import re
 import socket
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from acsard.bus.address import require_id
@@ -253,7 +255,12 @@ def _name(text: str) -> str:
 
 
 def _address(text: str) -> str:
-    if not certificates.ADDRESS.match(text):
+    with suppress(ValueError):
+        ipaddress.ip_address(text)
+        return text
+    # The last part of a host name is never a number, so such a text is a mistyped address.
+    mistyped = ":" in text or text.rpartition(".")[2].isdigit() or ".." in text
+    if mistyped or not certificates.ADDRESS.match(text):
         raise argparse.ArgumentTypeError(f"{text!r} is not a host name or an IP address")
     return text
 

@@ -361,10 +361,11 @@ def test_an_invalid_number_of_days_is_refused_and_leaves_no_file(
     assert sorted(own.parent.rglob("*")) == before
 
 
+@pytest.mark.parametrize("address", ["r\u00f6bot", "256.1.1.1", "10.0.0", "a..b", "fe80::g"])
 def test_an_invalid_address_is_refused_and_leaves_no_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ("--directory", str(tmp_path / "tls"), "--address", "r\u00f6bot")
+    words = ("--directory", str(tmp_path / "tls"), "--address", address)
     assert tls("init", *words) == Exit.USAGE
     assert "address" in capsys.readouterr().err
     assert files(tmp_path) == {}
