@@ -784,6 +784,18 @@ class Bus:
         assert state["mode"] in modes, state
         return state
 
+    def stands(self, within: float = 5.0) -> Any:
+        """Wait until no wheel turns. Return the state.
+
+        The mode may still be `driving`, because a client repeats its zero.
+        """
+
+        def look() -> Any:
+            state = self.state()
+            return state if state["wheels"] and not any(state["wheels"]) else None
+
+        return until(look, within, "that no wheel turns")
+
     def at_rest(self, within: float = 5.0) -> Any:
         """Wait until the robot is ready and its wheels do not turn. Return the state."""
 

@@ -347,7 +347,7 @@ def test_space_during_a_leg_stops_the_robot_within_the_ramp_and_writes_no_file(
             begun(terminal, program, bus)
             pressed = time.monotonic()
             terminal.press(" ")
-            bus.at_rest()
+            bus.stands()
             took = time.monotonic() - pressed
             print(f"space -> at rest: {took:.2f} s")
             # 0.3 m/s at 1 m/s2, and a part of the way.

@@ -111,7 +111,7 @@ async def test_a_key_stops_the_leg_and_other_clients_see_the_procedure_and_canno
         assert (standing.state()["linear"] or 0.0) > 0.25
         pressed = time.monotonic()
         await guided.ours.say(press="key")
-        await beside(standing.at_rest)
+        await beside(standing.stands)
         took = time.monotonic() - pressed
         # 0.3 m/s at 1 m/s2, and a part of the way.
         assert took < 0.3 + 0.4 + lost(pressed, pressed + took)
@@ -142,11 +142,11 @@ async def test_a_browser_that_disconnects_during_a_leg_leaves_zeros_and_no_child
         (child,) = commands(page)
         begun = time.monotonic()
         how(guided, page)
-        await beside(standing.at_rest)
+        await beside(standing.stands)
         took = time.monotonic() - begun
         assert took < 0.3 + 0.4 + lost(begun, begun + took)
         await beside(lambda: none_left(page))
-        assert not Path(f"/proc/{child}").exists()
+        await beside(lambda: until(lambda: ended(child), 3.0, "the child ends"))
     async with guiding(page) as another:
         await another.begin("calibrate", method="tape")
         await another.asks("How far apart")
@@ -166,7 +166,7 @@ async def test_a_guide_client_that_sends_no_signs_of_life_loses_its_procedure(
                 break
             await guided.says(lambda message: message.get("running") == "")
         assert f"page or program sent no sign of life for {MAX_INPUT_SILENCE_S:g} s" in end["text"]
-        await beside(standing.at_rest)
+        await beside(standing.stands)
 
 
 async def test_a_client_that_falls_silent_during_a_leg_stops_it_within_a_second(
@@ -176,7 +176,7 @@ async def test_a_client_that_falls_silent_during_a_leg_stops_it_within_a_second(
         await drives(guided, standing)
         silent = time.monotonic()
         guided.falls_silent()
-        await beside(standing.at_rest)
+        await beside(standing.stands)
         took = time.monotonic() - silent
         # Add the ramp: 0.3 m/s at 1 m/s2, and a part of the way.
         assert took < 1.0 + 0.3 + 0.4 + lost(silent, silent + took)
@@ -267,7 +267,7 @@ def test_a_server_that_ends_or_hangs_takes_its_child_with_it(
                 await drives(guided, standing)
                 (child,) = commands(page)
                 page.signal(number)
-                await beside(standing.at_rest)
+                await beside(standing.stands)
                 await beside(
                     lambda: until(lambda: ended(child), 8.0, "the child ends with its server")
                 )

@@ -245,7 +245,7 @@ def test_the_dashboard_of_the_manual_drives_until_a_finger_takes_over_and_stops(
 
         def drives(source: str) -> bool:
             state = bus.state()
-            return bool(state["source"] == source and state["linear"] > 0.1)
+            return bool(state["source"] == source and (state["linear"] or 0.0) > 0.1)
 
         browser.open(origin)
         shows("ready by nobody")
