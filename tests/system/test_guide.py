@@ -148,6 +148,7 @@ async def test_a_browser_that_disconnects_during_a_leg_leaves_zeros_and_no_child
         await beside(lambda: none_left(page))
         await beside(lambda: until(lambda: ended(child), 3.0, "the child ends"))
     async with guiding(page) as another:
+        await another.says(lambda message: message.get("running") == "")
         await another.begin("calibrate", method="tape")
         await another.asks("How far apart")
     none_left(page)
