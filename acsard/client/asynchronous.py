@@ -100,16 +100,16 @@ class AsyncClient:
 
     async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
         """Drive for `seconds`, as `Client.drive` does. If the task is cancelled, send zeros."""
+        drove = False
         try:
             with closing(drive(self._client, linear, angular, seconds)) as steps:
                 for pause in steps:
+                    drove = drove or self._client.commands_motion
                     await asyncio.sleep(pause)
-        except UnheardError as error:
-            raise await _in_thread(partial(self._client.explain_error, error)) from None
         except BaseException as error:
-            for pause in repeat_zeros(self._client):
+            for pause in repeat_zeros(self._client) if drove else ():
                 await asyncio.sleep(pause)
-            if isinstance(error, NoAnswerError):
+            if isinstance(error, UnheardError | NoAnswerError):
                 raise await _in_thread(partial(self._client.explain_error, error)) from None
             raise
 

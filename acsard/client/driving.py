@@ -101,20 +101,33 @@ def drive(
         checks.watch.end()
 
 
-def repeat_zeros(robot: CommandClient) -> Generator[float, None, None]:
+def repeat_zeros(robot: CommandClient, idle_s: float = 0.0) -> Generator[float, None, None]:
     """Send zeros until the robot's `state` shows that the robot has stopped.
 
     Call this when a drive ends early, and in place of the next speed. This generator yields the
     time, s, for which the caller must wait before resuming the generator. It ends after `MAX_END_S`
     at the latest, or when the connection is closed.
+
+    `idle_s` is the time since the last command, s. After more than `GRACE_S`, the robot may follow
+    another sender, whom a zero would stop. So if the state shows this, no zero is sent.
     """
     # If the connection is closed, sending raises one of these errors, and subscribing the other.
     with suppress(zenoh.ZError, NoAnswerError):
-        robot.send(0.0, 0.0)
+        if idle_s <= GRACE_S:
+            robot.send(0.0, 0.0)
         begun = now = clock.steady_s()
         zeros, watch = FinalZeros(robot.source, robot.sender), Watch(robot, now)
         zeros.drove(now)
         try:
+            if idle_s > GRACE_S:
+                while watch.state is None and now - begun < GRACE_S:
+                    yield SEND_PERIOD_S
+                    now = clock.steady_s()
+                    list(watch.poll(now))
+                state = watch.state
+                followed = (robot.source, robot.sender)
+                if state is not None and (state.source, state.sender) != followed:
+                    return
             while zeros.wanted(now) and now - begun < MAX_END_S:
                 yield SEND_PERIOD_S
                 robot.send(0.0, 0.0)

@@ -7,7 +7,7 @@ import os
 import platform
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from functools import lru_cache
 from typing import Any
@@ -105,8 +105,8 @@ def connect(
         robot.end()
 
 
-_open: dict[Client, int] = {}
-"""The clients whose connection is open, each with the id of the process that opened it."""
+_open: dict[Client, tuple[int, threading.Thread]] = {}
+"""The clients whose connection is open, each with the process and the thread that opened it."""
 
 
 def end_at_exit(client: Client) -> None:
@@ -115,18 +115,44 @@ def end_at_exit(client: Client) -> None:
     If Python ended with an open connection, a thread of Zenoh or a thread that waits for messages
     could block it or abort it.
     """
-    _open[client] = os.getpid()
+    _open[client] = os.getpid(), threading.current_thread()
 
 
 def _end_all() -> None:
-    # The threads of a connection do not exist in a forked child.
-    for client in [client for client, pid in _open.items() if pid == os.getpid()]:
-        client.end()
+    # The threads of a connection do not exist in a forked child. Python waits for a thread that is
+    # neither the main thread nor a daemon, so such a thread ends its connections itself.
+    main, pid = threading.main_thread(), os.getpid()
+    _end(
+        [
+            client
+            for client, (opened_pid, thread) in _open.items()
+            if opened_pid == pid and (thread is main or thread.daemon or not thread.is_alive())
+        ]
+    )
 
 
 # Python waits for all threads before it calls the functions of `atexit`, and the threads of an open
 # subscription do not end. The functions of `threading._register_atexit` are called before the wait.
 getattr(threading, "_register_atexit", atexit.register)(_end_all)
+atexit.register(_end_all)
+
+
+def _end(clients: Sequence[Client]) -> None:
+    """Close the connections of these clients. First stop each robot that may still follow them."""
+    now, ends = clock.steady_s(), []
+    for client in clients:
+        _open.pop(client, None)
+        for sender, at_s in client._spacing.end():
+            # After the longest timeout, the robot no longer follows the sender, so a zero would
+            # only stop the next sender.
+            if now - at_s < MAX_SOURCE_TIMEOUT_S:
+                ends.append(repeat_zeros(sender, idle_s=now - at_s))
+    try:
+        while ends := [zeros for zeros in ends if next(zeros, None) is not None]:
+            time.sleep(SEND_PERIOD_S)
+    finally:
+        for client in clients:
+            close(client.session)
 
 
 def close(session: zenoh.Session) -> None:
@@ -152,6 +178,12 @@ class _CommandSpacing:
         zero."""
         self.ending = False
         """Whether the connection is being closed, so that only zeros may be sent."""
+
+    def end(self) -> list[tuple[Client, float]]:
+        """Permit only zeros from now on. Return the clients in `moving` with their times."""
+        with self._lock:
+            self.ending = True
+            return list(self.moving.items())
 
     @contextmanager
     def wait(self) -> Iterator[None]:
@@ -269,17 +301,12 @@ class Client:
         Without a zero, the robot would drive on until the timeout of the source, which may be 10 s.
         From this call on, other threads and tasks can send only zeros.
         """
-        _open.pop(self, None)
-        begun_s, self._spacing.ending = clock.steady_s(), True
-        # After the longest timeout, the robot no longer follows the client, so a zero would only
-        # stop the next sender.
-        known = list(self._spacing.moving.items())
-        ends = [repeat_zeros(client) for client, s in known if begun_s - s < MAX_SOURCE_TIMEOUT_S]
-        try:
-            while ends := [zeros for zeros in ends if next(zeros, None) is not None]:
-                time.sleep(SEND_PERIOD_S)
-        finally:
-            close(self.session)
+        _end([self])
+
+    @property
+    def commands_motion(self) -> bool:
+        """Whether the last command of this client was not zero."""
+        return self in self._spacing.moving
 
     def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
         """Drive for `seconds` (above 0), then slow down, and return when the robot stands still.
@@ -296,16 +323,16 @@ class Client:
             NoAnswerError: The daemon is silent.
             UsageError: An argument is not valid.
         """
+        drove = False
         try:
             with closing(drive(self, linear, angular, seconds)) as steps:
                 for pause in steps:
+                    drove = drove or self.commands_motion
                     time.sleep(pause)
-        except UnheardError as error:
-            raise self.explain_error(error) from None
         except BaseException as error:
-            for pause in repeat_zeros(self):
+            for pause in repeat_zeros(self) if drove else ():
                 time.sleep(pause)
-            if isinstance(error, NoAnswerError):
+            if isinstance(error, UnheardError | NoAnswerError):
                 raise self.explain_error(error) from None
             raise
 

@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Struct
 
 from acsard.bus.zenoh_sessions import client_session
-from acsard.calibration.guided.drive_plan import GuideError, Leg, setup
+from acsard.calibration.guided.drive_plan import DisturbedError, GuideError, Leg, setup
 from acsard.calibration.guided.robot_on_bus import RobotOnBus
 from acsard.calibration.guided.runner import guide
 from acsard.calibration.runs import Run
@@ -17,7 +17,7 @@ from acsard.client.synchronous import Client
 from acsard.core.config.settings import Config
 from acsard.core.messages.keys_and_roles import IMU, full_key
 from acsard.core.messages.schema import Info
-from acsard.host.errors import UsageError
+from acsard.host.errors import NoAnswerError, UsageError
 from acsard.terminal.prompt import Prompt
 
 TRUE_POSE = "sim/pose"
@@ -95,7 +95,12 @@ def guided_drive(
             robot.positions(options.positions or "", elsewhere)
 
         def ride(leg: Leg) -> Run:
-            require_same_robot(client, info, settings)
+            try:
+                require_same_robot(client, info, settings)
+            except NoAnswerError as error:
+                why = f"the daemon did not answer before the leg ({error})"
+                text = f"{why}. The tool did not change any file"
+                raise (DisturbedError(why, text) if robot.returns() else GuideError(text)) from None
             return robot.ride(leg)
 
         try:
@@ -118,8 +123,7 @@ def require_same_robot(client: Client, info: Info, settings: object) -> None:
     was, port = (("the simulator" if x.simulated else x.port) for x in (info, now))
     if port != was:
         raise GuideError(
-            f"the daemon was restarted and now drives {port} instead of {was}: begin the "
-            "calibration again"
+            f"the daemon now drives {port} instead of {was}: begin the calibration again"
         )
     if client.get("config") != settings:
         raise GuideError(

@@ -12,10 +12,11 @@ from enum import StrEnum
 from acsard.calibration.guided.drive_plan import Leg
 from acsard.client.commander import NEVER_DRIVING_MODES, OPEN_TIMEOUT_S, OPENING_S, objection
 from acsard.client.follower import MAX_STATE_AGE_S
-from acsard.core.config.settings import DriveConfig
+from acsard.core.config.settings import Config, DriveConfig, LimitsConfig
 from acsard.core.link.link_diagnosis import blames_host
 from acsard.core.messages.schema import RobotState
 from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.limits import Limiter
 from acsard.core.values import REST, Twist, WheelSpeeds
 
 STALL_REASON = (
@@ -31,12 +32,20 @@ DEVIATION_TIMEOUT_S = 1.0
 """Time for which the daemon may not follow the commands, or may report no wheel speeds, s, before
 the leg is halted."""
 
-DISTANCE_OFF, TURN_OFF = (0.1, 0.05), (0.15, 0.1)
+PATH_OFF_M, PATH_OFF_RAD = 0.1, 0.15
+SAME_SHARE, OTHER_SHARE = 0.05, 0.03
 """Limits for the difference between the path that the wheels rolled and the commanded path.
 
-The rolled distance may differ by 0.1 m plus 5 % of the commanded distance, and the turn by 0.15 rad
-plus 10 % of the commanded turn. With a larger difference, the robot could leave the free floor.
+The wheels may be slower or faster than commanded by the fraction `SAME_SHARE`, and those of one
+side may differ from those of the other side by about twice the fraction `OTHER_SHARE`. So the
+rolled distance may differ by `PATH_OFF_M` m plus `SAME_SHARE` of the commanded distance plus
+`OTHER_SHARE` of the distance that the wheels roll in the commanded turns. The turn may differ by
+`PATH_OFF_RAD` rad plus the same two parts, with turn and distance exchanged. With a larger
+difference, the robot could leave the free floor.
 """
+
+MAX_SAMPLE_GAP_S = 2.0
+"""Longest time between two samples of the wheel speeds, s, over which the path is continued."""
 
 STANDSTILL_SPEED = 0.02
 """Largest speed at which a wheel is considered to stand still, rad/s."""
@@ -70,17 +79,20 @@ class Phase(StrEnum):
 class CommandedPath:
     """Compares the path that the wheels rolled in a leg with the commanded path.
 
-    The robot follows each command with a delay and a ramp. Therefore the rolled distance must be
-    equal to one of the commanded distances of the last `RESPONSE_TIMEOUT_S`, within the limits.
-    The same is required of the turn. The turn of the wheels is compared, and not that of a gyro,
-    because a robot that skids turns less than commanded.
-
-    Every argument `now` is the present time on one monotonic clock, s.
+    The commanded path contains the ramps of the configured `[limits]`, but not a `speed_limit` or a
+    limit that was changed later. The robot follows with a delay. Therefore the rolled distance must
+    be equal to one of the commanded distances of the last `RESPONSE_TIMEOUT_S`, within the limits
+    of this module. The same is required of the turn. The turn of the wheels is compared, and not
+    that of a gyro, because a robot that skids turns less than commanded.
     """
 
-    def __init__(self, drive: DriveConfig, now: float) -> None:
+    def __init__(self, drive: DriveConfig, limits: LimitsConfig, now: float) -> None:
         self._kinematics = Kinematics(drive)
-        self._stepped = self._rolled_until = now
+        self._ramps = Limiter(limits, self._kinematics)
+        self._lever = drive.wheel_separation * drive.wheel_separation_multiplier / 2.0
+        self._stepped = now
+        self._sampled: tuple[float, Twist] | None = None
+        """Stamp of the last sample, s, and its twist."""
         self._lengths = [0.0, 0.0]
         """Length of the commanded path, m, and sum of the sizes of the commanded turns, rad."""
         self._commanded, self._rolled = (0.0, 0.0), (0.0, 0.0)
@@ -89,9 +101,13 @@ class CommandedPath:
         """The values of `_commanded` in the last `RESPONSE_TIMEOUT_S`, each with its time, s."""
 
     def command(self, twist: Twist, now: float) -> None:
-        """Add the path of the command `twist`, which was in force since the last call."""
+        """Add the path of the command `twist`, which was in force since the last call.
+
+        `now` is the present time on a monotonic clock, s.
+        """
         passed, self._stepped = now - self._stepped, now
-        x, turn = twist.linear * passed, twist.angular * passed
+        allowed = self._ramps.follow(twist, passed) if passed > 0.0 else self._ramps.twist
+        x, turn = allowed.linear * passed, allowed.angular * passed
         self._commanded = self._commanded[0] + x, self._commanded[1] + turn
         self._lengths[0] += abs(x)
         self._lengths[1] += abs(turn)
@@ -99,23 +115,30 @@ class CommandedPath:
         while len(self._recent) > 1 and self._recent[1][0] < now - RESPONSE_TIMEOUT_S:
             self._recent.popleft()
 
-    def wheels(self, speeds: WheelSpeeds, now: float) -> None:
-        """Add the path that the wheels rolled at `speeds` since the last call."""
-        # If this process was paused, the robot has braked in the meantime.
-        passed = min(now - self._rolled_until, MAX_STATE_AGE_S / 2)
-        self._rolled_until = now
-        twist = self._kinematics.twist(speeds)
-        x, turn = self._rolled
-        self._rolled = x + twist.linear * passed, turn + twist.angular * passed
+    def wheels(self, speeds: WheelSpeeds, stamp: float) -> None:
+        """Add the path that the wheels rolled since the last sample. `stamp` is its time, s."""
+        twist, before = self._kinematics.twist(speeds), self._sampled
+        self._sampled = stamp, twist
+        if before is None or not 0.0 < stamp - before[0] <= MAX_SAMPLE_GAP_S:
+            return
+        half, (x, turn) = (stamp - before[0]) / 2.0, self._rolled
+        self._rolled = (
+            x + (before[1].linear + twist.linear) * half,
+            turn + (before[1].angular + twist.angular) * half,
+        )
 
     @property
     def error(self) -> str:
         """The difference that is too large, as a text; "" if there is none."""
-        for i, ((off, share), unit, name) in enumerate(
-            ((DISTANCE_OFF, "m", "rolled"), (TURN_OFF, "rad", "turned"))
+        distance, turn = self._lengths
+        limits = (
+            PATH_OFF_M + SAME_SHARE * distance + OTHER_SHARE * turn * self._lever,
+            PATH_OFF_RAD + SAME_SHARE * turn + OTHER_SHARE * distance / self._lever,
+        )
+        for i, (limit, unit, name) in enumerate(
+            zip(limits, ("m", "rad"), ("rolled", "turned"), strict=True)
         ):
-            recent = [path[i] for _, path in self._recent]
-            rolled, limit = self._rolled[i], off + share * self._lengths[i]
+            recent, rolled = [path[i] for _, path in self._recent], self._rolled[i]
             if not min(recent) - limit <= rolled <= max(recent) + limit:
                 return (
                     f"the robot {name} {rolled:.2f} {unit} by its wheels although "
@@ -133,13 +156,13 @@ class LegDriver:
     which also advances while the computer is suspended.
     """
 
-    def __init__(self, leg: Leg, source: str, drive: DriveConfig, now: float, sender: str) -> None:
+    def __init__(self, leg: Leg, source: str, config: Config, now: float, sender: str) -> None:
         """Start a leg.
 
         The daemon recognizes the commands of this leg by their `source` and `sender`.
         """
         self._leg, self._source, self._sender = leg, source, sender
-        self._path = CommandedPath(drive, now)
+        self._path = CommandedPath(config.drive, config.limits, now)
         self.phase = Phase.OPENING
         self.halted = ""
         """The reason why the leg ended early; "" if it did not end early."""
@@ -214,14 +237,14 @@ class LegDriver:
             disturbed = bool(silent) or why == self._starved
             self._tolerate_briefly(why or silent, now, disturbed=disturbed)
 
-    def wheels(self, speeds: WheelSpeeds, now: float) -> None:
-        """Process wheel speeds from the daemon, rad/s.
+    def wheels(self, speeds: WheelSpeeds, stamp: float, now: float) -> None:
+        """Process wheel speeds from the daemon, rad/s. `stamp` is their time, s.
 
         They show whether the robot follows the commanded path, and whether it stands still at the
         end of the leg.
         """
         self._received = now
-        self._path.wheels(speeds, now)
+        self._path.wheels(speeds, stamp)
         if max(map(abs, speeds.as_tuple())) > STANDSTILL_SPEED:
             self._still_since = None
         elif self._still_since is None:

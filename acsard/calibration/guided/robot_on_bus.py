@@ -215,7 +215,7 @@ class RobotOnBus:
 
     def __init__(self, client: Client, config: Config, prompt: Prompt) -> None:
         self._client, self._prompt = client, prompt
-        self._joints, self._geometry = config.joints.as_tuple(), config.drive
+        self._joints, self._config = config.joints.as_tuple(), config
         commands = Sensor(client.session, client.key("cmd_vel_out"), (TwistStamped,))
         self._sensors: list[tuple[Sensor, str]] = [(commands, "command")]
         self._wheels = Sensor(client.session, client.key("wheel_states"), (JointState,))
@@ -250,7 +250,7 @@ class RobotOnBus:
         recorder = LegRecorder(self._joints)
         self._drain()
         sender = self._client.sender
-        driver = LegDriver(leg, SOURCE, self._geometry, clock.steady_s(), sender)
+        driver = LegDriver(leg, SOURCE, self._config, clock.steady_s(), sender)
         try:
             self._drive(driver, recorder)
         finally:
@@ -264,7 +264,7 @@ class RobotOnBus:
         if driver.halted:
             end = "" if driver.halted.endswith("?") else "."
             text = f"{driver.halted}{end} The tool commanded zero speed and did not change any file"
-            if driver.disturbed or (driver.silent and self._returns()):
+            if driver.disturbed or (driver.silent and self.returns()):
                 raise DisturbedError(driver.halted, text)
             raise GuideError(text)
         log = recorder.log()
@@ -272,7 +272,8 @@ class RobotOnBus:
             self._prompt.show_text(f"note: {note}")
         return log.runs[0]
 
-    def _returns(self) -> bool:
+    def returns(self) -> bool:
+        """Wait for a state of the daemon, and return whether one has arrived."""
         end = clock.steady_s() + RECONNECT_TIMEOUT_S
         while clock.steady_s() < end:
             if self._watch.poll(clock.steady_s()):
@@ -303,7 +304,8 @@ class RobotOnBus:
             driver.state(state, now)
 
         def wheels(message: JointState, arrival: float) -> None:
-            driver.wheels(recorder.wheels(message, arrival), arrival)
+            stamp = message.header.stamp.to_ns() / NS_PER_S
+            driver.wheels(recorder.wheels(message, arrival), stamp or arrival, arrival)
 
         self._wheels.receive(wheels, now)
         for sensor, name in self._sensors:

@@ -110,8 +110,9 @@ def guide(
             raise disturbed
         again = begins_again(legs, number, sensor=not method.tool)
         back = "" if simulated else ": put the robot back where it stood when that leg began"
+        end = "" if disturbed.why.endswith("?") else "."
         prompt.show_text(
-            f"Leg {number + 1} was disturbed: {disturbed.why}. The drive continues with leg "
+            f"Leg {number + 1} was disturbed: {disturbed.why}{end} The drive continues with leg "
             f"{again + 1}{back}."
         )
         if method.tool and again == number and (since := angle_before(leg)):

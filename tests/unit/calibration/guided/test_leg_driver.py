@@ -6,14 +6,17 @@ from collections.abc import Callable
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from acsard.calibration.guided.drive_plan import Leg, Move
 from acsard.calibration.guided.leg_driver import STALL_REASON, LegDriver, Phase
 from acsard.client.commander import OPEN_TIMEOUT_S
 from acsard.client.follower import MAX_STATE_AGE_S
-from acsard.core.config.settings import DriveConfig
+from acsard.core.config.settings import Config, DriveConfig, LimitsConfig
 from acsard.core.link.link_diagnosis import HOST_STALL
 from acsard.core.messages.schema import RobotState, SourceState, Time
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.limits import Limiter
 from acsard.core.values import REST, Twist, WheelSpeeds
 from tests.each import each
 
@@ -23,6 +26,13 @@ TURN = Leg("", "", (Move(5.0, 0.0, 0.5),), by_key=True)
 
 TICK = 0.02
 RADIUS, TRACK = 0.05, 0.30
+
+NO_RAMPS = Config(
+    limits=LimitsConfig(
+        linear_acceleration=1000.0, linear_deceleration=1000.0, angular_acceleration=1000.0,
+        angular_deceleration=1000.0,
+    )
+)  # fmt: skip
 
 Late = Callable[[RobotState], RobotState]
 
@@ -45,10 +55,11 @@ class World:
 
     def __init__(self, leg: Leg) -> None:
         self.now = 100.0
-        self.driver = LegDriver(leg, "app", DriveConfig(), self.now, US)
+        self.driver = LegDriver(leg, "app", NO_RAMPS, self.now, US)
         self.said: list[Twist] = []
         self.tells: Late = lambda state: state
         self.speaks = True
+        self.period, self.wheels_due = 0.0, 0.0
 
     def run(self, seconds: float) -> World:
         for _ in range(round(seconds / TICK)):
@@ -57,8 +68,9 @@ class World:
             if self.speaks:
                 state = self.tells(telling(done))
                 self.driver.state(state, self.now)
-                if state.wheels:
-                    self.driver.wheels(WheelSpeeds(*state.wheels), self.now)
+                if state.wheels and self.now >= self.wheels_due:
+                    self.wheels_due = self.now + self.period
+                    self.driver.wheels(WheelSpeeds(*state.wheels), self.now + 1e9, self.now)
             self.said.append(self.driver.step(self.now))
         return self
 
@@ -86,7 +98,7 @@ def test_wheels_that_follow_their_command_by_the_configured_radii_do_not_halt_th
     leg, size = Leg("", "", (Move(4.0, 0.3, 0.0),)), 0.6
     world = World(leg)
     drive = DriveConfig(left_wheel_radius_multiplier=size, right_wheel_radius_multiplier=size)
-    world.driver = LegDriver(leg, "app", drive, world.now, US)
+    world.driver = LegDriver(leg, "app", replace(NO_RAMPS, drive=drive), world.now, US)
     world.tells = lambda state: msgspec.structs.replace(
         state, wheels=[speed / size for speed in state.wheels]
     )
@@ -294,17 +306,69 @@ def test_a_leg_halts_if_a_limit_keeps_the_robot_from_the_planned_path(
     assert world.said.count(Twist(0.3)) * TICK < 6.7 + TICK
 
 
-def test_a_robot_that_follows_late_and_with_ramps_finishes_a_square() -> None:
-    world, rolling = World(SQUARE), [0.0, 0.0]
+def ramped(linear: float, angular: float, right: float = 1.0) -> Late:
+    """Return a function that lets a robot follow with these accelerations, m/s2 and rad/s2.
 
-    def ramp(state: RobotState) -> RobotState:
+    `right` is the speed of the right wheels as a fraction of the commanded speed.
+    """
+    rolling = [0.0, 0.0]
+
+    def follow(state: RobotState) -> RobotState:
         for i, (goal, step) in enumerate(
-            ((state.linear or 0.0, 0.4 * TICK), (state.angular or 0.0, 1.2 * TICK))
+            ((state.linear or 0.0, linear * TICK), (state.angular or 0.0, angular * TICK))
         ):
-            rolling[i] += max(-step, min(step, 0.97 * goal - rolling[i]))
-        return msgspec.structs.replace(state, wheels=telling(Twist(*rolling)).wheels)
+            rolling[i] += max(-step, min(step, goal - rolling[i]))
+        front, left, rear, last = telling(Twist(*rolling)).wheels
+        return msgspec.structs.replace(state, wheels=[front * right, left, rear, last * right])
 
-    world.tells = ramp
+    return follow
+
+
+SLOW_RAMPS = LimitsConfig(
+    linear_acceleration=0.3, linear_deceleration=1.0, angular_acceleration=1.0,
+    angular_deceleration=4.0,
+)  # fmt: skip
+TURNS = Leg("", "", (Move(0.6), Move(63.0, 0.0, 1.0), Move(0.6)))
+
+
+@each(
+    ("leg", "limits", "tells"),
+    [
+        (SQUARE, NO_RAMPS.limits, ramped(0.4, 1.2)),
+        (SQUARE, NO_RAMPS.limits, ramped(9.0, 9.0, right=0.95)),
+        (Leg("", "", (Move(6.7, 0.3),)), NO_RAMPS.limits, ramped(9.0, 9.0, right=0.95)),
+        (TURNS, NO_RAMPS.limits, ramped(9.0, 9.0, right=0.95)),
+    ],
+)
+def test_a_robot_that_follows_within_a_few_percent_finishes_its_leg(
+    leg: Leg, limits: LimitsConfig, tells: Late
+) -> None:
+    world = World(leg)
+    world.driver = LegDriver(leg, "app", Config(limits=limits), world.now, US)
+    world.tells = tells
+    world.run(80.0)
+    assert (world.driver.phase, world.driver.halted) == (Phase.DONE, "")
+
+
+def test_the_ramps_of_the_configuration_are_part_of_the_commanded_path() -> None:
+    """Each side of a square is shorter because the robot starts more slowly than it brakes."""
+    world = World(SQUARE)
+    config = Config(limits=SLOW_RAMPS)
+    world.driver = LegDriver(SQUARE, "app", config, world.now, US)
+    limiter = Limiter(SLOW_RAMPS, Kinematics(DriveConfig()))
+
+    def follow(state: RobotState) -> RobotState:
+        twist = limiter.follow(Twist(state.linear or 0.0, state.angular or 0.0), TICK)
+        return msgspec.structs.replace(state, wheels=telling(twist).wheels)
+
+    world.tells = follow
+    world.run(40.0)
+    assert (world.driver.phase, world.driver.halted) == (Phase.DONE, "")
+
+
+def test_wheel_speeds_may_be_published_rarely() -> None:
+    world = World(SQUARE)
+    world.period = 0.3
     world.run(40.0)
     assert (world.driver.phase, world.driver.halted) == (Phase.DONE, "")
 
@@ -363,6 +427,6 @@ def test_wheels_that_never_come_to_rest_are_reported() -> None:
     for _ in range(500):
         world.now += TICK
         world.driver.state(telling(REST), world.now)
-        world.driver.wheels(WheelSpeeds(0.1, -0.1, 0.1, -0.1), world.now)
+        world.driver.wheels(WheelSpeeds(0.1, -0.1, 0.1, -0.1), world.now, world.now)
         world.driver.step(world.now)
     assert "come to rest" in world.driver.halted
