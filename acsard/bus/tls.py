@@ -170,13 +170,15 @@ def expiry_times(directory: str) -> dict[str, int]:
 
 
 def is_signed(directory: str) -> bool:
-    """Return whether an authority in `ca.pem` has signed `certificate.pem` or its chain.
+    """Return whether an authority in `ca.pem` has signed `certificate.pem`.
+
+    The certificate may also be signed by the next one in `certificate.pem`, and so on.
 
     Return True, too, if a file cannot be read, or if the library `cryptography` is missing.
     """
     try:
         from cryptography import x509
-        from cryptography.exceptions import InvalidSignature
+        from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
     except ImportError:
         return True
     try:
@@ -186,11 +188,19 @@ def is_signed(directory: str) -> bool:
         )
     except (OSError, ValueError, x509.InvalidVersion):
         return True
-    for certificate in chain:
-        for authority in authorities:
-            with suppress(ValueError, TypeError, InvalidSignature):
-                certificate.verify_directly_issued_by(authority)
-                return True
+
+    def signed(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
+        try:
+            certificate.verify_directly_issued_by(authority)
+        except (ValueError, TypeError, InvalidSignature, UnsupportedAlgorithm):
+            return False
+        return True
+
+    for n, certificate in enumerate(chain):
+        if any(signed(certificate, authority) for authority in authorities):
+            return True
+        if not (n + 1 < len(chain) and signed(certificate, chain[n + 1])):
+            return False
     return False
 
 

@@ -67,8 +67,8 @@ The name of a subcommand is also the name of its module in this package.
 MUST_FINISH = {
     "call", "set", "bench", "doctor", "mcu", "accuracy", "calibrate", "tls", "service",
 }  # fmt: skip
-"""Subcommands that act or judge. If the reader of their output ends early, they have failed. The
-other subcommands only print."""
+"""Subcommands whose exit code says whether something was done or judged. If the reader of their
+output ends early, they have failed."""
 
 MAX_ARGUMENT_LENGTH = 4096
 """Largest length of an argument, characters. Zenoh fails on keys above 65,535 bytes."""

@@ -13,7 +13,7 @@ from acsard.cli.connection import add_bus, connected, require_one
 from acsard.core.config.settings import AngularSpeed, LinearSpeed
 from acsard.core.messages.permissions import COMMAND_ROLE, has
 from acsard.host.errors import NoAnswerError, NotPermittedError, UsageError
-from acsard.host.logs import output_in_threads
+from acsard.host.logs import MAX_LAST_OUTPUT_S, output_in_threads
 from acsard.top import terminal
 from acsard.top.drive_screen import HELP
 from acsard.top.keyboard import Keyboard, KeyboardDrive
@@ -48,7 +48,7 @@ def main(args: argparse.Namespace) -> int:
             "acsard drive reads single key presses, so run it in a terminal; a program must use "
             "acsard.client instead"
         )
-    with output_in_threads(), connected(args, args.source) as robot:
+    with output_in_threads(MAX_LAST_OUTPUT_S), connected(args, args.source) as robot:
         if robot.where.tls and not has((us := robot.whoami()).role, COMMAND_ROLE):
             raise (NotPermittedError if us.role else NoAnswerError)(us.describe())
         ride = KeyboardDrive(robot, Keyboard(args.linear, args.angular))

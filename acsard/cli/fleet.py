@@ -19,7 +19,7 @@ from acsard.bus.robot_discovery import ALL_ROBOTS
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
 from acsard.core.formatting import json_line
 from acsard.host.errors import Exit, UnreachableError
-from acsard.host.logs import output_in_threads
+from acsard.host.logs import MAX_LAST_OUTPUT_S, output_in_threads
 from acsard.terminal.output import has_screen
 from acsard.top import terminal
 from acsard.top.fleet_table import Roster, table
@@ -41,7 +41,7 @@ def main(args: argparse.Namespace) -> int:
         ids = (many or (robot.where.robot_id,)) if args.id else (ALL_ROBOTS,)
         fleet = Roster(robot, ids)
         if not (args.once or args.json) and has_screen():
-            with output_in_threads():
+            with output_in_threads(MAX_LAST_OUTPUT_S):
                 terminal.roster(fleet)
             return int(Exit.OK)
         rows = fleet.gather()

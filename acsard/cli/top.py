@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 
 from acsard.cli.connection import add_bus, connected
-from acsard.host.logs import output_in_threads
+from acsard.host.logs import MAX_LAST_OUTPUT_S, output_in_threads
 from acsard.terminal.output import has_screen
 from acsard.top import terminal
 from acsard.top.feed import Feed
@@ -24,6 +24,6 @@ def main(args: argparse.Namespace) -> int:
         if args.once or not has_screen():
             print(terminal.one_screen(feed))
         else:
-            with output_in_threads():
+            with output_in_threads(MAX_LAST_OUTPUT_S):
                 terminal.show_live(feed)
     return 0

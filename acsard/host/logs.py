@@ -16,13 +16,14 @@ import queue
 import socket
 import sys
 import threading
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import Any, Literal, TextIO, cast
 
 from acsard.core.config.settings import LogConfig
 from acsard.core.formatting import printable
 from acsard.core.values import Event, EventName
+from acsard.host import clock
 from acsard.host.terminal_modes import may_use_color
 
 # structlog imports rich to draw tracebacks, but this log contains no tracebacks. The daemon's
@@ -95,6 +96,14 @@ class JournalStream(io.StringIO):
 CLOSE_TIMEOUT_S = 0.2
 """Longest time for which the end of the process waits until the queued lines are written, s."""
 
+MAX_LAST_OUTPUT_S = 10.0
+"""Longest time for which a tool with a screen waits at its end until a slow terminal has shown the
+last output, s."""
+
+MAX_PART, PART_TIMEOUT_S = 1024, 1.5
+"""Number of bytes that are written to a terminal at once, and longest time for which a tool with a
+screen waits for them at its end, s. At 9600 baud, they take 1.1 s."""
+
 Form = Literal["console", "json", "logfmt", "journal"]
 
 MAX_VALUE_LENGTH = 500
@@ -114,6 +123,8 @@ class Writer:
         # In a minute the daemon logs fewer lines than this queue holds, even with all faults at
         # once (`event_throttle.py`).
         self._lines: queue.Queue[str | None] = queue.Queue(1000)
+        self._parts = 0
+        """Number of parts of texts that were written."""
         self._thread = threading.Thread(target=self._work, name="log", daemon=True)
         self._thread.start()
 
@@ -131,6 +142,9 @@ class Writer:
     def isatty(self) -> bool:
         return self._stream.isatty()
 
+    def fileno(self) -> int:
+        return self._stream.fileno()
+
     @property
     def encoding(self) -> str:
         return self._stream.encoding
@@ -140,32 +154,41 @@ class Writer:
         """Whether everything is written. It stays False while the reader of the stream stalls."""
         return not self._lines.unfinished_tasks
 
-    def close(self, timeout: float) -> None:
-        """Wait for at most `timeout` s until the queued lines are written.
+    def close(self, timeout: float, most: float | None = None) -> None:
+        """Wait until the queued lines are written, but no longer than `timeout` s.
 
-        If the queue is full, return immediately.
+        If `most` is not None, the wait also ends after `most` s, and `timeout` is the longest time
+        without progress, s. If the queue is full, return immediately.
         """
         try:
             self._lines.put_nowait(None)
         except queue.Full:
             return
-        self._thread.join(timeout)
+        end, before = clock.steady_s() + (timeout if most is None else most), -1
+        while before != self._parts and (left := end - clock.steady_s()) > 0:
+            before = self._parts
+            self._thread.join(min(timeout, left))
+            if not self._thread.is_alive():
+                return
+
+    def _count_part(self) -> None:
+        self._parts += 1
 
     def _work(self) -> None:
         while (text := self._lines.get()) is not None:
             try:
-                write_through(self._stream, text)
+                write_through(self._stream, text, self._count_part)
             except (OSError, ValueError):
                 # On a full disk or a closed stream the log loses lines, and control goes on.
                 pass
             self._lines.task_done()
 
 
-def write_through(stream: TextIO, text: str) -> None:
+def write_through(stream: TextIO, text: str, progress: Callable[[], None]) -> None:
     """Write a text directly to the stream's file descriptor, without the stream's buffer.
 
     A thread that hung in a write through the buffer would keep the buffer's lock. Python could then
-    not flush the stream when the process ends.
+    not flush the stream when the process ends. `progress` is called after each part of the text.
     """
     try:
         fd = stream.fileno()
@@ -173,14 +196,20 @@ def write_through(stream: TextIO, text: str) -> None:
     except (OSError, ValueError):
         stream.write(text)
         return
-    data = text.encode(errors="replace")
+    data = text.encode(stream.encoding or "utf-8", errors="replace")
+    # Elsewhere, the lines of two processes must not mix.
+    most = MAX_PART if os.isatty(fd) else len(data)
     while data:
-        data = data[os.write(fd, data) :]
+        data = data[os.write(fd, data[:most]) :]
+        progress()
 
 
 @contextmanager
-def output_in_threads() -> Iterator[None]:
+def output_in_threads(most: float | None = None) -> Iterator[None]:
     """Let `sys.stdout` and `sys.stderr` never block during a `with` block.
+
+    At the end of the block, wait until all output is written, but at most `CLOSE_TIMEOUT_S`. If
+    `most` is not None, wait for up to `most` s while the reader goes on reading.
 
     A `Writer` replaces each of the two streams. This holds for everything that Python code writes:
     `print`, warnings, tracebacks, and the log records of libraries such as aiohttp.
@@ -190,8 +219,9 @@ def output_in_threads() -> Iterator[None]:
         with redirect_stdout(cast(TextIO, output)), redirect_stderr(cast(TextIO, errors)):
             yield
     finally:
-        output.close(CLOSE_TIMEOUT_S)
-        errors.close(CLOSE_TIMEOUT_S)
+        timeout = CLOSE_TIMEOUT_S if most is None else PART_TIMEOUT_S
+        output.close(timeout, most)
+        errors.close(timeout, most)
 
 
 class Log:

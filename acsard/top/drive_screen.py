@@ -11,7 +11,6 @@ from textwrap import wrap
 from msgspec import Struct
 from rich.text import Text
 
-from acsard.client.commander import only_needs_zero
 from acsard.core.formatting import printable
 from acsard.core.messages.schema import RobotState
 from acsard.core.messages.short_texts import place, speeds
@@ -136,14 +135,8 @@ def reason(state: RobotState) -> str:
 
 
 def refused(teleop: Teleop) -> str:
-    """Return a sentence which says that the keys do not drive the robot, and why.
-
-    If the robot requires a zero command first, the sentence also says which key sends a zero
-    command.
-    """
-    zero_first = teleop.state is not None and only_needs_zero(teleop.state, teleop.source)
-    mend = " (press space, then press the key again)" if zero_first else ""
-    return f"your keys do not drive the robot: {printable(teleop.objection)}{mend}"
+    """Return a sentence which says that the keys do not drive the robot, and why."""
+    return f"your keys do not drive the robot: {printable(teleop.objection)}"
 
 
 def selected_speeds(teleop: Teleop) -> str:

@@ -582,9 +582,8 @@ class Gyro:
         if lost:
             # Samples are missing, so the wheels also give the turn since the sample before them,
             # unless they slipped already then.
-            if self._slipped_before:
-                self._doubt += self._guessed * self._guessed
-            else:
+            self._doubt += self._guessed * self._guessed
+            if not self._slipped_before:
                 angle, self._contradicted, self._slip_s = -self._guessed, 0.0, 0.0
             self._guessed = 0.0
         if self._frozen:

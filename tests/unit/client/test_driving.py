@@ -510,3 +510,28 @@ def test_a_closed_connection_gets_no_zeros(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(world, "send", closed)
     assert zeros_of(world, monkeypatch) == 0.0
+
+
+def test_a_sender_that_was_idle_sends_no_zero_if_the_robot_follows_another_source(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World(lambda t, last, sent: replace(FOLLOWED, source="nav", sender=OTHER, linear=0.3))
+    world.set_clock(monkeypatch)
+    robot: Any = world
+    for pause in repeat_zeros(robot, idle_s=2 * GRACE_S):
+        world.now += pause
+    assert world.sent == []
+    assert not world.subscribed
+
+
+@pytest.mark.parametrize("says", [lambda t, last, sent: None, followed])
+def test_a_sender_that_was_idle_sends_zeros_if_the_robot_follows_it_or_is_silent(
+    says: Says, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = World(says)
+    world.set_clock(monkeypatch)
+    world.now += 1.0
+    robot: Any = world
+    for pause in repeat_zeros(robot, idle_s=2 * GRACE_S):
+        world.now += pause
+    assert set(world.sent) == {0.0}

@@ -405,3 +405,10 @@ def test_an_imu_message_that_the_daemon_refuses_is_not_decoded(payload: bytes) -
         reading(Arrival("imu", True, payload, "", 0, None, ""))
     with pytest.raises(DecodeError):
         decoder("imu").decode("", payload)
+
+
+def test_a_wrong_argument_of_drive_sends_nothing(session: Session) -> None:
+    robot = client_of(session)
+    with pytest.raises(client.UsageError):
+        robot.drive(0.3, seconds=0.0)
+    assert session.heard == []

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from acsard.core.messages.schema import SourceState
 from acsard.core.motion.modes import Mode
 from acsard.top.drive_screen import HELP, Teleop, last_report_lines, lines, report_lines
 from acsard.top.text import MODE_STYLES
@@ -67,19 +66,6 @@ def test_help_stays_on_a_screen_of_few_lines() -> None:
     rows = texts(of(reason=LONG), 40, 10)
     assert len(rows) == 10
     assert rows[-len(HELP) :] == list(HELP)
-
-
-def test_a_refused_key_must_be_pressed_again_after_space() -> None:
-    why = "send a zero first: teleop must send a zero before it can drive"
-    seen = of(mode="ready", sources=[SourceState("teleop", 100, None, why, "neutral")])
-    text = " ".join(report_lines(replace(seen, objection=why), 200))
-    assert (
-        f"your keys do not drive the robot: {why} (press space, then press the key again)" in text
-    )
-    stopped = of(mode="stopped", sources=[SourceState("teleop", 100, None, why, "neutral")])
-    assert "press space" not in " ".join(
-        report_lines(replace(stopped, objection="stopped by anna"), 200)
-    )
 
 
 def test_keys_that_do_not_drive_are_reported() -> None:

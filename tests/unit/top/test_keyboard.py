@@ -564,3 +564,12 @@ def test_the_operator_is_informed_why_keys_have_no_effect(monkeypatch: pytest.Mo
     assert drive.ride.screen_data().objection == ""
     drive.step("i", times=4)
     assert drive.ride.screen_data().objection == "stopped by request"
+
+
+def test_a_held_key_that_must_be_released_is_explained_with_the_key_to_press(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    keyboard = HeldKeyDrive(ZERO_FIRST, monkeypatch)
+    keyboard.step("i", times=12)
+    assert keyboard.ride.screen_data().objection == RELEASE_REASON
+    assert "press space, then press the key again" in RELEASE_REASON
