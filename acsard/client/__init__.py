@@ -10,9 +10,9 @@
 typed messages (`acsard.core.messages.schema`). The daemon refuses late commands, and requires a
 zero (a command with the speed 0) from each sender before that sender may move the robot. The client
 follows these rules: it signs, numbers and stamps its commands, and sends zeros before each drive.
-When the `with` block ends, even with an exception, the client sends a zero if its last command was
-not zero. `drive` raises an error if the robot does not follow the commands. When `drive` returns,
-the robot stands still, unless something else moves it.
+When the `with` block ends, even with an exception, the client sends zeros until the robot stands,
+for up to 2 s, if its last command was not zero. `drive` raises an error if the robot does not
+follow the commands. When `drive` returns, the robot stands still, unless something else moves it.
 
 If you leave out an argument, its value comes from the configuration file that the environment
 variable ACSARD_CONFIG names (`bus.listen`, `robot.id`, `bus.tls`). Without that variable, the
