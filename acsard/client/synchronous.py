@@ -125,7 +125,7 @@ def _end_all() -> None:
     _end(
         [
             client
-            for client, (opened_pid, thread) in _open.items()
+            for client, (opened_pid, thread) in list(_open.items())
             if opened_pid == pid and (thread is main or thread.daemon or not thread.is_alive())
         ]
     )
