@@ -83,7 +83,8 @@ class Authority:
         """Load the authority from its files in `directory`.
 
         `password` is a function that returns the password of the private key. It is called only if
-        the key is encrypted. Raises `OSError` or `ValueError` if the authority cannot be loaded.
+        the key is encrypted. Raises `OSError` or `ValueError` if the authority cannot be loaded or
+        has expired.
         """
         data = (directory / CA_KEY).read_bytes()
         try:
@@ -96,6 +97,12 @@ class Authority:
         certificate = x509.load_pem_x509_certificate((directory / CA).read_bytes())
         if certificate.public_key() != key.public_key():
             raise ValueError(f"{CA_KEY} is the key of another authority than {CA}")
+        end = certificate.not_valid_after_utc
+        if end <= datetime.now(UTC):
+            raise ValueError(
+                f"it expired on {end:%Y-%m-%d}; `acsard tls init --force` makes a new one, and then "
+                "every client needs a new certificate"
+            )
         return cls(certificate, key)
 
     def permits(self, address: str) -> bool:

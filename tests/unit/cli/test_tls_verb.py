@@ -718,6 +718,19 @@ def test_renew_refuses_the_key_of_another_authority(
     assert "ca-key.pem is the key of another authority than ca.pem" in capsys.readouterr().err
 
 
+@each("action", [("add", "anna"), ("renew",)])
+def test_an_expired_authority_signs_nothing(
+    own: Path, capsys: pytest.CaptureFixture[str], action: tuple[str, ...]
+) -> None:
+    """Every browser and client would refuse the new certificate."""
+    Authority.make(own, "expired", -1, ["localhost"])
+    before = files(own)
+    assert tls(*action, "--directory", str(own)) == Exit.FAILURE
+    assert files(own) == before
+    error = capsys.readouterr().err
+    assert "it expired on" in error and "`acsard tls init --force` makes a new one" in error
+
+
 @each("kept", ["ca-key.pem", "key.pem", "certificate.pem"])
 def test_init_overwrites_no_key_and_no_certificate(tmp_path: Path, kept: str) -> None:
     (directory := tmp_path / kept).mkdir()
