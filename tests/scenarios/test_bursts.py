@@ -1,15 +1,17 @@
-"""The odometry of a drive of 450 m with bursts of lost lines, on a link with encoder counts.
+"""The odometry of drives with bursts of lost lines.
 
-    pytest -s -m soak tests/scenarios/test_bursts.py
+    pytest -s -m "slow or soak or not soak" tests/scenarios/test_bursts.py
 
-The tests compare `state` with the simulated robot. `unit/mcu/test_bursts.py` does so for plain
-lines.
+The tests compare `state` with the simulated robot. `unit/core/link/test_bursts.py` tests the
+covariance of 1000 robots that lose plain lines.
 """
 
 from __future__ import annotations
 
 import math
 import random
+from contextlib import ExitStack
+from typing import Literal
 
 import pytest
 
@@ -69,3 +71,34 @@ def test_with_the_mcu_s_counts_bursts_of_lost_lines_cost_at_most_a_centimetre(
     assert lost > 10
     assert metres > 0.6 * seconds
     assert off <= 0.01
+
+
+@pytest.mark.parametrize("check", ["off", "auto"])
+@pytest.mark.parametrize("lag_s", [0.05, pytest.param(0.15, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("silence_s", [0.12, 0.15, 0.19, 0.3])
+@pytest.mark.parametrize("fault", ["lines to the host", "all lines", "the board"])
+def test_errors_of_many_equal_silences_add_up_within_the_covariance(
+    fault: str, silence_s: float, lag_s: float, check: Literal["off", "auto"]
+) -> None:
+    """Each silence has the same cause, so the errors of all have the same sign.
+
+    A loose cable loses the lines to the host or all lines, or the board itself is silent. In most
+    silences the daemon commands rest. `lag_s` is the time constant of the motors.
+    """
+    sim = SimConfig(motor_time_constant=lag_s)
+    made = World(Config(mcu=McuConfig(link_check=check), sim=sim))
+    made.run(2.5)
+    made.drive(0.8, 0.0, 2.0)
+    for _ in range(8):
+        with ExitStack() as fault_over, pytest.MonkeyPatch.context() as cable:
+            if fault == "the board":
+                fault_over.enter_context(made.mcu.mute())
+            else:
+                cable.setattr(made.port, "feed", lambda received: None)
+            if fault == "all lines":
+                cable.setattr(made.mcu, "receive", lambda *line: None)
+            made.hold(0.8, 0.0, silence_s)
+        made.hold(0.8, 0.0, 1.5)
+    made.drive(0.0, 0.0, 1.5)
+    error, variance = made.mcu.vehicle.pose.x - made.state.x, made.odom.pose.covariance[0]
+    assert abs(error) < 2.0 * math.sqrt(variance), f"{error:+.3f} m"

@@ -7,7 +7,8 @@ in the line, or these speeds times the time. Each time and each encoder count is
 
 In a gap that no line covers, `Rolling` assumes two speeds: the speed before the gap for the first
 half, and the speed after the gap for the second half. If the motors were commanded to rest in the
-gap, the speed before the gap is assumed only until that command.
+gap, the speed before the gap is assumed until that command, and an exponential decay to the speed
+after the gap from then on.
 """
 
 from __future__ import annotations
@@ -52,6 +53,10 @@ MAX_COMMANDED_S = 1.0
 feedback, the daemon usually commands rest much earlier. If the board receives nothing, its watchdog
 stops the motors."""
 
+MIN_DECAY = 0.02
+"""Fraction of its speed to which a wheel at rest is assumed to have slowed down after a command to
+rest. An exponential decay never reaches zero."""
+
 STEP_DECAY = 0.05
 """Fraction of the estimated quantization step that is forgotten with each line."""
 
@@ -83,9 +88,9 @@ class Rolled(Struct, frozen=True, gc=False):
     known: float
     """Total duration of the motion in `pieces` and `turned`, s; 0 if a part of the motion is
     unknown."""
-    doubtful: float = 0.0
-    """Time in the gap from the command to rest until the MCU's watchdog stops the motors, s. If the
-    MCU did not receive the command, the wheels moved on in this time."""
+    missed: Motors = AT_REST
+    """Angles that the wheels rolled in addition to `pieces` if the MCU did not receive the command
+    to rest, rad. The wheels then moved on until the MCU's watchdog stopped the motors."""
 
 
 class Rolling:
@@ -174,7 +179,7 @@ class Rolling:
         guessed = self._lost <= MAX_LOST_S or self._skipped <= MAX_LOST
         lost, unknown = (self._lost, 0.0) if guessed else (0.0, self._lost)
         turned, filled, unknown = self._turned, self._bridged, unknown + self._gap
-        driven, doubtful = self._driven_in(line), 0.0
+        driven, missed = self._driven_in(line), AT_REST
         known = lost + filled + self._counted + dt
         if self._skipped:
             self.forget()
@@ -188,41 +193,58 @@ class Rolling:
             if line.counted is not None:
                 pieces = _some(line.counted, times(speeds, lost))
             if bridged:
-                first, second = before.as_tuple(), speeds
-                # A running daemon commands rest after `quiet`. After an earlier command to rest,
-                # the wheels also need about this time to slow down.
-                stops = max(self._quiet, driven)
-                doubtful = max(0.0, min(bridged, WATCHDOG_S) - stops)
-                if self._quiet < driven < bridged:
-                    between = _until_rest(first, driven, second, bridged)
+                first, own = before.as_tuple(), seconds - bridged
+                if self._quiet < driven < bridged + own:
+                    between = _until_rest(first, driven, speeds, bridged, own)
+                    stopped = max(WATCHDOG_S, driven)
+                    moved_on = _until_rest(first, stopped, speeds, bridged, own)
+                    missed = plus(moved_on, times(between, -1.0))
                 else:
-                    on = min(bridged / 2, stops)
-                    between = plus(times(first, on), times(second, bridged - on))
+                    # A running daemon commands rest after `quiet`. After an earlier command to
+                    # rest, the wheels also need about this time to slow down.
+                    stops = max(self._quiet, driven)
+                    on, doubtful = min(bridged / 2, stops), min(bridged, WATCHDOG_S) - stops
+                    between = plus(times(first, on), times(speeds, bridged - on))
+                    if doubtful > 0.0:
+                        missed = times(plus(first, times(speeds, -1.0)), doubtful)
                 angles, pieces = plus(between, line_angles), _some(between, *pieces)
         known = 0.0 if unknown else known
-        return Rolled(pieces, turned, angles, seconds, bridged, unknown, known, doubtful)
+        return Rolled(pieces, turned, angles, seconds, bridged, unknown, known, missed)
 
 
 def _some(*pieces: Motors) -> tuple[Motors, ...]:
     return tuple([piece for piece in pieces if piece != AT_REST])
 
 
-def _until_rest(before: Motors, driven: float, after: Motors, bridged: float) -> Motors:
+def _until_rest(before: Motors, driven: float, after: Motors, bridged: float, own: float) -> Motors:
     """Return the angles that the wheels rolled in a gap, rad.
 
     The daemon commanded rest `driven` s after the gap began. `before` and `after` are the wheel
-    speeds before and after the gap, rad/s. `bridged` is the duration of the gap, s.
+    speeds before and after the gap, rad/s. `bridged` is the duration of the gap, s. The line with
+    the speeds `after` covers the `own` s after the gap.
     """
-    # A board that computes its speeds since its last reply reports the means over the gap. These
-    # means are large enough for the motion until the command to rest. A smaller speed is the speed
-    # at the end of the gap.
-    angles = []
+    # A board that computes its speeds since its last reply reports the means over the whole time.
+    # These means are large enough for the motion until the command to rest. A smaller speed is the
+    # speed after the gap.
+    angles, whole = [], bridged + own
     for old, new in zip(before, after, strict=True):
-        until, whole = old * driven, new * bridged
-        is_mean = abs(whole) >= abs(until) and whole * until >= 0.0
-        angles.append(whole if is_mean else until + new * (bridged - driven))
+        if old * new >= 0.0 and abs(new) * whole >= abs(old) * min(driven, whole):
+            angles.append(new * bridged)
+        elif driven >= bridged:
+            angles.append(old * bridged)
+        else:
+            angles.append(old * driven + _slowing(old, new) * (whole - driven) - new * own)
     front_right, front_left, rear_left, rear_right = angles
     return front_right, front_left, rear_left, rear_right
+
+
+def _slowing(old: float, new: float) -> float:
+    """Return the mean speed of a wheel whose speed decays exponentially from `old` to `new`."""
+    ratio = new / old if old else 1.0
+    if ratio >= 0.99:
+        return new
+    ratio = max(ratio, MIN_DECAY)
+    return old * (1.0 - ratio) / -math.log(ratio)
 
 
 def plus(a: Motors, b: Motors) -> Motors:
@@ -389,7 +411,6 @@ class Gaps:
         before: Twist,
         after: Twist,
         commanded: Twist,
-        doubtful: float = 0.0,
     ) -> tuple[float, float]:
         """Return a pair: the variances of distance (m2) and turn (rad2) that a filled gap adds.
 
@@ -402,20 +423,12 @@ class Gaps:
             after: the twist after the gap.
             commanded: the highest speeds that were commanded in the gap, m/s and rad/s, both
                 without sign.
-            doubtful: the time, s, after a command to rest that the board may not have received. The
-                odometry assumes the twist `after` for this time. With the probability 1/2, the
-                robot still had the twist `before`.
         """
         bridged, previous = self._bridged + seconds, self._given
         along, yaw = self.unseen(bridged, before, after, commanded)
         self.interrupt(after)
         self._bridged, self._given = bridged, (max(along, previous[0]), max(yaw, previous[1]))
-        late = doubtful * (before.linear - after.linear)
-        late_turn = doubtful * (before.angular - after.angular)
-        return (
-            max(0.0, along - previous[0]) + late**2 / 2,
-            max(0.0, yaw - previous[1]) + late_turn**2 / 2,
-        )
+        return max(0.0, along - previous[0]), max(0.0, yaw - previous[1])
 
     def unseen(
         self, seconds: float, before: Twist, after: Twist, commanded: Twist = REST

@@ -50,6 +50,10 @@ from acsard.core.values import (
     WheelSpeeds,
 )
 
+MISSED_STD = math.sqrt(0.5)
+"""Standard deviation of the motion that is missed in a gap if the board did not receive the command
+to rest, as a fraction of this motion. The board received the command with the probability 1/2."""
+
 MAX_RECOMPUTED_LINES = 128
 """Largest number of feedback lines that are recomputed when a wheel proves faulty."""
 
@@ -353,12 +357,16 @@ class Odometry:
 
         A gap that was not filled restarts the measurement.
         """
-        bridged, doubtful = rolled.bridged, rolled.doubtful
+        bridged = rolled.bridged
         if bridged > 0.0:
             self.bridged += bridged
-            along, yaw = self._gaps.fill(bridged, before, twist, self._highest, doubtful)
+            along, yaw = self._gaps.fill(bridged, before, twist, self._highest)
             by_counts, turn_by_counts = self._rounded(bridged)
             self._uncertainty.doubt(along + by_counts, yaw + turn_by_counts)
+            if rolled.missed != AT_REST:
+                ((distance, turn),) = self._arcs((rolled.missed,), None, self._track.share)
+                turn = 0.0 if self.checks.turn is not None else turn
+                self._uncertainty.miss(MISSED_STD * distance, MISSED_STD * turn)
         elif feedback.gap:
             self._gaps.interrupt(twist)
         else:

@@ -171,6 +171,22 @@ class PoseUncertainty:
             self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
             self._publish()
 
+    def miss(self, distance: float, turn: float) -> None:
+        """Add the uncertainty of a motion that the pose may have missed in a filled gap.
+
+        The cause is often the same in each gap, so these errors add up and do not average out.
+        `distance`, m, and `turn`, rad, are the standard deviations, with the signs of the motion.
+        """
+        if self._lost:
+            return
+        c, s = self._cos, self._sin
+        if self._of_gaps < 0:
+            self._of_gaps = self._widen()
+        self._columns = [*self._columns]
+        missed = (c * distance, s * distance, turn)
+        self._columns[self._of_gaps] = plus(self._columns[self._of_gaps], missed)
+        self._publish()
+
     def add_gap(self, distance: float, turn: float, along: float, yaw: float) -> None:
         """Add the uncertainty of a gap in the feedback during which the pose was not updated.
 
@@ -186,12 +202,8 @@ class PoseUncertainty:
         if self._lost:
             self._mark_unknown(distance, turn)
             return
+        self.miss(distance, turn)
         c, s = self._cos, self._sin
-        if self._of_gaps < 0:
-            self._of_gaps = self._widen()
-        self._columns = [*self._columns]
-        gone_on = plus(self._columns[self._of_gaps], (c * distance, s * distance, turn))
-        self._columns[self._of_gaps] = gone_on
         # The unknown motion may be an arc to the left or to the right, so the position also becomes
         # uncertain sideways.
         aside = (distance**2 + along) * min(1.0, (turn**2 + yaw) / 4)

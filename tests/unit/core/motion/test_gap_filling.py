@@ -36,6 +36,10 @@ def near(*values: float) -> Any:
     return pytest.approx(values)
 
 
+TO_REST = 4.0 * 0.98 / math.log(50.0)
+"""Mean speed of a wheel that slows down from 4 rad/s to a fiftieth of that, rad/s."""
+
+
 def total(rolled: Rolled) -> float:
     """Return the angle that the first wheel has turned in the line and its gap, rad."""
     return rolled.turned[0] + sum(piece[0] for piece in rolled.pieces)
@@ -70,23 +74,39 @@ def test_a_silence_continues_the_speed_before_it_until_rest_is_commanded() -> No
 
 
 @pytest.mark.parametrize(
-    ("driven", "on", "doubtful"),
-    [(-0.5, 0.1, 0.2), (0.05, 0.1, 0.2), (0.2, 0.2, 0.1), (0.6, 0.6, 0.0), (0.8, 0.35, 0.0)],
+    ("driven", "rolled", "missed"),
+    [
+        (-0.5, 4.0 * 0.1, 4.0 * 0.2),
+        (0.05, 4.0 * 0.1, 4.0 * 0.2),
+        (0.2, 4.0 * 0.2 + TO_REST * 0.6, (4.0 - TO_REST) * 0.1),
+        (0.6, 4.0 * 0.6 + TO_REST * 0.2, 0.0),
+        (0.75, 4.0 * 0.7, 0.0),
+        (0.9, 4.0 * 0.35, 0.0),
+    ],
 )
 def test_a_late_command_to_rest_is_used_and_an_early_one_leaves_time_to_slow_down(
-    driven: float, on: float, doubtful: float
+    driven: float, rolled: float, missed: float
 ) -> None:
-    """`on` is how long the wheels are assumed to go on at the speed before the gap, s.
+    """The wheels slow down from the command to rest until the end of the line, at 0.8 s.
 
-    If no command to rest was sent in the gap, `on` is half of the gap.
+    If no command to rest was sent before that end, they go on for half of the gap. `missed` is the
+    further angle, rad, if the command to rest was lost.
     """
     line = Feedback(AT, STILL, 0.8, bridged=0.7, driven=driven)
     stood = Rolling(quiet=0.1).take(line, FOUR)
-    assert total(stood) == pytest.approx(4.0 * on)
-    assert stood.doubtful == pytest.approx(doubtful)
+    assert total(stood) == pytest.approx(rolled)
+    assert stood.missed == all_four(missed)
 
 
-@pytest.mark.parametrize(("after", "angle"), [(1.5, 1.05), (1.0, 1.3), (-0.5, 0.55), (4.0, 2.8)])
+@pytest.mark.parametrize(
+    ("after", "angle"),
+    [
+        (1.5, 1.05),
+        (1.0, 0.8 + (4.0 - 1.0) / math.log(4.0) * 0.5),
+        (-0.5, 0.8 + TO_REST * 0.5),
+        (4.0, 2.8),
+    ],
+)
 def test_speeds_that_are_large_enough_are_means_over_the_gap(after: float, angle: float) -> None:
     """The line's speed is the mean over the gap if it is at least 1.14 rad/s.
 
@@ -99,14 +119,22 @@ def test_speeds_that_are_large_enough_are_means_over_the_gap(after: float, angle
     assert total(back) == pytest.approx(-angle)
 
 
+def test_a_mean_may_also_cover_the_time_after_the_gap() -> None:
+    """A board that was silent for 0.2 s reports the mean of this time, of which 0.1 s is a gap."""
+    line = Feedback(AT, WheelSpeeds(2.5, 2.5, 2.5, 2.5), 0.2, bridged=0.1, driven=0.105)
+    assert total(Rolling(quiet=0.1).take(line, FOUR)) == pytest.approx(2.5 * 0.2)
+
+
 def test_in_a_short_gap_no_command_to_rest_is_doubtful() -> None:
     line = Feedback(AT, TWO, 0.1, bridged=0.09, driven=0.05)
-    assert Rolling(quiet=0.1).take(line, FOUR).doubtful == 0.0
+    assert Rolling(quiet=0.1).take(line, FOUR).missed == AT_REST
 
 
-@pytest.mark.parametrize(("late", "on"), [(0.15, 0.25), (-0.05, 0.1)])
+@pytest.mark.parametrize(
+    ("late", "rolled"), [(0.15, 4.0 * 0.25 + TO_REST * 0.56), (-0.05, 4.0 * 0.1)]
+)
 def test_the_command_to_rest_may_come_in_the_gap_behind_an_implausible_line(
-    late: float, on: float
+    late: float, rolled: float
 ) -> None:
     """`late` is the time from the implausible line to the command to rest, s.
 
@@ -115,14 +143,14 @@ def test_the_command_to_rest_may_come_in_the_gap_behind_an_implausible_line(
     rolling = Rolling(quiet=0.1)
     rolling.skip(Feedback(AT, FOUR, 0.11, bridged=0.1, driven=0.4))
     stood = rolling.take(Feedback(AT, STILL, 0.7, bridged=0.6, driven=late), FOUR)
-    assert total(stood) == pytest.approx(4.0 * on)
+    assert total(stood) == pytest.approx(rolled)
 
 
 def test_the_command_to_rest_in_a_gap_before_an_implausible_line_is_used() -> None:
     rolling = Rolling(quiet=0.1)
     rolling.skip(Feedback(AT, FOUR, 0.61, bridged=0.6, driven=0.2))
     stood = rolling.take(Feedback(AT, STILL, 0.01, driven=-0.4), FOUR)
-    assert total(stood) == pytest.approx(4.0 * 0.2)
+    assert total(stood) == pytest.approx(4.0 * 0.2 + TO_REST * 0.42)
 
 
 def test_counts_take_precedence_over_the_speed() -> None:
@@ -400,20 +428,6 @@ def test_a_line_between_two_gaps_makes_their_errors_independent() -> None:
     gaps.follow(CRUISE, 0.01)
     assert gaps.fill(0.3, CRUISE, CRUISE, REST) == first
     assert gaps.fill(0.3, CRUISE, CRUISE, REST)[0] > 20 * first[0]
-
-
-def test_a_command_to_rest_that_may_be_lost_makes_the_motion_uncertain() -> None:
-    """Gap filling assumes that the robot stood for the last 0.2 s.
-
-    The robot moved on with a probability of 1/2, because the command to rest may be lost.
-    """
-    before, after = Twist(0.5, 1.0), Twist(0.1, -1.0)
-    sure = Gaps().fill(0.5, before, after, REST)
-    unsure = Gaps().fill(0.5, before, after, REST, doubtful=0.2)
-    assert (unsure[0] - sure[0], unsure[1] - sure[1]) == near(
-        (0.2 * 0.4) ** 2 / 2, (0.2 * 2.0) ** 2 / 2
-    )
-    assert Gaps().fill(0.5, REST, REST, REST, doubtful=0.2) == (0.0, 0.0)
 
 
 def rounding(
