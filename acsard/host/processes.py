@@ -39,20 +39,17 @@ class _Open(Struct, frozen=True):
     fd: str
 
     def device(self) -> int:
-        return os.stat(self.process / "fd" / self.fd).st_rdev
+        return _number(self.process / "fd" / self.fd)
 
     def fdinfo(self) -> list[str]:
-        return (self.process / "fdinfo" / self.fd).read_text().splitlines()
+        return _text(self.process / "fdinfo" / self.fd).splitlines()
 
 
 def holders(path: str) -> Iterator[Holder]:
     """Yield each process that has the device at `path` open."""
     for process in dict.fromkeys(descriptor.process for descriptor in _having_open(path)):
-        try:
-            yield _holder(process)
-        except OSError:
-            # The process has ended.
-            continue
+        if (holder := _holder(process)) is not None:
+            yield holder
 
 
 def holder_of(path: str) -> Holder | None:
@@ -60,17 +57,15 @@ def holder_of(path: str) -> Holder | None:
 
     If there are several, prefer a process that has locked the device.
     """
-    holder = None
+    last = None
     for descriptor in _having_open(path):
-        try:
-            if descriptor.process.name != str(os.getpid()):
-                holder = _holder(descriptor.process)
-                if any(line.startswith("lock:") for line in descriptor.fdinfo()):
-                    return holder
-        except OSError:
-            # The process has ended.
+        holder = _holder(descriptor.process)
+        if holder is None or holder.pid == os.getpid():
             continue
-    return holder
+        if any(line.startswith("lock:") for line in descriptor.fdinfo()):
+            return holder
+        last = holder
+    return last
 
 
 def master_of(path: str) -> Holder | None:
@@ -83,12 +78,8 @@ def master_of(path: str) -> Holder | None:
         return None
     index = f"tty-index:\t{os.minor(wanted) + 256 * (os.major(wanted) - PTY_MAJORS[0])}"
     for descriptor in _open_devices("/ptmx"):
-        try:
-            if index in descriptor.fdinfo():
-                return _holder(descriptor.process)
-        except OSError:
-            # The process has ended.
-            continue
+        if index in descriptor.fdinfo() and (holder := _holder(descriptor.process)) is not None:
+            return holder
     return None
 
 
@@ -97,10 +88,7 @@ def name_of(pid: int) -> str:
 
     Return "" if the process does not exist, or if the kernel hides it from this user.
     """
-    try:
-        return _name(PROC / str(pid))
-    except OSError:
-        return ""
+    return _name(PROC / str(pid))
 
 
 def waited_ns(pid: int) -> int:
@@ -115,14 +103,7 @@ def waited_ns(pid: int) -> int:
 
 
 def is_running(name: str) -> bool:
-    for process in _processes():
-        try:
-            if _comm(process) == name[:15]:
-                return True
-        except OSError:
-            # The process has ended.
-            continue
-    return False
+    return any(_comm(process) == name[:15] for process in _processes())
 
 
 def _processes() -> Iterator[Path]:
@@ -149,32 +130,43 @@ def _open_devices(part: str) -> Iterator[_Open]:
 def _having_open(path: str) -> Iterator[_Open]:
     wanted = _number(path)
     for descriptor in _open_devices("") if wanted else ():
-        try:
-            if descriptor.device() == wanted:
-                yield descriptor
-        except OSError:
-            # The process has closed the descriptor since.
-            continue
+        if descriptor.device() == wanted:
+            yield descriptor
 
 
-def _number(path: str) -> int:
+def _number(path: str | Path) -> int:
+    """Return the number of the device at `path`; 0 if there is no device."""
     try:
         return os.stat(path).st_rdev
     except OSError:
         return 0
 
 
-def _holder(process: Path) -> Holder:
-    return Holder(int(process.name), _name(process))
+def _holder(process: Path) -> Holder | None:
+    name = _name(process)
+    return Holder(int(process.name), name) if name else None
 
 
 def _name(process: Path) -> str:
     """Return the program name of a process, whose directory in /proc is `process`.
 
-    The name of `python -m acsard` and of `python /usr/bin/acsard` is "acsard", not "python".
+    The name of `python -m acsard` and of `python /usr/bin/acsard` is "acsard", not "python". The
+    name is "" if the process has ended.
     """
-    command = os.fsdecode((process / "cmdline").read_bytes()).split("\0")
+    command = _text(process / "cmdline").split("\0")
     return "acsard" if _executed(command) == "acsard" else _comm(process)
+
+
+def _comm(process: Path) -> str:
+    return _text(process / "comm").strip()
+
+
+def _text(file: Path) -> str:
+    """Return the content of a file in /proc; "" if its process has ended."""
+    try:
+        return os.fsdecode(file.read_bytes())
+    except OSError:
+        return ""
 
 
 def _executed(command: Sequence[str]) -> str:
@@ -196,10 +188,6 @@ def _executed(command: Sequence[str]) -> str:
             if option["letter"] in "cm":
                 return argument if option["letter"] == "m" else ""
     return ""
-
-
-def _comm(process: Path) -> str:
-    return (process / "comm").read_text().strip()
 
 
 def run_command(words: tuple[str, ...], within_s: float) -> subprocess.CompletedProcess[str]:
