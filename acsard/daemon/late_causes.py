@@ -21,6 +21,7 @@ from msgspec import Struct
 
 from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S, Event
+from acsard.host.clock import MIN_SUSPEND_NS
 from acsard.host.kernel_counters import Conditions, Program, Reading, Scheduled
 
 CAUSE_FRACTION = 0.5
@@ -43,11 +44,6 @@ MIN_STOLEN_NS = 3 * NS_PER_S // 100
 in which the host of a virtual machine took the processor away. In a test, 607 late periods had
 another cause. In 24 of these periods, the kernel still counted one tick of steal time, and in one
 period two ticks."""
-
-MIN_SUSPEND_NS = NS_PER_S // 10
-"""Shortest time that counts as a suspend, ns. A suspend is measured as a change of the difference
-between CLOCK_BOOTTIME and CLOCK_MONOTONIC. These clocks are not read at the same moment, so the
-difference varies a little even without a suspend."""
 
 
 class LatenessEvidence(Struct, frozen=True, omit_defaults=True):
@@ -109,57 +105,32 @@ def suspended(late: LatenessEvidence) -> str:
     )
 
 
-def undervoltage(late: LatenessEvidence) -> str:
-    """Return the cause in words if a low supply voltage slowed the control loop down, else ""."""
-    return low_voltage(late.after.conditions) if late.computed else ""
+def slowdowns(before: Conditions, now: Conditions) -> dict[str, str]:
+    """Return the conditions that slow the processor down now, by the name of their cause.
 
-
-def low_voltage(now: Conditions) -> str:
-    """Return the cause in words if `now` shows that the supply voltage is too low, else ""."""
-    return "the supply voltage is too low, which slows the processor" if now.undervoltage else ""
-
-
-def heat(late: LatenessEvidence) -> str:
-    """Return the cause in words if a hot processor slowed the control loop down, else "".
-
-    Each of three signs shows heat: a `thermal_throttle` count has risen, a cooling device slows the
-    processor, or on a Raspberry Pi one of the bits 1 to 3 of `get_throttled` is set. The bits do
-    not count at a low supply voltage, because the firmware then sets them too.
+    The values of the result describe the conditions in words. Heat also counts if the kernel has
+    counted a further slow-down by heat since the earlier reading `before`.
     """
-    hotter = late.after.conditions.throttled > late.before.conditions.throttled
-    return heat_text(late.after.conditions, hotter) if late.computed else ""
+    clauses = {}
+    if now.undervoltage:
+        clauses["undervoltage"] = "the supply voltage is too low, which slows the processor"
+    if now.slowed_by_heat or now.throttled > before.throttled:
+        clauses["heat"] = "the processor is too hot and runs slower"
+    if (clock := now.slow_clock) is not None:
+        clauses["governor"] = (
+            f"the CPU governor {clock.governor} keeps the processor at {clock.limit_mhz} of "
+            f"{clock.full_mhz} MHz"
+        )
+    return clauses
 
 
-def heat_text(now: Conditions, hotter: bool = False) -> str:
-    """Return the cause in words if heat slows the processor down, else "".
-
-    One of two signs is enough. `now.slowed_by_heat` is true if heat slows the processor down at
-    this moment. `hotter` is true if the kernel has counted further slow-downs by heat since an
-    earlier reading.
-    """
-    return "the processor is too hot and runs slower" if now.slowed_by_heat or hotter else ""
-
-
-def governor(late: LatenessEvidence) -> str:
-    """Return the cause in words if a limited clock frequency slowed the control loop down, else "".
-
-    The rule compares the frequency limit (`scaling_max_freq`) with the processor's full frequency
-    (`cpuinfo_max_freq`). With a governor that keeps the lowest frequency, the limit is
-    `scaling_min_freq` instead. If the function `heat` returns a cause, return "", because heat also
-    limits the frequency.
-    """
-    return clock_text(late.after.conditions) if late.computed and not heat(late) else ""
-
-
-def clock_text(now: Conditions) -> str:
-    """Return the cause in words if the conditions `now` show a limited clock frequency, else ""."""
-    clock = now.slow_clock
-    if clock is None:
+def slowed(late: LatenessEvidence, name: str) -> str:
+    """Return the cause in words if the condition `name` slowed the control loop down, else ""."""
+    if not late.computed:
         return ""
-    return (
-        f"the CPU governor {clock.governor} keeps the processor at {clock.limit_mhz} of "
-        f"{clock.full_mhz} MHz"
-    )
+    clauses = slowdowns(late.before.conditions, late.after.conditions)
+    # Heat also limits the clock frequency.
+    return "" if name == "governor" and "heat" in clauses else clauses.get(name, "")
 
 
 def cgroup_quota(late: LatenessEvidence) -> str:
@@ -175,7 +146,7 @@ def stolen(late: LatenessEvidence) -> str:
     stolen_ns = most_stolen(late.before, late.after)
     if stolen_ns < MIN_STOLEN_NS or not late.explains(stolen_ns):
         return ""
-    return f"the host gave this virtual machine no processor for {_seconds(stolen_ns)}"
+    return _stolen_text(stolen_ns)
 
 
 def most_stolen(before: Reading, after: Reading) -> int:
@@ -234,9 +205,17 @@ def other_program(late: LatenessEvidence) -> str:
 
 CAUSES = (
     Cause("suspended", suspended, "disable suspend: systemctl mask sleep.target"),
-    Cause("undervoltage", undervoltage, "use a stronger power supply and a shorter cable"),
-    Cause("heat", heat, "cool the processor"),
-    Cause("governor", governor, "choose the CPU governor schedutil or performance"),
+    Cause(
+        "undervoltage",
+        lambda late: slowed(late, "undervoltage"),
+        "use a stronger power supply and a shorter cable",
+    ),
+    Cause("heat", lambda late: slowed(late, "heat"), "cool the processor"),
+    Cause(
+        "governor",
+        lambda late: slowed(late, "governor"),
+        "choose the CPU governor schedutil or performance",
+    ),
     Cause("quota", cgroup_quota, "raise CPUQuota= of the service, or --cpus of the container"),
     Cause("steal", stolen, "give the virtual machine a processor of its own"),
     Cause(
@@ -299,17 +278,15 @@ def present(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, 
     The result is a list of pairs: the cause in words, and the advice. `before` and `after` are two
     readings of the kernel's counters, which were made `within_ns` ns apart.
     """
-    now = after.conditions
+    clauses = slowdowns(before.conditions, after.conditions)
     stolen_ns = most_stolen(before, after)
-    hotter = now.throttled > before.conditions.throttled
-    host = f"the host gave this virtual machine no processor for {_seconds(stolen_ns)}"
-    clauses = {
-        "undervoltage": low_voltage(now),
-        "heat": heat_text(now, hotter),
-        "governor": clock_text(now),
-        "steal": host if stolen_ns > STOLEN_FRACTION * within_ns else "",
-    }
-    return [(clauses[cause.name], cause.advice) for cause in CAUSES if clauses.get(cause.name)]
+    if stolen_ns > STOLEN_FRACTION * within_ns:
+        clauses["steal"] = _stolen_text(stolen_ns)
+    return [(clauses[cause.name], cause.advice) for cause in CAUSES if cause.name in clauses]
+
+
+def _stolen_text(stolen_ns: int) -> str:
+    return f"the host gave this virtual machine no processor for {_seconds(stolen_ns)}"
 
 
 def _seconds(duration_ns: int) -> str:

@@ -60,7 +60,8 @@ def now() -> Instant:
 
 
 MIN_SUSPEND_NS = 100_000_000
-"""Shortest time that counts as a suspend, ns. Every real suspend takes longer."""
+"""Shortest time that counts as a suspend, ns. Every real suspend takes longer. `asleep_ns` does not
+read its two clocks at the same moment, so its result varies a little even without a suspend."""
 
 
 class SuspendDetector:

@@ -100,8 +100,8 @@ class Authority:
         end = certificate.not_valid_after_utc
         if end <= datetime.now(UTC):
             raise ValueError(
-                f"it expired on {end:%Y-%m-%d}; `acsard tls init --force` makes a new one, and then "
-                "every client needs a new certificate"
+                f"it expired on {end:%Y-%m-%d}; `acsard tls init --force` makes a new one, and "
+                "then every client needs a new certificate"
             )
         return cls(certificate, key)
 
