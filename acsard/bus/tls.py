@@ -14,6 +14,7 @@ import ssl
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
@@ -220,7 +221,7 @@ def peer_ends_ns(endpoint: str, directory: str) -> int | None:
         from cryptography import x509
     except ImportError:
         return None
-    host, port = _place(endpoint)
+    host, port = host_and_port(endpoint)
     try:
         with (
             socket.create_connection((host, int(port)), HANDSHAKE_TIMEOUT_S) as plain,
@@ -247,11 +248,8 @@ def _ends_ns(certificate: Any) -> int:
     return int(certificate.not_valid_after_utc.timestamp()) * NS_PER_S
 
 
-def host_of(endpoint: str) -> str:
-    return _place(endpoint)[0]
-
-
-def _place(endpoint: str) -> tuple[str, str]:
+def host_and_port(endpoint: str) -> tuple[str, str]:
+    """Return the host, without brackets, and the port of an endpoint."""
     # An endpoint may end with options for Zenoh: `?metadata` and `#configuration`.
     bare = endpoint.partition("?")[0].partition("#")[0]
     host, _, port = bare.partition("/")[2].rpartition(":")
@@ -269,19 +267,17 @@ certificate reports that within this time. A server that accepts the certificate
 UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
 """Error numbers of the operating system that mean that no machine answers at the address."""
 
-EXPIRED, NOT_YET, WRONG_NAME, WRONG_ADDRESS = 10, 9, 62, 64
-"""OpenSSL's error codes (X509_V_ERR_...) for a certificate that has expired, is not valid yet, or
-is not for this host name or this IP address."""
-
-UNSIGNED, BARRED, WRONG_PURPOSE = (2, 7, 18, 19, 20, 21), (47, 48), 26
-"""Further error codes of OpenSSL: another authority signed the certificate, the authority may not
-sign for the names in the certificate, or the certificate is not for a server. For any other code,
-`trouble` reports OpenSSL's own text."""
-
 RENEW_ADVICE = (
     "run `acsard tls renew` on the machine that has ca-key.pem (with `--name NAME` for a robot of "
     "a fleet); this command prints the next step"
 )
+
+
+class DateError(IntEnum):
+    """OpenSSL's error codes (X509_V_ERR_...) for the dates of a certificate."""
+
+    NOT_YET_VALID = 9
+    EXPIRED = 10
 
 
 def trouble(endpoint: str, directory: str) -> str:
@@ -290,7 +286,7 @@ def trouble(endpoint: str, directory: str) -> str:
     Return "" if the connection succeeds. `directory` is the TLS directory of this machine. Blocks
     for a few seconds, or longer if the lookup of the host name is slow.
     """
-    host, port = _place(endpoint)
+    host, port = host_and_port(endpoint)
     try:
         plain = socket.create_connection((host, int(port)), HANDSHAKE_TIMEOUT_S)
     except socket.gaierror:
@@ -356,45 +352,47 @@ def _wrong_date(certificate: Mapping[str, Any]) -> int:
     """Return OpenSSL's error code if a decoded certificate is not valid now, or 0 if it is."""
     now = clock.now().wall_ns / NS_PER_S
     if now > ssl.cert_time_to_seconds(certificate["notAfter"]):
-        return EXPIRED
-    return NOT_YET if now < ssl.cert_time_to_seconds(certificate["notBefore"]) else 0
+        return DateError.EXPIRED
+    if now < ssl.cert_time_to_seconds(certificate["notBefore"]):
+        return DateError.NOT_YET_VALID
+    return 0
 
 
 def _server_certificate_error(code: int, reason: str, host: str, directory: str) -> str:
     """Return the error message for a certificate of the server that this client rejects.
 
-    `code` and `reason` are OpenSSL's error code and its text.
+    `code` and `reason` are OpenSSL's error code (X509_V_ERR_...) and its text.
     """
     now = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
     match code:
-        case _ if code == EXPIRED:
+        case DateError.EXPIRED:
             return (
                 f"the certificate of {host} has expired, according to this machine's clock "
                 f"({now}); if the clock is right, {RENEW_ADVICE}"
             )
-        case _ if code == NOT_YET:
+        case DateError.NOT_YET_VALID:
             return (
                 f"the certificate of {host} is not valid yet, according to this machine's clock "
                 f"({now}); either correct this machine's clock (`timedatectl`), or correct the "
                 "clock of the machine that made the certificate and then renew the certificate"
             )
-        case _ if code in (WRONG_NAME, WRONG_ADDRESS):
+        case 62 | 64:  # another host name, another IP address
             return (
                 f"the certificate of the server is not for {host}; connect to a name or address "
                 f"that the certificate contains, or run `acsard tls renew --address {host}` on the "
                 "robot; the command says what to do next"
             )
-        case _ if code in UNSIGNED:
+        case 2 | 7 | 18 | 19 | 20 | 21:  # no chain of signatures leads to the authority
             return (
                 f"the authority in {directory}/{CA} did not sign the certificate of {host} "
                 f"({reason}); use a certificate directory that `acsard tls add` made for this robot"
             )
-        case _ if code in BARRED:
+        case 47 | 48:  # a name is not permitted, or excluded
             return (
                 f"the authority in {directory}/{CA} may not sign for the names in the certificate "
                 f"of {host} ({reason}); to make one without these names, {RENEW_ADVICE}"
             )
-        case _ if code == WRONG_PURPOSE:
+        case 26:  # the wrong purpose
             return (
                 f"the certificate of {host} is not for a TLS server ({reason}); to make one for "
                 f"servers and clients, {RENEW_ADVICE}"

@@ -18,7 +18,7 @@ from acsard.bus.tls import (
     common_name,
     expiry_times,
     files_in,
-    host_of,
+    host_and_port,
     is_signed,
     require_usable,
 )
@@ -102,7 +102,7 @@ def renewal(tls: str, whose: str) -> str:
         return f"run `{_command('renew', directory)}`{there}"
     to = tls
     if whose:
-        name, to = host_of(whose.rpartition(" ")[2]), "the router"
+        name, to = host_and_port(whose.rpartition(" ")[2])[0], "the router"
     return (
         f"on the machine that has {CA_KEY}, in the directory of that file, run `acsard tls renew "
         f"--name {shlex.quote(name)} --directory .`; then copy clients/{name}/*.pem from there to "

@@ -7,6 +7,7 @@ from threading import Event
 
 import zenoh
 
+from acsard.bus.tls import host_and_port
 from acsard.core.config.settings import BusConfig
 from acsard.core.values import RoutersStatus
 from acsard.daemon.bus.bus_thread import BusThread
@@ -97,13 +98,11 @@ def _leads_there(endpoint: str, ends: set[str]) -> bool:
 
     `ends` contains far ends of links, such as "tcp/192.168.0.2:7447".
     """
-    bare = endpoint.partition("?")[0].partition("#")[0]
-    protocol, _, address = bare.partition("/")
-    host, _, port = address.rpartition(":")
-    if bare in ends:
+    if endpoint in ends:
         return True
+    protocol, (host, port) = endpoint.partition("/")[0], host_and_port(endpoint)
     try:
-        entries = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)
+        entries = socket.getaddrinfo(host, int(port), type=socket.SOCK_STREAM)
     except (OSError, ValueError):
         # The name no longer resolves, but a link to that host may still exist. So compare only the
         # protocol and the port.

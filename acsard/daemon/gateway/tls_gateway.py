@@ -15,7 +15,7 @@ import zenoh
 from zenoh.handlers import Callback
 
 from acsard.bus.certificate_watch import CertificateFiles
-from acsard.bus.tls import expiry_times, files_in, require_usable
+from acsard.bus.tls import expiry_times, files_in, host_and_port, require_usable
 from acsard.bus.zenoh_sessions import MAX_SESSIONS, gateway_session, reachable
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import encode, encoding_name
@@ -67,9 +67,9 @@ class Gateway(Listener):
 
     def ready(self) -> bool:
         """Return whether the daemon accepts connections. The gateway is opened only then."""
-        host, _, port = reachable(self._config.bus.plain[0]).partition("/")[2].rpartition(":")
+        host, port = host_and_port(reachable(self._config.bus.plain[0]))
         try:
-            with socket.create_connection((host.strip("[]"), int(port)), CONNECT_TIMEOUT_S):
+            with socket.create_connection((host, int(port)), CONNECT_TIMEOUT_S):
                 return True
         except OSError:
             return False
