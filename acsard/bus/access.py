@@ -27,7 +27,6 @@ from acsard.core.messages.keys_and_roles import (
     COMMANDS,
     DESCRIPTION,
     IMU,
-    Direction,
     full_key,
     json_key,
     offered,
@@ -38,13 +37,6 @@ from acsard.core.messages.keys_and_roles import (
 from acsard.core.messages.permissions import COMMAND_ROLE, Use, has, keys_for, least_role
 from acsard.core.ros.transports import PARAMETERS_PREFIX, Endpoint, claims, endpoints, left_out
 from acsard.core.values import ROLES, ROOT_KEY, Role
-
-LOCAL_LINKS = ("tcp",)
-"""Link protocols without certificates. Such a link connects two programs on the same machine,
-unless `bus.insecure` permits links to other machines."""
-
-LIVELINESS_TOKENS = ("@ros2_lv/**", "@/*/@ros2_lv/**")
-"""Key expressions of the liveliness tokens of ROS."""
 
 DECLARATIONS = (
     "declare_subscriber",
@@ -57,21 +49,22 @@ DECLARATIONS = (
 """Zenoh's names of the message types that a daemon sends, except `put` (data). Separate access
 rules allow `put`."""
 
-ALL_MESSAGES = (*DECLARATIONS, "put", "delete", "query")
-
 DRIVERS: tuple[Role, ...] = tuple(role for role in ROLES if has(role, COMMAND_ROLE))
 
-
-def _grants(role: Role) -> tuple[str, ...]:
-    own = [f"{least} {use}" for least in ROLES if has(role, least) for use in USES]
-    return ("speak", "tell", *own, *(("appear",) if role == "maintainer" else ()))
-
-
-USES = ("subscribes", "queries", "publishes")
-"""The three permissions for a key. They are the last words in the names of access rules, such as
-"viewer queries"."""
-
-GRANTS: dict[Role, tuple[str, ...]] = {role: _grants(role) for role in ROLES}
+GRANTS: dict[Role, tuple[str, ...]] = {
+    role: (
+        "speak",
+        "tell",
+        *(
+            f"{least} {use}"
+            for least in ROLES
+            if has(role, least)
+            for use in ("subscribes", "queries", "publishes")
+        ),
+        *(("appear",) if role == "maintainer" else ()),
+    )
+    for role in ROLES
+}
 """Maps each role to the names of its access rules. `_rules` defines these rules."""
 
 WIDE_SUBSCRIPTIONS: dict[Role, tuple[str, ...]] = {
@@ -137,13 +130,13 @@ class _Keys:
         self.imu = full_key(robot, IMU)
         self.published = [full_key(robot, topic.key) for topic in outgoing]
         self.published += [full_key(robot, json_key(topic.key)) for topic in outgoing]
-        self.published += _of(ros, "out")
+        self.published += [e.key for e in ros if e.direction == "out"]
         latched = [full_key(robot, topic.key) for topic in outgoing if topic.latched]
         latched += [e.key for e in ros if e.latched]
         self.kept = [f"{key}/@adv/**" for key in latched]
         """Keys under which Zenoh's advanced publishers keep samples for late subscribers."""
         self.subscribed = [full_key(robot, t.pattern) for t in topics if t.direction == "in"]
-        self.subscribed += _of(ros, "in")
+        self.subscribed += [e.key for e in ros if e.direction == "in"]
         """Key expressions to which the daemon subscribes."""
         self.commands = [full_key(robot, key) for key in source_keys(self._sources)]
         """Command keys of the configured sources, for clients that connect without a
@@ -213,7 +206,7 @@ def access_control(config: Config) -> dict[str, object]:
     Every TLS link of that session leads to a router. The router checks the certificate of each
     client. So the rules let the router forward the commands of every certificate.
     """
-    return _access(config, LOCAL_RULES, gateway=False)
+    return _access(config, gateway=False)
 
 
 def gateway_access(config: Config) -> dict[str, object]:
@@ -224,63 +217,57 @@ def gateway_access(config: Config) -> dict[str, object]:
     gateway's link to the daemon is its only link without a certificate. The rules allow all
     messages on this link.
     """
-    return _access(config, ("pass",), gateway=True)
+    return _access(config, gateway=True)
 
 
-def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[str, object]:
+def _access(config: Config, *, gateway: bool) -> dict[str, object]:
     """Return the value of Zenoh's setting `access_control` for one session.
 
-    `local` contains the names of the rules for links without a certificate. `gateway` is true for
-    the session of the TLS gateway. Only this session limits each certificate to its own command
-    keys.
+    `gateway` is true for the session of the TLS gateway. Only this session limits each certificate
+    to its own command keys.
     """
-    keys = _Keys(config)
+    keys, access = _Keys(config), config.access
     rules = _rules(keys)
-    access = config.access
-    names: dict[Role, tuple[str, ...]] = {
-        "viewer": access.viewers,
-        "operator": access.operators,
-        "maintainer": access.maintainers,
-    }
-    # Zenoh compares the name of a certificate only on a link that has authenticated the client.
-    subjects: dict[str, dict[str, list[str]]] = {"local": {"link_protocols": list(LOCAL_LINKS)}}
-    subjects |= {
-        role: {"link_protocols": ["tls"], "cert_common_names": list(members)}
-        for role, members in names.items()
-        if members
-    }
-    wide = WIDE_SUBSCRIPTIONS if access.wildcards else dict.fromkeys(GRANTS, ())
-    granted: dict[str, tuple[str, ...]] = {"local": local}
-    granted |= {role: (*GRANTS[role], *wide[role]) for role in GRANTS}
-    drivers = [name for role in DRIVERS for name in names[role]]
-    if gateway:
-        for name in drivers:
-            own = _rule(f"command as {name}", "ingress", ["put"], keys.commands_by(name))
-            rules[own["id"]] = own
-            subject = f"certificate {name}"
-            subjects[subject] = {"link_protocols": ["tls"], "cert_common_names": [name]}
-            granted[subject] = (own["id"],)
-    else:
-        for role in DRIVERS:
+    # Only a link between two programs on this machine needs no certificate, unless `bus.insecure`
+    # permits such links to other machines.
+    subjects: dict[str, dict[str, list[str]]] = {"local": {"link_protocols": ["tcp"]}}
+    granted: dict[str, tuple[str, ...]] = {"local": ("pass",) if gateway else LOCAL_RULES}
+    for role, names in access.members.items():
+        if names:
+            subjects[role] = _over_tls(*names)
+        granted[role] = GRANTS[role]
+        if access.wildcards:
+            granted[role] += WIDE_SUBSCRIPTIONS[role]
+        if role in DRIVERS and not gateway:
             granted[role] += ("hand_on",)
+    if gateway:
+        for name in (name for role in DRIVERS for name in access.members[role]):
+            own = _rule(f"command as {name}", "ingress", ["put"], keys.commands_by(name))
+            rules.append(own)
+            subject = f"certificate {name}"
+            subjects[subject], granted[subject] = _over_tls(name), (own["id"],)
+    usable = {rule["id"]: rule for rule in rules if rule["key_exprs"]}
     return {
         "enabled": True,
         "default_permission": "deny",
-        "rules": [rule for rule in rules.values() if rule["key_exprs"]],
+        "rules": list(usable.values()),
         "subjects": [{"id": name, **subject} for name, subject in subjects.items()],
         "policies": [
-            {
-                "rules": [rule for rule in granted[name] if rules[rule]["key_exprs"]],
-                "subjects": [name],
-            }
-            for name in subjects
-            if any(rules[rule]["key_exprs"] for rule in granted[name])
+            {"rules": allowed, "subjects": [subject]}
+            for subject in subjects
+            if (allowed := [rule for rule in granted[subject] if rule in usable])
         ],
     }
 
 
-def _rules(keys: _Keys) -> dict[str, Rule]:
-    tokens = [keys.alive, *keys.claims, *keys.kept, *LIVELINESS_TOKENS]
+def _over_tls(*names: str) -> dict[str, list[str]]:
+    # Zenoh compares the name of a certificate only on a link that has authenticated the client.
+    return {"link_protocols": ["tls"], "cert_common_names": list(names)}
+
+
+def _rules(keys: _Keys) -> list[Rule]:
+    # The last two are the tokens of ROS.
+    tokens = [keys.alive, *keys.claims, *keys.kept, "@ros2_lv/**", "@/*/@ros2_lv/**"]
     # The gyro's key is not forbidden, although the daemon of a simulator publishes on it. So the
     # daemon receives a client's sample on this key, and can refuse the sample with a reason.
     forged = [key for key in keys.answered if key != keys.imu]
@@ -299,7 +286,8 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
             _rule(f"{role} queries", "ingress", ["query"], keys.of(role, "query")),
             _rule(f"{role} publishes", "ingress", ["put"], keys.of(role, "publish")),
         ]
-    rules += [
+    return [
+        *rules,
         # A router has the role maintainer, and forwards the tokens of other daemons:
         _rule("appear", "ingress", ["liveliness_token"], [keys.alive, *keys.claims]),
         # A client without a certificate commands, and a router forwards commands:
@@ -319,9 +307,8 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
         _rule("forge", "ingress", ["put", "delete"], [*forged, *tokens], "deny"),
         # The TLS gateway and the daemon exchange all messages. In Zenoh, `**` does not match a part
         # of a key that begins with @, so the tokens are listed.
-        _rule("pass", "both", ALL_MESSAGES, ["**", *tokens]),
+        _rule("pass", "both", [*DECLARATIONS, "put", "delete", "query"], ["**", *tokens]),
     ]
-    return {rule["id"]: rule for rule in rules}
 
 
 def _rule(
@@ -338,7 +325,3 @@ def _rule(
         "messages": list(messages),
         "key_exprs": list(dict.fromkeys(keys)),
     }
-
-
-def _of(ros: Sequence[Endpoint], direction: Direction) -> list[str]:
-    return [e.key for e in ros if e.direction == direction]

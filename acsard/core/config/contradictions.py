@@ -374,10 +374,8 @@ def _page_problems(config: Config) -> list[str]:
 
 
 def _access_problems(config: Config) -> list[str]:
-    access = config.access
-    lists = {"viewers": access.viewers, "operators": access.operators}
-    lists |= {"maintainers": access.maintainers}
-    names = {f"access.{r}[{i}]": n for r, members in lists.items() for i, n in enumerate(members)}
+    members = config.access.members
+    names = {f"access.{role}s[{i}]": n for role in members for i, n in enumerate(members[role])}
     return _repeated("certificate", names)
 
 

@@ -373,6 +373,15 @@ class AccessConfig(Struct, frozen=True):
     maintainers: tuple[CommonName, ...] = ("maintainer",)
     wildcards: bool = False
 
+    @property
+    def members(self) -> dict[Role, tuple[str, ...]]:
+        """The common names of the certificates that have each role."""
+        return {
+            "viewer": self.viewers,
+            "operator": self.operators,
+            "maintainer": self.maintainers,
+        }
+
 
 class RosConfig(Struct, frozen=True):
     bridge: bool = True
