@@ -29,6 +29,7 @@ from acsard.core.values import NS_PER_S, Event, Instant, Latches
 from acsard.daemon.latch_rules import (
     MAX_BYTES,
     LatchFileError,
+    LatchKeeper,
     after_failed_write,
     at_start,
     decode,
@@ -98,7 +99,7 @@ def place(config: Config, environ: Mapping[str, str]) -> Path:
         ) from None
 
 
-class LatchFile:
+class LatchFile(LatchKeeper):
     """The file that stores a robot's latches: a stop, a fault or "inactive".
 
     The latches then survive a restart of the daemon. Call `start()` once, and then `keep()` after
@@ -262,30 +263,17 @@ class LatchFile:
                 with suppress(OSError):
                     left.unlink()
 
-    # The control loop calls the methods below.
+    # The control loop calls the methods below, which `LatchKeeper` describes.
 
     def keep(self, latches: Latches) -> None:
-        """Pass the latches in force to the writing thread, without waiting for the disk.
-
-        If this method is called again before the thread has written the latches, the thread writes
-        only the newest latches.
-        """
         self._newest_latches = latches
         self._box.put(latches)
 
     def holds(self, latches: Latches) -> bool:
-        """Return whether the file already contains these latches, so that a kill cannot lose them.
-
-        `latches` must be the object that was passed to `keep`. An equal copy does not count.
-        """
         return self._written_latches is latches
 
     def wait(self, latches: Latches, seconds: float) -> None:
-        """Block until the file contains these latches or a write fails, but at most `seconds` s.
-
-        `latches` must be the object that was passed to `keep`. If the last write or sync has
-        already failed, return immediately.
-        """
+        # The latches of a failed write may never be stored.
         end_ns = clock.mono_ns() + seconds * NS_PER_S
         while not self.holds(latches) and not self._failed and clock.mono_ns() < end_ns:
             time.sleep(0.001)
@@ -308,7 +296,6 @@ class LatchFile:
 
     @property
     def trouble(self) -> str:
-        """Reason why the latches would not survive a restart, in words, or "" if they would."""
         if not all(thread.is_alive() for thread in self._threads):
             return "the thread that writes stops to the latch file has ended; restart the daemon"
         failed = self._failed or (DISK_HANGS if self._hangs else "")

@@ -184,7 +184,10 @@ class LatchKeeper(Protocol):
     """
 
     def keep(self, latches: Latches) -> None:
-        """Store the latches that are now in force, in place of all earlier ones."""
+        """Store the latches that are now in force, in place of all earlier ones.
+
+        A later call may come before these latches are stored. They are then not stored at all.
+        """
 
     def holds(self, latches: Latches) -> bool:
         """Return whether these latches are stored, so that they survive a kill of the process.
@@ -193,7 +196,7 @@ class LatchKeeper(Protocol):
         """
 
     def wait(self, latches: Latches, seconds: float) -> None:
-        """Block until these latches are stored, but at most `seconds` s."""
+        """Block until these latches are stored or cannot be stored, but at most `seconds` s."""
 
     def take_events(self) -> list[Event]:
         """Return the events of the storage since the last call, such as a failed write."""

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from acsard.bus.subscription import direct
 from acsard.bus.zenoh_sessions import daemon_session
 from acsard.core.config.settings import Config
-from acsard.core.incoming.bus_interface import BusInput, Waker
+from acsard.core.incoming.bus_interface import Bus, BusInput, Waker
 from acsard.core.incoming.imu import SIMULATOR_SENDER
 from acsard.core.incoming.queries import Reply
 from acsard.core.messages.encodings import encoding_name
@@ -40,7 +40,7 @@ TWIN_TIMEOUT_S = 0.5
 s."""
 
 
-class ZenohBus:
+class ZenohBus(Bus):
     """The robot's keys on the bus, as an asynchronous context manager.
 
     The keys are declared when the context is entered, and removed when it is left.
@@ -66,25 +66,13 @@ class ZenohBus:
         """References to the declared Zenoh entities. Zenoh undeclares an entity when nothing refers
         to it."""
 
-    # The control loop calls the methods below.
+    # The control loop calls the methods below, which `Bus` describes.
 
     @property
     def wanted_keys(self) -> frozenset[str]:
-        """Keys of the topics whose messages the daemon must publish now.
-
-        These topics are latched or have a subscriber. The subscriber may use the topic's native key
-        (the key in the table of keys), its JSON key or its ROS key. The set contains native keys.
-        """
         return self._outlets.wanted
 
     def take(self, queries: int) -> BusInput:
-        """Return the samples and queries that have arrived since the last call.
-
-        The result contains at most `queries` queries, plus one slow query: a `set` request or a
-        query for ROS parameters. Further queries wait for the next call. It also contains the state
-        of the connections to routers if this state has changed, the number of dropped messages, and
-        whether the bus has begun to block.
-        """
         batch = self._inbox.take(queries)
         changes = self._links.changes
         if changes.waiting:
@@ -95,17 +83,10 @@ class ZenohBus:
         return replace(batch, dropped=dropped, stuck=stuck) if dropped or stuck else batch
 
     def publish(self, key: str, message: Message) -> None:
-        """Queue a message for the subscribers of a topic. `flush` wakes the thread that sends it.
-
-        `key` is the native key of the topic, without the robot's id.
-        """
         self._outlets.publish(key, message)
 
     def flush(self) -> None:
-        """Wake the thread that sends the queued messages, without waiting for this thread.
-
-        If an exception has ended a thread of the bus, raise this exception.
-        """
+        # An exception that has ended a thread of the bus must end the daemon too.
         if self._thread_errors:
             raise self._thread_errors[0]
         self._outlets.flush()
@@ -114,10 +95,6 @@ class ZenohBus:
         self._replies.send(reply)
 
     def retire(self, ticket: int) -> None:
-        """End a query, so that its client stops waiting for replies.
-
-        `ticket` is the number of the query, from the result of `take`.
-        """
         self._replies.retire(ticket)
 
     # Opening the session.
