@@ -9,6 +9,7 @@ import time
 
 import serial
 
+from acsard.checkup.board import Wire
 from acsard.checkup.findings import WireLostError
 from acsard.core.values import NS_PER_S
 from acsard.daemon.serial.device import close, draining, open_raw, refusal
@@ -16,8 +17,8 @@ from acsard.host import clock
 from acsard.host.processes import Holder, master_of, waited_ns
 
 SEND_TIMEOUT_S = 0.5
-"""Longest time for which `send` waits until the driver has accepted all bytes, s. A line needs only
-50 ms, even at the lowest baud rate."""
+"""Longest time for which `send` waits until the driver has accepted all bytes, s. After this time,
+the connection counts as lost. A line needs only 50 ms, even at the lowest baud rate."""
 
 DRAIN_TIMEOUT_S = 0.5
 """Longest time for which `close` waits until the driver has sent the last stop lines, s."""
@@ -27,8 +28,8 @@ CLOSE_TIMEOUT_S = 1.0
 because they first try to send the bytes in their buffer."""
 
 
-class BlockingPort:
-    """Blocking access to one serial device. It implements the protocol `checkup.board.Wire`."""
+class BlockingPort(Wire):
+    """Blocking access to one serial device. `Wire` describes its methods."""
 
     def __init__(self, path: str) -> None:
         self._path = path
@@ -38,11 +39,6 @@ class BlockingPort:
         self._waited_ns = 0
 
     def open(self, baud_rate: int) -> None:
-        """Open and lock the port. If the port is open already, change its baud rate.
-
-        Raises a `MendableError` if the port cannot be opened, and `WireLostError` if the baud rate
-        cannot be changed.
-        """
         if self._device is None:
             try:
                 self._device = open_raw(self._path, baud_rate)
@@ -61,10 +57,6 @@ class BlockingPort:
             raise WireLostError(f"{self._path}: {error}") from error
 
     def close(self) -> None:
-        """Wait until the last bytes are sent, then unlock and close the port.
-
-        The wait takes at most `DRAIN_TIMEOUT_S` plus `CLOSE_TIMEOUT_S`.
-        """
         device, self._device = self._device, None
         if device is None:
             return
@@ -77,22 +69,12 @@ class BlockingPort:
         return clock.mono_ns()
 
     def late_ns(self) -> int:
-        """Return how long the simulator at the other end of a pty has waited for a processor, ns.
-
-        This is the waiting time since the last call, or 0 for a real device. The caller must not
-        count it as lateness of the board.
-        """
         if self._program is None:
             return 0
         before_ns, self._waited_ns = self._waited_ns, waited_ns(self._program.pid)
         return max(0, self._waited_ns - before_ns)
 
     def send(self, data: bytes) -> None:
-        """Write all of `data`.
-
-        Raises `WireLostError` if the port is lost, or if it has not accepted all bytes after
-        `SEND_TIMEOUT_S`.
-        """
         fd = self._fileno()
         deadline_ns = clock.mono_ns() + int(SEND_TIMEOUT_S * NS_PER_S)
         while data:
@@ -107,11 +89,6 @@ class BlockingPort:
                 raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
 
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-        """Return the bytes that arrive until the monotonic time `until_ns`, ns.
-
-        The result is a list of pairs, one pair for each read: the monotonic time after the read,
-        ns, and the bytes. Raises `WireLostError` if the port is lost.
-        """
         fd = self._fileno()
         pieces: list[tuple[int, bytes]] = []
         while True:

@@ -18,7 +18,7 @@ from contextlib import suppress
 import serial
 import serial_asyncio
 
-from acsard.core.link.serial_output import Offered, SerialOutput
+from acsard.core.link.serial_output import Offered, Port, SerialOutput
 from acsard.core.values import Event, Instant, Received
 from acsard.daemon.serial.device import close, draining, open_raw, refusal, unsent
 from acsard.host import clock
@@ -49,7 +49,7 @@ MAX_READ_BYTES = 4096
 """Largest number of bytes in one read. It is the size of a driver's buffer."""
 
 
-class SerialPort:
+class SerialPort(Port):
     """The serial port to the board, as an asynchronous context manager.
 
     The port is opened when the context is entered. When the context is left, the port sends STOP
@@ -80,7 +80,6 @@ class SerialPort:
         self.is_open = False
         self._asleep = asleep or SuspendDetector()
         self.opened = 0
-        """Number of times that the port was opened."""
         self._path, self._baud_rate, self._stop = path, baud_rate, stop
         self._period_ns = period_ns
         self._wake, self._log = wake, log
@@ -92,30 +91,21 @@ class SerialPort:
         self._opening = set[tuple[int, int]]()
         """The devices that threads are opening now, each as a pair (`st_dev`, `st_ino`)."""
         self.trouble = ""
-        """Reason why the port is closed, in words; "" while the port is open."""
 
-    # The control loop calls the methods below.
+    # The control loop calls the methods below, which `Port` describes.
 
     @property
     def sent_ns(self) -> int:
-        """Monotonic time at which the kernel accepted the last line, ns."""
         return self._output.sent_ns
 
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
-        """Return the bytes received since the last call.
-
-        After a suspend of the computer, this method closes the port, even if the device still
-        works. `keep_open` then opens the port again, and every sender must send a zero before it
-        can move the robot.
-
-        Args:
-            late: the time of the present control step if periods were missed before this step, else
-                None. In such a step, this method also reads the bytes that wait in the kernel.
-                Otherwise the delay of the step would look like silence of the board.
-        """
+        # After a suspend of the computer, close the port, even if the device still works.
+        # `keep_open` then opens the port again, and every sender must send a zero before it can
+        # move the robot.
         if self._asleep.detect():
             self._leave(OSError(errno.EIO, "this computer was suspended"))
         if late is not None and self._transport is not None:
+            # Without the waiting bytes, the delay of the step would look like silence of the board.
             # If the port is lost, the reader notices and reports it.
             with suppress(serial.SerialException):
                 data = self._transport.serial.read(MAX_READ_BYTES)
@@ -127,14 +117,6 @@ class SerialPort:
         return pieces
 
     def offer(self, line: bytes, now: Instant) -> Offered:
-        """Try to write a line immediately, and return the result.
-
-        - "sent": the kernel accepted the line.
-        - "superseded": the line was not written completely, so a newer line must replace it.
-        - "down": the port is closed.
-
-        `now` is the time of the step that made the line.
-        """
         if not self.is_open:
             return "down"
         # Ask the driver for the unsent bytes before reading the clock, because asking takes time.
