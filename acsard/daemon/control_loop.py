@@ -172,8 +172,8 @@ class ControlLoop:
         replaced the line with zeros, or "". `_late_ns` is the time from the start of the step to
         the write of the line, ns. It is 0 if this time is below `MIN_WRITE_DELAY_NS`."""
         # Use the longest line of both directions, because answers must not queue in the MCU either.
-        period_ns = int(NS_PER_S / config.rate_hz)
-        self.pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
+        line_ns = wire_ns(config.mcu.line_bytes, config.mcu.baud_rate)
+        self.pace = Pace(line_ns, config.period_ns)
         self._stopwatch, self._late_watch = Stopwatch(), late_watch
 
     @property
@@ -201,7 +201,7 @@ class ControlLoop:
         A command waits if it arrived too soon after the last line to the board. None means that no
         command waits.
         """
-        return self.pace.retry_ns(self._port.sent_ns) if self.pace.command_waits else None
+        return self.pace.retry_ns(self._port.sent_ns)
 
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
         """Run one control step at the time `now`, and return the robot's outputs.

@@ -241,8 +241,9 @@ def _keeper(config: Config, stack: AsyncExitStack) -> LatchFile | None:
 
 
 def _port(config: Config, path: str, wake: Wakeup, tell: Callable[[Event], None]) -> SerialPort:
-    stop, period_ns = _stop_line(config), int(NS_PER_S / config.rate_hz)
-    return SerialPort(path, config.mcu.baud_rate, stop, period_ns, wake, tell)
+    mcu = config.mcu
+    stop = Codec(mcu.wheels, mcu.trailing_comma).stop
+    return SerialPort(path, mcu.baud_rate, stop, config.period_ns, wake, tell)
 
 
 @asynccontextmanager
@@ -280,7 +281,7 @@ async def _control(
     await asyncio.sleep(0)
     gc.collect()
     gc.freeze()  # the present objects live to the end, so later collections skip them
-    with Ticker(int(NS_PER_S / config.rate_hz), wake) as ticker:
+    with Ticker(config.period_ns, wake) as ticker:
 
         def step() -> Next | None:
             now = clock.now()
@@ -332,10 +333,6 @@ async def _repeat_latched(bus: ZenohBus, control: ControlLoop) -> None:
     while True:
         bus.publish("tf_static", control.report.tf_static())
         await asyncio.sleep(LATCHED_PERIOD_S)
-
-
-def _stop_line(config: Config) -> bytes:
-    return Codec(config.mcu.wheels, config.mcu.trailing_comma).stop
 
 
 def _info(config: Config, path: str) -> Info:

@@ -66,10 +66,6 @@ MAX_EVENTS = 64
 """Largest number of events that wait for the next control step. A newer event displaces the
 oldest."""
 
-NO_DIRECTORY = "no directory"
-"""Text that messages show in place of the file's path if no directory for the latch file is
-found."""
-
 
 def place(config: Config, environ: Mapping[str, str]) -> Path:
     """Return the path of this robot's latch file.
@@ -107,8 +103,8 @@ class LatchFile(LatchKeeper):
     """
 
     def __init__(self, config: Config, environ: Mapping[str, str]) -> None:
-        self.where = NO_DIRECTORY
-        """Path of the file as messages show it, or `NO_DIRECTORY`."""
+        self.where = "no directory"
+        """Path of the file as messages show it, or "no directory" if no directory is found."""
         self._path: Path | None = None
         """Path of the file. If the path is a link to a file, `_read` replaces the path by that of
         the link's target."""

@@ -172,7 +172,7 @@ class Stopwatch:
         """
         return self._missed.count(now_ns)
 
-    def period(self, now_ns: int, late_ns: int, missed: int = 0) -> None:
+    def period(self, now_ns: int, late_ns: int, missed: int) -> None:
         """Record how late a step began, and how many periods were missed before this step.
 
         Args:

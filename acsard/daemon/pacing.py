@@ -105,15 +105,11 @@ class Pace:
         """
         return self._possible and not (self._tried or self._waiting or self._idle > MAX_IDLE_WAKES)
 
-    @property
-    def command_waits(self) -> bool:
-        """Whether a new command waits, because it came too soon after the last line."""
-        return self._waiting and self._possible and not self._tried
-
     def retry_ns(self, sent_ns: int) -> int | None:
         """Return the monotonic time at which the waiting command may be sent, ns.
 
         Return None if no command waits. `sent_ns` is the monotonic time at which the last line was
         written, ns.
         """
-        return sent_ns + self._gap_ns if self.command_waits else None
+        waits = self._waiting and self._possible and not self._tried
+        return sent_ns + self._gap_ns if waits else None

@@ -17,9 +17,6 @@ from acsard.host.child import Child, acsard, how_it_ended
 from acsard.host.errors import Exit
 from acsard.host.threads import in_thread
 
-RESTART_PAUSE_S = 0.1
-"""Usual pause between the end of a process and its restart, s."""
-
 LONG_RESTART_PAUSE_S = 2.0
 """Longer pause before a restart, s. It applies if the process has ended with an exit code above 1,
 or could not be started."""
@@ -33,7 +30,7 @@ class Kind(Struct, frozen=True):
     """Name of the log event that reports the end of the process."""
     final: frozenset[int] = frozenset()
     """Exit codes after which the process is not started again."""
-    restart_pause_s: float = RESTART_PAUSE_S
+    restart_pause_s: float = 0.1
     """Pause before a restart, s.
 
     After an exit code above 1 the pause is `LONG_RESTART_PAUSE_S` instead.
@@ -73,9 +70,7 @@ its files are unusable at the first start. The pause before a restart is longer,
 starts must not take processor time from the robot."""
 
 
-async def keep_running(
-    words: Sequence[str], log: Callable[[Event], None], kind: Kind = GATEWAY
-) -> int:
+async def keep_running(words: Sequence[str], log: Callable[[Event], None], kind: Kind) -> int:
     """Run `acsard` with the arguments `words`, and restart it whenever it ends.
 
     If the process ends with an exit code that `kind` declares final, do not restart it, but return

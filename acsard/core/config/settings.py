@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
-from acsard.core.values import BatteryLevel, Role
+from acsard.core.values import NS_PER_S, BatteryLevel, Role
 
 Name = Annotated[
     str,
@@ -475,3 +475,8 @@ class Config(Struct, frozen=True):
             return float(self.control.rate)
         mcu = self.mcu
         return float(min(100, highest_rate(mcu.baud_rate, mcu.line_bytes, COMFORTABLE_USE)))
+
+    @property
+    def period_ns(self) -> int:
+        """Control period, ns."""
+        return int(NS_PER_S / self.rate_hz)
