@@ -399,45 +399,18 @@ GYRO_MENDS: dict[GyroDoes, str] = {
 }
 """Advice to the user for each status of the gyro in the message `state`; "" if none is needed."""
 
-MAX_CAUSES = 3
-"""Maximum number of causes of late control periods that the doctor shows: the latest causes."""
-
-CAUSES_PAGE = "deploy/systemd/README.md explains each cause of lateness"
-
-START_ADVICE = (
-    "if the daemon is a systemd service, `systemctl status acsard` shows why it does not run; "
-    "otherwise start it with `acsard run`. If the daemon was started with --listen ADDRESS, give "
-    "this command the same address with --connect"
-)
-
-OTHER_DAEMON_ADVICE = (
-    "if the daemon has another robot id, name that id with --id (`acsard fleet` lists the robots); "
-    "otherwise check whether another program listens at that address"
-)
-
 OTHER_VERSION_ADVICE = (
     "if the daemon has another version of acsard, run this tool from the same version"
 )
-
-GUARD_FAULT = "the daemon's guard"
-"""Words in the reason of a fault that the guard has found. Such a fault is a defect of acsard."""
 
 SIGN_ADVICE = (
     "or let the clients sign their commands (deploy/clients/README.md): signed commands do not "
     "need a common clock"
 )
 
-
 START_ROUTER_ADVICE = (
     "start the Zenoh router at that address (rmw_zenohd, zenohd or `acsard router`): the daemon "
     "then connects by itself"
-)
-
-
-PUT_ROUTER_ADVICE = (
-    "a daemon does not forward the messages of other daemons, so `acsard fleet` and `acsard call "
-    "stop --id '*'` do not reach a robot that is connected only to another daemon: connect all "
-    "robots to a Zenoh router (deploy/zenoh/README.md)"
 )
 
 
@@ -484,11 +457,20 @@ def query_or_finding(config: Config, address: Address) -> Running | Finding:
                 "doctor` again; until then, `systemctl status acsard` shows the state of the daemon"
             )
             return Finding("daemon", "warning", text, mend)
-        return Finding("daemon", "warning", f"no program listens at {endpoint}", START_ADVICE)
+        mend = (
+            "if the daemon is a systemd service, `systemctl status acsard` shows why it does not "
+            "run; otherwise start it with `acsard run`. If the daemon was started with --listen "
+            "ADDRESS, give this command the same address with --connect"
+        )
+        return Finding("daemon", "warning", f"no program listens at {endpoint}", mend)
     try:
         return query(config, address)
     except NoAnswerError as error:
-        return Finding("daemon", "failure", str(error), OTHER_DAEMON_ADVICE)
+        mend = (
+            "if the daemon has another robot id, name that id with --id (`acsard fleet` lists the "
+            "robots); otherwise check whether another program listens at that address"
+        )
+        return Finding("daemon", "failure", str(error), mend)
     except MendableError as error:
         # The text of such an error contains the advice.
         return Finding("daemon", "failure", str(error))
@@ -504,7 +486,7 @@ def daemon(running: Running) -> Iterator[Finding]:
         "correct the cause that this reason names, then release the fault with `acsard call "
         f"clear`; {check(running)}"
     )
-    if GUARD_FAULT in state.reason:
+    if "the daemon's guard" in state.reason:
         mend = (
             "this is a defect of acsard: report it with the newest recording (`acsard recording` "
             "lists the recordings), then release the fault with `acsard call clear`"
@@ -515,7 +497,7 @@ def daemon(running: Running) -> Iterator[Finding]:
     yield from clocks(running)
     yield from gyro(state.gyro, state.counters)
     rows = {row.name: row for row in running.rows}
-    yield from linked(rows)
+    yield from linked(rows.get("acsard: router"))
     yield from certificate(rows.get("acsard: certificate"), running.is_local)
     if state.counters.get("gateway_full"):
         text = (
@@ -567,7 +549,7 @@ def late(running: Running) -> Iterator[Finding]:
 
     There is a warning if the daemon has missed more than 1 % of the periods since its start, or if
     its diagnostics report recently missed periods. There is also a finding for each of the latest
-    `MAX_CAUSES` known causes.
+    three known causes.
     """
     counters = running.state.counters
     missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
@@ -587,11 +569,12 @@ def late(running: Running) -> Iterator[Finding]:
         for event in running.events
         if event.name == "missed_periods" and (cause := cause_in(event.text))
     ]
-    for event, cause in causes[-MAX_CAUSES:]:
+    for event, cause in causes[-3:]:
         level: Level = "warning" if messages else "ok"
         at = utc(event.stamp.to_ns())
         text = f"the daemon missed control periods just before {at}: it was late {cause}"
-        yield Finding("daemon", level, text, CAUSES_PAGE)
+        mend = "deploy/systemd/README.md explains each cause of lateness"
+        yield Finding("daemon", level, text, mend)
 
 
 def clocks(running: Running) -> Iterator[Finding]:
@@ -633,13 +616,12 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
     if the daemon has rejected gyro samples. `does` is the gyro's status in the message `state`, and
     `counters` are the daemon's counters.
     """
-    words = next((text for name, text in STATUS_TEXTS.items() if name == does), does)
     if does != "off":
-        mend = next(
-            (text for name, text in GYRO_MENDS.items() if name == does),
-            f"this tool does not know this status of the gyro: {OTHER_VERSION_ADVICE}",
+        status = cast(GyroDoes, does)  # a daemon of another version may have another status
+        mend = GYRO_MENDS.get(
+            status, f"this tool does not know this status of the gyro: {OTHER_VERSION_ADVICE}"
         )
-        yield Finding("gyro", "warning" if mend else "ok", words, mend)
+        yield Finding("gyro", "warning" if mend else "ok", STATUS_TEXTS.get(status, does), mend)
     refused = {n.removeprefix("imu_"): c for n, c in counters.items() if n.startswith("imu_") and c}
     if refused:
         most = sorted(refused.items(), key=lambda item: -item[1])
@@ -656,17 +638,19 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
         )
 
 
-def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
+def linked(row: DiagnosticStatus | None) -> Iterator[Finding]:
     """Yield a finding about the daemon's connection to routers.
 
-    `rows` contains the rows of the daemon's diagnostics, by name. Yield nothing if the row about
-    routers is missing.
+    `row` is the row about routers in the daemon's diagnostics. Yield nothing if this row is None.
     """
-    row = rows.get("acsard: router")
     if row is not None:
         mend = START_ROUTER_ADVICE if row.level else ""
         if any(pair.value == NO_ROUTER for pair in row.values):
-            mend = PUT_ROUTER_ADVICE
+            mend = (
+                "a daemon does not forward the messages of other daemons, so `acsard fleet` and "
+                "`acsard call stop --id '*'` do not reach a robot that is connected only to "
+                "another daemon: connect all robots to a Zenoh router (deploy/zenoh/README.md)"
+            )
         yield Finding("router", LEVELS[min(row.level, 2)], f"the daemon is {row.message}", mend)
 
 

@@ -125,17 +125,6 @@ def _inaccessible_part(path: Path) -> Path | None:
     return None
 
 
-OWN_DIRECTORIES = (
-    "bin",
-    "acsard",
-    "acsard.service.d",
-    "acsard-gateway.service.d",
-    "acsard-web.service.d",
-)
-"""Names of acsard's own directories. The removal of the service also deletes such a directory if
-the directory has become empty."""
-
-
 class File(Struct, frozen=True):
     """A file that the installation writes."""
 
@@ -287,6 +276,9 @@ def _unreadable(path: Path, error: OSError) -> MendableError:
 
 UNIT, GATEWAY, PAGE = "acsard.service", "acsard-gateway.service", "acsard-web.service"
 ALL_UNITS = (UNIT, GATEWAY, PAGE)
+OWN_DIRECTORIES = ("bin", "acsard", *(f"{unit}.d" for unit in ALL_UNITS))
+"""Names of acsard's own directories. The removal of the service also deletes such a directory if
+the directory has become empty."""
 STOP_PROGRAM = "acsard-stop"
 UNIT_DIRECTORY = Path("/etc/systemd/system")
 CONFIG_DIRECTORY = Path("/etc/acsard")
@@ -309,13 +301,11 @@ RELOAD_COMMANDS = (
     Run(("systemctl", "daemon-reload")),
     Run(("udevadm", "control", "--reload"), may_fail=True),
 )
-TRIGGERED_SUBSYSTEMS = ("tty", "usb-serial", "misc")
-"""Kernel subsystems to whose devices `udevadm trigger` applies the new udev rules."""
-
 INSTALL_COMMANDS = (
     *RELOAD_COMMANDS,
+    # Apply the new udev rules to the devices that are plugged in.
     Run(
-        ("udevadm", "trigger", *(f"--subsystem-match={one}" for one in TRIGGERED_SUBSYSTEMS)),
+        ("udevadm", "trigger", *(f"--subsystem-match={k}" for k in ("tty", "usb-serial", "misc"))),
         may_fail=True,
     ),
     # Start the daemon first, because the page's unit mounts a directory that systemd creates when
