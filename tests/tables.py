@@ -12,6 +12,7 @@ from typing import get_args
 
 from acsard.core.config.settings import Config, RosConfig
 from acsard.core.messages.keys_and_roles import (
+    PLAIN_SERVICES,
     PUBLISHED,
     TOPICS,
     Topic,
@@ -27,7 +28,7 @@ from acsard.core.messages.permissions import (
     has,
     keys_for,
 )
-from acsard.core.ros.transports import TRIGGERS, ros_names
+from acsard.core.ros.transports import ros_names
 from acsard.core.values import ROLES, Role, Verb
 from acsard.daemon.gateway.fleet_router import EXAMPLE_ROBOT
 
@@ -159,7 +160,7 @@ def bridge_file(text: str) -> str:
 
 def ros_page(text: str) -> str:
     """Return the page about ROS with the services that ROS can call."""
-    verbs = ", ".join(f"`acsard/{verb}`" for verb in TRIGGERS)
+    verbs = ", ".join(f"`acsard/{verb}`" for verb in PLAIN_SERVICES)
     return _replaced(r"(^\| )(?:`acsard/\w+`(?:, )?)+(?= \| std_srvs/Trigger \|)", verbs, text)
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from difflib import get_close_matches
 
-import msgspec
 import zenoh
 from msgspec import Struct
 
@@ -18,6 +17,7 @@ from acsard.bus.subscription import Subscription, queue_on
 from acsard.core.config.settings import TLS_PREFIX
 from acsard.core.formatting import many
 from acsard.core.messages.keys_and_roles import JSON_TREE, Topic, by_key, full_key, key_hint, row_of
+from acsard.core.messages.signature import Signature
 from acsard.core.values import ROOT_KEY
 from acsard.host.errors import NoAnswerError, UsageError
 
@@ -91,7 +91,7 @@ def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
         ids: the ids of the robots; "*" stands for all robots.
         sender: the caller's sender id, `NAME/SECRET`.
     """
-    by = msgspec.msgpack.encode({"sender": sender})
+    by = Signature(sender).pack()
     for robot_id in ids:
         session.put(full_key(robot_id, "stop"), b"", attachment=by, express=True)
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
 from msgspec import Struct
-from msgspec.structs import fields, replace
+from msgspec.structs import replace
 
 from acsard.core.config.contradictions import contradictions
 from acsard.core.config.nearest import hint
@@ -103,8 +103,6 @@ LIVE: dict[str, Live] = {
 key of a command source, "*" stands for the name of the source, as in `commands.sources.*.timeout`.
 """
 
-SECTIONS: dict[str, type[Struct]] = {field.name: field.type for field in fields(Config)}
-
 
 def find_live_setting(key: str) -> Live | None:
     """Return the entry of a setting in `LIVE`, the table of settings that may change at run time.
@@ -195,7 +193,9 @@ def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tupl
     for key, value in new.items():
         _set_value(tables, key.split("."), value)
     sections = {key.partition(".")[0] for key in new}
-    built = {name: build(SECTIONS[name], tables[name], name, problems) for name in sections}
+    built = {
+        name: build(type(getattr(config, name)), tables[name], name, problems) for name in sections
+    }
     if problems:
         raise ConfigError(problems)
     made = replace(config, **built)

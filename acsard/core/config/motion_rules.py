@@ -10,7 +10,7 @@ import math
 
 from msgspec import Struct
 
-from acsard.core.config.partial import Rule, mistakes
+from acsard.core.config.partial import Rule
 from acsard.core.config.settings import MAX_REPLY_PERIOD_S, Config
 
 MIN_JERK = 0.01
@@ -146,8 +146,3 @@ RULES: tuple[Rule, ...] = (
     lambda config: _feedback_problems(config, _reach(config).wheel),
     _reply_problems,
 )
-
-
-def problems(config: Config) -> list[str]:
-    """Return an error line for each contradiction between the settings that concern motion."""
-    return mistakes(RULES, config)

@@ -87,7 +87,9 @@ def named(text: str) -> NamedFault:
     known = {RESET_FAULT: "n", **dict.fromkeys(FAULTS, ""), **ARGUMENTS}
     if name not in known:
         near = nearest(name, known)
-        hint = f"did you mean {_form(near[0], known[near[0]])}?" if near else _all()
+        hint = f"the known faults are {', '.join((*FAULTS, *forms()))}"
+        if near:
+            hint = f"did you mean {_form(near[0], known[near[0]])}?"
         raise ValueError(f"not a known fault; {hint}")
     kinds, values = known[name], [word for word in arguments.split(":") if word]
     if len(values) != len(kinds):
@@ -149,10 +151,6 @@ def _problems(config: Config) -> list[str]:
 
 
 RULES: tuple[Rule, ...] = (_problems,)
-
-
-def _all() -> str:
-    return f"the known faults are {', '.join((*FAULTS, *forms()))}"
 
 
 def _form(name: str, kinds: str) -> str:

@@ -36,6 +36,13 @@ Text = Annotated[
         extra={"unit": "a text of 1 to 256 characters"},
     ),
 ]
+Directory = Annotated[
+    str,
+    Meta(
+        pattern=r"^[^\x00]{0,256}\Z",
+        extra={"unit": "a directory, or empty"},
+    ),
+]
 CommonName = Annotated[
     str,
     Meta(
@@ -340,10 +347,7 @@ class BusConfig(Struct, frozen=True):
     mode: Literal["peer", "client"] = "peer"
     listen: tuple[Text, ...] = ("tcp/127.0.0.1:7448",)
     connect: tuple[Text, ...] = ()
-    tls: Annotated[
-        str,
-        Meta(pattern=r"^[^\x00]{0,256}\Z", extra={"unit": "a directory, or empty"}),
-    ] = ""
+    tls: Directory = ""
     insecure: bool = False
 
     @property
@@ -407,10 +411,7 @@ RECORD_VARIABLE = "ACSARD_RECORD"
 
 
 class RecordConfig(Struct, frozen=True):
-    directory: Annotated[
-        str,
-        Meta(pattern=r"^[^\x00]{0,256}\Z", extra={"unit": "a directory, or empty"}),
-    ] = ""
+    directory: Directory = ""
     megabytes: Annotated[float, Meta(ge=10.0, le=1e6, extra={"unit": "MB"})] = 1000.0
     days: Annotated[float, Meta(ge=0.01, le=3650.0, extra={"unit": "days"})] = 14.0
 

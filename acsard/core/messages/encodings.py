@@ -13,7 +13,7 @@ Decoding raises `DecodeError` and no other exception.
 from __future__ import annotations
 
 import re
-from typing import Generic, Literal, TypeVar
+from typing import Generic, Literal, TypeVar, get_args
 
 import msgspec
 
@@ -21,16 +21,12 @@ from acsard.core.messages.cdr import Cdr, CdrError
 from acsard.core.values import AcsardError
 
 Format = Literal["msgpack", "json", "cdr"]
-FORMATS: tuple[Format, ...] = ("msgpack", "json", "cdr")
+FORMATS: tuple[Format, ...] = get_args(Format)
 
 T = TypeVar("T")
 
-_MIME: dict[Format, str] = {
-    "msgpack": "application/msgpack",
-    "json": "application/json",
-    "cdr": "application/cdr",
-}
-_FORM_OF: dict[str, Format] = {mime: form for form, mime in _MIME.items()} | {"text/json": "json"}
+_FORM_OF: dict[str, Format] = {f"application/{form}": form for form in FORMATS}
+_FORM_OF["text/json"] = "json"
 _pack = msgspec.msgpack.Encoder()
 _text = msgspec.json.Encoder()
 
@@ -56,7 +52,7 @@ def encoding_name(form: Format, type_name: str = "") -> str:
 
     If `type_name` is not "", the Encoding also contains this type of the message.
     """
-    return f"{_MIME[form]};acsard.{type_name}.v1" if type_name else _MIME[form]
+    return f"application/{form}" + (f";acsard.{type_name}.v1" if type_name else "")
 
 
 def encode(message: object, form: Format) -> bytes:

@@ -12,7 +12,6 @@ and later.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Container, Iterator
 from typing import Any
 
@@ -146,7 +145,7 @@ def _fields(name: str) -> str:
 
 
 def _short(kind: str) -> str:
-    return re.sub("/msg/", "/", kind)
+    return kind.replace("/msg/", "/")
 
 
 ENCODING, SCHEMA_ENCODING = "cdr", "ros2msg"

@@ -233,7 +233,7 @@ SETTING_SERVICES = ("set_parameters", "set_parameters_atomically")
 """The services that set parameters. `Parameters.answer` does not answer them."""
 
 
-def failure(service: str, why: str, request: bytes = b"") -> bytes:
+def failure(service: str, why: str, request: bytes) -> bytes:
     """Return the reply to a refused request of a parameter service, in CDR.
 
     Without a reply, the client would wait forever.
@@ -244,7 +244,6 @@ def failure(service: str, why: str, request: bytes = b"") -> bytes:
             contain it. All other replies are empty, as in rclcpp.
         request: the refused request, in CDR.
     """
-    refused = SetParametersResult(False, why)
     if service in SETTING_SERVICES:
         with suppress(CdrError):
             return outcome(service, request, successful=False, reason=why)
@@ -253,8 +252,8 @@ def failure(service: str, why: str, request: bytes = b"") -> bytes:
         "get_parameters": Values([]),
         "get_parameter_types": Types([]),
         "describe_parameters": Descriptors([]),
-        "set_parameters": SetReply([refused]),
-        "set_parameters_atomically": SetAtomicallyReply(refused),
+        # The number of parameters in a damaged request is not known.
+        "set_parameters": SetReply([SetParametersResult(False, why)]),
     }
     reply = replies[service]
     return Cdr(type(reply)).encode(reply)

@@ -82,9 +82,7 @@ class Endpoint(Struct, frozen=True):
 
 KINDS: dict[Direction, Kind] = {"out": "MP", "in": "MS", "query": "SS", "service": "SS"}
 
-TRIGGERS = PLAIN_SERVICES
-
-_NAMED = re.compile(rf"\bsrv/({'|'.join(TRIGGERS)})\b")
+_NAMED = re.compile(rf"\bsrv/({'|'.join(PLAIN_SERVICES)})\b")
 
 PARAMETER_SERVICES = {
     "describe_parameters": "rcl_interfaces/srv/DescribeParameters",
@@ -175,7 +173,7 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
         *(row for row in (GYRO_TOPIC,) if row.native not in silent),
         *(
             RosName(f"{ros.node}/{verb}", service_key(verb), "service", "std_srvs/srv/Trigger")
-            for verb in TRIGGERS
+            for verb in PLAIN_SERVICES
         ),
         *(
             RosName(f"{ros.node}/{name}", PARAMETERS_PREFIX + name, "query", type_name)

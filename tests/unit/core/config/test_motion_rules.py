@@ -12,7 +12,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from acsard.core.config.motion_rules import MAX_RAMP_S, MAX_STOP_S, problems
+from acsard.core.config.motion_rules import MAX_RAMP_S, MAX_STOP_S, RULES
+from acsard.core.config.partial import mistakes
 from acsard.core.config.settings import (
     MAX_REPLY_PERIOD_S,
     Config,
@@ -27,6 +28,10 @@ from acsard.core.values import REST, Twist
 from tests.each import each
 
 DT = 0.01
+
+
+def problems(config: Config) -> list[str]:
+    return mistakes(RULES, config)
 
 
 def thousandths(low: float, high: float) -> st.SearchStrategy[float]:

@@ -32,13 +32,13 @@ from acsard.core.incoming.queries import (
 from acsard.core.messages.cdr import Cdr
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
 from acsard.core.messages.json_schema import SCHEMAS
-from acsard.core.messages.keys_and_roles import PUBLISHED, SERVICES, TOPICS, offered
+from acsard.core.messages.keys_and_roles import PLAIN_SERVICES, PUBLISHED, SERVICES, TOPICS, offered
 from acsard.core.messages.report import Report
 from acsard.core.messages.schema import MESSAGES, Info, Interfaces, Message, ServiceReply, Topics
 from acsard.core.messages.signature import public_name
 from acsard.core.ros import parameters as rcl
 from acsard.core.ros.attachments import Attachment, unpack
-from acsard.core.ros.transports import PARAMETER_SERVICES, TRIGGERS
+from acsard.core.ros.transports import PARAMETER_SERVICES
 from acsard.core.values import ROLES, Answer, Outputs, Plain, Pose, Request
 from tests.each import each
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
@@ -493,7 +493,7 @@ def ros_query(topic: str, via: str = "rmw", payload: bytes = EMPTY, **changes: A
 
 
 @each("via", ["bridge", "rmw"])
-@each("verb", TRIGGERS)
+@each("verb", PLAIN_SERVICES)
 def test_a_ros_trigger_makes_a_request_to_the_robot_and_its_answer_is_cdr(
     verb: str, via: str
 ) -> None:
