@@ -36,27 +36,19 @@ def replace(
             cut then leaves the complete old or new file. If false, a power cut may leave a part of
             the new file until the caller has called `sync`.
     """
-    owner_ids = owner
-    if file.exists():
-        before = file.stat()
-        mode = stat.S_IMODE(before.st_mode) if mode is None else mode
-        owner_ids = owner or (before.st_uid, before.st_gid)
+    before = file.stat() if file.exists() else None
+    if mode is None:
+        mode = NEW_MODE if before is None else stat.S_IMODE(before.st_mode)
     handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
     try:
         with os.fdopen(handle, "wb") as new:
             new.write(content)
             new.flush()
-            os.fchmod(new.fileno(), NEW_MODE if mode is None else mode)
-            try:
-                if owner_ids:
-                    os.fchown(new.fileno(), *owner_ids)
-            except PermissionError:
-                # This process may not give a file to another user, so its own user owns the new
-                # file. The file keeps its group if this user is a member of the group.
-                if owner or owner_ids is None:
-                    raise
-                with suppress(PermissionError):
-                    os.fchown(new.fileno(), -1, owner_ids[1])
+            os.fchmod(new.fileno(), mode)
+            if owner is not None:
+                os.fchown(new.fileno(), *owner)
+            elif before is not None:
+                _keep_owner(new.fileno(), before)
             if synced:
                 os.fsync(new.fileno())
         os.replace(name, file)
@@ -64,6 +56,16 @@ def replace(
         with suppress(OSError):
             os.unlink(name)
         raise
+
+
+def _keep_owner(handle: int, before: os.stat_result) -> None:
+    try:
+        os.fchown(handle, before.st_uid, before.st_gid)
+    except PermissionError:
+        # This process may not give a file to another user, so its own user owns the new file. The
+        # file keeps its group if this user is a member of the group.
+        with suppress(PermissionError):
+            os.fchown(handle, -1, before.st_gid)
 
 
 def sync(path: Path) -> None:
