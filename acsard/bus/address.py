@@ -10,7 +10,7 @@ from msgspec import ValidationError, convert
 
 from acsard.bus.zenoh_sessions import reachable
 from acsard.core.config.parsing import ConfigError, parse
-from acsard.core.config.settings import TLS_PREFIX, Config, Name
+from acsard.core.config.settings import Config, Name, is_tls
 from acsard.host.config_file import read
 from acsard.host.errors import UsageError
 
@@ -47,9 +47,9 @@ def address_of(
     bus = config.bus
     # The daemon listens only in peer mode. A tcp endpoint comes first, because it needs no
     # certificate.
-    endpoints = sorted(bus.listen if bus.mode == "peer" else bus.connect, key=_is_tls)
+    endpoints = sorted(bus.listen if bus.mode == "peer" else bus.connect, key=is_tls)
     endpoint = connect or reachable(endpoints[0])
-    certificates = (tls or bus.tls) if _is_tls(endpoint) else ""
+    certificates = (tls or bus.tls) if is_tls(endpoint) else ""
     return Address(endpoint, robot_id, certificates)
 
 
@@ -62,7 +62,7 @@ def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str 
     of a robot's id, or if the file is unusable.
     """
     complete = endpoint is not None and robot_id is not None
-    if complete and (tls is not None or not _is_tls(endpoint or "")):
+    if complete and (tls is not None or not is_tls(endpoint or "")):
         # The arguments give every value, so do not read the file, which need not exist.
         config = Config()
     else:
@@ -100,7 +100,3 @@ def require_id(robot_id: str) -> None:
             f"{robot_id!r} is not a robot's id: an id has 1 to 32 characters of A-Z a-z 0-9 _ -; "
             "the id must equal robot.id in the robot's acsard.toml"
         ) from None
-
-
-def _is_tls(endpoint: str) -> bool:
-    return endpoint.startswith(TLS_PREFIX)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from acsard.bus.tls import expiry_times, peer_ends_ns, unusable
 from acsard.bus.zenoh_sessions import certificate_trouble
-from acsard.core.config.settings import TLS_PREFIX, BusConfig
+from acsard.core.config.settings import BusConfig
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.threads import NoThreadError, in_thread
@@ -116,7 +116,7 @@ async def watch_certificates(bus: BusConfig, known: MutableMapping[str, int]) ->
         known: maps the name of each certificate to its expiry time, ns since 1970. The names are
             the dict keys of `tls.expiry_times` and `router_expiry_times`.
     """
-    routers = [endpoint for endpoint in bus.connect if endpoint.startswith(TLS_PREFIX)]
+    routers = bus.tls_routers
     answered, reading = 0, 0
     while True:
         expiries: dict[str, int] = {}

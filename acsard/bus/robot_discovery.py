@@ -14,7 +14,7 @@ from msgspec import Struct
 
 from acsard.bus.address import require_id
 from acsard.bus.subscription import Subscription, queue_on
-from acsard.core.config.settings import TLS_PREFIX
+from acsard.core.config.settings import is_tls
 from acsard.core.formatting import many
 from acsard.core.messages.keys_and_roles import JSON_TREE, Topic, by_key, full_key, key_hint, row_of
 from acsard.core.messages.signature import Signature
@@ -103,7 +103,7 @@ def count_text(endpoint: str, robots: int) -> str:
 
 def no_robot_text(endpoint: str) -> str:
     """Return a message that explains why no robot is visible at an endpoint."""
-    if endpoint.startswith(TLS_PREFIX):
+    if is_tls(endpoint):
         return (
             "no robot is visible. Over TLS, name the robots (--id robot1,robot2), or set [access] "
             "wildcards = true on the robots. If that does not help, your certificate may have no "
@@ -182,7 +182,7 @@ def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) 
         more = len(presence.others) - len(near)
         named = ", ".join(near) + (f" and {more} more (`acsard fleet` lists them)" if more else "")
         return f"there is no robot {robot_id}. Robots here: {named}; use --id {near[0]}"
-    if endpoint.startswith(TLS_PREFIX):
+    if is_tls(endpoint):
         return (
             f"robot {robot_id} is not visible: no robot at {endpoint} has this robot.id, or your "
             f"certificate does not permit you to see the robot; `acsard whoami --id {robot_id}` "

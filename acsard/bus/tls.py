@@ -18,7 +18,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
-from acsard.core.config.settings import TLS_PREFIX
+from acsard.core.config.settings import is_tls
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.errors import CertificateError, NotPermittedError
@@ -102,7 +102,7 @@ def shown_at(endpoint: str, directory: str) -> str:
     Return "" if the endpoint needs no certificate, or if the certificate cannot be read.
     `directory` is the TLS directory of the client, or "".
     """
-    return common_name(directory) if directory and endpoint.startswith(TLS_PREFIX) else ""
+    return common_name(directory) if directory and is_tls(endpoint) else ""
 
 
 def names_in(directory: str) -> list[str]:

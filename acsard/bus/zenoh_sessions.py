@@ -23,7 +23,7 @@ from acsard.bus.tls import (
     require_usable,
     trouble,
 )
-from acsard.core.config.settings import TLS_PREFIX, Config
+from acsard.core.config.settings import TLS_PREFIX, Config, is_tls
 from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT, full_key, source_keys
 from acsard.core.ros.transports import command_keys
 from acsard.host.errors import (
@@ -68,7 +68,7 @@ def daemon_session(config: Config) -> zenoh.Session:
         "queries_default_timeout": 3000,
     }
     settings |= _listening() | _limits(config, access_control(config))
-    if any(endpoint.startswith(TLS_PREFIX) for endpoint in bus.connect):
+    if bus.tls_routers:
         # With files that Zenoh refuses, the session would open, and never reach the router.
         _require_accepted(bus.tls)
         settings |= _tls(bus.tls)
@@ -242,7 +242,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
         "timestamping/enabled": True,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
     }
-    secured = endpoint.startswith(TLS_PREFIX)
+    secured = is_tls(endpoint)
     if secured and not tls:
         raise CertificateError(
             f"{endpoint} requires a certificate: add --tls DIRECTORY (tls= in Python), the "

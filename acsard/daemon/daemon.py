@@ -21,7 +21,7 @@ from typing import Any, Self
 from acsard.bus.certificate_watch import watch_certificates
 from acsard.bus.tls import expiry_times, require_usable
 from acsard.bus.zenoh_sessions import log_from_environment
-from acsard.core.config.settings import TLS_PREFIX, Config
+from acsard.core.config.settings import Config
 from acsard.core.link.codec import Codec
 from acsard.core.messages.keys_and_roles import DESCRIPTION
 from acsard.core.messages.schema import Info
@@ -263,7 +263,7 @@ def _certificates(config: Config, ours: bool) -> dict[str, int]:
     true if this daemon itself starts the TLS gateway.
     """
     bus = config.bus
-    if not (any(e.startswith(TLS_PREFIX) for e in bus.connect) or (ours and bus.outside)):
+    if not (bus.tls_routers or (ours and bus.outside)):
         return {}
     require_usable(bus.tls)
     return expiry_times(bus.tls)

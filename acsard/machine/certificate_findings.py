@@ -23,7 +23,7 @@ from acsard.bus.tls import (
     require_usable,
 )
 from acsard.bus.zenoh_sessions import certificate_trouble
-from acsard.core.config.settings import TLS_PREFIX, Config
+from acsard.core.config.settings import Config
 from acsard.core.messages.certificate_expiry import expiry, first_expiry
 from acsard.host.clock import now
 from acsard.host.errors import MendableError
@@ -147,7 +147,6 @@ def router_certificates(config: Config) -> Iterator[Finding]:
     Yield nothing about a router that does not answer.
     """
     tls = config.bus.tls
-    routers = [endpoint for endpoint in config.bus.connect if endpoint.startswith(TLS_PREFIX)]
-    for whose, ends_ns in router_expiry_times(routers, tls).items():
+    for whose, ends_ns in router_expiry_times(config.bus.tls_routers, tls).items():
         level, words = expiry({whose: ends_ns}, now().wall_ns)
         yield Finding("router", LEVELS[level], words, renewal(tls, whose) if level else "")

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acsard.bus.tls import CA, CERTIFICATE, KEY
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, is_tls
 from acsard.core.values import ROLES
 from acsard.host.errors import MendableError, NotPermittedError, UsageError
 from acsard.host.extras import missing
@@ -179,7 +179,7 @@ def keys(config: Config, directory: Path) -> dict[str, object]:
     new `bus.tls` is `directory`, which contains the robot's certificate.
     """
     listen = list(config.bus.listen)
-    if not any(endpoint.startswith("tls/") for endpoint in listen):
+    if not any(map(is_tls, listen)):
         listen.append(f"tls/0.0.0.0:{PORT}")
     return {"bus.listen": listen, "bus.tls": str(directory)}
 
@@ -189,7 +189,7 @@ def port(config: Config) -> str:
 
     The settings that `keys` returns let the robot listen on this port.
     """
-    ports = [at.rpartition(":")[2] for at in config.bus.listen if at.startswith("tls/")]
+    ports = [at.rpartition(":")[2] for at in config.bus.listen if is_tls(at)]
     return ports[0] if ports else str(PORT)
 
 

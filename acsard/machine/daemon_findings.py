@@ -20,7 +20,7 @@ from acsard.bus.zenoh_sessions import no_endpoint, reachable
 from acsard.client import Client, connect
 from acsard.core.config.live import Difference, differences, find_live_setting
 from acsard.core.config.parsing import from_builtins
-from acsard.core.config.settings import SIMULATOR, BatteryConfig, Config
+from acsard.core.config.settings import SIMULATOR, BatteryConfig, Config, is_tls
 from acsard.core.config.validation import write
 from acsard.core.formatting import listed, many, utc
 from acsard.core.link.link_diagnosis import BUSY_ADVICE, MAX_UNANSWERED_FRACTION, blames_host
@@ -425,7 +425,7 @@ def routers(config: Config) -> Iterator[Finding]:
             yield Finding(
                 "router", "warning", f"no program listens at {endpoint}", START_ROUTER_ADVICE
             )
-        if endpoint.startswith("tls/"):
+        if is_tls(endpoint):
             continue
         text = (
             f"the daemon connects to the router at {endpoint} without TLS: every program that is "

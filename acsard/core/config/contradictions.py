@@ -14,7 +14,7 @@ from itertools import pairwise
 
 from acsard.core.config import motion_rules, named_faults
 from acsard.core.config.partial import Rule, mistakes
-from acsard.core.config.settings import BusConfig, Config, McuConfig
+from acsard.core.config.settings import BusConfig, Config, McuConfig, is_tls
 from acsard.core.config.validation import show
 from acsard.core.config.wire_time import (
     COMFORTABLE_USE,
@@ -325,7 +325,7 @@ def _endpoint_problems(config: Config, key: str) -> list[str]:
                 f"{where}: not an endpoint; write it like "
                 '"tcp/127.0.0.1:7448", "tcp/[::1]:7448" or "tls/0.0.0.0:7449"'
             )
-        elif endpoint.startswith("tls/"):
+        elif is_tls(endpoint):
             if not bus.tls:
                 errors.append(
                     f"{where}: needs certificates; `acsard tls init` makes them and prints the "

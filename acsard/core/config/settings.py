@@ -343,6 +343,10 @@ TLS_PREFIX = "tls/"
 certificate."""
 
 
+def is_tls(endpoint: str) -> bool:
+    return endpoint.startswith(TLS_PREFIX)
+
+
 class BusConfig(Struct, frozen=True):
     mode: Literal["peer", "client"] = "peer"
     listen: tuple[Text, ...] = ("tcp/127.0.0.1:7448",)
@@ -356,7 +360,7 @@ class BusConfig(Struct, frozen=True):
 
         The tuple is empty if `mode` is "client".
         """
-        return tuple(e for e in self.listen if not e.startswith(TLS_PREFIX)) if self._peer else ()
+        return tuple(e for e in self.listen if not is_tls(e)) if self._peer else ()
 
     @property
     def outside(self) -> tuple[str, ...]:
@@ -364,7 +368,12 @@ class BusConfig(Struct, frozen=True):
 
         The tuple is empty if `mode` is "client".
         """
-        return tuple(e for e in self.listen if e.startswith(TLS_PREFIX)) if self._peer else ()
+        return tuple(e for e in self.listen if is_tls(e)) if self._peer else ()
+
+    @property
+    def tls_routers(self) -> tuple[str, ...]:
+        """The endpoints in `connect` with TLS."""
+        return tuple(e for e in self.connect if is_tls(e))
 
     @property
     def _peer(self) -> bool:
