@@ -16,7 +16,7 @@ import queue
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import Any, Literal, TextIO, cast
 
@@ -171,37 +171,34 @@ class Writer:
             if not self._thread.is_alive():
                 return
 
-    def _count_part(self) -> None:
-        self._parts += 1
-
     def _work(self) -> None:
         while (text := self._lines.get()) is not None:
             try:
-                write_through(self._stream, text, self._count_part)
+                self._write_through(text)
             except (OSError, ValueError):
                 # On a full disk or a closed stream the log loses lines, and control goes on.
                 pass
             self._lines.task_done()
 
+    def _write_through(self, text: str) -> None:
+        """Write a text directly to the stream's file descriptor, without the stream's buffer.
 
-def write_through(stream: TextIO, text: str, progress: Callable[[], None]) -> None:
-    """Write a text directly to the stream's file descriptor, without the stream's buffer.
-
-    A thread that hung in a write through the buffer would keep the buffer's lock. Python could then
-    not flush the stream when the process ends. `progress` is called after each part of the text.
-    """
-    try:
-        fd = stream.fileno()
-    # A stream in memory has no descriptor.
-    except (OSError, ValueError):
-        stream.write(text)
-        return
-    data = text.encode(stream.encoding or "utf-8", errors="replace")
-    # Elsewhere, the lines of two processes must not mix.
-    most = MAX_PART if os.isatty(fd) else len(data)
-    while data:
-        data = data[os.write(fd, data[:most]) :]
-        progress()
+        A thread that hung in a write through the buffer would keep the buffer's lock. Python could
+        then not flush the stream when the process ends.
+        """
+        stream = self._stream
+        try:
+            fd = stream.fileno()
+        # A stream in memory has no descriptor.
+        except (OSError, ValueError):
+            stream.write(text)
+            return
+        data = text.encode(stream.encoding or "utf-8", errors="replace")
+        # Elsewhere, the lines of two processes must not mix.
+        most = MAX_PART if os.isatty(fd) else len(data)
+        while data:
+            data = data[os.write(fd, data[:most]) :]
+            self._parts += 1
 
 
 @contextmanager

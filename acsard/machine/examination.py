@@ -38,11 +38,6 @@ from acsard.machine.daemon_findings import (
 from acsard.machine.finding import Finding, Level
 from acsard.machine.serial_ports import BOARDS, serial_devices
 
-REAL_TIME_ADVICE = (
-    "run the daemon as the systemd service (deploy/systemd), which has real-time priority; without "
-    "this priority, other programs on a busy computer make the daemon late"
-)
-
 
 def port_grabbers() -> Iterator[Finding]:
     """Yield findings about running programs that take over serial ports or send data to them."""
@@ -86,30 +81,24 @@ def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
     running daemon, or None if no daemon runs.
     """
     has = None if pid is None else real_time.is_real_time(pid)
+    level: Level = "ok"
     if not wanted:
-        yield Finding(
-            "real time",
-            "ok",
-            "the configuration does not request real-time scheduling (control.real_time = false)",
-        )
+        text = "the configuration does not request real-time scheduling (control.real_time = false)"
     elif has:
-        yield Finding("real time", "ok", f"the running daemon (pid {pid}) has real-time scheduling")
+        text = f"the running daemon (pid {pid}) has real-time scheduling"
     elif has is False:
-        yield Finding(
-            "real time",
-            "warning",
-            f"the running daemon (pid {pid}) does not have real-time scheduling",
-            REAL_TIME_ADVICE,
-        )
+        level = "warning"
+        text = f"the running daemon (pid {pid}) does not have real-time scheduling"
     elif real_time.allowed():
-        yield Finding("real time", "ok", "a daemon that this user starts gets real-time scheduling")
+        text = "a daemon that this user starts gets real-time scheduling"
     else:
-        yield Finding(
-            "real time",
-            "warning",
-            "a daemon that this user starts does not get real-time scheduling",
-            REAL_TIME_ADVICE,
-        )
+        level = "warning"
+        text = "a daemon that this user starts does not get real-time scheduling"
+    mend = (
+        "run the daemon as the systemd service (deploy/systemd), which has real-time priority; "
+        "without this priority, other programs on a busy computer make the daemon late"
+    )
+    yield Finding("real time", level, text, "" if level == "ok" else mend)
 
 
 MEASUREMENT_S = 0.3

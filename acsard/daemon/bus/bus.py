@@ -18,7 +18,6 @@ from acsard.core.config.settings import Config
 from acsard.core.incoming.bus_interface import Bus, BusInput, Waker
 from acsard.core.incoming.imu import SIMULATOR_SENDER
 from acsard.core.incoming.queries import Reply
-from acsard.core.messages.encodings import encoding_name
 from acsard.core.messages.keys_and_roles import IMU, Topic, full_key, json_key, offered, published
 from acsard.core.messages.schema import Message
 from acsard.core.messages.signature import Signature
@@ -170,20 +169,20 @@ class ZenohBus(Bus):
                 on_query = direct(partial(inbox.on_query, topic.key))
                 self._entities.append(session.declare_queryable(key, on_query))
         for topic in published(self._config):
-            key, encoding = full_key(self._id, topic.key), encoding_name("msgpack", topic.type)
+            key = full_key(self._id, topic.key)
             signed = Signature(SIMULATOR_SENDER).pack() if topic.key == IMU else b""
             self._outlets.declare(
-                session, topic.key, key, "msgpack", encoding, topic.latched, signed=signed
+                session, topic.key, key, "msgpack", topic.type, topic.latched, signed=signed
             )
             self._declare_json(session, topic)
 
     def _declare_json(self, session: zenoh.Session, topic: Topic) -> None:
         """Declare the JSON key of a topic, for clients without msgpack."""
         below = json_key(topic.key)
-        key, encoding = full_key(self._id, below), encoding_name("json", topic.type)
+        key = full_key(self._id, below)
         # The publisher is not latched: a latched publisher encodes every message even without
         # subscribers. A late subscriber can query the key for the newest message instead.
-        self._outlets.declare(session, topic.key, key, "json", encoding)
+        self._outlets.declare(session, topic.key, key, "json", topic.type)
         on_query = direct(partial(self._inbox.on_query, below))
         self._entities.append(session.declare_queryable(key, on_query))
 
@@ -199,9 +198,8 @@ class ZenohBus(Bus):
                 self._entities.append(session.declare_queryable(key, on_query, complete=True))
             case "out":
                 identity = gid(endpoint.token) if endpoint.transport == "rmw" else b""
-                encoding = encoding_name("cdr")
                 self._outlets.declare(
-                    session, endpoint.native, key, "cdr", encoding, endpoint.latched, identity
+                    session, endpoint.native, key, "cdr", "", endpoint.latched, identity
                 )
         if endpoint.token:
             self._entities.append(session.liveliness().declare_token(endpoint.token))

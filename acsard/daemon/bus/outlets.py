@@ -18,7 +18,7 @@ import zenoh
 import zenoh.ext
 
 from acsard.bus.subscription import direct
-from acsard.core.messages.encodings import Format, encode
+from acsard.core.messages.encodings import Format, encode, encoding_name
 from acsard.core.messages.schema import Message
 from acsard.core.ros.attachments import Attachment
 from acsard.core.values import NS_PER_S
@@ -171,7 +171,7 @@ class Outlets:
         topic: str,
         key: str,
         form: Format,
-        encoding: str,
+        type_name: str,
         latched: bool = False,
         gid: bytes = b"",
         signed: bytes = b"",
@@ -183,12 +183,13 @@ class Outlets:
             topic: native key of the topic.
             key: full key on which the publisher puts the topic's messages.
             form: encoding of the messages.
-            encoding: Zenoh's name of this encoding.
+            type_name: type of the messages for Zenoh's Encoding, or "" to leave it out.
             latched: whether the publisher keeps its last sample for late subscribers.
             gid: identity of a ROS publisher, or b"" for a native publisher. Each sample of a ROS
                 publisher gets an attachment in the form of rmw_zenoh.
             signed: attachment of each sample of a native publisher, or b"" for no attachment.
         """
+        encoding = encoding_name(form, type_name)
         if latched:
             publisher: Any = zenoh.ext.declare_advanced_publisher(
                 session,

@@ -16,6 +16,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import zenoh
 
@@ -152,9 +153,8 @@ class Router(Listener):
             ) from None
         try:
             self._config = zenoh.Config.from_file(str(file))
-            mode = json.loads(self._config.get_json("mode"))
-            endpoints = json.loads(self._config.get_json("listen/endpoints"))
-            self.most = int(json.loads(self._config.get_json("transport/unicast/max_sessions")))
+            mode, endpoints = self._setting("mode"), self._setting("listen/endpoints")
+            self.most = int(self._setting("transport/unicast/max_sessions"))
             self._config.insert_json5("plugins_loading/enabled", "false")
         except zenoh.ZError as error:
             raise RouterFileError(
@@ -208,8 +208,11 @@ class Router(Listener):
             return False
         return True
 
+    def _setting(self, key: str) -> Any:
+        return json.loads(self._config.get_json(key))
+
     def _certificate_files(self) -> CertificateFiles | None:
-        tls = json.loads(self._config.get_json("transport/link/tls")) or {}
+        tls = self._setting("transport/link/tls") or {}
         named = [Path(tls[name]) for name in CERTIFICATE_FILES if tls.get(name)]
         return CertificateFiles(*named) if len(named) == len(CERTIFICATE_FILES) else None
 

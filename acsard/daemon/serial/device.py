@@ -191,23 +191,24 @@ def refusal(path: str, error: OSError) -> MendableError:
         case errno.ENOTTY | errno.EISDIR:
             return NoPortError(f"{path} is not a serial port; name another port ({_LISTED})")
         case errno.EACCES | errno.EPERM:
-            return NotPermittedError(f"no permission to open {path}; {_JOIN}")
+            return NotPermittedError(
+                f"no permission to open {path}; add your user to the device's group (`sudo usermod "
+                "-aG dialout $USER`), then log in again. The systemd service of acsard is in the "
+                "group dialout already: if the service has no permission, the device belongs to "
+                "another group, or acsard.service does not allow this type of device"
+            )
         case errno.EBUSY | errno.EAGAIN:
             holder = holder_of(path)
             owner = f"process {holder.pid}" if holder else "another process"
-            return InUseError(f"{path} is in use by {owner}; {_FREE}")
+            return InUseError(
+                f"{path} is in use by {owner}; stop that process first (`systemctl stop acsard` if "
+                "it is the service of acsard)"
+            )
         case _:
             return MendableError(f"cannot open {path}: {error}")
 
 
 _LISTED = "`acsard ports` lists the serial ports"
-_FREE = "stop that process first (`systemctl stop acsard` if it is the service of acsard)"
-_JOIN = (
-    "add your user to the device's group (`sudo usermod -aG dialout $USER`), then log in again. "
-    "The systemd service of acsard is in the group dialout already: if the service has no "
-    "permission, the device belongs to another group, or acsard.service does not allow this type "
-    "of device"
-)
 
 
 def require(path: str) -> None:
