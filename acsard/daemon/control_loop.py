@@ -148,7 +148,6 @@ class ControlLoop:
         self._latches_cache: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
         """Cache of the method `_to_keep`: the latches and the two sets of limits of its last
         computation, and the result."""
-        self._step_answers: tuple[Answer, ...] = ()
         self._answers: deque[tuple[int, Answer]] = deque()
         """Answers that wait until the latch file contains the newest latches. Each answer is paired
         with the monotonic time at which it was queued, ns."""
@@ -268,12 +267,10 @@ class ControlLoop:
         if inputs.gyro:
             self._turn_rates.clear()
         before = self._config
-        outputs, was_written = self._decided(inputs)
-        if refused_sets:
-            self._step_answers = (*refused_sets, *self._step_answers)
+        outputs, answers, was_written = self._decided(inputs)
         has_input = bool(commands or refusals or requests)
         pace.record_step(inputs.tick, outputs.due, was_written, outputs.news, has_input)
-        self._publish(outputs)
+        self._publish(outputs, (*refused_sets, *answers))
         # `adopted` may change the log's level, so call it after logging this step's events.
         if self._config is not before and self._adopted:
             self._adopted(self._config)
@@ -283,15 +280,16 @@ class ControlLoop:
         self._bus.flush()
         return outputs
 
-    def _decided(self, inputs: Inputs) -> tuple[Outputs, bool]:
-        """Run the robot's step. The returned bool is true if the port wrote the line."""
+    def _decided(self, inputs: Inputs) -> tuple[Outputs, tuple[Answer, ...], bool]:
+        """Run the robot's step, and return its outputs and the answers for the clients.
+
+        The returned bool is true if the port wrote the line.
+        """
         try:
             outputs = self.outputs = self.robot.step(inputs)
-            self._step_answers = outputs.answers
-            if outputs.answers or self.robot.config is not self._config:
-                self._step_answers = self._speed.settle(
-                    self.robot.config, outputs.answers, self._others
-                )
+            answers = outputs.answers
+            if answers or self.robot.config is not self._config:
+                answers = self._speed.settle(self.robot.config, answers, self._others)
             self._handover.take(self._to_keep(outputs.latches))
             if self.robot.config is not self._config:
                 self._adopt(self.robot.config)
@@ -302,7 +300,7 @@ class ControlLoop:
             raise
         if self._recorder is not None:
             self._recorder.step(inputs, outputs, line, self.robot, self._guard)
-        return outputs, line is not None
+        return outputs, answers, line is not None
 
     def _to_keep(self, latches: Latches) -> Latches:
         """Return `latches` in the form that must be stored for the next start of the daemon.
@@ -495,7 +493,7 @@ class ControlLoop:
             self.robot.counters["lines_superseded"] += 1
         return None
 
-    def _publish(self, outputs: Outputs) -> None:
+    def _publish(self, outputs: Outputs, answers: tuple[Answer, ...]) -> None:
         bus, queued_ns = self._bus, None
         for key, message in self.report.due(outputs, bus.wanted_keys, self._snapshot):
             bus.publish(key, message)
@@ -503,11 +501,9 @@ class ControlLoop:
                 queued_ns = self._mono_ns()
         for estimate in outputs.estimates:
             self._stopwatch.feedback(estimate, queued_ns)
-        if self._step_answers:
-            file, now_ns = self._settings_file, outputs.now.mono_ns
-            for answer in self._step_answers:
-                if file is None or not file.defers_answer(answer):
-                    self._answers.append((now_ns, answer))
+        for answer in answers:
+            if self._settings_file is None or not self._settings_file.defers_answer(answer):
+                self._answers.append((outputs.now.mono_ns, answer))
         if self._answers:
             self._answer(outputs.now)
         for event in outputs.events:
