@@ -186,17 +186,11 @@ def _count_problems(config: Config) -> list[str]:
 
 
 def _rate_problems(config: Config) -> list[str]:
-    rates = config.rates
-    each = {
-        "odom": rates.odom,
-        "wheel_states": rates.wheel_states,
-        "cmd_vel_out": rates.cmd_vel_out,
-    }
     return [
         f"rates.{name} = {hz:g} Hz: the rate must be 0 (every sample) or at least {MIN_RATE_HZ:g} "
         f"Hz; write rates.{name} = {MIN_RATE_HZ:g} or more"
-        for name, hz in each.items()
-        if 0.0 < hz < MIN_RATE_HZ
+        for name in ("odom", "wheel_states", "cmd_vel_out")
+        if 0.0 < (hz := getattr(config.rates, name)) < MIN_RATE_HZ
     ]
 
 

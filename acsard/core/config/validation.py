@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, TypeVar
 
 import msgspec
@@ -93,13 +94,10 @@ def _value(
         item = kind.item_type.cls
         made = [build(item, table, f"{where}[{i}]", problems) for i, table in enumerate(raw)]
         return None if None in made else tuple(made)
-    if not finite(raw):
-        value = None
-    else:
-        try:
+    value = None
+    if finite(raw):
+        with suppress(msgspec.ValidationError):
             value = msgspec.convert(raw, field.type)
-        except msgspec.ValidationError:
-            value = None
     if value is None:
         problems.append(f"{where} = {show(raw)}: expected {expected(kind)}; {_fix(field, where)}")
     return value
