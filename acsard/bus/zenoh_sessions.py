@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import socket
 import sys
 from pathlib import Path
 
@@ -170,6 +171,23 @@ def no_endpoint(text: str) -> UsageError:
 
 def _lacks_port(endpoint: str) -> bool:
     return endpoint.startswith(("tcp/", TLS_PREFIX)) and not re.search(r":\d+(?=$|[?#])", endpoint)
+
+
+def answers(endpoint: str) -> bool:
+    """Return whether a program accepts TCP connections at `endpoint`.
+
+    Raises `UsageError` if `endpoint` is not a valid endpoint.
+    """
+    host, _, port = reachable(endpoint).partition("/")[2].rpartition(":")
+    if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
+        raise no_endpoint(endpoint)
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=1.0).close()
+    except UnicodeError:  # the host has an empty or too long part
+        raise no_endpoint(endpoint) from None
+    except OSError:
+        return False
+    return True
 
 
 RETRY_SETTINGS = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}

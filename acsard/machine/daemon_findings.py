@@ -6,7 +6,6 @@ differences between the counters of the two states show how well the serial link
 
 from __future__ import annotations
 
-import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import cast
@@ -16,7 +15,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.bus.address import Address
-from acsard.bus.zenoh_sessions import no_endpoint, reachable
+from acsard.bus.zenoh_sessions import answers, reachable
 from acsard.client import Client, connect
 from acsard.core.config.live import Difference, differences, find_live_setting
 from acsard.core.config.parsing import from_builtins
@@ -192,23 +191,6 @@ def _tables(differing: Mapping[str, Difference]) -> str:
     """
     parts = [(key.rpartition("."), write(difference.its)) for key, difference in differing.items()]
     return "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in parts)
-
-
-def answers(endpoint: str) -> bool:
-    """Return whether a program accepts TCP connections at `endpoint`.
-
-    Raises `UsageError` if `endpoint` is not a valid endpoint.
-    """
-    host, _, port = reachable(endpoint).partition("/")[2].rpartition(":")
-    if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
-        raise no_endpoint(endpoint)
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=1.0).close()
-    except UnicodeError:  # the host has an empty or too long part
-        raise no_endpoint(endpoint) from None
-    except OSError:
-        return False
-    return True
 
 
 def link(running: Running) -> Iterator[Finding]:

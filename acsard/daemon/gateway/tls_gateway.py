@@ -7,7 +7,6 @@ rules allow. The worst effect that a client can have is a restart of the gateway
 
 from __future__ import annotations
 
-import socket
 import threading
 from typing import Any
 
@@ -15,8 +14,8 @@ import zenoh
 from zenoh.handlers import Callback
 
 from acsard.bus.certificate_watch import CertificateFiles
-from acsard.bus.tls import expiry_times, files_in, host_and_port, require_usable
-from acsard.bus.zenoh_sessions import MAX_SESSIONS, gateway_session, reachable
+from acsard.bus.tls import expiry_times, files_in, require_usable
+from acsard.bus.zenoh_sessions import MAX_SESSIONS, answers, gateway_session
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.keys_and_roles import full_key
@@ -29,8 +28,6 @@ from acsard.daemon.gateway.listener_process import (
     SessionHealth,
 )
 from acsard.host import clock
-
-CONNECT_TIMEOUT_S = 1.0
 
 PROBE_TIMEOUT_NS = NS_PER_S
 """Time between two queries to the daemon, ns. A query that has not ended when the next query is due
@@ -67,12 +64,7 @@ class Gateway(Listener):
 
     def ready(self) -> bool:
         """Return whether the daemon accepts connections. The gateway is opened only then."""
-        host, port = host_and_port(reachable(self._config.bus.plain[0]))
-        try:
-            with socket.create_connection((host, int(port)), CONNECT_TIMEOUT_S):
-                return True
-        except OSError:
-            return False
+        return answers(self._config.bus.plain[0])
 
     def open(self) -> zenoh.Session:
         session = gateway_session(self._config)

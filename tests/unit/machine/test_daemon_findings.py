@@ -10,6 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.bus.address import Address
+from acsard.bus.zenoh_sessions import answers
 from acsard.core.config.live import differences
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import (
@@ -37,7 +38,6 @@ from acsard.machine.daemon_findings import (
     GYRO_MENDS,
     MAX_KEYS,
     Running,
-    answers,
     certificate,
     check,
     clocks,
