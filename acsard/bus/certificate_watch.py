@@ -54,15 +54,10 @@ class CertificateFiles:
             return False
         self._due_ns = now_ns + FILES_CHECK_PERIOD_NS
         before, self._last_signature = self._last_signature, self._signature()
-        if (
-            self._last_signature != before
-            or self._last_signature == self._used
-            or not self._last_signature
-        ):
+        new = self._last_signature
+        if new != before or new in (self._used, ()) or unusable(*self._files):
             return False
-        if unusable(*self._files):
-            return False
-        self._used = self._last_signature
+        self._used = new
         return True
 
     def refused(self) -> str:

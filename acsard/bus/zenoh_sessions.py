@@ -261,12 +261,12 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
     }
     secured = is_tls(endpoint)
-    if secured and not tls:
-        raise CertificateError(
-            f"{endpoint} requires a certificate: add --tls DIRECTORY (tls= in Python), the "
-            "directory that `acsard tls init` or `acsard tls add` made for you"
-        )
     if secured:
+        if not tls:
+            raise CertificateError(
+                f"{endpoint} requires a certificate: add --tls DIRECTORY (tls= in Python), the "
+                "directory that `acsard tls init` or `acsard tls add` made for you"
+            )
         # For an unusable certificate Zenoh would report the same error as for an absent daemon.
         require_usable(tls)
         settings |= _tls(tls)

@@ -343,6 +343,6 @@ def _info(config: Config, path: str) -> Info:
         port=path,
         simulated=config.mcu.simulated,
         rate=config.rate_hz,
-        listen=list(config.bus.listen) if config.bus.mode == "peer" else [],
+        listen=list(config.bus.listening),
         connect=list(config.bus.connect),
     )

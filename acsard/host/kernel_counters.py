@@ -17,11 +17,6 @@ from msgspec.structs import replace
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
-THROTTLED_BITS = 0b1110
-"""Mask for three bits of the Raspberry Pi's `get_throttled` that are set while the processor is
-slowed down: the clock frequency is limited, the processor is throttled, or the soft temperature
-limit is active."""
-
 SELF_SCALING_DRIVERS = ("intel_pstate", "amd-pstate", "amd-pstate-epp")
 """The cpufreq drivers whose governor `powersave` adapts the frequency to the load. With every other
 driver, the governor `powersave` keeps the lowest frequency."""
@@ -285,12 +280,15 @@ class Kernel:
             bits |= _number(path, 16)
         # Bit 0 of the Raspberry Pi's `get_throttled`: the supply voltage is too low now.
         low = bool(bits & 1) or any(_number(path) for path in self._alarms)
+        # Bits 1 to 3: the clock frequency is limited, the processor is throttled, or the soft
+        # temperature limit is active. At a low voltage the firmware also sets these bits, so they
+        # do not prove heat.
+        throttled = bool(bits & 0b1110) and not low
         cooled = any(_number(path) > 0 for path in self._coolers)
         slow = (slow_clock(_policy(path)) for path in self._policies)
         return Conditions(
             low,
-            # At a low voltage the firmware also sets the other bits, so they do not prove heat.
-            cooled or (bool(bits & THROTTLED_BITS) and not low),
+            cooled or throttled,
             sum(map(_number, self._throttle_counts)),
             next((limit for limit in slow if limit is not None), None),
         )

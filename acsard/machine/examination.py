@@ -134,7 +134,7 @@ def serial_port(config: Config) -> Iterator[Finding]:
     There is also a finding about unknown or slow USB hardware of the port.
     """
     path = config.mcu.port
-    if path == "sim":
+    if config.mcu.simulated:
         mend = (
             "to drive a robot, set mcu.port to the board's serial port, for example "
             '"/dev/acsar"; `acsard ports` lists the ports'

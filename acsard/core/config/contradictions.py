@@ -311,7 +311,7 @@ def _reachability_problems(config: Config) -> list[str]:
 
 def _endpoint_problems(config: Config, key: str) -> list[str]:
     bus, errors = config.bus, []
-    for endpoint in _endpoints(bus).get(key, ()) if key == "listen" else bus.connect:
+    for endpoint in _endpoints(bus)["listen"] if key == "listen" else bus.connect:
         where = f"bus.{key} = {show(endpoint)}"
         host = _host(endpoint)
         if host is None:
@@ -336,8 +336,8 @@ def _endpoint_problems(config: Config, key: str) -> list[str]:
 
 
 def _listen_twice_problems(config: Config) -> list[str]:
-    listen = _endpoints(config.bus).get("listen", ())
-    names = {f"bus.listen[{i}]": endpoint for i, endpoint in enumerate(listen)}
+    listen = enumerate(_endpoints(config.bus)["listen"])
+    names = {f"bus.listen[{i}]": endpoint for i, endpoint in listen}
     return _repeated("host and port", names, lambda endpoint: endpoint.partition("/")[2])
 
 
@@ -385,9 +385,7 @@ def _ros_problems(config: Config) -> list[str]:
 
 
 def _endpoints(bus: BusConfig) -> dict[str, tuple[str, ...]]:
-    # A client listens at no endpoint.
-    listen = {"listen": bus.listen} if bus.mode == "peer" else {}
-    return listen | {"connect": bus.connect}
+    return {"listen": bus.listening, "connect": bus.connect}
 
 
 def _host(endpoint: str) -> str | None:

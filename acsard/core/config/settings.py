@@ -356,19 +356,13 @@ class BusConfig(Struct, frozen=True):
 
     @property
     def plain(self) -> tuple[str, ...]:
-        """The endpoints in `listen` without TLS, at which the daemon listens.
-
-        The tuple is empty if `mode` is "client".
-        """
-        return tuple(e for e in self.listen if not is_tls(e)) if self._peer else ()
+        """The endpoints without TLS, at which the daemon listens."""
+        return tuple(e for e in self.listening if not is_tls(e))
 
     @property
     def outside(self) -> tuple[str, ...]:
-        """The endpoints in `listen` with TLS, at which the TLS gateway listens.
-
-        The tuple is empty if `mode` is "client".
-        """
-        return tuple(e for e in self.listen if is_tls(e)) if self._peer else ()
+        """The endpoints with TLS, at which the TLS gateway listens."""
+        return tuple(e for e in self.listening if is_tls(e))
 
     @property
     def tls_routers(self) -> tuple[str, ...]:
@@ -376,8 +370,9 @@ class BusConfig(Struct, frozen=True):
         return tuple(e for e in self.connect if is_tls(e))
 
     @property
-    def _peer(self) -> bool:
-        return self.mode == "peer"
+    def listening(self) -> tuple[str, ...]:
+        """The endpoints at which the daemon or its gateway listens: none if `mode` is "client"."""
+        return self.listen if self.mode == "peer" else ()
 
 
 class AccessConfig(Struct, frozen=True):

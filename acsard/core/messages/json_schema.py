@@ -22,15 +22,12 @@ from acsard.core.messages.schema import (
     TwistStamped,
 )
 
-DIALECT = "https://json-schema.org/draft/2020-12/schema"
-
 INCOMING_ONLY = {
     "Twist",
     "SpeedLimit",
     "GatewayState",
     *(service.payload for service in SERVICES.values()),
 }
-BOTH_WAYS = (TwistStamped, JointState, Imu)
 
 REQUIRED_FIELDS: dict[type, list[str]] = {
     TwistStamped: ["twist"],
@@ -68,7 +65,8 @@ def _described(cls: type, name: str) -> Schema:
     whole: Schema = msgspec.json.decode(text)
     parts, own = whole["$defs"], whole["$ref"].rpartition("/")[2]
     top: Schema = parts.pop(own) | {"title": name}
-    return {"$schema": DIALECT, "$id": f"urn:acsard:{name}.v1"} | top | {"$defs": parts}
+    dialect = "https://json-schema.org/draft/2020-12/schema"
+    return {"$schema": dialect, "$id": f"urn:acsard:{name}.v1"} | top | {"$defs": parts}
 
 
 SCHEMAS: dict[str, Schema] = {
@@ -76,7 +74,10 @@ SCHEMAS: dict[str, Schema] = {
         name: (coming_in if name in INCOMING_ONLY else going_out)(cls, name)
         for name, cls in MESSAGES.items()
     },
-    **{f"{cls.__name__}In": coming_in(cls, f"{cls.__name__}In") for cls in BOTH_WAYS},
+    **{
+        f"{cls.__name__}In": coming_in(cls, f"{cls.__name__}In")
+        for cls in (TwistStamped, JointState, Imu)
+    },
     "Config": going_out(Config, "Config"),
 }
 """Maps the name of each schema, as in the key `schema/<Type>`, to the schema."""

@@ -57,8 +57,6 @@ from acsard.core.values import Twist as BodyTwist
 
 GetSnapshot = Callable[[], Snapshot]
 
-BATTERY_HZ = 1.0
-
 UNKNOWN_STATUS, CHARGING, DISCHARGING, NOT_CHARGING = range(4)
 """Values of `Battery.power_supply_status`."""
 
@@ -114,7 +112,7 @@ class Report:
     def use(self, config: Config) -> None:
         """Use the rates, frames and covariances of `config` from the next message on."""
         self._config = config
-        rates = asdict(config.rates) | {"battery": BATTERY_HZ}
+        rates = asdict(config.rates) | {"battery": 1.0}
         self._rates = {key: _Rate(hz) for key, hz in rates.items()}
         self._covariances = Covariances(config.odometry)
 

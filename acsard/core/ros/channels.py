@@ -200,15 +200,16 @@ def _published() -> dict[str, Channel]:
     return channels
 
 
-TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
-
 STATE_CHANNEL = Channel("state", "state", ACSARD_PREFIX + "RobotState", State)
 
 LOG_CHANNEL = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))
 """The topic of the daemon's events. Each event is one log message."""
 
 CMD_VEL_IN = Channel(
-    f"cmd_vel_in/{SOURCE_PLACEHOLDER}", f"cmd/{SOURCE_PLACEHOLDER}", TWIST_STAMPED, TwistStamped
+    f"cmd_vel_in/{SOURCE_PLACEHOLDER}",
+    f"cmd/{SOURCE_PLACEHOLDER}",
+    "geometry_msgs/msg/TwistStamped",
+    TwistStamped,
 )
 """The topics of the received commands, one topic for each command source. The stamp of a message
 is the time at which the command arrived."""

@@ -167,10 +167,6 @@ MAX_MEMORY_BYTES = 192 << 20
 connections are in use. An attack can use another 600 MB in each second, too fast for a periodic
 check. So the kernel enforces the limit: it refuses more memory, which ends the process."""
 
-NICE = 5
-"""Nice value of this process. It gives the daemon and ordinary programs priority over this
-process."""
-
 
 class Listener:
     """A Zenoh session that is open to the network: the TLS gateway, or the router of a fleet."""
@@ -321,6 +317,6 @@ def _confine() -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (MAX_MEMORY_BYTES, MAX_MEMORY_BYTES))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     with contextlib.suppress(OSError):
-        os.nice(NICE)
+        os.nice(5)  # the daemon and ordinary programs have priority over this process
     # If a lack of memory ends the process, a backtrace would only fill the log.
     os.environ["RUST_BACKTRACE"] = "0"

@@ -24,10 +24,6 @@ from acsard.host.processes import holder_of
 _left_open: list[int] = []
 """File descriptors that `close` could not close, because it could not start a thread."""
 
-DRAIN_STEP_S = 0.001
-"""Pause between two checks whether the driver has sent all bytes, s. The pause is shorter than the
-time that a line takes, even at the highest baud rate."""
-
 
 class _Device(serial.Serial):  # type: ignore[misc]
     """A port whose `read` makes one system call and never waits."""
@@ -115,7 +111,7 @@ def draining(fd: int, deadline_ns: int) -> Iterator[float]:
     `deadline_ns`, ns, even if the driver still has bytes to send.
     """
     while unsent(fd) and clock.mono_ns() < deadline_ns:
-        yield DRAIN_STEP_S
+        yield 0.001  # shorter than the time that a line takes, even at the highest baud rate
 
 
 def unlock(fd: int) -> None:

@@ -45,10 +45,6 @@ FINAL_STOP_TIMEOUT_S = 0.15
 a line at the lowest baud rate, plus a margin."""
 
 
-MAX_READ_BYTES = 4096
-"""Largest number of bytes in one read. It is the size of a driver's buffer."""
-
-
 class SerialPort(Port):
     """The serial port to the board, as an asynchronous context manager.
 
@@ -108,7 +104,7 @@ class SerialPort(Port):
             # Without the waiting bytes, the delay of the step would look like silence of the board.
             # If the port is lost, the reader notices and reports it.
             with suppress(serial.SerialException):
-                data = self._transport.serial.read(MAX_READ_BYTES)
+                data = self._transport.serial.read(4096)  # the size of a driver's buffer
                 self._received += [Received(late, data)] if data else []
         if not self._received:
             return ()
