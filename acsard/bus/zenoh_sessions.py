@@ -67,8 +67,10 @@ def daemon_session(config: Config) -> zenoh.Session:
         "scouting/gossip/enabled": bool(bus.connect),
         "timestamping/enabled": True,
         "queries_default_timeout": 3000,
+        "access_control": access_control(config),
+        "downsampling": [_command_limits(config)],
     }
-    settings |= _listening() | _limits(config, access_control(config))
+    settings |= _listening()
     if bus.tls_routers:
         # With files that Zenoh refuses, the session would open, and never reach the router.
         _require_accepted(bus.tls)
@@ -97,8 +99,9 @@ def gateway_session(config: Config) -> zenoh.Session:
     # Limit only PUT messages. Otherwise a flood of DELETE messages, which are not stops, would use
     # up the limit of the stops. The daemon's own session does not limit stops.
     stops = _rate_limit("stops", ["put"], [full_key(config.robot.id, "stop")])
-    settings |= _limits(config, gateway_access(config), stops)
     settings |= {
+        "access_control": gateway_access(config),
+        "downsampling": [_command_limits(config), stops],
         "listen/endpoints": list(bus.outside),
         "connect/endpoints": [reachable(bus.plain[0])],
         "scouting/gossip/enabled": False,
@@ -215,12 +218,6 @@ def _listening() -> dict[str, object]:
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
     }
-
-
-def _limits(
-    config: Config, access: dict[str, object], *more: dict[str, object]
-) -> dict[str, object]:
-    return {"access_control": access, "downsampling": [_command_limits(config), *more]}
 
 
 def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Session:

@@ -72,8 +72,7 @@ class Pace:
     def at_once(self, now_ns: int, sent_ns: int) -> bool:
         """Return whether a line between two control periods may be written now.
 
-        `now_ns` is the present monotonic time, ns. `sent_ns` is the monotonic time at which the
-        last line was written, ns.
+        `now_ns` is the present monotonic time, ns.
         """
         return self._possible and not self._tried and now_ns - sent_ns >= self._gap_ns
 
@@ -108,8 +107,7 @@ class Pace:
     def retry_ns(self, sent_ns: int) -> int | None:
         """Return the monotonic time at which the waiting command may be sent, ns.
 
-        Return None if no command waits. `sent_ns` is the monotonic time at which the last line was
-        written, ns.
+        Return None if no command waits.
         """
         waits = self._waiting and self._possible and not self._tried
         return sent_ns + self._gap_ns if waits else None

@@ -58,10 +58,10 @@ again. At a later restart a person may be changing the files, so the router is s
 PAGE = Kind(
     "the robot's page",
     "page_ended",
-    frozenset({Exit.OK, Exit.IN_USE}),
-    LONG_RESTART_PAUSE_S,
-    frozenset({Exit.USAGE, Exit.NO_PERMISSION, Exit.BAD_CONFIG}),
-    "to serve the page again, run `acsard web` or restart the daemon",
+    final=frozenset({Exit.OK, Exit.IN_USE}),
+    restart_pause_s=LONG_RESTART_PAUSE_S,
+    final_at_first=frozenset({Exit.USAGE, Exit.NO_PERMISSION, Exit.BAD_CONFIG}),
+    remedy="to serve the page again, run `acsard web` or restart the daemon",
 )
 """The process of the web page, which itself reports why it ends.
 

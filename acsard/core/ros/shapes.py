@@ -6,7 +6,7 @@ CDR cannot encode maps, so the counters of `state` become a list. Null becomes N
 from __future__ import annotations
 
 import re
-from typing import Annotated
+from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
@@ -83,13 +83,7 @@ class Counter(Struct, frozen=True):
 
 
 class Source(Struct, frozen=True):
-    """A command source.
-
-    `age` is the time since the last accepted command of the source, s. It is None after the start,
-    a fault, a `clear` or another event that discards the earlier commands, until the next accepted
-    command. `waits_for` says in words what must happen before the source can drive. It is "" while
-    the source drives.
-    """
+    """A command source, with the fields of the native `SourceState` except `wait`."""
 
     name: str
     priority: Whole
@@ -127,28 +121,11 @@ class State(Struct, frozen=True):
 
 def state(message: RobotState) -> State:
     """Convert a native `RobotState` to a message of the ROS type acsard/msg/RobotState."""
-    return State(
-        header=Header(message.stamp),
-        mode=message.mode,
-        reason=message.reason,
-        x=message.x,
-        y=message.y,
-        yaw=message.yaw,
-        linear=message.linear,
-        angular=message.angular,
-        wheels=message.wheels,
-        feedback_age=message.feedback_age,
-        link=message.link,
-        source=message.source,
-        sender=message.sender,
-        sources=[Source(s.name, s.priority, s.age, s.waits_for) for s in message.sources],
-        refused=message.refused,
-        gyro=message.gyro,
-        effective_track=message.effective_track,
-        wheel_fault=message.wheel_fault,
-        emergency_stop=message.emergency_stop,
-        bumpers=message.bumpers or [],
-        recording_error=message.recording_error,
-        certificate_expiry=message.certificate_expiry,
-        counters=[Counter(name, count) for name, count in message.counters.items()],
-    )
+    converted: dict[str, Any] = {
+        "header": Header(message.stamp),
+        "sources": [Source(s.name, s.priority, s.age, s.waits_for) for s in message.sources],
+        "bumpers": message.bumpers or [],
+        "counters": [Counter(name, count) for name, count in message.counters.items()],
+    }
+    same = [name for name in State.__struct_fields__ if name not in converted]
+    return State(**converted, **{name: getattr(message, name) for name in same})

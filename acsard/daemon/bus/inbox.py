@@ -203,13 +203,9 @@ class Inbox:
         self._waker = waker
 
     def take(self, queries: int) -> BusInput:
-        """Return the samples since the last call, and the first of the waiting queries.
+        """Return the samples since the last call, and the queries that `Bus.take` must return.
 
-        The stops come first, and then the other samples in the order of their arrival. The queries
-        are in this order: service calls, one slow query, other queries. A slow query is a `set`
-        request or a query for ROS parameters, whose answer takes much processor time. At most
-        `queries` queries are returned. If service calls alone reach this limit, the slow query is
-        returned in addition.
+        The stops come first, and then the other samples in the order of their arrival.
         """
         if not self._any:
             return NO_INPUT
