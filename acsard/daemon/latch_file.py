@@ -165,11 +165,9 @@ class LatchFile(LatchKeeper):
             file_latches = self._start_latches
             if file_latches is None:
                 self._blind = True
-                latches = stopped(Latches(), unreadable(self.where, why), now)
+                latches = self._if_unreadable(why, now)
             else:
-                latches = after_failed_write(
-                    file_latches, at_start(unwritable(self.where, why)), now
-                )
+                latches = self._if_unwritable(file_latches, why, now)
             self.keep(latches)
         threads = (
             threading.Thread(target=self._work, args=(now,), name="latches", daemon=True),
@@ -183,7 +181,7 @@ class LatchFile(LatchKeeper):
             # write, and must not report a recovery. `_barred` prevents both.
             self._barred = f"this process cannot start another thread ({error})"
             self._fail(self._barred)
-            return after_failed_write(latches, at_start(unwritable(self.where, self._failed)), now)
+            return self._if_unwritable(latches, self._failed, now)
         self._threads = threads
         return latches
 
@@ -195,11 +193,15 @@ class LatchFile(LatchKeeper):
             trouble = self._replace(latches)
             if trouble and not self._abandoned:
                 self._fail(trouble)
-                latches = after_failed_write(
-                    latches, at_start(unwritable(self.where, trouble)), now
-                )
+                latches = self._if_unwritable(latches, trouble, now)
                 self.keep(latches)
             return latches
+
+    def _if_unreadable(self, why: str, now: Instant) -> Latches:
+        return stopped(Latches(), unreadable(self.where, why), now)
+
+    def _if_unwritable(self, latches: Latches, why: str, now: Instant) -> Latches:
+        return after_failed_write(latches, at_start(unwritable(self.where, why)), now)
 
     def _read(self, now: Instant) -> Latches:
         """Lock the file, and return its latches. If the file cannot be read, return a stop.
@@ -225,11 +227,11 @@ class LatchFile(LatchKeeper):
         except FileNotFoundError:
             return Latches()
         except OSError as error:
-            return stopped(Latches(), unreadable(self.where, _reason(error)), now)
+            return self._if_unreadable(_reason(error), now)
         try:
             return decode(self._robot, _content(path))
         except (OSError, LatchFileError) as error:
-            return stopped(Latches(), unreadable(self.where, _reason(error)), now)
+            return self._if_unreadable(_reason(error), now)
 
     def _take_lock(self, path: Path) -> None:
         try:
