@@ -47,7 +47,7 @@ def address_of(
     bus = config.bus
     # The daemon listens only in peer mode. A tcp endpoint comes first, because it needs no
     # certificate.
-    endpoints = sorted(bus.listen if bus.mode == "peer" else bus.connect, key=is_tls)
+    endpoints = sorted(bus.listening or bus.connect, key=is_tls)
     endpoint = connect or reachable(endpoints[0])
     certificates = (tls or bus.tls) if is_tls(endpoint) else ""
     return Address(endpoint, robot_id, certificates)

@@ -283,7 +283,7 @@ def _bumpers(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
     elif pressed is not None:
         text = f"the board reports {many(len(pressed), 'bumper')}, and none is pressed"
         yield Finding("bumpers", "ok", text)
-    elif safety.bumpers and safety.bumper != "off":
+    elif safety.needs_bumpers:
         yield Finding("bumpers", "failure", bumpers.missing_text(safety), mend)
 
 

@@ -77,7 +77,7 @@ def warnings(config: Config) -> list[str]:
         messages.append('safety.bumper = "off": the robot ignores bumpers that its board reports')
     status_use = wire_use(STATUS_HZ, config.mcu.baud_rate, STATUS_BYTES)
     required = 'safety.estop = "required"' if config.safety.estop == "required" else ""
-    if config.safety.bumpers and config.safety.bumper != "off":
+    if config.safety.needs_bumpers:
         required = required or f"safety.bumpers = {show(config.safety.bumpers)}"
     if required and use + status_use > 1.0:
         left = highest_rate(config.mcu.baud_rate, count, COMFORTABLE_USE - status_use)

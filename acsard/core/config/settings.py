@@ -236,6 +236,11 @@ class SafetyConfig(Struct, frozen=True):
     bumpers: Annotated[tuple[Place, ...], Meta(max_length=4)] = ()
     bumper: BumperUse = "stop"
 
+    @property
+    def needs_bumpers(self) -> bool:
+        """True if the robot must not drive unless its board reports the bumpers."""
+        return bool(self.bumpers) and self.bumper != "off"
+
 
 Threshold = Annotated[float, Meta(ge=0.0, le=100.0, extra={"unit": "V or % (0 = off)"})]
 

@@ -195,8 +195,8 @@ def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
 
 def _board(config: Config, snapshot: Snapshot) -> list[Row]:
     safety, bumpers = config.safety, snapshot.bumpers
-    required, needed = safety.estop == "required", safety.bumpers and safety.bumper != "off"
-    if not (snapshot.board or required or needed):
+    required = safety.estop == "required"
+    if not (snapshot.board or required or safety.needs_bumpers):
         return []
     findings = [BOARD[snapshot.estop]]
     if required and not snapshot.estop:
@@ -205,7 +205,7 @@ def _board(config: Config, snapshot: Snapshot) -> list[Row]:
         findings.append((ERROR if snapshot.bumper == SILENT_BUMPERS else WARN, snapshot.bumper))
     elif bumpers is not None:
         findings.append((OK, f"{many(len(bumpers), 'bumper')} released"))
-    elif needed:
+    elif safety.needs_bumpers:
         findings.append((ERROR, missing_text(safety)))
     if snapshot.board.get("motor_driver") == "fault":
         findings.append((ERROR, DRIVER_FAULT_REASON))
