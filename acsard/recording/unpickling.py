@@ -76,21 +76,6 @@ FindClass = Callable[[str, str], type]
 It raises `ValueError` if objects of this class cannot be parts of a robot.
 """
 
-ARGUMENTS = {
-    "BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "SHORT_BINUNICODE", "BINUNICODE",
-    "SHORT_BINBYTES", "BINBYTES",
-}  # fmt: skip
-"""Opcodes that push their argument onto the stack."""
-
-VALUES = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
-"""Constant that an opcode pushes onto the stack, by opcode."""
-
-CONTAINERS: dict[str, type] = {"EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_SET": set}
-"""Type of the empty container that an opcode pushes onto the stack, by opcode."""
-
-TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
-"""Number of values from the top of the stack that an opcode joins to a tuple, by opcode."""
-
 KEY_TYPES = (str, int, float, bool, bytes, type(None))
 """Allowed types of dict keys and set elements. Members of an Enum are allowed too, and also short
 tuples of strings and small integers."""
@@ -187,35 +172,73 @@ class _Machine:
 
     def do(self, name: str, argument: Any) -> None:
         """Execute an opcode. Damaged operands may raise any exception that `unpickle` converts."""
-        if name in ARGUMENTS:
-            if type(argument) is int and argument.bit_length() > MAX_INT_BITS:
+        match name:  # the most frequent opcodes come first
+            case "MEMOIZE":
+                self._memo.append(self._stack[-1])
+            case "BINGET" | "LONG_BINGET":
+                entry = self._memo[argument]
+                entry.closed = True
+                self._stack.append(entry)
+            case (
+                "BININT" | "BININT1" | "BININT2" | "LONG1" | "BINFLOAT" | "SHORT_BINUNICODE"
+                | "BINUNICODE" | "SHORT_BINBYTES" | "BINBYTES"
+            ):  # fmt: skip
+                if type(argument) is int and argument.bit_length() > MAX_INT_BITS:
+                    raise ValueError(
+                        f"the robot state has a number of {argument.bit_length()} bits, too large "
+                        "for a real robot: the file is damaged or forged"
+                    )
+                self._push(argument)
+            case "NONE":
+                self._push(None)
+            case "NEWTRUE" | "NEWFALSE":
+                self._push(name == "NEWTRUE")
+            case "EMPTY_TUPLE":
+                self._push(())
+            case "EMPTY_LIST":
+                self._push([])
+            case "EMPTY_DICT":
+                self._push({})
+            case "EMPTY_SET":
+                self._push(set())
+            case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                self._push_of(tuple, self._top(int(name[-1])))
+            case "MARK":
+                self._marks.append(len(self._stack))
+            case "TUPLE":
+                self._push_of(tuple, self._marked())
+            case "FROZENSET":
+                parts = self._marked()
+                _keys(parts)
+                self._push_of(frozenset, parts)
+            case "APPEND":
+                self._append(self._top(1))
+            case "APPENDS":
+                self._append(self._marked())
+            case "SETITEM":
+                self._set_items(self._top(2))
+            case "SETITEMS":
+                self._set_items(self._marked())
+            case "ADDITEMS":
+                self._add_to_set(self._marked())
+            case "STACK_GLOBAL":
+                self._find_class()
+            case "REDUCE":
+                self._construct()
+            case "NEWOBJ":
+                self._make_bare()
+            case "BUILD":
+                self._set_attributes()
+            case "PROTO" | "FRAME" | "STOP":
+                pass
+            case _:
                 raise ValueError(
-                    f"the robot state has a number of {argument.bit_length()} bits, too large for "
-                    "a real robot: the file is damaged or forged"
+                    f"the robot state has the pickle opcode {name}, which this acsard never "
+                    "writes: the file is damaged or forged"
                 )
-            self._push(argument)
-        elif name in VALUES:
-            self._push(VALUES[name])
-        elif name in CONTAINERS:
-            self._push(CONTAINERS[name]())
-        elif name in TUPLES:
-            self._push_of(tuple, self._top(TUPLES[name]))
-        elif name in OPCODES:
-            OPCODES[name](self)
-        elif name in ("BINGET", "LONG_BINGET"):
-            entry = self._memo[argument]
-            entry.closed = True
-            self._stack.append(entry)
-        else:
-            raise ValueError(
-                f"the robot state has the pickle opcode {name}, which this acsard never "
-                "writes: the file is damaged or forged"
-            )
 
-    def _push(self, value: object) -> _Entry:
-        entry = _Entry(value)
-        self._stack.append(entry)
-        return entry
+    def _push(self, value: object) -> None:
+        self._stack.append(_Entry(value))
 
     def _push_of(self, kind: type, parts: list[_Entry]) -> None:
         entry = _Entry(None)
@@ -244,45 +267,14 @@ class _Machine:
                 "damaged or forged"
             )
 
-    # Each method below executes the opcodes that `OPCODES` assigns to it.
-
-    def proceed(self) -> None:
-        """Ignore an opcode that does not change the stack."""
-
-    def mark(self) -> None:
-        self._marks.append(len(self._stack))
-
-    def memoize(self) -> None:
-        self._memo.append(self._stack[-1])
-
-    def make_tuple(self) -> None:
-        self._push_of(tuple, self._marked())
-
-    def make_frozenset(self) -> None:
-        parts = self._marked()
-        _keys(parts)
-        self._push_of(frozenset, parts)
-
-    def append(self) -> None:
-        self._extend(self._top(1))
-
-    def appends(self) -> None:
-        self._extend(self._marked())
-
-    def _extend(self, parts: list[_Entry]) -> None:
+    def _append(self, parts: list[_Entry]) -> None:
         whole = self._stack[-1]
         if type(whole.value) not in (list, deque):
             raise TypeError("an instruction appends to an object that is not a list")
         whole.holds(parts)
         whole.value.extend([part.value for part in parts])
 
-    def set_item(self) -> None:
-        self._update(self._top(2))
-
-    def set_items(self) -> None:
-        self._update(self._marked())
-
-    def _update(self, parts: list[_Entry]) -> None:
+    def _set_items(self, parts: list[_Entry]) -> None:
         whole, keys, values = self._stack[-1], parts[::2], parts[1::2]
         if type(whole.value) is not dict:
             raise TypeError("an instruction sets keys of an object that is not a dict")
@@ -291,8 +283,7 @@ class _Machine:
         pairs = zip(keys, values, strict=True)
         whole.value.update({key.value: value.value for key, value in pairs})
 
-    def add_items(self) -> None:
-        parts = self._marked()
+    def _add_to_set(self, parts: list[_Entry]) -> None:
         whole = self._stack[-1]
         if not isinstance(whole.value, set):
             raise TypeError("an instruction adds elements to an object that is not a set")
@@ -300,13 +291,13 @@ class _Machine:
         whole.holds(parts)
         whole.value.update([part.value for part in parts])
 
-    def find_class(self) -> None:
+    def _find_class(self) -> None:
         module, name = [entry.value for entry in self._top(2)]
         if not isinstance(module, str) or not isinstance(name, str):
             raise TypeError("an instruction names a class with a value that is not a text")
         self._push(self._find(module, name))
 
-    def construct(self) -> None:
+    def _construct(self) -> None:
         kind, arguments = self._top(2)
         if not isinstance(kind.value, type) or not isinstance(arguments.value, tuple):
             raise TypeError(
@@ -319,7 +310,7 @@ class _Machine:
         entry.value = _construct(kind.value, arguments.value)
         self._stack.append(entry)
 
-    def make_bare(self) -> None:
+    def _make_bare(self) -> None:
         kind, arguments = self._top(2)
         if not isinstance(kind.value, type) or arguments.value != ():
             raise TypeError(
@@ -330,8 +321,8 @@ class _Machine:
             raise ValueError(f"{kind.value.__name__} cannot be constructed without values")
         self._push(object.__new__(kind.value))
 
-    def set_attributes(self) -> None:
-        """Pop a dict, and set its items as attributes of an object that `make_bare` has made."""
+    def _set_attributes(self) -> None:
+        """Pop a dict, and set its items as attributes of an object that `_make_bare` has made."""
         (state,) = self._top(1)
         whole, named = self._stack[-1], state.value
         if not _is_part(type(whole.value)) or not isinstance(named, dict):
@@ -348,28 +339,6 @@ class _Machine:
         whole.holds([state])
         self._copies(state)
         vars(whole.value).update(named)
-
-
-OPCODES: dict[str, Callable[[_Machine], None]] = {
-    "PROTO": _Machine.proceed,
-    "FRAME": _Machine.proceed,
-    "STOP": _Machine.proceed,
-    "MARK": _Machine.mark,
-    "MEMOIZE": _Machine.memoize,
-    "TUPLE": _Machine.make_tuple,
-    "FROZENSET": _Machine.make_frozenset,
-    "APPEND": _Machine.append,
-    "APPENDS": _Machine.appends,
-    "SETITEM": _Machine.set_item,
-    "SETITEMS": _Machine.set_items,
-    "ADDITEMS": _Machine.add_items,
-    "STACK_GLOBAL": _Machine.find_class,
-    "REDUCE": _Machine.construct,
-    "NEWOBJ": _Machine.make_bare,
-    "BUILD": _Machine.set_attributes,
-}
-"""Maps opcodes to the methods that execute them. `_Machine.do` itself executes the opcodes in
-`ARGUMENTS`, `VALUES`, `CONTAINERS` and `TUPLES`, and those that fetch a value from the memo."""
 
 
 def _keys(entries: Sequence[_Entry]) -> None:
