@@ -211,7 +211,7 @@ class Board:
                     break
                 self.zeros()
                 self.listen(2 * self.period_s)
-                self.runaway_seen = motion.fastest(self.replies, motion.RUNAWAY_SPEED) is not None
+                self.runaway_seen = motion.runaway(self.replies) is not None
         except WireLostError:
             # No line reaches the board any more, so its own watchdog must stop the motors.
             pass
@@ -286,12 +286,12 @@ class Board:
         self.wire.send(b"\r\n" + plain + (self.line(ZERO) if self.sealed else b""))
         self.restarts.record_speeds(ZERO, self.now_s)
 
-    def answers_within(self, seconds: float) -> bool:
-        """Send zero speeds until the board answers, for `seconds` s at most.
+    def comes_back(self) -> bool:
+        """Send zero speeds until the board answers, and return whether it answers in time.
 
-        Return whether the board has answered.
+        The time limit is `motion.BOOT_S`, in which a restarted board answers.
         """
-        before, end_s = len(self.replies), self.now_s + seconds
+        before, end_s = len(self.replies), self.now_s + motion.BOOT_S
         while len(self.replies) == before:
             if self.now_s >= end_s:
                 return False
@@ -454,16 +454,19 @@ class Board:
         return self.now_s - self.replies[-1].at_s if self.replies and not self.runaway_seen else 0.0
 
     def _guard(self) -> None:
-        fastest = motion.fastest(self.replies, motion.RUNAWAY_SPEED)
-        if fastest is None:
+        runaway = motion.runaway(self.replies)
+        if runaway is None:
             return
-        motor, speed = fastest
+        motor, speed = runaway
         commanded = self._commanded[motor]
         self._abandon()
-        outcome = "runaway: against" if commanded * speed < 0 else "runaway: along"
-        name, letter, most = motor_name(self.mcu, motor), LETTERS[motor], motion.RUNAWAY_SPEED
         finding = outcomes.find(
-            outcome, motor=name, letter=letter, told=commanded, seen=speed, most=most
+            "runaway: against" if commanded * speed < 0 else "runaway: along",
+            motor=motor_name(self.mcu, motor),
+            letter=LETTERS[motor],
+            told=commanded,
+            seen=speed,
+            most=motion.RUNAWAY_SPEED,
         )
         raise StoppedError(finding)
 
@@ -508,8 +511,7 @@ class Board:
 
     def _unheard_s(self, since_s: float) -> float:
         """Return the time since the last reply or since `since_s`, whichever is later, s."""
-        replies = motion.since(self.replies[-1:], since_s)
-        return self.now_s - (replies[-1].at_s if replies else since_s)
+        return self.now_s - max([since_s, *(reply.at_s for reply in self.replies[-1:])])
 
     def settles(self, comma: bool) -> bool:
         """Send zero speeds until all motors stand still, and return whether they do so in time.

@@ -70,8 +70,9 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
         return outcomes.find("damaged lines: right", lines=len(lines))
     outcome = "lenient" if took.keys() <= HARMLESS_KINDS else "taken"
     kinds = {what for what, _ in lines}
-    values = {"took": len(took), "kinds": len(kinds), "which": ", ".join(took)}
-    return outcomes.find(f"damaged lines: {outcome}", None, **values)
+    return outcomes.find(
+        f"damaged lines: {outcome}", took=len(took), kinds=len(kinds), which=", ".join(took)
+    )
 
 
 def _moves(board: Board, line: bytes) -> bool:

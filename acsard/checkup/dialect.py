@@ -9,11 +9,10 @@ steps.
 from __future__ import annotations
 
 import re
-from itertools import pairwise
 from statistics import fmean, median
 from typing import get_args
 
-from acsard.checkup import lateness, outcomes
+from acsard.checkup import lateness, motion, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError, motor_name
 from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, WATCHDOG_SILENCE_S, ZERO, BoardReply
@@ -39,8 +38,13 @@ def baud(board: Board) -> Finding:
     for rate in (rate for rate in reversed(get_args(Baud)) if rate != configured):
         board.open(rate)
         if _knock(board, 0.6):
-            values = {"rate": rate, "configured": configured, "heard": data.counted}
-            return outcomes.find("baud rate: other", {"mcu.baud_rate": rate}, **values)
+            return outcomes.find(
+                "baud rate: other",
+                {"mcu.baud_rate": rate},
+                rate=rate,
+                configured=configured,
+                heard=data.counted,
+            )
     board.open(configured)
     finding = outcomes.find(f"baud rate: {data.looks}", heard=data.counted, configured=configured)
     raise StoppedError(finding)
@@ -181,7 +185,7 @@ def rate(board: Board) -> Finding:
         answers += board.drive(ZERO, 1.0, period_s)
     if len(answers) < 2:
         return outcomes.find("reply rate: none")
-    gaps = [after.at_s - earlier.at_s for earlier, after in pairwise(answers)]
+    gaps = motion.gaps(answers)
     board.gap_s = gap_s = fmean(gaps)
     configured, answered = board.mcu.reply_period, len(answers) / (board.sent_lines - before)
     unset_s = max(0.1, 4 * period_s)  # the silence that the host allows by default

@@ -53,9 +53,11 @@ def per_turn(replies: Sequence[BoardReply], motors: Sequence[int]) -> float | No
     """
     counts = angle = 0.0
     for step in steps(replies):
-        for motor in motors if step.counts and step.mcu_s <= SHORT_MEASUREMENT_S else ():
+        if step.counts is None or step.mcu_s > SHORT_MEASUREMENT_S:
+            continue
+        for motor in motors:
             speed = step.speeds[motor]
-            if step.counts and abs(speed) >= 1.0:
+            if abs(speed) >= 1.0:
                 counts += math.copysign(1.0, speed) * step.counts[motor]
                 angle += abs(speed) * step.mcu_s
     # Below 2 rad, the rounding of the reported speeds makes the result too inaccurate.

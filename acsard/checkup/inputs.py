@@ -7,8 +7,6 @@ emergency stop switches the motors off, and some motor drivers must be enabled a
 
 from __future__ import annotations
 
-from msgspec import Struct
-
 from acsard.checkup import outcomes
 from acsard.checkup.board import Board, Operator
 from acsard.checkup.findings import Finding
@@ -19,14 +17,6 @@ PRESS_TIMEOUT_S = 20.0
 
 REPORT_TIMEOUT_S = 0.5
 """Time within which every board reports its emergency stop and each bumper at least once, s."""
-
-
-class Input(Struct, frozen=True):
-    """The emergency stop or one bumper of the board."""
-
-    number: int
-    """0 for the emergency stop, or 1, 2, ... for a bumper, in the order of the status line."""
-    name: str
 
 
 def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
@@ -42,15 +32,14 @@ def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
     counted = 0 if safety.bumper == "off" else sum(number > 0 for number in board.inputs)
     names = [f"{place} bumper" for place in places]
     names = names or [f"bumper {number}" for number in range(1, counted + 1)]
-    # Two bumpers can have the same place. Then their names also contain their numbers.
-    same = [names.count(name) > 1 for name in names]
-    inputs = [Input(0, "emergency stop")] if estop else []
-    inputs += [
-        Input(i + 1, f"{name} ({i + 1})" if same[i] else name) for i, name in enumerate(names)
-    ]
+    # The numbers are those of `Board.inputs`. If two bumpers have the same place, their names also
+    # contain their numbers.
+    inputs = {0: "emergency stop"} if estop else {}
+    for number, name in enumerate(names, 1):
+        inputs[number] = f"{name} ({number})" if names.count(name) > 1 else name
     if not inputs:
         return outcomes.find("inputs: none")
-    listed = ", ".join(each.name for each in inputs)
+    listed = ", ".join(inputs.values())
     if (estop and 0 not in board.inputs) or (places and counted != len(places)):
         fields = [*["estop=ok"] * estop, *["bumpers=" + "." * len(places)] * bool(places)]
         return outcomes.find("inputs: missing", listed=listed, fields=" ".join(fields))
@@ -60,15 +49,16 @@ def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
     )
     if operator.ask(question, ("ready", "skip")) != "ready":
         return outcomes.find("inputs: not pressed", listed=listed)
-    wrong = [text for each in inputs if (text := _pressed(board, operator, each, inputs))]
+    wrong = [text for number in inputs if (text := _pressed(board, operator, number, inputs))]
     if wrong:
         right = f"{len(inputs) - len(wrong)} of {len(inputs)} right"
         return outcomes.find("inputs: wrong", figure=right, wrong="; ".join(wrong))
     return outcomes.find("inputs: right", listed=listed)
 
 
-def _pressed(board: Board, operator: Operator, asked: Input, inputs: list[Input]) -> str:
-    operator.doing(f"press the {asked.name} and release it, within {PRESS_TIMEOUT_S:g} s")
+def _pressed(board: Board, operator: Operator, asked: int, inputs: dict[int, str]) -> str:
+    name = inputs[asked]
+    operator.doing(f"press the {name} and release it, within {PRESS_TIMEOUT_S:g} s")
     end_s, numbers = board.now_s + PRESS_TIMEOUT_S, set[int]()
     while board.now_s < end_s:
         board.send_zero()
@@ -76,10 +66,10 @@ def _pressed(board: Board, operator: Operator, asked: Input, inputs: list[Input]
         numbers |= now
         if numbers and not now:
             break
-    others = [each.name for each in inputs if each.number in numbers - {asked.number}]
-    if asked.number not in numbers:
+    others = [other for number, other in inputs.items() if number in numbers - {asked}]
+    if asked not in numbers:
         instead = f"; instead the board reported the {' and the '.join(others)}" if others else ""
-        return f"{asked.name}: no press was reported{instead}"
+        return f"{name}: no press was reported{instead}"
     if others:
-        return f"{asked.name}: the board also reported the {' and the '.join(others)}"
-    return "" if not now else f"{asked.name}: no release was reported"
+        return f"{name}: the board also reported the {' and the '.join(others)}"
+    return "" if not now else f"{name}: no release was reported"

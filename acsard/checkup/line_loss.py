@@ -9,7 +9,6 @@ line was lost if the motors do not obey the pulse.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from statistics import fmean, median
 
 from msgspec import Struct
@@ -122,16 +121,12 @@ def _counted(board: Board, began_s: float, lines: int, others: int) -> Count:
     return Count(len(replies) + lost, lost, damaged)
 
 
-def _gaps(replies: Sequence[BoardReply]) -> list[float]:
-    return [after.at_s - before.at_s for before, after in pairwise(replies)]
-
-
 def _left_out(replies: Sequence[BoardReply]) -> int:
     """Return how many replies are missing, for a board that sends them at regular intervals."""
     # Compute the number from the time between the first and the last reply. A single long gap does
     # not show a lost reply, because a reply that is received late makes one gap longer and the next
     # gap shorter.
-    gaps = _gaps(replies)
+    gaps = motion.gaps(replies)
     usual = median(gaps) if gaps else 0.0
     alike = [gap for gap in gaps if abs(gap - usual) < usual / 2]
     return max(0, round(sum(gaps) / fmean(alike)) - len(gaps)) if alike else 0
@@ -139,7 +134,7 @@ def _left_out(replies: Sequence[BoardReply]) -> int:
 
 def _silence_s(board: Board, replies: Sequence[BoardReply]) -> float:
     """Return the longest gap between two replies, s, or 0 if the daemon tolerates such a gap."""
-    longest = max(_gaps(replies), default=0.0)
+    longest = max(motion.gaps(replies), default=0.0)
     quiet_s = max(0.1, 4 / board.rate_hz, 3 * board.mcu.reply_period)
     return longest if longest > max(quiet_s, SILENCE_FACTOR * board.gap_s) else 0.0
 
@@ -221,7 +216,7 @@ def pulsed(board: Board, motors: Sequence[int]) -> PulseCounts | None:
     A pulse is a single line that turns `motors` for a moment from a standstill. Return None if the
     measured movement does not show which pulses arrived.
     """
-    on = motion.each(lambda motor: motion.SPEED if motor in motors else 0.0)
+    on = motion.only(motors)
     # If the board reports by its own clock, no earlier step has found a loss of lines to the board,
     # so a shorter search is enough.
     end_s = board.now_s + (10.0 if board.own_clock else MAX_PULSES_S)
@@ -256,8 +251,8 @@ def pulsed(board: Board, motors: Sequence[int]) -> PulseCounts | None:
 
 def _whole(board: Board, since_s: float) -> bool:
     """Return whether all reports of a free-running board since the time `since_s` have arrived."""
-    times = [reply.at_s for reply in motion.since(board.replies, since_s - board.gap_s)]
-    return all(after - before < 1.5 * board.gap_s for before, after in pairwise(times))
+    gaps = motion.gaps(motion.since(board.replies, since_s - board.gap_s))
+    return all(gap_s < 1.5 * board.gap_s for gap_s in gaps)
 
 
 def _grain(board: Board, motors: Sequence[int]) -> float:

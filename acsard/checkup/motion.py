@@ -98,6 +98,11 @@ def each(value: Callable[[int], float]) -> Motors:
     return a, b, c, d
 
 
+def only(motors: Sequence[int], speed: float = SPEED) -> Motors:
+    """Return the speeds that turn only `motors` (numbers 0 to 3), all at `speed` rad/s."""
+    return each(lambda motor: speed if motor in motors else 0.0)
+
+
 def moving(speeds: Motors, least: float = MOVING_SPEED) -> list[int]:
     """Return the numbers of the motors that turn at `least` rad/s or faster, in any direction."""
     return [motor for motor in range(4) if abs(speeds[motor]) >= least]
@@ -112,6 +117,11 @@ def since(
     """
     first = bisect_left(replies, since_s, key=lambda reply: reply.at_s)
     return replies[first : bisect_right(replies, until_s, key=lambda reply: reply.at_s)]
+
+
+def gaps(replies: Sequence[BoardReply]) -> list[float]:
+    """Return the times from each reply to the next reply, s."""
+    return [after.at_s - before.at_s for before, after in pairwise(replies)]
 
 
 def mean(replies: Sequence[BoardReply]) -> Motors:
@@ -201,8 +211,8 @@ def grain_s(steady: Sequence[BoardReply], motors: Sequence[int]) -> float:
     return max(course[-2] - course[1] for course in speeds) * between_s / SPEED
 
 
-def fastest(replies: Sequence[BoardReply], above: float) -> tuple[int, float] | None:
-    """Return a motor that several replies show to be faster than `above` rad/s, or None.
+def runaway(replies: Sequence[BoardReply]) -> tuple[int, float] | None:
+    """Return a motor that several replies show to be faster than `RUNAWAY_SPEED`, or None.
 
     The result is a pair: the number of the motor, and its mean speed in the last replies, rad/s. A
     single reply proves nothing, because it may be damaged, or show one count of a coarse encoder.
@@ -222,6 +232,6 @@ def fastest(replies: Sequence[BoardReply], above: float) -> tuple[int, float] | 
             # time would look like a high speed.
             seconds = max(SHORT_MEASUREMENT_S / 2, sum(seconds for seconds, _ in sure))
             speed = sum(seconds * speed for seconds, speed in sure) / seconds
-            if abs(speed) > above:
+            if abs(speed) > RUNAWAY_SPEED:
                 return motor, speed
     return None

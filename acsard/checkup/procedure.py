@@ -26,7 +26,7 @@ from acsard.checkup import (
 )
 from acsard.checkup.board import Board, Operator, Wire
 from acsard.checkup.findings import SKIPPED_STEPS, Finding, StoppedError, WireLostError, motor_name
-from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S
+from acsard.checkup.motion import SHORT_MEASUREMENT_S
 from acsard.checkup.outcomes import TimingFinding
 from acsard.checkup.restarts import Restart, RestartedError
 from acsard.checkup.wheels import Channel, encoder_finding, wheel_map
@@ -281,7 +281,7 @@ class _Steps:
                 break
             # The delay of a simulated board is known only when its program runs again, so wait for
             # an answer. If the board does not answer at all, a delay is not the cause.
-            if finding.verdict != "PASS" and not board.answers_within(BOOT_S):
+            if finding.verdict != "PASS" and not board.comes_back():
                 break
             meanwhile_s = board.lateness.since(began_s)
             if not lateness.is_doubtful(finding, meanwhile_s):
@@ -335,7 +335,7 @@ class _Steps:
     def _await_return(self, silent_s: float) -> None:
         board = self._board
         if board.silent_s > max(silent_s, 4 * board.gap_s):
-            board.answers_within(BOOT_S)
+            board.comes_back()
 
     def _come_back(self) -> None:
         board = self._board
@@ -343,7 +343,7 @@ class _Steps:
         self._operator.doing(
             "the board restarted; this part of the check runs again when the board answers"
         )
-        if not board.answers_within(BOOT_S):
+        if not board.comes_back():
             raise StoppedError(restarts.finding(board.mcu, self._all_restarts, back=False))
         if cause := restarts.cause(board.unrecognized_lines):
             self._all_restarts[-1] = structs.replace(self._all_restarts[-1], cause=cause)

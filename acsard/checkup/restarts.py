@@ -175,15 +175,15 @@ def finding(mcu: McuConfig, restarts: Sequence[Restart], back: bool = True) -> F
     last restart.
     """
     each = Counter(_restart_texts(mcu, restart) for restart in restarts)
-    values: dict[str, object] = {
-        "times": ", ".join(filter(None, ("restarted", _times(len(restarts))))),
-        "told": "; ".join(
+    return outcomes.find(
+        f"restarts: {_outcome(restarts) if back else 'gone'}",
+        times=f"restarted, {_times(len(restarts))}".removesuffix(", "),
+        told="; ".join(
             f"{_times(n)} while {when}: {sign}".lstrip() for (when, sign), n in each.items()
         ),
-        "silent": min(restart.silent_s for restart in restarts),
-        "patience": BOOT_S,
-    }
-    return outcomes.find(f"restarts: {_outcome(restarts) if back else 'gone'}", None, **values)
+        silent=min(restart.silent_s for restart in restarts),
+        patience=BOOT_S,
+    )
 
 
 def _outcome(restarts: Sequence[Restart]) -> str:

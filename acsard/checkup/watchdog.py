@@ -23,7 +23,7 @@ from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import BoardReply
 from acsard.checkup.wheels import run_up
 from acsard.core.config.wire_time import FIELD_VALUES
-from acsard.core.link.codec import LETTERS, Motors
+from acsard.core.link.codec import LETTERS
 
 DAMAGE_KINDS = ("a wrong letter", "neither p nor n", "cut short")
 """Kinds of damaged lines that must not feed the watchdog. The check sends lines of these kinds."""
@@ -181,7 +181,7 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
     speed.
     """
     began_s = board.now_s
-    full = run_up(board, command(motors))
+    full = run_up(board, motion.only(motors))
     if max(abs(full[motor]) for motor in motors) < motion.SPEED / 2:
         board.stop_motors()
         letters = ", ".join(LETTERS[motor] for motor in motors)
@@ -211,11 +211,6 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
     ran = motion.covered(board.replies, since_s, _per_turn(board, motors))
     ran_s = max(abs(ran[m] / full[m]) for m in motors if abs(full[m]) >= motion.SPEED / 2)
     return Run(silent_s, ran_s, slow_s, first, second, grain_s)
-
-
-def command(motors: Sequence[int]) -> Motors:
-    """Return the speeds that turn all `motors` at `motion.SPEED`, and no other motor."""
-    return motion.each(lambda motor: motion.SPEED if motor in motors else 0.0)
 
 
 def _per_turn(board: Board, motors: Sequence[int]) -> float:

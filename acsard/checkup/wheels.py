@@ -208,23 +208,18 @@ WHEEL_ANSWERS = {
 }  # fmt: skip
 
 
-def only_motor(motor: int, speed: float) -> Motors:
-    """Return the speeds that turn only the motor number `motor`, at `speed` rad/s."""
-    return motion.each(lambda index: speed if index == motor else 0.0)
-
-
 def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
     """Bring a motor to `speed`, rad/s, and measure the speeds of all encoders.
 
     Return a pair: the measured speeds, rad/s, and the possible relative error of this motor's
     measured speed. This error exists because an encoder counts only whole steps.
     """
-    means = run_up(board, only_motor(motor, speed))
+    means = run_up(board, motion.only([motor], speed))
     unsure = _unsure(board, motor, 2 * _look_s(board))
     if REPEAT_FRACTION * WARN_TOLERANCE + unsure < abs(means[motor] / speed - 1) <= FAIL_TOLERANCE:
         # The motor is weak, or its wheel is heavy and has not yet reached its speed. A longer
         # measurement shows which of the two is the case.
-        board.drive(only_motor(motor, speed), motion.MOTOR_TIMEOUT_S)
+        board.drive(motion.only([motor], speed), motion.MOTOR_TIMEOUT_S)
         means = motion.mean(motion.since(board.replies, board.now_s - LONG_MEASUREMENT_S))
         unsure = _unsure(board, motor, LONG_MEASUREMENT_S)
     return means, unsure
@@ -349,7 +344,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     while (
         board.now_s < began_s + motion.SHORT_MEASUREMENT_S and own > -4 * motion.PROBE_MOVING_SPEED
     ):
-        board.drive(only_motor(motor, speed), board.period_s)
+        board.drive(motion.only([motor], speed), board.period_s)
         own = mean_speeds()[motor]
     if own >= motion.PROBE_MOVING_SPEED:
         return None

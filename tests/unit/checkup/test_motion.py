@@ -35,8 +35,8 @@ def test_a_coarse_encoder_is_not_a_runaway_but_a_real_runaway_is_found(
     for speed in (3.0, -3.0):
         good = course(speed, per_turn, period_ms, 3.0, sampled)
         for n in range(1, len(good)):
-            assert motion.fastest(good[:n], 6.0) is None
-    runaway = motion.fastest(course(-9.0, per_turn, period_ms, 1.0, sampled), 6.0)
+            assert motion.runaway(good[:n]) is None
+    runaway = motion.runaway(course(-9.0, per_turn, period_ms, 1.0, sampled))
     assert runaway is not None
     assert runaway[0] == 1
     assert -10.0 < runaway[1] < -6.0
@@ -46,16 +46,16 @@ def test_a_coarse_encoder_is_not_a_runaway_but_a_real_runaway_is_found(
 def test_a_sudden_runaway_is_found_by_its_third_reply(sampled: bool) -> None:
     replies = course(1.0, 3200, 20, 1.0, sampled)
     for _ in range(3):
-        assert motion.fastest(replies, 6.0) is None
+        assert motion.runaway(replies) is None
         last = replies[-1]
         counts = (0, last.reading.counts[1] + 200, 0, 0) if last.reading else (0, 0, 0, 0)
         reading = last.reading and Reading(last.reading.mcu_ms + 20, counts)
         replies.append(BoardReply(last.at_s + 0.02, (0.0, 19.6, 0.0, 0.0), b"", reading))
-    assert motion.fastest(replies, 6.0) is not None
+    assert motion.runaway(replies) is not None
 
 
 def test_without_replies_there_is_no_runaway_no_angle_and_no_trend() -> None:
-    assert motion.fastest([], 6.0) is None
+    assert motion.runaway([]) is None
     assert motion.covered([], 0) == (0.0,) * 4
     assert motion.trend([], 0, 0.02) == (1.0,) * 4
 

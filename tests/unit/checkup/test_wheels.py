@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec import structs
 
-from acsard.checkup import dialect, wheels
+from acsard.checkup import dialect, motion, wheels
 from acsard.checkup.motion import SHORT_MEASUREMENT_S, SLOWING_TIMEOUT_S, SPEED
 from acsard.checkup.wheels import Channel, Kind, encoder_finding, wheel_map
 from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
@@ -109,7 +109,7 @@ def test_the_speed_is_ramped() -> None:
     robot = Robot("plain_only")
     with robot.board() as board:
         before = len(robot.sent)
-        wheels.run_up(board, wheels.only_motor(0, SPEED))
+        wheels.run_up(board, motion.only([0]))
         speeds = [float(line[2:7]) for line in robot.sent[before:]]
     assert speeds[:9] == sorted(speeds[:9])
     assert speeds[0] <= SPEED / 5
@@ -120,7 +120,7 @@ def test_a_motor_without_measured_speed_is_driven_only_briefly() -> None:
     robot = Robot("plain_only", "stuck_encoder=1".replace("1", "b"))
     with robot.board() as board:
         began = robot.now_ns()
-        wheels.run_up(board, wheels.only_motor(1, SPEED))
+        wheels.run_up(board, motion.only([1]))
         assert robot.now_ns() - began < 1e9
 
 
@@ -165,5 +165,5 @@ def test_a_motor_that_still_accelerates_is_driven_on_for_a_limited_time() -> Non
         robot = Robot("plain_only", config=Config(sim=SimConfig(motor_time_constant=lag)))
         with robot.board() as board:
             began = robot.now_ns()
-            assert wheels.run_up(board, wheels.only_motor(0, SPEED))[0] > speed
+            assert wheels.run_up(board, motion.only([0]))[0] > speed
             assert robot.now_ns() - began < 1.2e9 * SLOWING_TIMEOUT_S
