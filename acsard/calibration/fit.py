@@ -82,14 +82,13 @@ class Base(Struct, frozen=True):
 
         The track growth and all parameters of sensors are 0.
         """
-        return np.array(
-            [
-                self.left,
-                self.right,
-                1 / self.track,
-                *[0.0] * (PARAMETER_COUNT - Parameter.TRACK_GROWTH),
-            ]
-        )
+        parameters = np.zeros(PARAMETER_COUNT)
+        parameters[: Parameter.TRACK_GROWTH] = self.left, self.right, 1 / self.track
+        return parameters
+
+    def configured(self, parameters: Floats) -> Floats:
+        """Return `parameters` with the configured geometry, and with a track growth of 0."""
+        return np.concatenate((self.start()[: Parameter.DELAY], parameters[Parameter.DELAY :]))
 
     @property
     def radius_per_separation(self) -> float:
@@ -337,9 +336,7 @@ def fit(
             bias.
         held: constraints on the parameters.
     """
-    active: tuple[Parameter, ...] = tuple(Parameter)[
-        : Parameter.BIAS_ERROR if places else Parameter.DELAY
-    ]
+    active = tuple(Parameter)[: Parameter.BIAS_ERROR if places else Parameter.DELAY]
     usual = dict(PRIOR_STD)
     if gyro:
         active, usual[Parameter.SCALE_ERROR] = (*active, Parameter.SCALE_ERROR), GYRO_SCALE_STD

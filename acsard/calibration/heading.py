@@ -27,7 +27,7 @@ from acsard.calibration.fit import (
     huber,
 )
 from acsard.calibration.log_table import Floats, LogError
-from acsard.calibration.runs import Block, Run, cumulative, gaps, inside, rest_intervals
+from acsard.calibration.runs import Block, Run, gaps, inside, integral, rest_intervals
 
 REST_S, EDGE_S = 0.6, 0.3
 """Limits for a standstill of the robot from which the gyro's bias is measured, s.
@@ -179,7 +179,7 @@ def of_gyro(driven: Sequence[Run]) -> Headings | None:
         holes = gaps(run.gyro_t)
         steps = np.diff(run.gyro_t)
         steps[np.isin(run.gyro_t[:-1], holes[:, 0])] = 0.0
-        yaws.append(Heading(run.gyro_t, _sums(rate, steps), holes))
+        yaws.append(Heading(run.gyro_t, integral(rate, steps), holes))
     seconds = [float(run.t[-1]) for run in driven]
     return Headings(
         "yaw_rate", tuple(yaws), offset(yaws, driven), usual, bias_unknown=not len(all_biases),
@@ -274,10 +274,6 @@ def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
         for (t, _, _), last in zip(rested, seconds, strict=True)
     )
     return float(np.sqrt(noise + walk * (between + outside) / whole**2))
-
-
-def _sums(rate: Floats, steps: Floats) -> Floats:
-    return cumulative((rate[1:] + rate[:-1]) / 2 * steps) if len(rate) else rate
 
 
 def offset(headings: Sequence[Heading], driven: Sequence[Run]) -> float:
@@ -391,7 +387,7 @@ def without_constant_rate(rows: Rows) -> Rows:
 def _signed_square_integral(run: Run) -> Floats:
     apart = run.speed_difference(run.t)
     steps = np.minimum(np.diff(run.t), INTERVAL_S)
-    return _sums(np.abs(apart) * apart, steps)
+    return integral(np.abs(apart) * apart, steps)
 
 
 NOISE, SHARE = 0.01, 0.03

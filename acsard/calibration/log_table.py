@@ -105,8 +105,7 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
         if wild.any():
             example = float(values[wild][0])
             values[wild] = math.nan
-            count = int(wild.sum())
-            cells = f"{count} cell{'s' if count > 1 else ''}"
+            cells = many(int(wild.sum()), "cell")
             yield f"{cells} of {name} left out: no robot has a value like {example:g}"
 
 

@@ -63,11 +63,6 @@ class Multipliers(Struct, frozen=True):
     def std(self) -> Floats:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
-    @property
-    def ratio_std(self) -> float:
-        """Relative standard deviation of the ratio of the right to the left wheel radius."""
-        return self.relative_deviations().ratio
-
     def apart(self, base: Base) -> float:
         """Return how far these multipliers are from those of `base`, in standard deviations.
 

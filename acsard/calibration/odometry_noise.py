@@ -388,10 +388,13 @@ def noise(
         known: the standard deviations of the fitted track and wheel radii.
         odometry: the configured settings.
     """
-    motions: list[_Motion] = []
-    windows = _windows(folds, sensors, known, motions)
+    numbered = [
+        (at, window) for at, fold in enumerate(folds) for window in _of_drive(fold, sensors)
+    ]
+    windows = _padded(numbered, known) if numbered else None
     if windows is None or len(np.unique(windows.drive)) < 2:
         return None
+    motions = [window.motion for _, window in numbered]
     present = INITIAL_NOISE.copy()
     present[: Source.HEADING] = (
         odometry.distance_variance_per_metre, odometry.yaw_variance_per_metre,
@@ -495,22 +498,19 @@ class _Window(Struct, frozen=True):
         return basis.T @ self.residual, basis.T @ effects @ basis, basis.T @ sure_of @ basis
 
 
-def _windows(
-    folds: Sequence[Fold], sensors: Reference, known: Deviations, motions: list[_Motion]
-) -> Windows | None:
-    rows = []
-    for number, fold in enumerate(folds):
-        for window in _of_drive(fold, sensors):
-            motions.append(window.motion)
-            rows.append((number, *window.projected(known)))
-    if not rows:
-        return None
-    rows = rows[:: math.ceil(len(rows) / MAX_WINDOWS)]
-    most = max(len(residual) for _, residual, _, _ in rows)
+def _padded(numbered: Sequence[tuple[int, _Window]], known: Deviations) -> Windows:
+    """Return at most `MAX_WINDOWS` of the windows, padded to the same number of residuals.
+
+    `numbered` contains each window with the index of its drive.
+    """
+    motions = [window.motion for _, window in numbered]
     metres, turned = np.mean([(motion.metres, motion.turned) for motion in motions], axis=0)
     lasting = np.array([metres, metres / motions[0].track ** 2, turned])
+    used = numbered[:: math.ceil(len(numbered) / MAX_WINDOWS)]
+    rows = [(drive, *window.projected(known)) for drive, window in used]
+    most = max(len(residual) for _, residual, _, _ in rows)
     made = Windows(
-        np.array([number for number, *_ in rows]),
+        np.array([drive for drive, *_ in rows]),
         np.array([float(len(residual)) for _, residual, *_ in rows]),
         np.zeros((len(rows), most)), np.zeros((len(rows), SOURCE_COUNT, most, most)),
         np.tile(np.eye(most), (len(rows), 1, 1)), lasting,

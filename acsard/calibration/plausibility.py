@@ -15,7 +15,6 @@ from acsard.calibration import heading
 from acsard.calibration.fit import MIN_BLOCKS, Base, Fit, Parameter, condition
 from acsard.calibration.heading import Rows
 from acsard.calibration.log_table import Floats, NoCalibrationError
-from acsard.calibration.multipliers import Multipliers
 from acsard.calibration.positions import StartingPoint
 from acsard.calibration.runs import Block
 
@@ -35,8 +34,11 @@ MAX_CORRELATION = 0.98
 If it is larger, the robot drives the same curve all the time, and the log is refused.
 """
 
-MAX_LOG_STDS = 0.2, 0.03
-"""Largest accepted relative standard deviations of the track and of the ratio of the radii."""
+TRACK, RATIO = "the effective track", "the ratio of the right to the left wheel radius"
+"""Names of the two quantities that some logs do not determine accurately enough."""
+
+MAX_LOG_STDS = {TRACK: 0.2, RATIO: 0.03}
+"""Largest accepted relative standard deviation of each quantity."""
 
 MAX_CONDITION = 1e4
 """Largest condition number of the normal equations at which radii and track can be separated."""
@@ -165,41 +167,25 @@ def turns_enough(turned: Floats) -> None:
         )
 
 
-TRACK, RATIO = "the effective track", "the ratio of the right to the left wheel radius"
-"""Names of the two quantities that some logs do not determine accurately enough."""
-
-
 def too_inaccurate(
-    multipliers: Multipliers, track_std: float, worst: tuple[float, float] = MAX_LOG_STDS
+    deviations: Mapping[str, float], accepted: Mapping[str, float]
 ) -> dict[str, float]:
-    """Return the quantities that a log determines too inaccurately.
+    """Return the items of `deviations` that exceed the accepted values or are NaN.
 
-    The result maps the name of each such quantity, `TRACK` or `RATIO`, to its relative standard
-    deviation.
-
-    Args:
-        multipliers: the multipliers that were computed from the log.
-        track_std: relative standard deviation of the mean track. The track of a single turn varies
-            more.
-        worst: largest accepted relative standard deviations of `TRACK` and of `RATIO`.
+    Both arguments map `TRACK` and `RATIO` to relative standard deviations. That of the track is the
+    deviation of the mean track. The track of a single turn varies more.
     """
-    deviations = {TRACK: track_std, RATIO: multipliers.ratio_std}
-    return {
-        name: deviation
-        for (name, deviation), most in zip(deviations.items(), worst, strict=True)
-        if not deviation <= most
-    }
+    return {name: std for name, std in deviations.items() if not std <= accepted[name]}
 
 
-def inaccuracy(deviations: Mapping[str, float], worst: tuple[float, float]) -> str:
+def inaccuracy(deviations: Mapping[str, float], accepted: Mapping[str, float]) -> str:
     """Return the text of the error for a log that determines `TRACK` or `RATIO` too inaccurately.
 
     Args:
         deviations: the relative standard deviations of the quantities that are too inaccurate, by
             name. A deviation is inf or NaN if the log does not determine the quantity at all.
-        worst: largest accepted relative standard deviations of `TRACK` and of `RATIO`.
+        accepted: the largest accepted relative standard deviations of `TRACK` and of `RATIO`.
     """
-    accepted = dict(zip((TRACK, RATIO), worst, strict=True))
     reasons = [
         f"the standard deviation of {name} is {deviation:.1%}, but at most "
         f"{100 * accepted[name]:g}% is accepted"

@@ -205,8 +205,10 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> WheelPath:
     for index, of_step in turn_derivatives.items():
         heading_derivatives[index] = cumulative(of_step)
         middle = heading_derivatives[index][:-1] + of_step / 2
-        derivatives[index] = _sums(ahead * (rolls.get(index, 0.0) + 1j * distance * middle))
-    return WheelPath(steps.t, _sums(ahead * distance), heading, derivatives, heading_derivatives)
+        derivatives[index] = cumulative(ahead * (rolls.get(index, 0.0) + 1j * distance * middle))
+    return WheelPath(
+        steps.t, cumulative(ahead * distance), heading, derivatives, heading_derivatives
+    )
 
 
 def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
@@ -218,7 +220,7 @@ def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
     _, ahead = _directions(
         base.radius_per_separation * parameters[Parameter.INVERSE_TRACK] * (right - left)
     )
-    return _sums(ahead * base.radius * (left + right) / 2)
+    return cumulative(ahead * base.radius * (left + right) / 2)
 
 
 def _directions(turns: Floats) -> tuple[Floats, Complexes]:
@@ -228,10 +230,6 @@ def _directions(turns: Floats) -> tuple[Floats, Complexes]:
     """
     heading = cumulative(turns)
     return heading, np.exp(1j * (heading[:-1] + turns / 2)) * np.sinc(turns / (2 * np.pi))
-
-
-def _sums(steps: Complexes) -> Complexes:
-    return np.concatenate((np.zeros(1, dtype=np.complex128), np.cumsum(steps)))
 
 
 Paths = Sequence[WheelPath] | Mapping[int, WheelPath]

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import cached_property
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +26,7 @@ from acsard.calibration.log_table import APPLIED, FOUR, TWO, Floats, LogError, T
 Complexes = npt.NDArray[np.complex128]
 Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
+Number = TypeVar("Number", np.float64, np.complex128)
 
 MIN_BACKWARD_STEP_S = 1.0
 """If the times in a log jump back by more than this time, s, the recording may have restarted."""
@@ -167,8 +169,7 @@ class Run(Struct, frozen=True, dict=True):
         """
         steps = np.diff(self.t)
         steps[np.isin(self.t[:-1], self.gaps[:, 0])] = 0.0
-        left, right = (cumulative((v[1:] + v[:-1]) / 2 * steps) for v in (self.left, self.right))
-        return left, right
+        return integral(self.left, steps), integral(self.right, steps)
 
     @cached_property
     def moving(self) -> Mask:
@@ -257,8 +258,7 @@ def runs(table: Table) -> Log:
         whole, parts = len(parts), [piece for part in parts for piece in _pauses(t, part, columns)]
         notes.add(
             f"a new run begins after each gap of over {NEW_RUN_AFTER_S:g} s in the wheel speeds; "
-            f"number "
-            "of gaps: {}",
+            "number of gaps: {}",
             len(parts) - whole,
         )
         for at, part in enumerate(parts):
@@ -335,7 +335,7 @@ def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
     """Split `rows` into drives where the times of the wheel samples jump back."""
     # The times of rows without wheel speeds may jump back within a drive, because a file may list
     # all rows of one sensor after all rows of another.
-    wheels = rows[np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])]
+    wheels = _wheel_rows(rows, columns)
     back = np.flatnonzero(np.diff(t[wheels]) < -MIN_BACKWARD_STEP_S) + 1
     if not 0 < len(back) <= MAX_RESTARTS:
         return [rows]
@@ -347,15 +347,14 @@ def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
     return list(np.split(rows, np.searchsorted(rows, wheels[back])))
 
 
-def _wheel_times(t: Floats, rows: Rows, columns: dict[str, Floats]) -> Floats:
-    finite = np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])
-    return np.sort(t[rows[finite]])
+def _wheel_rows(rows: Rows, columns: dict[str, Floats]) -> Rows:
+    return rows[np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])]
 
 
 def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floats]) -> None:
     """Raise `LogError` if the times of a run are not in seconds or are too coarse."""
     for rows in parts:
-        times = _wheel_times(t, rows, columns)
+        times = np.sort(t[_wheel_rows(rows, columns)])
         if len(times) < MIN_ROWS:
             continue
         once = np.unique(times)
@@ -375,7 +374,7 @@ def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floa
 
 def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
     # Without this split, one row with a time of another day would make the drive many hours long.
-    times = _wheel_times(t, rows, columns)
+    times = np.sort(t[_wheel_rows(rows, columns)])
     ends = np.flatnonzero(np.diff(times) > NEW_RUN_AFTER_S)
     if not len(ends):
         return [rows]
@@ -399,7 +398,7 @@ def _streams(columns: dict[str, Floats], rows: Rows, notes: Notes) -> Streams | 
 def _run(name: str, streams: Streams) -> Run:
     wheels, gyro, yaw, place, commands = (streams[stream] for stream in SENSOR_NAMES)
     start = float(wheels[0][0])
-    x, y = place[1:] if len(place[0]) else (np.zeros(0), np.zeros(0))
+    _, x, y = place
     points = (x - x[:1]) + 1j * (y - y[:1])
     return Run(
         name, start, wheels[0] - start, wheels[1], wheels[2], gyro[0] - start, gyro[1],
@@ -501,9 +500,17 @@ def inside(begin: Floats, end: Floats, holes: Floats) -> Mask:
     return np.asarray(after == before)
 
 
-def cumulative(steps: Floats) -> Floats:
+def cumulative(steps: npt.NDArray[Number]) -> npt.NDArray[Number]:
     """Return 0, followed by the cumulative sums of `steps`. The result is one element longer."""
-    return np.concatenate((np.zeros(1), np.cumsum(steps)))
+    return np.concatenate((np.zeros(1, steps.dtype), np.cumsum(steps)))
+
+
+def integral(values: Floats, steps: Floats) -> Floats:
+    """Return the integral of `values` from the first sample to each sample (trapezoidal rule).
+
+    `steps` contains the times from each sample to the next. The result is empty without samples.
+    """
+    return cumulative((values[1:] + values[:-1]) / 2 * steps) if len(values) else values
 
 
 def rest_intervals(run: Run, least_s: float, edge_s: float) -> Floats:

@@ -334,7 +334,7 @@ def _calibrated(
     # With a tape, the calibration gives the size of the wheels even if the log improves nothing.
     if worse and tape is None and (log_noise is None or not log_noise.better):
         raise NoCalibrationError(worse)
-    return _calibration(log, tape, best, odometry, log_noise)
+    return _calibration(log, tape, best, known, odometry, log_noise)
 
 
 def _used_deviations(best: Candidate, odometry: OdometryConfig) -> Deviations:
@@ -358,8 +358,7 @@ def _noise(
     made, fitted = best.made, best.fitted
     test_folds = folds(fitted, made.parts, drives(made.runs), best.rate)
     if present:
-        start = fitted.parameters.copy()
-        start[: Parameter.DELAY] = made.base.start()[: Parameter.DELAY]
+        start = made.base.configured(fitted.parameters)
         test_folds = [replace(fold, parameters=start) for fold in test_folds]
     parameters = fitted.parameters.copy()
     if made.headings is not None:
@@ -394,9 +393,10 @@ def _candidates(made: Prepared) -> list[Candidate]:
                 np.sqrt(candidate.covariance[Parameter.INVERSE_TRACK, Parameter.INVERSE_TRACK])
             )
             track /= abs(float(fitted.parameters[Parameter.INVERSE_TRACK]))
-            too_wide = plausibility.too_inaccurate(candidate.result, track, MAX_LOG_STDS)
+            found = {TRACK: track, RATIO: candidate.result.relative_deviations().ratio}
+            too_wide = plausibility.too_inaccurate(found, MAX_LOG_STDS)
             if not fixed:
-                deviations = {TRACK: track, RATIO: candidate.result.ratio_std}
+                deviations = found
                 if not plausibility.separates_track(fitted):
                     too_wide[RATIO] = deviations[RATIO] = np.inf
             if not too_wide:
@@ -432,11 +432,11 @@ def _candidate(made: Prepared, fitted: Fit) -> Candidate:
     gyro_bias = (headings.bias if headings is not None else 0.0) + bias_error
     rows = replace(rows, turned=(rows.turned - bias_error * rows.seconds) / gyro_scale)
     rate = rates(rows, by_wheels)
-    present = fitted.parameters.copy()
-    present[: Parameter.DELAY] = base.start()[: Parameter.DELAY]
     test_folds = folds(fitted, made.parts, drives(made.runs), rate)
     places = [positions_of(fold.drive, made.runs) if made.segments else [] for fold in test_folds]
-    better = improvement(test_folds, present, base, rows, places, made.steps)
+    better = improvement(
+        test_folds, base.configured(fitted.parameters), base, rows, places, made.steps
+    )
     covariance = fitted.covariance([part.run for part in made.parts])
     result = multipliers(fitted.parameters, covariance, rate)
     better = replace(better, apart=result.apart(base))
@@ -447,6 +447,7 @@ def _calibration(
     log: Log,
     tape: Tape | None,
     best: Candidate,
+    known: Deviations,
     odometry: OdometryConfig,
     log_noise: LogNoise | None,
 ) -> Calibration:
@@ -467,7 +468,6 @@ def _calibration(
         scale.append("distance")
         notes.append(f"the distance of {tape.metres:g} m by tape was compared with run {name}")
     plausibility.in_range(result.values)
-    known = _used_deviations(best, odometry)
     if tape is not None:
         known = replace(known, scale=result.relative_deviations().scale)
     totals = DriveTotals.of(log.runs, rows, by_wheels, base, result, rate)

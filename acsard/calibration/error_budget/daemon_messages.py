@@ -149,11 +149,11 @@ class MessageCollector:
         )
 
     def _coarse(self, last: RobotState) -> bool:
-        now, before = last.counters, self._first.counters
-        lines, coarse = (
-            now.get(name, 0) - before.get(name, 0) for name in ("lines", "coarse_encoder_lines")
-        )
+        lines, coarse = (self._counted(last, name) for name in ("lines", "coarse_encoder_lines"))
         return coarse > MAX_COARSE_FRACTION * lines
+
+    def _counted(self, last: RobotState, name: str) -> int:
+        return last.counters.get(name, 0) - self._first.counters.get(name, 0)
 
     def _join(self, stamp_ns: int) -> None:
         odom, wheels = self._odom.get(stamp_ns), self._wheels.get(stamp_ns)
@@ -173,13 +173,10 @@ class MessageCollector:
 
     def _complete(self, last: RobotState) -> bool:
         """Return whether this program received nearly every feedback line of the daemon."""
-        rates, before = self._config.rates, self._first.counters
+        rates = self._config.rates
         if rates.odom or rates.wheel_states:
             return False
-        lines, impossible = (
-            last.counters.get(name, 0) - before.get(name, 0)
-            for name in ("lines", "line_implausible")
-        )
+        lines, impossible = (self._counted(last, name) for name in ("lines", "line_implausible"))
         lost = lines - impossible - self._count
         return lost <= max(LEAST_LOST, SHARE_LOST * lines)
 

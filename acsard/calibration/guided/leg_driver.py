@@ -10,6 +10,7 @@ from collections import deque
 from enum import StrEnum
 
 from acsard.calibration.guided.drive_plan import Leg
+from acsard.calibration.runs import STANDSTILL_SPEED
 from acsard.client.commander import NEVER_DRIVING_MODES, OPEN_TIMEOUT_S, OPENING_S, objection
 from acsard.client.follower import MAX_STATE_AGE_S
 from acsard.core.config.settings import Config, DriveConfig, LimitsConfig
@@ -46,9 +47,6 @@ difference, the robot could leave the free floor.
 
 MAX_SAMPLE_GAP_S = 2.0
 """Longest time between two samples of the wheel speeds, s, over which the path is continued."""
-
-STANDSTILL_SPEED = 0.02
-"""Largest speed at which a wheel is considered to stand still, rad/s."""
 
 STANDING_S, STANDS_S = 0.5, 6.0
 """Times for the end of a leg, s.

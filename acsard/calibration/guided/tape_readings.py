@@ -43,7 +43,7 @@ from acsard.calibration.improvement import (
 from acsard.calibration.log_table import Floats, NoCalibrationError
 from acsard.calibration.multipliers import SEPARATION, configured, multipliers
 from acsard.calibration.odometry_noise import settings
-from acsard.calibration.plausibility import in_range, remarks, too_inaccurate
+from acsard.calibration.plausibility import RATIO, TRACK, in_range, remarks, too_inaccurate
 from acsard.calibration.positions import WheelSteps, extent, path, wheel_steps
 from acsard.calibration.runs import Run, blocks
 from acsard.calibration.solve import Calibration, DriveTotals
@@ -378,8 +378,8 @@ def slant(near: float, far: float, apart: float) -> float:
     return math.asin(sine)
 
 
-MAX_TAPE_STDS = 0.1, 0.02
-"""Largest accepted relative standard deviations of the track and of the ratio of the radii."""
+MAX_TAPE_STDS = {TRACK: 0.1, RATIO: 0.02}
+"""Largest accepted relative standard deviation of each quantity."""
 
 ADVICE = (
     "the readings contradict each other, or the robot skids much. Start again on even ground, "
@@ -412,7 +412,8 @@ def calibrated(
     result = multipliers(fit.parameters, fit.covariance, rate)
     inverse_track, std = fit.parameters[Parameter.INVERSE_TRACK], np.sqrt(np.diag(fit.covariance))
     chance = float(std[Parameter.INVERSE_TRACK] / abs(inverse_track))
-    for name, deviation in too_inaccurate(result, chance, MAX_TAPE_STDS).items():
+    deviations = {TRACK: chance, RATIO: result.relative_deviations().ratio}
+    for name, deviation in too_inaccurate(deviations, MAX_TAPE_STDS).items():
         raise NoCalibrationError(
             f"these readings determine {name} only to {deviation:.1%}, which is too inaccurate: "
             f"{ADVICE}"
@@ -439,8 +440,7 @@ def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Ra
     If this fit fails, the fit to all readings is used.
     """
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
-    present = fit.parameters.copy()
-    present[: Parameter.DELAY] = base.start()[: Parameter.DELAY]
+    present = base.configured(fit.parameters)
     constant = with_constant_track(fit.parameters, rate)
     for number, reading in enumerate(readings):
         steps = reading.steps

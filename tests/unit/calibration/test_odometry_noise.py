@@ -305,7 +305,7 @@ def measured(kind: Set, way: str, robots: int) -> Row:
             tracks.append((track - kind.track(log)) / made.std[0])
         if RATIO not in calibration.stays_configured:
             true = kind.robot.right / kind.robot.left
-            ratios.append(math.log(right / left / true) / made.ratio_std)
+            ratios.append(math.log(right / left / true) / made.relative_deviations().ratio)
         # No other sensor shows the scale of this gyro: the best odometry turns as far as it says.
         gyro_scale = scale if way == "gyro" else 1.0
         for _ in range(2):
@@ -501,23 +501,17 @@ def test_the_search_finds_the_noise_that_made_the_residuals() -> None:
 
 
 @pytest.mark.parametrize(("count", "used"), [(79, 79), (80, 80), (81, 41), (159, 80), (160, 80)])
-def test_the_noise_is_computed_from_at_most_80_evenly_spaced_windows(
-    count: int, used: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def of_drive(*_: object) -> list[Any]:
-        effects, motion = np.zeros((SOURCE_COUNT, 1, 1)), SimpleNamespace(metres=1.0, turned=1.0)
-        motion.track = 0.5
-        return [
-            SimpleNamespace(
-                motion=motion,
-                projected=lambda _, n=number: (np.array([float(n)]), effects, np.zeros((1, 1))),
-            )
-            for number in range(count)
-        ]
-
-    monkeypatch.setattr(odometry_noise, "_of_drive", of_drive)
-    unused: Any = None
-    windows = odometry_noise._windows([unused], unused, unused, [])
-    assert windows is not None
+def test_the_noise_is_computed_from_at_most_80_evenly_spaced_windows(count: int, used: int) -> None:
+    effects, motion = np.zeros((SOURCE_COUNT, 1, 1)), SimpleNamespace(metres=1.0, turned=1.0)
+    motion.track = 0.5
+    single: list[Any] = [
+        SimpleNamespace(
+            motion=motion,
+            projected=lambda _, n=number: (np.array([float(n)]), effects, np.zeros((1, 1))),
+        )
+        for number in range(count)
+    ]
+    known: Any = None
+    windows = odometry_noise._padded([(0, window) for window in single], known)
     assert len(windows.residual) == used
     assert np.ptp(np.diff(windows.residual[:, 0])) == 0.0

@@ -16,6 +16,7 @@ from acsard.calibration.heading import Rows
 from acsard.calibration.log_table import NoCalibrationError
 from acsard.calibration.multipliers import Multipliers
 from acsard.calibration.plausibility import (
+    MAX_LOG_STDS,
     RATIO,
     TRACK,
     drives_enough,
@@ -214,7 +215,7 @@ def test_turns_and_straight_drives_are_enough() -> None:
     rolls_enough(rows([9, -9, 9, -9], [9, -9, -9, 9]))
     turns_enough(np.full(10, 1.0))
     drives_enough([Block(0, 0, 4)] * 5)
-    assert not too_inaccurate(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-5), 0.01)
+    assert not too_inaccurate({TRACK: 0.01, RATIO: 0.0045}, MAX_LOG_STDS)
 
 
 @pytest.mark.parametrize(
@@ -251,12 +252,14 @@ def test_turns_on_the_spot_are_enough_if_one_side_always_rolls_a_little_further(
 
 def test_an_uncertain_parameter_is_named_with_its_deviation() -> None:
     apart = Multipliers(np.array([1.6, 1, 1]), np.diag([0, 1e-3, 1e-3]))
-    assert too_inaccurate(apart, 0.01) == {RATIO: pytest.approx(0.0447, abs=1e-4)}
-    assert TRACK in too_inaccurate(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-6), np.nan)
+    ratio = apart.relative_deviations().ratio
+    assert ratio == pytest.approx(0.0447, abs=1e-4)
+    assert too_inaccurate({TRACK: 0.01, RATIO: ratio}, MAX_LOG_STDS) == {RATIO: ratio}
+    assert TRACK in too_inaccurate({TRACK: np.nan, RATIO: 0.001}, MAX_LOG_STDS)
 
 
 def test_the_text_names_the_deviation_and_its_limit_or_says_that_there_is_no_value() -> None:
-    sentence = inaccuracy({RATIO: 0.05, TRACK: np.inf}, (0.2, 0.03))
+    sentence = inaccuracy({RATIO: 0.05, TRACK: np.inf}, MAX_LOG_STDS)
     assert sentence.startswith(
         "this log is too inaccurate: the standard deviation of the ratio of the right to the left "
         "wheel radius is 5.0%, but at most 3% is accepted, and the effective track cannot be "

@@ -131,7 +131,7 @@ def test_standard_deviations_are_as_wide_as_the_errors(kind: str, way: str) -> N
             off = np.log(
                 calibration.multipliers.values[2] / calibration.multipliers.values[1] * 0.99 / 1.01
             )
-            ratios.append(off / calibration.multipliers.ratio_std)
+            ratios.append(off / calibration.multipliers.relative_deviations().ratio)
     track, ratio = (float(np.sqrt(np.mean(np.square(z)))) for z in (tracks, ratios))
     print(f"{kind}, {way}: rms z {track:.2f} of the track, {ratio:.2f} of left to right")
     least = 0.7 if way == "gyro" else 0.5
@@ -249,7 +249,7 @@ def test_a_log_is_refused_with_the_quantities_that_are_too_inaccurate(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Turns on the spot do not determine the ratio of the radii at all."""
-    monkeypatch.setattr(solve, "MAX_LOG_STDS", (1e-9, 0.03))
+    monkeypatch.setattr(solve, "MAX_LOG_STDS", {TRACK: 1e-9, RATIO: 0.03})
     plan: Plan = [(3, 0, 0), (20, 0, 1), (20, 0, -1)]
     with pytest.raises(NoCalibrationError) as refused:
         calibrated(table(drive(Robot(rng=np.random.default_rng(0)), plan), places=False))
