@@ -64,7 +64,8 @@ PART_SUFFIX = ".mcap.part"
 MARKER_SUFFIX = ".left"
 """Suffix of a marker file, which shows that the disk, and not a crash, cut off a `.part` file."""
 
-SUFFIX_OF_KIND: dict[Kind, str] = {"plain": MCAP_SUFFIX, "near": NEAR_SUFFIX, "kept": KEPT_SUFFIX}
+# The last suffix is the end of every name.
+SUFFIX_OF_KIND: dict[Kind, str] = {"kept": KEPT_SUFFIX, "near": NEAR_SUFFIX, "plain": MCAP_SUFFIX}
 """Maps each retention class to the end of the name of a finished file."""
 
 # `RecordingDirectory.maintain` is called once a second, so there is a search every ten minutes.
@@ -112,16 +113,11 @@ def _number(path: Path) -> int | None:
 
 
 def _kind(path: Path) -> Kind:
-    return (
-        "kept"
-        if path.name.endswith(KEPT_SUFFIX)
-        else "near"
-        if path.name.endswith(NEAR_SUFFIX)
-        else "plain"
-    )
+    return next(kind for kind, suffix in SUFFIX_OF_KIND.items() if path.name.endswith(suffix))
 
 
-def _stem(path: Path) -> str:
+def stem(path: Path) -> str:
+    """Return the part of a file's name that stays the same when the state of the file changes."""
     return path.name.partition(".")[0]
 
 
@@ -228,8 +224,8 @@ class RecordingDirectory:
             self.trim(None, refused)
             self._recover()
             for marker in self._directory.glob(f".*{PART_SUFFIX}.*{MARKER_SUFFIX}"):
-                stem = marker.name[1:].partition(PART_SUFFIX)[0]
-                if not marker.with_name(f"{stem}{PART_SUFFIX}").exists():
+                recording = marker.name[1:].partition(PART_SUFFIX)[0]
+                if not marker.with_name(f"{recording}{PART_SUFFIX}").exists():
                     # The recording of this marker is finished.
                     marker.unlink()
             if self._open_to_all:
@@ -247,7 +243,7 @@ class RecordingDirectory:
                 continue
             ours = self._run.cut.get(part.name)
             kind, cut = (ours, "disk") if ours else marked or ("kept", "crash")
-            whole = part.with_name(_stem(part) + SUFFIX_OF_KIND[kind])
+            whole = part.with_name(stem(part) + SUFFIX_OF_KIND[kind])
             try:
                 message = recover(part, whole, cut, disk.free - status.st_size > disk.spare)
             # Recording new steps is more important than finishing an old file.
@@ -313,7 +309,7 @@ class RecordingDirectory:
             why: an explanation of this cause in words, or "".
         """
         writing.finish(cut, why)
-        path = writing.path.with_name(_stem(writing.path) + SUFFIX_OF_KIND[kind])
+        path = writing.path.with_name(stem(writing.path) + SUFFIX_OF_KIND[kind])
         writing.path.rename(path)
         self._run.numbers.add(_number(path) or 0)
         sync(self._directory)
@@ -339,7 +335,7 @@ class RecordingDirectory:
         if path.name.endswith(MCAP_SUFFIX) and _kind(path) == "plain":
             # Another process may have removed the file.
             with suppress(FileNotFoundError):
-                path.rename(path.with_name(_stem(path) + NEAR_SUFFIX))
+                path.rename(path.with_name(stem(path) + NEAR_SUFFIX))
             sync(self._directory)
 
     def maintain(self, now: Instant) -> None:

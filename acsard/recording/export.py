@@ -36,8 +36,6 @@ from acsard.recording.recorded_steps import RecordedStep
 from acsard.recording.replay import replay_step
 from acsard.recording.time_span import WHOLE_SPAN, Span
 
-BAG_VERSION = 5
-
 _RELIABLE, _BEST_EFFORT = 1, 2
 _TRANSIENT_LOCAL, _VOLATILE = 1, 2
 
@@ -88,7 +86,7 @@ def bag_metadata(file: str, topics: Sequence[BagTopic], first_ns: int, last_ns: 
     lasts = f"nanoseconds: {last_ns - first_ns}"
     lines = [
         "rosbag2_bagfile_information:",
-        f"  version: {BAG_VERSION}",
+        "  version: 5",
         "  storage_identifier: mcap",
         f"  duration: {{{lasts}}}",
         f"  starting_time: {{{begins}}}",
@@ -358,33 +356,29 @@ def export(
         OSError: the disk refuses to write.
     """
     run = RecordedRun(recording, other)
-
-    def write(writer: _Writer, stream: BinaryIO) -> None:
-        _write_steps(run, writer, recording, span, progress)
-        if not writer.count:
-            raise RecordingError(
-                f"{recording.path} has nothing in that span of time; correct --from and --to"
-            )
-        writer.finish()
-        synced(stream)
-
-    def message_writer(stream: BinaryIO) -> _MessageWriter:
-        with run.state_errors():
-            return _MessageWriter(stream, run, recording.about, recording.path.name)
-
     with replacing(new, force) as part:
+        file = part
         if kind == "rosbag2":
             part.mkdir()
             file = part / f"{new.name}_0.mcap"
-            with file.open("wb") as stream:
-                write(bag := message_writer(stream), stream)
+        writer: _TableWriter | _MessageWriter
+        with file.open("wb") as stream:
+            if kind == "csv":
+                writer = _TableWriter(stream)
+            else:
+                with run.state_errors():
+                    writer = _MessageWriter(stream, run, recording.about, recording.path.name)
+            _write_steps(run, writer, recording, span, progress)
+            if not writer.count:
+                raise RecordingError(
+                    f"{recording.path} has nothing in that span of time; correct --from and --to"
+                )
+            writer.finish()
+            synced(stream)
+        if kind == "rosbag2" and isinstance(writer, _MessageWriter):
             with (part / METADATA).open("wb") as stream:
-                stream.write(bag_metadata(file.name, bag.topics, *bag.times).encode())
+                stream.write(bag_metadata(file.name, writer.topics, *writer.times).encode())
                 synced(stream)
-            return ExportResult(bag.count, _gaps(run, span, recording.about))
-        with part.open("wb") as stream:
-            writer: _Writer = _TableWriter(stream) if kind == "csv" else message_writer(stream)
-            write(writer, stream)
         return ExportResult(writer.count, _gaps(run, span, recording.about))
 
 

@@ -127,7 +127,7 @@ def _items(
             if topic == "state":
                 yield checkpoint(data)
             elif topic == "steps":
-                batch = list(decode(data))
+                batch = decode(data)
                 if copies is not None:
                     copies.batch(batch)
                 yield batch

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from msgspec.structs import replace
 
-from acsard.core.messages.report import GetSnapshot, Report
+from acsard.core.messages.report import Report
 from acsard.core.messages.schema import DiagnosticArray, RobotState, TFMessage, Time
 from acsard.core.robot import Robot
 from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG_CHANNEL, Channel, published_channels
@@ -87,9 +87,14 @@ class Publisher:
         now = step.inputs.now
         for command in step.inputs.commands:
             yield self._received(command, now)
-        yield from self._latched(now)
-        snapshot = self._snapshot(now)
-        for key, message in self._report.due(outputs, self._wanted, snapshot):
+        if self._static_due and "tf_static" in self._wanted:
+            self._static_due = False
+            static = self._report.tf_static()
+            if static != self._static:
+                self._static = static
+                yield Published(BY_KEY["tf_static"], "", now.wall_ns, static)
+        messages = self._report.due(outputs, self._wanted, lambda: self.robot.snapshot(now.mono_ns))
+        for key, message in messages:
             yield Published(BY_KEY[key], "", now.wall_ns, _without_measurements(message))
         yield from self.skip(step)
 
@@ -113,17 +118,6 @@ class Publisher:
             wall_ns = self._now.wall_ns
         line = Log(Time.from_ns(wall_ns), LEVELS[entry.level], entry.name, entry.sentence)
         return Published(LOG_CHANNEL, "", wall_ns, line)
-
-    def _snapshot(self, now: Instant) -> GetSnapshot:
-        return lambda: self.robot.snapshot(now.mono_ns)
-
-    def _latched(self, now: Instant) -> Iterator[Published]:
-        if self._static_due and "tf_static" in self._wanted:
-            self._static_due = False
-            static = self._report.tf_static()
-            if static != self._static:
-                self._static = static
-                yield Published(BY_KEY["tf_static"], "", now.wall_ns, static)
 
     def _received(self, command: Command, now: Instant) -> Published:
         arrived_ns = command.arrived_ns + now.wall_ns - now.mono_ns

@@ -19,7 +19,7 @@ from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, Event, Inputs, Outputs, Recording
 from acsard.recording.recorded_steps import FinishedStep, StateBeforeStep, Unfinished
-from acsard.recording.state import freeze
+from acsard.recording.state import MAX_ERROR_LENGTH, freeze
 from acsard.recording.step_writer import Bug, StepWriter
 
 MAX_QUEUED_STEPS = 4096
@@ -34,9 +34,6 @@ SLOW_DISK = "the disk has accepted no data for 3 s"
 SYNC_PAUSE_S = 0.98
 """Pause between two syncs of the file to the disk, s. The pause and one sync together take about a
 second."""
-
-MAX_ERROR_LENGTH = 200
-"""Number of characters to which the text of an exception is cut."""
 
 ENDED = (
     "the recorder has ended because of an internal error, which is in the log: restart the daemon "

@@ -32,8 +32,6 @@ from acsard.recording.recorded_steps import (
     status_of,
 )
 
-FAULT = "fault"
-
 Output = Literal[
     "line",
     "sent line",
@@ -210,7 +208,7 @@ class Replay:
         comparison.first = comparison.first or difference
         for output in difference.what:
             comparison.first_by_output.setdefault(output, difference)
-        if difference.replayed.status[0] == FAULT != difference.recorded.status[0]:
+        if difference.replayed.status[0] == "fault" != difference.recorded.status[0]:
             comparison.fault = comparison.fault or difference
 
     def _compare(

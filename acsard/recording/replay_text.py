@@ -14,9 +14,6 @@ from acsard.recording.file_replay import Gap
 from acsard.recording.recorded_steps import US_PER_S, RecordedOutputs
 from acsard.recording.replay import Comparison, Difference, max_wheel_speed
 
-SPEED_DIVISOR = 100.0
-"""Divisor that converts a wheel speed in 0.01 rad/s to rad/s."""
-
 LINE_SETTINGS = ("limits.", "drive.", "mcu.wheels.")
 """Prefixes of the names of the settings that affect the speeds in the lines to the board."""
 
@@ -173,10 +170,8 @@ def _value(key: str, settings: Mapping[str, object]) -> str:
 
 
 def _speeds(recorded: int, replayed: int) -> str:
-    return (
-        f"{recorded / SPEED_DIVISOR:.2f} rad/s recorded, {replayed / SPEED_DIVISOR:.2f} rad/s "
-        f"replayed"
-    )
+    """Return a text with two wheel speeds in rad/s. The arguments are in 0.01 rad/s."""
+    return f"{recorded / 100:.2f} rad/s recorded, {replayed / 100:.2f} rad/s replayed"
 
 
 def describe_outcome(comparison: Comparison) -> list[str]:

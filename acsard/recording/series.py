@@ -16,7 +16,7 @@ from msgspec import Struct, field
 
 from acsard.core.values import NS_PER_S, AcsardError
 from acsard.host.errors import RecordingError
-from acsard.recording.directory import listed
+from acsard.recording.directory import listed, stem
 from acsard.recording.end_record import read_end
 from acsard.recording.file import Recording, Topic
 from acsard.recording.time_span import Contents, Span, clock, part_between, read_contents
@@ -60,7 +60,7 @@ class Series(Recording):
         self.damaged, self.ended, self.cut, self.why = 0, False, "", ""
         self.unfinished = None
         for path in self.paths:
-            part, counted = Recording(_present(path)), 0
+            part, counted = _read(path), 0
             for message in part.messages():
                 self.damaged += part.damaged - counted
                 counted = part.damaged
@@ -131,7 +131,7 @@ def search(files: Sequence[Path], first: float, last: float) -> Search:
             if covered.begin - TIME_TOLERANCE_S > last or covered.end + TIME_TOLERANCE_S < first:
                 pieces.append(covered)
                 continue
-            contents = read_contents(Recording(_present(path)))
+            contents = read_contents(_read(path))
         except RecordingError as error:
             result.unreadable.append(str(error))
             continue
@@ -144,7 +144,7 @@ def search(files: Sequence[Path], first: float, last: float) -> Search:
             chosen[number] = contents
     for group in _groups(files, chosen):
         paths = [files[number] for number in group]
-        recording = Recording(_present(paths[0])) if len(paths) == 1 else Series(paths)
+        recording = _read(paths[0]) if len(paths) == 1 else Series(paths)
         contents = chosen[group[0]] if len(paths) == 1 else read_contents(recording)
         part = part_between(contents.stretches, first, last) if contents else None
         if part is not None:
@@ -189,7 +189,7 @@ def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int
     while number > 0 and contents.first.recorded.status[0] == "driving":
         number -= 1
         try:
-            before = read_contents(Recording(_present(files[number])))
+            before = read_contents(_read(files[number]))
         except RecordingError:
             break
         if before is None or not _continues(before, contents):
@@ -206,7 +206,7 @@ def _continues(before: Contents, contents: Contents) -> bool:
 
 
 def _covered(path: Path) -> _CoveredRange:
-    end = read_end(path) or Recording(_present(path)).compute_end_record()
+    end = read_end(path) or _read(path).compute_end_record()
     earliest_ns = end.wall_ns if end.earliest_ns is None else end.earliest_ns
     return _CoveredRange(min(earliest_ns, end.wall_ns) / NS_PER_S, end.last_ns / NS_PER_S, path)
 
@@ -215,8 +215,11 @@ def _present(path: Path) -> Path:
     """Return the present path of a recording, which the daemon may have renamed."""
     if path.exists() or not path.parent.is_dir():
         return path
-    stem = path.name.partition(".")[0]
-    return next((p for p in listed(path.parent) if p.name.partition(".")[0] == stem), path)
+    return next((p for p in listed(path.parent) if stem(p) == stem(path)), path)
+
+
+def _read(path: Path) -> Recording:
+    return Recording(_present(path))
 
 
 def _nearest(pieces: Sequence[_CoveredRange], first: float, last: float) -> str:

@@ -97,10 +97,7 @@ def checkpoint(data: bytes) -> Checkpoint:
     try:
         return _checkpoint.decode(data)
     except msgspec.MsgspecError as error:
-        raise StateError(
-            "this version of acsard cannot read the robot state at the start of the recording: "
-            f"{short(error)}"
-        ) from None
+        raise _unreadable(error) from None
 
 
 def freeze(robot: Robot, memory: Memory) -> bytes:
@@ -124,15 +121,18 @@ def thaw(data: bytes) -> State:
     try:
         made = unpickle(data, part_class)
     except ValueError as error:
-        text = (
-            "this version of acsard cannot read the robot state at the start of the recording: "
-            f"{short(error)}"
-        )
-        raise StateError(text) from None
+        raise _unreadable(error) from None
     match made:
         case (Robot() as robot, Memory() as memory):
             return State(robot, memory)
     raise StateError("the robot state at the start of the recording is not valid")
+
+
+def _unreadable(error: Exception) -> StateError:
+    return StateError(
+        "this version of acsard cannot read the robot state at the start of the recording: "
+        f"{short(error)}"
+    )
 
 
 def short(error: Exception) -> str:

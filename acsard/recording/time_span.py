@@ -230,10 +230,12 @@ def span(recording: Recording, begin: When | None, end: When | None) -> Span:
     If `begin` or `end` is None, the part is not limited on that side.
     """
     by_clock = any(isinstance(when, TimeOfDay | Moment) for when in (begin, end))
-    stretch_list = stretches(recording) if by_clock else []
-    first = None if begin is None else _seconds(begin, stretch_list, end=False)
-    last = None if end is None else _seconds(end, stretch_list, end=True)
-    return Span(-math.inf if first is None else first, math.inf if last is None else last)
+    contents = read_contents(recording) if by_clock else None
+    stretch_list = contents.stretches if contents else []
+    return Span(
+        -math.inf if begin is None else _seconds(begin, stretch_list, end=False),
+        math.inf if end is None else _seconds(end, stretch_list, end=True),
+    )
 
 
 def _seconds(when: When, stretch_list: list[Stretch], end: bool) -> float:
@@ -290,15 +292,6 @@ class Contents(NamedTuple):
     last: RecordedStep
 
 
-def stretches(recording: Recording) -> list[Stretch]:
-    """Return the parts of a recording without an adjustment of the wall clock, in order.
-
-    The list is empty if no step is readable.
-    """
-    contents = read_contents(recording)
-    return contents.stretches if contents else []
-
-
 def read_contents(recording: Recording) -> Contents | None:
     """Return the stretches of a recording, and its first and last readable step.
 
@@ -340,6 +333,6 @@ def _from(recording: Recording, now: Instant) -> Stretch:
 
 def _steps(data: bytes) -> list[RecordedStep]:
     try:
-        return list(decode(data)) if data else []
+        return decode(data) if data else []
     except BatchError:
         return []
