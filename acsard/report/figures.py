@@ -33,10 +33,6 @@ from acsard.report.plot_elements import (
 )
 from acsard.report.report_data import Mark, Marks, ReportData
 
-ROW_PX, AXIS_PX = 54, 68
-"""Height of each row in the picture of the command sources, and additional height for the time
-axis, both in px."""
-
 
 class Line(NamedTuple):
     """A curve in a diagram."""
@@ -55,10 +51,6 @@ class Line(NamedTuple):
 
 GAP_PX = 30
 """Height of the gap above each diagram of a picture, px. The gap holds the diagram's title."""
-
-LEAST_LINEAR, LEAST_ANGULAR = 0.1, 0.2
-"""Smallest range of the axis for the forward speed, m/s, and of that for the turn rate, rad/s.
-Without these limits, the range would be empty if the robot never moves."""
 
 UNDER_CURVE_PX = 3.4
 """Width of a curve that is drawn under another curve, px.
@@ -141,8 +133,6 @@ Row = tuple[str, list[Span]]
 """A row in the picture of the command sources: its name, and the spans of time that are drawn as
 bands."""
 
-DRIVES_STATE = "drives"
-
 
 class BandStyle(NamedTuple):
     """Color and fill pattern of the bands that show one state of a command source over time.
@@ -171,9 +161,9 @@ class BandStyle(NamedTuple):
 
 
 def _styles(rows: list[Row]) -> Iterator[BandStyle]:
-    drivers = [name for name, spans in rows if any(span.kind == DRIVES_STATE for span in spans)]
+    drivers = [name for name, spans in rows if any(span.kind == "drives" for span in spans)]
     for kind in dict.fromkeys(span.kind for _, spans in rows for span in spans):
-        if kind == DRIVES_STATE:
+        if kind == "drives":
             for number, name in enumerate(drivers):
                 yield BandStyle(kind, name, *source_style(number))
         else:
@@ -312,9 +302,11 @@ class TimeFigures:
         """Return the picture of the commanded, limited and measured speeds."""
         data, parts = self._data, list[Part]()
         gap = MIN_MARK_DISTANCE * data.seconds
+        # The last number is the smallest range of the axis, which would otherwise be empty if the
+        # robot never moves.
         for title, curves, least in (
-            ("forward, m/s", data.linear, LEAST_LINEAR),
-            ("turning, rad/s", data.angular, LEAST_ANGULAR),
+            ("forward, m/s", data.linear, 0.1),
+            ("turning, rad/s", data.angular, 0.2),
         ):
             wished, limited, measured = (
                 curves[name].points() for name in ("commanded", "limited", "measured")
@@ -420,7 +412,7 @@ class TimeFigures:
         )
         if silent:
             caption += f" These sources were silent all the time: {', '.join(silent)}."
-        height = ROW_PX * len(rows) + AXIS_PX
+        height = 54 * len(rows) + 68  # the rows and the time axis, px
         title = "Active source, and why others wait"
         return Figure("sources", title, caption, _keys(styles), height, traces, axes)
 

@@ -302,20 +302,20 @@ class ReportData:
     def __init__(
         self,
         config: Config,
-        begin: float | None = None,
-        end: float | None = None,
+        begin: float = -math.inf,
+        end: float = math.inf,
         robot_errors: RobotErrors = nullcontext,
     ) -> None:
         """Prepare for the first step.
 
         Args:
             config: the configuration at the beginning of the recording.
-            begin: wall-clock time at which the report begins, s since 1970; None for no limit.
-            end: wall-clock time at which the report ends, s since 1970; None for no limit.
+            begin: wall-clock time at which the report begins, s since 1970; -inf for no limit.
+            end: wall-clock time at which the report ends, s since 1970; inf for no limit.
             robot_errors: function that returns a context manager, in which each use of the replayed
                 robot runs (see `RobotErrors`).
         """
-        self._window = (-math.inf if begin is None else begin, math.inf if end is None else end)
+        self._window = (begin, end)
         self.config = config
         """Configuration at the beginning of the recording."""
         self.path = Track()

@@ -17,6 +17,7 @@ from acsard.core.config.settings import Config
 from acsard.core.config.validation import show
 from acsard.core.formatting import lasting, listed, many
 from acsard.daemon.late_causes import cause_in
+from acsard.recording.timeline import INCIDENT_WORDS
 from acsard.report.report_data import Mark, ReportData
 
 Clock = Callable[[float, bool], str]
@@ -62,12 +63,8 @@ class Setting(NamedTuple):
     """Default value; "-" if the default configuration lacks the setting."""
 
 
-BOARD_INPUTS = {
-    "emergency_stop": "emergency stop",
-    "bumper_pressed": "bumper hit",
-    "battery_stop": "battery stop",
-}
-"""Words for each event in which the board stopped the robot, by the name of the event."""
+BOARD_STOPS = ("emergency_stop", "bumper_pressed", "battery_stop")
+"""Names of the events in which the board stopped the robot."""
 
 
 def differences(config: Config) -> list[Setting]:
@@ -108,25 +105,20 @@ def summary(data: ReportData) -> str:
     )
     stops = many(counts["stop"], "stop")
     by = _names([mark for mark in data.marks.all() if mark.name == "stop"])
+    be = "was" if counts["fault"] == 1 else "were"
     faults = many(counts["fault"], "fault")
-    for name, word in BOARD_INPUTS.items():
-        by += f", {many(counts[name], word)}" if counts[name] else ""
+    for name in BOARD_STOPS:
+        by += f", {many(counts[name], INCIDENT_WORDS[name])}" if counts[name] else ""
     lost = counts["link_down"] + counts["link_stale"]
     link = f", {many(lost, 'loss', 'losses')} of the link to the board" if lost else ""
     late = counts["link_late"]
     link += f", {many(late, 'stall')} of the robot's computer" if late else ""
-    return f"{drive} There {_be(counts['fault'])} {faults}, {stops}{by}{link}."
-
-
-def _be(count: int) -> str:
-    return "was" if count == 1 else "were"
+    return f"{drive} There {be} {faults}, {stops}{by}{link}."
 
 
 def _names(marks: list[Mark]) -> str:
     names = list(dict.fromkeys(mark.by for mark in marks if mark.by))
-    if not names:
-        return ""
-    return f" (by {listed(names, MAX_NAMES)})"
+    return f" (by {listed(names, MAX_NAMES)})" if names else ""
 
 
 def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
@@ -209,13 +201,13 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
         for name, driven in data.driven.items()
     ]
     yield "Driven by", ", ".join(drivers) or "no source"
-    titles = {name: f"{word.capitalize()}s" for name, word in BOARD_INPUTS.items()}
-    for name, title in {"fault": "Faults", "stop": "Stops", **titles}.items():
+    for name in ("fault", "stop", *BOARD_STOPS):
         marks = [mark for mark in data.marks.all() if mark.name == name]
         count = data.marks.counts[name]
-        # Few boards can report the events in `BOARD_INPUTS`. Such an event has a row only if it
+        # Few boards can report the events in `BOARD_STOPS`. Such an event has a row only if it
         # happened.
-        if count or name not in BOARD_INPUTS:
+        if count or name not in BOARD_STOPS:
+            title = f"{INCIDENT_WORDS[name].capitalize()}s"
             yield title, f"{count}: {_first_of_each(marks, clock)}" if count else "none"
     lines = data.serial
     # If `reply_period` is set, the board reports by its own clock and answers no line.

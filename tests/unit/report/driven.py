@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
 
@@ -17,8 +18,8 @@ from tests.scenarios.world import World
 
 def report_of(
     drive: Callable[[World], None],
-    begin: float | None = None,
-    end: float | None = None,
+    begin: float = -math.inf,
+    end: float = math.inf,
     late_watch: LateWatch | None = None,
     config: Config | None = None,
 ) -> tuple[ReportData, list[RecordedStep]]:
@@ -33,8 +34,8 @@ def report_of(
 def report_from(
     steps: list[RecordedStep],
     config: Config | None = None,
-    begin: float | None = None,
-    end: float | None = None,
+    begin: float = -math.inf,
+    end: float = math.inf,
     ending: str = "",
     state: State | None = None,
 ) -> ReportData:
