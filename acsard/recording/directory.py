@@ -93,7 +93,7 @@ def listed(directory: Path) -> list[Path]:
         path
         for path in directory.iterdir()
         # A pipe or a link with such a name is not a recording, and reading a pipe may never end.
-        if _number(path) is not None and path.is_file() and not path.is_symlink()
+        if _number(path) >= 0 and path.is_file() and not path.is_symlink()
     ]
     return sorted(paths, key=lambda path: (_number(path), path.name))
 
@@ -107,9 +107,10 @@ def is_being_recorded(path: Path, now_s: float) -> bool:
     return path.name.endswith(PART_SUFFIX) and abs(now_s - path.stat().st_mtime) < BEING_RECORDED_S
 
 
-def _number(path: Path) -> int | None:
+def _number(path: Path) -> int:
+    """Return the number at the beginning of a recording's name, or -1 for any other name."""
     head, _, rest = path.name.partition("-")
-    return int(head) if head.isdecimal() and rest.endswith((MCAP_SUFFIX, PART_SUFFIX)) else None
+    return int(head) if head.isdecimal() and rest.endswith((MCAP_SUFFIX, PART_SUFFIX)) else -1
 
 
 def _kind(path: Path) -> Kind:
@@ -251,7 +252,7 @@ class RecordingDirectory:
                 message = f"{part.name} cannot be completed: {error.strerror}"
             self.messages += [message] if message else []
             if ours:
-                self._run.numbers.add(_number(part) or 0)
+                self._run.numbers.add(_number(part))
             elif whole.exists() and not marked:
                 self.cut_ns = status.st_mtime_ns
                 self._retain_before(part, status.st_mtime_ns)
@@ -266,7 +267,7 @@ class RecordingDirectory:
             # Another process may have just removed the file.
             with suppress(FileNotFoundError):
                 before_ns = cut_ns - path.stat().st_mtime_ns
-                earlier = (_number(path) or 0) < (_number(part) or 0)
+                earlier = _number(path) < _number(part)
                 # A computer without a battery-backed clock starts with a time in the past. Then all
                 # older files seem to have ended long after the crash. They must not match.
                 if earlier and abs(before_ns) < INCIDENT_MARGIN_NS:
@@ -291,7 +292,7 @@ class RecordingDirectory:
         The number in the name of the file is one above the largest number in the directory.
         """
         files = listed(self._directory)
-        number = 1 + max([_number(path) or 0 for path in files], default=0)
+        number = 1 + max([_number(path) for path in files], default=0)
         stamp = time.strftime(NAME_TIME_FORMAT, time.gmtime(about.wall_ns // 1_000_000_000))
         path = self._directory / f"{number:06}-{stamp}{PART_SUFFIX}"
         writing = RecordingWriter(path, about, OPEN_MODE if self._open_to_all else FILE_MODE)
@@ -311,7 +312,7 @@ class RecordingDirectory:
         writing.finish(cut, why)
         path = writing.path.with_name(stem(writing.path) + SUFFIX_OF_KIND[kind])
         writing.path.rename(path)
-        self._run.numbers.add(_number(path) or 0)
+        self._run.numbers.add(_number(path))
         sync(self._directory)
         return path
 
@@ -391,7 +392,7 @@ class RecordingDirectory:
                 continue
             # Another process may have just removed the file.
             with suppress(FileNotFoundError):
-                status, number = path.stat(), _number(path) or 0
+                status, number = path.stat(), _number(path)
                 this_run = number in self._run.numbers
                 size, at_s = status.st_size, status.st_mtime
                 ended.append(FinishedFile(path.name, number, _kind(path), size, at_s, this_run))

@@ -143,10 +143,10 @@ class StepWriter:
         self._handed = self._safe = 0
         try:
             if self._pause == 0 or over:
-                directory = self._directory = self._directory or self._open_directory()
+                self._directory = self._directory or self._open_directory()
                 for start, steps in split_at_states(items):
-                    self._write_group(directory, start, steps)
-                self._flush(directory, over)
+                    self._write_group(start, steps)
+                self._flush(over)
             else:
                 self._pause -= 1
         except OSError as error:
@@ -177,21 +177,22 @@ class StepWriter:
             self._report(Event("recording", text, "warning"))
         return directory
 
-    def _write_group(
-        self,
-        directory: RecordingDirectory,
-        start: StateBeforeStep | None,
-        steps: list[FinishedStep],
-    ) -> None:
+    @property
+    def _opened(self) -> RecordingDirectory:
+        """The directory, which `write` opens before it calls the methods that use it."""
+        assert self._directory is not None
+        return self._directory
+
+    def _write_group(self, start: StateBeforeStep | None, steps: list[FinishedStep]) -> None:
         """Write `steps` to the current file.
 
         `start` is the robot's state before these steps, or None. The state begins a new file, or
         becomes a checkpoint in the current file.
         """
-        if start is not None and self._writing is not None and self._goes_on(directory, start):
+        if start is not None and self._writing is not None and self._goes_on(start):
             self._add_checkpoint(self._writing, start, self._last)
         elif start is not None:
-            self._finish(directory)
+            self._finish()
             self._start, self._number = start, start.number
         if self._writing is None:
             if self._start is None or not steps:
@@ -199,17 +200,19 @@ class StepWriter:
                 self._handed += len(steps)
                 self._safe = self._handed
                 return
-            self._begin(directory, self._start, steps[0].inputs.now)
+            self._begin(self._start, steps[0].inputs.now)
         assert self._writing is not None
         for at in range(0, len(steps), MAX_BATCH_STEPS):
-            self._add(directory, self._writing, steps[at : at + MAX_BATCH_STEPS])
+            self._add(self._writing, steps[at : at + MAX_BATCH_STEPS])
 
-    def _goes_on(self, directory: RecordingDirectory, start: StateBeforeStep) -> bool:
-        return start.number == self._number and not self._is_long_enough(directory)
+    def _goes_on(self, start: StateBeforeStep) -> bool:
+        return start.number == self._number and not self._is_long_enough()
 
-    def _is_long_enough(self, directory: RecordingDirectory) -> bool:
+    def _is_long_enough(self) -> bool:
         too_long = self._last.mono_ns - self._began_ns > MAX_FILE_NS
-        return too_long or (self._writing is not None and self._writing.size > directory.file_bytes)
+        return too_long or (
+            self._writing is not None and self._writing.size > self._opened.file_bytes
+        )
 
     def _add_checkpoint(
         self, writing: RecordingWriter, start: StateBeforeStep, now: Instant
@@ -218,15 +221,13 @@ class StepWriter:
             writing.add("state", now.wall_ns, Checkpoint(start.number, start.state).encode())
         self._state_ns = now.mono_ns
 
-    def _add(
-        self, directory: RecordingDirectory, writing: RecordingWriter, batch: list[FinishedStep]
-    ) -> None:
+    def _add(self, writing: RecordingWriter, batch: list[FinishedStep]) -> None:
         data = encode(self._number, batch)
         # The reader refuses a larger message.
         if len(data) > MAX_DATA_BYTES and len(batch) > 1:
             half = len(batch) // 2
-            self._add(directory, writing, batch[:half])
-            self._add(directory, writing, batch[half:])
+            self._add(writing, batch[:half])
+            self._add(writing, batch[half:])
             return
         writing.add("steps", batch[0].inputs.now.wall_ns, data)
         self._number += len(batch)
@@ -236,12 +237,12 @@ class StepWriter:
             for event in outputs.events:
                 writing.event(entry_of(event, outputs.now.wall_ns))
                 if event.name in INCIDENTS:
-                    self._retain(directory, outputs.now)
+                    self._retain(outputs.now)
 
-    def _begin(self, directory: RecordingDirectory, start: StateBeforeStep, now: Instant) -> None:
-        directory.trim(now)
+    def _begin(self, start: StateBeforeStep, now: Instant) -> None:
+        self._opened.trim(now)
         if not self._looked_back:
-            self._look_back(directory, now)
+            self._look_back(now)
         about = About(
             robot=self._config.robot.id,
             version=version(),
@@ -251,7 +252,7 @@ class StepWriter:
             started_ns=self._started_ns,
             config="\n".join(document(effective(start.config))) + "\n",
         )
-        self._writing, self._start = directory.begin(about), None
+        self._writing, self._start = self._opened.begin(about), None
         self._began_ns = now.mono_ns
         if self._cut_ns is not None:
             since_ns, self._cut_ns = now.wall_ns - self._cut_ns, None
@@ -259,36 +260,36 @@ class StepWriter:
         self._incidents.begin(now.mono_ns)
         self._add_checkpoint(self._writing, start, now)
 
-    def _look_back(self, directory: RecordingDirectory, now: Instant) -> None:
+    def _look_back(self, now: Instant) -> None:
         """Register recent files of the previous run of the daemon in `_incidents`.
 
         An incident at the beginning of this run then protects the recent files. An incident in one
         of the recent files protects the first file of this run.
         """
-        for path, kind, ended_ns in directory.just_ended(now):
+        for path, kind, ended_ns in self._opened.just_ended(now):
             self._incidents.earlier(path, kind, ended_ns)
         self._looked_back = True
 
-    def _retain(self, directory: RecordingDirectory, now: Instant) -> None:
+    def _retain(self, now: Instant) -> None:
         for path in self._incidents.happened(now.mono_ns):
-            directory.retain(path)
+            self._opened.retain(path)
 
-    def _write_bug(self, directory: RecordingDirectory, bug: Bug) -> None:
+    def _write_bug(self, bug: Bug) -> None:
         if bug.at is not None and self._writing is None and self._start is not None:
-            self._begin(directory, self._start, bug.at)
+            self._begin(self._start, bug.at)
         if self._writing is None:
             return
         self._last = bug.at or self._last
         if bug.unfinished:
             self._writing.add("unfinished", self._last.wall_ns, bug.unfinished)
-        self._retain(directory, self._last)
+        self._retain(self._last)
 
-    def _flush(self, directory: RecordingDirectory, over: bool) -> None:
+    def _flush(self, over: bool) -> None:
         if over:
             if self.bug is not None:
-                self._write_bug(directory, self.bug)
-            self._finish(directory, *(("bug", self.bug.why) if self.bug else ()))
-            directory.close()
+                self._write_bug(self.bug)
+            self._finish(*(("bug", self.bug.why) if self.bug else ()))
+            self._opened.close()
         if self._writing is None:
             return
         self.sync_timer.begin()
@@ -297,7 +298,7 @@ class StepWriter:
         finally:
             self.sync_timer.end()
         self._safe, self._run.freed = self._handed, 0
-        directory.maintain(self._last)
+        self._opened.maintain(self._last)
         if self.trouble or not self._reported:
             missing = many(self.lost - self._lost_before, "step is", "steps are")
             if self.lost > self._lost_before and self._safe_ns is not None:
@@ -314,13 +315,13 @@ class StepWriter:
             self.trouble, self._reported = "", True
             self._report(Event("recording", f"the daemon records to {self.where}{since}"))
         self._safe_ns = self._last.mono_ns
-        if self._is_long_enough(directory) or self._last.mono_ns - self._state_ns > CHECKPOINT_NS:
+        if self._is_long_enough() or self._last.mono_ns - self._state_ns > CHECKPOINT_NS:
             self._request_state()
 
-    def _finish(self, directory: RecordingDirectory, cut: str = "", why: str = "") -> None:
+    def _finish(self, cut: str = "", why: str = "") -> None:
         if self._writing is None:
             return
-        path = directory.end(self._writing, self._incidents.kind, cut, why)
+        path = self._opened.end(self._writing, self._incidents.kind, cut, why)
         self._writing, self._safe = None, self._handed
         self._incidents.end(path, self._last.mono_ns)
 
