@@ -55,6 +55,11 @@ class CalibrationReport(Struct, frozen=True):
     field `..._error_after` is the same error with the new multipliers. Both errors are measured on
     drives that the fit did not use. Both fields are None if the log does not show how large the
     error is.
+
+    A field `..._noise_before` is a standard deviation of the random error of the odometry after
+    10 m of driving, according to the configured noise settings. The field `..._noise_after` is the
+    same deviation according to the new noise settings. The heading applies to a robot that turns as
+    much per metre as in the log. All four fields are None if the noise settings stay as configured.
     """
 
     log: str
@@ -74,20 +79,10 @@ class CalibrationReport(Struct, frozen=True):
     left_wheel_radius_multiplier: float
     right_wheel_radius_multiplier: float
     wheel_separation_multiplier_std: float | None
-    """Standard deviation of `wheel_separation_multiplier`.
-
-    It is None if the track stays as configured.
-    """
+    """Standard deviation of the multiplier; None if the track stays as configured."""
     left_wheel_radius_multiplier_std: float | None
-    """Standard deviation of `left_wheel_radius_multiplier`.
-
-    It is None if the ratio of the wheel radii stays as configured.
-    """
+    """Standard deviation of the multiplier; None if the ratio of the radii stays as configured."""
     right_wheel_radius_multiplier_std: float | None
-    """Standard deviation of `right_wheel_radius_multiplier`.
-
-    It is None if the ratio of the wheel radii stays as configured.
-    """
     covariance: Sequence[Sequence[float]]
     """Covariance matrix of the multipliers, shape (3, 3).
 
@@ -128,29 +123,14 @@ class CalibrationReport(Struct, frozen=True):
     """RMS position error over whole drives with the configured multipliers, m."""
     position_error_after: float | None
     heading_noise_before: float | None
-    """Standard deviation of the heading error after 10 m of driving, deg.
-
-    It is computed from the configured noise settings, for a robot that turns as much per metre as
-    in the log. It is None if the noise settings stay as configured.
-    """
+    """Random error of the heading with the configured noise settings, deg."""
     heading_noise_after: float | None
-    """Standard deviation of the heading error after 10 m of driving, deg.
-
-    It is computed from the new noise settings, for a robot that turns as much per metre as in the
-    log. It is None if the noise settings stay as configured.
-    """
     distance_noise_before: float | None
-    """Standard deviation of the error of the distance after 10 m of driving, m.
+    """Random error of the distance with the configured noise settings, m.
 
-    It is computed from the configured noise settings. It is None if the noise settings stay as
-    configured, or if the log has no positions.
+    It is None also if the log has no positions.
     """
     distance_noise_after: float | None
-    """Standard deviation of the error of the distance after 10 m of driving, m.
-
-    It is computed from the new noise settings. It is None if the noise settings stay as
-    configured, or if the log has no positions.
-    """
     time_offsets: dict[str, float]
     """Delay of each sensor's recorded times relative to those of the wheels, s, by sensor name.
 
@@ -228,13 +208,9 @@ def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
 
 
 def _deviations(calibration: Calibration) -> list[float | None]:
-    fixed = (
-        TRACK in calibration.stays_configured,
-        RATIO in calibration.stays_configured,
-        RATIO in calibration.stays_configured,
-    )
-    deviations = calibration.multipliers.std.tolist()
-    return [None if stays else std for stays, std in zip(fixed, deviations, strict=True)]
+    """Return the standard deviation of each multiplier; None if it stays as configured."""
+    named = zip((TRACK, RATIO, RATIO), calibration.multipliers.std.tolist(), strict=True)
+    return [None if name in calibration.stays_configured else std for name, std in named]
 
 
 def keys(calibration: Calibration) -> dict[str, object]:

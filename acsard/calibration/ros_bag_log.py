@@ -252,6 +252,18 @@ def table(messages: Iterable[RosMessage], joints: Sequence[str], choice: Choice)
     return _Log(list(topics.values()), others, joints, choice).table()
 
 
+class _Rolled(NamedTuple):
+    """The angles that the wheels of each side have rolled since the first sample, rad.
+
+    An interval without a speed counts as rest.
+    """
+
+    t: Floats
+    """Times of the samples, s."""
+    left: Floats
+    right: Floats
+
+
 class _Log:
     def __init__(
         self, topics: list[_Topic], others: dict[str, str], joints: Sequence[str], choice: Choice
@@ -270,11 +282,11 @@ class _Log:
                 )
         times = dict(zip((topic.name for topic in used), self._times(used), strict=True))
         parts = [self._wheels(wheels, times[wheels.name])]
-        sides = _sides(parts[0])
+        rolled = _rolled(parts[0])
         if gyro is not None:
-            parts.append(self._gyro(gyro, times[gyro.name], sides))
+            parts.append(self._gyro(gyro, times[gyro.name], rolled))
         if places is not None:
-            parts.append(self._places(places, times[places.name], sides))
+            parts.append(self._places(places, times[places.name], rolled))
         if self._choice.axis and gyro is None:
             raise LogError(
                 "--yaw-axis is the axis of an IMU, but the tool uses no IMU: leave this option out"
@@ -432,12 +444,10 @@ class _Log:
             )
         return {"t": t} | dict(zip(topic.wheels, speeds.T, strict=True))
 
-    def _gyro(
-        self, topic: _Topic, t: Floats, sides: tuple[Floats, Floats, Floats]
-    ) -> dict[str, Floats]:
+    def _gyro(self, topic: _Topic, t: Floats, rolled: _Rolled) -> dict[str, Floats]:
         rates, axis = topic.columns(), self._axis
         sign, used = (-1.0 if axis[0] == "-" else 1.0), "xyz".index(axis[-1])
-        follow = np.nan_to_num([_follows(t, rates[:, at], sides) for at in range(3)])
+        follow = np.nan_to_num([_follows(t, rates[:, at], rolled) for at in range(3)])
         best = int(np.argmax(np.abs(follow)))
         if abs(follow[used]) < UPRIGHT and abs(follow[best]) > LYING:
             up = "-" * bool(follow[best] < 0.0) + "xyz"[best]
@@ -448,12 +458,10 @@ class _Log:
             )
         return {"t": t, "yaw_rate": sign * rates[:, used]}
 
-    def _places(
-        self, topic: _Topic, t: Floats, sides: tuple[Floats, Floats, Floats]
-    ) -> dict[str, Floats]:
+    def _places(self, topic: _Topic, t: Floats, rolled: _Rolled) -> dict[str, Floats]:
         x, y, yaw = topic.columns().T
         named = topic.name in self._choice.topics
-        if topic.kind is Odometry and not named and _computed_from(t, yaw, sides):
+        if topic.kind is Odometry and not named and _computed_from(t, yaw, rolled):
             raise LogError(
                 f"{topic} shows exactly the same turns as the wheels, so it was computed from "
                 f"the wheels and cannot show their errors: record {REFERENCES}. If it comes from a "
@@ -519,56 +527,56 @@ def _unwrapped(angles: Floats) -> Floats:
     return np.unwrap(angles) if jumps and within else angles
 
 
-def _sides(wheels: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:
+def _rolled(wheels: dict[str, Floats]) -> _Rolled:
     t = wheels["t"]
     left, right = (
         np.mean([wheels[name] for name in wheels if name in names], axis=0)
         for names in (("left", "fl", "rl"), ("right", "fr", "rr"))
     )
-    return t, _summed(t, left), _summed(t, right)
+    return _Rolled(t, _summed(t, left), _summed(t, right))
 
 
 def _summed(t: Floats, rates: Floats) -> Floats:
     return cumulative(np.nan_to_num((rates[1:] + rates[:-1]) / 2 * np.diff(t)))
 
 
-def _edges(t: Floats, sides: tuple[Floats, Floats, Floats]) -> Floats:
-    wheels = sides[0]
-    if not len(t) or not len(wheels):
+def _edges(t: Floats, rolled: _Rolled) -> Floats:
+    """Return the limits of the intervals in which sensor and wheels are compared, s."""
+    if not len(t) or not len(rolled.t):
         return np.zeros(0)
-    return np.arange(max(t.min(), wheels[0]), min(t.max(), wheels[-1]), INTERVAL_S)
+    return np.arange(max(t.min(), rolled.t[0]), min(t.max(), rolled.t[-1]), INTERVAL_S)
 
 
-def _follows(t: Floats, rates: Floats, sides: tuple[Floats, Floats, Floats]) -> float:
+def _follows(t: Floats, rates: Floats, rolled: _Rolled) -> float:
     """Return how well the turns of a sensor follow the robot's turns according to the wheels.
 
     The result is a correlation from -1 to 1, or NaN if it is unknown.
     """
     order = np.argsort(t, kind="stable")
-    edges = _edges(t, sides)
+    edges = _edges(t, rolled)
     if len(edges) < 4:
         return math.nan
     sensor_turns = np.diff(np.interp(edges, t[order], _summed(t[order], rates[order])))
-    wheels, left, right = sides
-    turned = np.diff(np.interp(edges, wheels, right - left))
+    turned = np.diff(np.interp(edges, rolled.t, rolled.right - rolled.left))
     if not np.ptp(sensor_turns) or not np.ptp(turned):
         return math.nan
     return float(np.corrcoef(sensor_turns, turned)[0, 1])
 
 
-def _computed_from(t: Floats, yaw: Floats, sides: tuple[Floats, Floats, Floats]) -> bool:
+def _computed_from(t: Floats, yaw: Floats, rolled: _Rolled) -> bool:
     """Return whether the yaw follows the wheels so exactly that it was computed from them."""
     finite = np.isfinite(yaw)
     order = np.argsort(t[finite], kind="stable")
     times, angle = t[finite][order], np.unwrap(yaw[finite][order])
-    edges = _edges(times, sides)[1:-1]
+    edges = _edges(times, rolled)[1:-1]
     if len(edges) < 4:
         return False
-    wheels, left, right = sides
-    rolled = np.column_stack([np.diff(np.interp(edges, wheels, side)) for side in (left, right)])
+    sides = np.column_stack(
+        [np.diff(np.interp(edges, rolled.t, side)) for side in (rolled.left, rolled.right)]
+    )
     for delay in DELAYS_S:
         turned = np.diff(np.interp(edges + delay, times, angle))
-        off = turned - rolled @ np.linalg.lstsq(rolled, turned, rcond=None)[0]
+        off = turned - sides @ np.linalg.lstsq(sides, turned, rcond=None)[0]
         if float(off @ off) <= MAX_COPY_DIFFERENCE**2 * float(turned @ turned):
             return True
     return False

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from msgspec import Struct
@@ -52,6 +53,20 @@ the last `STEADY_S` s, the speed changes by less than the fraction `CONSTANT`.
 
 AGREEMENT_FACTOR = 1.5
 """If the fitted and the configured response time differ by at most this factor, they agree."""
+
+
+class Commanded(NamedTuple):
+    """The wheel speeds of a run, with the commands that applied to them."""
+
+    steps: Floats
+    """Interval before each sample of the wheel speeds, s.
+
+    It is NaN if no command applies to this sample, or if the interval is a gap.
+    """
+    wanted: Floats
+    """Commanded speeds (left, right), rad/s, shape (samples, 2)."""
+    actual: Floats
+    """Measured speeds (left, right), rad/s, shape (samples, 2)."""
 
 
 class WheelResponse(Struct, frozen=True):
@@ -130,21 +145,20 @@ def response(
 
     The result is None if the log has too few commands, or if the wheels do not follow them.
     """
-    parts: list[tuple[Floats, Floats, Floats]] = []
+    parts: list[Commanded] = []
     room = MOST_ROWS
     for run in driven:
         if len(run.commands_t) > 1 and room:
-            steps, wanted, actual = _commanded(run, drive)
-            parts.append((steps[:room], wanted[:room], actual[:room]))
-            room -= len(parts[-1][0])
-    if sum(len(steps) for steps, _, _ in parts) < LEAST_ROWS:
+            parts.append(Commanded(*(column[:room] for column in _commanded(run, drive))))
+            room -= len(parts[-1].steps)
+    if sum(len(part.steps) for part in parts) < LEAST_ROWS:
         return None
     fastest = _fastest(parts)
     squares, whole = np.zeros(len(RESPONSE_TIMES_S)), 0.0
-    for steps, wanted, actual in parts:
-        expected = _expected(steps, np.clip(wanted, -fastest, fastest), actual)
-        squares += ((expected - actual[:, :, None]) ** 2).sum(axis=(0, 1))
-        whole += float((actual**2).sum())
+    for part in parts:
+        slower = part._replace(wanted=np.clip(part.wanted, -fastest, fastest))
+        squares += ((_expected(slower) - part.actual[:, :, None]) ** 2).sum(axis=(0, 1))
+        whole += float((part.actual**2).sum())
     best = int(np.argmin(squares))
     if not squares[best] < MAX_UNEXPLAINED * whole:
         return None
@@ -164,12 +178,7 @@ def response(
     )
 
 
-def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
-    """Return time steps, s, and the commanded and measured speeds (left, right), rad/s.
-
-    A time step is the interval before a sample of the wheel speeds. It is NaN if no command applies
-    to this sample, or if the interval is a gap.
-    """
+def _commanded(run: Run, drive: DriveConfig) -> Commanded:
     kinematics = Kinematics(drive)
     ahead = kinematics.wheel_speeds(Twist(1.0, 0.0))
     turning = kinematics.wheel_speeds(Twist(0.0, 1.0))
@@ -180,10 +189,10 @@ def _commanded(run: Run, drive: DriveConfig) -> tuple[Floats, Floats, Floats]:
     wanted = run.linear[at, None] * (ahead.front_left, ahead.front_right) + run.angular[
         at, None
     ] * (turning.front_left, turning.front_right)
-    return steps, np.asarray(wanted), np.column_stack((run.left, run.right))
+    return Commanded(steps, np.asarray(wanted), np.column_stack((run.left, run.right)))
 
 
-def _expected(steps: Floats, wanted: Floats, actual: Floats) -> Floats:
+def _expected(part: Commanded) -> Floats:
     """Return the wheel speeds, rad/s, that each of `RESPONSE_TIMES_S` predicts.
 
     The shape is (samples, 2 sides, response times).
@@ -191,6 +200,7 @@ def _expected(steps: Floats, wanted: Floats, actual: Floats) -> Floats:
     # The speed y of a healthy wheel follows the command u with the response time T:
     #
     #     T dy/dt = u - y
+    steps, wanted, actual = part
     expected = np.empty((*wanted.shape, len(RESPONSE_TIMES_S)))
     last = np.zeros((2, len(RESPONSE_TIMES_S)))
     for number, step in enumerate(steps):
@@ -202,9 +212,7 @@ def _expected(steps: Floats, wanted: Floats, actual: Floats) -> Floats:
     return expected
 
 
-def _evidence(
-    parts: Sequence[tuple[Floats, Floats, Floats]], response_time: float, fault_time: float
-) -> float:
+def _evidence(parts: Sequence[Commanded], response_time: float, fault_time: float) -> float:
     """Return the longest time for which a wheel contradicts the daemon's model of a wheel, s.
 
     If this time exceeds `fault_time`, the daemon would report a fault.
@@ -227,7 +235,7 @@ def _evidence(
     return longest
 
 
-def _fastest(parts: Sequence[tuple[Floats, Floats, Floats]]) -> float:
+def _fastest(parts: Sequence[Commanded]) -> float:
     """Return the highest speed, rad/s, that a wheel keeps although its command is higher.
 
     Return infinity if the log shows no such speed.

@@ -82,6 +82,10 @@ class Sensor:
             count += 1
         return count
 
+    def discard(self) -> int:
+        """Discard each message that has arrived, and return the number of messages."""
+        return self.receive(lambda message, now: None, 0.0)
+
     def await_first(self, what: str) -> None:
         """Wait until a message arrives on the key, and discard it.
 
@@ -89,7 +93,7 @@ class Sensor:
         of the message in the text of this error.
         """
         end = clock.steady_s() + FIRST_STATE_TIMEOUT_S
-        while not self.receive(lambda message, now: None, 0.0):
+        while not self.discard():
             if clock.steady_s() > end:
                 raise GuideError(
                     f"{what} does not arrive on the Zenoh key {self.key}: does the sender run, and "
@@ -313,7 +317,7 @@ class RobotOnBus:
 
     def _drain(self) -> None:
         for sensor in (self._wheels, *(sensor for sensor, _ in self._sensors)):
-            sensor.receive(lambda message, now: None, 0.0)
+            sensor.discard()
         self._watch.poll(clock.steady_s())
 
     def _full(self, key: str) -> str:
