@@ -53,6 +53,9 @@ class Parameter(IntEnum):
 
 
 PARAMETER_COUNT = len(Parameter)
+RADII = [Parameter.LEFT, Parameter.RIGHT]
+WHEEL_PARAMETERS = list(Parameter)[: Parameter.DELAY]
+"""Indices of the parameters that describe the wheels: radii, inverse track and track growth."""
 
 HUBER_LIMIT = 2.0
 """If a residual exceeds this number of standard deviations, its weight is less than 1 (Huber)."""
@@ -344,7 +347,7 @@ def fit(
         active, usual[Parameter.BIAS_ERROR] = (*active, Parameter.BIAS_ERROR), bias_std
     if not places:
         both = np.zeros(PARAMETER_COUNT)
-        both[[Parameter.LEFT, Parameter.RIGHT]] = 1.0
+        both[RADII] = 1.0
         held = (*held, (both, float(both @ start)))
     parameters, size = start.copy(), np.inf
     for at in range(MAX_STEPS):

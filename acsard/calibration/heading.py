@@ -400,16 +400,14 @@ fraction `SHARE` of the wheels' turn.
 
 def turned(rows: Rows, base: Base, parameters: Floats) -> Floats:
     """Return the robot's turn in each interval, rad, computed from the wheels with `parameters`."""
-    left, right, inverse, growth = parameters[
-        [Parameter.LEFT, Parameter.RIGHT, Parameter.INVERSE_TRACK, Parameter.TRACK_GROWTH]
-    ]
+    left, right, inverse, growth = parameters[: Parameter.DELAY]
     constant = base.radius_per_separation * inverse * (right * rows.right - left * rows.left)
     return np.asarray(constant + growth * _by_growth(rows, base, parameters))
 
 
 def _by_growth(rows: Rows, base: Base, parameters: Floats) -> Floats:
     """Return the derivative of each interval's turn with respect to TRACK_GROWTH, rad2/s."""
-    left, right, inverse = parameters[[Parameter.LEFT, Parameter.RIGHT, Parameter.INVERSE_TRACK]]
+    left, right, inverse = parameters[: Parameter.TRACK_GROWTH]
     gain = base.radius_per_separation * inverse * (left + right) / 2
     return np.asarray(-gain * abs(gain) * rows.signed_square_integral)
 

@@ -27,8 +27,8 @@ TIME = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9
 TIME |= {"\N{MICRO SIGN}s": 1e-6, "\N{GREEK SMALL LETTER MU}s": 1e-6}
 LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3}
 ANGLE = {"rad": 1.0, "deg": math.radians(1.0), "°": math.radians(1.0), "mrad": 1e-3}
-TURNS = {"rpm": math.tau / 60, "rps": math.tau, "dps": math.radians(1.0)}
-RATE = {f"{unit}/s": size for unit, size in ANGLE.items()} | TURNS
+RATE = {f"{unit}/s": size for unit, size in ANGLE.items()}
+RATE |= {"rpm": math.tau / 60, "rps": math.tau, "dps": math.radians(1.0)}
 
 SPEED = {f"{unit}/s": size for unit, size in LENGTH.items()}
 APPLIED = "applied_linear", "applied_angular"
@@ -147,18 +147,14 @@ FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
 `FOUR` has a column for each wheel. `TWO` has a column for the mean speed of each side.
 """
 
-NUMBER_COLUMNS = ("t", *FOUR, *TWO, "yaw_rate", "x", "y", "yaw", *APPLIED)
-COLUMNS = (*NUMBER_COLUMNS, "run")
-"""Columns that a log can have: `NUMBER_COLUMNS`, and the column with the name of the run."""
+COLUMNS = ("t", *FOUR, *TWO, "yaw_rate", "x", "y", "yaw", *APPLIED, "run")
+"""Columns that a log can have. The column `run` contains names, and the others contain numbers."""
 
 EMPTY_CELLS = frozenset(("", "nan", "-nan(ind)", "null", "none", "na", "n/a", "#n/a", "-", "--"))
 """Contents of a cell without a value, in lower case."""
 
 COUNT_COLUMN = re.compile(r"tick|count|(?:^|_)enc")
 """Pattern for names of columns with encoder counts, which the user must convert to speeds."""
-
-COMMENT_MARKS = ("#", "%")
-"""Characters with which a comment line above the table begins."""
 
 TRAILING_COMMENT = re.compile(r"(?:^|\s)#")
 """Pattern for the start of a comment after a number.
@@ -248,7 +244,7 @@ def _header(lines: Sequence[str]) -> tuple[int, list[tuple[str, str]], str]:
     comment = ""
     for at, line in enumerate(lines):
         text = line.strip()
-        if text.startswith(COMMENT_MARKS):
+        if text.startswith(("#", "%")):
             comment = text.strip("#% \t") or comment
         elif text and not text.lower().startswith("sep="):  # `sep=` is a hint for spreadsheets
             separator = _separator(text)

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from acsard.calibration import heading
-from acsard.calibration.fit import MIN_BLOCKS, Base, Fit, Parameter, condition
+from acsard.calibration.fit import MIN_BLOCKS, RADII, Base, Fit, Parameter, condition
 from acsard.calibration.heading import Rows
 from acsard.calibration.log_table import Floats, NoCalibrationError
 from acsard.calibration.positions import StartingPoint
@@ -245,9 +245,7 @@ def turns_the_right_way(
     by_places = by_heading = ""
     if starting_point is not None:
         turn = starting_point.parameters[Parameter.INVERSE_TRACK]
-        by_places = by_heading = _wrong_sign(
-            starting_point.parameters[[Parameter.LEFT, Parameter.RIGHT]] * turn
-        )
+        by_places = by_heading = _wrong_sign(starting_point.parameters[RADII] * turn)
     if sides is not None:
         by_heading = _wrong_sign(sides)
     for side in ("left", "right"):

@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.calibration.fit import PARAMETER_COUNT, Base, Evidence, Parameter, fit, huber
+from acsard.calibration.fit import PARAMETER_COUNT, RADII, Base, Evidence, Parameter, fit, huber
 from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Block, Complexes, Run, cumulative
 
@@ -179,9 +179,7 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> WheelPath:
 
     Each step is an exact arc.
     """
-    left, right, turn, rate = parameters[
-        [Parameter.LEFT, Parameter.RIGHT, Parameter.INVERSE_TRACK, Parameter.TRACK_GROWTH]
-    ]
+    left, right, turn, growth = parameters[: Parameter.DELAY]
     gain = base.radius_per_separation * turn
     mean = gain * (left + right) / 2
     turn_derivatives = {
@@ -193,7 +191,7 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> WheelPath:
     }
     turns = (
         turn * turn_derivatives[Parameter.INVERSE_TRACK]
-        + rate * turn_derivatives[Parameter.TRACK_GROWTH]
+        + growth * turn_derivatives[Parameter.TRACK_GROWTH]
     )
     rolls = {
         Parameter.LEFT: base.radius * steps.left / 2,
@@ -410,11 +408,11 @@ def search(
     points: list[StartingPoint] = []
     for left, way in itertools.product((1.0, -1.0), (1.0, -1.0)):
         points += _local_minima(
-            [_tried(subset, steps, base, (left, way * turn, 0.0)) for turn in INVERSE_TRACK_RATIOS]
+            [_tried(subset, steps, base, left, way * turn) for turn in INVERSE_TRACK_RATIOS]
         )
     if sides is not None:
         left, way = np.sign(sides[0] * sides[1]), np.sign(sides[1]) * np.abs(sides).mean()
-        points.append(_tried(subset, steps, base, (float(left), float(way), 0.0)))
+        points.append(_tried(subset, steps, base, float(left), float(way)))
 
     def badness(point: StartingPoint) -> float:
         return (point.unexplained + UNEXPLAINED_OFFSET) * _penalty(point, sides)
@@ -450,10 +448,7 @@ def _penalty(point: StartingPoint, sides: Floats | None) -> float:
     The factor is 1 for a usual robot. It is larger if the robot turns unusually much or little, or
     if turns or wheels are reversed. `sides` is the result of `heading.side_factors()`, or None.
     """
-    signed = (
-        point.parameters[[Parameter.LEFT, Parameter.RIGHT]]
-        * point.parameters[Parameter.INVERSE_TRACK]
-    )
+    signed = point.parameters[RADII] * point.parameters[Parameter.INVERSE_TRACK]
     turn, (least, most) = float(np.abs(signed).mean()), USUAL_TURN_RANGE
     like = np.ones(2)
     if sides is not None:
@@ -477,9 +472,8 @@ def _turn(parameters: Floats) -> float:
 def _timed(
     point: StartingPoint, subset: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
 ) -> StartingPoint:
-    parameters = point.parameters
-    shape = float(np.sign(parameters[Parameter.LEFT])), _turn(parameters)
-    tried = [_tried(subset, steps, base, (*shape, late)) for late in DELAYS_S]
+    left, turn = float(np.sign(point.parameters[Parameter.LEFT])), _turn(point.parameters)
+    tried = [_tried(subset, steps, base, left, turn, delay_s) for delay_s in DELAYS_S]
     return min([point, *tried], key=lambda point: point.unexplained)
 
 
@@ -487,27 +481,27 @@ def _tried(
     subset: Sequence[Segment],
     steps: dict[int, WheelSteps],
     base: Base,
-    shape: tuple[float, float, float],
+    left: float,
+    turn: float,
+    delay_s: float = 0.0,
 ) -> StartingPoint:
     """Return the starting point for a shape of the path, with the wheel size that fits best.
 
-    `shape` contains three numbers:
-
-    - 1, or -1 if the speeds of the left wheels have the wrong sign
-    - the ratio of configured to true track, which is negative if all turns are reversed
-    - the delay of the positions, s
+    Args:
+        subset: the measured positions.
+        steps: the wheel steps of each run.
+        base: the configured geometry.
+        left: 1, or -1 if the speeds of the left wheels have the wrong sign.
+        turn: the ratio of configured to true track, which is negative if all turns are reversed.
+        delay_s: the delay of the positions, s.
     """
     parameters = base.start()
-    parameters[[Parameter.LEFT, Parameter.RIGHT, Parameter.INVERSE_TRACK, Parameter.DELAY]] = (
-        shape[0],
-        1.0,
-        shape[1],
-        shape[2],
-    )
+    parameters[: Parameter.TRACK_GROWTH] = left, 1.0, turn
+    parameters[Parameter.DELAY] = delay_s
     paths = {run: place(of_run, base, parameters) for run, of_run in steps.items()}
     cross = squares = size = 0.0
     for segment in subset:
-        along = np.interp(segment.t - shape[2], steps[segment.run].t, paths[segment.run])
+        along = np.interp(segment.t - delay_s, steps[segment.run].t, paths[segment.run])
         centred, centred_path = segment.place - segment.place.mean(), along - along.mean()
         # Each path is rotated so that it fits best, but all paths share one scale.
         cross += abs(complex(np.vdot(centred_path, centred)))
@@ -516,7 +510,7 @@ def _tried(
     if not size or not squares:
         return StartingPoint(parameters, np.inf)
     scale = cross / size
-    parameters[[Parameter.LEFT, Parameter.RIGHT]] *= scale
+    parameters[RADII] *= scale
     parameters[Parameter.INVERSE_TRACK] /= scale
     return StartingPoint(parameters, 1.0 - cross**2 / (size * squares))
 

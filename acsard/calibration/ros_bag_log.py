@@ -188,8 +188,6 @@ _SHORT = {
 
 _COLUMN = {word: column for column, words in _SHORT.items() for word in words}
 
-_NO_WHEEL = ("caster", "castor", "steer")
-
 
 def wheel_of(joint: str) -> str:
     """Return the log column for the wheel that a joint's name means, such as "fl" or "left".
@@ -197,7 +195,7 @@ def wheel_of(joint: str) -> str:
     Return "" if the name does not mean a wheel.
     """
     name = re.sub(r"([a-z])([A-Z])", r"\1_\2", joint).lower()
-    if any(word in name for word in _NO_WHEEL):
+    if any(word in name for word in ("caster", "castor", "steer")):
         return ""
     sides = [side for side in TWO if side in name]
     if len(sides) == 1:

@@ -12,7 +12,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.calibration import heading, plausibility, positions
-from acsard.calibration.fit import PARAMETER_COUNT, Base, Fit, Held, Parameter, Source, fit
+from acsard.calibration.fit import PARAMETER_COUNT, RADII, Base, Fit, Held, Parameter, Source, fit
 from acsard.calibration.heading import Headings, Rates, Rows, rates
 from acsard.calibration.improvement import (
     UNMEASURED,
@@ -260,8 +260,8 @@ def prepared(
         )
     plausibility.turns_the_right_way(headings.source if headings else "", sides, by_positions)
     if sides is not None:
-        mean, size = float(sides.mean()), float(start[[Parameter.LEFT, Parameter.RIGHT]].mean())
-        start[[Parameter.LEFT, Parameter.RIGHT]] = size * sides / mean
+        mean, size = float(sides.mean()), float(start[RADII].mean())
+        start[RADII] = size * sides / mean
         start[Parameter.INVERSE_TRACK] = mean / size
     if headings is not None:
         plausibility.turn_rates(headings.source, rows)
@@ -270,12 +270,12 @@ def prepared(
 
 
 def _check_units(headings: Headings | None, start: Floats, base: Base, sized: bool) -> None:
-    size, configured = float(start[[Parameter.LEFT, Parameter.RIGHT]].mean()), base.start()
+    size, configured = float(start[RADII].mean()), base.start()
     if sized:
         plausibility.distance_units(size, base)
     turn_without_multipliers = size * float(start[Parameter.INVERSE_TRACK])
     turn = turn_without_multipliers / float(
-        configured[[Parameter.LEFT, Parameter.RIGHT]].mean() * configured[Parameter.INVERSE_TRACK]
+        configured[RADII].mean() * configured[Parameter.INVERSE_TRACK]
     )
     plausibility.turn_units(
         headings.source if headings else "", turn, turn_without_multipliers, base
@@ -415,7 +415,7 @@ def _candidates(made: Prepared) -> list[Candidate]:
 
 def _constraints(base: Base) -> dict[str, list[Held]]:
     ratio, track, growth = np.zeros((3, PARAMETER_COUNT))
-    ratio[[Parameter.LEFT, Parameter.RIGHT]] = base.right, -base.left
+    ratio[RADII] = base.right, -base.left
     track[Parameter.INVERSE_TRACK] = growth[Parameter.TRACK_GROWTH] = 1.0
     return {"": [], RATIO: [(ratio, 0.0)], TRACK: [(track, 1 / base.track), (growth, 0.0)]}
 
@@ -549,7 +549,7 @@ def _copied_from_wheels(what: str) -> str:
 def _follow(made: Prepared, fitted: Fit, rate: Rates) -> Follow:
     def follow(values: Floats, number: int) -> Extent:
         parameters = fitted.parameters.copy()
-        parameters[[Parameter.LEFT, Parameter.RIGHT]] = values[[LEFT_RADIUS, RIGHT_RADIUS]]
+        parameters[RADII] = values[[LEFT_RADIUS, RIGHT_RADIUS]]
         parameters[Parameter.INVERSE_TRACK] = 1 / (
             values[SEPARATION] * (1 - parameters[Parameter.TRACK_GROWTH] * rate.mean)
         )

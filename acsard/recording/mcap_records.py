@@ -31,10 +31,8 @@ from zstandard import COMPRESSOBJ_FLUSH_BLOCK, ZstdCompressionParameters
 
 # At this level, ten seconds of steps are compressed in 2 to 8 ms. The result is 13 to 16 % smaller
 # than at level 3.
-ZSTD_LEVEL = 9
-
 ZSTD_PARAMETERS = ZstdCompressionParameters.from_level(
-    ZSTD_LEVEL, source_size=1 << 18, write_content_size=False
+    9, source_size=1 << 18, write_content_size=False
 )
 """Parameters of the zstd compressor for chunks of 256 KiB. The compressor then needs 3 MB of
 memory."""

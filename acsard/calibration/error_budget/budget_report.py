@@ -42,17 +42,6 @@ BASIS_TEXTS: dict[Basis, str] = {
     "unknown": "nothing",
 }
 
-COARSE_ADVICE = (
-    "the encoders are coarse and the daemon does not know how many counts they have per wheel "
-    "turn, so an error in the time of a feedback line becomes an error of the heading: write the "
-    "counts per wheel turn as mcu.encoder_counts (`acsard mcu check` estimates them)"
-)
-
-CALIBRATE_ADVICE = (
-    "the errors of the configured wheel radii and track width are unknown, and if the wheels skid, "
-    "they are usually the largest errors: run `acsard calibrate`"
-)
-
 
 def parts(budget: Budget) -> Iterator[RenderableType]:
     """Yield the parts of the printed report: sentences, and a table of the causes."""
@@ -78,9 +67,19 @@ def advice(budget: Budget) -> str:
             "does not show most causes of errors"
         )
     measured, largest = budget.largest("measured"), budget.largest("measured", "settings")
-    advice = [COARSE_ADVICE] if budget.coarse else []
+    advice = []
+    if budget.coarse:
+        advice.append(
+            "the encoders are coarse and the daemon does not know how many counts they have per "
+            "wheel turn, so an error in the time of a feedback line becomes an error of the "
+            "heading: write the counts per wheel turn as mcu.encoder_counts (`acsard mcu check` "
+            "estimates them)"
+        )
     if any(share.cause == "parameters" and share.basis == "unknown" for share in budget.shares):
-        advice.append(CALIBRATE_ADVICE)
+        advice.append(
+            "the errors of the configured wheel radii and track width are unknown, and if the "
+            "wheels skid, they are usually the largest errors: run `acsard calibrate`"
+        )
     if largest is not None and largest is not measured:
         advice.append(
             "according to the settings in [odometry], the largest cause of errors is "

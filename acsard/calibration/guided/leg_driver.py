@@ -55,11 +55,6 @@ The leg is done when the wheels have stood still for `STANDING_S`. If the leg is
 `STANDS_S` after the last move, it is halted.
 """
 
-NO_FEEDBACK = "the microcontroller sends no feedback: check its cable and its power supply"
-
-ENTER = "\r\n"
-KEY_PRESSED = "a key was pressed"
-
 
 class Phase(StrEnum):
     """The phases of a leg, in their order. `HALTED` can follow any phase except `DONE`."""
@@ -202,7 +197,7 @@ class LegDriver:
         keys are ignored. In the phase OPENING, Enter is ignored, because the person may still hold
         the Enter key that started the leg.
         """
-        if self.phase is Phase.OPENING and pressed in ENTER:
+        if self.phase is Phase.OPENING and pressed in "\r\n":
             return
         if self.phase is Phase.MOVING and now - self._stepped > MAX_STATE_AGE_S / 2:
             # This process was paused, and the robot stopped during the pause. The person may have
@@ -212,7 +207,7 @@ class LegDriver:
         if self.phase is Phase.MOVING and self._leg.by_key and last:
             self._settle(now)
         elif self.phase is not Phase.SETTLING or not self._leg.by_key:
-            self._halt(KEY_PRESSED)
+            self._halt("a key was pressed")
 
     def state(self, state: RobotState, now: float) -> None:
         """Process the daemon's `state`. Halt the leg if the robot does not follow its commands."""
@@ -231,9 +226,11 @@ class LegDriver:
         elif state.sender not in ("", self._sender):
             self._halt(why)
         elif self.phase is Phase.MOVING:
-            silent = "" if state.wheels or why else NO_FEEDBACK
-            disturbed = bool(silent) or why == self._starved
-            self._tolerate_briefly(why or silent, now, disturbed=disturbed)
+            disturbed = why == self._starved
+            if not (why or state.wheels):
+                why = "the microcontroller sends no feedback: check its cable and its power supply"
+                disturbed = True
+            self._tolerate_briefly(why, now, disturbed=disturbed)
 
     def wheels(self, speeds: WheelSpeeds, stamp: float, now: float) -> None:
         """Process wheel speeds from the daemon, rad/s. `stamp` is their time, s.

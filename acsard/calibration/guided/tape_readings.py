@@ -20,6 +20,8 @@ from acsard.calibration import heading
 from acsard.calibration.fit import (
     PARAMETER_COUNT,
     PRIOR_STD,
+    RADII,
+    WHEEL_PARAMETERS,
     Base,
     Parameter,
     condition,
@@ -75,13 +77,6 @@ CONVERGED = 1e-9
 
 MAX_CONDITION = 1e8
 """Largest condition number of normal equations from which the parameters can be computed."""
-
-FITTED_PARAMETERS = [
-    Parameter.LEFT,
-    Parameter.RIGHT,
-    Parameter.INVERSE_TRACK,
-    Parameter.TRACK_GROWTH,
-]
 
 MAX_STARTING_STD = 0.2
 """Largest relative standard deviation of a `turned` reading with which the fit may start.
@@ -189,17 +184,17 @@ def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
     parameters.
     """
     parameters, normal = _solved(readings, base, _starting_parameters(readings, base))
-    left, right, inverse = parameters[[Parameter.LEFT, Parameter.RIGHT, Parameter.INVERSE_TRACK]]
+    left, right, inverse = parameters[: Parameter.TRACK_GROWTH]
     in_range(np.array([1 / inverse, left, right]))
     compared = [(residual, weight) for _, residual, weight in _compared(readings, base, parameters)]
     residuals, weights = np.array(compared).T
     # Combine the scatter of these readings with the assumed noise. If there are few readings, the
     # scatter is uncertain itself, so widen the deviation to that of Student's t.
-    free = PRIOR_DEGREES_OF_FREEDOM + max(0.0, len(readings) - len(FITTED_PARAMETERS) + 1.0)
+    free = PRIOR_DEGREES_OF_FREEDOM + max(0.0, len(readings) - len(WHEEL_PARAMETERS) + 1.0)
     scale = (PRIOR_DEGREES_OF_FREEDOM + float(weights @ residuals**2)) / free
     covariance = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT))
-    inner = np.linalg.inv(normal[np.ix_(FITTED_PARAMETERS, FITTED_PARAMETERS)])
-    covariance[np.ix_(FITTED_PARAMETERS, FITTED_PARAMETERS)] = (
+    inner = np.linalg.inv(normal[np.ix_(WHEEL_PARAMETERS, WHEEL_PARAMETERS)])
+    covariance[np.ix_(WHEEL_PARAMETERS, WHEEL_PARAMETERS)] = (
         inner * max(1.0, scale) * student_factor(free)
     )
     held_out = np.array(
@@ -253,25 +248,22 @@ def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Flo
         for prediction, residual, weight in _compared(readings, base, parameters):
             normal += weight * np.outer(prediction.derivatives, prediction.derivatives)
             score += weight * prediction.derivatives * residual
-        normal[Parameter.TRACK_GROWTH, Parameter.TRACK_GROWTH] += (
-            PRIOR_STD[Parameter.TRACK_GROWTH] ** -2
-        )
-        score[Parameter.TRACK_GROWTH] -= (
-            parameters[Parameter.TRACK_GROWTH] * PRIOR_STD[Parameter.TRACK_GROWTH] ** -2
-        )
+        growth, certainty = Parameter.TRACK_GROWTH, PRIOR_STD[Parameter.TRACK_GROWTH] ** -2
+        normal[growth, growth] += certainty
+        score[growth] -= parameters[growth] * certainty
         both = np.zeros(PARAMETER_COUNT)
-        both[[Parameter.LEFT, Parameter.RIGHT]] = 0.5
+        both[RADII] = 0.5
         normal += np.outer(both, both) / PRIOR_RADIUS_STD**2
         score += both * float(both @ (configured - parameters)) / PRIOR_RADIUS_STD**2
-        inner = normal[np.ix_(FITTED_PARAMETERS, FITTED_PARAMETERS)]
+        inner = normal[np.ix_(WHEEL_PARAMETERS, WHEEL_PARAMETERS)]
         if condition(inner) > MAX_CONDITION:
             raise NoCalibrationError(
                 "the measurements cannot separate errors of the wheel radii from errors of the "
                 "track width, because the robot hardly moved or hardly turned: give the robot "
                 "room, and start again"
             )
-        step = np.linalg.solve(inner, score[FITTED_PARAMETERS])
-        parameters[FITTED_PARAMETERS] += step * min(1.0, 0.3 / (float(np.abs(step).max()) or 1.0))
+        step = np.linalg.solve(inner, score[WHEEL_PARAMETERS])
+        parameters[WHEEL_PARAMETERS] += step * min(1.0, 0.3 / (float(np.abs(step).max()) or 1.0))
         if float(np.abs(step).max()) < CONVERGED:
             return parameters, normal
     raise NoCalibrationError(
@@ -381,11 +373,6 @@ def slant(near: float, far: float, apart: float) -> float:
 MAX_TAPE_STDS = {TRACK: 0.1, RATIO: 0.02}
 """Largest accepted relative standard deviation of each quantity."""
 
-ADVICE = (
-    "the readings contradict each other, or the robot skids much. Start again on even ground, "
-    "place the robot exactly, and measure to the millimetre"
-)
-
 TURNED, STRAIGHT = np.pi, 0.5
 """Limits for the angle that the robot turns in the legs of a reading, rad.
 
@@ -416,7 +403,8 @@ def calibrated(
     for name, deviation in too_inaccurate(deviations, MAX_TAPE_STDS).items():
         raise NoCalibrationError(
             f"these readings determine {name} only to {deviation:.1%}, which is too inaccurate: "
-            f"{ADVICE}"
+            "the readings contradict each other, or the robot skids much. Start again on even "
+            "ground, place the robot exactly, and measure to the millimetre"
         )
     drives = DriveTotals.of(rides, rows, by_wheels, base, result, rate)
     notes = remarks({}, 0.0, by_wheels, result.values, base, sized=True)
