@@ -112,27 +112,28 @@ def config_of(recording: Recording) -> Config:
 
 def steps(recording: Recording) -> Iterator[RecordedStep]:
     """Yield every readable step in order. Steps are missing where their numbers jump."""
-    for item in _items(recording):
-        if not isinstance(item, Checkpoint):
-            yield from item
+    for step, _ in _steps_and_states(recording):
+        yield step
 
 
-def _items(
+def _steps_and_states(
     recording: Recording, copies: EventCopies | None = None
-) -> Iterator[list[RecordedStep] | Checkpoint]:
+) -> Iterator[tuple[RecordedStep, Checkpoint | None]]:
+    """Yield every readable step in order, with the last recorded robot state before it."""
+    saved: Checkpoint | None = None
     for topic, _, data in recording.messages():
         if topic == "events" and copies is not None:
             copies.copy(data)
         try:
-            if topic == "state":
-                yield checkpoint(data)
-            elif topic == "steps":
-                batch = decode(data)
-                if copies is not None:
-                    copies.batch(batch)
-                yield batch
+            saved = checkpoint(data) if topic == "state" else saved
+            batch = decode(data) if topic == "steps" else []
         except (BatchError, StateError):
             recording.damaged += 1
+            continue
+        if batch and copies is not None:
+            copies.batch(batch)
+        for step in batch:
+            yield step, saved
 
 
 # A genuine file stays below this limit. Without the limit, the replay of a forged file of 5 kB took
@@ -262,32 +263,26 @@ class RecordedRun(_Source):
         recording = self._recording
         replayed_ns = recording.about.mono_ns
         read, damaged = self._next, 0
-        saved: Checkpoint | None = None
         last: RecordedStep | None = None
         gap: Gap | None = None
-        for item in _items(recording, self._copies):
-            if isinstance(item, Checkpoint):
-                saved = item
-                continue
-            damaged = recording.damaged
-            for step in item:
-                now_ns = step.inputs.now.mono_ns
-                missing, read = step.number - read, step.number + 1
-                if gap is None and (missing or (last is None and now_ns > replayed_ns)):
-                    gap = self._open_gap(replayed_ns)
-                last = step
-                known = step.number == self._next or self._resume(saved, step.number)
-                if gap is not None:
-                    gap.end_ns = max(gap.end_ns, now_ns)
-                    gap.unreadable += max(0, missing)
-                    if not known:
-                        gap.skipped += 1
-                        gap.lines += step.recorded.line is not None
-                        self.on_skipped(step)
-                        continue
-                    gap = None
-                self.number, self._next, replayed_ns = step.number, step.number + 1, now_ns
-                yield step
+        for step, saved in _steps_and_states(recording, self._copies):
+            damaged, now_ns = recording.damaged, step.inputs.now.mono_ns
+            missing, read = step.number - read, step.number + 1
+            if gap is None and (missing or (last is None and now_ns > replayed_ns)):
+                gap = self._open_gap(replayed_ns)
+            last = step
+            known = step.number == self._next or self._resume(saved, step.number)
+            if gap is not None:
+                gap.end_ns = max(gap.end_ns, now_ns)
+                gap.unreadable += max(0, missing)
+                if not known:
+                    gap.skipped += 1
+                    gap.lines += step.recorded.line is not None
+                    self.on_skipped(step)
+                    continue
+                gap = None
+            self.number, self._next, replayed_ns = step.number, step.number + 1, now_ns
+            yield step
         if last is None:
             raise RecordingError(
                 f"{recording.path} has no readable steps, because it ends within its first second "
@@ -430,28 +425,22 @@ class DisplayReplay(_Source):
         The robot has just replayed the step. Raises `RecordingError` if the robot fails because its
         recorded state lacks a part.
         """
-        saved: Checkpoint | None = None
         number: int | None = None
-        for item in _items(self._recording):
-            if isinstance(item, Checkpoint):
-                saved = item
-                continue
-            for step in item:
-                if number is None and self._state is None and step.number > 0 and not self.notes:
-                    note = (
-                        "the first steps of the recording are missing: the replay begins after them"
-                    )
-                    self.notes.append(note)
-                if number is not None and step.number != number + 1:
-                    self._in_gap = True
-                number = step.number
-                if self._in_gap and (state := self._resumed(saved, number)) is not None:
-                    self._state, self._in_gap = state, False
-                    self.replay.resume(*state)
-                with self.state_errors():
-                    self.replay.step(step)
-                if self.replay.outputs is not None:
-                    yield step, self.replay.outputs, self.replay.robot
+        for step, saved in _steps_and_states(self._recording):
+            if number is None and self._state is None and step.number > 0 and not self.notes:
+                self.notes.append(
+                    "the first steps of the recording are missing: the replay begins after them"
+                )
+            if number is not None and step.number != number + 1:
+                self._in_gap = True
+            number = step.number
+            if self._in_gap and (state := self._resumed(saved, number)) is not None:
+                self._state, self._in_gap = state, False
+                self.replay.resume(*state)
+            with self.state_errors():
+                self.replay.step(step)
+            if self.replay.outputs is not None:
+                yield step, self.replay.outputs, self.replay.robot
 
 
 def _first_state(recording: Recording) -> tuple[int, State | None]:
