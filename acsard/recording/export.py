@@ -345,8 +345,7 @@ def export(
         kind: the format of the exported data.
         other: the configuration of the replay; None for the recorded configuration.
         span: the part of the recording that is exported.
-        progress: function that is called every `PROGRESS_STEPS` steps with the wall-clock time of
-            the step, ns since 1970.
+        progress: shows the progress. It is called every `PROGRESS_STEPS` steps.
         force: true if an existing file or ROS bag at `new` may be overwritten. A recording is never
             overwritten.
 

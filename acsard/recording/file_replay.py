@@ -236,8 +236,7 @@ class RecordedRun(_Source):
         """
         super().__init__(recording)
         self._other, self._recorded, self._copies = other, config_of(recording), copies
-        self.config = other or self._recorded
-        """Configuration with which the replay begins."""
+        config = other or self._recorded
         self.gaps: list[Gap] = []
         """The gaps that `steps()` has found so far."""
         self.number: int | None = None
@@ -247,13 +246,13 @@ class RecordedRun(_Source):
         self._next, self._state = _first_state(recording)
         """`_next` is the number of the step that `robot` can replay next. `_state` is the recorded
         state from which `robot` was rebuilt, or None for a new robot."""
-        self.robot, self.memory = self._state or (Robot(self.config), Memory())
+        self.robot, self.memory = self._state or (Robot(config), Memory())
         """`robot` is the robot that replays the steps. `memory` is the memory of the robot's guard,
         which checks each line to the board. After a gap, `steps()` replaces both with the next
         robot and memory in the file."""
         if self._state is not None:
             with self.state_errors():
-                adopt(self.robot, Robot(self._recorded), Robot(self.config))
+                adopt(self.robot, Robot(self._recorded), Robot(config))
 
     def steps(self) -> Iterator[RecordedStep]:
         """Yield the steps that can be replayed, in order. Collect the gaps in `gaps`.
@@ -340,7 +339,7 @@ def replay_file(
     Args:
         recording: the recording to replay.
         other: the configuration of the replay; None for the recorded configuration.
-        progress: function that is called every `PROGRESS_STEPS` steps.
+        progress: shows the progress. It is called every `PROGRESS_STEPS` steps.
 
     Raises:
         RecordingError: the recording cannot be replayed.
@@ -348,7 +347,7 @@ def replay_file(
     copies = EventCopies(recording)
     run = RecordedRun(recording, other, copies)
     with run.state_errors():
-        replay = Replay(run.config, run.robot, run.memory)
+        replay = Replay(run.robot, run.memory)
         for number, step in enumerate(run.steps()):
             if number % PROGRESS_STEPS == 0:
                 progress(step.inputs.now.wall_ns)
@@ -411,9 +410,9 @@ class DisplayReplay(_Source):
             with self.state_errors():
                 if self._state is not None:
                     adopt(self._state.robot, Robot(self.config), Robot(self.config))
-                self.replay = Replay(self.config, *(self._state or ()))
+                self.replay = Replay(*(self._state or (Robot(self.config),)))
         except RecordingError as error:
-            self._state, self.replay = None, Replay(self.config)
+            self._state, self.replay = None, Replay(Robot(self.config))
             self.notes.append(
                 "the recorded state of the robot cannot be used, so the replay begins with a robot "
                 f"that has just started, and may differ from the recorded drive: {error}"

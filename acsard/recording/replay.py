@@ -16,7 +16,6 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.core.config.settings import Config
 from acsard.core.guard import Guard, Memory
 from acsard.core.robot import Robot
 from acsard.core.values import Event, Instant, Outputs
@@ -147,26 +146,17 @@ def replay_step(robot: Robot, step: RecordedStep) -> Outputs:
 class Replay:
     """A robot that replays a recording step by step."""
 
-    def __init__(
-        self, config: Config, robot: Robot | None = None, memory: Memory | None = None
-    ) -> None:
-        """Prepare for the first step.
-
-        Args:
-            config: the configuration of a new robot. It is used only if `robot` is None.
-            robot: the robot that replays the steps, or None for a new robot.
-            memory: the memory of the robot's guard, which checks each line to the board; None for a
-                new guard.
-        """
+    def __init__(self, robot: Robot, memory: Memory | None = None) -> None:
+        """Prepare for the first step. `resume` describes the arguments."""
         self.outputs: Outputs | None = None
         """Outputs of the last replayed step; None before the first step."""
         self.comparison = Comparison()
-        self.resume(robot or Robot(config), memory)
+        self.resume(robot, memory)
         self._checksum = self._names = 0
         self._pose: Micropose = (0, 0, 0)
 
     def resume(self, robot: Robot, memory: Memory | None) -> None:
-        """Replay the next steps with another robot, for example after missing steps.
+        """Replay the next steps with `robot`, for example after missing steps.
 
         `memory` is the memory of this robot's guard, which checks each line to the board. It is
         None for a new guard.

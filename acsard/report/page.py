@@ -194,8 +194,7 @@ def make_report(
         recording: the recording to replay.
         library: the JavaScript code of plotly.
         span: the part of the recording that the report shows.
-        progress: function that is called every `PROGRESS_STEPS` steps with the wall-clock time of
-            the step, ns since 1970.
+        progress: shows the progress. It is called every `PROGRESS_STEPS` steps.
 
     Raises:
         RecordingError: the part has no step, or the recording cannot be replayed.

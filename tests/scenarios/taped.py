@@ -144,8 +144,7 @@ def chunks(data: bytes | bytearray) -> list[tuple[int, int]]:
 
 def replayed(tape: Tape, config: Config, first: int = 0) -> Replay:
     """Replay the tape, from the start or from one of its states."""
-    state = thaw(tape.states[first]) if first else ()
-    replay = Replay(config, *state)
+    replay = Replay(*(thaw(tape.states[first]) if first else (Robot(config),)))
     for step in tape.steps(first):
         replay.step(step)
     return replay

@@ -188,7 +188,7 @@ def test_a_pose_that_differs_in_one_bit_is_the_same_but_not_exact() -> None:
 def test_a_replay_with_other_limits_reports_the_first_line_that_differs() -> None:
     tape = Tape()
     World(recorder=tape).drive(0.5, seconds=2.0)
-    replay = Replay(SLOW_LIMITS)
+    replay = Replay(Robot(SLOW_LIMITS))
     for step in tape.steps():
         replay.step(step)
     comparison = replay.comparison
@@ -208,7 +208,7 @@ def test_a_replay_may_change_the_limits_in_the_middle_of_a_drive() -> None:
     (first,) = tape.states
     state = thaw(tape.states[first])
     adopt(state.robot, Robot(PLAIN), Robot(SLOW_LIMITS))
-    replay = Replay(SLOW_LIMITS, *state)
+    replay = Replay(*state)
     for step in tape.steps(first):
         replay.step(step)
     comparison = replay.comparison

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import lru_cache
 
 from acsard.core.config.settings import Config
+from acsard.core.robot import Robot
 from acsard.daemon.late_watch import LateWatch
 from acsard.recording.recorded_steps import RecordedStep
 from acsard.recording.replay import Replay
@@ -45,7 +46,7 @@ def report_from(
     daemon's start.
     """
     config = config or Config()
-    report, replay = ReportData(config, begin, end), Replay(config, *(state or ()))
+    report, replay = ReportData(config, begin, end), Replay(*(state or (Robot(config),)))
     for step in steps:
         replay.step(step)
         assert replay.outputs is not None
