@@ -64,16 +64,11 @@ class CalibrationReport(Struct, frozen=True):
 
     log: str
     reference: str
-    """Names of the sensors, or of the measuring tool, with which the wheels were compared.
-
-    Examples are "yaw_rate and positions" and "a tape".
-    """
+    """Names of the sensors, or of the measuring tool, as in `Calibration.reference`."""
     scale: str
-    """Kind of the measurements that show the size of the wheels.
+    """Kind of the measurements that show the size of the wheels, as in `Calibration.scale`.
 
-    The value is "positions" (from a sensor), "distance" (by tape), "positions and distance", or
-    "". If it is "", no measurement shows the size, and the mean of the two wheel radii stays as
-    configured.
+    If it is "", the mean of the two wheel radii stays as configured.
     """
     wheel_separation_multiplier: float
     left_wheel_radius_multiplier: float
@@ -89,17 +84,9 @@ class CalibrationReport(Struct, frozen=True):
     The order is wheel separation, left radius, right radius.
     """
     odometry: dict[str, float]
-    """New values for settings of `[odometry]`, by the name of the setting.
-
-    These settings state the uncertainty of the wheel radii and of the track. The noise settings
-    are included only if their new values describe the log clearly better than the configured ones.
-    """
+    """New values for settings of `[odometry]`, as in `Calibration.odometry`, but rounded."""
     feedback: dict[str, float]
-    """New values for settings of `[feedback]`, by the name of the setting.
-
-    The dictionary is empty if the configured settings cause no false wheel fault in this log, or
-    if no better settings were found.
-    """
+    """New values for settings of `[feedback]`, as in `Calibration.feedback`."""
     effective_track: float
     """Effective track, m: the distance between left and right wheels that explains the turns."""
     effective_track_std: float | None
@@ -132,10 +119,7 @@ class CalibrationReport(Struct, frozen=True):
     """
     distance_noise_after: float | None
     time_offsets: dict[str, float]
-    """Delay of each sensor's recorded times relative to those of the wheels, s, by sensor name.
-
-    A delay is positive if the sensor records the same event with a later time than the wheels.
-    """
+    """Delay of each sensor's recorded times, s, by sensor name, as in `Calibration.delays`."""
     gyro_bias: float
     """Gyro bias, rad/s; 0 without a gyro."""
     runs: int

@@ -18,7 +18,7 @@ from acsard.core.formatting import many
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, Event, Inputs, Outputs, Recording
-from acsard.recording.recorded_steps import FinishedStep, StateBeforeStep, Unfinished
+from acsard.recording.recorded_steps import FinishedStep, StateBeforeStep, StepRecorder, Unfinished
 from acsard.recording.state import MAX_ERROR_LENGTH, freeze
 from acsard.recording.step_writer import Bug, StepWriter
 
@@ -46,7 +46,7 @@ CLOSE_S, MARK_S = 0.5, 0.1
 the file. If the disk is too slow for that, `MARK_S` applies to writing a marker file."""
 
 
-class Recorder:
+class Recorder(StepRecorder):
     """The black box of a running daemon.
 
     The control loop calls `step`, which never waits for the disk. A thread writes the steps to the
@@ -108,11 +108,6 @@ class Recorder:
     def step(
         self, inputs: Inputs, outputs: Outputs, sent: bytes | None, robot: Robot, guard: Guard
     ) -> None:
-        """Record a finished step.
-
-        `sent` is the line that was written to the serial port, or None. `robot` and `guard` are in
-        their state after the step.
-        """
         self._number += 1
         if self._events:
             self._report(self._events.popleft())

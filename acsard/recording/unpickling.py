@@ -88,18 +88,14 @@ def unpickle(data: bytes, find: FindClass) -> object:
     the bytes are damaged, or if they contain anything that a pickled robot never contains.
     """
     if len(data) > MAX_BYTES:
-        raise ValueError(
-            f"the robot state has {len(data)} bytes, more than any real robot needs: the file is "
-            "damaged or forged"
-        )
+        raise _forged(f"the robot state has {len(data)} bytes, more than any real robot needs")
     machine = _Machine(find)
     at = -1
     try:
         for count, (opcode, argument, place) in enumerate(pickletools.genops(data)):
             if count >= MAX_OPCODES:
-                raise ValueError(
-                    "the robot state has more instructions than the state of any real robot: "
-                    "the file is damaged or forged"
+                raise _forged(
+                    "the robot state has more instructions than the state of any real robot"
                 )
             machine.do(opcode.name, argument)
             at = place or 0
@@ -108,6 +104,10 @@ def unpickle(data: bytes, find: FindClass) -> object:
     if at + 1 != len(data):
         raise ValueError("there is data after the end of the robot state")
     return machine.result()
+
+
+def _forged(what: str) -> ValueError:
+    return ValueError(f"{what}: the file is damaged or forged")
 
 
 class _Entry:
@@ -129,16 +129,10 @@ class _Entry:
         Raises `ValueError` if the value must not grow, or if it exceeds a limit.
         """
         if self.closed:
-            raise ValueError(
-                "a part of the robot state contains itself, or grows after it was used: the file "
-                "is damaged or forged"
-            )
+            raise _forged("a part of the robot state contains itself, or grows after it was used")
         for part in parts:
             if isinstance(part.value, type):
-                raise ValueError(
-                    "the robot state has a class where a value should be: the file is damaged or "
-                    "forged"
-                )
+                raise _forged("the robot state has a class where a value should be")
             self.depth = max(self.depth, 1 + part.depth)
             self.size += part.size
         if self.depth > MAX_DEPTH:
@@ -147,10 +141,7 @@ class _Entry:
                 f"than {MAX_DEPTH}"
             )
         if self.size > MAX_PARTS:
-            raise ValueError(
-                "the robot state has more values than the state of any real robot: the file is "
-                "damaged or forged"
-            )
+            raise _forged("the robot state has more values than the state of any real robot")
 
 
 class _Machine:
@@ -184,9 +175,9 @@ class _Machine:
                 | "BINUNICODE" | "SHORT_BINBYTES" | "BINBYTES"
             ):  # fmt: skip
                 if type(argument) is int and argument.bit_length() > MAX_INT_BITS:
-                    raise ValueError(
+                    raise _forged(
                         f"the robot state has a number of {argument.bit_length()} bits, too large "
-                        "for a real robot: the file is damaged or forged"
+                        "for a real robot"
                     )
                 self._push(argument)
             case "NONE":
@@ -232,9 +223,8 @@ class _Machine:
             case "PROTO" | "FRAME" | "STOP":
                 pass
             case _:
-                raise ValueError(
-                    f"the robot state has the pickle opcode {name}, which this acsard never "
-                    "writes: the file is damaged or forged"
+                raise _forged(
+                    f"the robot state has the pickle opcode {name}, which this acsard never writes"
                 )
 
     def _push(self, value: object) -> None:
@@ -262,10 +252,7 @@ class _Machine:
     def _copies(self, entry: _Entry) -> None:
         self._copied += entry.size
         if self._copied > MAX_COPIED_PARTS:
-            raise ValueError(
-                "the robot state copies more values than the state of any real robot: the file is "
-                "damaged or forged"
-            )
+            raise _forged("the robot state copies more values than the state of any real robot")
 
     def _append(self, parts: list[_Entry]) -> None:
         whole = self._stack[-1]
@@ -326,9 +313,9 @@ class _Machine:
         (state,) = self._top(1)
         whole, named = self._stack[-1], state.value
         if not _is_part(type(whole.value)) or not isinstance(named, dict):
-            raise ValueError(
+            raise _forged(
                 f"the robot state sets attributes of a {type(whole.value).__name__}, which this "
-                "acsard never writes: the file is damaged or forged"
+                "acsard never writes"
             )
         for name in named:
             if not isinstance(name, str) or hasattr(type(whole.value), name):

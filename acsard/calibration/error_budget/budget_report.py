@@ -115,19 +115,20 @@ def _table(budget: Budget) -> Table:
 
 
 def _track(budget: Budget, learned: float) -> str:
-    implied = f"{learned:.3f} (standard deviation {budget.learned_std:.3f})"
+    implied = (
+        f"According to the gyro, drive.wheel_separation_multiplier should be {learned:.3f} "
+        f"(standard deviation {budget.learned_std:.3f})."
+    )
     if budget.learned_used:
         return (
-            f"According to the gyro, drive.wheel_separation_multiplier should be {implied}. "
-            "Odometry uses this value while no gyro messages arrive; the configured value is "
-            f"{budget.multiplier:.3f}."
+            f"{implied} Odometry uses this value while no gyro messages arrive; the configured "
+            f"value is {budget.multiplier:.3f}."
         )
     return (
-        f"According to the gyro, drive.wheel_separation_multiplier should be {implied}. Odometry "
-        f"uses the configured value, {budget.multiplier:.3f}. If the two values differ on the "
-        "ground where the robot works, either run `acsard calibrate`, or set [odometry] "
-        "learned_track = true: odometry then uses the value that it learned from the gyro while no "
-        "gyro messages arrive."
+        f"{implied} Odometry uses the configured value, {budget.multiplier:.3f}. If the two values "
+        "differ on the ground where the robot works, either run `acsard calibrate`, or set "
+        "[odometry] learned_track = true: odometry then uses the value that it learned from the "
+        "gyro while no gyro messages arrive."
     )
 
 
