@@ -326,7 +326,7 @@ def _of_positions(
         if points := sum(len(segment.t) for segment in out):
             run = fold.drive.run
             new = {run: path(steps[run], base, fold.parameters)}
-            errors = spread(out, present, configured), spread(out, new, fold.parameters)
+            errors = spread(out, present), spread(out, new)
             squares[number] = [*(points * error**2 for error in errors), points]
     return squares
 

@@ -535,14 +535,12 @@ def _of_drive(fold: Fold, sensors: Reference) -> Iterator[_Window]:
             at = t + late
             whole = inside(at[:1], at[-1:], heading.gaps) & inside(t[:1], t[-1:], run.gaps)
             if whole[0]:
-                yield _by_headings(t, at, heading, way, track, sensors.headings, parameters)
+                yield _by_headings(t, at, heading, way, track, sensors.headings)
     if sensors.places:
         for segment in positions_of(drive, sensors.runs):
             for t in _times(float(segment.t[0]), float(segment.t[-1])):
                 part = slice(*np.searchsorted(segment.t, (t[0], t[-1])))
-                yield from _by_places(
-                    t, segment.t[part], segment.place[part], way, track, parameters
-                )
+                yield from _by_places(t, segment.t[part], segment.place[part], way, track)
 
 
 def _times(begin: float, end: float) -> Iterator[Floats]:
@@ -555,14 +553,13 @@ def _times(begin: float, end: float) -> Iterator[Floats]:
 
 
 def _by_headings(
-    t: Floats, at: Floats, heading: Heading, way: WheelPath, track: float, headings: Headings,
-    parameters: Floats,
-) -> _Window:  # fmt: skip
+    t: Floats, at: Floats, heading: Heading, way: WheelPath, track: float, headings: Headings
+) -> _Window:
     """Return a window whose residuals are measured headings minus headings from the wheels.
 
     `t` are times on the wheels' clock, and `at` the same moments on the sensor's clock.
     """
-    motion, since = _Motion.of(t, way, track), t - t[0]
+    motion, since, parameters = _Motion.of(t, way, track), t - t[0], way.parameters
     turned = np.interp(at, heading.t, heading.angle) - parameters[Parameter.BIAS_ERROR] * since
     residual = turned / (1 + parameters[Parameter.SCALE_ERROR]) - np.interp(t, way.t, way.heading)
     yaw = (motion.middle < t[:, None]).astype(np.float64)
@@ -576,7 +573,7 @@ def _by_headings(
 
 
 def _by_places(
-    t: Floats, at: Floats, place: Complexes, way: WheelPath, track: float, parameters: Floats
+    t: Floats, at: Floats, place: Complexes, way: WheelPath, track: float
 ) -> Iterator[_Window]:
     """Yield a window of position residuals: measured position minus the path of the robot.
 
@@ -585,11 +582,11 @@ def _by_places(
     positions. If a time has no position, nothing is yielded. `place` contains the positions (x +
     iy, m), and `at` their times, s. `t` and `at` are times on the clock of the positions.
     """
-    group = np.searchsorted((t[1:] + t[:-1]) / 2, at)
+    group, delay_s = np.searchsorted((t[1:] + t[:-1]) / 2, at), way.parameters[Parameter.DELAY]
     numbers = range(len(t))
     if np.bincount(group, minlength=len(t)).min() == 0:
         return
-    along = way.at(at, parameters)[0]
+    along = way.at(at)[0]
     centred, centred_path = place - place.mean(), along - along.mean()
     match = complex(np.vdot(centred_path, centred))
     off = centred * np.conj(match / abs(match) if match else 1.0) - centred_path
@@ -597,10 +594,8 @@ def _by_places(
         [complex(np.median(o.real), np.median(o.imag)) for o in (off[group == n] for n in numbers)]
     )
     spots = np.array([along[group == number].mean() for number in numbers])
-    times = (
-        np.array([at[group == number].mean() for number in numbers]) - parameters[Parameter.DELAY]
-    )
-    motion = _Motion.of(t - parameters[Parameter.DELAY], way, track)
+    times = np.array([at[group == number].mean() for number in numbers]) - delay_s
+    motion = _Motion.of(t - delay_s, way, track)
     before = motion.middle < times[:, None]
     ahead = np.exp(1j * np.interp(motion.middle, way.t, way.heading))
     lever = spots[:, None] - np.interp(motion.middle, way.t, way.place)

@@ -86,6 +86,8 @@ class WheelPath(Struct, frozen=True):
     It is interpolated linearly between the times `t`.
     """
 
+    parameters: Floats
+    """Parameters with which the path was computed, shape (PARAMETER_COUNT,)."""
     t: Floats
     """Times of the points of the path, s."""
     place: Complexes
@@ -98,33 +100,35 @@ class WheelPath(Struct, frozen=True):
     """Derivatives of `heading` with respect to the radii, the inverse track and the track growth.
     """
 
-    def at(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
+    def at(self, t: Floats) -> tuple[Complexes, Complexes]:
         """Return the places of the position sensor at the times `t`, m, and their derivatives.
 
         `t` contains recorded times of positions, s. The delay `Parameter.DELAY` is subtracted from
         them. The derivatives are with respect to the parameters, and have the shape (times,
         PARAMETER_COUNT).
         """
-        t = t - parameters[Parameter.DELAY]
+        t = t - self.parameters[Parameter.DELAY]
         derivatives = np.zeros((len(t), PARAMETER_COUNT), dtype=np.complex128)
-        here, ahead = self._sensor(t, parameters)
-        lever = 1j * complex(parameters[Parameter.SENSOR_X], parameters[Parameter.SENSOR_Y]) * ahead
+        here, ahead = self._sensor(t)
+        lever = 1j * self._mounting * ahead
         for index, values in self.derivatives.items():
             turned = np.interp(t, self.t, self.heading_derivatives[index])
             derivatives[:, index] = np.interp(t, self.t, values) + lever * turned
         derivatives[:, Parameter.SENSOR_X], derivatives[:, Parameter.SENSOR_Y] = ahead, 1j * ahead
         before, after = (
-            self._sensor(t + s, parameters)[0]
-            for s in (-SPEED_HALF_INTERVAL_S, SPEED_HALF_INTERVAL_S)
+            self._sensor(t + s)[0] for s in (-SPEED_HALF_INTERVAL_S, SPEED_HALF_INTERVAL_S)
         )
         derivatives[:, Parameter.DELAY] = (before - after) / (2 * SPEED_HALF_INTERVAL_S)
         return here, derivatives
 
-    def _sensor(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
+    @property
+    def _mounting(self) -> complex:
+        return complex(self.parameters[Parameter.SENSOR_X], self.parameters[Parameter.SENSOR_Y])
+
+    def _sensor(self, t: Floats) -> tuple[Complexes, Complexes]:
         """Return the places of the sensor, x + iy, m, and the headings as unit complex numbers."""
         ahead = np.exp(1j * np.interp(t, self.t, self.heading))
-        lever = complex(parameters[Parameter.SENSOR_X], parameters[Parameter.SENSOR_Y])
-        return np.interp(t, self.t, self.place) + lever * ahead, ahead
+        return np.interp(t, self.t, self.place) + self._mounting * ahead, ahead
 
 
 def segments(driven: Sequence[Run], parts: Sequence[Block]) -> list[Segment]:
@@ -205,7 +209,7 @@ def path(steps: WheelSteps, base: Base, parameters: Floats) -> WheelPath:
         middle = heading_derivatives[index][:-1] + of_step / 2
         derivatives[index] = cumulative(ahead * (rolls.get(index, 0.0) + 1j * distance * middle))
     return WheelPath(
-        steps.t, cumulative(ahead * distance), heading, derivatives, heading_derivatives
+        parameters, steps.t, cumulative(ahead * distance), heading, derivatives, heading_derivatives
     )
 
 
@@ -252,14 +256,14 @@ class Aligned(Struct, frozen=True):
     """
 
 
-def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> Iterator[Aligned]:
+def aligned(segments: Sequence[Segment], paths: Paths) -> Iterator[Aligned]:
     """Yield the positions of each segment, compared with the path computed from the wheels.
 
     The path is first shifted and rotated so that it fits the positions best. Outliers have smaller
     weights.
     """
     for segment in segments:
-        place, derivatives = paths[segment.run].at(segment.t, parameters)
+        place, derivatives = paths[segment.run].at(segment.t)
         weight = np.ones(len(place))
         for _ in range(3):
             share = weight / weight.sum()
@@ -278,20 +282,17 @@ def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> It
         yield Aligned(segment.block, root * residual, root[:, None] * columns)
 
 
-def evidence(
-    segments: Sequence[Segment], paths: Paths, parameters: Floats, blocks: int
-) -> Evidence:
+def evidence(segments: Sequence[Segment], paths: Paths, blocks: int) -> Evidence:
     """Return the evidence of the positions: their contribution to the normal equations of the fit.
 
-    The caller must have computed `paths` with the same `parameters`. `blocks` is the number of
-    blocks (a few seconds of driving each).
+    `blocks` is the number of blocks (a few seconds of driving each).
     """
     normal, score = (
         np.zeros((blocks, PARAMETER_COUNT, PARAMETER_COUNT)),
         np.zeros((blocks, PARAMETER_COUNT)),
     )
     squares, counts = np.zeros(blocks), np.zeros(blocks)
-    for part in aligned(segments, paths, parameters):
+    for part in aligned(segments, paths):
         conj = np.conj(part.derivatives.T)
         normal[part.block] += np.real(conj @ part.derivatives)
         score[part.block] += np.real(conj @ part.residual)
@@ -301,14 +302,14 @@ def evidence(
     return Evidence(normal, score, squares, counts)
 
 
-def spread(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> float:
+def spread(segments: Sequence[Segment], paths: Paths) -> float:
     """Return the RMS distance between the measured positions and the paths of the wheels, m.
 
     Each path is first shifted and rotated so that it fits the positions best. Outliers have smaller
     weights.
     """
     squares, count = 0.0, 0
-    for part in aligned(segments, paths, parameters):
+    for part in aligned(segments, paths):
         squares += float(np.sum(np.abs(part.residual) ** 2))
         count += len(part.residual)
     return float(np.sqrt(squares / max(1, count)))
@@ -521,14 +522,14 @@ def _refined(
     segments = [replace(segment, block=number) for number, segment in enumerate(few)]
 
     def source(parameters: Floats) -> Evidence:
-        return evidence(segments, paths(parameters), parameters, len(segments))
+        return evidence(segments, paths(parameters), len(segments))
 
     def paths(parameters: Floats) -> dict[int, WheelPath]:
         return {run: path(of_run, base, parameters) for run, of_run in steps.items()}
 
     def unexplained(parameters: Floats) -> float:
         squares = sum(float(np.sum(np.abs(s.place - s.place.mean()) ** 2)) for s in segments)
-        off = spread(segments, paths(parameters), parameters)
+        off = spread(segments, paths(parameters))
         return off**2 * sum(len(s.t) for s in segments) / squares if squares else np.inf
 
     before = StartingPoint(point.parameters, unexplained(point.parameters))

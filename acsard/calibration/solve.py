@@ -249,7 +249,7 @@ def prepared(
         plausibility.positions_follow(by_positions)
         sources.append(
             lambda p: positions.evidence(
-                segments, [positions.path(g, base, p) for g in steps], p, count
+                segments, [positions.path(g, base, p) for g in steps], count
             )
         )
         start = by_positions.parameters.copy()
@@ -534,7 +534,7 @@ def _too_good(made: Prepared, fitted: Fit, log: Log) -> Iterator[str]:
     if made.segments and not log.true_positions:
         along = [positions.path(steps, base, fitted.parameters) for steps in made.steps]
         reach = max(positions.extent(segment.place) for segment in made.segments)
-        if positions.spread(made.segments, along, fitted.parameters) < MIN_DIFFERENCE * reach:
+        if positions.spread(made.segments, along) < MIN_DIFFERENCE * reach:
             yield _copied_from_wheels("the positions")
 
 

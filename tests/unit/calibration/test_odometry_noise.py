@@ -428,7 +428,7 @@ def test_positions_that_are_recorded_a_second_later_give_the_same_window() -> No
     trip = LOG[0]
     run = log_of_runs([trip], gyro=False).runs[0]
     early = BASE.start()
-    way = path(wheel_steps(run), BASE, early)
+    steps = wheel_steps(run)
     times = np.linspace(2.0, 20.0, 6)
     within = (run.place_t >= 2.0) & (run.place_t <= 20.0)
     late = early.copy()
@@ -437,7 +437,7 @@ def test_positions_that_are_recorded_a_second_later_give_the_same_window() -> No
         next(
             odometry_noise._by_places(
                 times + p[Parameter.DELAY], run.place_t[within] + p[Parameter.DELAY],
-                run.place[within], way, 0.3, p,
+                run.place[within], path(steps, BASE, p), 0.3,
             )
         )
         for p in (early, late)

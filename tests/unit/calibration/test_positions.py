@@ -27,7 +27,7 @@ def of(drive: Drive):  # type: ignore[no-untyped-def]
 def test_the_true_parameters_leave_no_residual() -> None:
     run, segments = of(ideal())
     paths = [positions.path(positions.wheel_steps(run), BASE, TRUE)]
-    assert positions.spread(segments, paths, TRUE) < 0.001
+    assert positions.spread(segments, paths) < 0.001
 
 
 def test_a_path_without_derivatives_is_the_same_path() -> None:
@@ -39,11 +39,11 @@ def test_a_path_without_derivatives_is_the_same_path() -> None:
 def test_derivatives_are_those_of_the_position_of_the_sensor() -> None:
     run, _ = of(ideal())
     steps, t = positions.wheel_steps(run), np.arange(5.0, 20.0, 0.7)
-    place, derivatives = positions.path(steps, BASE, OFF).at(t, OFF)
+    place, derivatives = positions.path(steps, BASE, OFF).at(t)
     for index in range(PARAMETER_COUNT):
         more = OFF.copy()
         more[index] += 1e-5
-        moved, _ = positions.path(steps, BASE, more).at(t, more)
+        moved, _ = positions.path(steps, BASE, more).at(t)
         size = np.abs(derivatives[:, index]).max()
         assert np.allclose((moved - place) / 1e-5, derivatives[:, index], atol=0.01 * size)
 
@@ -54,22 +54,20 @@ def test_a_jump_of_the_source_costs_no_more_than_its_block_s_alignment() -> None
     run, segments = of(replace(drive, place=moved))
     assert len(positions.jumps(run)) == 1
     paths = [positions.path(positions.wheel_steps(run), BASE, TRUE)]
-    assert positions.spread(segments, paths, TRUE) < 0.001
+    assert positions.spread(segments, paths) < 0.001
 
 
 def test_outliers_are_removed() -> None:
     run, segments = of(usual())
     assert len(positions.jumps(run)) >= 4
     paths = [positions.path(positions.wheel_steps(run), BASE, TRUE)]
-    assert positions.spread(segments, paths, TRUE) < 0.05
+    assert positions.spread(segments, paths) < 0.05
 
 
 def test_one_step_by_the_evidence_reaches_the_true_parameters() -> None:
     run, segments = of(ideal())
     near = TRUE + np.array([0.002, -0.001, 0.002, 0, 0, 0, 0])
-    made = positions.evidence(
-        segments, [positions.path(positions.wheel_steps(run), BASE, near)], near, 9
-    )
+    made = positions.evidence(segments, [positions.path(positions.wheel_steps(run), BASE, near)], 9)
     step = np.linalg.lstsq(made.normal.sum(axis=0)[:3, :3], made.score.sum(axis=0)[:3], rcond=None)
     assert near[:3] + step[0] == pytest.approx(TRUE[:3], abs=3e-4)
 
