@@ -155,8 +155,8 @@ def positions_of(drive: Block, driven: Sequence[Run]) -> list[Segment]:
     return segments(driven, [piece for piece in pieces if piece.end > piece.begin])
 
 
-def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rates) -> list[Fold]:
-    """Return a fold for each drive in `left_out`, with the parameters that fit all other drives.
+def folds(fit: Fit, parts: Sequence[Block], driven: Sequence[Run], rate: Rates) -> list[Fold]:
+    """Return a fold for each of `drives(driven)`, with the parameters that fit all other drives.
 
     `parts` are the blocks (a few seconds each) of the fit. A fold leaves out each block that
     overlaps its drive in time. A drive gets no fold if no block overlaps it, or if all blocks do.
@@ -166,7 +166,7 @@ def folds(fit: Fit, parts: Sequence[Block], left_out: Sequence[Block], rate: Rat
         np.array(column) for column in zip(*((p.run, p.begin, p.end) for p in parts), strict=True)
     )
     result = []
-    for drive in left_out:
+    for drive in drives(driven):
         out = (run == drive.run) & (begin < drive.end - 1e-6) & (end > drive.begin + 1e-6)
         if out.any() and not out.all():
             result.append(Fold(drive, out, with_constant_track(fit.without(out), rate)))

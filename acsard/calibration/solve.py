@@ -17,7 +17,6 @@ from acsard.calibration.heading import Headings, Rates, Rows, rates
 from acsard.calibration.improvement import (
     UNMEASURED,
     Improvement,
-    drives,
     folds,
     improvement,
     no_better,
@@ -356,7 +355,7 @@ def _noise(
     the fitted geometry.
     """
     made, fitted = best.made, best.fitted
-    test_folds = folds(fitted, made.parts, drives(made.runs), best.rate)
+    test_folds = folds(fitted, made.parts, made.runs, best.rate)
     if present:
         start = made.base.configured(fitted.parameters)
         test_folds = [replace(fold, parameters=start) for fold in test_folds]
@@ -432,7 +431,7 @@ def _candidate(made: Prepared, fitted: Fit) -> Candidate:
     gyro_bias = (headings.bias if headings is not None else 0.0) + bias_error
     rows = replace(rows, turned=(rows.turned - bias_error * rows.seconds) / gyro_scale)
     rate = rates(rows, by_wheels)
-    test_folds = folds(fitted, made.parts, drives(made.runs), rate)
+    test_folds = folds(fitted, made.parts, made.runs, rate)
     places = [positions_of(fold.drive, made.runs) if made.segments else [] for fold in test_folds]
     better = improvement(
         test_folds, base.configured(fitted.parameters), base, rows, places, made.steps

@@ -69,7 +69,6 @@ SILENT_STEPS: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
 They send only zero speeds and questions.
 """
 
-Tell = Callable[[Finding], None]
 Step = Callable[[], Finding | None]
 
 LATE_AGAIN, LATE_MOST = 2, 8
@@ -99,7 +98,7 @@ def run(
     wire: Wire,
     operator: Operator,
     config: Config,
-    tell: Tell,
+    tell: Callable[[Finding], None],
     asleep_ns: Callable[[], int] = lambda: 0,
 ) -> None:
     """Check one microcontroller, and call `tell` with each finding as soon as it is known.

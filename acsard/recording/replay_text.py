@@ -88,15 +88,19 @@ def describe_difference(difference: Difference, began_ns: int) -> list[str]:
         difference: the first step whose recorded and replayed outputs differ.
         began_ns: the monotonic time at which the recording began, ns.
     """
-    seconds = (difference.at.mono_ns - began_ns) / 1e9
     what = ", ".join(difference.what)
     return [
-        f"the first difference is in step {difference.number}, {seconds:.3f} s after the "
+        f"the first difference is in step {difference.number}, "
+        f"{_seconds(difference, began_ns):.3f} s after the "
         f"beginning of the recording: {what}",
         *_side("recorded", difference.recorded),
         *_side("replayed", difference.replayed),
         *([f"            the guard: {difference.trip}"] if difference.trip else []),
     ]
+
+
+def _seconds(difference: Difference, began_ns: int) -> float:
+    return (difference.at.mono_ns - began_ns) / NS_PER_S
 
 
 def _side(name: str, outputs: RecordedOutputs) -> list[str]:
@@ -141,20 +145,18 @@ def explain_settings(
     first, fault = comparison.first_by_output.get("line"), comparison.fault
     if first is not None:
         if first is not comparison.first:
-            seconds = (first.at.mono_ns - began_ns) / 1e9
             rows.append(
                 f"the first line to the board that differs is in step {first.number}, "
-                f"{seconds:.3f} s after the beginning of the recording"
+                f"{_seconds(first, began_ns):.3f} s after the beginning of the recording"
             )
         speeds = _speeds(max_wheel_speed(first.recorded.line), max_wheel_speed(first.replayed.line))
         shaping = [key for key in keys if key.startswith(LINE_SETTINGS)]
         because = f", because of {', '.join(shaping[:MAX_KEYS])}" if shaping else ""
         rows.append(f"the highest wheel speed in the first line that differs: {speeds}{because}")
     if fault is not None:
-        seconds = (fault.at.mono_ns - began_ns) / 1e9
         rows.append(
-            f"the replayed robot is in the mode fault from t = {seconds:.3f} s onward: "
-            f"{printable(fault.replayed.status[1])}"
+            "the replayed robot is in the mode fault from "
+            f"t = {_seconds(fault, began_ns):.3f} s onward: {printable(fault.replayed.status[1])}"
         )
         if first is not None and first.number < fault.number:
             rows.append(

@@ -17,7 +17,7 @@ from acsard.core.values import NS_PER_S, AcsardError, Instant
 from acsard.recording.file import Recording
 from acsard.recording.recorded_steps import RecordedStep
 from acsard.recording.rows import BatchError, decode
-from acsard.recording.timeline import MIN_CLOCK_CHANGE_NS
+from acsard.recording.timeline import MIN_CLOCK_CHANGE_NS, clock_change_ns
 
 
 class Span(NamedTuple):
@@ -312,8 +312,7 @@ def read_contents(recording: Recording) -> Contents | None:
                 first = batch[0]
                 stretch_list.append(_from(recording, first.inputs.now))
             for previous, other in pairwise(times):
-                ahead_ns = other.wall_ns - other.mono_ns - previous.wall_ns + previous.mono_ns
-                if abs(ahead_ns) >= MIN_CLOCK_CHANGE_NS:
+                if abs(clock_change_ns(previous, other)) >= MIN_CLOCK_CHANGE_NS:
                     stretch_list[-1] = stretch_list[-1]._replace(end=previous.wall_ns / NS_PER_S)
                     stretch_list.append(_from(recording, other))
         last_ns, before = wall_ns, data

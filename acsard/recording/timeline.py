@@ -69,6 +69,14 @@ NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
 numbers count as equal."""
 
 
+def clock_change_ns(before: Instant, after: Instant) -> int:
+    """Return by how much the wall clock was set forward between two times, ns.
+
+    The result is negative if the clock was set back.
+    """
+    return after.wall_ns - after.mono_ns - before.wall_ns + before.mono_ns
+
+
 class TimelineEntry(Struct, frozen=True, omit_defaults=True):
     """An event of the daemon's log, or another entry of a recording's timeline."""
 
@@ -397,10 +405,7 @@ class TimelineWriter:
         self._shutting_down = step.inputs.shutting_down
 
     def _clock(self, now: Instant) -> Iterator[TimelineEntry]:
-        last = self._now
-        if last is None:
-            return
-        ahead_ns = now.wall_ns - now.mono_ns - last.wall_ns + last.mono_ns
+        ahead_ns = 0 if self._now is None else clock_change_ns(self._now, now)
         if abs(ahead_ns) < MIN_CLOCK_CHANGE_NS:
             return
         way = "forward" if ahead_ns > 0 else "back"

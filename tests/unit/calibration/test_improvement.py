@@ -31,7 +31,7 @@ def cross_validation(drive: Drive, *, places: bool = True) -> tuple[list[Fold], 
     log = table(drive, places=places)
     made, runs = ready(log), log_of(log).runs
     fitted = fit(made.sources, made.start, places=places)
-    cv_folds = folds(fitted, made.parts, drives(runs), RATE)
+    cv_folds = folds(fitted, made.parts, runs, RATE)
     segments = [positions_of(fold.drive, runs) for fold in cv_folds]
     return cv_folds, improvement(cv_folds, BASE.start(), BASE, made.rows, segments, made.steps)
 
