@@ -26,7 +26,7 @@ import os
 import stat
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Literal
@@ -351,14 +351,8 @@ class RecordingWriter:
         self.end_chunk()
         for record in self._about:
             self._write(record)
-        self._write(Metadata(END_RECORD_NAME, as_metadata(self._end_builder.end_record(cut, why))))
-        self._write(DataEnd(0))
-        summary_at = self._file.tell()
-        for record in (*_definitions(), *self._index.records()):
-            self._write(record)
-        # In MCAP a checksum of 0 means that the checksum is absent.
-        self._write(Footer(summary_at, 0, 0))
-        self._file.write(MAGIC)
+        last, at = self._end_builder.end_record(cut, why), self._file.tell()
+        self._file.write(file_end(last, self._index, at, _definitions()))
         self._sync()
         self._file.close()
 
@@ -369,6 +363,26 @@ class RecordingWriter:
         except OSError:
             # A disk that refuses to write also refuses the rest of the buffer.
             pass
+
+
+def file_end(
+    last: EndRecord, index: Index, at: int, definitions: Iterable[McapRecord] = ()
+) -> bytes:
+    """Return the last bytes of an MCAP file: end record, summary section and footer.
+
+    Args:
+        last: the end record.
+        index: the statistics and the index of the file. The end record is added to it.
+        at: the offset in the file at which the caller writes the bytes.
+        definitions: the schema and the channels, for the summary section.
+    """
+    record = Metadata(END_RECORD_NAME, as_metadata(last))
+    data = encoded(record)
+    index.record(record, at, len(data))
+    data += encoded(DataEnd(0))
+    # In MCAP a checksum of 0 means that the checksum is absent.
+    footer = Footer(at + len(data), 0, 0)
+    return data + encoded(*definitions, *index.records(), footer) + MAGIC
 
 
 def _about_records(about: About) -> list[McapRecord]:

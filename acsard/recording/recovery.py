@@ -14,12 +14,12 @@ from contextlib import suppress
 from io import FileIO
 from pathlib import Path
 
-from mcap.records import Attachment, DataEnd, Footer, Metadata
+from mcap.records import Attachment, Footer
 
 from acsard.core.formatting import many
 from acsard.host.errors import RecordingError
-from acsard.recording.end_record import END_RECORD_NAME, EndRecord, as_metadata
-from acsard.recording.file import EndRecordBuilder, Index, Recording, event_of, rewrite
+from acsard.recording.end_record import EndRecord
+from acsard.recording.file import EndRecordBuilder, Index, Recording, event_of, file_end, rewrite
 from acsard.recording.mcap_records import LAST_BLOCK, MAGIC, chunk_places, encoded, walk
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -189,7 +189,10 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
     if not chunk.complete:
         before_end = LAST_BLOCK
         heads.append((chunk.begin, chunk.head(before)))
-    end = before_end + _end(last, index, chunk.end + len(before_end))
+    # The summary section does not repeat the schema and the channels, because the disk may be
+    # nearly full. It has the statistics, because some readers treat a file without statistics as
+    # empty.
+    end = before_end + file_end(last, index, chunk.end + len(before_end))
     return [(chunk.end, end), *heads], chunk.end + len(end)
 
 
@@ -199,19 +202,3 @@ def _write_at(stream: FileIO, at: int, data: bytes) -> None:
     while data:
         data = data[stream.write(data) :]
     os.fsync(stream.fileno())
-
-
-def _end(last: EndRecord, index: Index, at: int) -> bytes:
-    """Return the last bytes of an MCAP file: end record, summary section and footer.
-
-    The caller writes them at the offset `at`.
-    """
-    # The summary section does not repeat the schema and the channels, because the disk may be
-    # nearly full. It has the statistics, because some readers treat a file without statistics as
-    # empty.
-    record = Metadata(END_RECORD_NAME, as_metadata(last))
-    data = encoded(record)
-    index.record(record, at, len(data))
-    data += encoded(DataEnd(0))
-    summary_at = at + len(data)
-    return data + encoded(*index.records(), Footer(summary_at, 0, 0)) + MAGIC
