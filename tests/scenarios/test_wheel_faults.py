@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from contextlib import ExitStack
 from typing import Literal
 
 import pytest
@@ -240,6 +241,40 @@ def test_a_wheel_that_is_ignored_as_dead_leaves_the_turn_rate_uncertain() -> Non
     truth = (made.mcu.vehicle.pose.yaw - before) / 0.1
     assert abs(truth) > 0.5
     assert made.odom.twist.covariance[35] > (truth / 3) ** 2
+
+
+@pytest.mark.parametrize("kind", ["dead motor", "reversed motor", "both right encoders"])
+@pytest.mark.parametrize(("linear", "angular"), [(0.5, 0.0), (0.3, 1.0)])
+def test_a_wheel_that_may_be_right_although_it_is_ignored_is_in_the_covariance(
+    kind: str, linear: float, angular: float
+) -> None:
+    """The noise of the wheels is small here, so the covariance comes from the fault."""
+    odometry = OdometryConfig(
+        distance_variance_per_metre=1e-6,
+        yaw_variance_per_metre=1e-6,
+        yaw_variance_per_radian=1e-5,
+        left_wheel_radius_multiplier_std=1e-4,
+        right_wheel_radius_multiplier_std=1e-4,
+        wheel_separation_multiplier_std=1e-3,
+    )
+    made = World(Config(odometry=odometry))
+    made.run(1.5)
+    made.drive(linear, angular, seconds=2.0)
+    before = off(made)[1]
+    with ExitStack() as faults:
+        if kind == "both right encoders":
+            mcu = made.mcu
+            faults.enter_context(pytest.MonkeyPatch.context()).setattr(
+                mcu, "_speeds", lambda now, read=mcu._speeds: [0.0, *read(now)[1:3], 0.0]
+            )
+        else:
+            fault = made.mcu.dead_motor if kind == "dead motor" else made.mcu.reversed_motor
+            faults.enter_context(fault(0))
+        made.hold(linear, angular, seconds=1.0)
+        made.run(1.0)
+    assert made.state.mode == "fault"
+    error, std = off(made)[1] - before, math.sqrt(made.odom.pose.covariance[35])
+    assert 0.1 < error < 2.0 * std
 
 
 def test_slip_makes_the_covariance_a_hundred_times_as_large() -> None:

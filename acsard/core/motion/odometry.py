@@ -39,7 +39,7 @@ from acsard.core.motion.gyro import REST_S, Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.motion.path import Path
-from acsard.core.motion.uncertainty import ASSUMED_COUNTS, PoseUncertainty
+from acsard.core.motion.uncertainty import ASSUMED_COUNTS, Missed, PoseUncertainty
 from acsard.core.values import (
     REST,
     STILL,
@@ -51,8 +51,9 @@ from acsard.core.values import (
 )
 
 MISSED_STD = math.sqrt(0.5)
-"""Standard deviation of the motion that is missed in a gap if the board did not receive the command
-to rest, as a fraction of this motion. The board received the command with the probability 1/2."""
+"""Standard deviation of a motion that the pose may have missed, as a fraction of this motion. The
+pose has missed the motion with the probability 1/2: the board may have received the command to rest
+in a gap or not, and a wheel that contradicts another one or its command may be right or not."""
 
 MAX_RECOMPUTED_LINES = 128
 """Largest number of feedback lines that are recomputed when a wheel proves faulty."""
@@ -253,6 +254,7 @@ class Odometry:
         if rolled.unknown > 0.0:
             self._add_unseen_motion(rolled.unknown, before, twist)
         turned = self._move(self._settled(rolled, at_rest), turn, speeds, slips)
+        self._doubt_wheels(rolled.seen, rolled.seconds)
         self._go_on(rolled, feedback, before, twist)
         variances = self._twist_variances(twist, feedback, at_rest, turn, slips)
         if turn is not None and dt > 0.0:
@@ -307,6 +309,8 @@ class Odometry:
             arcs = self._arcs(step.pieces, step.gyro, step.share)
             for distance, angle in arcs:
                 self._path.advance(distance, angle)
+            for piece in step.pieces:
+                self._doubt_wheels(piece, 0.0)
             if step.on_trial:
                 on_trial += math.fsum([angle for _, angle in arcs]) - step.turn
         self._steps.clear()
@@ -364,13 +368,28 @@ class Odometry:
             by_counts, turn_by_counts = self._rounded(bridged)
             self._uncertainty.doubt(along + by_counts, yaw + turn_by_counts)
             if rolled.missed != AT_REST:
-                ((distance, turn),) = self._arcs((rolled.missed,), None, self._track.share)
-                turn = 0.0 if self.checks.turn is not None else turn
-                self._uncertainty.miss(MISSED_STD * distance, MISSED_STD * turn)
+                self._miss("gap", self.checks.wheels.believed(rolled.missed))
         elif feedback.gap:
             self._gaps.interrupt(twist)
         else:
             self._gaps.follow(twist, feedback.dt)
+
+    def _doubt_wheels(self, angles: Motors, seconds: float) -> None:
+        """Add the uncertainty because of wheels that may be right or wrong.
+
+        `angles` contains the angles that the wheels reported, rad, in `seconds` s. `seconds` is 0
+        for an earlier line.
+        """
+        missed = self.checks.wheels.missed(angles, seconds)
+        if missed is not None:
+            self._miss("wheel", missed)
+
+    def _miss(self, cause: Missed, angles: Motors) -> None:
+        """Add the uncertainty because the wheels may have rolled `angles`, rad, in addition."""
+        distance, turn = self._kinematics.moved(angles)
+        # A gyro does not miss a turn.
+        turn = 0.0 if self.checks.turn is not None else turn / self._track.share
+        self._uncertainty.miss(cause, MISSED_STD * distance, MISSED_STD * turn)
 
     def _twist_variances(
         self, twist: Twist, feedback: Feedback, at_rest: bool, gyro: Turn | None, slips: bool

@@ -28,6 +28,7 @@ the heading is so uncertain that the possible positions form an arc and not an e
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 from acsard.core.motion.error_model import SLIP_FACTOR, Column, ErrorModel
 from acsard.core.motion.se2 import (
@@ -57,6 +58,10 @@ GYRO_SCALE_STD = 0.004
 """Relative standard deviation of the scale factor of a gyro. An error of this size changes the
 heading by 1.4 degrees in one revolution. After equal turns to the left and to the right, its
 effects cancel."""
+
+Missed = Literal["gap", "wheel"]
+"""Cause of a motion that the pose may have missed: a gap in the feedback, or a wheel that the pose
+ignored although it may have been right."""
 
 NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
 
@@ -107,11 +112,12 @@ class PoseUncertainty:
             self._p = added(self._p, *self._phase, self._cos, self._sin)
         self._effects = self._parameters
         self._columns: list[Vector] = [ORIGIN for _ in self._effects]
-        """The columns of the matrix J (see the module). The columns for the gyro's scale and for
-        gaps are added when needed."""
-        self._of_gyro = self._of_gaps = -1
-        """Two indices in `_columns`: `_of_gyro` is the column for the gyro's scale, and `_of_gaps`
-        the column for gaps. An index is -1 before its column is added."""
+        """The columns of the matrix J (see the module). The columns for the gyro's scale, for gaps
+        and for ignored wheels are added when needed."""
+        self._of_gyro = -1
+        """The index in `_columns` of the column for the gyro's scale; -1 before it is added."""
+        self._of_missed: dict[Missed, int] = {}
+        """The indices in `_columns` of the columns for motions that the pose missed."""
         self._columns_before = self._columns
         self._turned = self._middle = 0.0
         self._second = SecondOrder(len(self._effects))
@@ -171,27 +177,24 @@ class PoseUncertainty:
             self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
             self._publish()
 
-    def miss(self, distance: float, turn: float) -> None:
-        """Add the uncertainty of a motion that the pose may have missed in a filled gap.
+    def miss(self, cause: Missed, distance: float, turn: float) -> None:
+        """Add the uncertainty of a motion that the pose may have missed in the last step.
 
-        The cause is often the same in each gap, so these errors add up and do not average out.
-        `distance`, m, and `turn`, rad, are the standard deviations, with the signs of the motion.
+        Motions that the pose misses for the same cause add up and do not average out. Therefore
+        they are treated like the error of a parameter. `distance`, m, and `turn`, rad, are the
+        standard deviations, with the signs of the motion.
         """
         if self._lost:
             return
-        c, s = self._cos, self._sin
-        if self._of_gaps < 0:
-            self._of_gaps = self._widen()
+        if cause not in self._of_missed:
+            self._of_missed[cause] = self._widen()
+        index, c, s = self._of_missed[cause], self._cos, self._sin
         self._columns = [*self._columns]
-        missed = (c * distance, s * distance, turn)
-        self._columns[self._of_gaps] = plus(self._columns[self._of_gaps], missed)
+        self._columns[index] = plus(self._columns[index], (c * distance, s * distance, turn))
         self._publish()
 
     def add_gap(self, distance: float, turn: float, along: float, yaw: float) -> None:
         """Add the uncertainty of a gap in the feedback during which the pose was not updated.
-
-        The motions that the pose missed in several gaps add up and do not average out. Therefore
-        they are treated like the error of a parameter.
 
         Args:
             distance: the probable distance driven in the gap, m.
@@ -202,7 +205,7 @@ class PoseUncertainty:
         if self._lost:
             self._mark_unknown(distance, turn)
             return
-        self.miss(distance, turn)
+        self.miss("gap", distance, turn)
         c, s = self._cos, self._sin
         # The unknown motion may be an arc to the left or to the right, so the position also becomes
         # uncertain sideways.

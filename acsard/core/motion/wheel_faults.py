@@ -87,6 +87,8 @@ class _Side:
         self._fault: WheelFault = "dead"
         self.late = False
         """Whether a wheel that is not ignored turns too slowly."""
+        self.contradicts = False
+        """Whether both wheels contradict their command in the last line, and none is ignored."""
         self._out_s = 0.0
         """Time for which the ignored wheel has contradicted both the other wheel of its side and
         its command, s."""
@@ -117,7 +119,7 @@ class _Side:
         ]
 
     def forget(self) -> None:
-        self._out_s = 0.0
+        self._out_s, self.contradicts = 0.0, False
         for part in (self.expected, *self.witnesses):
             part.forget()
 
@@ -131,10 +133,11 @@ class _Side:
         """
         i, j = self.wheels
         front, rear = self.witnesses
-        bad = front.check_speed(speeds[i], self.expected, dt, most, count, still)
-        bad = rear.check_speed(speeds[j], self.expected, dt, most, count, still) or bad
+        bad_front = front.check_speed(speeds[i], self.expected, dt, most, count, still)
+        bad_rear = rear.check_speed(speeds[j], self.expected, dt, most, count, still)
+        self.contradicts = bad_front and bad_rear and self.out is None
         self.late = (front.slow and self.out != 0) or (rear.slow and self.out != 1)
-        return bad or self._out_s > 0.0
+        return bad_front or bad_rear or self._out_s > 0.0
 
     def fault(self, speeds: Motors, limit: float) -> str:
         for i, witness in enumerate(self.witnesses):
@@ -243,12 +246,18 @@ class _Side:
 
     @property
     def may_slip(self) -> bool:
-        """Whether the wheels of this side contradict each other, so that one of them may slip.
+        """Whether the wheels of this side contradict each other, so that one of them may slip."""
+        return self.slip_s > 0.0 or self.may_be_right
 
-        A wheel that is ignored because it reports no motion may have a dead encoder, or it may be
-        blocked. If it is blocked, the side moves more slowly than its other wheel.
+    @property
+    def may_be_right(self) -> bool:
+        """Whether the pose ignores a wheel of this side that may report its true motion.
+
+        A wheel that reports no motion may have a dead encoder, or it may be blocked. A wheel that
+        reports the opposite motion may have a reversed encoder or a reversed motor. If the wheel is
+        right, the side moves as the mean of its two wheels, and not as the other wheel.
         """
-        return self.slip_s > 0.0 or (self.out is not None and self._fault == "dead")
+        return self.out is not None and self._fault != "stuck"
 
     def _pass(self, dt: float) -> None:
         self.slip_s = max(0.0, self.slip_s - dt)
@@ -282,7 +291,7 @@ class WheelFaults:
         self._busy = self._leaves_out = self._stands = False
         self.slips = False
         """Whether a side may slip: its wheels contradicted each other in the last `SLIP_HOLD_S`, or
-        one of them is ignored because it reports no motion."""
+        one of them is ignored although it may be right."""
         self._rolled, self._unreported = 0.0, REPEATED_S
         self.pushed = ""
         """Message that wheels turn without a command, for example by hand; "" unless the last line
@@ -318,6 +327,34 @@ class WheelFaults:
             if side.out is not None:
                 share = side.residual.stand_in(front=side.out == 0)
                 values[side.wheels[side.out]] = share * values[side.wheels[1 - side.out]]
+        front_right, front_left, rear_left, rear_right = values
+        return front_right, front_left, rear_left, rear_right
+
+    def missed(self, wheels: Motors, seconds: float) -> Motors | None:
+        """Return the angles that the wheels may have rolled and that the pose leaves out, rad.
+
+        - The pose ignores a wheel that may be right (`_Side.may_be_right`). The angle is the
+          difference from the angle that replaces it.
+        - Both wheels of a side contradict their command. The cause may be the encoders of this
+          side. The angle is the difference from the expected angle.
+
+        The angle of each other wheel is 0. Return None if all angles are 0.
+
+        Args:
+            wheels: the reported angles, rad, in `WHEELS` order.
+            seconds: the time in which the wheels rolled these angles, s; 0 for an earlier line, to
+                which the contradictions do not belong.
+        """
+        if not any(side.may_be_right or side.contradicts for side in self._sides):
+            return None
+        values, believed = [0.0, 0.0, 0.0, 0.0], self.believed(wheels)
+        for side in self._sides:
+            if side.out is not None and side.may_be_right:
+                wheel = side.wheels[side.out]
+                values[wheel] = wheels[wheel] - believed[wheel]
+            elif side.contradicts and seconds:
+                for wheel in side.wheels:
+                    values[wheel] = side.expected.speed * seconds - wheels[wheel]
         front_right, front_left, rear_left, rear_right = values
         return front_right, front_left, rear_left, rear_right
 
