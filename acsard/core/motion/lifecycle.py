@@ -241,11 +241,11 @@ class Lifecycle:
             )
         if latches.fault is None:
             self._latch(stop=None)
-            return "cleared; each sender must send a zero before it drives"
+            return self._cleared_text()
         self._cleared_ns = now.mono_ns
         self._latch(fault=None)
         if latches.stop is None:
-            return "cleared; each sender must send a zero before it drives"
+            return self._cleared_text()
         return (
             f"fault cleared, but the robot is still {_still(latches.stop)}: call srv/clear again "
             f"in {LATCH_REQUIRED_S:g} s"
@@ -357,6 +357,15 @@ class Lifecycle:
             linked=self._linked,
             commanded=self._commanded,
         )
+
+    def _cleared_text(self) -> str:
+        zero = "each sender must send a zero before it drives"
+        if self._off:
+            return (
+                "cleared, but the robot is still switched off: call srv/activate to switch it on, "
+                f"then {zero}"
+            )
+        return f"cleared; {zero}"
 
     def _require_latch_was_seen(
         self, was: str, still: str, set_ns: int, asked_ns: int, call: str

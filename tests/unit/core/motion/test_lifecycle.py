@@ -710,6 +710,20 @@ def test_a_robot_that_starts_switched_off_has_the_number_0() -> None:
     assert activate(life, 1.0, 0)
 
 
+@each("cause", ["stop", "fault"])
+def test_a_clear_of_a_robot_that_is_switched_off_says_so_and_names_activate(cause: str) -> None:
+    life = off()
+    if cause == "stop":
+        stop(life, 2.0)
+    else:
+        life.fault("a wheel is dead", at(2.0))
+    assert clear(life, 5.0) == (
+        "cleared, but the robot is still switched off: call srv/activate to switch it on, then "
+        "each sender must send a zero before it drives"
+    )
+    assert mode(life) is Mode.INACTIVE
+
+
 def test_the_latch_in_force_is_the_fault_then_the_stop_then_the_switch() -> None:
     assert Latches(STOP, FAULT, OFF).in_force is FAULT
     assert Latches(STOP, None, OFF).in_force is STOP
