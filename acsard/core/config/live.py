@@ -221,6 +221,11 @@ def _refusal(key: str, value: object, known: Mapping[str, object]) -> str:
             "acsard.toml and restart acsard (`acsard set` lists the keys that can change "
             "without a restart)"
         )
+    if key == "use_sim_time":  # each node of rclcpp and rclpy has this parameter
+        return (
+            "use_sim_time: the daemon does not support this ROS parameter, because it always uses "
+            "the clock of its host; leave use_sim_time false in the nodes that use this robot"
+        )
     return f"{show(key)}: unknown key; {hint(key, known, '`acsard set` lists the settings')}"
 
 

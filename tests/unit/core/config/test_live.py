@@ -163,6 +163,8 @@ def test_limits_above_the_largest_feedback_speed_are_refused() -> None:
         ("limits", {"linear_speed": 1.0}, "unknown key"),
         ("commands.sources.ghost.timeout", 0.5, "did you mean commands.sources."),
         ("x" * 4000, 1.0, "unknown key"),
+        ("use_sim_time", True, "always uses the clock of its host"),
+        ("use_sim_time", False, "leave use_sim_time false in the nodes"),
         (
             "mcu.port",
             "/dev/x",
