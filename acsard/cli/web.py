@@ -23,6 +23,7 @@ from acsard.core.values import ROLES
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install
 from acsard.host.logs import Log, output_in_threads
+from acsard.web.callers import LOCAL_NAME
 
 if TYPE_CHECKING:
     from acsard.web.listen import Listen
@@ -222,5 +223,10 @@ def _name(text: str) -> str:
     if not NAME.match(text):
         raise argparse.ArgumentTypeError(
             f"{text!r} is not a name: use 1 to 32 characters of A-Z a-z 0-9 _ . -"
+        )
+    if text == LOCAL_NAME:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is the name of each browser on the robot itself; choose another name, so "
+            "that the log shows who called a service"
         )
     return text

@@ -10,6 +10,7 @@ import pytest
 from acsard.cli import main
 from acsard.host.errors import Exit
 from acsard.machine.authority import Authority
+from acsard.web.callers import LOCAL_NAME
 from tests.each import each
 
 
@@ -81,6 +82,14 @@ def test_an_invalid_or_repeated_lifetime_of_a_token_is_refused_with_a_hint(
     with pytest.raises(SystemExit):
         main(["web", "--invite", "viewer", *words])
     assert hint in capsys.readouterr().err
+
+
+def test_a_token_cannot_have_the_name_of_the_clients_on_the_robot_itself(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["web", "--invite", "operator", "--name", LOCAL_NAME])
+    assert "'here' is the name of each browser on the robot itself" in capsys.readouterr().err
 
 
 @each("option", ["--name phone", "--days 3", "--hours 3"])
