@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from threading import Lock
 from typing import Any
@@ -153,8 +154,21 @@ class Settings:
             if not full:
                 self._wishes.put(wishes)
         if full:
-            text = f"not set: {MAX_WAITING_CHANGES} earlier changes wait for the daemon; try again"
-            self._notices.enqueue("error", "set", text)
+            why = f"{MAX_WAITING_CHANGES} earlier changes wait for the daemon; try again"
+            return self.refuse(wishes, why)
+        return self._present_values(wishes)
+
+    def refuse(self, wishes: dict[str, Any], why: str) -> dict[str, Any]:
+        """Tell all viewers that a change was refused, and return the present values.
+
+        Args:
+            wishes: maps the settings of the refused change to their requested values.
+            why: the reason of the refusal, as text.
+        """
+        self._notices.enqueue("error", "set", f"not set: {why}")
+        return self._present_values(wishes)
+
+    def _present_values(self, wishes: dict[str, Any]) -> dict[str, Any]:
         with self._lock:
             return select_settings(self._known, wishes.keys()) if wishes else {}
 
@@ -178,8 +192,7 @@ class Settings:
         self._notices.enqueue(
             "info" if done else "error", "set", text if done else f"not set: {text}"
         )
-        with self._lock:
-            return news | (select_settings(self._known, wishes.keys()) if wishes else {})
+        return news | self._present_values(wishes)
 
     def is_due(self, here: bool) -> bool:
         """Return whether `refresh` has a change to make or settings to query.
@@ -263,6 +276,9 @@ class Listener:
         self, client: Client, parameters: list[foxglove.Parameter], request_id: str | None = None
     ) -> list[foxglove.Parameter]:
         wishes = {parameter.name: parameter.get_value() for parameter in parameters}
+        if len(wishes) < len(parameters):
+            ((name, _),) = Counter(parameter.name for parameter in parameters).most_common(1)
+            return as_parameters(self._settings.refuse(wishes, f"{name} is in the request twice"))
         return as_parameters(self._settings.set(wishes))
 
     def on_parameters_subscribe(self, param_names: list[str]) -> None:

@@ -10,6 +10,8 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from foxglove import Parameter
+from foxglove.websocket import Client as Viewer
 
 from acsard.client import Client
 from acsard.core.config.live import LIVE
@@ -118,6 +120,21 @@ def test_a_change_that_fails_gives_the_viewers_the_present_value_and_the_reason(
     made.set({KEY: 999.0})
     assert made.refresh(here=False) == {KEY: NOW[KEY]}
     assert words() == ["not set: no answer from the daemon"]
+
+
+def test_a_request_with_one_parameter_twice_changes_nothing_and_names_the_parameter() -> None:
+    robot = Robot()
+    made, words = of_robot(robot)
+    listener = Listener(ShownTopics(lambda: None), cast(DrivingViewers, None), made)
+    asked: list[tuple[str, Any]] = [(KEY, 7.0), ("log.level", "debug"), (KEY, 8.0)]
+    parameters = [Parameter(name, value=value) for name, value in asked]
+    answer = listener.on_set_parameters(cast(Viewer, None), parameters)
+    assert {shown.name: shown.get_value() for shown in answer} == {
+        name: NOW[name] for name, _ in asked
+    }
+    made.refresh(here=True)
+    assert not robot.asked
+    assert words() == [f"not set: {KEY} is in the request twice"]
 
 
 def test_changes_beyond_the_limit_are_refused_with_a_reason() -> None:
