@@ -43,6 +43,10 @@ DAEMON_GONE_ID = "daemon"
 LEARN_RETRY_S = 1.0
 """Shortest time from a failed query of the robot's configuration to the next query, s."""
 
+STOP_TIMEOUT_S = 2.0
+"""Time limit for the end of the server, s. foxglove-sdk waits without a limit for each connection
+that has not sent its WebSocket request yet."""
+
 RELEASE_ADVICE = "release the button for two seconds, and press it again"
 """Advice to an operator if the daemon waits for a zero command. After a panel has paused for longer
 than `commander.RELEASE_TIMEOUT_NS`, the bridge sends a zero before the panel's next command."""
@@ -127,9 +131,13 @@ class Bridge:
         self._wake.set()
 
     def close(self) -> None:
-        """Send a zero command for each viewer that may be driving, then stop the server."""
+        """Send a zero command for each viewer that may be driving, then stop the server.
+
+        Wait at most `STOP_TIMEOUT_S` for the server.
+        """
         self._drives.end()
-        self._server.stop()
+        with suppress(TimeoutError):
+            future_of(self._server.stop, lambda: None).result(STOP_TIMEOUT_S)
 
     def _viewer(self, client: int) -> Client:
         """Return a bus client for one viewer. To the daemon, each viewer is a different sender."""

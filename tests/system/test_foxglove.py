@@ -25,6 +25,7 @@ from acsard.core.config.settings import JointsConfig
 from acsard.core.messages.encodings import FORMATS, encode, encoding_name
 from acsard.core.messages.schema import Header, JointState, Twist, TwistStamped, Vector3
 from acsard.core.values import NS_PER_S
+from acsard.foxglove.bridge import STOP_TIMEOUT_S
 from tests.system.bystander import lost
 from tests.system.harness import (
     ZERO,
@@ -651,6 +652,15 @@ def test_a_daemon_that_is_gone_is_reported_and_waited_for(tmp_path: Path) -> Non
             count = len(looked.came)
             until(lambda: len(looked.came) > count + 10, 10.0, "odometry again")
             assert viewer.call("/acsard/stop", {})["success"]
+
+
+@SLOW
+def test_foxglove_ends_while_a_connection_never_sends_its_request(shared: Daemon) -> None:
+    with Shows(shared) as own, socket.create_connection(("127.0.0.1", own.port)):
+        with Viewer(own.port):  # the server has accepted the silent connection, too
+            pass
+        own.signal(signal.SIGTERM)
+        assert own.ended(STOP_TIMEOUT_S) == 0
 
 
 @SLOW
