@@ -55,6 +55,10 @@ from acsard.web.viewer import PING_INTERVAL_S, Parts, Viewer
 BODY_TIMEOUT_S = 5.0
 """Time limit for receiving the body of a request, s. Most bodies have a few hundred bytes."""
 
+STOP_BODY_TIMEOUT_S = 0.3
+"""Time after which a stop whose body has not arrived stops the page's own robot, s. A body that
+arrives later still stops the robot that it names."""
+
 REPORT_TIMEOUT_S = 300.0
 """Time limit for sending a report to a client that does not accept gzip, s."""
 
@@ -284,22 +288,20 @@ class Page:
 
         The arguments of the service are the fields of the JSON object in the request's body.
         """
-        verb = request.path.removeprefix("/api/srv/")
+        verb, call = request.path.removeprefix("/api/srv/"), self._parts.calls.call
+        reading = asyncio.create_task(_arguments_in(request))
         try:
-            arguments = await _arguments_in(request)
-        except (RequestRefusedError, web.HTTPException):
-            # The body names no other robot, and a stop of the page's own robot is never refused.
             if verb == "stop":
-                await self._parts.calls.call(request[IDENTITY_KEY], verb, {})
-            raise
-        robot = arguments.pop("robot", "")
-        if not isinstance(robot, str):
-            text = (
-                "`robot` must be the id of a robot as a JSON string; for robots other than its "
-                "own, this page accepts only the service stop"
-            )
-            raise RequestRefusedError("malformed", text)
-        answer = await self._parts.calls.call(request[IDENTITY_KEY], verb, arguments, robot)
+                await asyncio.wait([reading], timeout=STOP_BODY_TIMEOUT_S)
+                if not reading.done() or reading.exception() is not None:
+                    # No body names another robot, and a stop of the page's own robot is never
+                    # refused.
+                    stop = call(request[IDENTITY_KEY], verb, {})
+                    await asyncio.gather(stop, asyncio.wait([reading]))
+            robot, arguments = await reading
+        finally:
+            reading.cancel()
+        answer = await call(request[IDENTITY_KEY], verb, arguments, robot)
         return reply(answer, 200 if answer.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
@@ -403,12 +405,21 @@ async def _body_of(request: web.Request) -> bytes:
         ) from None
 
 
-async def _arguments_in(request: web.Request) -> dict[str, Any]:
+async def _arguments_in(request: web.Request) -> tuple[str, dict[str, Any]]:
+    """Return the id of the robot ("" for the page's own robot), and the service's arguments."""
     body = await _body_of(request)
     try:
-        return msgspec.json.decode(body, type=dict[str, Any]) if body.strip() else {}
+        arguments = msgspec.json.decode(body, type=dict[str, Any]) if body.strip() else {}
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise RequestRefusedError("malformed", f"the body must be a JSON object: {error}") from None
+    robot = arguments.pop("robot", "")
+    if not isinstance(robot, str):
+        text = (
+            "`robot` must be the id of a robot as a JSON string; for robots other than its own, "
+            "this page accepts only the service stop"
+        )
+        raise RequestRefusedError("malformed", text)
+    return robot, arguments
 
 
 async def _token_posted(request: web.Request) -> TokenForm:

@@ -185,6 +185,22 @@ def decode(text: str) -> Frame:
     return frame
 
 
+def asks_to_stop(text: str, robot: str) -> bool:
+    """Return whether a message asks the robot with the id `robot` to stop, even if it is not valid.
+
+    The message must be a JSON object with `call` = "stop". Every other defect is ignored. The
+    message asks another robot if its field `robot` is a text that is neither empty nor `robot`.
+    """
+    try:
+        # Decode only the two fields that matter, because any other field may be invalid.
+        fields = _heads.decode(text)
+        call, other = bytes(fields.get("call", b"")), bytes(fields.get("robot", b""))
+        named = other.startswith(b'"') and msgspec.json.decode(other) not in ("", robot)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return False
+    return call == b'"stop"' and not named
+
+
 def _require(frame: Frame) -> None:
     # All numbers are finite here: JSON has no NaN, and msgspec refuses numbers that are too large.
     if isinstance(frame, Command) and not 0.0 < frame.stamp < MAX_STAMP_MS:

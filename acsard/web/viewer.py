@@ -44,6 +44,7 @@ from acsard.web.socket_messages import (
     Reply,
     Subscribe,
     Unsubscribe,
+    asks_to_stop,
     decode,
 )
 from acsard.web.socket_sender import Keys, Outgoing
@@ -222,6 +223,8 @@ class Viewer:
             frame = decode(message.data)
         except FrameError as error:
             self._out.refuse(error.about, "malformed", str(error))
+            if asks_to_stop(message.data, self._robots.id):
+                self._obey(Call("stop"))
         else:
             # A message that ends a drive or stops the robot is obeyed even beyond the limit.
             urgent = (

@@ -6,28 +6,33 @@ import asyncio
 import os
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+from unittest.mock import Mock
 
 import pytest
-from aiohttp import web
+from aiohttp import StreamReader, web
 from aiohttp.test_utils import make_mocked_request
 from msgspec.structs import replace
 
+from acsard.client import Client
 from acsard.core.config.live import LIVE
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
-from acsard.core.values import NS_PER_S
+from acsard.core.messages.schema import ServiceReply
+from acsard.core.values import NS_PER_S, Role
 from acsard.host import clock
 from acsard.host.threads import NoThreadError
 from acsard.web import app
 from acsard.web.acceptor import Acceptor
 from acsard.web.admission import IDENTITY_KEY
 from acsard.web.app import Page, settings_in
+from acsard.web.callers import RequestRefusedError
 from acsard.web.camera import Camera
 from acsard.web.guide import Guide, Reach
 from acsard.web.metrics import Counts
 from acsard.web.tokens import FILE, Vault
 from acsard.web.viewer import Parts
+from tests.each import each
 from tests.unit.web.hanging_disk import threads_named
 from tests.unit.web.test_callers import MAINTAINER
 from tests.unit.web.test_fleet_rows import robots
@@ -115,6 +120,90 @@ async def test_the_age_of_a_picture_counts_a_suspend(
     page._camera.close()
     assert int(headers["Age-Ms"]) >= 3_600_000
     assert int(headers["Waited-Ms"]) < 60_000
+
+
+class Daemon:
+    """A client of the page's own robot that records the calls, and of other robots."""
+
+    certificate, session, name = "", None, ""
+
+    def __init__(self, calls: list[tuple[str, str]], robot: str = "acsar") -> None:
+        self._calls, self._robot = calls, robot
+
+    def sibling(self, robot: str) -> Daemon:
+        return Daemon(self._calls, robot)
+
+    def request(self, verb: str, payload: object) -> ServiceReply:
+        self._calls.append((verb, self._robot))
+        return ServiceReply(True, "stopped")
+
+
+def page_with_daemon(directory: Path) -> tuple[Page, list[tuple[str, str]]]:
+    """Return a page, and the list of the calls that reach a robot: verb and robot."""
+    counts, calls = Counts(), list[tuple[str, str]]()
+    parts = Parts(robots(cast(Client, Daemon(calls))), Guide(Reach("", "", "", ""), ""), counts)
+    return Page(parts, Vault(directory, "acsar"), frozenset(), Acceptor(counts)), calls
+
+
+def posted(verb: str, *body: bytes, end: bool = True, role: Role = "viewer") -> web.Request:
+    """Return a request that calls a service. If `end` is false, the body has not ended yet."""
+    content = StreamReader(Mock(_reading_paused=False), 2**16)
+    for part in body:
+        content.feed_data(part)
+    if end:
+        content.feed_eof()
+    request = make_mocked_request("POST", f"/api/srv/{verb}", payload=content)
+    request[IDENTITY_KEY] = replace(MAINTAINER, role=role)
+    return request
+
+
+UNREADABLE = [b"{", b"[]", b'{"robot": null}', b'{"robot": 1}', b'{"robot": ["r2"]}']
+
+
+@each("body", UNREADABLE)
+async def test_a_stop_whose_body_names_no_other_robot_stops_this_robot_and_is_refused(
+    body: bytes, tmp_path: Path
+) -> None:
+    page, calls = page_with_daemon(tmp_path)
+    with pytest.raises(RequestRefusedError):
+        await page.service(posted("stop", body))
+    assert calls == [("stop", "acsar")]
+
+
+@each("body", UNREADABLE)
+async def test_another_service_with_an_unreadable_body_is_only_refused(
+    body: bytes, tmp_path: Path
+) -> None:
+    page, calls = page_with_daemon(tmp_path)
+    with pytest.raises(RequestRefusedError):
+        await page.service(posted("clear", body, role="maintainer"))
+    assert calls == []
+
+
+async def test_a_stop_of_another_robot_does_not_stop_this_robot(tmp_path: Path) -> None:
+    page, calls = page_with_daemon(tmp_path)
+    await page.service(posted("stop", b'{"robot": "r2"}'))
+    with pytest.raises(RequestRefusedError):
+        await page.service(posted("stop", b'{"robot": "r 2/**"}'))
+    assert calls == [("stop", "r2")]
+
+
+async def test_a_stop_whose_body_is_late_stops_this_robot_first_and_then_the_named_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(app, "STOP_BODY_TIMEOUT_S", 0.01)
+    page, calls = page_with_daemon(tmp_path)
+    request = posted("stop", b'{"robot"', end=False)
+    answer = asyncio.create_task(page.service(request))
+    async with asyncio.timeout(20.0):
+        while not calls:
+            await asyncio.sleep(0.01)
+    assert calls == [("stop", "acsar")]
+    assert not answer.done()
+    request.content.feed_data(b': "r2"}')
+    request.content.feed_eof()
+    assert (await answer).status == 200
+    assert calls == [("stop", "acsar"), ("stop", "r2")]
 
 
 ROWS = {row.key: row for row in settings_in(effective(Config()))}

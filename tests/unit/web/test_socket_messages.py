@@ -26,6 +26,7 @@ from acsard.web.socket_messages import (
     Subscribe,
     Unsubscribe,
     Wish,
+    asks_to_stop,
     decode,
 )
 from tests.each import each
@@ -115,12 +116,48 @@ def test_an_invalid_message_is_refused_with_the_kind_it_was_meant_as(text: str, 
     assert str(caught.value)
 
 
+STOPS_OF_R1 = [
+    '{"call": "stop", "id": null}',
+    '{"call": "stop", "id": 1e999}',
+    '{"call": "stop", "id": 1, "robot": null}',
+    '{"call": "stop", "id": 1, "robot": 1e999}',
+    '{"call": "stop", "id": true, "robot": ""}',
+    '{"call": "stop", "id": 1, "robot": "r1", "payload": []}',
+    '{"call": "stop", "id": 1, "payload": null}',
+    '{"call": "stop", "id": 1, "extra": 1}',
+    '{"call": "stop", "id": 1, "subscribe": "odom"}',
+]
+"""Invalid messages that ask the robot `r1` to stop."""
+
+
+@each("text", STOPS_OF_R1)
+def test_an_invalid_message_that_asks_for_a_stop_is_recognized(text: str) -> None:
+    assert asks_to_stop(text, "r1")
+    assert not asks_to_stop(text.replace('"stop"', '"clear"'), "r1")
+
+
+@each(
+    "text",
+    [
+        '{"call": "stop", "id": null, "robot": "r2"}',
+        '{"call": "stop", "id": null, "robot": "r1/**"}',
+        '{"call": ["stop"]}',
+        '{"subscribe": "stop"}',
+        '"stop"',
+        "",
+    ],
+)
+def test_a_message_for_another_robot_or_without_a_call_asks_for_no_stop(text: str) -> None:
+    assert not asks_to_stop(text, "r1")
+
+
 @given(st.text())
 def test_any_text_decodes_or_raises_a_frame_error(text: str) -> None:
     try:
         decode(text)
     except FrameError:
         pass
+    assert not asks_to_stop(text, "r1")
 
 
 @given(st.integers(0, len(json.dumps(COMMAND)) - 1), st.characters())

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
+from unittest.mock import Mock
 
 import aiohttp
 import pytest
@@ -12,8 +14,9 @@ import pytest
 from acsard.bus.address import Address
 from acsard.client import Client
 from acsard.client.commander import Commander, CommandSigner, Wish
+from acsard.core.messages.schema import ServiceReply
 from acsard.core.messages.signature import unpack
-from acsard.core.values import NS_PER_S, Twist
+from acsard.core.values import NS_PER_S, Role, Twist
 from acsard.host import clock
 from acsard.web.callers import AdmittedClient
 from acsard.web.guide import Guide, Reach
@@ -21,6 +24,7 @@ from acsard.web.limits import COMMAND_RATE
 from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
 from acsard.web.viewer import Parts, Viewer, ViewerCommands
+from tests.unit.web.test_socket_messages import STOPS_OF_R1
 
 PATIENCE_S = 20.0
 
@@ -127,3 +131,47 @@ async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
     drive(0.0, 1100.0)
     parts.commands.outbox.flush(PATIENCE_S)
     assert put == [(0.5, "slow"), (0.0, "slow")]
+
+
+class Page:
+    """A viewer of the robot r1, and the stops of this robot that it has called."""
+
+    def __init__(self, role: Role) -> None:
+        self.stops: list[ServiceReply] = []
+        counts = Counts()
+        about = About("1", True, 1.0, 4.0, 10.0, "", {})
+        robots = Robots(Address("tcp/127.0.0.1:1", "r1", ""), Mock(), about, counts)
+        parts = Parts(robots, Guide(Reach("", "", "", ""), ""), counts)
+        parts.calls._called = self._called  # type: ignore[assignment, method-assign]
+        who = AdmittedClient(role, "bob", "token", "1.2.3.4")
+        socket, request = cast(Any, SimpleNamespace()), cast(Any, SimpleNamespace(transport=None))
+        self.viewer, self.counts = Viewer(socket, request, who, parts, camera=False), counts
+
+    async def _called(self, who: object, verb: str, payload: object, other: str) -> ServiceReply:
+        assert (verb, payload, other) == ("stop", {}, "")
+        self.stops.append(ServiceReply(True, "stopped"))
+        return self.stops[-1]
+
+    async def take(self, frame: str) -> None:
+        message: Any = SimpleNamespace(type=aiohttp.WSMsgType.TEXT, data=frame)
+        self.viewer._take(message)
+        await asyncio.gather(*self.viewer._tasks, *self.viewer._stops)
+
+
+@pytest.mark.parametrize("role", ["viewer", "maintainer"])
+async def test_an_invalid_message_that_asks_for_a_stop_is_refused_and_stops_this_robot(
+    role: Role,
+) -> None:
+    page = Page(role)
+    for count, text in enumerate(STOPS_OF_R1, 1):
+        await page.take(text)
+        assert len(page.stops) == count, text
+        assert page.counts.refused() == {"malformed": count}
+
+
+async def test_an_invalid_message_without_a_stop_of_this_robot_is_only_refused() -> None:
+    page = Page("maintainer")
+    for text in ('{"call": "stop", "id": null, "robot": "r2"}', '{"call": "clear", "id": null}'):
+        await page.take(text)
+    assert page.stops == []
+    assert page.counts.refused() == {"malformed": 2}
