@@ -27,13 +27,16 @@ from typing import Literal
 from msgspec import Struct, field
 
 from acsard.core.config.settings import RECORD_VARIABLE, RecordConfig
-from acsard.core.values import NS_PER_S, Instant
+from acsard.core.formatting import listed as listed_names
+from acsard.core.formatting import many
+from acsard.core.values import NS_PER_S, Event, Instant
 from acsard.host.atomic_file import sync
 from acsard.recording.end_record import CUT_TEXTS
 from acsard.recording.file import FILE_MODE, About, RecordingWriter
 from acsard.recording.recovery import recover
 from acsard.recording.retention import (
     INCIDENT_MARGIN_NS,
+    MIN_FILE_BYTES,
     Bounds,
     ClockWatch,
     Disk,
@@ -75,6 +78,9 @@ TRIM_ROUNDS = 600
 old."""
 
 S_PER_DAY = 86400
+
+MAX_NAMES = 5
+"""Largest number of deleted files that an event names."""
 
 BEING_RECORDED_S = 10.0
 """If no daemon has written to a `.part` file for this time, s, the file no longer counts as being
@@ -148,6 +154,27 @@ def _marked(part: Path) -> tuple[Kind, str] | None:
     return None
 
 
+def _deletion(names: list[str], disk: Disk, refused: bool) -> Event:
+    if disk.low:
+        reason = (
+            f"only {disk.free / 1e6:.1f} MB of the disk were free, and recordings leave "
+            f"{disk.spare / 1e6:.1f} MB to other programs; remove other files from the disk"
+        )
+    elif refused:
+        reason = "the disk accepted no more data; remove other files from the disk"
+    else:
+        reason = "they exceeded record.megabytes or record.days"
+    text = f"{many(len(names), 'recording')} deleted ({listed_names(names, MAX_NAMES)}): {reason}"
+    return Event("recording", text, "warning" if disk.low or refused else "info")
+
+
+def has_room(directory: Path) -> bool:
+    """Return whether the disk of a directory reports enough free space for a small file."""
+    size = os.statvfs(directory)
+    # Some file systems do not report their size.
+    return not size.f_blocks or size.f_bavail * size.f_frsize >= MIN_FILE_BYTES
+
+
 class Run(Struct):
     """State that all `RecordingDirectory` objects of one run of the daemon share.
 
@@ -163,6 +190,8 @@ class Run(Struct):
     """Total size of the recordings that were deleted because the disk was full, bytes. It counts
     the deletions since the last successful write."""
     clock: ClockWatch = field(default_factory=ClockWatch)
+    events: list[Event] = field(default_factory=list)
+    """Events that report the deleted recordings. `StepWriter` takes them from this list."""
 
 
 class RecordingDirectory:
@@ -184,7 +213,7 @@ class RecordingDirectory:
             settings: the configuration of the recordings.
             run: the `Run` of the `RecordingDirectory` before the last disk error; None for the
                 first `RecordingDirectory` in a run of the daemon.
-            refused: true if the last write failed because the disk was full.
+            refused: true if the disk refused the last write although it reported free space.
         """
         self._directory = Path(settings.directory)
         self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
@@ -369,7 +398,7 @@ class RecordingDirectory:
 
         Args:
             now: the present time; None if the time is not known, so that no file counts as too old.
-            refused: true if the last write failed because the disk was full.
+            refused: true if the disk refused the last write although it reported free space.
         """
         ended, disk = self._ended(), self._disk()
         oldest_s = -math.inf
@@ -377,12 +406,16 @@ class RecordingDirectory:
             oldest_s = now.wall_ns / NS_PER_S - self._days * S_PER_DAY
         freed = self._run.freed if refused else None
         names = to_delete(ended, Bounds(self._bytes, oldest_s), disk, freed)
+        deleted = list[str]()
         for file in ended:
             # The file may belong to another user. Recording goes on in any case.
             with suppress(OSError):
                 if file.name in names:
                     (self._directory / file.name).unlink()
                     self._run.freed += file.size if refused else 0
+                    deleted.append(file.name)
+        if deleted:
+            self._run.events.append(_deletion(deleted, disk, refused))
         self.file_bytes = file_size_limit(self._bytes, sum(file.size for file in ended), disk)
 
     def _ended(self) -> list[FinishedFile]:

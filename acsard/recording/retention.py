@@ -9,6 +9,9 @@ than `MAX_KEPT_FILES` recordings contain an incident, only the newest of them st
   unprotected recordings are deleted, the oldest first, but not the newest recording.
 - Protected recordings and the newest recording are deleted too if less than a fifth of `Disk.spare`
   is free, or if the recordings exceed the limit on their total size.
+- If other programs fill the disk, less than a fifth of `Disk.spare` would be free even without any
+  recordings. Deleting recordings does not help then, so protected recordings and recordings of this
+  run of the daemon are not deleted to free disk space.
 """
 
 from __future__ import annotations
@@ -140,6 +143,9 @@ def to_delete(
     - If `freed` is less than `MIN_FILE_BYTES`, at least one unprotected recording is deleted, if
       any exists.
     - If `freed` is `MIN_FILE_BYTES` or more, the refusal has no effect.
+
+    If other programs fill the disk, neither the refusal nor the lack of free space is a reason to
+    delete protected recordings and recordings of this run of the daemon.
     """
     protected = _protected(ended)
     plain = [file for file in ended if file.name not in protected]
@@ -149,6 +155,7 @@ def to_delete(
     free = disk.free + sum(file.size for file in old)
     most = bounds.size - file_size_limit(bounds.size, own, disk)
     needed = int(disk.spare * NEEDED_FRACTION)
+    vain = own + free < needed
     for file in plain + [file for file in ended if file.name in protected]:
         if file.name in names:
             continue
@@ -156,7 +163,8 @@ def to_delete(
         required = disk.spare if is_plain and file is not ended[-1] else needed
         must_free = freed is not None and not names
         may_help = not freed or (is_plain and freed < MIN_FILE_BYTES)
-        if own > most or free < required or (must_free and may_help):
+        lacks_space = free < required or (must_free and may_help)
+        if own > most or (lacks_space and not (vain and (file.this_run or not is_plain))):
             names.add(file.name)
             own, free = own - file.size, free + file.size
     return names

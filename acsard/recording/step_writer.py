@@ -20,7 +20,7 @@ from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S, Event, Instant
 from acsard.host.version import version
 from acsard.host.wait_timer import WaitTimer
-from acsard.recording.directory import RecordingDirectory, Run, mark_cut
+from acsard.recording.directory import RecordingDirectory, Run, has_room, mark_cut
 from acsard.recording.file import About, RecordingWriter
 from acsard.recording.mcap_records import MAX_DATA_BYTES
 from acsard.recording.recorded_steps import FinishedStep, StateBeforeStep, split_at_states
@@ -113,7 +113,7 @@ class StepWriter:
         self._reported = False
         """True once this object has reported that the daemon records."""
         self._refused = False
-        """True if the last write failed because the disk was full."""
+        """True if the disk refused the last write although it reported free space."""
         self._looked_back = False
         """True once the files of the previous run are registered in `_incidents`."""
         self._run = Run()
@@ -151,6 +151,9 @@ class StepWriter:
                 self._pause -= 1
         except OSError as error:
             self._fail(error)
+        for event in self._run.events:
+            self._report(event)
+        self._run.events.clear()
         lost = sum(isinstance(item, FinishedStep) for item in items) - self._safe
         if lost:
             self.lost += lost
@@ -339,6 +342,11 @@ class StepWriter:
         for resource in (self._writing, self._directory):
             if resource is not None:
                 resource.close()
-        self._refused = error.errno in DISK_FULL
+        # If the disk reports that it is full, this report alone decides which recordings are
+        # deleted. Otherwise the daemon would delete one more when the disk has room again.
+        try:
+            self._refused = error.errno in DISK_FULL and has_room(Path(self.where))
+        except OSError:
+            self._refused = False
         self._writing = self._directory = None
         self._pause = RETRY_ROUNDS

@@ -24,7 +24,13 @@ from acsard.recording.directory import (
 )
 from acsard.recording.end_record import read_end
 from acsard.recording.file import About, Recording, RecordingWriter
-from acsard.recording.retention import MAX_KEPT_FILES, MIN_FILE_BYTES, STEADY_CLOCK_NS, Kind
+from acsard.recording.retention import (
+    MAX_KEPT_FILES,
+    MIN_FILE_BYTES,
+    STEADY_CLOCK_NS,
+    Disk,
+    Kind,
+)
 
 DAY_NS = 86_400_000_000_000
 NOW_NS = 1_800_000_000_000_000_000
@@ -408,6 +414,37 @@ def test_an_incomplete_copy_is_deleted(tmp_path: Path) -> None:
     (left := tmp_path / f".000007-20270115T080000Z{PART_SUFFIX}.new").write_bytes(b"half")
     RecordingDirectory(RecordConfig(str(tmp_path)), run=Run())
     assert not left.exists()
+
+
+def test_deleted_recordings_are_reported_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = RecordingDirectory(RecordConfig(str(tmp_path), 10.0), run=(run := Run()))
+    first, *_ = [record(store, MIN_FILE_BYTES) for _ in range(7)]
+    monkeypatch.setattr(store, "_disk", lambda: Disk(10**9, 10**9))
+    store.trim(None)
+    assert run.events == []
+    store.trim(None, refused=True)
+    monkeypatch.setattr(store, "_disk", lambda: Disk(10**9, 49 * 10**6))
+    store.trim(None)
+    (refused, low) = run.events
+    assert refused.text.startswith(f"1 recording deleted ({first.name}): the disk accepted no more")
+    assert low.text.startswith("5 recordings deleted (000002-")
+    assert "only 49.0 MB of the disk were free, and recordings leave 50.0 MB" in low.text
+    assert {refused.level, low.level} == {"warning"}
+
+
+def test_recordings_beyond_the_limits_are_deleted_with_an_event_that_is_not_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = RecordingDirectory(RecordConfig(str(tmp_path), 1.0), run=(run := Run()))
+    monkeypatch.setattr(store, "_disk", lambda: Disk(10**9, 10**9))
+    for _ in range(10):
+        record(store, MIN_FILE_BYTES)
+    store.trim(None)
+    (event,) = run.events
+    assert "exceeded record.megabytes or record.days" in event.text
+    assert event.level == "info"
 
 
 def test_a_recording_that_could_not_be_deleted_does_not_count_as_freed(

@@ -82,6 +82,18 @@ def test_if_the_disk_is_nearly_full_all_files_make_room_for_the_next() -> None:
     assert to_delete(ended, BOUNDS, Disk(100_000, 300)) == {"2", "3"}
 
 
+def test_if_even_deleting_all_files_frees_too_little_incidents_and_this_run_are_kept() -> None:
+    full = Disk(100_000, 0)
+    ended = files("kept", "near", "plain", size=333)
+    assert to_delete(ended, BOUNDS, full) == {"3"}
+    assert to_delete(ended, BOUNDS, full, freed=0) == {"3"}
+    for freed in (None, 0):
+        this_run = files("plain", "kept", "plain", size=333, this_run=True)
+        assert to_delete(this_run, BOUNDS, full, freed) == set()
+    assert to_delete(ended, BOUNDS, full._replace(free=1)) == {"1", "2", "3"}
+    assert to_delete(ended, BOUNDS._replace(size=MIN_FILE_BYTES), full) == {"1", "2", "3"}
+
+
 def test_a_disk_that_refuses_despite_free_space_gets_one_file_deleted() -> None:
     assert to_delete(files("kept", "plain", "plain"), BOUNDS, WIDE, freed=0) == {"2"}
     assert to_delete(files("kept"), BOUNDS, WIDE, freed=0) == {"1"}
