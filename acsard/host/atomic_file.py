@@ -28,15 +28,16 @@ def replace(
     Args:
         file: path of the file. Other processes find the complete old file or the complete new file.
         content: new content. Only the owner can read the new file until its mode is set.
-        mode: permission bits. If None, an existing file keeps its mode, and a new file gets
-            `NEW_MODE`.
-        owner: uid and gid of the new file. If None, the file keeps its owner and group, as far as
-            this process has the permission to set them.
+        mode: permission bits. If None, an existing regular file keeps its mode, and any other file
+            gets `NEW_MODE`.
+        owner: uid and gid of the new file. If None, a regular file keeps its owner and group, as
+            far as this process has the permission to set them.
         synced: if true, wait before the rename until the disk has stored the new content. A power
             cut then leaves the complete old or new file. If false, a power cut may leave a part of
             the new file until the caller has called `sync`.
     """
-    before = file.stat() if file.exists() else None
+    # A device, which a symbolic link may name, has a mode and an owner for other purposes.
+    before = file.stat() if file.is_file() else None
     if mode is None:
         mode = NEW_MODE if before is None else stat.S_IMODE(before.st_mode)
     handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")

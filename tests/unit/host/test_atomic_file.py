@@ -44,6 +44,16 @@ def test_a_file_keeps_its_mode_unless_another_is_given(file: Path) -> None:
     assert mode_of(file) == 0o600
 
 
+def test_a_file_that_replaces_a_link_to_a_device_does_not_get_the_mode_of_the_device(
+    tmp_path: Path,
+) -> None:
+    link = tmp_path / "link"
+    link.symlink_to("/dev/null")
+    replace(link, NEW)
+    assert not link.is_symlink()
+    assert mode_of(link) == NEW_MODE
+
+
 def test_a_new_file_can_be_read_by_all_unless_another_mode_is_given(tmp_path: Path) -> None:
     before = os.umask(0o077)
     try:
