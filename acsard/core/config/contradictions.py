@@ -14,7 +14,7 @@ from itertools import pairwise
 
 from acsard.core.config import motion_rules, named_faults
 from acsard.core.config.partial import Rule, mistakes
-from acsard.core.config.settings import BusConfig, Config, McuConfig, is_tls
+from acsard.core.config.settings import SIMULATOR, BusConfig, Config, McuConfig, is_tls
 from acsard.core.config.validation import show
 from acsard.core.config.wire_time import (
     COMFORTABLE_USE,
@@ -61,6 +61,12 @@ def warnings(config: Config) -> list[str]:
             f"before they are sent; write {comfortable} or less"
         )
     messages += _count_warnings(config)
+    messages += _port_warnings(config.mcu)
+    if not config.commands.sources:
+        messages.append(
+            "commands.sources = []: no program can drive this robot; add a [[commands.sources]] "
+            "table, or leave the key out to get the default sources"
+        )
     drive, limits = config.drive, config.limits
     needed = limits.linear_speed / drive.wheel_radius
     if needed > limits.wheel_speed:
@@ -132,6 +138,17 @@ def _count_warnings(config: Config) -> list[str]:
             f"to 30 % wrong; write control.rate = {FASTEST_HZ:g} or less"
         )
     return messages
+
+
+def _port_warnings(mcu: McuConfig) -> list[str]:
+    if mcu.simulated or "/" in mcu.port:
+        return []
+    remedy = (
+        f'write mcu.port = "{SIMULATOR}" for the simulator'
+        if mcu.port.lower() == SIMULATOR
+        else f"write the whole path, such as mcu.port = {show(f'/dev/{mcu.port}')}"
+    )
+    return [f"mcu.port = {show(mcu.port)} is a file in the daemon's working directory; {remedy}"]
 
 
 def contradictions(config: Config) -> list[str]:

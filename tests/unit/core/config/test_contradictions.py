@@ -13,6 +13,7 @@ from acsard.core.config.settings import (
     AccessConfig,
     BatteryConfig,
     BusConfig,
+    CommandsConfig,
     Config,
     ControlConfig,
     FeedbackConfig,
@@ -279,6 +280,25 @@ def test_an_ignored_emergency_stop_is_a_warning() -> None:
     assert warning == (
         'safety.estop = "off": the robot ignores an emergency stop that its board reports'
     )
+
+
+def test_a_robot_without_command_sources_is_a_warning() -> None:
+    (line,) = warnings(Config(commands=CommandsConfig(sources=())))
+    assert line.startswith("commands.sources = []: no program can drive this robot; ")
+
+
+@each(
+    ("port", "remedy"),
+    [
+        ("SIM", 'write mcu.port = "sim" for the simulator'),
+        ("ttyUSB0", 'write the whole path, such as mcu.port = "/dev/ttyUSB0"'),
+    ],
+)
+def test_a_port_in_the_working_directory_is_a_warning(port: str, remedy: str) -> None:
+    (line,) = warnings(Config(mcu=McuConfig(port=port)))
+    assert line.startswith(f'mcu.port = "{port}" is a file in the daemon\'s working directory')
+    assert line.endswith(remedy)
+    assert warnings(Config(mcu=McuConfig(port=f"/dev/{port}"))) == []
 
 
 def test_ignored_bumpers_are_a_warning() -> None:
