@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+from codecs import BOM_UTF8
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -274,7 +275,10 @@ def _changed(
 def _decoded(content: bytes) -> str:
     # `read` may cut a character of a file that is too large. That is not the mistake to report, so
     # replace the character. The text stays too large, and `parse` reports that.
-    return content.decode(errors="replace" if len(content) > MAX_BYTES else "strict")
+    # An editor on Windows may have put a byte-order mark before the text. The changed file does not
+    # need the mark.
+    text = content.removeprefix(BOM_UTF8)
+    return text.decode(errors="replace" if len(content) > MAX_BYTES else "strict")
 
 
 def _not_changed(file: Path, error: Exception) -> MendableError:

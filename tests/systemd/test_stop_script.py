@@ -111,6 +111,8 @@ def config(where: Path, text: str) -> Path:
         '[mcu]\nport = "PORT"\n[mcu.wheels]\nport = "/dev/null"\n',
         '[mcu]\r\nport = "PORT"\r\nbaud_rate = 115200\r\n',
         '[mcu]\nport = "PORT"',
+        '\ufeff[mcu]\r\nport = "PORT"\r\n',
+        '\ufeffmcu.port = "PORT"\r\n',
     ],
 )
 def test_the_stop_script_finds_the_port_in_every_toml_notation(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from codecs import BOM_UTF8
 
 from msgspec import convert, to_builtins
 
@@ -29,7 +30,7 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
     """Decode and check the text of an `acsard.toml`.
 
     Args:
-        text: the content of the file, TOML in UTF-8.
+        text: the content of the file, TOML in UTF-8, with or without a byte-order mark.
         overrides: values from the command line, by table and key. They replace the values in
             `text`.
 
@@ -41,7 +42,7 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
             [f"more than {MAX_BYTES} bytes: too large for a configuration; shorten the file"]
         )
     try:
-        table = tomllib.loads(text.decode("utf-8"))
+        table = tomllib.loads(text.removeprefix(BOM_UTF8).decode("utf-8"))
     except UnicodeDecodeError as error:
         raise ConfigError([f"not UTF-8 text: {error}; save the file as UTF-8"]) from None
     except tomllib.TOMLDecodeError as error:

@@ -92,6 +92,13 @@ def test_a_missing_file_is_created_if_the_caller_permits_it(tmp_path: Path) -> N
     assert os.listdir(tmp_path) == ["acsard.toml"]
 
 
+def test_a_file_with_a_byte_order_mark_is_changed_and_loses_the_mark(tmp_path: Path) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_bytes(b"\xef\xbb\xbf# mine\r\n[mcu]\r\nencoder_counts = 5\r\n")
+    change(file, {"mcu.encoder_counts": 10})
+    assert file.read_bytes() == b"# mine\r\n[mcu]\r\nencoder_counts = 10\r\n"
+
+
 def test_new_values_may_be_calculated_from_the_present_configuration(tmp_path: Path) -> None:
     file = tmp_path / "acsard.toml"
     file.write_bytes(b"# mine\r\n[mcu]\r\nencoder_counts = 5\r\n")

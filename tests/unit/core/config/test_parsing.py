@@ -44,6 +44,12 @@ def test_an_empty_file_gives_the_defaults() -> None:
     assert parse(b"") == Config()
 
 
+def test_a_file_may_begin_with_a_byte_order_mark() -> None:
+    # Notepad on Windows writes this mark.
+    config = parse(b'\xef\xbb\xbf[robot]\r\nid = "r7"\r\n')
+    assert config.robot.id == "r7"
+
+
 def test_the_reference_file_decodes_to_exactly_the_defaults() -> None:
     assert parse(REFERENCE.read_bytes()) == Config()
 
