@@ -68,7 +68,8 @@ MUST_FINISH = {
     "call", "set", "bench", "doctor", "mcu", "accuracy", "calibrate", "tls", "service",
 }  # fmt: skip
 """Subcommands whose exit code says whether something was done or judged. If the reader of their
-output ends early, they have failed."""
+output ends early, they have failed. An action of another subcommand, such as `recording replay`,
+sets `must_finish` instead."""
 
 MAX_ARGUMENT_LENGTH = 4096
 """Largest length of an argument, characters. Zenoh fails on keys above 65,535 bytes."""
@@ -156,10 +157,12 @@ def main(argv: list[str] | None = None) -> int:
     if trouble:
         print(f"acsard: {trouble}", file=sys.stderr)
         return int(Exit.USAGE)
-    code = int(Exit.FAILURE if words[0] in MUST_FINISH else Exit.OK)
+    must_finish = words[0] in MUST_FINISH
+    code = int(Exit.FAILURE if must_finish else Exit.OK)
     try:
         try:
             args = parser(words[:1]).parse_args(words)
+            must_finish = must_finish or getattr(args, "must_finish", False)
             code = int(args.main(args))
         except AcsardError as error:
             print(f"acsard: {lines(str(error))}", file=sys.stderr)
@@ -175,7 +178,8 @@ def main(argv: list[str] | None = None) -> int:
             with suppress(OSError):
                 print(f"acsard: {error}", file=sys.stderr)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return code if isinstance(error, BrokenPipeError) else code or int(Exit.FAILURE)
+        failed = must_finish or not isinstance(error, BrokenPipeError)
+        return code or int(Exit.FAILURE if failed else Exit.OK)
     except KeyboardInterrupt:
         return 130
     return code

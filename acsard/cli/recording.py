@@ -1,9 +1,10 @@
 """Work with the recordings that the daemon has made. Without a subcommand, list them, oldest
 first, with the main events of each. `!` marks recordings with a stop, a fault or a crash. With
 --from and --to, list only the recordings from the time between them. The argument FILE of a
-subcommand is the file of a recording, its number in the list, or `all`. Without FILE, a subcommand
-uses the newest recording. If --from or --to is a date or a time of day, it uses all recordings in
-that span.
+subcommand is the file of a recording, or its number in the list. Without FILE, `show`, `replay`,
+`export` and `report` use the newest recording. FILE of `show`, `export` and `report` can also be
+`all`; without FILE, and if --from or --to is a date or a time of day, these three use all
+recordings in that span.
 """
 
 from __future__ import annotations
@@ -125,7 +126,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "part that cannot be read because of damage is not compared. Exit codes: 0 everything is "
         "the same, 1 something differs, 65 a part was not compared and the rest is the same.",
     )
-    replay.set_defaults(main=main_replay)
+    replay.set_defaults(main=main_replay, must_finish=True)
     recover = actions.add_parser(
         "recover",
         help="write the intact part of an unfinished or damaged recording as a finished file",
@@ -359,7 +360,7 @@ def main_replay(args: argparse.Namespace) -> int:
     The exit code is 1 if results differ and --config was not given. Otherwise it is 65 if a part of
     the recording was not compared, and 0 if every part was compared.
     """
-    _refuse_times(args, "replay")
+    _require_one(args, "replay")
     recording = _recording(args)
     other = None if args.config is None else load(args.config)[1]
     with _progress(recording) as tell:
@@ -384,7 +385,7 @@ def main_replay(args: argparse.Namespace) -> int:
 
 
 def main_recover(args: argparse.Namespace) -> int:
-    _refuse_times(args, "recover")
+    _require_one(args, "recover")
     recording, new = _recording(args), Path(args.new)
     replaces = ""
 
@@ -447,9 +448,14 @@ def main_report(args: argparse.Namespace) -> int:
     return int(Exit.OK)
 
 
-def _refuse_times(args: argparse.Namespace, subcommand: str) -> None:
-    if args.begin is not None or args.end is not None:
-        raise UsageError(f"{subcommand} takes a whole recording: leave out --from and --to")
+def _require_one(args: argparse.Namespace, subcommand: str) -> None:
+    if args.begin is not None or args.end is not None or args.file == "all":
+        new = " NEW" if subcommand == "recover" else ""
+        raise UsageError(
+            f"{subcommand} takes one whole recording: leave out --from and --to, and write its "
+            f"file or number, not `all`, as in `acsard recording {subcommand} 12{new}`; `acsard "
+            "recording` lists the numbers"
+        )
 
 
 def _require_suffix(new: str | None, kind: Kind | Literal["html"]) -> None:
@@ -502,7 +508,8 @@ def _search(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
     first, last = _range(args)
     where, files = _files(args)
     try:
-        result = search(files, first, last)
+        with _search_progress(len(files)) as tell:
+            result = search(files, first, last, tell)
     except NothingRecordedError as error:
         raise RecordingError(
             f"{error} (searched {many(len(files), 'recording')} in {where})"
@@ -576,6 +583,23 @@ def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
 
     def print_progress(wall_ns: int) -> None:
         text = f"\r{(wall_ns - began_ns) / 1e9:.0f}{whole} s of the recording"
+        print(text, end="", file=sys.stderr, flush=True)
+
+    try:
+        yield print_progress
+    finally:
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def _search_progress(count: int) -> Iterator[Callable[[int], None]]:
+    """Yield a function that shows on a terminal how many of `count` files have been searched."""
+    if not sys.stderr.isatty():
+        yield lambda searched: None
+        return
+
+    def print_progress(searched: int) -> None:
+        text = f"\rsearched {searched} of {many(count, 'recording')}"
         print(text, end="", file=sys.stderr, flush=True)
 
     try:

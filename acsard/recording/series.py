@@ -8,7 +8,7 @@ or a replay can continue from one file to the next.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -109,7 +109,7 @@ class _CoveredRange(NamedTuple):
     path: Path
 
 
-def search(files: Sequence[Path], first: float, last: float) -> Search:
+def search(files: Sequence[Path], first: float, last: float, tell: Callable[[int], None]) -> Search:
     """Find the recordings that have steps in a range of time.
 
     Successive files without a missing step between them are joined into a `Series`. If a file
@@ -119,6 +119,7 @@ def search(files: Sequence[Path], first: float, last: float) -> Search:
         files: paths of the files to search, the oldest first.
         first: beginning of the range, s since 1970; -inf for no limit.
         last: end of the range, s since 1970; inf for no limit.
+        tell: receives the number of files that have been searched, before each file.
 
     Raises:
         NothingRecordedError: no recording has a step in the range.
@@ -126,6 +127,7 @@ def search(files: Sequence[Path], first: float, last: float) -> Search:
     result, pieces = Search(), list[_CoveredRange]()
     chosen: dict[int, Contents] = {}
     for number, path in enumerate(files):
+        tell(number)
         try:
             covered = _covered(path)
             if covered.begin - TIME_TOLERANCE_S > last or covered.end + TIME_TOLERANCE_S < first:

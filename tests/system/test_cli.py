@@ -21,8 +21,11 @@ import pytest
 
 from acsard.bus.robot_discovery import Presence, presence
 from acsard.client import connect
+from acsard.core.config.settings import Config
 from acsard.host.errors import Exit
 from tests.each import each
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import World
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,
@@ -312,6 +315,20 @@ def test_a_failure_keeps_its_exit_code_when_the_reader_of_the_output_has_left(
     ):
         assert get.ended(10.0) == Exit.UNREACHABLE
     assert "Traceback" not in get.stderr
+
+
+def test_a_replay_fails_if_the_reader_of_its_output_has_left(tmp_path: Path) -> None:
+    env = {key: value for key, value in environment().items() if key != "PYTHONUNBUFFERED"}
+    tape, path = Tape(), tmp_path / "drive.mcap"
+    World(recorder=tape).run(0.5)
+    tape.write(path, Config())
+    words = acsard("recording", "replay", str(path))
+    assert finish(words, tmp_path, 10.0).code == Exit.OK
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "wb") as closed, Program(words, tmp_path, env, stdout=closed) as replay:
+        assert replay.ended(10.0) == Exit.FAILURE
+    assert replay.stderr == ""
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

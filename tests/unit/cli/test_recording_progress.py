@@ -44,6 +44,16 @@ def test_the_progress_is_shown_on_a_terminal(
     assert output.endswith("\r\x1b[K")
 
 
+def test_the_progress_of_a_search_is_shown_on_a_terminal(
+    recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded.rename(recorded.with_name("000001-20270115T080000Z.mcap"))
+    words = ["recording", "show", "all", "--directory", str(recorded.parent)]
+    output = on_terminal(80, lambda: main(words), monkeypatch)
+    recorded.with_name("000001-20270115T080000Z.mcap").rename(recorded)
+    assert output.startswith("\rsearched 0 of 1 recording\r\x1b[K")
+
+
 def test_no_progress_is_written_into_a_pipe(
     recorded: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -309,6 +309,18 @@ def test_seconds_are_refused_for_all_recordings_and_not_recommended(
     assert "second" not in TIME_EXAMPLES
 
 
+@each("verb", ["replay", "recover"])
+def test_a_subcommand_for_one_recording_refuses_all_and_says_how_to_name_one(
+    verb: str, tmp_path: Path
+) -> None:
+    new = ["new.mcap"] if verb == "recover" else []
+    for words in (["--from", "14:05", verb, "1", *new], [verb, "all", *new]):
+        code, _, err = recording(tmp_path, *words)
+        assert code == 2
+        assert f"{verb} takes one whole recording" in err
+        assert f"`acsard recording {verb} 12" in err
+
+
 @each(
     ("verb", "words"), [("", "-h"), ("show", "also a number of seconds"), ("export", "FILE `all`")]
 )
