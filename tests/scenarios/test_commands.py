@@ -240,15 +240,15 @@ def test_failed_hardware_holds_the_robot_and_the_reason_is_reported(world: World
             world.send(0.0, source="ros2_control")
             world.send(0.3, source="nav")
             world.run(0.05)
-        assert ("ros2_control keeps the robot at rest" in world.state.reason) == (second >= 3)
+        assert ("ros2_control commands zero speed" in world.state.reason) == (second >= 3)
     # a person may hold the robot by these zeros, so no other client drives past them
     assert world.state.linear == 0.0
     assert world.state.reason == (
-        "driving: ros2_control keeps the robot at rest: it has sent only zeros for over 10 s; the "
+        "driving: ros2_control commands zero speed: it has sent only zeros for over 10 s; the "
         "speeds of nav have no effect"
     )
     (text,) = [event.text for event in world.events if event.name == "commands_without_effect"]
-    assert "ros2_control keeps the robot at rest" in text
+    assert "ros2_control commands zero speed" in text
     assert "the speeds of nav have no effect" in text
     world.run(0.3)
     world.drive(0.3, seconds=0.5, source="nav")

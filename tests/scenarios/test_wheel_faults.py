@@ -114,6 +114,18 @@ def test_a_stuck_wheel_is_left_out_within_50_ms_and_the_fault_follows_in_time() 
     assert off(made)[1] < 0.01
 
 
+@pytest.mark.parametrize(("speed", "mode"), [(0.1, "driving"), (0.12, "fault")])
+def test_a_dead_encoder_stops_the_robot_above_2_rad_s_and_is_named_at_any_speed(
+    speed: float, mode: str
+) -> None:
+    made = world(fault_time=0.5)
+    made.drive(speed, seconds=1.0)
+    with made.mcu.stuck_encoder(0):
+        made.hold(speed, seconds=2.0)
+    assert made.state.mode == mode
+    assert made.state.wheel_fault.startswith("front_right wheel is left out of the pose")
+
+
 @SLOW
 def test_an_encoder_that_works_again_is_used_again() -> None:
     made = world()

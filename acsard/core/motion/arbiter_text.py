@@ -69,7 +69,7 @@ def waiting(wait: Wait) -> str:
         case "zeros":
             note = f"; the speeds of {wait.kept} have no effect" if wait.kept else ""
             zeros = f"only zeros for over {lasting(wait.lasts)}"
-            return f"{wait.source} keeps the robot at rest: it has sent {zeros}{note}"
+            return f"{wait.source} commands zero speed: it has sent {zeros}{note}"
         case "higher":
             return f"{wait.source} has priority: wait until it is silent"
         case "equal":

@@ -40,16 +40,16 @@ SENTENCES = [
     ),
     (
         Wait("zeros", "app", lasts=3.0),
-        "app keeps the robot at rest: it has sent only zeros for over 3 s",
+        "app commands zero speed: it has sent only zeros for over 3 s",
     ),
     (
         Wait("zeros", "ros2_control", lasts=600.0, kept="nav"),
-        "ros2_control keeps the robot at rest: it has sent only zeros for over 10 min; the speeds "
+        "ros2_control commands zero speed: it has sent only zeros for over 10 min; the speeds "
         "of nav have no effect",
     ),
     (
         Wait("zeros", "app", lasts=3600.0),
-        "app keeps the robot at rest: it has sent only zeros for over 1 h",
+        "app commands zero speed: it has sent only zeros for over 1 h",
     ),
     (
         Wait("proof", "high", 0.25),
