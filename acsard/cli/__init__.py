@@ -156,9 +156,9 @@ def main(argv: list[str] | None = None) -> int:
     trouble = _unusable(words)
     if trouble:
         print(f"acsard: {trouble}", file=sys.stderr)
-        return int(Exit.USAGE)
+        return Exit.USAGE
     must_finish = words[0] in MUST_FINISH
-    code = int(Exit.FAILURE if must_finish else Exit.OK)
+    code: int = Exit.FAILURE if must_finish else Exit.OK
     try:
         try:
             args = parser(words[:1]).parse_args(words)
@@ -166,7 +166,7 @@ def main(argv: list[str] | None = None) -> int:
             code = int(args.main(args))
         except AcsardError as error:
             print(f"acsard: {lines(str(error))}", file=sys.stderr)
-            code = int(error.code if isinstance(error, MendableError) else Exit.FAILURE)
+            code = error.code if isinstance(error, MendableError) else Exit.FAILURE
         finally:
             sys.stdout.flush()
     except OSError as error:
@@ -179,7 +179,7 @@ def main(argv: list[str] | None = None) -> int:
                 print(f"acsard: {error}", file=sys.stderr)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         failed = must_finish or not isinstance(error, BrokenPipeError)
-        return code or int(Exit.FAILURE if failed else Exit.OK)
+        return code or (Exit.FAILURE if failed else Exit.OK)
     except KeyboardInterrupt:
         return 130
     return code
@@ -237,10 +237,10 @@ def entry() -> NoReturn:
     try:
         code = main()
     except SystemExit as end:  # argparse ends this way after --help, --version and usage errors
-        code = end.code if isinstance(end.code, int) else int(Exit.FAILURE)
+        code = end.code if isinstance(end.code, int) else Exit.FAILURE
     except BaseException:  # noqa: BLE001 - print the traceback as Python would
         traceback.print_exc()
-        code = int(Exit.FAILURE)
+        code = Exit.FAILURE
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()

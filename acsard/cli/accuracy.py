@@ -50,7 +50,7 @@ def main(args: argparse.Namespace) -> int:
             _print(budget, args.json)
             if not args.follow:
                 break
-    return int(Exit.OK)
+    return Exit.OK
 
 
 def _config(robot: Client, path: str | None) -> Config:

@@ -161,7 +161,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
         print(
             "restart the daemon: it uses the new calibration only after a restart", file=sys.stderr
         )
-    return int(Exit.OK)
+    return Exit.OK
 
 
 def _require_fitting(args: argparse.Namespace) -> None:

@@ -192,7 +192,7 @@ def _record(
     try:
         while most is None or count < most:
             if timeout is not None and time.monotonic() - heard_s > timeout:
-                return int(Exit.FAILURE)
+                return Exit.FAILURE
             for key, queue, reader in queues:
                 while (sample := queue.try_recv()) is not None and count != most:
                     on_message()
@@ -208,7 +208,7 @@ def _record(
             time.sleep(0.02)
     except KeyboardInterrupt:
         pass
-    return int(Exit.OK)
+    return Exit.OK
 
 
 def _report_left_out(full_key: str, key: str, error: Exception) -> None:

@@ -43,7 +43,7 @@ def main(args: argparse.Namespace) -> int:
         if not (args.once or args.json) and has_screen():
             with output_in_threads(MAX_LAST_OUTPUT_S):
                 terminal.roster(fleet)
-            return int(Exit.OK)
+            return Exit.OK
         rows = fleet.gather()
         if not rows:
             # Over TLS the client's certificate may not be permitted to see any of the named robots.
@@ -52,10 +52,10 @@ def main(args: argparse.Namespace) -> int:
             raise UnreachableError("; ".join(filter(None, (fleet.hint(), silence))))
         if args.json:
             print(json_line(msgspec.json.encode(rows).decode()), flush=True)
-            return int(Exit.OK)
+            return Exit.OK
         width = output_size().columns
         # Flush now, so that a session that closes slowly does not hold back the table.
         print("\n".join(table(rows, width)), flush=True)
     for text in filter(None, (fleet.presence_text, fleet.left_out_text)):
         print(f"acsard: {text}", file=sys.stderr)
-    return int(Exit.OK)
+    return Exit.OK

@@ -55,7 +55,7 @@ def main(args: argparse.Namespace) -> int:
             bridge.run()
         finally:
             bridge.close()
-    return int(Exit.OK)
+    return Exit.OK
 
 
 def loopback(text: str) -> tuple[str, int]:

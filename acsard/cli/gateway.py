@@ -40,8 +40,7 @@ def main(args: argparse.Namespace) -> int:
     log, manager = Log(config.log), Systemd(os.environ, os.getpid())
     try:
         holder = sys.stdin.fileno() if args.supervised else None
-        code = ListenerProcess(Gateway(config), log, manager, holder).run()
+        return ListenerProcess(Gateway(config), log, manager, holder).run()
     finally:
         manager.close()
         log.close()
-    return int(code)

@@ -45,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
                 print(printable(f"{robot_id}: NO ANSWER: {error}"), file=sys.stderr)
                 continue
             _show(of_robot(robot_id, line))
-    return int(Exit.UNREACHABLE if silent else Exit.OK)
+    return Exit.UNREACHABLE if silent else Exit.OK
 
 
 def _show(line: str) -> None:

@@ -132,7 +132,7 @@ def _checked(
         raise trouble
     if found_changes and not args.write:
         prompt.offer(args.config, found_changes)
-    return int(Exit.OK if result.passed else Exit.FAILURE)
+    return Exit.OK if result.passed else Exit.FAILURE
 
 
 def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | JsonPrompt:

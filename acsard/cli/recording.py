@@ -268,7 +268,7 @@ def main(args: argparse.Namespace) -> int:
         words = f" {in_words(first, last)}" if files else ""
         mend = ": leave out --from and --to to list all recordings" if words else ""
         print(f"no recordings{words} in {where}{mend}")
-    return int(Exit.OK)
+    return Exit.OK
 
 
 def _row(path: Path, end: EndRecord, note: str) -> tuple[str, ...]:
@@ -293,7 +293,7 @@ def main_show(args: argparse.Namespace) -> int:
         if _is_being_recorded(recording):
             note = note.replace(UNFINISHED, "being recorded")
         _note(recording, _bracketed(note))
-    return int(Exit.OK)
+    return Exit.OK
 
 
 def _is_being_recorded(recording: Recording) -> bool:
@@ -380,8 +380,8 @@ def main_replay(args: argparse.Namespace) -> int:
     _note(recording, left_out)
     _note(recording, _bracketed(recording.missing_text))
     if not result.same and other is None:
-        return int(Exit.FAILURE)
-    return int(Exit.INCOMPLETE if left_out else Exit.OK)
+        return Exit.FAILURE
+    return Exit.INCOMPLETE if left_out else Exit.OK
 
 
 def main_recover(args: argparse.Namespace) -> int:
@@ -402,7 +402,7 @@ def main_recover(args: argparse.Namespace) -> int:
     except OSError as error:
         raise MendableError(f"cannot write {new}: {error.strerror}") from None
     print(f"{many(count, 'message')} in {new}{replaces}{_bracketed(recording.missing_text)}")
-    return int(Exit.OK)
+    return Exit.OK
 
 
 def main_export(args: argparse.Namespace) -> int:
@@ -422,7 +422,7 @@ def main_export(args: argparse.Namespace) -> int:
         _note(recording, _bracketed(recording.missing_text))
         if left_out:
             code = Exit.INCOMPLETE
-    return int(code)
+    return code
 
 
 def main_report(args: argparse.Namespace) -> int:
@@ -445,7 +445,7 @@ def main_report(args: argparse.Namespace) -> int:
         print(f"{new}: {len(text) / 1e6:.1f} MB; open it in any browser")
         for note in notes:
             _note(recording, note)
-    return int(Exit.OK)
+    return Exit.OK
 
 
 def _require_one(args: argparse.Namespace, subcommand: str) -> None:

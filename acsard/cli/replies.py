@@ -98,6 +98,6 @@ def print_each(
     if ALL_ROBOTS in ids:
         print(f"acsard: {count_text(robot.where.endpoint, len(replies))}", file=sys.stderr)
     if any(isinstance(reply, AcsardError) for reply in replies.values()):
-        return int(Exit.UNREACHABLE)
+        return Exit.UNREACHABLE
     done = [isinstance(reply, ServiceReply) and reply.success for reply in replies.values()]
-    return int(Exit.OK if all(done) else Exit.FAILURE)
+    return Exit.OK if all(done) else Exit.FAILURE

@@ -37,7 +37,7 @@ def main(args: argparse.Namespace) -> int:
             return asyncio.run(_keep_router(str(args.file), log))
         log_from_environment()
         manager = Systemd({}, os.getpid())
-        return int(ListenerProcess(router, log, manager, sys.stdin.fileno()).run())
+        return ListenerProcess(router, log, manager, sys.stdin.fileno()).run()
     finally:
         log.close()
 

@@ -50,7 +50,7 @@ def main_install(args: argparse.Namespace) -> int:
     if trouble:
         print(f"acsard: {trouble}", file=sys.stderr)
         if not (args.dry_run or args.force):
-            return int(Exit.FAILURE)
+            return Exit.FAILURE
     files = service.files()
     steps = service.installing(
         files, service.present(files), service.wrong_modes(files), force=args.force

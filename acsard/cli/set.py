@@ -80,7 +80,7 @@ def main(args: argparse.Namespace) -> int:
     with connected_to_many(args) as (robot, many):
         if not settings:
             _print_settings(robot.get("config"), args.json)
-            return int(Exit.OK)
+            return Exit.OK
         if many:
             return _set_all(robot, many, settings, keep=args.keep, as_json=args.json)
         reply = robot.set(settings, keep=args.keep)
@@ -92,7 +92,7 @@ def main(args: argparse.Namespace) -> int:
             raise MendableError(f"{text}; not written: {error}") from None
         text = f"{reply.message}; written to {file}"
     print(json_line(encode(reply, "json").decode()) if args.json else lines(text))
-    return int(Exit.OK if reply.success else Exit.FAILURE)
+    return Exit.OK if reply.success else Exit.FAILURE
 
 
 def pairs(words: Sequence[str]) -> dict[str, Plain]:

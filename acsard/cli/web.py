@@ -143,7 +143,7 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
             asyncio.run(server.serve(options, announce, log))
     finally:
         log.close()
-    return int(Exit.OK)
+    return Exit.OK
 
 
 def _listen(args: argparse.Namespace, config: Config) -> tuple[Listen, ...]:
@@ -179,7 +179,7 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
     print(f"\nto revoke the token before that: acsard web --revoke {token.name}")
     if unknown := vault.unknown_to():
         print(unknown)
-    return int(Exit.OK)
+    return Exit.OK
 
 
 def _vault(args: argparse.Namespace, config: Config) -> Vault:
@@ -206,13 +206,13 @@ def _list(vault: Vault) -> int:
             f"no tokens for the robot {vault.robot} are in {vault.path}; `acsard web --invite "
             "ROLE` makes one"
         )
-    return int(Exit.OK)
+    return Exit.OK
 
 
 def _revoke(vault: Vault, name: str) -> int:
     vault.revoke(name)
     print(f"{name} is revoked")
-    return int(Exit.OK)
+    return Exit.OK
 
 
 def _clock(seconds: int) -> str:

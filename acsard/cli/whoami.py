@@ -27,5 +27,5 @@ def main(args: argparse.Namespace) -> int:
     else:
         print(f"{us.describe()}\nsender {us.sender}")
     if us.role:
-        return int(Exit.OK)
-    return int(Exit.NO_PERMISSION if us.certificate else Exit.UNREACHABLE)
+        return Exit.OK
+    return Exit.NO_PERMISSION if us.certificate else Exit.UNREACHABLE

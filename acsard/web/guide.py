@@ -228,7 +228,7 @@ class Guide:
         # Python raises `RuntimeError` if it cannot start a thread for the child process.
         except (FrameError, OSError, TimeoutError, RuntimeError) as error:
             code, text = (
-                int(Exit.USAGE),
+                Exit.USAGE,
                 str(error) or SLOW_PORTS,
             )
         finally:
@@ -338,7 +338,7 @@ class _Job:
         `OSError` if the child cannot be started.
         """
         if self.left:
-            return int(Exit.FAILURE), ""
+            return Exit.FAILURE, ""
         async with running(acsard(*options), stdin=PIPE, stdout=PIPE, stderr=PIPE) as process:
             self._process = process
             if self.left:
