@@ -22,7 +22,7 @@ from asyncio import sslproto
 from collections import Counter
 from collections.abc import Callable, Collection
 from contextlib import suppress
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 from aiohttp import StreamReader, web, web_protocol
 from aiohttp.web_protocol import RequestHandler
@@ -67,6 +67,16 @@ s."""
 Factory = Callable[[], "Reader"]
 
 
+class _Listener(NamedTuple):
+    """A listening socket, and how the server serves the connections at it."""
+
+    opened: socket.socket
+    secure: ssl.SSLContext | None
+    """TLS context, or None for plain HTTP."""
+    make: Factory
+    """Function that creates the HTTP handler of one connection."""
+
+
 class Acceptor:
     """Accepts TCP connections at the listening addresses, and cuts connections beyond the limits.
 
@@ -79,7 +89,7 @@ class Acceptor:
         files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         self._here = Sockets["_Connection"](MAX_LOCAL_TCP_CONNECTIONS)
         self._away = Sockets["_Connection"](sockets_for(files))
-        self._listeners: list[socket.socket] = []
+        self._listeners: list[_Listener] = []
         self._waiting: dict[str, dict[_Connection, None]] = {}
         """Connections that wait for their TLS handshake, by network. When a network's handshake
         starts, the network moves to the end of this dict, so the networks take turns."""
@@ -102,15 +112,16 @@ class Acceptor:
         # A browser waits for the answer before it sends the next request on a connection. aiohttp
         # would queue 32 requests, whose headers can take megabytes.
         web_protocol.MAX_MSG_QUEUE_SIZE = 1
-        self._listeners.append(opened)
-        self._resume(opened, secure, make)
+        listener = _Listener(opened, secure, make)
+        self._listeners.append(listener)
+        self._resume(listener)
 
     def close(self) -> None:
         """Stop accepting connections. Also cut the open connections of unidentified clients."""
         loop = asyncio.get_running_loop()
-        for opened in self._listeners:
-            loop.remove_reader(opened)
-            opened.close()
+        for listener in self._listeners:
+            loop.remove_reader(listener.opened)
+            listener.opened.close()
         self._listeners.clear()
         for pool in (self._here, self._away):
             for connection in pool.strangers():
@@ -151,51 +162,46 @@ class Acceptor:
         for connection in self._ended & before:
             connection.cut()
 
-    def _resume(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        if opened in self._listeners:
-            loop = asyncio.get_running_loop()
-            loop.add_reader(opened, self._accept, opened, secure, make)
+    def _resume(self, listener: _Listener) -> None:
+        if listener in self._listeners:
+            asyncio.get_running_loop().add_reader(listener.opened, self._accept, listener)
 
-    def _accept(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
+    def _accept(self, listener: _Listener) -> None:
         # Accept at most 32 connections in a row, so that other work of the event loop has its turn.
         for _ in range(32):
             try:
-                accepted, place = opened.accept()
+                accepted, place = listener.opened.accept()
             except (BlockingIOError, InterruptedError):
                 return
             except OSError as error:
                 if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM):
-                    self._no_file(opened, secure, make)
+                    self._no_file(listener)
                     return
                 continue  # the client has gone already
             peer = unmapped(str(place[0]))
             pool = self._here if is_loopback(peer) else self._away
-            _Connection(self, pool, accepted, peer, secure, make).enter()
+            _Connection(self, pool, accepted, peer, listener).enter()
 
-    def _no_file(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        """Close an old connection, and accept no new ones at `opened` for `NO_FILES_PAUSE_S`.
+    def _no_file(self, listener: _Listener) -> None:
+        """Close an old connection, and accept no new ones at `listener` for `NO_FILES_PAUSE_S`.
 
         Call this if the process has no free file descriptor.
         """
         loop = asyncio.get_running_loop()
-        loop.remove_reader(opened)
-        loop.call_later(NO_FILES_PAUSE_S, self._resume, opened, secure, make)
+        loop.remove_reader(listener.opened)
+        loop.call_later(NO_FILES_PAUSE_S, self._resume, listener)
         if (victim := self._away.displaced() or self._here.displaced()) is not None:
-            self.crowded(victim)
+            self.refuse(victim, "crowded")
 
     # The connections call the methods below.
 
-    def crowded(self, connection: _Connection) -> None:
-        """Cut a connection and count the refusal under the reason `crowded`.
+    def refuse(self, connection: _Connection, reason: Literal["crowded", "slow"]) -> None:
+        """Cut a connection, and count the refusal.
 
-        Call this if there is no room for the connection, or if its request headers are too long.
+        The reason is "slow" if the connection exceeds a time limit. It is "crowded" if there is no
+        room for the connection, or if its request headers are too long.
         """
-        self._counts.refuse("crowded", connection.peer)
-        connection.cut()
-
-    def slow(self, connection: _Connection) -> None:
-        """Cut a connection that exceeds a time limit, and count the refusal as `slow`."""
-        self._counts.refuse("slow", connection.peer)
+        self._counts.refuse(reason, connection.peer)
         connection.cut()
 
     def wait(self, connection: _Connection) -> None:
@@ -261,7 +267,7 @@ class Acceptor:
         if now < begun + MIN_ABORT_AGE_S:
             return False
         del self._starting[oldest]
-        self.slow(oldest)
+        self.refuse(oldest, "slow")
         return True
 
 
@@ -274,11 +280,11 @@ class _Connection(asyncio.Protocol):
         pool: Sockets[_Connection],
         accepted: socket.socket,
         peer: str,
-        secure: ssl.SSLContext | None,
-        make: Factory,
+        listener: _Listener,
     ) -> None:
         self.pool, self.peer, self.network = pool, peer, network_of(peer)
-        self._acceptor, self._socket, self._secure, self._make = acceptor, accepted, secure, make
+        self._acceptor, self._socket = acceptor, accepted
+        self._secure, self._make = listener.secure, listener.make
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._task: asyncio.Task[None] | None = None
@@ -292,14 +298,14 @@ class _Connection(asyncio.Protocol):
     def enter(self) -> None:
         victim = self.pool.enter(self.network, self)
         if victim is self:
-            self._acceptor.crowded(self)
+            self._acceptor.refuse(self, "crowded")
             return
         if victim is not None:
-            self._acceptor.crowded(victim)
+            self._acceptor.refuse(victim, "crowded")
         self._socket.setblocking(False)
         option, unread_ms = socket.TCP_USER_TIMEOUT, round(1000 * UNREAD_TIMEOUT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, option, unread_ms)
-        self._timer = self._loop.call_later(REQUEST_TIMEOUT_S, self._acceptor.slow, self)
+        self._timer = self._loop.call_later(REQUEST_TIMEOUT_S, self._acceptor.refuse, self, "slow")
         self._loop.add_reader(self._socket, self._first_byte)
 
     def _first_byte(self) -> None:
@@ -336,7 +342,7 @@ class _Connection(asyncio.Protocol):
             # garbage collection.
             traceback.clear_frames(error.__traceback__)
             if isinstance(error, ConnectionAbortedError):
-                self._acceptor.slow(self)  # `HANDSHAKE_S` is over
+                self._acceptor.refuse(self, "slow")  # `HANDSHAKE_S` is over
             # Otherwise the client does not speak TLS, or does not trust the certificate.
         finally:
             if secure is not None:
@@ -391,7 +397,7 @@ class _Connection(asyncio.Protocol):
         self._head += len(data)
         # Headers that never end would fill the memory.
         if self._head > 131072:
-            self._acceptor.crowded(self)
+            self._acceptor.refuse(self, "crowded")
 
     def eof_received(self) -> None:
         if self._inner is not None:
