@@ -41,6 +41,7 @@ from acsard.web.limits import GUESSES, GUESSES_OF_ONE, REFUSAL_DELAY_S, REQUEST_
 from acsard.web.metrics import Counts
 from acsard.web.routes import Route
 from acsard.web.socket_messages import MAX_MESSAGE_BYTES
+from acsard.web.tasks import shared
 from acsard.web.tokens import Token, Vault, owner_in
 
 HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
@@ -85,8 +86,7 @@ class Lookups:
         `TimeoutError` if the disk does not answer.
         """
         if self._next is None:
-            self._next = asyncio.create_task(self._later())
-            self._next.add_done_callback(lambda done: done.cancelled() or done.exception())
+            self._next = shared(self._later())
         return await asyncio.shield(self._next)
 
     async def _later(self) -> Sequence[Token]:

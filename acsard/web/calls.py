@@ -27,6 +27,7 @@ from acsard.host.threads import in_thread
 from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.limits import REMOTE_STOP_RATE
 from acsard.web.robots import Robots
+from acsard.web.tasks import shared
 
 MAX_CALLS, MAX_STOPS = 16, 32
 """`MAX_CALLS` is the maximum number of simultaneous queries and service calls; stops do not count.
@@ -230,9 +231,8 @@ class StopMerger:
         if rest is None:
             self._begin_pause(name)
             return await stop()
-        task = self._next[name] = asyncio.create_task(self._later(name, rest, stop))
-        task.add_done_callback(lambda done: done.cancelled() or done.exception())
-        return await asyncio.shield(task)
+        self._next[name] = shared(self._later(name, rest, stop))
+        return await asyncio.shield(self._next[name])
 
     def _begin_pause(self, name: Hashable) -> None:
         self._rests[name] = asyncio.Event()
@@ -268,8 +268,7 @@ class Stops:
             async with self._room:
                 return await in_thread(call, ANSWER_TIMEOUT_S)
         if self._next is None:
-            self._next = asyncio.create_task(self._later(call))
-            self._next.add_done_callback(lambda done: done.cancelled() or done.exception())
+            self._next = shared(self._later(call))
         return await asyncio.shield(self._next)
 
     async def _later(self, call: Callable[[], ServiceReply]) -> ServiceReply:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable, Coroutine
-from contextlib import suppress
-from typing import Any
 
 from acsard.bus.robot_discovery import ALL_ROBOTS
 from acsard.client import Client, fleet
@@ -14,7 +11,8 @@ from acsard.core.messages.state_warnings import charge, warnings
 from acsard.host.threads import in_thread
 from acsard.web.robots import Robots
 from acsard.web.socket_messages import Row
-from acsard.web.streams import DECLARE_TIMEOUT_S, NOT_READY_ERRORS, STATE_KEY
+from acsard.web.streams import DECLARE_TIMEOUT_S, NOT_READY_ERRORS, STATE_KEY, attempt
+from acsard.web.tasks import start
 
 MAX_ROBOTS = 200
 
@@ -79,9 +77,9 @@ class FleetTracker:
         if not self._joined or client is None or self._busy:
             return
         if tracked is None:
-            self._start(self._declare(client))
+            start(self._declare(client), self._busy)
         elif due := tracked.due():
-            self._start(_within_time(lambda: tracked.send_queries(due)))
+            start(attempt(lambda: tracked.send_queries(due)), self._busy)
 
     async def _declare(self, client: Client) -> None:
         def declare() -> fleet.Fleet:
@@ -107,18 +105,8 @@ class FleetTracker:
 
     def _tidy(self) -> None:
         if not self._joined and self._tracked is not None:
-            self._start(_within_time(self._tracked.end))
+            start(attempt(self._tracked.end), self._busy)
             self._tracked = None
-
-    def _start(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.get_running_loop().create_task(work)
-        self._busy.add(task)
-        task.add_done_callback(self._busy.discard)
-
-
-async def _within_time(call: Callable[[], None]) -> None:
-    with suppress(*NOT_READY_ERRORS):  # the bus is stuck or closed
-        await in_thread(call, DECLARE_TIMEOUT_S)
 
 
 def _row(entry: fleet.Row) -> Row:

@@ -25,6 +25,7 @@ from acsard.recording.end_record import ending_text, read_end
 from acsard.web.answers import READ_TIMEOUT_S, TroubleError
 from acsard.web.callers import RequestRefusedError, is_loopback
 from acsard.web.robots import Robots
+from acsard.web.tasks import shared
 
 POLICY = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src "
@@ -90,7 +91,7 @@ class BlackBox:
 
     def __init__(self, robots: Robots) -> None:
         self._robots = robots
-        self._listing: asyncio.Future[list[Recording]] | None = None
+        self._listing: asyncio.Task[list[Recording]] | None = None
         self._listed_ns = 0
         """Monotonic time at which the task `_listing` was started, ns."""
 
@@ -102,12 +103,7 @@ class BlackBox:
         place, now_ns = self._place(), clock.mono_ns()
         old = now_ns - self._listed_ns > MIN_LIST_INTERVAL_NS
         if self._listing is None or (old and self._listing.done()):
-            self._listing = asyncio.ensure_future(in_thread(lambda: rows(place), READ_TIMEOUT_S))
-            # All clients may have gone when the listing fails. Retrieve the error here too, because
-            # asyncio logs every error that nothing retrieves.
-            self._listing.add_done_callback(
-                lambda listing: listing.cancelled() or listing.exception()
-            )
+            self._listing = shared(in_thread(lambda: rows(place), READ_TIMEOUT_S))
             self._listed_ns = now_ns
         try:
             return await asyncio.shield(self._listing)

@@ -23,6 +23,7 @@ from acsard.host import clock
 from acsard.host.errors import UsageError
 from acsard.host.threads import in_thread
 from acsard.web.limits import STREAMS, STREAMS_OF_ONE, Shares
+from acsard.web.tasks import start
 
 Take = Callable[[zenoh.Sample], None]
 
@@ -146,16 +147,11 @@ class Streams:
             return
         del self._streams[robot, key]
         if stream.declared is not None:
-            task = asyncio.create_task(_ended(stream.declared))
-            self._ending.add(task)
-            task.add_done_callback(self._ending.discard)
+            start(attempt(stream.declared.undeclare), self._ending)
 
     async def _declare(self, own: Client, robot: str, key: str, stream: Stream) -> Any:
         client = own.sibling(robot)
         asks = key not in STORED_KEYS or own.key(key) == client.key(key)
-
-        def late(subscriber: Any) -> None:
-            subscriber.undeclare()
 
         def of_it(take: Take) -> Take:
             return lambda sample: take(sample) if has_exact_key(client.key(key), sample) else None
@@ -172,12 +168,13 @@ class Streams:
                 raise
             return subscription
 
-        return await in_thread(declare, DECLARE_TIMEOUT_S, late)
+        return await in_thread(declare, DECLARE_TIMEOUT_S, lambda late: late.undeclare())
 
 
-async def _ended(subscriber: Any) -> None:
-    with suppress(TimeoutError, zenoh.ZError):  # the bus is stuck or closed, so no samples arrive
-        await in_thread(subscriber.undeclare, DECLARE_TIMEOUT_S)
+async def attempt(call: Callable[[], object]) -> None:
+    """Make a call that waits for the bus, in a thread. Ignore that the bus is stuck or closed."""
+    with suppress(*NOT_READY_ERRORS):
+        await in_thread(call, DECLARE_TIMEOUT_S)
 
 
 def as_json(encoding: str, payload: bytes) -> bytes:

@@ -48,6 +48,7 @@ from acsard.web.socket_messages import (
     decode,
 )
 from acsard.web.socket_sender import Keys, Outgoing
+from acsard.web.tasks import start
 
 ACTIONS: dict[str, Role] = {
     **{str(verb): role for verb, role in SERVICE_ROLES.items()},
@@ -312,7 +313,7 @@ class Viewer:
     def _call(self, frame: Call) -> None:
         if frame.call == "stop":
             # Keep stops in a separate set of tasks, which continue when the connection ends.
-            self._start(self._answer(frame), self._stops)
+            start(self._answer(frame), self._stops)
         else:
             if self._calling >= MAX_OPEN_CALLS:
                 self._refuse(
@@ -397,10 +398,5 @@ class Viewer:
             self._out.enqueue(socket_messages.Rows(self._fleet.rows(), self._fleet.note))
         return now + 0.25
 
-    def _start(
-        self, work: Coroutine[Any, Any, None], among: set[asyncio.Task[None]] | None = None
-    ) -> None:
-        among = self._tasks if among is None else among
-        task = asyncio.get_running_loop().create_task(work)
-        among.add(task)
-        task.add_done_callback(among.discard)
+    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+        start(work, self._tasks)
