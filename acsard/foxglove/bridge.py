@@ -200,15 +200,12 @@ class Bridge:
             self._outdated, self._retry_s = True, clock.steady_s() + LEARN_RETRY_S
             self._notices.enqueue("error", "daemon", str(error), status_id=DAEMON_GONE_ID)
             return
-        self._learn(facts)
-        self._notices.remove(DAEMON_GONE_ID)
-        self._notices.enqueue("info", "daemon", f"the daemon of robot {self._id} is back")
-
-    def _learn(self, facts: Facts) -> None:
         self._relay.offer(facts)
         self._drives.forbidden = facts.forbidden
         self._drives.timeout_s = self._timeout_s(facts)
         self._server.publish_parameter_values(as_parameters(self._settings.learn(facts.tables)))
+        self._notices.remove(DAEMON_GONE_ID)
+        self._notices.enqueue("info", "daemon", f"the daemon of robot {self._id} is back")
 
     def _timeout_s(self, facts: Facts) -> float:
         sources = facts.config.commands.sources

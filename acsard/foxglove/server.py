@@ -98,18 +98,16 @@ class Settings:
         """Number of times that the configuration was stored."""
         self.learn(tables)
 
-    def learn(self, tables: object) -> dict[str, Any]:
-        """Store the robot's configuration, and return the settings that have changed.
-
-        `tables` is the configuration as nested dicts, or None if this program may not read it.
-        """
-        return self._store(tables, None)
-
     def _query(self) -> dict[str, Any]:
         learned = self._learned
-        return self._store(self._robot.get("config"), learned)
+        return self.learn(self._robot.get("config"), learned)
 
-    def _store(self, tables: object, learned: int | None) -> dict[str, Any]:
+    def learn(self, tables: object, learned: int | None = None) -> dict[str, Any]:
+        """Store the robot's configuration, and return the settings that have changed.
+
+        `tables` is the configuration as nested dicts, or None if this program may not read it. If
+        it was queried, `learned` is the value of `_learned` before the query.
+        """
         now = {} if tables is None else live_settings(tables)
         with self._lock:
             if learned not in (None, self._learned):
@@ -129,7 +127,7 @@ class Settings:
         """
         with self._lock:
             self._asked = True
-            return select_settings(self._known, names)
+            return select_settings(self._known, names) if names else dict(self._known)
 
     def follow(self, names: Collection[str]) -> None:
         with self._lock:
@@ -170,7 +168,7 @@ class Settings:
 
     def _present_values(self, wishes: dict[str, Any]) -> dict[str, Any]:
         with self._lock:
-            return select_settings(self._known, wishes.keys()) if wishes else {}
+            return select_settings(self._known, wishes.keys())
 
     def _change(self, wishes: dict[str, Any]) -> dict[str, Any]:
         """Change all settings in `wishes`, or none.
@@ -236,8 +234,8 @@ def live_settings(config: object) -> dict[str, Any]:
 
 
 def select_settings(known: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """Return those settings in `known` whose names are in `names`, or all if `names` is empty."""
-    return {key: value for key, value in known.items() if key in names or not names}
+    """Return those settings in `known` whose names are in `names`."""
+    return {key: value for key, value in known.items() if key in names}
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:

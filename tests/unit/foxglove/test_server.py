@@ -29,7 +29,6 @@ from acsard.foxglove.server import (
     ShownTopics,
     changes,
     live_settings,
-    select_settings,
 )
 from acsard.host import clock
 
@@ -189,7 +188,8 @@ def test_parameter_values_have_only_types_of_the_protocol() -> None:
     ],
 )
 def test_a_request_gets_the_named_parameters_or_all(names: list[str], parameters: set[str]) -> None:
-    assert set(select_settings(NOW, names)) == parameters
+    settings, _ = of_robot(Robot())
+    assert set(settings.get(names)) == parameters
 
 
 def test_changes_are_only_settings_with_another_value() -> None:
