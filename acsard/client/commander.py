@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from msgspec import Struct
 
-from acsard.core.messages.schema import RobotState
+from acsard.core.messages.schema import RobotState, SourceState
 from acsard.core.messages.signature import Signature
 from acsard.core.values import NS_PER_S, REST, Twist
 
@@ -125,10 +125,8 @@ class Commander:
         self.replaced = self.stale = 0
         """Two counters of commands that were not sent. `replaced` counts the commands that a newer
         command replaced, and `stale` counts the commands that were too old or came in a burst."""
-        self._sends_leading_zero, self._gather_ns = (
-            sends_leading_zero,
-            BURST_WINDOW_NS if detects_bursts else 0,
-        )
+        self._sends_leading_zero = sends_leading_zero
+        self._gather_ns = BURST_WINDOW_NS if detects_bursts else 0
         self._wish: Wish | None = None
         self._last = Wish(REST)
         """The newest command, sent or not."""
@@ -281,7 +279,7 @@ def objection(state: RobotState, source: str, sender: str) -> str:
     """
     if state.mode in NEVER_DRIVING_MODES:
         return state.reason
-    ours = next((entry for entry in state.sources if entry.name == source), None)
+    ours = _entry(state, source)
     if ours is None:
         names = ", ".join(entry.name for entry in state.sources)
         return (
@@ -290,7 +288,7 @@ def objection(state: RobotState, source: str, sender: str) -> str:
         )
     if state.mode == "waiting":
         return state.reason
-    if not receives_commands(state, source):
+    if ours.wait == "command":
         return no_command(source)
     if state.source != source:
         return ours.waits_for or state.reason
@@ -320,16 +318,17 @@ def must_release_key(state: RobotState, source: str) -> bool:
     `NEVER_DRIVING_MODES`, or "waiting"), or `source` must first send a zero. Otherwise, a held key
     would move the robot as soon as the robot can drive again, which the operator may not expect.
     """
-    return not _can_drive(state) or only_needs_zero(state, source)
+    return not can_drive(state) or only_needs_zero(state, source)
 
 
 def only_needs_zero(state: RobotState, source: str) -> bool:
     """Return whether the robot can drive, and `source` can drive it after a zero."""
-    waits = any(entry.name == source and entry.wait == "neutral" for entry in state.sources)
-    return waits and _can_drive(state)
+    ours = _entry(state, source)
+    return ours is not None and ours.wait == "neutral" and can_drive(state)
 
 
-def _can_drive(state: RobotState) -> bool:
+def can_drive(state: RobotState) -> bool:
+    """Return whether some command can move the robot in its present mode."""
     return state.mode not in NEVER_DRIVING_MODES and state.mode != "waiting"
 
 
@@ -338,7 +337,8 @@ def receives_commands(state: RobotState, source: str) -> bool:
 
     Late commands count too.
     """
-    return any(entry.name == source and entry.wait != "command" for entry in state.sources)
+    ours = _entry(state, source)
+    return ours is not None and ours.wait != "command"
 
 
 def refuses_for_good(state: RobotState, source: str) -> bool:
@@ -347,4 +347,8 @@ def refuses_for_good(state: RobotState, source: str) -> bool:
     If so, waiting cannot help: no command moves the robot in its present mode, or the source is not
     configured.
     """
-    return state.mode in NEVER_DRIVING_MODES or all(entry.name != source for entry in state.sources)
+    return state.mode in NEVER_DRIVING_MODES or _entry(state, source) is None
+
+
+def _entry(state: RobotState, source: str) -> SourceState | None:
+    return next((entry for entry in state.sources if entry.name == source), None)

@@ -377,15 +377,40 @@ class Client:
                 require_size(verb, payload)
             except DecodeError as error:
                 return invalid_call(verb, error)
-        return Decoder(schema.ServiceReply).decode(*self._query(key, payload))
+        return Decoder(schema.ServiceReply).decode(*self.reply(key, payload))
 
     def get(self, name: str) -> Any:
         """Return the last message on a key such as `odom` or `state`, decoded to its type."""
         return decoder(name).decode(*self.reply(name))
 
-    def reply(self, name: str) -> tuple[str, bytes]:
-        """Return the last message on a key, not decoded, as a pair of encoding and payload."""
-        return self._query(name)
+    def reply(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
+        """Return the last message on a key, not decoded, as a pair of encoding and payload.
+
+        For the key of a service, call this service with the arguments in `payload`, and return its
+        reply.
+        """
+        # Ignore later replies, because any client on the bus may send any number of replies.
+        end_s = time.monotonic() + REPLY_TIMEOUT_S
+        while True:
+            reply = self._first(name, payload)
+            if reply is None:
+                raise self._unanswered(name)
+            if reply.ok is not None:
+                return encoded(reply.ok)
+            error_text = ""
+            if reply.err is not None:
+                error_text = reply.err.payload.to_bytes().decode(errors="replace")
+            if error_text == TIMED_OUT:
+                raise NoAnswerError(
+                    f"no answer on the Zenoh key {self.key(name)} within {REPLY_TIMEOUT_S:g} s: "
+                    "the daemon or the network is stuck; try again, or run `acsard doctor` on the "
+                    "robot"
+                )
+            # Repeat a query, but not a service call: since the first attempt, another client may
+            # have called a service with the opposite effect.
+            if error_text != BUSY or name in VERBS or time.monotonic() > end_s:
+                raise ReplyError(f"{name}: {error_text}")
+            time.sleep(0.03)
 
     def whoami(self) -> ClientIdentity:
         """Return this client's role and name at the robot. The role is "" if it is unknown."""
@@ -498,30 +523,6 @@ class Client:
             self._spacing.moving[self] = clock.steady_s()
         else:
             self._spacing.moving.pop(self, None)
-
-    def _query(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
-        # Ignore later replies, because any client on the bus may send any number of replies.
-        end_s = time.monotonic() + REPLY_TIMEOUT_S
-        while True:
-            reply = self._first(name, payload)
-            if reply is None:
-                raise self._unanswered(name)
-            if reply.ok is not None:
-                return encoded(reply.ok)
-            error_text = ""
-            if reply.err is not None:
-                error_text = reply.err.payload.to_bytes().decode(errors="replace")
-            if error_text == TIMED_OUT:
-                raise NoAnswerError(
-                    f"no answer on the Zenoh key {self.key(name)} within {REPLY_TIMEOUT_S:g} s: "
-                    "the daemon or the network is stuck; try again, or run `acsard doctor` on the "
-                    "robot"
-                )
-            # Repeat a query, but not a service call: since the first attempt, another client may
-            # have called a service with the opposite effect.
-            if error_text != BUSY or name in VERBS or time.monotonic() > end_s:
-                raise ReplyError(f"{name}: {error_text}")
-            time.sleep(0.03)
 
     def _first(self, name: str, payload: bytes | None) -> zenoh.Reply | None:
         try:

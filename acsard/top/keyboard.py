@@ -21,11 +21,11 @@ import time
 from acsard.client import Client
 from acsard.client.commander import (
     GRACE_S,
-    NEVER_DRIVING_MODES,
     RELEASE_TIMEOUT_NS,
     ZEROS,
     Commander,
     Wish,
+    can_drive,
     must_release_key,
     objection,
 )
@@ -247,10 +247,7 @@ class KeyboardDrive:
         why = ""
         if watch.state is not None and now - self._fine > GRACE_S:
             why = objection(watch.state, robot.source, robot.sender)
-            if self._keyboard.ignores(now) and watch.state.mode not in (
-                *NEVER_DRIVING_MODES,
-                "waiting",
-            ):
+            if self._keyboard.ignores(now) and can_drive(watch.state):
                 why = RELEASE_REASON
         return Teleop(
             robot.where.robot_id,
