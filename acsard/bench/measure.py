@@ -115,13 +115,6 @@ def _own(state: RobotState) -> dict[str, Summary]:
     }
 
 
-def _no_command_arrived(sent: int, state: RobotState) -> MendableError:
-    return MendableError(
-        f"the simulated microcontroller received none of the {sent} commands, so the benchmark "
-        f"measured nothing. The daemon reports: {state.reason}",
-    )
-
-
 def _result(
     config: Config, port: str, seconds: float, rig: Rig, shares: tuple[float, float]
 ) -> Result:
@@ -140,7 +133,10 @@ def _result(
         outside["feedback_to_odometry"] = summary([line.delay_ns for line in fed])
         wire_count, lines_said, lines_told = len(waits), len(record.feedback_lines), len(fed)
         if record.sent and not wire_count:
-            raise _no_command_arrived(len(record.sent), state)
+            raise MendableError(
+                f"the simulated microcontroller received none of the {len(record.sent)} commands, "
+                f"so the benchmark measured nothing. The daemon reports: {state.reason}"
+            )
         lines_waiting = max((line.waiting for line in fed), default=0)
         start_up = round((daemon_lines[0][0] - record.began_ns) / 1e6, 1)
     return Result(

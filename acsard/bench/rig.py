@@ -19,7 +19,6 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import TracebackType
 from typing import Self, TypeVar
 
 import msgspec
@@ -166,12 +165,7 @@ class Rig:
             self._stack = stack.pop_all()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._stack.close()
 
     # Starting
@@ -339,8 +333,7 @@ class Rig:
             if at.mono_ns < self._settled_ns:
                 continue
             odometry = decoder.decode(encoding_name("msgpack"), payload)
-            stamp = odometry.header.stamp
-            stamp_ns = stamp.sec * NS_PER_S + stamp.nanosec
+            stamp_ns = odometry.header.stamp.to_ns()
             samples.append(Sample(at, stamp_ns, odometry.twist.twist.linear.x))
         return Record(self._began_ns, window_ns, wire_data, self._sent, samples)
 

@@ -5,6 +5,7 @@ varies. Each second until Ctrl-C, the tool prints one line about the last 10 s.
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from collections import deque
 
@@ -36,7 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     require_followed(args.topic)
     times: deque[float] = deque(maxlen=MAX_TIMES)
-    left = args.n
+    lines = itertools.count() if args.n is None else range(args.n)
     with connected(args) as robot, silence_explained(robot, args.topic) as on_message:
 
         def take(_: zenoh.Sample) -> None:
@@ -45,7 +46,7 @@ def main(args: argparse.Namespace) -> int:
 
         subscriber = robot.listen(args.topic, take)
         try:
-            while left is None or left > 0:
+            for _ in lines:
                 time.sleep(1.0)
                 now = time.monotonic()
                 while times and now - times[0] > SPAN_S:
@@ -53,7 +54,6 @@ def main(args: argparse.Namespace) -> int:
                 figures = rate(list(times))
                 text = msgspec.json.encode(figures).decode() if args.json else _line(figures)
                 print(text, flush=True)
-                left = None if left is None else left - 1
         except KeyboardInterrupt:
             pass
         subscriber.undeclare()

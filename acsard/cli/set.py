@@ -132,30 +132,27 @@ def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> N
 
 
 def _with_duration(message: str) -> str:
-    until = _duration_of_changes(message)
-    return f"{message}; {until}" if until else message
+    """Return the daemon's answer `message`, followed by how long the changes stay in force.
 
-
-def _duration_of_changes(message: str) -> str:
-    """Return a text that says how long the changes stay in force, or "" without any change.
-
-    `message` is the daemon's answer, with text such as "KEY = NEW (was OLD)" for each change.
+    The answer contains text such as "KEY = NEW (was OLD)" for each change.
     """
     changes = {key: (new, old) for key, new, old in _CHANGE.findall(message)}
     if not changes:
-        return ""
+        return message
     limits = {key: pair for key, pair in changes.items() if survives_restart(key)}
     try:
         lower_limits = lowered(_limits(limits, 1), _limits(limits, 0))
     except (TypeError, ValueError):  # a daemon of another version may have other limits
         lower_limits = {}
     if not lower_limits:
-        return "in force until the daemon's next start"
+        return f"{message}; in force until the daemon's next start"
     if len(lower_limits) == len(changes):
-        return "a lowered limit survives a restart of the daemon, except on the simulator"
+        return (
+            f"{message}; a lowered limit survives a restart of the daemon, except on the simulator"
+        )
     return (
-        f"in force until the daemon's next start, except {', '.join(lower_limits)}: a lowered "
-        "limit survives a restart. On the simulator, no setting survives a restart"
+        f"{message}; in force until the daemon's next start, except {', '.join(lower_limits)}: a "
+        "lowered limit survives a restart. On the simulator, no setting survives a restart"
     )
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from acsard.web.listen import Listen
     from acsard.web.tokens import Vault
 
-MOST_DAYS, MOST_HOURS = 3650, 72
+MOST_HOURS = 72
 
 DEFAULT_DAYS = 30
 
@@ -73,7 +73,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     lasting = parser.add_mutually_exclusive_group()
     lasting.add_argument(
         "--days",
-        type=whole("days", MOST_DAYS, "; for less than a day use --hours"),
+        type=whole("days", 3650, "; for less than a day use --hours"),
         metavar="N",
         help=f"days until the token expires (default: {DEFAULT_DAYS})",
     )
@@ -108,7 +108,9 @@ def main(args: argparse.Namespace) -> int:
     if args.tokens:
         return _list(_vault(args, config))
     if args.revoke:
-        return _revoke(_vault(args, config), args.revoke)
+        _vault(args, config).revoke(args.revoke)
+        print(f"{args.revoke} is revoked")
+        return Exit.OK
     return _serve(args, config)
 
 
@@ -206,12 +208,6 @@ def _list(vault: Vault) -> int:
             f"no tokens for the robot {vault.robot} are in {vault.path}; `acsard web --invite "
             "ROLE` makes one"
         )
-    return Exit.OK
-
-
-def _revoke(vault: Vault, name: str) -> int:
-    vault.revoke(name)
-    print(f"{name} is revoked")
     return Exit.OK
 
 

@@ -76,7 +76,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
         rows += folded(f"status: {waits(source, state)}", width, 4)
         if len(lines) > 1 and len(lines) + len(rows) > room:
             break
-        lines += [*rows]
+        lines += rows
         left.pop(0)
     if left:
         lines.append(Text(hidden(left), "dim"))
@@ -124,9 +124,7 @@ def timing(state: RobotState, width: int) -> list[Text]:
         lines.append(Text(f"{since:<16}{heads}", "dim"))
         for name in NAMES:
             latency = state.latencies.get(name)
-            figures = (
-                None if latency is None else latency.last_minute if last else latency.since_start
-            )
+            figures = (latency.last_minute if last else latency.since_start) if latency else None
             lines.append(Text(f"{name:<16}").append_text(spread(figures)))
     return lines
 

@@ -114,10 +114,8 @@ class Admission:
         `names` are the robot's host names and addresses, in lower case. `rules` is the section
         `web` of the configuration.
         """
-        self._local, self._origins = (
-            AdmittedClient(rules.local, LOCAL_NAME),
-            frozenset(rules.origins),
-        )
+        self._local = AdmittedClient(rules.local, LOCAL_NAME)
+        self._origins = frozenset(rules.origins)
         self._robot, self._names, self._vault = robot, names, vault
         self._acceptor, self._counts = acceptor, counts
         self._guesses, self._strangers = Buckets(GUESSES_OF_ONE, GUESSES), Buckets(STRANGER_RATE)
@@ -256,12 +254,9 @@ class Admission:
     def _too_fast(self, identity: AdmittedClient, row: Route | None) -> bool:
         if not identity.token:
             return False  # clients on the robot itself have no rate limit
-        rate = row.rate if row else REQUEST_RATE
-        name = (
-            f"{identity.token} {network_of(identity.address)}"
-            if row and row.waits
-            else identity.token
-        )
+        rate, name = row.rate if row else REQUEST_RATE, identity.token
+        if row and row.waits:
+            name += f" {network_of(identity.address)}"
         return not self._paces.setdefault(rate, Buckets(rate)).take(name, clock.mono_ns())
 
     def _listed(self, request: web.Request) -> bool:

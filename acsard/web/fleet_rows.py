@@ -83,16 +83,13 @@ class FleetTracker:
 
     async def _declare(self, client: Client) -> None:
         def declare() -> fleet.Fleet:
-            robots = self._robots
+            robots, note = self._robots, NO_ROUTER_NOTE
             by_name = robots.endpoint.startswith("tls/")
-            why = (
-                OWN_ROBOT_NOTE
-                if by_name
-                else ""
-                if client.session.info.routers_zid()
-                else NO_ROUTER_NOTE
-            )
-            self.note = why.format(robot=robots.id, endpoint=robots.endpoint)
+            if by_name:
+                note = OWN_ROBOT_NOTE
+            elif client.session.info.routers_zid():
+                note = ""
+            self.note = note.format(robot=robots.id, endpoint=robots.endpoint)
             # A robot that has been silent for 30 s is dropped, unless its liveliness token is
             # present.
             return fleet.Fleet(client, [robots.id if by_name else ALL_ROBOTS], MAX_ROBOTS, 30.0)

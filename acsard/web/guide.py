@@ -35,9 +35,6 @@ SLOW_PORTS = "listing the serial ports took too long: try again"
 MAX_ERROR_BYTES = 4000
 """The error text shows at most this many bytes from the end of the child's standard error."""
 
-CONTINUATION_BYTES = bytes(range(0x80, 0xC0))
-"""All byte values that may follow the first byte of a UTF-8 character."""
-
 END_TIMEOUT_S = 6.0
 """An interrupted child process is killed if it has not exited after this time, s. Until then the
 child can send zero speeds."""
@@ -224,23 +221,17 @@ class Guide:
 
     async def _run_job(self, job: _Job, asked: Begin) -> None:
         try:
-            code, text = await job.run(arguments(asked, self._reach, await self._ports(asked)))
+            ports = await self._boards() if asked.begin == "check" else []
+            options = arguments(asked, self._reach, [board.port for board in ports])
+            code, text = await job.run(options)
         # Python raises `RuntimeError` if it cannot start a thread for the child process.
         except (FrameError, OSError, TimeoutError, RuntimeError) as error:
-            code, text = (
-                Exit.USAGE,
-                str(error) or SLOW_PORTS,
-            )
+            code, text = Exit.USAGE, str(error) or SLOW_PORTS
         finally:
             self._job = None
         meaning = "stopped" if job.left else EXIT_TEXTS.get(code) or how_it_ended(code)
         job.say(Guided(Ended(code if code >= 0 else 128 - code, meaning, text)))
         self._tell_all()
-
-    async def _ports(self, asked: Begin) -> list[str]:
-        if asked.begin != "check":
-            return []
-        return [board.port for board in await self._boards()]
 
     async def _boards(self) -> list[Board]:
         return await in_thread(lambda: boards(self._configured), 5.0)
@@ -434,4 +425,5 @@ def last_part(output: bytes) -> bytes:
     tail = output[-MAX_ERROR_BYTES:]
     if len(output) <= MAX_ERROR_BYTES:
         return tail
-    return tail.partition(b"\n")[2] or tail.lstrip(CONTINUATION_BYTES)
+    # These values are the bytes after the first byte of a UTF-8 character.
+    return tail.partition(b"\n")[2] or tail.lstrip(bytes(range(0x80, 0xC0)))

@@ -119,16 +119,12 @@ class BlackBox:
         place = self._place()
 
         def find_file() -> tuple[Path, tuple[int, int]] | None:
-            path = next((path for path in _files(place) if path.name == name), None)
-            try:
-                status = path.stat() if path is not None else None
-            except FileNotFoundError:  # the daemon has just renamed or deleted the file
-                return None
-            return (
-                None
-                if path is None or status is None
-                else (path, (status.st_mtime_ns, status.st_size))
-            )
+            with suppress(FileNotFoundError):  # the daemon has just renamed or deleted the file
+                for path in _files(place):
+                    if path.name == name:
+                        status = path.stat()
+                        return path, (status.st_mtime_ns, status.st_size)
+            return None
 
         try:
             entry = await in_thread(find_file, READ_TIMEOUT_S)
@@ -177,15 +173,12 @@ def _files(directory: Path) -> list[Path]:
 
 
 def _row(path: Path) -> Recording:
-    size = path.stat().st_size
-    if path.name.endswith(PART_SUFFIX):
-        words = (
-            "being recorded" if is_being_recorded(path, time.time()) else "cut off: no end marker"
-        )
-        return Recording(path.name, _begun(path), None, size, words)
-    last = read_end(path)
+    size, unfinished = path.stat().st_size, path.name.endswith(PART_SUFFIX)
+    last = None if unfinished else read_end(path)
     if last is None:
-        return Recording(path.name, _begun(path), None, size, "cut off: no end marker")
+        recorded = unfinished and is_being_recorded(path, time.time())
+        words = "being recorded" if recorded else "cut off: no end marker"
+        return Recording(path.name, _begun(path), None, size, words)
     events = "; ".join(filter(None, [last.said, ending_text(last.cut, last.why)]))
     seconds = (last.last_ns - last.wall_ns) / NS_PER_S
     return Recording(path.name, last.wall_ns / NS_PER_S, round(seconds, 3), size, events)

@@ -24,12 +24,10 @@ from acsard.host.atomic_file import replace
 from acsard.host.errors import MSGSPEC_ERRORS, MendableError, NotPermittedError, UsageError
 from acsard.web.callers import AdmittedClient
 
-FILE, MODE = "tokens.json", 0o600
+FILE = "tokens.json"
 
 SERVICE_DIRECTORY = Path("/var/lib/acsard-web")
 """State directory of the systemd service that runs `acsard web`."""
-
-HOUR_S, DAY_S = 3600, 86400
 
 MAX_TOKENS = 200
 """Maximum number of tokens of one robot."""
@@ -127,7 +125,7 @@ class Vault:
         with self._changing() as tokens:
             now_s = int(time.time())
             tokens[:] = [record for record in tokens if record.ends > now_s]
-            ours = [record for record in tokens if record.robot == self.robot]
+            ours = self._own(tokens)
             if any(record.name == name for record in ours):
                 raise UsageError(
                     f"the token {name} exists already: either give another --name, or revoke the "
@@ -138,7 +136,7 @@ class Vault:
                     f"the robot already has {MAX_TOKENS} tokens: revoke some with --revoke NAME"
                 )
             text = secrets.token_urlsafe(32)
-            ends = now_s + days * DAY_S + hours * HOUR_S
+            ends = now_s + 3600 * (24 * days + hours)
             token = Token(name, role, _digest(text), now_s, ends, self.robot)
             tokens.append(token)
         return text, token
@@ -149,7 +147,7 @@ class Vault:
         Raises `UsageError` if the robot has no token with this name.
         """
         with self._changing() as tokens:
-            ours = [token for token in tokens if token.robot == self.robot]
+            ours = self._own(tokens)
             if all(token.name != name for token in ours):
                 known = ", ".join(token.name for token in ours) or "none"
                 raise UsageError(
@@ -201,7 +199,7 @@ class Vault:
         # its own user.
         directory = self.path.parent.stat()
         owner = (directory.st_uid, directory.st_gid) if os.geteuid() == 0 else None
-        replace(self.path, msgspec.json.encode(tokens), mode=MODE, owner=owner)
+        replace(self.path, msgspec.json.encode(tokens), mode=0o600, owner=owner)
 
 
 def place() -> Path:

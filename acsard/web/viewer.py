@@ -132,10 +132,8 @@ class Parts:
 
     def __init__(self, robots: Robots, guide: Guide, counts: Counts) -> None:
         self.robots, self.guide, self.counts = robots, guide, counts
-        self.commands, self.fleet = (
-            ViewerCommands(lambda: robots.client, counts),
-            FleetTracker(robots),
-        )
+        self.commands = ViewerCommands(lambda: robots.client, counts)
+        self.fleet = FleetTracker(robots)
         self.calls = Calls(robots, guide.stop, self.fleet.sees)
 
 
@@ -314,12 +312,9 @@ class Viewer:
         if frame.call == "stop":
             # Keep stops in a separate set of tasks, which continue when the connection ends.
             start(self._answer(frame), self._stops)
+        elif self._calling >= MAX_OPEN_CALLS:
+            self._refuse(frame, f"{MAX_OPEN_CALLS} calls are running already: wait for an answer")
         else:
-            if self._calling >= MAX_OPEN_CALLS:
-                self._refuse(
-                    frame, f"{MAX_OPEN_CALLS} calls are running already: wait for an answer"
-                )
-                return
             self._calling += 1
             self._start(self._answer(frame))
 
