@@ -19,6 +19,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -76,13 +77,12 @@ def show_live(feed: Feed) -> None:
     # A failed query does not matter, because the screen says that it waits for a state.
     with suppress(AcsardError):
         feed.query_state()
-    console = Console()
 
-    def draw() -> RenderableType:
+    def draw(width: int, height: int) -> RenderableType:
         feed.poll()
-        return screen(feed.screen_data("q quits"), *console.size)
+        return screen(feed.screen_data("q quits"), width, height)
 
-    _run_suspendable(lambda suspend: _watch(draw, console, suspend))
+    _run_suspendable(partial(_watch, draw))
 
 
 def drive(ride: KeyboardDrive) -> None:
@@ -91,8 +91,7 @@ def drive(ride: KeyboardDrive) -> None:
     The function returns when the input ends or a signal arrives.
     """
     if has_screen():
-        console = Console()
-        _run_suspendable(lambda suspend: _steer(ride, console, suspend))
+        _run_suspendable(partial(_steer, ride))
     else:
         _drive_in_lines(ride)
 
@@ -118,11 +117,9 @@ def print_last_report(ride: KeyboardDrive) -> None:
 
 def roster(fleet: Roster) -> None:
     """Show a table of robots until `q` is typed, the input ends or a signal arrives."""
-    console = Console()
 
-    def draw() -> RenderableType:
+    def draw(width: int, height: int) -> RenderableType:
         rows = fleet.rows()
-        width, height = console.size
         texts = [Text(line, no_wrap=True) for line in table(rows, width, max(1, height - 2))]
         texts[0].stylize("bold cyan")
         for line in texts[1:]:
@@ -134,14 +131,14 @@ def roster(fleet: Roster) -> None:
         last = Text(below.rstrip(), "dim", no_wrap=bool(rows), overflow="ellipsis")
         return Group(*texts, Text(), last)
 
-    _run_suspendable(lambda suspend: _watch(draw, console, suspend))
+    _run_suspendable(partial(_watch, draw))
 
 
-def _watch(draw: Callable[[], RenderableType], console: Console, suspend: list[bool]) -> bool:
-    with keys() as read, _screen(console) as display:
+def _watch(draw: Callable[[int, int], RenderableType], suspend: list[bool]) -> bool:
+    with keys() as read, _screen() as display:
         while not suspend:
             if _terminal_reads():
-                display.update(draw(), refresh=True)
+                display.update(draw(*display.console.size), refresh=True)
             typed = read(DRAW_PERIOD_S)
             if typed is None or "q" in typed.lower():
                 return False
@@ -153,9 +150,9 @@ def _terminal_reads() -> bool:
     return not isinstance(sys.stdout, Writer) or sys.stdout.is_idle
 
 
-def _screen(console: Console) -> Live:
+def _screen() -> Live:
     return Live(
-        console=console,
+        console=Console(),
         screen=True,
         auto_refresh=False,
         redirect_stdout=False,
@@ -182,12 +179,12 @@ def _run_suspendable(shows: Callable[[list[bool]], bool]) -> None:
             os.kill(os.getpid(), signal.SIGSTOP)  # suspend as ^Z does; fg resumes here
 
 
-def _steer(ride: KeyboardDrive, console: Console, suspend: list[bool]) -> bool:
+def _steer(ride: KeyboardDrive, suspend: list[bool]) -> bool:
     """Drive the robot with the typed keys, and show the screen.
 
     Return True if the user pressed Ctrl-Z, and False at the end of the input.
     """
-    with keys() as read, _screen(console) as display:
+    with keys() as read, _screen() as display:
         due = 0.0
         while not suspend:
             typed = read(KEY_POLL_S)
@@ -196,7 +193,8 @@ def _steer(ride: KeyboardDrive, console: Console, suspend: list[bool]) -> bool:
             ride.step(typed)
             if (typed or time.monotonic() >= due) and _terminal_reads():
                 due = time.monotonic() + DRAW_PERIOD_S
-                display.update(Group(*lines(ride.screen_data(), *console.size)), refresh=True)
+                size = display.console.size
+                display.update(Group(*lines(ride.screen_data(), *size)), refresh=True)
     for letter in ("k", "", ""):
         ride.step(letter)  # stop the robot, because a suspended program sends no commands
     ride.end()

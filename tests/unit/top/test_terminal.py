@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import pytest
 from msgspec.structs import replace
+from rich.console import Console
 
 from acsard.core.messages.schema import RobotState
 from acsard.top import terminal
@@ -100,12 +101,10 @@ def test_the_last_report_waits_until_the_robot_no_longer_follows_the_drive(
 def test_a_terminal_of_any_height_shows_the_heading_of_the_table_of_robots(
     height: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def watch(draw: Any, console: Any, suspend: list[bool]) -> bool:
-        console.print(draw())
+    def watch(draw: Any, suspend: list[bool]) -> bool:
+        Console(width=80).print(draw(80, height))
         return False
 
-    monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.setenv("LINES", str(height))
     monkeypatch.setattr(terminal, "_watch", watch)
     monkeypatch.setattr(terminal, "_run_suspendable", lambda shows: shows([]))
     fleet = SimpleNamespace(rows=lambda: [ROW], left_out_text="", presence_text="1 robot")
