@@ -56,10 +56,8 @@ def of_each(
     If a robot does not reply, its entry is the error. Raises `NoAnswerError` if `ids` contains "*"
     and no robot is present.
 
-    Args:
-        robot: a client that is connected to the bus of the robots.
-        ids: the ids of the robots. An id "*" stands for all robots that are present.
-        call: function that gets a client of one robot, and calls the service of this robot.
+    `robot` is a client of any robot on the bus. An id "*" in `ids` stands for all robots that are
+    present. `call` gets a client of one robot, and calls the service of this robot.
     """
     wanted = (
         running_robots(robot.session, ids, robot.where.endpoint) if ALL_ROBOTS in ids else list(ids)
@@ -83,12 +81,8 @@ def print_each(
     The exit code is `OK` if all robots did as asked. It is `UNREACHABLE` if any robot did not
     answer, and otherwise `FAILURE` if any robot refused.
 
-    Args:
-        replies: the replies by robot id.
-        robot: the client with which the robots were called.
-        ids: the ids that the operator typed. If they contain "*", the number of robots is printed.
-        silence: text for a robot that did not answer. `{error}` in it stands for the reason.
-        as_json: whether to print each reply as JSON instead of text.
+    `ids` are the ids that the operator typed. If they contain "*", the number of robots is printed.
+    `silence` is the text for a robot that did not answer. `{error}` in it stands for the reason.
     """
     for robot_id, reply in replies.items():
         if isinstance(reply, AcsardError):

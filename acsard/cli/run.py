@@ -153,13 +153,8 @@ def main(args: argparse.Namespace) -> int:
 def settings_file(where: str, config: Config, cli_values: dict[str, object]) -> SettingsFile:
     """Return the `SettingsFile` with which the daemon changes its own configuration file.
 
-    The `SettingsFile` parses the file as the daemon would after a restart.
-
-    Args:
-        where: the path of the configuration file, or another text if there is no file.
-        config: the present configuration.
-        cli_values: maps dotted keys to values from the command line, which replace those of the
-            file.
+    The `SettingsFile` parses the file as the daemon would after a restart. `where` is the path of
+    the file, or another text if there is no file. `cli_values` is the result of `options`.
     """
     overrides = tables(cli_values, by_environment())
     file = Path(where).absolute() if Path(where).is_file() else None
@@ -216,13 +211,9 @@ def banner(
 ) -> str:
     """Return the banner that the daemon prints at its start.
 
-    Args:
-        config: the daemon's configuration.
-        where: the path of the configuration file.
-        device: the path of the serial device.
-        trouble: the reason why the serial device cannot be opened yet, or "" if it is open.
-        reach: the options that another tool needs to connect to this daemon.
-        served: whether the robot's web page is served.
+    `where` is the path of the configuration file. `trouble` is the reason why the serial device
+    cannot be opened yet, or "" if it is open. `reach` is the result of the function `reach`.
+    `served` says whether the robot's web page is served.
     """
     port = f"{device} at {config.mcu.baud_rate} baud"
     if trouble:

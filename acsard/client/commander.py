@@ -95,7 +95,8 @@ class Wish(Struct, frozen=True):
 class Commander:
     """Decides when to send the commands of one sender, and which commands to drop.
 
-    At most one command waits to be sent. A newer command replaces the waiting command.
+    At most one command waits to be sent. A newer command replaces the waiting command. All times
+    are monotonic times in ns.
 
     Args:
         sends_leading_zero: whether to send a zero (a command with the speed 0) before the first
@@ -150,9 +151,8 @@ class Commander:
     def take(self, wish: Wish, now_ns: int) -> int | None:
         """Store a command that has arrived. It replaces a command that still waits to be sent.
 
-        Returns the time since the previous command arrived, ns, if this time is longer than
-        `BRAKING_AFTER_NS`. Returns None after a shorter time, and for the first command. `now_ns`
-        is the monotonic time, ns.
+        Returns the time since the previous command arrived, if this time is longer than
+        `BRAKING_AFTER_NS`. Returns None after a shorter time, and for the first command.
         """
         silence = None if self._heard_ns is None else now_ns - self._heard_ns
         begins = silence is None or silence > BRAKING_AFTER_NS
@@ -172,16 +172,13 @@ class Commander:
         return silence if begins else None
 
     def due_ns(self) -> int | None:
-        """Return the monotonic time at which the caller must call `send`, ns.
-
-        Returns None if nothing waits to be sent.
-        """
+        """Return the time at which the caller must call `send`; None if nothing waits."""
         if self._lead:
             return self._came_ns
         return None if self._wish is None else self._hold_until_ns
 
     def send(self, now_ns: int) -> Wish | None:
-        """Return the command that the caller must send at the monotonic time `now_ns`, or None.
+        """Return the command that the caller must send now, or None.
 
         A nonzero command is dropped if it is older than `STALE_NS`, or if it came in a burst.
         """
@@ -209,8 +206,7 @@ class Commander:
         The command that waits to be sent is discarded. The result is a zero if the robot may still
         follow a nonzero command of this sender. The result is None if the last command was a zero,
         or if the timeout has passed since the last nonzero command, because a zero would then only
-        stop the next sender. `timeout_s` is the timeout of this sender's source, s, and `now_ns` is
-        the monotonic time, ns.
+        stop the next sender. `timeout_s` is the timeout of this sender's source, s.
         """
         moved_ns, self._moved_ns = self._moved_ns, None
         self._wish = self._asked_ns = None
@@ -234,11 +230,7 @@ class Commander:
         return self._asked_ns is not None
 
     def is_driving(self, now_ns: int) -> bool:
-        """Return whether this sender counts as driving at the monotonic time `now_ns`, ns.
-
-        A sender counts as driving if its last command was not zero, and arrived within the last
-        `DRIVING_TIMEOUT_NS`.
-        """
+        """Return whether the last command was not zero and arrived within `DRIVING_TIMEOUT_NS`."""
         return self._asked_ns is not None and now_ns - self._asked_ns <= DRIVING_TIMEOUT_NS
 
 

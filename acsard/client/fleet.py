@@ -72,8 +72,7 @@ class Fleet:
 
         Args:
             robot: A client of any robot on the same bus.
-            ids: The ids of the robots. The id "*" stands for all robots. A robot that is named here
-                is never dropped.
+            ids: The ids of the robots. The id "*" stands for all robots.
             most: Maximum number of robots. When it is reached, a new robot replaces a robot that
                 `ids` does not name and whose liveliness token is absent. If there is no such robot,
                 the new robot is left out.
@@ -100,10 +99,7 @@ class Fleet:
             raise
 
     def rows(self) -> list[Row]:
-        """Return one row for each robot. First drop robots that have been silent for `forget_s` s.
-
-        A robot that `ids` names, or whose liveliness token is present, is never dropped.
-        """
+        """Return a row for each robot. First drop robots that have been silent for `forget_s` s."""
         now = clock.steady_s()
         with self._lock:
             for name, robot in list(self._known.items()):

@@ -86,9 +86,8 @@ class Follower:
     def answered(self, state: RobotState, now: float) -> bool:
         """Process an answer to a query of `state`. Return whether it proves that the daemon runs.
 
-        `state` is the answer, which arrived at the time `now`, s. The answer may be an old state
-        from the storage of a router. Therefore, it is a proof only if its stamp is newer than the
-        stamp of `self.state` or of the previous answer.
+        The answer may be an old state from the storage of a router. Therefore, it is a proof only
+        if its stamp is newer than the stamp of `self.state` or of the previous answer.
         """
         # The previous answer is compared too, because the robot's clock may have been set back
         # since `self.state`.
@@ -106,10 +105,7 @@ class Follower:
         return False
 
     def query_is_due(self, now: float) -> bool:
-        """Return whether the caller must query `state` now. If so, set the time of the next query.
-
-        `now` is the present time, s.
-        """
+        """Return whether the caller must query `state` now. If so, set the time of the next one."""
         if now < self.due:
             return False
         self.due = now + self._query_period_s
@@ -119,7 +115,7 @@ class Follower:
         """Return the time since the running daemon last sent a state, s.
 
         An old state from the storage of a router does not count. Before the first state, return the
-        time since this object was created. `now` is the present time, s.
+        time since this object was created.
         """
         return max(0.0, now - self.last_seen)
 
@@ -167,7 +163,7 @@ class Watch(Follower):
     ) -> None:
         """Subscribe to the state of the robot to which the client `robot` is connected.
 
-        `now` is the present time, s. A thread of Zenoh calls `wake` each time a state arrives.
+        A thread of Zenoh calls `wake` each time a state arrives.
         """
         super().__init__(now)
         self._robot, self._decoder = robot, Decoder(RobotState)
@@ -181,7 +177,7 @@ class Watch(Follower):
         """Process the states that have arrived, and return the new states.
 
         If no state has arrived for some time, also send a query. A later call processes the reply.
-        `now` is the present time, s. Raises `ZError` if the session was closed.
+        Raises `ZError` if the session was closed.
         """
         states = []
         for _ in range(MAX_QUEUED_SAMPLES):  # bounded, so that a flood cannot block the caller

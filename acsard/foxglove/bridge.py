@@ -65,11 +65,8 @@ class Bridge:
     ) -> None:
         """Query the robot, and start the server.
 
-        Args:
-            robot: the bus client for the robot.
-            address: host name or IP address, and port, at which the server listens.
-            tell: function that prints a message at the terminal.
-            acts: whether viewers may drive the robot, call all services and change settings.
+        `tell` prints a message at the terminal. `acts` says whether viewers may drive the robot,
+        call all services and change settings.
         """
         self._robot, self._id = robot, robot.where.robot_id
         robot.name += " foxglove"

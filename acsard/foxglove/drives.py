@@ -121,7 +121,8 @@ class DrivingViewers:
         self.timeout_s = MAX_SOURCE_TIMEOUT_S
         """Timeout of the command source that the viewers use, s."""
 
-    # The server's threads call the methods below.
+    # The server's threads call the methods below. `client` is the id of a viewer, and `channel` is
+    # the id of one of its channels.
 
     def advertised(
         self, client: int, channel: int, topic: str, encoding: str, schema_name: str
@@ -130,14 +131,7 @@ class DrivingViewers:
 
         If messages on the channel cannot drive the robot, `received` reports the reason when a
         message arrives. A channel beyond `MAX_CHANNELS` is not registered, and `received` reports
-        that.
-
-        Args:
-            client: the id of the viewer.
-            channel: the id of the channel.
-            topic: the topic on which the viewer publishes.
-            encoding: Foxglove's name of the encoding, "json" or "cdr".
-            schema_name: ROS type of the messages, such as "geometry_msgs/Twist".
+        that. The forms of `encoding` and `schema_name` are those of `encoding_of`.
         """
         zenoh_encoding, problem = "", ""
         if topic != self.topic:
@@ -155,10 +149,7 @@ class DrivingViewers:
                 viewer.channels[channel] = zenoh_encoding, problem
 
     def received(self, client: int, channel: int, data: bytes) -> None:
-        """Queue the command in a viewer's message. If it is refused, tell the viewers why.
-
-        `client` and `channel` are the ids of the viewer and of its channel. `data` is the message.
-        """
+        """Queue the command in a viewer's message. If it is refused, tell the viewers why."""
         viewer = self._viewers.get(client)
         if viewer is None:
             return
@@ -190,11 +181,7 @@ class DrivingViewers:
             )
 
     def withdrawn(self, client: int, channel: int) -> None:
-        """Remove a channel on which a viewer has published.
-
-        If the viewer may be driving the robot, send a zero command. `client` is the id of the
-        viewer, and `channel` is the id of the channel.
-        """
+        """Remove a channel of a viewer. If the viewer may be driving the robot, send a zero."""
         with self._lock:
             viewer = self._viewers.get(client)
             if viewer is None:

@@ -77,11 +77,8 @@ class Notices:
     def send(self, server: WebSocketServer, log: Callable[[Log], None], *, newcomers: bool) -> None:
         """Send the waiting notices to the viewers, and print them at the terminal.
 
-        Args:
-            server: the server to which the viewers are connected.
-            log: function that publishes a message on the topic `log`.
-            newcomers: whether new viewers have come. If so, first repeat the messages that remain
-                visible.
+        `log` publishes a message on the topic `log`. If `newcomers` is true, new viewers have come,
+        so first repeat the messages that remain visible.
         """
         if newcomers:
             for notice in self._staying.values():

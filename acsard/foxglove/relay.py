@@ -94,12 +94,7 @@ def command_forms(
 ) -> dict[str, CommandForm]:
     """Return the `CommandForm` of each full key on which commands of a source may arrive, by key.
 
-    The keys are those of acsard and those of ROS.
-
-    Args:
-        key_of: function that adds the robot's id to a key of acsard.
-        ros: the robot's settings for ROS.
-        source: the name of the command source.
+    The keys are those of acsard and those of ROS. `key_of` adds the robot's id to a key of acsard.
     """
     native = source_keys([source])
     forms = {key_of(key): CommandForm(key) for key in (*native, *source_keys([source], "*"))}

@@ -47,14 +47,9 @@ class Facts(Struct, frozen=True):
 
 
 def key_of(row: Channel, source: str) -> str:
-    """Return the Zenoh key on which the messages of a topic arrive.
+    """Return the Zenoh key of a topic, without its beginning `acsard/<robot.id>/`.
 
-    The result does not contain the beginning of the key, `acsard/<robot.id>/`.
-
-    Args:
-        row: the description of the topic.
-        source: the name of the command source whose commands the key carries. Only the topic
-            `CMD_VEL_IN` has a key for each source. All other topics ignore `source`.
+    Only the topic `CMD_VEL_IN` has a key for each command source. All other topics ignore `source`.
     """
     return row.native.replace(SOURCE_PLACEHOLDER, source)
 

@@ -142,10 +142,7 @@ class Settings:
 
         `refresh` makes the change later. A notice then tells all viewers whether the change
         succeeded. If `MAX_WAITING_CHANGES` changes wait already, the new change is dropped, and a
-        notice says so.
-
-        Args:
-            wishes: maps settings to their new values.
+        notice says so. `wishes` maps settings to their new values.
         """
         with self._lock:
             full = len(self._wishes.waiting) >= MAX_WAITING_CHANGES
@@ -301,15 +298,8 @@ def start(
 ) -> WebSocketServer:
     """Start the server, and return it.
 
+    Viewers show the name `name`. `acts` says whether viewers may send commands and change settings.
     Raises `InUseError` if the port is in use, and `NotPermittedError` if the port needs root.
-
-    Args:
-        name: the name of the server, which viewers show.
-        address: host name or IP address, and port, at which the server listens.
-        listener: the callbacks for requests of viewers.
-        services: the services that viewers may call.
-        context: the context of the channels that viewers can show.
-        acts: whether viewers may send commands and change settings.
     """
     host, port = address
     takes = [Capability.Services]

@@ -212,10 +212,8 @@ class JsonPrompt:
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
         """Ask whether to write `keys` into the configuration file, and do so if the person agrees.
 
-        Return whether the file was written. `keys` maps dotted keys of the configuration to values.
-        `config` is the path of the file, or None to search for the file. `trouble` is a reason not
-        to write, or "". If there is such a reason, or if the file cannot be changed, send a message
-        with the reason, and do not ask.
+        If there is a reason not to write, or if the file cannot be changed, send a message with the
+        reason, and do not ask.
         """
         try:
             if trouble:

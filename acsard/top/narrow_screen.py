@@ -86,8 +86,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
 def link(data: ScreenData, state: RobotState, width: int) -> list[Text]:
     """Return the lines about the serial link, the commands and the rejected inputs.
 
-    `data` contains the data of the screen, and `state` is the state to show. A line has at most
-    `width` character cells.
+    A line has at most `width` character cells.
     """
     before = data.before or state
     lines = [rule(width, [(0, title(data, state))])]

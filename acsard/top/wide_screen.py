@@ -53,10 +53,7 @@ event a to event b."""
 
 
 def motion(state: RobotState, width: int) -> list[Text]:
-    """Return lines with the robot's pose and twist on the left, and its wheel speeds on the right.
-
-    `width` is the width of the screen in character cells.
-    """
+    """Return lines with pose and twist on the left, and the wheel speeds on the right."""
     (right, left, rear_left, rear_right), scale = speeds(state)
     cells = 6 + max(0, width - 80) // 2
     at = ((0, "pose and twist"), (40, "wheels rad/s"), (56, "left"), (68 + cells, "right"))
@@ -103,7 +100,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
     """Return a heading, and at most `room` lines with one command source each.
 
     If there are more sources than lines, the last line counts the remaining sources, and names the
-    first of them. `width` is the width of the screen in character cells.
+    first of them.
     """
     room_name = 13 + max(0, width - 80) // 2
     start = room_name + 3
@@ -156,7 +153,7 @@ def link(data: ScreenData, state: RobotState, width: int) -> list[Text]:
     """Return the lines about the serial link, the commands and the rejected inputs.
 
     There are also lines about the gyro, the effective track and the board's inputs, if the robot
-    reports them. `data` contains the data of the screen, and `state` is the state to show.
+    reports them.
     """
     before = data.before or state
     head = title(data, state)

@@ -68,13 +68,11 @@ Factory = Callable[[], "Reader"]
 
 
 class _Listener(NamedTuple):
-    """A listening socket, and how the server serves the connections at it."""
+    """The arguments of `Acceptor.listen`."""
 
     opened: socket.socket
     secure: ssl.SSLContext | None
-    """TLS context, or None for plain HTTP."""
     make: Factory
-    """Function that creates the HTTP handler of one connection."""
 
 
 class Acceptor:

@@ -69,11 +69,8 @@ class Calls:
     ) -> None:
         """Create an instance that has no running calls.
 
-        Args:
-            robots: object with the connection to the daemon.
-            interrupt_guide: function that interrupts the running check or calibration, if any.
-            is_known: function that returns whether the server has found the robot with the given
-                id on the bus.
+        `interrupt_guide` interrupts the running check or calibration, if any. `is_known` returns
+        whether the server has found the robot with the given id on the bus.
         """
         self._robots, self._interrupt_guide, self._is_known = robots, interrupt_guide, is_known
         self._stops, self._merged = Stops(), StopMerger()
@@ -88,18 +85,10 @@ class Calls:
     ) -> ServiceReply:
         """Call the service `verb` for the client `identity`, and return the reply.
 
-        A stop of the page's own robot also interrupts the running check or calibration.
-
-        Args:
-            identity: the client of the page.
-            verb: the name of the service.
-            payload: the arguments of the service.
-            robot: the id of the robot, or "" for the page's own robot. Only `stop` may be called
-                for another robot.
-
-        Raises:
-            RequestRefusedError: the client may not make this call, or sends too many stops to
-                robots that may not exist.
+        A stop of the page's own robot also interrupts the running check or calibration. `robot` is
+        the id of the robot, or "" for the page's own robot. Only `stop` may be called for another
+        robot. Raises `RequestRefusedError` if the client may not make this call, or sends too many
+        stops to robots that may not exist.
         """
         require(identity, verb)
         other = "" if robot == self._robots.id else robot

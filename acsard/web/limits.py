@@ -248,20 +248,14 @@ class WebSocketLimits:
         self._networks = Places(MAX_WEBSOCKETS, MAX_WEBSOCKETS_OF_NETWORK)
 
     def refusal(self, address: str, token: str) -> str:
-        """Return "" if a client may open a WebSocket now, else the reason and the remedy.
-
-        `address` is the client's IP address, and `token` is the client's token.
-        """
+        """Return "" if a client may open a WebSocket now, else the reason and the remedy."""
         for places, name, full in self._places(address, token):
             if not places.room(name):
                 return full
         return ""
 
     def enter(self, address: str, token: str) -> str:
-        """Count a new WebSocket and return "". If a limit forbids it, return reason and remedy.
-
-        `address` is the client's IP address, and `token` is the client's token.
-        """
+        """Count a new WebSocket and return "". If a limit forbids it, return reason and remedy."""
         if full := self.refusal(address, token):
             return full
         for places, name, _ in self._places(address, token):

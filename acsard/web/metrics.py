@@ -35,15 +35,9 @@ def text(
 ) -> str:
     """Return all metrics in the text format of Prometheus.
 
-    Args:
-        robot: the robot's id.
-        version: the version of the daemon.
-        state: the newest state of the robot, or None before the first state.
-        is_reachable: whether messages from the daemon arrive. If not, the robot's metrics are left
-            out.
-        viewers: the number of open WebSockets.
-        counts: the number of the server's actions, by name.
-        refused: the number of the server's refusals, by reason.
+    `is_reachable` says whether messages from the daemon arrive. If not, the robot's metrics are
+    left out. `viewers` is the number of open WebSockets. `counts` are the numbers of the server's
+    actions by name, and `refused` the numbers of its refusals by reason.
     """
     lines: list[str] = []
 
@@ -173,11 +167,7 @@ class Counts:
             self._counts[name] += more
 
     def refuse(self, reason: Reason, origin: str = "") -> None:
-        """Count a refusal.
-
-        `reason` is the reason, and `origin` is the client's address and name, or "" if the client
-        is unknown.
-        """
+        """Count a refusal. `origin` is the client's address and name; "" if it is unknown."""
         with self._lock:
             self._refused[reason] += 1
             if origin and (origin in self._origins or len(self._origins) < MAX_COUNTED_CLIENTS):

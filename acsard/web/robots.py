@@ -91,11 +91,8 @@ class Robots:
     def __init__(self, address: Address, connect: Connect, about: About, counts: Counts) -> None:
         """Create an instance without a connection. `run()` connects to the daemon.
 
-        Args:
-            address: the address of the daemon.
-            connect: function that connects to the daemon.
-            about: the values from the local configuration, which are used until the daemon answers.
-            counts: the counters of the page's server.
+        `about` contains values from the local configuration, which are used until the daemon
+        answers.
         """
         self.id, self.endpoint = address.robot_id, address.endpoint
         self.certificate = shown_at(address.endpoint, address.tls)

@@ -188,14 +188,11 @@ processor time from the commands."""
 
 
 class Keys:
-    """The subscriptions of one WebSocket.
+    """The subscriptions of one WebSocket, which its outgoing side `out` stores.
 
-    Args:
-        out: the outgoing side of the WebSocket, which stores its subscriptions.
-        robots: the connection to the bus.
-        start: function that starts a task, which ends with the WebSocket.
-        holder: the name under which the limits count the subscriptions: the client's token, or the
-            name of a client without a token.
+    The function `start` starts a task, which ends with the WebSocket. `holder` is the name under
+    which the limits count the subscriptions: the client's token, or the name of a client without a
+    token.
     """
 
     def __init__(

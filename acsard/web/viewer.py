@@ -92,14 +92,8 @@ class ViewerCommands:
         """Queue a command and return True. It replaces an unsent command of the same commander.
 
         If the owner exceeds the rate limit `COMMAND_RATE`, queue nothing and return False. However,
-        a zero command after a nonzero command is always queued.
-
-        Args:
-            owner: the client's token, or the public name of a viewer on the robot itself.
-            source: the command source.
-            commander: the viewer's commander for this source.
-            sender: the signer of the viewer's commands.
-            wish: the command.
+        a zero command after a nonzero command is always queued. `owner` is the client's token, or
+        the public name of a viewer on the robot itself.
         """
         ends = wish.twist == REST and commander.last_is_nonzero
         if not self._rates.take(owner, clock.mono_ns()) and not ends:
