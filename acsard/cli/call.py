@@ -9,9 +9,8 @@ import math
 from collections.abc import Sequence
 
 from acsard.bus import robot_discovery
-from acsard.bus.robot_discovery import parse_ids
 from acsard.cli.common import options_text
-from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
+from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, several_ids
 from acsard.cli.replies import of_each, print_each
 from acsard.client import Client
 from acsard.core.formatting import json_line, lines
@@ -56,7 +55,7 @@ def main(args: argparse.Namespace) -> int:
     for name, value in zip(wanted, args.values, strict=True):
         if not math.isfinite(value):
             raise UsageError(f"{name.upper()} = {value}: the number must be finite; correct it")
-    if args.service != "stop" and (ids := parse_ids(args.id or "")):
+    if args.service != "stop" and (ids := several_ids(args)):
         typed = (("--config", args.config), ("--connect", args.connect), ("--tls", args.tls))
         raise UsageError(one_robot_only_text(args.service, args.values, ids, options_text(typed)))
     with connected_to_many(args) as (robot, many):

@@ -71,9 +71,14 @@ def robot_address(args: argparse.Namespace) -> Address:
     return address_of(config, args.connect, args.id, args.tls)
 
 
+def several_ids(args: argparse.Namespace) -> tuple[str, ...]:
+    """Return the ids in `--id` if it names several robots, ("*",) for all robots, otherwise ()."""
+    return parse_ids(args.id or "")
+
+
 def require_one(args: argparse.Namespace) -> None:
     """Raise `UsageError` if `--id` names several robots."""
-    if parse_ids(args.id or ""):
+    if several_ids(args):
         raise UsageError(
             f"--id '{args.id}' names several robots, but `acsard {args.verb}` takes one: "
             "`acsard fleet` lists the robots; only echo, get, set, fleet and call stop take several"
@@ -89,7 +94,7 @@ def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[
     contains their ids, or only "*" for `--id '*'`. Then use `Client.sibling` to get a client of
     one of these robots.
     """
-    many = parse_ids(args.id or "")
+    many = several_ids(args)
     _, config = load(args.config)
     where = address_of(config, args.connect, None if many else args.id, args.tls)
     with connect(where.endpoint, robot_id=where.robot_id, tls=where.tls) as robot:
@@ -202,7 +207,7 @@ def explained(
 
 
 def silence_explained(
-    robot: Client, key: str = "", timeout_s: float | None = None
+    robot: Client, key: str, timeout_s: float | None = None
 ) -> AbstractContextManager[Callable[[], None]]:
     """Return a context that prints why no message arrives on a key, or that the connection is lost.
 

@@ -15,13 +15,7 @@ from typing import Any
 
 import zenoh
 
-from acsard.bus.robot_discovery import (
-    ALL_ROBOTS,
-    follow,
-    parse_ids,
-    robot_of,
-    running_robots,
-)
+from acsard.bus.robot_discovery import ALL_ROBOTS, follow, robot_of, running_robots
 from acsard.bus.subscription import encoded
 from acsard.calibration.log_table import HEADER, KEYS, row
 from acsard.cli.common import between, count
@@ -31,6 +25,7 @@ from acsard.cli.connection import (
     connected,
     connected_to_many,
     require_followed,
+    several_ids,
     silence_explained,
 )
 from acsard.cli.replies import json_line, of_robot
@@ -74,7 +69,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     topic = args.topic[0]
     if args.csv:
-        if parse_ids(args.id or ""):
+        if several_ids(args):
             raise UsageError(
                 "a CSV log can contain only one robot: with --csv, name one robot in --id"
             )
@@ -139,7 +134,7 @@ def _print(
     timeout: float | None,
     on_message: Callable[[], None],
 ) -> int:
-    """Print the messages. Return 0 after Ctrl-C or a used-up `quota`, and 1 if messages cease."""
+    """Print the messages until Ctrl-C, until the `quota` is used up, or until messages cease."""
     printed_s = time.monotonic()
     try:
         for sample in samples:
@@ -149,12 +144,12 @@ def _print(
                 print(_message_text(decoder, *encoded(sample), whose), flush=True)
                 printed_s = time.monotonic()
             elif timeout is not None and time.monotonic() - printed_s > timeout:
-                return 1
+                return Exit.FAILURE
             if quota.used_up:
-                return 0
+                return Exit.OK
     except KeyboardInterrupt:
-        return 0
-    return 1
+        return Exit.OK
+    return Exit.FAILURE
 
 
 def _shortened(key: str) -> Decoder[Any]:

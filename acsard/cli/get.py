@@ -11,9 +11,8 @@ import sys
 
 import msgspec
 
-from acsard.bus.robot_discovery import ALL_ROBOTS, running_robots
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, require_asked
-from acsard.cli.replies import json_line, of_robot
+from acsard.cli.replies import json_line, of_robot, present_ids
 from acsard.core import formatting
 from acsard.core.formatting import printable
 from acsard.core.values import AcsardError
@@ -32,12 +31,7 @@ def main(args: argparse.Namespace) -> int:
             _show(json_line(*robot.reply(args.key)))
             return 0
         silent = 0
-        wanted = (
-            running_robots(robot.session, many, robot.where.endpoint)
-            if ALL_ROBOTS in many
-            else many
-        )
-        for robot_id in wanted:
+        for robot_id in present_ids(robot, many):
             try:
                 line = json_line(*robot.sibling(robot_id).reply(args.key))
             except AcsardError as error:

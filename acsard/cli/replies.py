@@ -48,20 +48,26 @@ Replies = Mapping[str, ServiceReply | AcsardError]
 """Maps the id of each robot to its reply, or to the error that explains why a reply is missing."""
 
 
+def present_ids(robot: Client, ids: Sequence[str]) -> Sequence[str]:
+    """Return `ids`, or the ids of all robots that are present if `ids` contains "*".
+
+    `robot` is a client of any robot on the bus. Raises `NoAnswerError` if `ids` contains "*" and no
+    robot is present.
+    """
+    if ALL_ROBOTS in ids:
+        return running_robots(robot.session, ids, robot.where.endpoint)
+    return ids
+
+
 def of_each(
     robot: Client, ids: Sequence[str], call: Callable[[Client], ServiceReply]
 ) -> dict[str, ServiceReply | AcsardError]:
     """Call a service of several robots at the same time, and return the replies by robot id.
 
-    If a robot does not reply, its entry is the error. Raises `NoAnswerError` if `ids` contains "*"
-    and no robot is present.
-
-    `robot` is a client of any robot on the bus. An id "*" in `ids` stands for all robots that are
-    present. `call` gets a client of one robot, and calls the service of this robot.
+    `robot` and `ids` are those of `present_ids`. `call` gets a client of one robot, and calls the
+    service of this robot. If a robot does not reply, its entry is the error.
     """
-    wanted = (
-        running_robots(robot.session, ids, robot.where.endpoint) if ALL_ROBOTS in ids else list(ids)
-    )
+    wanted = present_ids(robot, ids)
 
     def called(robot_id: str) -> ServiceReply | AcsardError:
         try:

@@ -21,8 +21,7 @@ from pathlib import Path
 
 import msgspec
 
-from acsard.bus.robot_discovery import parse_ids
-from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
+from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, several_ids
 from acsard.cli.replies import of_each, print_each
 from acsard.client import Client
 from acsard.core.config.live import find_live_setting, flat
@@ -72,7 +71,7 @@ def main(args: argparse.Namespace) -> int:
     settings = pairs(args.settings)
     if args.keep and not settings:
         raise UsageError("--keep needs a setting: acsard set limits.linear_speed 0.8 --keep")
-    if parse_ids(args.id or ""):
+    if several_ids(args):
         _require_for_many(args, settings)
     file = _file(args.config, settings) if args.write else None
     if file is not None:
