@@ -44,12 +44,6 @@ FLEET_QUERY_PERIOD_S = 2.0
 program queries the `state` of that robot. The time is longer than `QUERY_PERIOD_S`, because such a
 program sends many queries."""
 
-STATE_KEY = "state"
-
-MAX_WAITING_ANSWERS = 16
-"""Maximum number of replies that wait to be processed. The daemon and each storage send one reply
-to a query."""
-
 MONOTONIC_COUNTERS = ("lines", "lines_sent", "commands")
 """Names of counters in `state` that decrease only when the daemon restarts."""
 
@@ -167,11 +161,12 @@ class Watch(Follower):
         """
         super().__init__(now)
         self._robot, self._decoder = robot, Decoder(RobotState)
-        self._states = robot.subscribe(STATE_KEY)
+        self._states = robot.subscribe("state")
         if wake is not None:
             self._states.wakes(wake)
-        self._answers = Mailbox[zenoh.Sample](MAX_WAITING_ANSWERS)
-        """Replies to queries, which a thread of Zenoh adds."""
+        self._answers = Mailbox[zenoh.Sample](16)
+        """Replies to queries, which a thread of Zenoh adds. The daemon and each storage send one
+        reply to a query."""
 
     def poll(self, now: float) -> list[RobotState]:
         """Process the states that have arrived, and return the new states.
@@ -195,7 +190,7 @@ class Watch(Follower):
             if state is not None and self.answered(state, now):
                 states.append(state)
         if self.query_is_due(now):
-            self._robot.start_query(STATE_KEY, self._answers.put)
+            self._robot.start_query("state", self._answers.put)
         return states
 
     def _decode(self, sample: zenoh.Sample) -> RobotState | None:

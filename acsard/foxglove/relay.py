@@ -30,8 +30,6 @@ from acsard.foxglove.robot_facts import Facts, key_of
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
-EVENTS_KEY = "events"
-
 
 class EventDeduplicator:
     """Converts the daemon's lists of events to log messages.
@@ -281,8 +279,8 @@ class Relay:
             out = self._outs.get(topic)
             if out is None or out.key not in self._followed:
                 continue
-            if out.key == EVENTS_KEY:
-                self._robot.start_query(EVENTS_KEY, self._followed[EVENTS_KEY].add)
+            if out.key == "events":
+                self._robot.start_query("events", self._followed["events"].add)
             elif out.key in ("tf_static", "diagnostics", "state") and out.last:
                 # These keys are published rarely, so a new viewer receives the last message.
                 out.channel.log(out.last)

@@ -93,7 +93,11 @@ def link(data: ScreenData, state: RobotState, width: int) -> list[Text]:
     if state.certificate_expiry:
         lines += flow([certificate(state)], width, 2)
     counted = rates(data, state, before)
-    figures = [Text(f"{what} {counted(name)}") for what, name in COUNTER_LINES]
+    figures = [
+        Text(f"lines in {counted('lines')}"),
+        Text(f"lines out {counted('lines_sent')}"),
+        Text(f"commands {counted('commands')}"),
+    ]
     superseded = state.counters.get("lines_superseded", 0)
     figures += [Text(f"superseded {count(superseded)}"), missed(state, before), overrun(state)]
     if met := state.counters.get("commands_of_new_senders", 0):
@@ -111,9 +115,6 @@ def link(data: ScreenData, state: RobotState, width: int) -> list[Text]:
     if not kinds:
         lines.append(Text("rejected nothing"))
     return [*lines, *folded(f"last one {clean(state.refused) or '-'}", width, 2)]
-
-
-COUNTER_LINES = (("lines in", "lines"), ("lines out", "lines_sent"), ("commands", "commands"))
 
 
 def timing(state: RobotState, width: int) -> list[Text]:

@@ -21,9 +21,6 @@ from acsard.top.text import ScreenData, bar, clean, count, rate, row, rule
 MAX_COLUMNS = 116
 """Maximum width of the screen in character cells. Longer lines are harder to read."""
 
-SHORT_WORDS, LONG_WORDS = 21, 56
-"""Widths of the two explanations in `LATENCY_ROWS`, character cells: short and long."""
-
 MOST_REASONS, MOST_PORT = 16, 34
 
 LINK_STYLES = {"up": "green", "booting": "yellow"}
@@ -48,8 +45,8 @@ LATENCY_ROWS = {
         "from sending a line to its answer (checked link only)",
     ),
 }
-"""Maps the name of each latency to a short and a long explanation. `a → b` means the time from
-event a to event b."""
+"""Maps the name of each latency to a short and a long explanation, which have at most 21 and 56
+character cells. `a → b` means the time from event a to event b."""
 
 
 def motion(state: RobotState, width: int) -> list[Text]:
@@ -299,7 +296,7 @@ def refused(state: RobotState, before: RobotState) -> list[tuple[str, list[Text]
 
 def timing(state: RobotState, width: int) -> list[Text]:
     long = width >= MAX_COLUMNS
-    room = LONG_WORDS if long else SHORT_WORDS
+    room = 56 if long else 21
     start = 16 + room
     at = ((0, "timing"), (start + 2, "last minute"), (start + 23, "since start"))
     heads = "".join(f"{name:>7}" for name in ("p50", "p99", "max"))

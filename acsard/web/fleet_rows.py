@@ -11,7 +11,7 @@ from acsard.core.messages.state_warnings import charge, warnings
 from acsard.host.threads import in_thread
 from acsard.web.robots import Robots
 from acsard.web.socket_messages import Row
-from acsard.web.streams import DECLARE_TIMEOUT_S, NOT_READY_ERRORS, STATE_KEY, attempt
+from acsard.web.streams import DECLARE_TIMEOUT_S, NOT_READY_ERRORS, attempt
 from acsard.web.tasks import start
 
 MAX_ROBOTS = 200
@@ -68,7 +68,7 @@ class FleetTracker:
         That is the case if the robot's liveliness token is present, or if a viewer is subscribed to
         the robot's key `state` and a state has arrived.
         """
-        states = self._robots.streams.followed(robot, STATE_KEY)
+        states = self._robots.streams.followed(robot, "state")
         here = self._tracked is not None and self._tracked.is_present(robot)
         return here or bool(states and states.number)
 

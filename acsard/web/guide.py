@@ -47,8 +47,6 @@ NO_DEVICE = (
 
 ABSENT_PORT = "configured, but it does not exist now"
 
-POSITIONS = "positions"
-
 KEY = re.compile(r"(?=.{1,80}\Z)[A-Za-z0-9_][A-Za-z0-9_-]*(/[A-Za-z0-9_-]+)*\Z")
 
 Say = Callable[[Guided], None]
@@ -288,10 +286,10 @@ def arguments(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
 def _method(begin: Begin) -> list[str]:
     if begin.method and begin.method not in NEEDS:
         raise FrameError("begin", f"method must be one of {', '.join(NEEDS)}")
-    if (begin.method == POSITIONS) != bool(begin.positions):
+    if (begin.method == "positions") != bool(begin.positions):
         raise FrameError(
             "begin",
-            f"the method {POSITIONS} needs `positions`, a Zenoh key; no other method uses it",
+            "the method positions needs `positions`, a Zenoh key; no other method uses it",
         )
     if begin.positions and not KEY.match(begin.positions):
         raise FrameError(

@@ -33,8 +33,6 @@ ROW_LENGTH = MEASURED_COUNT + 5
 """Number of values in a row: measured speeds (`MEASURED_COUNT`), commanded twist (2), lateness (2)
 and voltage (1)."""
 
-MS = 1e-3
-
 Column = Sequence[float | None]
 """The values of one plotted line, oldest first; None where the value is unknown."""
 
@@ -88,7 +86,7 @@ class Minute:
         twist = [wished.linear.x, wished.angular.z] if wished else [None, None]
         figure = state.latencies.get("period_lateness")
         late = figure.last_minute if figure else None
-        lateness = [late.p99 * MS, late.max * MS] if late else [None, None]
+        lateness = [late.p99 * 1e-3, late.max * 1e-3] if late else [None, None]
         volts = state.battery.volts if state.battery else None
         row = [*measured, *twist, *lateness, volts]
         self._rows.append((at_ns, [None if value is None else round(value, 3) for value in row]))

@@ -37,7 +37,8 @@ from acsard.web.socket_messages import DEFAULT_SOURCE
 from acsard.web.tokens import Vault
 from acsard.web.viewer import Parts
 
-TIDY_S, REPORT_PERIOD_S = 1.0, 1.0
+TIDY_S = 1.0
+"""Interval of the server's regular tasks, s."""
 
 FIELD_BYTES, FIELDS = 8190, 64
 """Maximum size of the request line and of each header, bytes (`FIELD_BYTES`), and maximum number of
@@ -146,7 +147,7 @@ async def _tidy(page: Page) -> None:
 
 async def _report_refusals(counts: Counts, log: Log) -> None:
     while True:
-        await asyncio.sleep(REPORT_PERIOD_S)
+        await asyncio.sleep(TIDY_S)
         if (refusals := counts.new_refusals()) is not None:
             log.event(refusals)
 

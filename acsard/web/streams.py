@@ -32,9 +32,7 @@ VIEWER_KEYS = frozenset(topic.key for topic in FOLLOWED)
 
 DECLARE_TIMEOUT_S = 3.0
 
-STATE_KEY = "state"
-
-STORED_KEYS = (STATE_KEY, "odom")
+STORED_KEYS = ("state", "odom")
 """Keys that the server queries only for the page's own robot. For another robot, a router's storage
 could answer with an old value, even a week after the robot was switched off."""
 
