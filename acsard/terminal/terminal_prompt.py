@@ -11,9 +11,9 @@ import select
 import sys
 import termios
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from typing import Self, TypeVar
+from typing import Self
 
 from rich.table import Table
 from rich.text import Text
@@ -21,8 +21,6 @@ from rich.text import Text
 from acsard.checkup.findings import Finding
 from acsard.terminal.output import MAX_TEXT_WIDTH, has_room, show, table
 from acsard.terminal.prompt import NobodyError, NumberQuestion
-
-T = TypeVar("T")
 
 BAR_WIDTH = 30
 
@@ -133,7 +131,7 @@ class TerminalPrompt(Screen):
             _forget_input()
             while True:
                 self._print(f"\n{question}{choice} ")
-                line = _end_if_closed(_line)
+                line = _line()
                 word = line.strip().lower()
                 if not line or word == QUIT_KEY:
                     raise KeyboardInterrupt
@@ -186,13 +184,24 @@ def row(finding: Finding) -> Table:
     return table([(verdict, head), *(("", text) for text in below if text)], gap=1)
 
 
+@contextmanager
+def _quits_if_closed() -> Iterator[None]:
+    """Raise `KeyboardInterrupt` if the terminal has been closed."""
+    try:
+        yield
+    except (OSError, termios.error):
+        raise KeyboardInterrupt from None
+
+
+@_quits_if_closed()
 def _read() -> str:
-    read = _end_if_closed(lambda: os.read(sys.stdin.fileno(), 256))
+    read = os.read(sys.stdin.fileno(), 256)
     if not read:
         raise KeyboardInterrupt
     return read.decode(errors="replace")
 
 
+@_quits_if_closed()
 def _line() -> str:
     try:
         return sys.stdin.readline()
@@ -200,28 +209,22 @@ def _line() -> str:
         return "?\n"  # not an answer to any question
 
 
-def _end_if_closed(call: Callable[[], T]) -> T:
-    """Return the result of `call`. If the terminal has been closed, raise `KeyboardInterrupt`."""
-    try:
-        return call()
-    except (OSError, termios.error):
-        raise KeyboardInterrupt from None
-
-
+@_quits_if_closed()
 def _forget_input() -> None:
     if sys.stdin.isatty():
-        _end_if_closed(lambda: termios.tcflush(sys.stdin, termios.TCIFLUSH))
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)
 
 
 @contextmanager
 def _lines() -> Iterator[None]:
     """Let the terminal deliver and echo whole lines of input in the `with` block."""
-    before = _end_if_closed(lambda: termios.tcgetattr(sys.stdin))
-    cooked = list(before)
-    # Python 3.12.0 and 3.12.1 clear ICRNL in `tty.setcbreak`. Then Enter would not end a line.
-    cooked[0] |= termios.ICRNL
-    cooked[3] |= termios.ICANON | termios.ECHO
-    _end_if_closed(lambda: termios.tcsetattr(sys.stdin, termios.TCSANOW, cooked))
+    with _quits_if_closed():
+        before = termios.tcgetattr(sys.stdin)
+        cooked = list(before)
+        # Python 3.12.0 and 3.12.1 clear ICRNL in `tty.setcbreak`. Then Enter would not end a line.
+        cooked[0] |= termios.ICRNL
+        cooked[3] |= termios.ICANON | termios.ECHO
+        termios.tcsetattr(sys.stdin, termios.TCSANOW, cooked)
     try:
         yield
     finally:
