@@ -19,6 +19,7 @@ from collections.abc import Callable, Collection, Sequence
 import msgspec
 from msgspec import Struct
 
+from acsard.bus.address import Address
 from acsard.calibration.guided.drive_plan import NEEDS, SIMULATED
 from acsard.core.config.settings import SIMULATOR
 from acsard.host import clock
@@ -50,18 +51,6 @@ ABSENT_PORT = "configured, but it does not exist now"
 KEY = re.compile(r"(?=.{1,80}\Z)[A-Za-z0-9_][A-Za-z0-9_-]*(/[A-Za-z0-9_-]+)*\Z")
 
 Say = Callable[[Guided], None]
-
-
-class Reach(Struct, frozen=True):
-    """The options with which a child process connects to the daemon of this server's robot.
-
-    If a value is empty, the server leaves out the option with this value.
-    """
-
-    config: str
-    endpoint: str
-    robot_id: str
-    tls: str
 
 
 class Board(Struct, frozen=True):
@@ -96,13 +85,13 @@ class _ChildLine(Struct, frozen=True):
 class Guide:
     """Runs one check or calibration at a time, and tells all viewers of the page which one runs."""
 
-    def __init__(self, reach: Reach, configured: str) -> None:
+    def __init__(self, address: Address, config: str, port: str) -> None:
         """Create an instance in which no check or calibration runs.
 
-        `reach` contains the options that connect a child to the daemon. `configured` is the serial
-        port in the configuration.
+        `address` is the address of the daemon. `config` is the path of the configuration file from
+        the command line, or "". `port` is the serial port in the configuration.
         """
-        self._reach, self._configured = reach, configured
+        self._address, self._config, self._configured = address, config, port
         self._viewers: dict[object, Say] = {}
         self._job: _Job | None = None
         self._task: asyncio.Task[None] | None = None
@@ -220,8 +209,8 @@ class Guide:
     async def _run_job(self, job: _Job, asked: Begin) -> None:
         try:
             ports = await self._boards() if asked.begin == "check" else []
-            options = arguments(asked, self._reach, [board.port for board in ports])
-            code, text = await job.run(options)
+            allowed = [board.port for board in ports]
+            code, text = await job.run(arguments(asked, self._address, self._config, allowed))
         # Python raises `RuntimeError` if it cannot start a thread for the child process.
         except (FrameError, OSError, TimeoutError, RuntimeError) as error:
             code, text = Exit.USAGE, str(error) or SLOW_PORTS
@@ -261,14 +250,15 @@ def boards(configured: str) -> list[Board]:
     return [Board(port, texts[port]) for port in ports]
 
 
-def arguments(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
+def arguments(begin: Begin, address: Address, file: str, ports: Collection[str]) -> list[str]:
     """Return the arguments with which `acsard` runs the check or calibration `begin`.
 
     A text from the browser becomes only the value of an option, so a browser cannot add options.
-    `reach` contains the options that connect a calibration to the daemon. `ports` are the ports
-    that a check may use. Raises `FrameError` if a value in `begin` is not permitted.
+    `address` is the address of the daemon, for a calibration. `file` is the configuration file, or
+    "". `ports` are the ports that a check may use. Raises `FrameError` if a value in `begin` is not
+    permitted.
     """
-    config = [f"--config={reach.config}"] if reach.config else []
+    config = [f"--config={file}"] if file else []
     if begin.begin == "check":
         if begin.method or begin.positions:
             raise FrameError("begin", "`method` and `positions` are only for a calibration")
@@ -277,9 +267,9 @@ def arguments(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
         return ["mcu", "check", "--json-lines", *config, f"--port={begin.port}"]
     if begin.port:
         raise FrameError("begin", "`port` is only for a check of the board, not for a calibration")
-    options = [f"--connect={reach.endpoint}", f"--id={reach.robot_id}"]
-    if reach.tls:
-        options.append(f"--tls={reach.tls}")
+    options = [f"--connect={address.endpoint}", f"--id={address.robot_id}"]
+    if address.tls:
+        options.append(f"--tls={address.tls}")
     return ["calibrate", "--json-lines", *config, *options, *_method(begin)]
 
 

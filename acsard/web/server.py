@@ -29,7 +29,7 @@ from acsard.host.threads import NoThreadError, in_thread
 from acsard.web.acceptor import READ_BYTES, Acceptor, Reader
 from acsard.web.app import Page
 from acsard.web.callers import is_loopback
-from acsard.web.guide import Guide, Reach
+from acsard.web.guide import Guide
 from acsard.web.listen import Listen, open_sockets, own_name, require_certificate
 from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
@@ -90,7 +90,7 @@ async def serve(
     files = CertificateFiles(*files_in(options.tls))
     secure, names = _certified(options)
     robots = Robots(options.address, lambda: _connected(options.address), _about(options), counts)
-    guide = Guide(_reach(options), options.config.mcu.port)
+    guide = Guide(options.address, options.file, options.config.mcu.port)
     parts = Parts(robots, guide, counts)
     vault, acceptor = Vault(options.state, options.address.robot_id), Acceptor(counts)
     page = Page(parts, vault, names, acceptor, options.config.web)
@@ -175,11 +175,6 @@ async def _watch_parent(leaving: asyncio.Event) -> None:
 def _connected(address: Address) -> Client:
     session = client_session(address.endpoint, address.tls)
     return Client(session, address.robot_id, DEFAULT_SOURCE, address.tls, address.endpoint)
-
-
-def _reach(options: ServerOptions) -> Reach:
-    address = options.address
-    return Reach(options.file, address.endpoint, address.robot_id, address.tls)
 
 
 def _about(options: ServerOptions) -> About:

@@ -20,7 +20,7 @@ from acsard.core.messages.signature import MAX_INT64
 from acsard.host.errors import UnreachableError
 from acsard.web.acceptor import Acceptor
 from acsard.web.app import DEFAULT_CONFIG, Page
-from acsard.web.guide import Guide, Reach
+from acsard.web.guide import Guide
 from acsard.web.limits import MAX_OVERRUNS, MAX_UNREAD_BYTES
 from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
@@ -48,7 +48,7 @@ class Inside:
             raise UnreachableError("nobody is there")
 
         self.robots = Robots(Address("tcp/127.0.0.1:1", "acsar", ""), connect, ABOUT, self.counts)
-        guide = Guide(Reach("", "", "acsar", ""), "sim")
+        guide = Guide(Address("", "acsar", ""), "", "sim")
         self.parts = Parts(self.robots, guide, self.counts)
         self.page = Page(
             self.parts, Vault(where, "acsar"), frozenset(), Acceptor(self.counts), rules=rules

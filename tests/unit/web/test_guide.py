@@ -10,12 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acsard.bus.address import Address
 from acsard.calibration.guided.drive_plan import NEEDS, SIMULATED
 from acsard.calibration.guided.methods import METHODS
 from acsard.cli import parser
 from acsard.host.processes import Holder
 from acsard.machine.serial_ports import SerialDevice
-from acsard.web.guide import KEY, NO_DEVICE, Guide, Reach, arguments, boards, last_part
+from acsard.web.guide import KEY, NO_DEVICE, Guide, arguments, boards, last_part
 from acsard.web.socket_messages import Begin, Ended, FrameError, Guided
 from tests.each import each
 
@@ -62,7 +63,8 @@ def test_the_configured_port_is_the_first_choice(
     assert boards(configured)[0].port == configured
 
 
-REACH = Reach("/etc/acsard/acsard.toml", "tls/robot:7447", "robot2", "/etc/acsard/tls")
+FILE = "/etc/acsard/acsard.toml"
+ADDRESS = Address("tls/robot:7447", "robot2", "/etc/acsard/tls")
 PORTS = ("/dev/acsar", "sim")
 
 
@@ -79,7 +81,7 @@ async def test_a_server_that_sees_no_port_says_what_to_do(
     configured: str, devices: list[SerialDevice], note: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("acsard.web.guide.serial_devices", lambda: devices)
-    assert (await Guide(REACH, configured).choices(simulated=False)).note == note
+    assert (await Guide(ADDRESS, FILE, configured).choices(simulated=False)).note == note
 
 
 def parsed(argv: list[str]) -> argparse.Namespace:
@@ -88,8 +90,8 @@ def parsed(argv: list[str]) -> argparse.Namespace:
 
 
 def test_a_check_gets_the_port_and_the_file_and_asks_before_it_moves() -> None:
-    args = parsed(arguments(Begin("check", "/dev/acsar"), REACH, PORTS))
-    assert (args.port, args.config) == ("/dev/acsar", REACH.config)
+    args = parsed(arguments(Begin("check", "/dev/acsar"), ADDRESS, FILE, PORTS))
+    assert (args.port, args.config) == ("/dev/acsar", FILE)
     assert args.json_lines
     assert [args.yes, args.write, args.wheels_are_lifted] == [False] * 3
 
@@ -97,15 +99,15 @@ def test_a_check_gets_the_port_and_the_file_and_asks_before_it_moves() -> None:
 @each("way", ["", *NEEDS])
 def test_a_calibration_is_of_the_page_s_robot_and_asks_before_it_moves(way: str) -> None:
     positions = "sim/pose" if way == "positions" else ""
-    args = parsed(arguments(Begin("calibrate", "", way, positions), REACH, ()))
-    assert (args.connect, args.id, args.tls) == (REACH.endpoint, REACH.robot_id, REACH.tls)
+    args = parsed(arguments(Begin("calibrate", "", way, positions), ADDRESS, FILE, ()))
+    assert (args.connect, args.id, args.tls) == (ADDRESS.endpoint, ADDRESS.robot_id, ADDRESS.tls)
     assert (args.method or "", args.positions or "") == (way, positions)
     assert args.json_lines
     assert [args.yes, args.write, args.log] == [False, False, None]
 
 
 def test_unknown_values_are_not_passed_as_options() -> None:
-    argv = arguments(Begin("calibrate"), Reach("", "tcp/127.0.0.1:7448", "acsar", ""), ())
+    argv = arguments(Begin("calibrate"), Address("tcp/127.0.0.1:7448", "acsar", ""), "", ())
     assert not any(
         word.startswith(("--config", "--tls", "--method", "--positions")) for word in argv
     )
@@ -135,7 +137,7 @@ def test_unknown_values_are_not_passed_as_options() -> None:
 )
 def test_a_request_that_was_not_offered_is_refused_with_a_reason(wish: Begin) -> None:
     with pytest.raises(FrameError) as caught:
-        arguments(wish, REACH, PORTS)
+        arguments(wish, ADDRESS, FILE, PORTS)
     assert caught.value.about == "begin"
     assert str(caught.value)
 
@@ -145,7 +147,7 @@ def test_no_text_becomes_an_option_of_its_own(
     what: str, port: str, way: str, positions: str
 ) -> None:
     try:
-        argv = arguments(Begin(what, port, way, positions), REACH, PORTS)  # type: ignore[arg-type]
+        argv = arguments(Begin(what, port, way, positions), ADDRESS, FILE, PORTS)  # type: ignore[arg-type]
     except FrameError:
         return
     names = {word.partition("=")[0] for word in argv}
@@ -197,7 +199,7 @@ async def test_the_end_of_a_job_says_how_its_process_ended(
     command = [sys.executable, "-c", f"import os; {end}"]
     monkeypatch.setattr("acsard.web.guide.acsard", lambda *words: command)
     said: asyncio.Queue[Guided] = asyncio.Queue()
-    guide, viewer = Guide(REACH, "sim"), object()
+    guide, viewer = Guide(ADDRESS, FILE, "sim"), object()
     guide.join(viewer, said.put_nowait)
     assert guide.begin(viewer, "joe", Begin("calibrate")) == ""
     async with asyncio.timeout(10.0):

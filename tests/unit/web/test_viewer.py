@@ -19,7 +19,7 @@ from acsard.core.messages.signature import unpack
 from acsard.core.values import NS_PER_S, Role, Twist
 from acsard.host import clock
 from acsard.web.callers import AdmittedClient
-from acsard.web.guide import Guide, Reach
+from acsard.web.guide import Guide
 from acsard.web.limits import COMMAND_RATE
 from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
@@ -108,7 +108,7 @@ async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
     fake: Any = Fake()
     robots = Robots(Address("tcp/127.0.0.1:1", "acsar", ""), lambda: fake, about, counts)
     robots.client = fake
-    parts = Parts(robots, Guide(Reach("", "", "", ""), ""), counts)
+    parts = Parts(robots, Guide(Address("", "", ""), "", ""), counts)
     request: Any = SimpleNamespace(transport=None)
     socket: Any = SimpleNamespace()
     viewer = Viewer(
