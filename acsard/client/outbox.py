@@ -111,9 +111,8 @@ class Outbox:
 
     def _due(self) -> list[tuple[Commander, Put]]:
         now_ns = clock.steady_ns()
-        known = [(commander.due_ns(), commander, put) for commander, put in self._senders.items()]
         return [
-            (sender, put)
-            for due_ns, sender, put in known
-            if due_ns is not None and due_ns <= now_ns
+            (commander, put)
+            for commander, put in self._senders.items()
+            if (due_ns := commander.due_ns()) is not None and due_ns <= now_ns
         ]

@@ -210,47 +210,50 @@ class Keys:
         If the message is not valid or exceeds a limit, report the reason to the client instead.
         """
         robot, key = frame.robot or self._robots.id, frame.subscribe
-        try:
-            require_id(robot)
-        except UsageError as error:
-            self._out.refuse("subscribe", "malformed", str(error))
-            return
-        if key not in VIEWER_KEYS:
-            text = f"{key!r} is not a key to follow; choose one of {', '.join(sorted(VIEWER_KEYS))}"
-            self._out.refuse("subscribe", "malformed", text)
-            return
         known = self._out.following.get((robot, key))
-        others = sum(
-            1.0 / subscription.period
-            for subscription in self._out.following.values()
-            if subscription is not known
-        )
-        if others + frame.rate > MAX_FRAMES_HZ:
-            self._out.refuse(
-                "subscribe",
-                "too_many",
-                f"the rates of your keys add up to more than {MAX_FRAMES_HZ:g} messages a second: "
-                "lower some of them",
-            )
+        if (refusal := self._enter(robot, key, frame.rate, known)) is not None:
+            self._out.refuse("subscribe", *refusal)
         elif known is not None:
             known.period, known.due = 1.0 / frame.rate, 0.0
             self._out.wake()
-        elif len(self._out.following) >= MAX_SUBSCRIBED_KEYS:
-            self._out.refuse(
-                "subscribe",
-                "too_many",
-                f"you already follow {MAX_SUBSCRIBED_KEYS} keys: unsubscribe from some",
-            )
-        elif robot != self._robots.id and not self._shares.enter(self._holder, (robot, key)):
-            text = (
-                f"one token may follow at most {STREAMS_OF_ONE} keys of other robots, "
-                f"and all tokens together at most {STREAMS}"
-            )
-            self._out.refuse("subscribe", "too_many", f"{text}: unsubscribe from some")
         else:
             subscription = Following(robot, key, self._robots.id, 1.0 / frame.rate)
             self._out.following[robot, key] = subscription
             self._start(self._join(subscription))
+
+    def _enter(
+        self, robot: str, key: str, rate: float, known: Following | None
+    ) -> tuple[Reason, str] | None:
+        """Count a subscription. If it is not valid or exceeds a limit, return the refusal instead.
+
+        `known` is the present subscription to the key, if there is one. It is not counted again.
+        """
+        try:
+            require_id(robot)
+        except UsageError as error:
+            return "malformed", str(error)
+        if key not in VIEWER_KEYS:
+            keys = ", ".join(sorted(VIEWER_KEYS))
+            return "malformed", f"{key!r} is not a key to follow; choose one of {keys}"
+        following = self._out.following
+        others = sum(1.0 / other.period for other in following.values() if other is not known)
+        if others + rate > MAX_FRAMES_HZ:
+            return "too_many", (
+                f"the rates of your keys add up to more than {MAX_FRAMES_HZ:g} messages a second: "
+                "lower some of them"
+            )
+        if known is not None:
+            return None
+        if len(following) >= MAX_SUBSCRIBED_KEYS:
+            return "too_many", (
+                f"you already follow {MAX_SUBSCRIBED_KEYS} keys: unsubscribe from some"
+            )
+        if robot != self._robots.id and not self._shares.enter(self._holder, (robot, key)):
+            return "too_many", (
+                f"one token may follow at most {STREAMS_OF_ONE} keys of other robots, and all "
+                f"tokens together at most {STREAMS}: unsubscribe from some"
+            )
+        return None
 
     def unsubscribe(self, frame: Unsubscribe) -> None:
         name = frame.robot or self._robots.id, frame.unsubscribe
