@@ -65,8 +65,6 @@ REPORT_TIMEOUT_S = 300.0
 DRAWING_STATUS: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
 """HTTP status of the answer to a request for a recording's report, by the state of the report."""
 
-DEFAULT_CONFIG = WebConfig()
-
 
 class TokenForm(Struct, frozen=True):
     """The token of an invitation, which the browser gets back as a cookie.
@@ -107,7 +105,7 @@ class Page:
         vault: Vault,
         names: AbstractSet[str],
         acceptor: Acceptor,
-        rules: WebConfig = DEFAULT_CONFIG,
+        rules: WebConfig,
     ) -> None:
         """Create the web application.
 

@@ -19,7 +19,7 @@ from acsard.core.config.settings import Config, WebConfig
 from acsard.core.messages.signature import MAX_INT64
 from acsard.host.errors import UnreachableError
 from acsard.web.acceptor import Acceptor
-from acsard.web.app import DEFAULT_CONFIG, Page
+from acsard.web.app import Page
 from acsard.web.guide import Guide
 from acsard.web.limits import MAX_OVERRUNS, MAX_UNREAD_BYTES
 from acsard.web.metrics import Counts
@@ -36,6 +36,8 @@ MISSED = 50
 """Messages at 50 a second that one client does not read."""
 
 ABOUT = About("1", True, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
+
+DEFAULT_CONFIG = WebConfig()
 
 
 class Inside:

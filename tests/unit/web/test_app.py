@@ -18,7 +18,7 @@ from acsard.bus.address import Address
 from acsard.client import Client
 from acsard.core.config.live import LIVE
 from acsard.core.config.parsing import effective
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, WebConfig
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import NS_PER_S, Role
 from acsard.host import clock
@@ -58,7 +58,7 @@ class Phone:
 def page_with_phone(directory: Path, ends: list[str]) -> Page:
     counts = Counts()
     parts = Parts(robots(None), Guide(Address("", "", ""), "", ""), counts)
-    page = Page(parts, Vault(directory, "acsar"), frozenset(), Acceptor(counts))
+    page = Page(parts, Vault(directory, "acsar"), frozenset(), Acceptor(counts), WebConfig())
     page._viewers.add(Phone(ends))  # type: ignore[arg-type]
     return page
 
@@ -105,7 +105,7 @@ async def test_the_age_of_a_picture_counts_a_suspend(
     """The age must include the suspend, in which the monotonic clock stands still."""
     counts, headers = Counts(), dict[str, str]()
     parts = Parts(robots(None), Guide(Address("", "", ""), "", ""), counts)
-    page = Page(parts, Vault(tmp_path, "acsar"), frozenset(), Acceptor(counts))
+    page = Page(parts, Vault(tmp_path, "acsar"), frozenset(), Acceptor(counts), WebConfig())
     page._camera = Camera("http://127.0.0.1:1/")
 
     async def sent(request: web.Request, body: bytes, fields: dict[str, str], *_: object) -> None:
