@@ -11,6 +11,7 @@ import gc
 import os
 import select
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import msgspec
@@ -117,10 +118,7 @@ def main(part: Part) -> None:
     sys.stdout.write(end.path + "\n")
     sys.stdout.flush()
     gc.disable()
-    if part.free_running:
-        with mcu.free_running(part.free_running):
-            end.play(sys.stdin.fileno())
-    else:
+    with mcu.free_running(part.free_running) if part.free_running else nullcontext():
         end.play(sys.stdin.fileno())
     try:
         sys.stdout.buffer.write(msgspec.msgpack.encode(end.seen))

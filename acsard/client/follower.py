@@ -203,12 +203,8 @@ class Watch(Follower):
     def objection(self, source: str, sender: str, now: float) -> str:
         """Return why the robot does not follow the commands of a sender; "" if it follows them.
 
-        Before the first state arrives, the result is "" until the robot counts as silent.
-
-        Args:
-            source: the command source of the sender's commands.
-            sender: the public name of the sender.
-            now: the present time, s.
+        Before the first state arrives, the result is "" until the robot counts as silent. `source`
+        and `sender` are those of the function `objection`.
         """
         if self.silent(now):
             return (

@@ -105,14 +105,8 @@ def identity(
 ) -> ClientIdentity:
     """Query the robot for this client's role, and return the client's identity.
 
-    Blocks for up to `WHOAMI_S`.
-
-    Args:
-        ask: function that sends a query to the robot.
-        tls: the directory of the client's certificate, or "" without a certificate.
-        sender: the name that the daemon gives to this client as a sender of commands.
-        robot: the robot's id, for messages.
-        endpoint: the endpoint of the daemon or router, for messages.
+    Blocks for up to `WHOAMI_S`. `tls` is the directory of the client's certificate, or "" without a
+    certificate. The other arguments, except `ask`, become fields of the result.
     """
     answers: SimpleQueue[str] = SimpleQueue()
     for role in ROLES:

@@ -54,15 +54,11 @@ class Notices:
         self._staying: dict[str, Notice] = {}
 
     def enqueue(self, level: Level, name: str, text: str, status_id: str = "") -> None:
-        """Queue a message to all viewers.
+        """Queue a message to all viewers. `name` is its subject on the topic `log`.
 
-        Args:
-            level: how serious the message is.
-            name: the subject of the message on the topic `log`.
-            text: the message.
-            status_id: id of a message that remains visible until `remove` is called with this id.
-                The message is dropped if it is visible already. With "", the message is dropped if
-                its text is repeated faster than `REPEAT_RATE` permits.
+        A message with a `status_id` remains visible until `remove` is called with this id. It is
+        dropped if it is visible already. A message without a `status_id` is dropped if its text is
+        repeated faster than `REPEAT_RATE` permits.
         """
         now_ns = clock.mono_ns()
         with self._lock:
@@ -112,12 +108,9 @@ class Objections:
     def update(self, objection: str, now_ns: int) -> bool:
         """Update the reported reason `reported`, and return whether it has changed.
 
-        A reason is reported if the robot has not followed the viewer for `GRACE_S`.
-
-        Args:
-            objection: the present reason why the robot does not follow the viewer, in words, or ""
-                if the robot follows.
-            now_ns: the present monotonic time, ns.
+        A reason is reported if the robot has not followed the viewer for `GRACE_S`. `objection` is
+        the present reason, in words, or "" if the robot follows. `now_ns` is the present monotonic
+        time, ns.
         """
         if not objection:
             self._since_ns = None

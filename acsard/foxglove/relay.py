@@ -258,10 +258,8 @@ class Relay:
     def follow(self, topics: Collection[str], fresh: Collection[str]) -> None:
         """Subscribe to the keys of the topics that viewers show, and to no other keys.
 
-        Args:
-            topics: the topics that viewers show.
-            fresh: the topics with a new viewer. If such a topic is published rarely, its last
-                message is sent again for the new viewer.
+        `fresh` are the topics with a new viewer. If such a topic is published rarely, its last
+        message is sent again for the new viewer.
         """
         if self.log_topic in fresh:
             # A viewer that opens the log receives the last events too.

@@ -106,10 +106,7 @@ def is_queryable(topic: Topic) -> bool:
 
 
 def values(handler: Handler) -> Iterator[Route]:
-    """Yield the route `GET /api/<key>` for each key whose last value a program may query.
-
-    `handler` is the handler of all these routes.
-    """
+    """Yield the route `GET /api/<key>` for each key whose last value a program may query."""
     for topic in filter(is_queryable, TOPICS):
         path = f"/api/{topic.key.replace('<Type>', '{type}')}"
         gives = {200: Body("The last value.", topic.type if topic.type in SCHEMAS else "")}
@@ -117,10 +114,7 @@ def values(handler: Handler) -> Iterator[Route]:
 
 
 def services(handler: Handler) -> Iterator[Route]:
-    """Yield the route `POST /api/srv/<name>` for each service of the robot.
-
-    `handler` is the handler of all these routes.
-    """
+    """Yield the route `POST /api/srv/<name>` for each service of the robot."""
     notes = {topic.key: topic.note for topic in TOPICS}
     for key, verb in VERBS.items():
         # The daemon decodes the payload, so a refusal contains the daemon's message.

@@ -81,9 +81,8 @@ class Outgoing:
     def refuse(self, what: str, reason: Reason, text: str) -> None:
         """Count a refused message, and report the refusal to the client.
 
-        Reports beyond the limit `REPORT_RATE` are left out. `what` is the kind of the refused
-        message, `reason` is the reason under which it is counted, and `text` is the reason in
-        words.
+        Reports beyond the limit `REPORT_RATE` are left out. `what` is the kind of the message, and
+        `text` is the reason in words.
         """
         self._counts.refuse(reason, self._origin)
         if self._reports.take(f"{what} {reason}", clock.mono_ns()):

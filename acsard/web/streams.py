@@ -110,9 +110,8 @@ class Streams:
     async def follow(self, client: Client, robot: str, key: str) -> Stream:
         """Return the stream of a robot's key. Subscribe to the key if it has no user yet.
 
-        The caller must call `leave` after use. `client` is this server's bus client, and `robot` is
-        the id of the robot. Raises one of the errors in `NOT_READY_ERRORS` if the bus is stuck or
-        closed.
+        The caller must call `leave` after use. Raises one of `NOT_READY_ERRORS` if the bus is stuck
+        or closed.
         """
         name = robot, key
         stream = self._streams.get(name)
