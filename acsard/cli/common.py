@@ -116,29 +116,21 @@ def options_text(options: Iterable[tuple[str, str | None]]) -> str:
     return "".join([f" {name} {shlex.quote(value)}" for name, value in options if value])
 
 
-def by_environment() -> dict[str, dict[str, object]]:
-    """Return the configuration values that environment variables set, as nested dictionaries.
+def overrides(options: Mapping[str, object]) -> dict[str, dict[str, object]]:
+    """Return the configuration values that options and the environment set, by table and key.
 
-    The only such variable is `ACSARD_TLS`, which sets `bus.tls`. If the variable is not set, the
-    result is empty. A systemd unit sets the variable to the directory of its credentials.
+    `options` maps dotted keys, such as "mcu.port", to values. A key with the value None is ignored.
+    The only environment variable is `ACSARD_TLS`, which sets `bus.tls` unless an option does. A
+    systemd unit sets this variable to the directory of its credentials.
     """
-    return {"bus": {"tls": os.environ["ACSARD_TLS"]}} if "ACSARD_TLS" in os.environ else {}
-
-
-def tables(
-    options: Mapping[str, object], before: Mapping[str, Mapping[str, object]]
-) -> dict[str, dict[str, object]]:
-    """Return a copy of the configuration tables `before`, with the values of `options`.
-
-    `before` maps the name of each table, such as "mcu", to its keys and values. `options` maps
-    dotted keys, such as "mcu.port", to values, which replace those in `before`. A key with the
-    value None is ignored.
-    """
-    result = {table: dict(values) for table, values in before.items()}
-    for key, value in options.items():
-        if value is not None:
-            table, _, name = key.partition(".")
-            result.setdefault(table, {})[name] = value
+    values: dict[str, object] = {}
+    if "ACSARD_TLS" in os.environ:
+        values["bus.tls"] = os.environ["ACSARD_TLS"]
+    values |= {key: value for key, value in options.items() if value is not None}
+    result: dict[str, dict[str, object]] = {}
+    for key, value in values.items():
+        table, _, name = key.partition(".")
+        result.setdefault(table, {})[name] = value
     return result
 
 
@@ -168,10 +160,10 @@ def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple
             with the value None is ignored.
     """
     where, text = find(path)
-    overrides = tables(options or {}, by_environment())
-    typed = {key: OPTIONS[key] for key, value in (options or {}).items() if value is not None}
+    options = options or {}
+    typed = {key: OPTIONS[key] for key, value in options.items() if value is not None}
     try:
-        return where, configuration.parse(text, overrides)
+        return where, configuration.parse(text, overrides(options))
     except ConfigError as error:
         places = [typed.get(re.split(r"[ :\[]", message)[0], where) for message in error.problems]
         for place, problem in zip(places, error.problems, strict=True):

@@ -14,7 +14,7 @@ import msgspec
 from rich.text import Text
 
 from acsard.bus.address import address_of
-from acsard.cli.common import by_environment
+from acsard.cli.common import overrides
 from acsard.cli.connection import add_bus, require_one
 from acsard.core.formatting import json_line, lines, printable
 from acsard.host.config_file import find
@@ -32,7 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     require_one(args)
     find_address = partial(address_of, connect=args.connect, robot_id=args.id, tls=args.tls)
-    findings = list(examine(*find(args.config), by_environment(), find_address))
+    findings = list(examine(*find(args.config), overrides({}), find_address))
     if args.json:
         print(json_line(msgspec.json.encode(findings).decode()))
     else:

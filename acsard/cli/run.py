@@ -13,14 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from acsard.bus.zenoh_sessions import reachable
-from acsard.cli.common import (
-    add_config,
-    by_environment,
-    load,
-    options_text,
-    tables,
-    with_record_directory,
-)
+from acsard.cli.common import add_config, load, options_text, overrides, with_record_directory
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
@@ -156,9 +149,9 @@ def settings_file(where: str, config: Config, cli_values: dict[str, object]) -> 
     The `SettingsFile` parses the file as the daemon would after a restart. `where` is the path of
     the file, or another text if there is no file. `cli_values` is the result of `options`.
     """
-    overrides = tables(cli_values, by_environment())
+    values = overrides(cli_values)
     file = Path(where).absolute() if Path(where).is_file() else None
-    return SettingsFile(file, lambda text: with_record_directory(parse(text, overrides)), config)
+    return SettingsFile(file, lambda text: with_record_directory(parse(text, values)), config)
 
 
 def page(config: Config, where: str) -> list[str] | None:

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from acsard.cli import parser, run
-from acsard.cli.common import tables
+from acsard.cli.common import overrides
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, McuConfig, WebConfig
 from acsard.machine.daemon_findings import OPTION_KEYS
@@ -15,7 +15,7 @@ from tests.each import each
 
 
 def given_by(*words: str) -> dict[str, dict[str, object]]:
-    return tables(run.options(parser(["run"]).parse_args(["run", *words])), {})
+    return overrides(run.options(parser(["run"]).parse_args(["run", *words])))
 
 
 def test_without_options_nothing_is_overridden() -> None:
