@@ -142,8 +142,9 @@ class Daemon:
 def page_with_daemon(directory: Path) -> tuple[Page, list[tuple[str, str]]]:
     """Return a page, and the list of the calls that reach a robot: verb and robot."""
     counts, calls = Counts(), list[tuple[str, str]]()
-    parts = Parts(robots(cast(Client, Daemon(calls))), Guide(Reach("", "", "", ""), ""), counts)
-    return Page(parts, Vault(directory, "acsar"), frozenset(), Acceptor(counts)), calls
+    parts = Parts(robots(cast(Client, Daemon(calls))), Guide(Address("", "", ""), "", ""), counts)
+    vault = Vault(directory, "acsar")
+    return Page(parts, vault, frozenset(), Acceptor(counts), WebConfig()), calls
 
 
 def posted(verb: str, *body: bytes, end: bool = True, role: Role = "viewer") -> web.Request:

@@ -141,7 +141,7 @@ class Page:
         counts = Counts()
         about = About("1", True, 1.0, 4.0, 10.0, "", {})
         robots = Robots(Address("tcp/127.0.0.1:1", "r1", ""), Mock(), about, counts)
-        parts = Parts(robots, Guide(Reach("", "", "", ""), ""), counts)
+        parts = Parts(robots, Guide(Address("", "", ""), "", ""), counts)
         parts.calls._called = self._called  # type: ignore[assignment, method-assign]
         who = AdmittedClient(role, "bob", "token", "1.2.3.4")
         socket, request = cast(Any, SimpleNamespace()), cast(Any, SimpleNamespace(transport=None))
