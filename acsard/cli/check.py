@@ -13,6 +13,7 @@ from acsard.cli.common import add_config, load
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import effective
 from acsard.core.config.toml_text import document
+from acsard.core.formatting import json_line
 from acsard.daemon.robot_description import robot_description
 
 
@@ -26,7 +27,7 @@ def main(args: argparse.Namespace) -> int:
     robot_description(config.ros.urdf)
     plain = effective(config)
     if args.json:
-        print(msgspec.json.encode(plain).decode())
+        print(json_line(msgspec.json.encode(plain).decode()))
     else:
         print(f"# effective configuration from {where}")
         print("\n".join(document(plain)))

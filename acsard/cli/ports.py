@@ -10,6 +10,7 @@ import sys
 
 import msgspec
 
+from acsard.core.formatting import json_line
 from acsard.machine.serial_ports import serial_devices
 
 NO_PORT_ADVICE = (
@@ -25,7 +26,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     ports = serial_devices()
     if args.json:
-        print(msgspec.json.encode(ports).decode())
+        print(json_line(msgspec.json.encode(ports).decode()))
         return 0 if ports else 1
     if not ports:
         print(f"no serial ports: {NO_PORT_ADVICE}", file=sys.stderr)

@@ -11,6 +11,7 @@ import argparse
 import msgspec
 
 from acsard.cli.connection import add_bus, connected
+from acsard.core.formatting import json_line
 from acsard.host.errors import Exit
 
 
@@ -23,7 +24,7 @@ def main(args: argparse.Namespace) -> int:
     with connected(args) as robot:
         us = robot.whoami()
     if args.json:
-        print(msgspec.json.encode(us).decode())
+        print(json_line(msgspec.json.encode(us).decode()))
     else:
         print(f"{us.describe()}\nsender {us.sender}")
     if us.role:

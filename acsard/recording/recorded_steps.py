@@ -140,6 +140,12 @@ class RecordedStep(Struct, frozen=True):
     """True for the first step of a batch. The checksums of the exact values and of the names
     restart from 0 at this step."""
 
+    @property
+    def places(self) -> bool:
+        """Whether a request sets the pose. It takes effect after the poses of this step."""
+        verbs = [request.verb for request in self.inputs.requests]
+        return "set_pose" in verbs or "reset_odometry" in verbs
+
 
 class UnfinishedError(AcsardError):
     """The recorded inputs of the step in which the daemon failed cannot be decoded.

@@ -424,6 +424,9 @@ class TimelineWriter:
                 moved = math.hypot(pose[0] - self._pose[0], pose[1] - self._pose[1])
                 self._distance_m += moved / US_PER_S
             self._pose = pose
+        if step.places:
+            # The pose jumps before the next step, and a jump is no distance.
+            self._pose = None
         mode, _, _, source = step.recorded.status
         now_ns = step.inputs.now.mono_ns
         if mode == "driving":

@@ -447,9 +447,7 @@ class ReportData:
             self._place, self._jumps = place, False
             if inside:
                 self.path.add(place)
-        # A request takes effect after the poses of its step.
-        if any(request.verb in ("set_pose", "reset_odometry") for request in step.inputs.requests):
-            self._jumps = True
+        self._jumps = self._jumps or step.places
 
     def _driven(self, source: str) -> Driven:
         return self.driven.setdefault(self.sources.name(source), Driven())

@@ -33,7 +33,7 @@ from acsard.core.config.settings import Config, OdometryConfig
 from acsard.core.motion.error_model import SPEED_RESOLUTION, ErrorModel, TwistUncertainty, columns
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.path import Path
-from acsard.core.motion.uncertainty import GYRO_SCALE_STD, PoseUncertainty
+from acsard.core.motion.uncertainty import PoseUncertainty
 from acsard.core.values import REST, PoseCovariance
 
 Cause = Literal["time", "quantization", "gaps", "slip", "parameters", "gyro"]
@@ -206,7 +206,10 @@ def budget(received: DriveMessages, config: Config, metres: float = BUDGET_DISTA
     still = _standing(received, config, model)
     if len(lines) < MIN_LINES:
         return still
-    moved = motion(lines, np.array(received.sent), model.kinematics, received.complete)
+    moved = motion(
+        lines, np.array(received.sent), model.kinematics, received.complete,
+        model.odometry.gyro_scale_std,
+    )  # fmt: skip
     rolled, turned = float(np.abs(moved.distance).sum()), float(np.abs(moved.turn).sum())
     if rolled < LEAST_M and turned < LEAST_RAD:
         return still
@@ -284,7 +287,7 @@ def _causes(
     if received.gyro:
         known = odometry.covariance == "model" and driving.tells_gyro
         basis = "measured" if known else "unknown"
-        yield share("gyro", basis, driving.turned_by_gyro(), scale=GYRO_SCALE_STD)
+        yield share("gyro", basis, driving.turned_by_gyro(), scale=odometry.gyro_scale_std)
 
 
 class _Model:

@@ -19,7 +19,6 @@ from acsard.calibration.log_table import Floats
 from acsard.core.motion.error_model import SPEED_RESOLUTION
 from acsard.core.motion.gap_filling import Gaps
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.uncertainty import GYRO_SCALE_STD
 from acsard.core.values import Twist, WheelSpeeds
 
 Counts = npt.NDArray[np.int64]
@@ -214,7 +213,13 @@ class Motion(Struct, frozen=True):
     """Total duration of the gaps in the feedback, s."""
 
 
-def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool) -> Motion:
+def motion(
+    lines: list[Line],
+    sent: Floats,
+    kinematics: Kinematics,
+    whole: bool,
+    gyro_scale_std: float = 0.0,
+) -> Motion:
     """Compute the motion between at least 3 feedback lines, and the errors of this motion.
 
     Args:
@@ -224,6 +229,7 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
         whole: whether this program received every feedback line that the daemon received. If it is
             false, a line that is missing here may have reached the daemon. Such a line counts as
             lost only if the odometry of the daemon has a gap too.
+        gyro_scale_std: relative standard deviation of the gyro's scale; 0 without a gyro.
     """
     t = np.array([line.at for line in lines])
     times = line_times(t, sent)
@@ -235,7 +241,7 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
     turns = [math.remainder(b.yaw - a.yaw, math.tau) for a, b in pairwise(lines)]
     growth = _noise(
         t, np.array([line.speeds for line in lines]), np.array(turns),
-        np.array([line.yaw_variance for line in lines]),
+        np.array([line.yaw_variance for line in lines]), gyro_scale_std,
     )  # fmt: skip
     filled, unfilled, missing, unseen = _gaps(t, twists, rolled, times, whole)
     late = _late(t, twists, times)
@@ -247,20 +253,23 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
     )  # fmt: skip
 
 
-def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Floats | None:
+def _noise(
+    t: Floats, speeds: Floats, turns: Floats, variances: Floats, scale_std: float
+) -> Floats | None:
     """Return the variance, rad2, that the gyro's noise adds to the heading between two lines.
 
     Return None if the noise cannot be separated from the gyro's scale error. `variances` contains
-    the variance of the heading at each line, rad2.
+    the variance of the heading at each line, rad2. `scale_std` is the relative standard deviation
+    of the gyro's scale.
     """
-    # The gyro's scale error also adds to the variance of the heading: S^2 A^2, where S is the
-    # relative standard deviation of the scale, and A is the turn since the pose was last set. A
-    # further turn dA adds 2 S^2 A dA. A is unknown at the first line, so a least-squares fit
-    # estimates A and the noise together.
+    # The gyro's scale error also adds to the variance of the heading: S^2 A^2, where S is
+    # `scale_std`, and A is the turn since the pose was last set. A further turn dA adds
+    # 2 S^2 A dA. A is unknown at the first line, so a least-squares fit estimates A and the noise
+    # together.
     #
     # Leave out the lines in which the variance falls, because the pose was set there.
     dt, moves = np.diff(t), speeds[1:].any(axis=1) & (variances[1:] > variances[:-1] / 2)
-    levers, before = 2 * GYRO_SCALE_STD**2 * turns, np.cumsum(turns) - turns / 2
+    levers, before = 2 * scale_std**2 * turns, np.cumsum(turns) - turns / 2
     grown = np.diff(variances) - levers * before
     columns = np.column_stack((dt, levers))[moves]
     sizes = np.sqrt(np.sum(columns**2, axis=0))

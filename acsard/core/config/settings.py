@@ -303,6 +303,7 @@ class OdometryConfig(Struct, frozen=True):
     base_frame: Frame = "base_link"
     publish_tf: bool = True
     gyro: bool = False
+    gyro_scale_std: Deviation = 0.004
     learned_track: bool = False
     pose_covariance_diagonal: Diagonal = (1e-6, 1e-6, 1e6, 1e6, 1e6, 1e-6)
     twist_covariance_diagonal: Diagonal = (1e-3, 1e-3, 1e6, 1e6, 1e6, 1e-2)

@@ -157,7 +157,8 @@ class Odometry:
 
         Some motion is not in the pose yet, for example the motion in feedback lines that are held
         back or implausible. This motion is dropped, because it happened before this call. However,
-        a small motion at rest (`_held`) is still added to the angles of the wheels.
+        a small motion at rest (`_held`) is still added to the angles of the wheels. If this call
+        comes in a silence of the board, the next line still adds the motion of the whole silence.
         """
         self._positions = plus(self._positions, self._held)
         self._held = AT_REST

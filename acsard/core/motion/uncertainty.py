@@ -54,11 +54,6 @@ configured. Few encoders have fewer counts."""
 
 UNKNOWN_POSE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
-GYRO_SCALE_STD = 0.004
-"""Relative standard deviation of the scale factor of a gyro. An error of this size changes the
-heading by 1.4 degrees in one revolution. After equal turns to the left and to the right, its
-effects cancel."""
-
 Missed = Literal["gap", "wheel"]
 """Cause of a motion that the pose may have missed: a gap in the feedback, or a wheel that the pose
 ignored although it may have been right."""
@@ -129,7 +124,7 @@ class PoseUncertainty:
 
     def advance(
         self, distance: float, turn: float, dx: float, dy: float, heading: float,
-        variance: float | None = None, slips: bool = False, scale: float = GYRO_SCALE_STD,
+        variance: float | None = None, slips: bool = False, scale: float | None = None,
     ) -> None:  # fmt: skip
         """Update the covariance after a step, which is an arc of `distance` m through `turn` rad.
 
@@ -144,7 +139,8 @@ class PoseUncertainty:
                 distance.
             slips: whether the wheels slip. The noise of the wheels is then larger by the factor
                 `SLIP_FACTOR`.
-            scale: the relative standard deviation of the gyro's scale.
+            scale: the relative standard deviation of the gyro's scale; None for the configured one,
+                `odometry.gyro_scale_std`.
         """
         if self._lost:
             self._mark_unknown(distance, turn)
@@ -155,6 +151,7 @@ class PoseUncertainty:
             along, yaw, both = SLIP_FACTOR * along, SLIP_FACTOR * yaw, SLIP_FACTOR * both
         if variance is not None:
             yaw, both = variance, 0.0
+            scale = self._model.settings.gyro_scale_std if scale is None else scale
         self._p = stepped(self._p, dx, dy, along, yaw, both, c, s)
         if variance is not None and scale and self._of_gyro < 0:
             self._of_gyro = self._widen()

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
+from msgspec.structs import replace
 
 from acsard.cli import main
 from acsard.machine.serial_ports import SerialDevice
@@ -37,3 +40,14 @@ def test_the_tool_says_that_no_port_looks_like_a_board(
     assert bool(words) == bool(err)
     assert ('port = "/dev/acsar"' in out) == (MEGA in ports)
     assert all(port.device in out for port in ports)
+
+
+def test_json_has_no_control_characters_from_the_description_of_a_device(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    port = replace(UNKNOWN, description="USB \x9b2J Serial")
+    monkeypatch.setattr("acsard.cli.ports.serial_devices", lambda: [port])
+    assert main(["ports", "--json"]) == 0
+    out = capsys.readouterr().out
+    assert out.strip().isprintable()
+    assert json.loads(out)[0]["description"] == port.description

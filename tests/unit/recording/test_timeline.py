@@ -52,6 +52,17 @@ def test_the_timeline_has_the_start_each_drive_and_the_end() -> None:
     assert [entry.seconds for entry in entries] == sorted(entry.seconds for entry in entries)
 
 
+def test_a_pose_that_is_set_during_a_drive_is_no_distance() -> None:
+    tape, world = recorded_world()
+    world.drive(0.5, seconds=1.0)
+    world.call("set_pose", b'{"x": 100.0, "y": 0.0, "yaw": 0.0}')
+    world.hold(0.5, seconds=1.0)
+    world.send(0.0)
+    world.run(1.0)
+    (drive,) = [entry for entry in story(tape) if entry.name == "drive"]
+    assert drive.text.startswith("drove 0.9")
+
+
 def test_a_recording_that_continues_another_begins_with_what_the_robot_does() -> None:
     tape, world = recorded_world()
     world.drive(0.5, 0.2, seconds=2.0)

@@ -13,7 +13,6 @@ from msgspec.structs import replace
 from acsard.calibration.error_budget.budget import Budget, Cause, DriveMessages, Share, budget
 from acsard.calibration.error_budget.measured_errors import Line
 from acsard.core.config.settings import Config, McuConfig, OdometryConfig
-from acsard.core.motion.uncertainty import GYRO_SCALE_STD
 from tests.unit.calibration.error_budget import drives
 from tests.unit.calibration.error_budget.drives import ReportedDrive
 
@@ -133,7 +132,7 @@ def test_with_a_gyro_no_error_of_the_wheels_changes_the_heading() -> None:
         assert share(result, cause).deg_per_turn == 0.0
     turns = result.turned / 360
     grown = math.degrees(
-        math.sqrt(lines[-1].yaw_variance / turns + (GYRO_SCALE_STD * math.tau) ** 2)
+        math.sqrt(lines[-1].yaw_variance / turns + (CONFIG.odometry.gyro_scale_std * math.tau) ** 2)
     )
     assert share(result, "gyro").deg_per_turn == pytest.approx(grown, rel=0.05)
 
@@ -148,7 +147,9 @@ def with_a_gyro(lines: list[Line], before: float = 0.0) -> Share:
     for last, line in pairwise([lines[0], *lines]):
         heading += math.remainder(line.yaw - last.yaw, math.tau)
         noise += 1e-6 if any(line.speeds) else 0.0
-        made.append(replace(line, yaw_variance=noise + (GYRO_SCALE_STD * heading) ** 2))
+        made.append(
+            replace(line, yaw_variance=noise + (CONFIG.odometry.gyro_scale_std * heading) ** 2)
+        )
     return share(budget(DriveMessages(made, [], gyro=True), CONFIG), "gyro")
 
 
