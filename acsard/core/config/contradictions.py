@@ -14,7 +14,7 @@ from itertools import pairwise
 
 from acsard.core.config import motion_rules, named_faults
 from acsard.core.config.partial import Rule, mistakes
-from acsard.core.config.settings import SIMULATOR, BusConfig, Config, McuConfig, is_tls
+from acsard.core.config.settings import SIMULATOR, Config, McuConfig, is_tls
 from acsard.core.config.validation import show
 from acsard.core.config.wire_time import (
     COMFORTABLE_USE,
@@ -100,7 +100,7 @@ def warnings(config: Config) -> list[str]:
         messages.append(
             "access.wildcards = true: every client with a certificate can stall the bus"
         )
-    hosts = [_host(endpoint) for ends in _endpoints(config.bus).values() for endpoint in ends]
+    hosts = [_host(endpoint) for endpoint in (*config.bus.listening, *config.bus.connect)]
     outside = not all(_is_loopback(host) for host in hosts if host)
     if outside and config.robot.id == Config().robot.id:
         messages.append(
@@ -328,7 +328,7 @@ def _reachability_problems(config: Config) -> list[str]:
 
 def _endpoint_problems(config: Config, key: str) -> list[str]:
     bus, errors = config.bus, []
-    for endpoint in _endpoints(bus)["listen"] if key == "listen" else bus.connect:
+    for endpoint in bus.listening if key == "listen" else bus.connect:
         where = f"bus.{key} = {show(endpoint)}"
         host = _host(endpoint)
         if host is None:
@@ -353,8 +353,7 @@ def _endpoint_problems(config: Config, key: str) -> list[str]:
 
 
 def _listen_twice_problems(config: Config) -> list[str]:
-    listen = enumerate(_endpoints(config.bus)["listen"])
-    names = {f"bus.listen[{i}]": endpoint for i, endpoint in listen}
+    names = {f"bus.listen[{i}]": endpoint for i, endpoint in enumerate(config.bus.listening)}
     return _repeated("host and port", names, lambda endpoint: endpoint.partition("/")[2])
 
 
@@ -399,10 +398,6 @@ def _ros_problems(config: Config) -> list[str]:
             'namespace, like "robot1"'
         ]
     return []
-
-
-def _endpoints(bus: BusConfig) -> dict[str, tuple[str, ...]]:
-    return {"listen": bus.listening, "connect": bus.connect}
 
 
 def _host(endpoint: str) -> str | None:

@@ -452,6 +452,17 @@ def test_a_rule_is_not_applied_to_a_key_with_an_unknown_value() -> None:
     assert [line.split(" = ")[0] for line in problems_of(text)] == ["mcu.baudrate", "bus.insecur"]
 
 
+def test_an_invalid_router_does_not_hide_a_problem_of_the_endpoints_to_listen_at() -> None:
+    text = """
+        [bus]
+        connect = 5
+        listen = ["tcp/0.0.0.0:7448", "nowhere"]
+        """
+    names = [line.partition(":")[0] for line in problems_of(text)]
+    assert names[0].startswith("bus.connect = 5")
+    assert names[1:] == ['bus.listen = "tcp/0.0.0.0', 'bus.listen = "nowhere"']
+
+
 def test_the_error_message_lists_all_problems() -> None:
     with pytest.raises(ConfigError) as caught:
         parse(b"a = 1\nb = 2")
