@@ -23,6 +23,13 @@ forget who held it."""
 KEPT = 4000
 """Commands that are remembered."""
 
+OUTDATED_NS = 3 * NS
+"""After a stall of more than `LATE_NS`, commands older than this are forgotten. The daemon gives a
+speed that may have waited in the stall an arrival 4 s ago, which can be that of a true command."""
+
+LATE_NS = NS // 20
+"""A step that comes later than this after the one before may have stalled."""
+
 OBEYED_NS = 20_000_000
 """A command that was accepted is obeyed within this time and one period."""
 
@@ -303,6 +310,9 @@ class Followed:
         disarmed = armed_since_ns != self._armed_since_ns or mode in ("fault", "shutdown")
         self._armed_since_ns = armed_since_ns
         stood = decided_ns - self._decided_ns > STOOD_NS
+        if decided_ns - self._decided_ns > LATE_NS:
+            known = self._arrived.items()
+            self._arrived = {at: entry for at, entry in known if at > decided_ns - OUTDATED_NS}
         self._decided_ns = decided_ns
         if disarmed or stood or witness.pending or link != "up":
             self.forget()

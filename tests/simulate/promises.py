@@ -346,7 +346,7 @@ class Witness:
             self.fault_ns = min(self.faults, default=None)
         if faulty:
             self.unfaulted_ns = asked_ns
-        if "still" in text:
+        if text.startswith("fault cleared, but"):
             return
         self.perhaps_latched.discard("clear")
         self._release(self.stops, "a clear releases no later stop", asked_ns, read_ns, name)

@@ -937,6 +937,14 @@ def test_a_clear_that_its_sender_sent_before_the_stop_must_not_release_it() -> N
     assert witness.must_rest is None
 
 
+def test_a_clear_of_a_robot_that_is_switched_off_releases_the_stop() -> None:
+    witness = witnessed()
+    witness.stops.append(5 * NS)
+    text = "cleared, but the robot is still switched off: call srv/activate to switch it on"
+    witness.cleared(9 * NS, 6 * NS, text, "ann")
+    assert witness.stops == []
+
+
 @pytest.mark.parametrize(("at_s", "finding"), [(6.9, True), (7.0, False)])
 @pytest.mark.parametrize("what", ["start", "clear"])
 def test_a_clear_without_a_number_must_wait_behind_a_start_and_behind_the_clear_of_a_fault(
