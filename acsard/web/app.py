@@ -22,6 +22,7 @@ from acsard.core.config.live import WHEN_TEXTS, find_live_setting, flat
 from acsard.core.config.settings import WebConfig
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.permissions import least_role
+from acsard.core.messages.schema import ServiceReply
 from acsard.core.ros.parameters import kind_of
 from acsard.core.values import Role
 from acsard.host import clock
@@ -286,20 +287,25 @@ class Page:
 
         The arguments of the service are the fields of the JSON object in the request's body.
         """
-        verb, call = request.path.removeprefix("/api/srv/"), self._parts.calls.call
-        reading = asyncio.create_task(_arguments_in(request))
+        verb, who = request.path.removeprefix("/api/srv/"), request[IDENTITY_KEY]
+        call, reading = self._parts.calls.call, asyncio.create_task(_arguments_in(request))
+        own: asyncio.Task[ServiceReply] | None = None
         try:
             if verb == "stop":
                 await asyncio.wait([reading], timeout=STOP_BODY_TIMEOUT_S)
                 if not reading.done() or reading.exception() is not None:
                     # No body names another robot, and a stop of the page's own robot is never
                     # refused.
-                    stop = call(request[IDENTITY_KEY], verb, {})
-                    await asyncio.gather(stop, asyncio.wait([reading]))
+                    own = asyncio.create_task(call(who, verb, {}))
             robot, arguments = await reading
+            if own is not None and robot in ("", self._robots.id):
+                answer = await own
+            else:
+                answer = await call(who, verb, arguments, robot)
         finally:
             reading.cancel()
-        answer = await call(request[IDENTITY_KEY], verb, arguments, robot)
+            if own is not None:
+                await asyncio.wait([own])
         return reply(answer, 200 if answer.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:

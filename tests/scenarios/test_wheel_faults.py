@@ -289,6 +289,24 @@ def test_a_wheel_that_may_be_right_although_it_is_ignored_is_in_the_covariance(
     assert 0.1 < error < 2.0 * std
 
 
+@pytest.mark.parametrize("configured", [False, True])
+@pytest.mark.parametrize("counts", [16, 40, 100])
+@pytest.mark.parametrize(("linear", "angular"), [(0.5, 0.0), (0.15, 0.0), (0.0, 1.5)])
+def test_a_healthy_encoder_with_few_counts_does_not_look_like_one_that_fails(
+    linear: float, angular: float, counts: int, configured: bool
+) -> None:
+    """Such an encoder reports no motion in most lines."""
+    sim = SimConfig(encoder_counts=counts, motor_time_constant=0.1)
+    mcu = McuConfig(encoder_counts=counts if configured else 0)
+    made = World(Config(sim=sim, mcu=mcu))
+    made.run(1.5)
+    made.drive(linear, angular, seconds=4.0)
+    made.drive(linear, -angular, seconds=4.0)
+    pose = made.odom.pose.covariance
+    assert math.sqrt(pose[0]) < 0.1
+    assert math.sqrt(pose[35]) < 0.5
+
+
 def test_slip_makes_the_covariance_a_hundred_times_as_large() -> None:
     made = world()
     made.drive(0.5, seconds=1.5)

@@ -225,10 +225,12 @@ def _until_rest(before: Motors, driven: float, after: Motors, bridged: float, ow
     """
     # A board that computes its speeds since its last reply reports the means over the whole time.
     # These means are large enough for the motion until the command to rest. A smaller speed is the
-    # speed after the gap.
+    # speed after the gap. A wheel that became faster until then has not slowed down yet.
     angles, whole = [], bridged + own
     for old, new in zip(before, after, strict=True):
-        if old * new >= 0.0 and abs(new) * whole >= abs(old) * min(driven, whole):
+        if driven >= bridged and old * new > 0.0 and abs(new) > abs(old):
+            angles.append((old + new) / 2 * bridged)
+        elif old * new >= 0.0 and abs(new) * whole >= abs(old) * min(driven, whole):
             angles.append(new * bridged)
         elif driven >= bridged:
             angles.append(old * bridged)

@@ -255,7 +255,7 @@ class Odometry:
         if rolled.unknown > 0.0:
             self._add_unseen_motion(rolled.unknown, before, twist)
         turned = self._move(self._settled(rolled, at_rest), turn, speeds, slips)
-        self._doubt_wheels(rolled.seen, rolled.seconds)
+        self._miss("wheel", checks.wheels.possible(rolled.seen), turn)
         self._go_on(rolled, feedback, before, twist)
         variances = self._twist_variances(twist, feedback, at_rest, turn, slips)
         if turn is not None and dt > 0.0:
@@ -311,7 +311,7 @@ class Odometry:
             for distance, angle in arcs:
                 self._path.advance(distance, angle)
             for piece in step.pieces:
-                self._doubt_wheels(piece, 0.0)
+                self._miss("wheel", self.checks.wheels.possible_before(piece), step.gyro)
             if step.on_trial:
                 on_trial += math.fsum([angle for _, angle in arcs]) - step.turn
         self._steps.clear()
@@ -368,28 +368,22 @@ class Odometry:
             along, yaw = self._gaps.fill(bridged, before, twist, self._highest)
             by_counts, turn_by_counts = self._rounded(bridged)
             self._uncertainty.doubt(along + by_counts, yaw + turn_by_counts)
-            if rolled.missed != AT_REST:
-                self._miss("gap", self.checks.wheels.believed(rolled.missed))
+            self._miss("gap", self.checks.wheels.believed(rolled.missed), self.checks.turn)
         elif feedback.gap:
             self._gaps.interrupt(twist)
         else:
             self._gaps.follow(twist, feedback.dt)
 
-    def _doubt_wheels(self, angles: Motors, seconds: float) -> None:
-        """Add the uncertainty because of wheels that may be right or wrong.
+    def _miss(self, cause: Missed, angles: Motors, gyro: Turn | None) -> None:
+        """Add the uncertainty because the wheels may have rolled `angles`, rad, in addition.
 
-        `angles` contains the angles that the wheels reported, rad, in `seconds` s. `seconds` is 0
-        for an earlier line.
+        `gyro` is the turn that a gyro measured, or None.
         """
-        missed = self.checks.wheels.missed(angles, seconds)
-        if missed is not None:
-            self._miss("wheel", missed)
-
-    def _miss(self, cause: Missed, angles: Motors) -> None:
-        """Add the uncertainty because the wheels may have rolled `angles`, rad, in addition."""
+        if angles == AT_REST:
+            return
         distance, turn = self._kinematics.moved(angles)
         # A gyro does not miss a turn.
-        turn = 0.0 if self.checks.turn is not None else turn / self._track.share
+        turn = turn / self._track.share if gyro is None else 0.0
         self._uncertainty.miss(cause, MISSED_STD * distance, MISSED_STD * turn)
 
     def _twist_variances(

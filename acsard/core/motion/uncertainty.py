@@ -55,8 +55,8 @@ configured. Few encoders have fewer counts."""
 UNKNOWN_POSE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
 Missed = Literal["gap", "wheel"]
-"""Cause of a motion that the pose may have missed: a gap in the feedback, or a wheel that the pose
-ignored although it may have been right."""
+"""Cause of a motion that the pose may have missed: a gap in the feedback, or wheels whose reports
+may be wrong or were ignored."""
 
 NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
 
@@ -107,8 +107,8 @@ class PoseUncertainty:
             self._p = added(self._p, *self._phase, self._cos, self._sin)
         self._effects = self._parameters
         self._columns: list[Vector] = [ORIGIN for _ in self._effects]
-        """The columns of the matrix J (see the module). The columns for the gyro's scale, for gaps
-        and for ignored wheels are added when needed."""
+        """The columns of the matrix J (see the module). The columns for the gyro's scale and for
+        missed motions are added when needed."""
         self._of_gyro = -1
         """The index in `_columns` of the column for the gyro's scale; -1 before it is added."""
         self._of_missed: dict[Missed, int] = {}

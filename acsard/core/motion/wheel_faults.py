@@ -62,6 +62,12 @@ RECOVERY_S = 0.5
 """Time for which an ignored wheel must agree with the other wheel of its side while both roll, s.
 After this time, the pose uses the ignored wheel again."""
 
+UNFOLLOWED_COUNTS = 3.0
+"""Number of encoder counts that a side must miss before both of its encoders may be the cause."""
+
+MAX_UNFOLLOWED_LINE_S = 0.1
+"""Longest time of a feedback line for which a side counts as not following its command, s."""
+
 Same = tuple[bool, bool, bool, bool]
 """Whether each wheel reports the same speed as in the previous feedback line, in `WHEELS` order."""
 
@@ -87,8 +93,9 @@ class _Side:
         self._fault: WheelFault = "dead"
         self.late = False
         """Whether a wheel that is not ignored turns too slowly."""
-        self.contradicts = False
-        """Whether both wheels contradict their command in the last line, and none is ignored."""
+        self._unfollowed_s, self._unfollowed = 0.0, (0.0, 0.0)
+        """Time for which neither wheel has followed its command, s, and the further angles that the
+        wheels would have rolled otherwise, rad."""
         self._out_s = 0.0
         """Time for which the ignored wheel has contradicted both the other wheel of its side and
         its command, s."""
@@ -119,7 +126,8 @@ class _Side:
         ]
 
     def forget(self) -> None:
-        self._out_s, self.contradicts = 0.0, False
+        self._out_s = 0.0
+        self.drop_unfollowed()
         for part in (self.expected, *self.witnesses):
             part.forget()
 
@@ -135,9 +143,33 @@ class _Side:
         front, rear = self.witnesses
         bad_front = front.check_speed(speeds[i], self.expected, dt, most, count, still)
         bad_rear = rear.check_speed(speeds[j], self.expected, dt, most, count, still)
-        self.contradicts = bad_front and bad_rear and self.out is None
+        if bad_front and bad_rear and self.out is None:
+            passed = min(dt, MAX_UNFOLLOWED_LINE_S)
+            front_angle, rear_angle = self._unfollowed
+            self._unfollowed_s += passed
+            self._unfollowed = (
+                front_angle + (self.expected.speed - speeds[i]) * passed,
+                rear_angle + (self.expected.speed - speeds[j]) * passed,
+            )
+        else:
+            self.drop_unfollowed()
         self.late = (front.slow and self.out != 0) or (rear.slow and self.out != 1)
         return bad_front or bad_rear or self._out_s > 0.0
+
+    def drop_unfollowed(self) -> None:
+        self._unfollowed_s, self._unfollowed = 0.0, (0.0, 0.0)
+
+    def take_unfollowed(self, count: float) -> tuple[float, float]:
+        """Return the angles that the wheels may have rolled while they did not follow, rad.
+
+        The angles begin after the last call that returned some. A slow encoder often reports no
+        motion although its wheel turns, so they are 0 until the side has been silent for
+        `UNFOLLOWED_COUNTS` counts. `count` is the angle of an encoder count, rad.
+        """
+        if self._unfollowed_s * abs(self.expected.speed) < UNFOLLOWED_COUNTS * count:
+            return 0.0, 0.0
+        angles, self._unfollowed = self._unfollowed, (0.0, 0.0)
+        return angles
 
     def fault(self, speeds: Motors, limit: float) -> str:
         for i, witness in enumerate(self.witnesses):
@@ -330,33 +362,44 @@ class WheelFaults:
         front_right, front_left, rear_left, rear_right = values
         return front_right, front_left, rear_left, rear_right
 
-    def missed(self, wheels: Motors, seconds: float) -> Motors | None:
+    def possible(self, wheels: Motors) -> Motors:
         """Return the angles that the wheels may have rolled and that the pose leaves out, rad.
+
+        Call this once for each feedback line, after `check_line`.
 
         - The pose ignores a wheel that may be right (`_Side.may_be_right`). The angle is the
           difference from the angle that replaces it.
-        - Both wheels of a side contradict their command. The cause may be the encoders of this
-          side. The angle is the difference from the expected angle.
+        - Neither wheel of a side follows its command. The cause may be the encoders of this side.
+          The angle is the difference from the expected angle.
 
-        The angle of each other wheel is 0. Return None if all angles are 0.
-
-        Args:
-            wheels: the reported angles, rad, in `WHEELS` order.
-            seconds: the time in which the wheels rolled these angles, s; 0 for an earlier line, to
-                which the contradictions do not belong.
+        The angle of each other wheel is 0. `wheels` contains the angles that the wheels reported,
+        in `WHEELS` order, rad.
         """
-        if not any(side.may_be_right or side.contradicts for side in self._sides):
-            return None
-        values, believed = [0.0, 0.0, 0.0, 0.0], self.believed(wheels)
+        values = self._ignored(wheels, self._sides)
         for side in self._sides:
-            if side.out is not None and side.may_be_right:
-                wheel = side.wheels[side.out]
-                values[wheel] = wheels[wheel] - believed[wheel]
-            elif side.contradicts and seconds:
-                for wheel in side.wheels:
-                    values[wheel] = side.expected.speed * seconds - wheels[wheel]
+            for wheel, angle in zip(side.wheels, side.take_unfollowed(self._count), strict=True):
+                values[wheel] += angle
         front_right, front_left, rear_left, rear_right = values
         return front_right, front_left, rear_left, rear_right
+
+    def possible_before(self, wheels: Motors) -> Motors:
+        """Return what `possible` would have returned for an earlier line, rad.
+
+        The newly faulty wheel is included, and no other one, because it was not yet ignored then.
+        """
+        sides = () if self._found is None else (self._found,)
+        front_right, front_left, rear_left, rear_right = self._ignored(wheels, sides)
+        return front_right, front_left, rear_left, rear_right
+
+    def _ignored(self, wheels: Motors, sides: tuple[_Side, ...]) -> list[float]:
+        values = [0.0, 0.0, 0.0, 0.0]
+        if self._leaves_out:
+            believed = self.believed(wheels)
+            for side in sides:
+                if side.out is not None and side.may_be_right:
+                    wheel = side.wheels[side.out]
+                    values[wheel] = wheels[wheel] - believed[wheel]
+        return values
 
     def forget(self) -> None:
         """Drop the evidence of faults, because the link was lost or a fault was cleared."""
@@ -372,6 +415,7 @@ class WheelFaults:
         """
         self.pushed, speeds = "", wheel_speeds.as_tuple()
         for side in self._sides:
+            side.drop_unfollowed()
             front, rear = side.wheels
             if not any(witness.suspected for witness in side.witnesses):
                 side.expected.slow_down(speeds[front], speeds[rear])

@@ -27,7 +27,7 @@ from acsard.web import app
 from acsard.web.acceptor import Acceptor
 from acsard.web.admission import IDENTITY_KEY
 from acsard.web.app import Page, settings_in
-from acsard.web.callers import RequestRefusedError
+from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.camera import Camera
 from acsard.web.guide import Guide
 from acsard.web.metrics import Counts
@@ -190,11 +190,24 @@ async def test_a_stop_of_another_robot_does_not_stop_this_robot(tmp_path: Path) 
     assert calls == [("stop", "r2")]
 
 
+@each("named", ["r2", "acsar"])
 async def test_a_stop_whose_body_is_late_stops_this_robot_first_and_then_the_named_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The stop of the named robot does not wait until the page's own robot has answered."""
     monkeypatch.setattr(app, "STOP_BODY_TIMEOUT_S", 0.01)
     page, calls = page_with_daemon(tmp_path)
+    call, own_answer = page._parts.calls.call, asyncio.Event()
+
+    async def slow(
+        who: AdmittedClient, verb: str, payload: dict[str, object], robot: str = ""
+    ) -> ServiceReply:
+        answer = await call(who, verb, payload, robot)
+        if not robot:
+            await own_answer.wait()
+        return answer
+
+    monkeypatch.setattr(page._parts.calls, "call", slow)
     request = posted("stop", b'{"robot"', end=False)
     answer = asyncio.create_task(page.service(request))
     async with asyncio.timeout(20.0):
@@ -202,10 +215,15 @@ async def test_a_stop_whose_body_is_late_stops_this_robot_first_and_then_the_nam
             await asyncio.sleep(0.01)
     assert calls == [("stop", "acsar")]
     assert not answer.done()
-    request.content.feed_data(b': "r2"}')
+    request.content.feed_data(f': "{named}"}}'.encode())
     request.content.feed_eof()
+    expected = [("stop", robot) for robot in dict.fromkeys(("acsar", named))]
+    async with asyncio.timeout(20.0):
+        while calls != expected:
+            await asyncio.sleep(0.01)
+    own_answer.set()
     assert (await answer).status == 200
-    assert calls == [("stop", "acsar"), ("stop", "r2")]
+    assert calls == expected
 
 
 ROWS = {row.key: row for row in settings_in(effective(Config()))}

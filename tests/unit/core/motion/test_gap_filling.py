@@ -125,6 +125,15 @@ def test_a_mean_may_also_cover_the_time_after_the_gap() -> None:
     assert total(Rolling(quiet=0.1).take(line, FOUR)) == pytest.approx(2.5 * 0.2)
 
 
+@pytest.mark.parametrize(("after", "angle"), [(6.0, 0.5 + 0.06), (3.0, 0.4 + 0.03)])
+def test_a_wheel_that_became_faster_before_the_command_to_rest_has_the_mean_speed(
+    after: float, angle: float
+) -> None:
+    """The command to rest came between the gap and the end of the line."""
+    line = Feedback(AT, WheelSpeeds(after, after, after, after), 0.11, bridged=0.1, driven=0.105)
+    assert total(Rolling(quiet=0.1).take(line, FOUR)) == pytest.approx(angle)
+
+
 def test_in_a_short_gap_no_command_to_rest_is_doubtful() -> None:
     line = Feedback(AT, TWO, 0.1, bridged=0.09, driven=0.05)
     assert Rolling(quiet=0.1).take(line, FOUR).missed == AT_REST
