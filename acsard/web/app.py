@@ -10,6 +10,7 @@ import asyncio
 import socket
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
+from contextlib import suppress
 from typing import Annotated, Any
 from urllib.parse import parse_qsl
 
@@ -306,6 +307,8 @@ class Page:
             reading.cancel()
             if own is not None:
                 await asyncio.wait([own])
+                with suppress(asyncio.CancelledError):
+                    own.exception()  # asyncio logs an exception that nobody retrieves
         return reply(answer, 200 if answer.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:

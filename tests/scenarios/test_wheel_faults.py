@@ -71,6 +71,16 @@ def encoder_fault(made: World, kind: str, wheel: int) -> Fault:
 
 SLOW = pytest.mark.slow
 
+SURE = OdometryConfig(
+    distance_variance_per_metre=1e-6,
+    yaw_variance_per_metre=1e-6,
+    yaw_variance_per_radian=1e-5,
+    left_wheel_radius_multiplier_std=1e-4,
+    right_wheel_radius_multiplier_std=1e-4,
+    wheel_separation_multiplier_std=1e-3,
+)
+"""Small errors of healthy wheels, so that the covariance shows the errors of a fault."""
+
 
 @pytest.mark.parametrize(
     ("kind", "wheel"),
@@ -260,16 +270,7 @@ def test_a_wheel_that_is_ignored_as_dead_leaves_the_turn_rate_uncertain() -> Non
 def test_a_wheel_that_may_be_right_although_it_is_ignored_is_in_the_covariance(
     kind: str, linear: float, angular: float
 ) -> None:
-    """The noise of the wheels is small here, so the covariance comes from the fault."""
-    odometry = OdometryConfig(
-        distance_variance_per_metre=1e-6,
-        yaw_variance_per_metre=1e-6,
-        yaw_variance_per_radian=1e-5,
-        left_wheel_radius_multiplier_std=1e-4,
-        right_wheel_radius_multiplier_std=1e-4,
-        wheel_separation_multiplier_std=1e-3,
-    )
-    made = World(Config(odometry=odometry))
+    made = World(Config(odometry=SURE))
     made.run(1.5)
     made.drive(linear, angular, seconds=2.0)
     before = off(made)[1]
@@ -305,6 +306,26 @@ def test_a_healthy_encoder_with_few_counts_does_not_look_like_one_that_fails(
     pose = made.odom.pose.covariance
     assert math.sqrt(pose[0]) < 0.1
     assert math.sqrt(pose[35]) < 0.5
+
+
+def test_stalls_of_the_computer_do_not_make_an_encoder_with_few_counts_look_failing() -> None:
+    """A line that covers a stall has a mean speed, which is not that of a single count."""
+    made = World(Config(sim=SimConfig(encoder_counts=20, motor_time_constant=0.1)))
+    made.run(1.5)
+    made.drive(0.15, seconds=1.0)
+    for _ in range(30):
+        made.hold(0.15, seconds=0.8)
+        made.stall(0.06)
+    assert math.sqrt(made.odom.pose.covariance[0]) < 0.1
+
+
+def test_wheels_of_both_sides_that_may_be_right_do_not_cancel() -> None:
+    made = World(Config(odometry=SURE, feedback=FeedbackConfig(fault_time=0.0)))
+    made.run(1.5)
+    made.drive(0.5, seconds=1.0)
+    with made.mcu.stuck_encoder(0), made.mcu.bias(1, 0.0):
+        made.hold(0.5, seconds=1.0)
+    assert math.sqrt(made.odom.pose.covariance[35]) > 0.5
 
 
 def test_slip_makes_the_covariance_a_hundred_times_as_large() -> None:

@@ -8,7 +8,7 @@ in the line, or these speeds times the time. Each time and each encoder count is
 In a gap that no line covers, `Rolling` assumes two speeds: the speed before the gap for the first
 half, and the speed after the gap for the second half. If the motors were commanded to rest in the
 gap, the speed before the gap is assumed until that command, and an exponential decay to the speed
-after the gap from then on.
+after the gap from then on. An exception is a speed after the gap that may be the mean of the gap.
 """
 
 from __future__ import annotations

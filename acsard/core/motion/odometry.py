@@ -255,7 +255,8 @@ class Odometry:
         if rolled.unknown > 0.0:
             self._add_unseen_motion(rolled.unknown, before, twist)
         turned = self._move(self._settled(rolled, at_rest), turn, speeds, slips)
-        self._miss("wheel", checks.wheels.possible(rolled.seen), turn)
+        for side, angles in checks.wheels.possible(rolled.seen):
+            self._miss(side, angles, turn)
         self._go_on(rolled, feedback, before, twist)
         variances = self._twist_variances(twist, feedback, at_rest, turn, slips)
         if turn is not None and dt > 0.0:
@@ -311,7 +312,8 @@ class Odometry:
             for distance, angle in arcs:
                 self._path.advance(distance, angle)
             for piece in step.pieces:
-                self._miss("wheel", self.checks.wheels.possible_before(piece), step.gyro)
+                for side, angles in self.checks.wheels.possible_before(piece):
+                    self._miss(side, angles, step.gyro)
             if step.on_trial:
                 on_trial += math.fsum([angle for _, angle in arcs]) - step.turn
         self._steps.clear()
@@ -368,7 +370,8 @@ class Odometry:
             along, yaw = self._gaps.fill(bridged, before, twist, self._highest)
             by_counts, turn_by_counts = self._rounded(bridged)
             self._uncertainty.doubt(along + by_counts, yaw + turn_by_counts)
-            self._miss("gap", self.checks.wheels.believed(rolled.missed), self.checks.turn)
+            if rolled.missed != AT_REST:
+                self._miss("gap", self.checks.wheels.believed(rolled.missed), self.checks.turn)
         elif feedback.gap:
             self._gaps.interrupt(twist)
         else:
@@ -379,12 +382,14 @@ class Odometry:
 
         `gyro` is the turn that a gyro measured, or None.
         """
-        if angles == AT_REST:
-            return
         distance, turn = self._kinematics.moved(angles)
         # A gyro does not miss a turn.
         turn = turn / self._track.share if gyro is None else 0.0
         self._uncertainty.miss(cause, MISSED_STD * distance, MISSED_STD * turn)
+        if cause == "gap":
+            # The board may also have received the command in some gaps and not in others. Motions
+            # of opposite directions would cancel in the common part.
+            self._uncertainty.doubt(distance**2 / 4, turn**2 / 4)
 
     def _twist_variances(
         self, twist: Twist, feedback: Feedback, at_rest: bool, gyro: Turn | None, slips: bool

@@ -54,9 +54,9 @@ configured. Few encoders have fewer counts."""
 
 UNKNOWN_POSE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
-Missed = Literal["gap", "wheel"]
-"""Cause of a motion that the pose may have missed: a gap in the feedback, or wheels whose reports
-may be wrong or were ignored."""
+Missed = Literal["gap", "left", "right"]
+"""Cause of a motion that the pose may have missed: a gap in the feedback, or wheels of one side
+whose reports may be wrong or were ignored."""
 
 NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
 

@@ -23,6 +23,7 @@ sends.
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 from acsard.core.config.motion_rules import MIN_EVIDENCE_LINES
 from acsard.core.config.settings import FeedbackConfig
@@ -62,8 +63,15 @@ RECOVERY_S = 0.5
 """Time for which an ignored wheel must agree with the other wheel of its side while both roll, s.
 After this time, the pose uses the ignored wheel again."""
 
-UNFOLLOWED_COUNTS = 3.0
-"""Number of encoder counts that a side must miss before both of its encoders may be the cause."""
+SideName = Literal["left", "right"]
+
+LATE_PERIODS = 1.5
+"""Duration of a feedback line, in usual durations, above which its speeds do not show the angle of
+an encoder count."""
+
+UNFOLLOWED_COUNTS = 6.0
+"""Number of encoder counts that a side must miss before both of its encoders may be the cause. A
+loaded robot that drives at a fifth of its expected speed reports a count in less time."""
 
 MAX_UNFOLLOWED_LINE_S = 0.1
 """Longest time of a feedback line for which a side counts as not following its command, s."""
@@ -80,7 +88,7 @@ LEFT, RIGHT = (1, 2), (0, 3)
 class _Side:
     """The two wheels of one side: the ignored wheel, and the evidence of faults and slip."""
 
-    def __init__(self, name: str, wheels: tuple[int, int]) -> None:
+    def __init__(self, name: SideName, wheels: tuple[int, int]) -> None:
         self.name, self.wheels = name, wheels
         self.expected, self.residual = Expected(), Residual()
         self.witnesses = Witness(), Witness()
@@ -156,15 +164,30 @@ class _Side:
         self.late = (front.slow and self.out != 0) or (rear.slow and self.out != 1)
         return bad_front or bad_rear or self._out_s > 0.0
 
+    @property
+    def follows_not(self) -> bool:
+        """Whether neither wheel followed its command in the last line."""
+        return self._unfollowed_s > 0.0
+
+    def spread(self, front: float, rear: float) -> Motors:
+        """Return the values of all four wheels: `front` and `rear` for this side, 0 for the other.
+
+        The values are in `WHEELS` order.
+        """
+        if self.wheels == LEFT:
+            return 0.0, front, rear, 0.0
+        return front, 0.0, 0.0, rear
+
     def drop_unfollowed(self) -> None:
         self._unfollowed_s, self._unfollowed = 0.0, (0.0, 0.0)
 
     def take_unfollowed(self, count: float) -> tuple[float, float]:
-        """Return the angles that the wheels may have rolled while they did not follow, rad.
+        """Return the further angles that the wheels may have rolled since the last call, rad.
 
-        The angles begin after the last call that returned some. A slow encoder often reports no
-        motion although its wheel turns, so they are 0 until the side has been silent for
-        `UNFOLLOWED_COUNTS` counts. `count` is the angle of an encoder count, rad.
+        An encoder with few counts often reports no motion although its wheel turns. Therefore the
+        angles are 0 until the expected motion, in the time in which neither wheel has followed its
+        command, is `UNFOLLOWED_COUNTS` counts. The first angles after that contain the motion of
+        this whole time. `count` is the angle of an encoder count, rad.
         """
         if self._unfollowed_s * abs(self.expected.speed) < UNFOLLOWED_COUNTS * count:
             return 0.0, 0.0
@@ -314,6 +337,8 @@ class WheelFaults:
         """
         self._kinematics, self._settings = kinematics, feedback
         self._count = math.tau / counts if counts else MAX_COUNT_ANGLE
+        self._most_count = self._count
+        """Largest possible angle of an encoder count, rad."""
         self._seeking, self._period = not counts, ASSUMED_PERIOD_S
         self._least, self._looked = [MAX_COUNT_ANGLE] * RECURRENCES, 0
         """`_least` contains the `RECURRENCES` smallest angles that a front wheel rolled in one of
@@ -362,7 +387,7 @@ class WheelFaults:
         front_right, front_left, rear_left, rear_right = values
         return front_right, front_left, rear_left, rear_right
 
-    def possible(self, wheels: Motors) -> Motors:
+    def possible(self, wheels: Motors) -> list[tuple[SideName, Motors]]:
         """Return the angles that the wheels may have rolled and that the pose leaves out, rad.
 
         Call this once for each feedback line, after `check_line`.
@@ -372,34 +397,35 @@ class WheelFaults:
         - Neither wheel of a side follows its command. The cause may be the encoders of this side.
           The angle is the difference from the expected angle.
 
-        The angle of each other wheel is 0. `wheels` contains the angles that the wheels reported,
-        in `WHEELS` order, rad.
+        The result contains each side with such a wheel, and the angles of all wheels, in `WHEELS`
+        order. The angle of each other wheel is 0. `wheels` contains the angles that the wheels
+        reported, rad.
         """
-        values = self._ignored(wheels, self._sides)
+        found = []
         for side in self._sides:
-            for wheel, angle in zip(side.wheels, side.take_unfollowed(self._count), strict=True):
-                values[wheel] += angle
-        front_right, front_left, rear_left, rear_right = values
-        return front_right, front_left, rear_left, rear_right
+            if side.may_be_right:
+                found.append((side.name, self._ignored(side, wheels)))
+            elif side.follows_not:
+                front, rear = side.take_unfollowed(self._most_count)
+                if front or rear:
+                    found.append((side.name, side.spread(front, rear)))
+        return found
 
-    def possible_before(self, wheels: Motors) -> Motors:
+    def possible_before(self, wheels: Motors) -> list[tuple[SideName, Motors]]:
         """Return what `possible` would have returned for an earlier line, rad.
 
         The newly faulty wheel is included, and no other one, because it was not yet ignored then.
         """
-        sides = () if self._found is None else (self._found,)
-        front_right, front_left, rear_left, rear_right = self._ignored(wheels, sides)
-        return front_right, front_left, rear_left, rear_right
+        side = self._found
+        if side is None or not side.may_be_right:
+            return []
+        return [(side.name, self._ignored(side, wheels))]
 
-    def _ignored(self, wheels: Motors, sides: tuple[_Side, ...]) -> list[float]:
-        values = [0.0, 0.0, 0.0, 0.0]
-        if self._leaves_out:
-            believed = self.believed(wheels)
-            for side in sides:
-                if side.out is not None and side.may_be_right:
-                    wheel = side.wheels[side.out]
-                    values[wheel] = wheels[wheel] - believed[wheel]
-        return values
+    def _ignored(self, side: _Side, wheels: Motors) -> Motors:
+        """Return the angle by which the ignored wheel of `side` differs from its replacement."""
+        believed = self.believed(wheels)
+        front, rear = (wheels[wheel] - believed[wheel] for wheel in side.wheels)
+        return side.spread(front, rear)
 
     def forget(self) -> None:
         """Drop the evidence of faults, because the link was lost or a fault was cleared."""
@@ -557,7 +583,11 @@ class WheelFaults:
         A wheel that turns reports at least one count. Therefore the smallest angle that recurs in
         the lines is the angle of a count (`RECURRENCES`).
         """
+        # A line that covers more time has a mean of several counts, which says nothing about one.
+        late = dt > LATE_PERIODS * self._period
         self._period += PERIOD_GAIN * (dt - self._period)
+        if late:
+            return
         self._looked += 1
         if self._looked > LEARNING_LINES:
             self._least, self._looked = [MAX_COUNT_ANGLE] * RECURRENCES, 1
