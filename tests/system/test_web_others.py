@@ -80,12 +80,16 @@ async def test_another_robot_can_be_followed_and_stopped_and_nothing_else(two: T
 
 async def test_a_page_without_a_connection_stops_another_robot_too(two: Two) -> None:
     async with aiohttp.ClientSession(two.page.here) as session:
-        wishes = ((THEIRS, "stop", 200), (THEIRS, "clear", 403), (3, "stop", 400))
-        for robot, verb, status in wishes:
+        wishes = (
+            (THEIRS, "stop", 200, "ready"),
+            (THEIRS, "clear", 403, "ready"),
+            (3, "stop", 400, "stopped"),
+        )
+        for robot, verb, status, own_mode in wishes:
             async with session.post(f"/api/srv/{verb}", json={"robot": robot}) as answer:
                 assert answer.status == status, await answer.text()
-    assert two.theirs.state()["mode"] == "stopped"
-    assert two.ours.state()["mode"] == "ready"
+            assert two.theirs.state()["mode"] == "stopped"
+            assert two.ours.state()["mode"] == own_mode
 
 
 async def test_a_stop_of_an_absent_robot_or_an_invalid_id_is_answered_with_an_error(
