@@ -101,7 +101,7 @@ class _Side:
         self._fault: WheelFault = "dead"
         self.late = False
         """Whether a wheel that is not ignored turns too slowly."""
-        self._unfollowed_s, self._unfollowed = 0.0, (0.0, 0.0)
+        self.unfollowed_s, self._unfollowed = 0.0, (0.0, 0.0)
         """Time for which neither wheel has followed its command, s, and the further angles that the
         wheels would have rolled otherwise, rad."""
         self._out_s = 0.0
@@ -154,20 +154,15 @@ class _Side:
         if bad_front and bad_rear and self.out is None:
             passed = min(dt, MAX_UNFOLLOWED_LINE_S)
             front_angle, rear_angle = self._unfollowed
-            self._unfollowed_s += passed
+            self.unfollowed_s += passed
             self._unfollowed = (
                 front_angle + (self.expected.speed - speeds[i]) * passed,
                 rear_angle + (self.expected.speed - speeds[j]) * passed,
             )
-        else:
+        elif self.unfollowed_s:
             self.drop_unfollowed()
         self.late = (front.slow and self.out != 0) or (rear.slow and self.out != 1)
         return bad_front or bad_rear or self._out_s > 0.0
-
-    @property
-    def follows_not(self) -> bool:
-        """Whether neither wheel followed its command in the last line."""
-        return self._unfollowed_s > 0.0
 
     def spread(self, front: float, rear: float) -> Motors:
         """Return the values of all four wheels: `front` and `rear` for this side, 0 for the other.
@@ -179,7 +174,7 @@ class _Side:
         return front, 0.0, 0.0, rear
 
     def drop_unfollowed(self) -> None:
-        self._unfollowed_s, self._unfollowed = 0.0, (0.0, 0.0)
+        self.unfollowed_s, self._unfollowed = 0.0, (0.0, 0.0)
 
     def take_unfollowed(self, count: float) -> tuple[float, float]:
         """Return the further angles that the wheels may have rolled since the last call, rad.
@@ -189,7 +184,7 @@ class _Side:
         command, is `UNFOLLOWED_COUNTS` counts. The first angles after that contain the motion of
         this whole time. `count` is the angle of an encoder count, rad.
         """
-        if self._unfollowed_s * abs(self.expected.speed) < UNFOLLOWED_COUNTS * count:
+        if self.unfollowed_s * abs(self.expected.speed) < UNFOLLOWED_COUNTS * count:
             return 0.0, 0.0
         angles, self._unfollowed = self._unfollowed, (0.0, 0.0)
         return angles
@@ -401,11 +396,13 @@ class WheelFaults:
         order. The angle of each other wheel is 0. `wheels` contains the angles that the wheels
         reported, rad.
         """
-        found = []
+        found: list[tuple[SideName, Motors]] = []
+        if not (self._leaves_out or self._left.unfollowed_s or self._right.unfollowed_s):
+            return found  # as for nearly every line
         for side in self._sides:
             if side.may_be_right:
                 found.append((side.name, self._ignored(side, wheels)))
-            elif side.follows_not:
+            elif side.unfollowed_s:
                 front, rear = side.take_unfollowed(self._most_count)
                 if front or rear:
                     found.append((side.name, side.spread(front, rear)))
