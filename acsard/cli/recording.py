@@ -575,35 +575,33 @@ def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
 
     The function takes the time of the last step that was read, ns since 1970.
     """
-    if not sys.stderr.isatty():
-        yield lambda wall_ns: None
-        return
-    began_ns, last = recording.about.wall_ns, read_end(recording.paths[-1])
+    began_ns = recording.about.wall_ns
+    last = read_end(recording.paths[-1]) if sys.stderr.isatty() else None
     whole = f" of {(last.last_ns - began_ns) / 1e9:.0f}" if last else ""
-
-    def print_progress(wall_ns: int) -> None:
-        text = f"\r{(wall_ns - began_ns) / 1e9:.0f}{whole} s of the recording"
-        print(text, end="", file=sys.stderr, flush=True)
-
-    try:
-        yield print_progress
-    finally:
-        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+    with _overwritten_line() as show_line:
+        yield lambda wall_ns: show_line(
+            f"{(wall_ns - began_ns) / 1e9:.0f}{whole} s of the recording"
+        )
 
 
 @contextmanager
 def _search_progress(count: int) -> Iterator[Callable[[int], None]]:
     """Yield a function that shows on a terminal how many of `count` files have been searched."""
+    with _overwritten_line() as show_line:
+        yield lambda searched: show_line(f"searched {searched} of {many(count, 'recording')}")
+
+
+@contextmanager
+def _overwritten_line() -> Iterator[Callable[[str], None]]:
+    """Yield a function that shows a line on a terminal in the place of its last line.
+
+    The line is cleared at the end. Without a terminal, the function does nothing.
+    """
     if not sys.stderr.isatty():
-        yield lambda searched: None
+        yield lambda text: None
         return
-
-    def print_progress(searched: int) -> None:
-        text = f"\rsearched {searched} of {many(count, 'recording')}"
-        print(text, end="", file=sys.stderr, flush=True)
-
     try:
-        yield print_progress
+        yield lambda text: print(f"\r{text}", end="", file=sys.stderr, flush=True)
     finally:
         print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 

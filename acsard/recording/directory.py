@@ -168,7 +168,7 @@ def _deletion(names: list[str], disk: Disk, refused: bool) -> Event:
     return Event("recording", text, "warning" if disk.low or refused else "info")
 
 
-def has_room(directory: Path) -> bool:
+def disk_has_room(directory: Path) -> bool:
     """Return whether the disk of a directory reports enough free space for a small file."""
     size = os.statvfs(directory)
     # Some file systems do not report their size.

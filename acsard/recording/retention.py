@@ -155,7 +155,7 @@ def to_delete(
     free = disk.free + sum(file.size for file in old)
     most = bounds.size - file_size_limit(bounds.size, own, disk)
     needed = int(disk.spare * NEEDED_FRACTION)
-    vain = own + free < needed
+    others_fill_disk = own + free < needed
     for file in plain + [file for file in ended if file.name in protected]:
         if file.name in names:
             continue
@@ -164,7 +164,8 @@ def to_delete(
         must_free = freed is not None and not names
         may_help = not freed or (is_plain and freed < MIN_FILE_BYTES)
         lacks_space = free < required or (must_free and may_help)
-        if own > most or (lacks_space and not (vain and (file.this_run or not is_plain))):
+        stays = others_fill_disk and (file.this_run or not is_plain)
+        if own > most or (lacks_space and not stays):
             names.add(file.name)
             own, free = own - file.size, free + file.size
     return names

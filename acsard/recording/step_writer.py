@@ -20,7 +20,7 @@ from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S, Event, Instant
 from acsard.host.version import version
 from acsard.host.wait_timer import WaitTimer
-from acsard.recording.directory import RecordingDirectory, Run, has_room, mark_cut
+from acsard.recording.directory import RecordingDirectory, Run, disk_has_room, mark_cut
 from acsard.recording.file import About, RecordingWriter
 from acsard.recording.mcap_records import MAX_DATA_BYTES
 from acsard.recording.recorded_steps import FinishedStep, StateBeforeStep, split_at_states
@@ -345,7 +345,7 @@ class StepWriter:
         # If the disk reports that it is full, this report alone decides which recordings are
         # deleted. Otherwise the daemon would delete one more when the disk has room again.
         try:
-            self._refused = error.errno in DISK_FULL and has_room(Path(self.where))
+            self._refused = error.errno in DISK_FULL and disk_has_room(Path(self.where))
         except OSError:
             self._refused = False
         self._writing = self._directory = None

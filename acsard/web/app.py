@@ -10,7 +10,6 @@ import asyncio
 import socket
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
-from contextlib import suppress
 from typing import Annotated, Any
 from urllib.parse import parse_qsl
 
@@ -51,6 +50,7 @@ from acsard.web.recordings import POLICY, BlackBox, Recording, Reports, ReportSt
 from acsard.web.routes import FORM, JSON, RECORDINGS_ROLE, Body, Problem, Route, services, values
 from acsard.web.socket_messages import MAX_MESSAGE_BYTES, Begin
 from acsard.web.streams import as_json
+from acsard.web.tasks import shared
 from acsard.web.tokens import Vault
 from acsard.web.viewer import PING_INTERVAL_S, Parts, Viewer
 
@@ -297,7 +297,7 @@ class Page:
                 if not reading.done() or reading.exception() is not None:
                     # No body names another robot, and a stop of the page's own robot is never
                     # refused.
-                    own = asyncio.create_task(call(who, verb, {}))
+                    own = shared(call(who, verb, {}))
             robot, arguments = await reading
             if own is not None and robot in ("", self._robots.id):
                 answer = await own
@@ -307,8 +307,6 @@ class Page:
             reading.cancel()
             if own is not None:
                 await asyncio.wait([own])
-                with suppress(asyncio.CancelledError):
-                    own.exception()  # asyncio logs an exception that nobody retrieves
         return reply(answer, 200 if answer.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:

@@ -255,7 +255,7 @@ class Odometry:
         if rolled.unknown > 0.0:
             self._add_unseen_motion(rolled.unknown, before, twist)
         turned = self._move(self._settled(rolled, at_rest), turn, speeds, slips)
-        for side, angles in checks.wheels.possible(rolled.seen):
+        for side, angles in checks.wheels.possible_motion(rolled.seen):
             self._miss(side, angles, turn)
         self._go_on(rolled, feedback, before, twist)
         variances = self._twist_variances(twist, feedback, at_rest, turn, slips)
@@ -312,7 +312,7 @@ class Odometry:
             for distance, angle in arcs:
                 self._path.advance(distance, angle)
             for piece in step.pieces:
-                for side, angles in self.checks.wheels.possible_before(piece):
+                for side, angles in self.checks.wheels.possible_motion_before(piece):
                     self._miss(side, angles, step.gyro)
             if step.on_trial:
                 on_trial += math.fsum([angle for _, angle in arcs]) - step.turn

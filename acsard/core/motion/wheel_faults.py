@@ -382,7 +382,7 @@ class WheelFaults:
         front_right, front_left, rear_left, rear_right = values
         return front_right, front_left, rear_left, rear_right
 
-    def possible(self, wheels: Motors) -> list[tuple[SideName, Motors]]:
+    def possible_motion(self, wheels: Motors) -> list[tuple[SideName, Motors]]:
         """Return the angles that the wheels may have rolled and that the pose leaves out, rad.
 
         Call this once for each feedback line, after `check_line`.
@@ -408,8 +408,8 @@ class WheelFaults:
                     found.append((side.name, side.spread(front, rear)))
         return found
 
-    def possible_before(self, wheels: Motors) -> list[tuple[SideName, Motors]]:
-        """Return what `possible` would have returned for an earlier line, rad.
+    def possible_motion_before(self, wheels: Motors) -> list[tuple[SideName, Motors]]:
+        """Return what `possible_motion` would have returned for an earlier line, rad.
 
         The newly faulty wheel is included, and no other one, because it was not yet ignored then.
         """
