@@ -15,6 +15,14 @@ from msgspec.structs import replace
 WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
 """Names of the wheels, in the order of every value with one item per wheel."""
 
+# Types that name the unit and the clock of a value, so that no sentence has to.
+Ns = int  # monotonic time, or a duration, ns
+WallNs = int  # time since 1970 by a wall clock, ns
+Seconds = float
+Rad = float
+RadPerS = float
+Metres = float
+
 NS_PER_S = 1_000_000_000
 
 ROOT_KEY = "acsard"
