@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cmath
 import json
 import math
 import signal
@@ -14,7 +13,6 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import msgspec
-import numpy as np
 import pytest
 import zenoh
 
@@ -35,7 +33,6 @@ from acsard.core.config.settings import Config, JointsConfig
 from acsard.core.link.link_diagnosis import blames_host
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
-from acsard.terminal.prompt import NumberQuestion
 from acsard.terminal.terminal_prompt import NoPrompt
 from tests.system.bystander import lost
 from tests.system.harness import (
@@ -50,8 +47,6 @@ from tests.system.harness import (
 )  # fmt: skip
 from tests.system.terminals import Terminal, at_terminal
 from tests.system.typed import typed
-from tests.unit.calibration.guided.played import Player
-from tests.unit.calibration.robots import Robot
 
 SKIDDING: dict[str, dict[str, object]] = {
     "odometry": {"gyro": True},
@@ -255,9 +250,9 @@ Reads = Callable[[str], str]
 """The reply that a person types to this question."""
 
 
-def goes_through(daemon: Daemon, bus: Bus, way: str, reads: Reads) -> str:
-    """Do a whole calibration with the method `way`, answer each question, and return the output."""
-    with calibrating(daemon, "--method", way, "--write") as (terminal, program):
+def goes_through(daemon: Daemon, bus: Bus, reads: Reads) -> str:
+    """Do a whole calibration by tape, answer each question, and return the output."""
+    with calibrating(daemon, "--method", "tape", "--write") as (terminal, program):
         offset = 0
         while program.process.poll() is None:
             words = until(lambda: question(terminal, program, offset), RIDES_S, "a question")  # noqa: B023
@@ -280,61 +275,12 @@ def test_a_person_with_a_tape_alone_is_guided_to_the_written_file(tmp_path: Path
         return "" if STARTS in words else measured(bus, words)
 
     with running(tmp_path, config=SKIDDING) as (daemon, bus):
-        output = goes_through(daemon, bus, "tape", reads)
+        output = goes_through(daemon, bus, reads)
         written = parse(daemon.config.read_bytes()).drive
     assert "heading error after a turn of 360 deg" in output
     assert abs(written.wheel_separation_multiplier - 1.6 * 1.06) < 0.1
     assert written.left_wheel_radius_multiplier == pytest.approx(0.99, abs=0.006)
     assert written.right_wheel_radius_multiplier == pytest.approx(1.0, abs=0.006)
-
-
-class Beside:
-    """A simulated person who places the robot where a leg asks for it, and measures its position.
-
-    The simulated robot cannot be carried, so its current position counts as that place.
-    """
-
-    def __init__(self, bus: Bus) -> None:
-        self._bus, self._player = bus, Player(Robot(rng=np.random.default_rng(1)))
-        self._place, self._yaw = self._true()
-
-    def reads(self, words: str) -> str:
-        if STARTS in words:
-            if any(phrase in words for phrase in SETS):
-                self._place, self._yaw = self._true()
-            return ""
-        place, yaw = self._true()
-        self._player.place = (place - self._place) * cmath.exp(-1j * self._yaw)
-        self._player.yaw = yaw - self._yaw
-        unit = words.rstrip(":").rpartition(" ")[2]
-        return f"{self._player.answer(NumberQuestion(words, unit, -math.inf, math.inf)):.4g}"
-
-    def _true(self) -> tuple[complex, float]:
-        pose = self._bus.get("sim/pose")["pose"]
-        where, turn = pose["position"], pose["orientation"]
-        return complex(where["x"], where["y"]), 2 * math.atan2(turn["z"], turn["w"])
-
-
-SETS = ("Push", "Place", "Mark")
-"""Words of legs before which a person sets the robot by hand."""
-
-
-@pytest.mark.soak
-@pytest.mark.timeout(120 * TRIES)
-@pytest.mark.parametrize("way", ["wall", "umbmark"])
-def test_a_person_with_a_wall_or_marks_is_guided_to_the_written_file(
-    tmp_path: Path, way: str
-) -> None:
-    config = SKIDDING | {"control": {"rate": 10.0}}  # the link, which a busy machine may interrupt
-    with running(tmp_path, config=config) as (daemon, bus):
-        output = tried(bus, lambda: goes_through(daemon, bus, way, Beside(bus).reads))
-        written = parse(daemon.config.read_bytes()).drive
-    print(f"{way}: {written.wheel_separation_multiplier} {written.left_wheel_radius_multiplier} "
-          f"{written.right_wheel_radius_multiplier}")  # fmt: skip
-    assert "heading error after a turn of 360 deg" in output
-    assert abs(written.wheel_separation_multiplier - 1.6 * 1.06) < 0.1
-    ratio = written.left_wheel_radius_multiplier / written.right_wheel_radius_multiplier
-    assert ratio == pytest.approx(0.99, abs=0.006)
 
 
 @pytest.mark.slow

@@ -30,8 +30,6 @@ NEEDS: dict[str, str] = {
     "gyro": "a gyro on the Zenoh key imu, and a tape measure",
     "positions": "positions of the robot on a Zenoh key",
     "tape": "a tape measure and a straight line on the floor",
-    "wall": "a straight wall and a tape measure",
-    "umbmark": "a tape measure and marks",
 }
 """Equipment that the person needs for each method, by the name of the method in `--method`."""
 
@@ -39,8 +37,7 @@ SIMULATED = (
     "positions",
     "The simulator has no floor to measure with a tape. Use either the method positions with the "
     "Zenoh key sim/pose (the true position), or the method gyro if [odometry] gyro is on; the "
-    "method gyro asks for a distance, which you leave empty. The methods tape, wall and umbmark "
-    "are for a real robot.",
+    "method gyro asks for a distance, which you leave empty. The method tape is for a real robot.",
 )
 """Method of calibration to try first on the simulator, and the reason for this choice."""
 
@@ -71,42 +68,35 @@ class Move(Struct, frozen=True):
     """Commanded turn rate, rad/s, positive to the left."""
 
 
-UNITS = {"m": 1.0, "mm": 1e-3, "deg": math.pi / 180}
-"""Factors that convert the units of the person's answers to m or rad."""
+UNITS = {"m": 1.0, "mm": 1e-3}
+"""Factors that convert the units of the person's answers to m."""
 
 
-Quantity = Literal["turned", "angle", "distance", "ahead", "aside"]
+Quantity = Literal["turned", "angle", "distance"]
 """Kind of a measurement of the robot's motion since its pose was last known.
 
 - `turned`: the turn in rad, positive to the left, including whole turns.
 - `angle`: the turn in rad, positive to the left, with an unknown number of whole turns.
 - `distance`: the straight-line distance in m.
-- `ahead`: the displacement in m along the heading of the known pose.
-- `aside`: the displacement in m to the left of the heading of the known pose.
 """
 
 
-class Mean(Struct, frozen=True):
-    """A measurement that is computed as the mean of the person's answers, plus a known constant."""
+class Distance(Struct, frozen=True):
+    """A straight-line distance of the leg just driven, which a person measures by tape."""
 
-    quantity: Quantity
-    answers: tuple[str, ...]
-    """Names of the answers from which the mean is computed."""
+    answer: str
+    """Name of the answer."""
     deviation: float
-    """Standard deviation of the measurement, m or rad."""
-    plus: float = 0.0
-    """Constant to add, m or rad, for example the whole turns that the answers do not include."""
-    over: tuple[str, ...] = ()
-    """Names of the legs whose total motion the person measured; () means the leg just driven."""
+    """Standard deviation of the answer, m."""
 
 
 class Slant(Struct, frozen=True):
     """A measurement of the robot's turn by the distances of two points of the robot to a line.
 
-    The person measures the distances. The line is on the floor, or it is a wall.
+    The person measures the distances. The line is on the floor.
     """
 
-    quantity: Quantity
+    quantity: Literal["turned", "angle"]
     near: str
     """Name of the answer with the distance of one point of the robot from the line.
 
@@ -128,12 +118,12 @@ class Slant(Struct, frozen=True):
     "" means that the robot started parallel to the line.
     """
     plus: float = 0.0
-    """Whole and half turns to add, rad, because the distances to the line do not show them."""
+    """Whole turns to add, rad, because the distances to the line do not show them."""
     over: tuple[str, ...] = ()
     """Names of the legs whose total motion the person measured; () means the leg just driven."""
 
 
-Measure = Mean | Slant
+Measure = Distance | Slant
 
 
 class Leg(Struct, frozen=True):
@@ -151,8 +141,6 @@ class Leg(Struct, frozen=True):
 
     The duration of this move is then a timeout.
     """
-    placed: bool = False
-    """Whether a person places the robot before this leg, so that the leg begins at a known pose."""
 
     @property
     def seconds(self) -> float:
@@ -308,11 +296,8 @@ class Method(Struct, frozen=True):
     legs: Legs
     asks: tuple[NumberQuestion, ...] = ()
     """Questions that the person answers before the first leg."""
-    tool: str = ""
-    """Name of the measuring tool that the person uses, such as "a tape".
-
-    It is "" if a sensor measures instead.
-    """
+    by_tape: bool = False
+    """Whether a person measures the motion by tape; otherwise a sensor measures it."""
 
     def longest_s(self, setup: Setup) -> float:
         """Return the total driving time of all legs, s, for the least favorable effective track.

@@ -144,7 +144,7 @@ def choose_method(options: DriveOptions, config: Config) -> str:
     if gyro and options.imu in (None, IMU) and not config.odometry.gyro:
         raise UsageError(
             "this robot's daemon does not read a gyro: set odometry.gyro = true and restart "
-            "the daemon, or use --method tape, wall or umbmark"
+            "the daemon, or use --method tape"
         )
     return options.method or ("gyro" if gyro or config.odometry.gyro else "tape")
 

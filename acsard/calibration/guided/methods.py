@@ -1,23 +1,14 @@
-"""The methods of calibration by a guided drive, and the legs of each method.
-
-The method "umbmark" follows Borenstein & Feng, UMBmark: A Benchmark Test for Measuring Odometry
-Errors in Mobile Robots (1995). The robot drives squares, and a person measures the displacement
-between the start and the end of each square. The paper evaluates these measurements with two
-formulas for small errors. Here the measurements go into the fit of `tape_readings.py` instead,
-because the track of a robot that skids is far from the configured track.
-"""
+"""The methods of calibration by a guided drive, and the legs of each method."""
 
 from __future__ import annotations
 
 import math
 
 from acsard.calibration.guided.drive_plan import (
-    EDGE_MARGIN_M,
     FLOOR_M,
     MAX_TRACK_RATIO,
+    Distance,
     Leg,
-    Mean,
-    Measure,
     Method,
     Move,
     Setup,
@@ -32,15 +23,6 @@ STRAIGHT_LEG_STD_M = 0.005
 It covers the errors at both ends of the tape.
 """
 
-EYE_HEADING_STD = 0.07
-"""Standard deviation of a heading that a person judges by eye, rad."""
-
-END_STD_M = 0.003
-"""Standard deviation of a distance between the robot and its marks after a square, m.
-
-It includes the error with which the person made the marks beside the robot.
-"""
-
 FIRST_TURN_RATE = 1.2
 """Turn rate of the first turn in place, rad/s, if the robot does not skid."""
 
@@ -53,11 +35,8 @@ The robot with the largest effective track (`MAX_TRACK_RATIO`) needs the longest
 MAX_SPIN_S = 24.0
 """Longest total time of the full turns in place in one leg, s."""
 
-STOP, SETTLE = Move(0.6), Move(1.0)
-"""Pauses between moves.
-
-In `STOP`, the robot comes to rest. In `SETTLE`, the robot also stops shaking.
-"""
+SETTLE = Move(1.0)
+"""Pause between moves, in which the robot comes to rest and stops shaking."""
 
 ROUND_LEG = "once round"
 """Name of the leg in which the robot turns once in place, until the person presses a key."""
@@ -67,7 +46,7 @@ FROM_MARK = NumberQuestion(
     "m", MIN_TAPE_M, 2 * FLOOR_M,
     name="metres",
 )  # fmt: skip
-DISTANCE = Mean("distance", ("metres",), STRAIGHT_LEG_STD_M)
+DISTANCE = Distance("metres", STRAIGHT_LEG_STD_M)
 
 
 def _at_the_edge(setup: Setup) -> str:
@@ -78,32 +57,29 @@ def _at_the_edge(setup: Setup) -> str:
     )
 
 
-def once_round(
-    setup: Setup, until: str, asks: tuple[NumberQuestion, ...] = (), *measures: Measure
-) -> Leg:
-    """Return the leg of one left turn in place, which the person ends with a key.
-
-    Args:
-        setup: the robot, and the speeds of its drive.
-        until: the words after "Press SPACE" in the instruction, such as "when it has turned ...".
-        asks: the questions after the turn.
-        measures: the measurements that follow from the answers.
-    """
+def once_round(setup: Setup) -> Leg:
+    """Return the leg of one left turn in place, which the person ends with a key."""
     longest = FIRST_TURN_TIMEOUT_FACTOR * 2 * math.pi * MAX_TRACK_RATIO
     rate = abs(setup.command(FIRST_TURN_RATE)) * setup.rate_per_command
-    words = f"The robot turns left in place. Press SPACE {until}"
+    words = (
+        "The robot turns left in place. Press SPACE when it has turned one full circle and faces "
+        "along the line as before; an error of 20 deg does not matter."
+    )
     turn = setup.spin(FIRST_TURN_RATE, longest / rate)
-    return Leg(ROUND_LEG, words, (turn,), asks, measures, by_key=True)
+    measure = Slant(
+        "turned", *LINE_ANSWERS, since="ahead", plus=2 * math.pi, over=("back", ROUND_LEG)
+    )
+    return Leg(ROUND_LEG, words, (turn,), TO_LINE, (measure,), by_key=True)
 
 
-def turns(setup: Setup, rate: float, track: float, most: int) -> int:
-    """Return how many full turns in place fit into `MAX_SPIN_S`, from 1 to `most`.
+def turns(setup: Setup, rate: float, track: float) -> int:
+    """Return how many full turns in place fit into `MAX_SPIN_S`, from 1 to 3.
 
     `rate` is the true turn rate, rad/s. `track` is the ratio of effective track to wheel
     separation.
     """
     turn_s = setup.turn(2 * math.pi, rate, track).seconds
-    return max(1, min(most, int(MAX_SPIN_S / turn_s)))
+    return max(1, min(3, int(MAX_SPIN_S / turn_s)))
 
 
 # The method "tape": a tape measure, and a straight line on the floor.
@@ -134,20 +110,13 @@ The answers describe a line on the left of the robot.
 def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
     def spun(how: str, side: int, rate: float, since: str) -> Leg:
         # `rate` is a true rate, rad/s. Two rates show how the track depends on the rate.
-        count = turns(setup, rate, track, 3)
+        count = turns(setup, rate, track)
         around = setup.turn(side * 2 * math.pi * count, rate, track)
         to = "left" if side > 0 else "right"
         words = f"The robot turns {count} full circles to the {to}, {how}."
         measure = Slant("angle", *LINE_ANSWERS, since=since)
         return Leg(how, words, (SETTLE, around, SETTLE), TO_LINE, (measure,))
 
-    around = once_round(
-        setup,
-        "when it has turned one full circle and faces along the line as before; an error of 20 deg "
-        "does not matter.",
-        TO_LINE,
-        Slant("turned", *LINE_ANSWERS, since="ahead", plus=2 * math.pi, over=("back", ROUND_LEG)),
-    )
     return (
         Leg(
             "ahead",
@@ -161,189 +130,16 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
             (SETTLE, setup.ahead(setup.length), SETTLE),
             (FROM_MARK, *TO_LINE),
             (DISTANCE, Slant("angle", *LINE_ANSWERS)),
-            placed=True,
         ),
         Leg(
             "back",
             "The robot drives back to the middle of the floor.",
             (setup.ahead(-setup.to_middle), SETTLE),
         ),
-        around,
+        once_round(setup),
         spun("slowly", -1, 0.6, ROUND_LEG),
         spun("fast", 1, 1.2, "slowly"),
     )
-
-
-# The method "wall": a tape measure, and a wall against which a person sets the robot's back.
-
-GAP_M = 0.2
-"""Distance from the wall at which the robot stops when it returns, m."""
-
-OUTWARD_M = 0.9
-"""Distance that the robot drives away from the wall before several turns in place, m."""
-
-HALF_RATE, ROUND_RATE = 0.8, 1.2
-"""True turn rates in the method "wall", rad/s.
-
-`HALF_RATE` is that of half turns, and `ROUND_RATE` that of several full turns.
-"""
-
-PLACE_ROBOT_BACK = (
-    "Push the robot's back flat against the wall by hand, so that both its rear corners touch it"
-)
-
-
-def _corners(end: str) -> tuple[NumberQuestion, NumberQuestion]:
-    return (
-        NumberQuestion(
-            f"How far is the robot's {end} left corner from the wall?", "mm", 0, 2500, name="left"
-        ),
-        NumberQuestion(
-            f"How far is the robot's {end} right corner from the wall?", "mm", 0, 2500, name="right"
-        ),
-    )
-
-
-# A turn to the left moves the rear left corner towards a wall behind the robot, and the front right
-# corner towards a wall in front of it.
-REAR, FRONT = ("left", "right", "rear width"), ("right", "left", "front width")
-
-
-def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
-    out, count = setup.ahead(setup.length), turns(setup, ROUND_RATE, track, 2)
-    around = setup.turn(-2 * math.pi * count, ROUND_RATE, track)
-
-    def there_and_back(to: str, side: int) -> Leg:
-        half = setup.turn(side * math.pi, HALF_RATE, track)
-        home = setup.ahead(setup.length - 2 * GAP_M)
-        return Leg(
-            f"half round to the {to}",
-            f"{PLACE_ROBOT_BACK}. The robot drives away from the wall, turns half a circle to the "
-            f"{to}, and drives back.",
-            (STOP, out, STOP, half, STOP, home, STOP),
-            _corners("front"),
-            (Slant("angle", *FRONT, plus=side * math.pi),),
-            placed=True,
-        )
-
-    return (
-        Leg(
-            "out",
-            f"Along a straight wall, {FLOOR_M:g} m x {FLOOR_M:g} m must be free. "
-            f"{PLACE_ROBOT_BACK}, in the "
-            "middle of the free part of the wall. The robot drives straight away from the wall for "
-            f"{setup.length:.2f} m.",
-            (STOP, out, STOP),
-            (
-                NumberQuestion(
-                    "How far is the robot's back from the wall now?", "m", MIN_TAPE_M, 2 * FLOOR_M,
-                    name="metres",
-                ),
-            ),
-            (DISTANCE,),
-            placed=True,
-        ),
-        once_round(
-            setup,
-            "when it has turned one full circle and faces straight away from the wall as before; "
-            "an error of 10 deg does not matter.",
-        ),
-        Leg(
-            "home",
-            "The robot drives back towards the wall.",
-            (setup.ahead(GAP_M - setup.length), STOP),
-            _corners("rear"),
-            (Slant("turned", *REAR, plus=2 * math.pi, over=("out", ROUND_LEG, "home")),),
-        ),
-        there_and_back("left", 1),
-        there_and_back("right", -1),
-        Leg(
-            "round at the wall",
-            f"{PLACE_ROBOT_BACK}. The robot drives away from the wall, turns {count} full circles "
-            "to the right, and drives back.",
-            (
-                STOP, setup.ahead(OUTWARD_M), STOP, around,
-                STOP, setup.ahead(GAP_M - OUTWARD_M), STOP,
-            ),
-            _corners("rear"),
-            (Slant("angle", *REAR),),
-            placed=True,
-        ),
-    )  # fmt: skip
-
-
-# The method "umbmark": squares in both directions, and marks on the floor.
-
-CORNER_RATE = 0.9
-"""True turn rate at the corners of the square in the method "umbmark", rad/s."""
-
-
-def side_of_square(setup: Setup) -> float:
-    """Return the side length of the square in the method "umbmark", m.
-
-    It is 1.2 m, or less for a large robot.
-    """
-    return min(1.2, FLOOR_M - 2 * (setup.from_edge + 2 * EDGE_MARGIN_M))
-
-
-def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
-    edge = side_of_square(setup)
-    marks = (
-        "How far ahead of its mark is the middle of the robot's {} side (negative if behind it)?"
-    )
-    ends = (
-        NumberQuestion(marks.format("left"), "mm", -1500, 1500, name="left"),
-        NumberQuestion(marks.format("right"), "mm", -1500, 1500, name="right"),
-        NumberQuestion(
-            "How far to the left of its marks is the robot (negative if to the right of them)?",
-            "mm", -1500, 1500, name="aside",
-        ),
-    )  # fmt: skip
-
-    def square(to: str, other: str, side: int) -> Leg:
-        corner = setup.turn(side * math.pi / 2, CORNER_RATE, track)
-        return Leg(
-            f"square to the {to}",
-            f"Place the robot so that its middle is {(FLOOR_M - edge) / 2:.2f} m from the edge of "
-            f"the floor behind it, and the same distance from the edge on its {other}. Make two "
-            "marks on the floor: one exactly beside the middle of the robot's left side, one "
-            "exactly beside the middle of its right side. The robot drives a square with sides of "
-            f"{edge:.2f} m and all turns to the {to}, and ends about where it started.",
-            (STOP, *(setup.ahead(edge), STOP, corner, STOP) * 4),
-            ends,
-            (
-                Mean("ahead", ("left", "right"), END_STD_M),
-                Mean("aside", ("aside",), END_STD_M),
-                Slant("angle", "left", "right", "width"),
-            ),
-            placed=True,
-        )
-
-    return (
-        Leg(
-            "ahead",
-            f"{_at_the_edge(setup)} Mark on the floor where one wheel stands. The robot drives "
-            f"{setup.length:.2f} m straight ahead.",
-            (STOP, setup.ahead(setup.length), STOP),
-            (FROM_MARK,),
-            (DISTANCE,),
-            placed=True,
-        ),
-        once_round(
-            setup,
-            "exactly when it has turned one full circle and faces as before; the tool then asks "
-            "how far past that point the robot has turned.",
-            (
-                NumberQuestion(
-                    "How many degrees past a full circle did the robot turn (negative if less)?",
-                    "deg", -90, 90, name="past",
-                ),
-            ),
-            Mean("turned", ("past",), EYE_HEADING_STD, plus=2 * math.pi),
-        ),
-        square("left", "right", 1),
-        square("right", "left", -1),
-    )  # fmt: skip
 
 
 # The methods "gyro" and "positions". Each drive goes there and back, so the robot stays on the
@@ -440,19 +236,9 @@ WHEELBASE = NumberQuestion(
     "How far apart are the front left and the rear left wheel, axle to axle?", "mm", 50, 2000,
     name="wheelbase",
 )  # fmt: skip
-REAR_WIDTH = NumberQuestion(
-    "How far apart are the robot's rear corners, where they touch the wall?", "mm", 50, 2000,
-    name="rear width",
-)  # fmt: skip
-FRONT_WIDTH = NumberQuestion(
-    "How far apart are the robot's front corners?", "mm", 50, 2000, name="front width"
-)
-WIDTH = NumberQuestion("How wide is the robot, from side to side?", "mm", 50, 2000, name="width")
 
 METHODS: dict[str, Method] = {
     "gyro": Method(_gyro),
     "positions": Method(_positions),
-    "tape": Method(_tape, (WHEELBASE,), "a tape"),
-    "wall": Method(_wall, (REAR_WIDTH, FRONT_WIDTH), "a wall"),
-    "umbmark": Method(_umbmark, (WIDTH,), "UMBmark"),
+    "tape": Method(_tape, (WHEELBASE,), by_tape=True),
 }

@@ -42,15 +42,13 @@ def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
     """Return the index of the leg with which the drive continues after a disturbed leg.
 
     If a sensor measures the motion (`sensor`), only the disturbed leg `number` is repeated.
-    Otherwise a person measures by tape, relative to the place where the person put the robot. The
-    drive then returns to the last leg before which the person placed the robot.
+    Otherwise a person measures by tape, relative to the place where the person put the robot before
+    the first leg. The drive then returns to the first leg.
 
     Some legs need only the robot's angle at their start (`angle_before`). Such a leg is repeated
     alone, after the person has measured this angle again.
     """
-    if sensor or angle_before(legs[number]):
-        return number
-    return max(at for at in range(number + 1) if legs[at].placed or at == 0)
+    return number if sensor or angle_before(legs[number]) else 0
 
 
 def angle_before(leg: Leg) -> str:
@@ -108,14 +106,14 @@ def guide(
         repeats[leg.name] = repeats.get(leg.name, 0) + 1
         if repeats[leg.name] > most:
             raise disturbed
-        again = begins_again(legs, number, sensor=not method.tool)
+        again = begins_again(legs, number, sensor=not method.by_tape)
         back = "" if simulated else ": put the robot back where it stood when that leg began"
         end = "" if disturbed.why.endswith("?") else "."
         prompt.show_text(
             f"Leg {number + 1} was disturbed: {disturbed.why}{end} The drive continues with leg "
             f"{again + 1}{back}."
         )
-        if method.tool and again == number and (since := angle_before(leg)):
+        if method.by_tape and again == number and (since := angle_before(leg)):
             (before,) = [candidate for candidate in legs if candidate.name == since]
             ask_for(since, before.asks)
         return again
@@ -135,11 +133,11 @@ def guide(
         for measure in leg.measures:
             made = reading(measure, leg.name, rides, answers)
             readings[leg.name].append(made)
-            if measure.quantity == "turned":
+            if made.quantity == "turned":
                 track = track_ratio(made, setup.drive)
-    if method.tool:
+    if method.by_tape:
         all_readings = [made for leg in legs for made in readings[leg.name]]
-        result = calibrated(method.tool, all_readings, setup.drive, setup.odometry)
+        result = calibrated(all_readings, setup.drive, setup.odometry)
         follows = response(list(rides.values()), setup.drive, setup.feedback)
         if follows is None:
             return result

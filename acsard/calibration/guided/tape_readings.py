@@ -1,7 +1,7 @@
 """Computes a `Calibration` from tape readings: wheel radii, effective track and improvement.
 
-A reading is one measurement of the robot's motion since its pose was last known: a distance, a
-turn, or a displacement. A Gauss-Newton fit compares all readings with the path that is computed
+A reading is one measurement of the robot's motion since its pose was last known: a distance or a
+turn. A Gauss-Newton fit compares all readings with the path that is computed
 from the wheel speeds. A reading differs from this path because the person measures inaccurately,
 and because the robot skids. If there are enough readings, their scatter shows how much the robot
 skidded.
@@ -29,8 +29,8 @@ from acsard.calibration.fit import (
 )
 from acsard.calibration.guided.drive_plan import (
     MAX_TRACK_RATIO,
+    Distance,
     GuideError,
-    Mean,
     Measure,
     Quantity,
 )
@@ -39,14 +39,13 @@ from acsard.calibration.improvement import (
     NOT_COMPARED,
     Improvement,
     per_amount,
-    rms,
     with_constant_track,
 )
 from acsard.calibration.log_table import Floats, NoCalibrationError
 from acsard.calibration.multipliers import SEPARATION, configured, multipliers
 from acsard.calibration.odometry_noise import settings
 from acsard.calibration.plausibility import RATIO, TRACK, in_range, remarks, too_inaccurate
-from acsard.calibration.positions import WheelSteps, extent, path, wheel_steps
+from acsard.calibration.positions import WheelSteps, path, wheel_steps
 from acsard.calibration.runs import Run, blocks
 from acsard.calibration.solve import Calibration, DriveTotals
 from acsard.core.config.settings import DriveConfig, OdometryConfig
@@ -88,7 +87,7 @@ The first estimate of the effective track is computed from this reading.
 class Reading(Struct, frozen=True, dict=True):
     """A measurement of the robot's motion over one or more recorded legs, in rad or m.
 
-    A person made it by tape or by eye.
+    A person made it by tape.
     """
 
     rides: tuple[Run, ...]
@@ -96,7 +95,7 @@ class Reading(Struct, frozen=True, dict=True):
     quantity: Quantity
     value: float
     deviation: float
-    """Standard deviation of the measurement by tape or by eye, rad or m."""
+    """Standard deviation of the measurement by tape, rad or m."""
 
     @cached_property
     def steps(self) -> WheelSteps:
@@ -159,22 +158,15 @@ def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Flo
     driven = path(steps, base, parameters)
     rolled = base.radius * float(np.abs(steps.left).sum() + np.abs(steps.right).sum()) / 2
     derivatives = np.zeros(PARAMETER_COUNT)
-    place, heading_variance = complex(driven.place[-1]), SKID_HEADING_STD**2 * rolled
-    if quantity in ("turned", "angle"):
+    if quantity != "distance":
         for index, values in driven.heading_derivatives.items():
             derivatives[index] = values[-1]
-        return Predicted(float(driven.heading[-1]), derivatives, heading_variance)
-    # The direction of the measurement: towards the end point, ahead, or to the left.
-    along = {"ahead": 1.0 + 0j, "aside": 1j}.get(quantity, place / (abs(place) or 1.0))
+        return Predicted(float(driven.heading[-1]), derivatives, SKID_HEADING_STD**2 * rolled)
+    place = complex(driven.place[-1])
+    along = place / (abs(place) or 1.0)
     for index, by_parameter in driven.derivatives.items():
         derivatives[index] = (np.conj(along) * by_parameter[-1]).real
-    variance = (SKID_LENGTH_STD * abs(place)) ** 2
-    if quantity != "distance":
-        # A heading error during the drive displaces the end point by the error times the remaining
-        # distance. The mean square of this distance is a third of the span squared.
-        span = extent(driven.place)
-        variance += heading_variance * span**2 / 3
-    return Predicted(float((np.conj(along) * place).real), derivatives, variance)
+    return Predicted(abs(place), derivatives, (SKID_LENGTH_STD * abs(place)) ** 2)
 
 
 def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
@@ -311,11 +303,9 @@ def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answe
     Raises:
         NoCalibrationError: the answers are impossible.
     """
+    if isinstance(measure, Distance):
+        return Reading((rides[leg],), "distance", answers[leg, measure.answer], measure.deviation)
     driven = tuple(rides[name] for name in measure.over or (leg,))
-    if isinstance(measure, Mean):
-        numbers = [answers[leg, name] for name in measure.answers]
-        value = measure.plus + sum(numbers) / len(numbers)
-        return Reading(driven, measure.quantity, value, measure.deviation)
     apart = answers["", measure.apart]
 
     def angle(leg: str) -> float:
@@ -364,7 +354,7 @@ def slant(near: float, far: float, apart: float) -> float:
     if abs(sine) > 0.98:
         raise NoCalibrationError(
             f"two points of the robot that are {apart * 1000:.0f} mm apart cannot be "
-            f"{near * 1000:.0f} mm and {far * 1000:.0f} mm from the line or wall: start the "
+            f"{near * 1000:.0f} mm and {far * 1000:.0f} mm from the line: start the "
             "calibration again, and measure again"
         )
     return math.asin(sine)
@@ -382,9 +372,9 @@ straight driving.
 
 
 def calibrated(
-    tool: str, readings: Sequence[Reading], drive: DriveConfig, odometry: OdometryConfig
+    readings: Sequence[Reading], drive: DriveConfig, odometry: OdometryConfig
 ) -> Calibration:
-    """Return the calibration from readings that a person made with `tool`, such as "a tape".
+    """Return the calibration from readings that a person made with a tape.
 
     Raises `NoCalibrationError` if the readings contradict each other or are too inaccurate.
     """
@@ -409,7 +399,7 @@ def calibrated(
     drives = DriveTotals.of(rides, rows, by_wheels, base, result, rate)
     notes = remarks({}, 0.0, by_wheels, result.values, base, sized=True)
     return Calibration(
-        reference=tool, drives=drives, configured=configured(base), multipliers=result,
+        reference="a tape", drives=drives, configured=configured(base), multipliers=result,
         scale="distance", growth=float(fit.parameters[Parameter.TRACK_GROWTH]),
         growth_std=float(std[Parameter.TRACK_GROWTH]),
         improvement=_improvement(readings, base, fit, rate),
@@ -427,7 +417,7 @@ def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Ra
     For each reading, the error of the new parameters is computed with a fit to all other readings.
     If this fit fails, the fit to all readings is used.
     """
-    sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
+    sums = {name: np.zeros(3) for name in ("turn", "straight")}
     present = base.configured(fit.parameters)
     constant = with_constant_track(fit.parameters, rate)
     for number, reading in enumerate(readings):
@@ -438,16 +428,15 @@ def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Ra
         residual = fit.residuals[number] if np.isnan(fit.held_out[number]) else fit.held_out[number]
         # Unlike the fit, the robot uses one track for all turn rates.
         after = residual - (predicted(steps, reading.quantity, base, constant).value - fitted)
+        if reading.quantity == "distance":
+            continue
         turn = abs(predicted(steps, "turned", base, fit.parameters).value)
-        if reading.quantity in ("turned", "angle"):
-            if turn > TURNED:
-                sums["turn"] += abs(before), abs(after), turn
-            elif turn < STRAIGHT:
-                rolled = abs(predicted(steps, "distance", base, fit.parameters).value)
-                sums["straight"] += abs(before), abs(after), rolled
-        elif reading.quantity in ("ahead", "aside"):
-            sums["place"] += before**2, after**2, 1.0
+        if turn > TURNED:
+            sums["turn"] += abs(before), abs(after), turn
+        elif turn < STRAIGHT:
+            rolled = abs(predicted(steps, "distance", base, fit.parameters).value)
+            sums["straight"] += abs(before), abs(after), rolled
     return Improvement(
         per_amount(sums["turn"], 360.0), per_amount(sums["straight"], math.degrees(10.0)),
-        NOT_COMPARED, rms(sums["place"]),
+        NOT_COMPARED, NOT_COMPARED,
     )  # fmt: skip

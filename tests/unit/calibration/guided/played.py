@@ -22,8 +22,8 @@ from acsard.terminal.prompt import NumberQuestion
 from acsard.terminal.terminal_prompt import NoPrompt
 from tests.unit.calibration.robots import Drive, Plan, Robot, drive
 
-LENGTH, WIDTH = 0.25, 0.30
-"""Distance between the points of the robot's sides and of its ends that the person measures, m."""
+LENGTH = 0.25
+"""Distance between the two wheels whose distances to the line the person measures, m."""
 
 REACTION_RAD = 0.12
 READ_M = 0.002
@@ -57,7 +57,7 @@ class Player:
     drives: list[Drive] = field(default_factory=list)
 
     def ride(self, leg: Leg) -> Run:
-        if any(words in leg.words for words in ("Push", "Mark", "Place")):
+        if "Mark" in leg.words:
             rng = self.robot.rng
             self.yaw = math.atan2(float(rng.normal(0, READ_M * math.sqrt(2))), LENGTH)
             self.place = 0j
@@ -98,25 +98,15 @@ class Player:
         noise = float(self.robot.rng.normal(0, READ_M))
         off = math.remainder(self.yaw, math.pi)
         half = math.sin(off) / 2
-        for phrase, value in (
-            ("front left and the rear left", LENGTH), ("apart", WIDTH), ("front corners?", WIDTH),
-            ("wide", WIDTH),
-        ):  # fmt: skip
-            if phrase in words:
-                return value
+        if "front left and the rear left" in words:
+            return LENGTH
         for phrase, value in (
             ("front left wheel", 0.3 - LENGTH * half), ("rear left wheel", 0.3 + LENGTH * half),
-            ("rear left corner", 0.3 - WIDTH * half), ("rear right corner", 0.3 + WIDTH * half),
-            ("front left corner", 0.3 + WIDTH * half), ("front right corner", 0.3 - WIDTH * half),
-            ("robot's left side", self.place.real - WIDTH * half),
-            ("robot's right side", self.place.real + WIDTH * half),
-            ("left of its marks", self.place.imag),
-            ("from the wall now", self.place.real), ("How far is", abs(self.place)),
+            ("How far is", abs(self.place)),
         ):  # fmt: skip
             if phrase in words:
                 return value + noise
-        assert "degrees" in words, words
-        return round(math.degrees(off) + float(self.robot.rng.normal(0, 2.0)))
+        raise AssertionError(words)
 
 
 class PlayedPrompt(NoPrompt):

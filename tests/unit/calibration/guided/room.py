@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 from acsard.calibration.guided.drive_plan import Leg, Setup
-from acsard.calibration.guided.methods import METHODS, side_of_square
+from acsard.calibration.guided.methods import METHODS
 
 SIDE = 3.0
 STEP_S = 0.05
@@ -24,38 +24,16 @@ Start = tuple[complex, float]
 The position is in m from the near right corner of the room.
 """
 
-Drive = tuple[Start, Sequence[Leg]]
-"""Start pose and the legs that follow it without a person moving the robot by hand."""
 
-
-def drives(way: str, setup: Setup, track: float) -> Iterator[Drive]:
-    """Yield every drive of a calibration whose estimated track is `track`.
-
-    Before the first leg of a drive a person puts the robot at its start. In the poses x is forward
-    and y is left.
-    """
-    aside = (SIDE - side_of_square(setup)) / 2
-    starts: dict[str, Start] = {
-        "square to the left": (complex(aside, aside), 0.0),
-        "square to the right": (complex(aside, SIDE - aside), 0.0),
-    }
-    drive: list[Leg] = []
-    for leg in reversed(METHODS[way].legs(setup, track)):
-        drive.insert(0, leg)
-        if any(words in leg.words for words in ("Push", "Place the")):
-            edge = setup.reach + (0.0 if way == "wall" else 0.1)
-            yield starts.get(leg.name, (complex(edge, SIDE / 2), 0.0)), drive
-            drive = []
-    assert not drive, "nobody says where the first leg begins"
-
-
-def places(drive: Drive, setup: Setup, track: float, bend: float) -> Iterator[complex]:
+def places(
+    start: Start, legs: Sequence[Leg], setup: Setup, track: float, bend: float
+) -> Iterator[complex]:
     """Yield every position of the robot's centre during a drive.
 
     `track` is the true effective track divided by the geometric one. `bend` is how much larger the
     right wheels are than the left ones, as a fraction.
     """
-    (place, yaw), legs = drive
+    place, yaw = start
     geometric = setup.drive.wheel_separation
     believed = setup.drive.wheel_separation_multiplier * geometric
     for leg in legs:
@@ -74,12 +52,14 @@ def places(drive: Drive, setup: Setup, track: float, bend: float) -> Iterator[co
 def beyond(way: str, setup: Setup, track: float, estimate: float, bend: float) -> float:
     """Return the distance by which a part of the robot leaves the room in the worst case, m.
 
-    The distance is negative if the whole robot stays inside. The robot may touch the wall where the
-    person pushes it against that wall.
+    The distance is negative if the whole robot stays inside. A person puts the robot at its start
+    before the first leg, and does not move it later.
     """
-    most = -SIDE
-    for drive in drives(way, setup, estimate):
-        for place in places(drive, setup, track, bend):
-            for where in (place.real, SIDE - place.real, place.imag, SIDE - place.imag):
-                most = max(most, setup.reach - where)
-    return most
+    legs = METHODS[way].legs(setup, estimate)
+    assert "Place the" in legs[0].words
+    start = complex(setup.reach + 0.1, SIDE / 2), 0.0
+    return max(
+        setup.reach - where
+        for place in places(start, legs, setup, track, bend)
+        for where in (place.real, SIDE - place.real, place.imag, SIDE - place.imag)
+    )

@@ -27,7 +27,7 @@ WITH_GYRO = Config(odometry=OdometryConfig(gyro=True))
     [
         (DriveOptions(), Config(), "tape"),
         (DriveOptions(), WITH_GYRO, "gyro"),
-        (DriveOptions("wall"), WITH_GYRO, "wall"),
+        (DriveOptions("tape"), WITH_GYRO, "tape"),
         (DriveOptions(positions="sim/pose"), WITH_GYRO, "positions"),
         (DriveOptions(imu="other/imu"), Config(), "gyro"),
     ],

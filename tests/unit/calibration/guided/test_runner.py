@@ -27,10 +27,6 @@ SET_BACK_RAD = 0.3
     [
         ("gyro", "turns", "turns"), ("positions", "turns", "turns"), ("tape", "ahead", "ahead"),
         ("tape", "once round", "ahead"), ("tape", "slowly", "slowly"), ("tape", "fast", "fast"),
-        ("wall", "home", "out"), ("wall", "half round to the left", "half round to the left"),
-        ("wall", "round at the wall", "round at the wall"),
-        ("umbmark", "once round", "ahead"), ("umbmark", "square to the right",
-                                             "square to the right"),
     ],
 )  # fmt: skip
 def test_a_drive_resumes_at_the_last_leg_whose_measurement_stands_alone(
@@ -39,7 +35,7 @@ def test_a_drive_resumes_at_the_last_leg_whose_measurement_stands_alone(
     method = METHODS[way]
     legs = method.legs(usual_setup(), 1.6)
     number = [stage.name for stage in legs].index(leg)
-    assert legs[begins_again(legs, number, sensor=not method.tool)].name == again
+    assert legs[begins_again(legs, number, sensor=not method.by_tape)].name == again
 
 
 class Disturbed:
@@ -65,7 +61,7 @@ class Disturbed:
 
 @pytest.mark.parametrize(
     ("way", "leg"),
-    [("gyro", "turns"), ("tape", "slowly"), ("tape", "once round"), ("wall", "home")],
+    [("gyro", "turns"), ("tape", "slowly"), ("tape", "once round")],
 )
 def test_a_disturbed_leg_is_repeated_and_the_result_is_right(
     way: str, leg: str, capsys: pytest.CaptureFixture[str]
