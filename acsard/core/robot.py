@@ -238,7 +238,7 @@ class Robot:
             self._first_events = []
         if inputs.missed:
             self.counters["missed_periods"] += inputs.missed
-            events.append(missed(inputs.missed))
+            events.append(missed(inputs.missed, self.config.period_ns))
         self._settle(inputs)
         estimates = self._fold(inputs, events)
         answers = self._serve(inputs, events)

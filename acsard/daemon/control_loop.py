@@ -51,7 +51,6 @@ from acsard.core.values import (
     Snapshot,
 )
 from acsard.daemon.latch_rules import MAX_ANSWER_DELAY_NS, Handover, LatchKeeper
-from acsard.daemon.late_watch import LateWatch
 from acsard.daemon.latencies import Stopwatch
 from acsard.daemon.pacing import NO_PERIOD, Pace, Period
 from acsard.daemon.settings_file import SettingsFile, keeps
@@ -104,7 +103,6 @@ class ControlLoop:
         latches: Latches = Latches(),  # noqa: B008
         keeper: LatchKeeper | None = None,
         settings_file: SettingsFile | None = None,
-        late_watch: LateWatch | None = None,
     ) -> None:
         """Create the robot and the parts that convert its inputs and outputs.
 
@@ -130,7 +128,6 @@ class ControlLoop:
                 latches are not stored.
             settings_file: writes settings to the configuration file. With None, a `set` request
                 with the field `keep` is refused.
-            late_watch: finds the causes of late periods. With None, no causes are reported.
         """
         self.robot = Robot(config, latches)
         self.report = Report(config, start, certificate_ends)
@@ -173,7 +170,7 @@ class ControlLoop:
         # Use the longest line of both directions, because answers must not queue in the MCU either.
         line_ns = wire_ns(config.mcu.line_bytes, config.mcu.baud_rate)
         self.pace = Pace(line_ns, config.period_ns)
-        self._stopwatch, self._late_watch = Stopwatch(), late_watch
+        self._stopwatch = Stopwatch()
 
     @property
     def at_rest(self) -> bool:
@@ -223,15 +220,7 @@ class ControlLoop:
         ended = period.expired > 0
         missed = period.expired - 1 if ended else 0
         if ended:
-            late_ns = now.mono_ns - period.due_ns
-            self._stopwatch.period(now.mono_ns, late_ns, missed)
-            if self._late_watch is not None:
-                self._late_watch.period(now.mono_ns, late_ns, missed)
-                # The log joins events of one name into one line, which shows the text of the last
-                # event. After missed periods, the robot's own event follows in this step. Its text
-                # states only the number of periods, and would hide the cause.
-                if not missed:
-                    self._others += self._late_watch.take_events()
+            self._stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns, missed)
             self._others += self._handover.take_events()
         commands, refusals, requests = self._from_bus(now)
         if self._settings_file is not None and self._settings_file.pending:

@@ -29,7 +29,6 @@ from acsard.core.values import NS_PER_S, Event, Latches
 from acsard.daemon.bus.bus import ZenohBus
 from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_file import LatchFile
-from acsard.daemon.late_watch import LateWatch
 from acsard.daemon.robot_description import robot_description
 from acsard.daemon.serial.port import SerialPort
 from acsard.daemon.serial.simulator_pty import Simulated
@@ -194,7 +193,6 @@ async def run(
             Latches() if keeper is None else await keeper.start(clock.now()),
             keeper,
             settings_file,
-            stack.enter_context(LateWatch()),
         )
         control.report.description = urdf
         if (description := control.report.robot_description()) is not None:

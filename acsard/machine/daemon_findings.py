@@ -21,14 +21,13 @@ from acsard.core.config.live import Difference, differences, find_live_setting
 from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import SIMULATOR, BatteryConfig, Config, is_tls
 from acsard.core.config.validation import write
-from acsard.core.formatting import listed, many, utc
+from acsard.core.formatting import listed, many
 from acsard.core.link.link_diagnosis import BUSY_ADVICE, MAX_UNANSWERED_FRACTION, blames_host
 from acsard.core.messages.diagnostics import NO_ROUTER
 from acsard.core.messages.schema import (
     BatterySummary,
     DiagnosticStatus,
     Info,
-    LogEvent,
     RobotState,
 )
 from acsard.core.motion import bumpers
@@ -44,7 +43,6 @@ from acsard.core.motion.emergency_stop import (
 )
 from acsard.core.motion.gyro import STATUS_TEXTS
 from acsard.core.values import NS_PER_S, AcsardError, BatteryLevel, BatteryStatus, GyroDoes
-from acsard.daemon.late_causes import cause_in
 from acsard.host import clock
 from acsard.host.errors import MendableError, NoAnswerError
 from acsard.host.processes import name_of
@@ -118,7 +116,6 @@ class Running(Struct, frozen=True):
     """Rows of the daemon's diagnostics."""
     is_local: bool = True
     """Whether the daemon runs on this machine."""
-    events: tuple[LogEvent, ...] = ()
 
 
 def query(config: Config, address: Address) -> Running:
@@ -132,13 +129,13 @@ def query(config: Config, address: Address) -> Running:
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         info, before = robot.get("info"), robot.get("state")
         time.sleep(1.0)  # the daemon counts about a hundred lines in this time
-        rows, events = tuple(robot.get("diagnostics").status), tuple(robot.get("events").events)
+        rows = tuple(robot.get("diagnostics").status)
         runs, is_local = _configuration(robot, info, config), name_of(info.pid) == "acsard"
         sent = clock.now()
         state, answered = robot.get("state"), clock.now()
         round_trip_ns = answered.mono_ns - sent.mono_ns
         queried_ns = sent.wall_ns + round_trip_ns // 2
-        return Running(info, runs, before, state, queried_ns, round_trip_ns, rows, is_local, events)
+        return Running(info, runs, before, state, queried_ns, round_trip_ns, rows, is_local)
 
 
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
@@ -530,8 +527,7 @@ def late(running: Running) -> Iterator[Finding]:
     """Yield findings about late control periods of the daemon.
 
     There is a warning if the daemon has missed more than 1 % of the periods since its start, or if
-    its diagnostics report recently missed periods. There is also a finding for each of the latest
-    three known causes.
+    its diagnostics report recently missed periods.
     """
     counters = running.state.counters
     missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
@@ -546,17 +542,6 @@ def late(running: Running) -> Iterator[Finding]:
             "service has real-time priority"
         )
         yield Finding("daemon", "warning", text, mend)
-    causes = [
-        (event, cause)
-        for event in running.events
-        if event.name == "missed_periods" and (cause := cause_in(event.text))
-    ]
-    for event, cause in causes[-3:]:
-        level: Level = "warning" if messages else "ok"
-        at = utc(event.stamp.to_ns())
-        text = f"the daemon missed control periods just before {at}: it was late {cause}"
-        mend = "deploy/systemd/README.md explains each cause of lateness"
-        yield Finding("daemon", level, text, mend)
 
 
 def clocks(running: Running) -> Iterator[Finding]:

@@ -22,9 +22,8 @@ from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.config.settings import Config
 from acsard.core.values import NS_PER_S
-from acsard.daemon.late_causes import present
 from acsard.host import clock, real_time
-from acsard.host.kernel_counters import Kernel
+from acsard.host.kernel_counters import Kernel, Reading
 from acsard.host.processes import holders, is_running
 from acsard.machine.certificate_findings import certificates, router_certificates
 from acsard.machine.daemon_findings import (
@@ -106,6 +105,11 @@ MEASUREMENT_S = 0.3
 each clock tick, and there are 30 ticks in this time."""
 
 
+MAX_STEAL_FRACTION = 0.02
+"""Share of the measurement above which steal time is reported. Steal time is time in which the host
+of a virtual machine took the processor away."""
+
+
 def slowness(kernel: Kernel | None = None) -> Iterator[Finding]:
     """Yield findings about present conditions of this computer that slow down programs.
 
@@ -115,16 +119,40 @@ def slowness(kernel: Kernel | None = None) -> Iterator[Finding]:
     kernel = kernel or Kernel()
     before, began_ns = kernel.read(), clock.mono_ns()
     time.sleep(MEASUREMENT_S)
-    after, passed_ns = kernel.read(), clock.mono_ns() - began_ns
-    causes = present(before, after, passed_ns)
-    for clause, advice in causes:
-        yield Finding("computer", "warning", f"{clause}, so the daemon can be late", advice)
+    causes = slowdowns(before, kernel.read(), clock.mono_ns() - began_ns)
+    for text, advice in causes:
+        yield Finding("computer", "warning", f"{text}, so the daemon can be late", advice)
     if not causes:
         text = (
             "the kernel reports no undervoltage, no overheating, no slowed processor clock and no "
             "high steal time"
         )
         yield Finding("computer", "ok", text)
+
+
+def slowdowns(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, str]]:
+    """Return the causes that slow down every program on this computer now, each with advice.
+
+    `before` and `after` are two readings of the kernel's counters, made `within_ns` apart.
+    """
+    causes, now = [], after.conditions
+    if now.undervoltage:
+        text = "the supply voltage is too low, which slows the processor"
+        causes.append((text, "use a stronger power supply and a shorter cable"))
+    if now.slowed_by_heat or now.throttled > before.conditions.throttled:
+        causes.append(("the processor is too hot and runs slower", "cool the processor"))
+    if (limit := now.slow_clock) is not None:
+        text = (
+            f"the CPU governor {limit.governor} keeps the processor at {limit.limit_mhz} of "
+            f"{limit.full_mhz} MHz"
+        )
+        causes.append((text, "choose the CPU governor schedutil or performance"))
+    pairs = zip(before.steal_ns, after.steal_ns, strict=False)
+    stolen_ns = max((new - old for old, new in pairs), default=0)
+    if stolen_ns > MAX_STEAL_FRACTION * within_ns:
+        text = f"the host gave this virtual machine no processor for {stolen_ns / NS_PER_S:.2f} s"
+        causes.append((text, "give the virtual machine a processor of its own"))
+    return causes
 
 
 def serial_port(config: Config) -> Iterator[Finding]:

@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 from msgspec import Struct
-from msgspec.structs import replace
 
 from acsard.core.config.live import flat
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import show
 from acsard.core.formatting import lasting, listed, many
-from acsard.daemon.late_causes import cause_in
 from acsard.recording.timeline import INCIDENT_WORDS
 from acsard.report.report_data import Mark, ReportData
 
@@ -150,15 +148,6 @@ def _first_of_each(marks: list[Mark], clock: Clock) -> str:
     return listed(texts, MAX_NAMES, "; ")
 
 
-def _late(marks: Iterable[Mark], clock: Clock) -> str:
-    late = [
-        replace(mark, text=cause)
-        for mark in marks
-        if mark.name == "missed_periods" and (cause := cause_in(mark.text))
-    ]
-    return f"; {_first_of_each(late, clock)}" if late else ""
-
-
 def notes(data: ReportData, origin: Origin) -> list[str]:
     """Return the notes for the user of the report.
 
@@ -223,7 +212,7 @@ def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, 
     yield (
         "Control loop",
         f"{config.rate_hz:g} Hz, at most {lateness.most_ms:.1f} ms late, "
-        f"{many(lateness.missed, 'period')} missed{_late(data.marks.all(), clock)}",
+        f"{many(lateness.missed, 'period')} missed",
     )
     simulated = " on the simulator" if config.mcu.simulated else f" on {config.mcu.port}"
     yield "Robot", f"{origin.robot}{simulated}"

@@ -29,7 +29,6 @@ from acsard.core.simulator.true_messages import turn_rate
 from acsard.core.values import NS_PER_S, Event, Instant, Latches, Outputs, Pose, Received
 from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_rules import LatchKeeper
-from acsard.daemon.late_watch import LateWatch
 from acsard.daemon.pacing import NO_PERIOD, Period
 from acsard.daemon.settings_file import SettingsFile
 from acsard.recording.recorded_steps import StepRecorder
@@ -156,7 +155,6 @@ class World:
         keeper: LatchKeeper | None = None,
         settings_file: SettingsFile | None = None,
         wanted: Collection[str] = (),
-        late_watch: LateWatch | None = None,
     ) -> None:
         """Start the daemon. It encodes messages only for the keys in `wanted`.
 
@@ -199,7 +197,6 @@ class World:
             latches=latches,
             keeper=keeper,
             settings_file=settings_file,
-            late_watch=late_watch,
         )
         self._queries = 0
         self._moved_ns: dict[str, int] = {}

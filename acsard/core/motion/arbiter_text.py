@@ -9,7 +9,7 @@ from __future__ import annotations
 from acsard.core.formatting import lasting, many
 from acsard.core.motion.arbiter import MAX_SENDERS, Choice
 from acsard.core.motion.modes import Mode
-from acsard.core.values import Event, Refusal, Wait
+from acsard.core.values import NS_PER_S, Event, Refusal, Wait
 
 REFUSED = {
     "unknown_source": "this source is not in commands.sources",
@@ -81,10 +81,10 @@ def waiting(wait: Wait) -> str:
             )
 
 
-def missed(periods: int) -> Event:
+def missed(periods: int, period_ns: int) -> Event:
     """Return the log event for `periods` successive control periods without a step of the robot."""
     when = "one control period" if periods == 1 else f"{periods} successive control periods"
-    text = f"no control step ran in {when}"
+    text = f"late by {periods * period_ns / NS_PER_S:.2f} s: no control step ran in {when}"
     return Event("missed_periods", text, "warning", kind="missed", count=periods, news=False)
 
 

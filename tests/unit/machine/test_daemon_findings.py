@@ -27,7 +27,6 @@ from acsard.core.messages.schema import (
     BatterySummary,
     DiagnosticStatus,
     Info,
-    LogEvent,
     RobotState,
     Time,
 )
@@ -509,29 +508,6 @@ def test_a_lost_link_is_reported_with_the_number_of_losses() -> None:
     (finding,) = link_findings({}, {"link_lost": 4})
     assert finding.level == "warning"
     assert "lost 4 times" in finding.text
-
-
-def test_the_last_causes_of_lateness_are_warnings_only_if_periods_are_missed_now() -> None:
-    texts = [
-        "11 x missed: no control step ran in 11 successive control periods",
-        *(f"late: by 0.1{n} s, because it is {n}" for n in range(5)),
-    ]
-    events = tuple(
-        LogEvent(Time.from_ns(NOW + n * S), "missed_periods", "warning", text, "", 1)
-        for n, text in enumerate(texts)
-    )
-    calm = replace(running_daemon(0.0, lines_sent=345_600_000, missed_periods=600), events=events)
-    findings = list(late(calm))
-    assert [finding.level for finding in findings] == ["ok", "ok", "ok"]
-    assert [finding.text.rpartition("because ")[2] for finding in findings] == [
-        "it is 2", "it is 3", "it is 4",
-    ]  # fmt: skip
-    assert (
-        "missed control periods just before 2027-01-15 08:00:05 UTC: it was late by 0.14 s, because"
-        in findings[-1].text
-    )
-    row = DiagnosticStatus(1, "acsard: control loop", "600 of 6000 periods missed", "acsar", [])
-    assert {finding.level for finding in late(replace(calm, rows=(row,)))} == {"warning"}
 
 
 @pytest.mark.parametrize("host", ["a..b", "a" * 70])

@@ -8,7 +8,6 @@ from functools import lru_cache
 
 from acsard.core.config.settings import Config
 from acsard.core.robot import Robot
-from acsard.daemon.late_watch import LateWatch
 from acsard.recording.recorded_steps import RecordedStep
 from acsard.recording.replay import Replay
 from acsard.recording.state import State
@@ -21,12 +20,11 @@ def report_of(
     drive: Callable[[World], None],
     begin: float = -math.inf,
     end: float = math.inf,
-    late_watch: LateWatch | None = None,
     config: Config | None = None,
 ) -> tuple[ReportData, list[RecordedStep]]:
     """Return the report's data of a drive, and the steps of the drive."""
     config, tape = config or Config(), Tape()
-    world = World(config, recorder=tape, late_watch=late_watch)
+    world = World(config, recorder=tape)
     drive(world)
     steps = tape.steps()
     return report_from(steps, config, begin, end), steps

@@ -8,7 +8,6 @@ from msgspec.structs import replace
 from acsard.core.config.settings import BatteryConfig, Config, McuConfig, Source
 from acsard.report.figures import path_figure
 from acsard.report.report_text import Origin, Setting, differences, reasons, rows, summary
-from tests.scenarios.instant_watch import InstantWatch
 from tests.scenarios.world import World
 from tests.unit.report.driven import drive_of_two, report_of
 
@@ -103,24 +102,6 @@ def test_a_host_stall_does_not_count_as_a_loss_of_the_link() -> None:
 
     report, _ = report_of(late)
     assert summary(report).endswith("no stops, 1 stall of the robot's computer.")
-
-
-def test_the_control_loop_has_the_cause_of_a_late_period() -> None:
-    def late(world: World) -> None:
-        world.run(0.2)
-        world.stall(0.05)
-        world.run(0.5)
-
-    origin = Origin("a.mcap", "r2", "0.1.0", "3.11.0")
-    words = []
-    for watch in (None, InstantWatch()):
-        report, _ = report_of(late, late_watch=watch)
-        table = dict(rows(report, origin, lambda s, day: f"<{s:.0f}>"))
-        words.append(table["Control loop"])
-    assert words[0].endswith("4 periods missed")
-    assert words[1].startswith(
-        f"{words[0]}; <1800000000> by 0.04 s, because other programs used the processor"
-    )
 
 
 def test_the_reports_of_a_board_with_its_own_clock_are_not_called_answers() -> None:

@@ -32,14 +32,11 @@ def test_a_fault_is_still_listed_after_an_hour_of_missed_periods() -> None:
     happened = RecentEvents()
     happened.add([FAULT], at(0))
     for second in range(1, 3600):
-        happened.add([missed(3)], at(second))
+        happened.add([missed(3, 10_000_000)], at(second))
     fault, others = message_of(happened).events
     assert (fault.name, fault.stamp) == ("fault", Time.from_ns(at(0).wall_ns))
     assert (others.name, others.count) == ("missed_periods", 3 * 3599)
-    assert (
-        others.text
-        == f"{3 * 3599} times; the last: no control step ran in 3 successive control periods"
-    )
+    assert others.text.startswith(f"{3 * 3599} times; the last: late by 0.03 s: ")
     assert others.stamp == message_of(happened).stamp == Time.from_ns(at(3599).wall_ns)
     assert message_of(happened).total == 3600
 
@@ -47,16 +44,16 @@ def test_a_fault_is_still_listed_after_an_hour_of_missed_periods() -> None:
 def test_a_repeated_event_gets_a_new_row_after_a_minute_without_it() -> None:
     happened = RecentEvents()
     for second in (0, 60, 121):
-        happened.add([missed(1)], at(second))
+        happened.add([missed(1, 10_000_000)], at(second))
     assert [event.count for event in message_of(happened).events] == [2, 1]
 
 
 def test_a_repeated_event_moves_after_newer_events() -> None:
     happened = RecentEvents()
-    happened.add([missed(1)], at(0))
+    happened.add([missed(1, 10_000_000)], at(0))
     happened.add([FAULT], at(1))
     assert names(happened) == ["missed_periods", "fault"]
-    happened.add([missed(1)], at(2))
+    happened.add([missed(1, 10_000_000)], at(2))
     assert names(happened) == ["fault", "missed_periods"]
 
 

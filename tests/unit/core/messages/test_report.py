@@ -461,7 +461,7 @@ def test_events_are_kept_without_subscribers_and_published_with_earlier_events()
 
 def test_a_fault_stays_in_the_list_during_a_repeated_event() -> None:
     report, fault = Report(CONFIG, START), Event("fault", "a wheel is dead", "error")
-    for second, event in enumerate([fault, *[missed(3)] * 100]):
+    for second, event in enumerate([fault, *[missed(3, 10_000_000)] * 100]):
         list(report.due(replace(OUTPUTS, events=(event,), now=later(second)), set(), get_snapshot))
     message = report.current("events", never)
     assert isinstance(message, Events)

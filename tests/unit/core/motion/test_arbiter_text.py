@@ -219,9 +219,9 @@ def test_the_event_of_a_refusal_has_its_reason_its_text_and_its_sender() -> None
 
 
 def test_the_event_of_missed_periods_counts_each_period() -> None:
-    assert missed(3) == Event(
+    assert missed(3, 10_000_000) == Event(
         "missed_periods",
-        "no control step ran in 3 successive control periods",
+        "late by 0.03 s: no control step ran in 3 successive control periods",
         "warning",
         kind="missed",
         count=3,
