@@ -8,9 +8,7 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
-NEW_MODE = 0o644
-"""Permission bits of a new file if the caller does not choose them. Other users may read the file,
-because the systemd service may run as another user."""
+NEW_MODE = 0o644  # other users may read it: the systemd service may run as another user
 
 
 def replace(
@@ -21,20 +19,12 @@ def replace(
     owner: tuple[int, int] | None = None,
     synced: bool = True,
 ) -> None:
-    """Replace the content of a file, or create the file.
+    """Replace the content of a file, or create the file; a reader sees the old or the new content.
 
-    Raises `OSError` if that fails, and leaves the old file unchanged.
-
-    Args:
-        file: path of the file. Other processes find the complete old file or the complete new file.
-        content: new content. Only the owner can read the new file until its mode is set.
-        mode: permission bits. If None, an existing regular file keeps its mode, and any other file
-            gets `NEW_MODE`.
-        owner: uid and gid of the new file. If None, a regular file keeps its owner and group, as
-            far as this process has the permission to set them.
-        synced: if true, wait before the rename until the disk has stored the new content. A power
-            cut then leaves the complete old or new file. If false, a power cut may leave a part of
-            the new file until the caller has called `sync`.
+    `mode` None keeps the mode of an existing regular file (else `NEW_MODE`), and `owner` None its
+    uid and gid, as far as permitted. Only the owner can read the new file until its mode is set.
+    With `synced` a power cut, too, leaves the complete old or new file. Raises `OSError`, and then
+    leaves the old file unchanged.
     """
     # A device, which a symbolic link may name, has a mode and an owner for other purposes.
     before = file.stat() if file.is_file() else None

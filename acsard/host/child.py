@@ -1,11 +1,9 @@
 """Starts child processes, limits them, watches their signs of life, and ends them.
 
-Each child runs in a separate session, so a Ctrl-C at the terminal reaches only the parent. The
-parent then ends its children. A child does not outlive its parent.
-
-The parent uses the class `Child`, and the child uses the class `Parent`. A socket connects the two
-processes, and is the child's standard input. The child writes signs of life to the socket, and ends
-when the parent closes the socket. The parent kills a child that falls silent.
+Each child has its own session, so a Ctrl-C at the terminal reaches only the parent, which then ends
+its children. A child does not outlive its parent: a socket (`Child` and `Parent`), which is the
+child's standard input, carries its signs of life, and the child ends when the parent closes it. The
+parent kills a child that falls silent.
 """
 
 from __future__ import annotations
@@ -27,43 +25,32 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Ns
 from acsard.host import clock
 
+# With them, a child could notify systemd in its parent's name.
 SYSTEMD_VARIABLES = ("NOTIFY_SOCKET", "INVOCATION_ID")
-"""Environment variables of systemd that a child does not get from its parent. With them, a child
-could send notifications to systemd in its parent's name."""
 
-HEARTBEAT_S = 0.5
-"""Longest pause, s, between two signs of life of a child, and between two checks by its parent."""
+HEARTBEAT_S = 0.5  # longest pause between two signs of life, and between two checks
 
+# The TLS gateway ends itself after 1 s without progress, so this is for a process that cannot.
 SILENCE_TIMEOUT_NS = 3 * NS_PER_S
-"""Time without a sign of life after which a parent kills its child, ns. The TLS gateway ends itself
-after 1 s without progress, so this limit is for a process that cannot do even that."""
 
-START_TIMEOUT_NS = 15 * NS_PER_S
-"""Longest time for which the parent waits for a child's first sign of life, ns. Python starts
-slowly on a busy machine."""
+START_TIMEOUT_NS = 15 * NS_PER_S  # Python starts slowly on a busy machine
 
 
 class Silence:
-    """Measures how long another process has been silent, which means without a sign of life.
+    """Measures how long another process has given no sign of life.
 
-    The silence is too long if it exceeds `timeout_ns`, ns.
-
-    If more than 0.5 s passes between two calls of `too_long`, only 0.5 s counts as silence, because
-    the computer may have stopped both processes meanwhile.
+    Between two calls of `too_long` at most 0.5 s counts, because the computer may have stopped both
+    processes meanwhile.
     """
 
-    def __init__(self, timeout_ns: int) -> None:
+    def __init__(self, timeout_ns: Ns) -> None:
         self._timeout_ns, self._ns = timeout_ns, 0
 
-    def too_long(self, alive: bool, passed_ns: int) -> bool:
-        """Return whether the silence exceeds the limit.
-
-        `alive` is true if a sign of life came since the last call. `passed_ns` is the time since
-        the last call, ns.
-        """
+    def too_long(self, alive: bool, passed_ns: Ns) -> bool:
+        """Return whether the silence is too long, `passed_ns` after the last call."""
         self._ns = 0 if alive else self._ns + min(passed_ns, NS_PER_S // 2)
         return self._ns > self._timeout_ns
 
@@ -78,31 +65,23 @@ def acsard(*words: str) -> list[str]:
 
 
 def environment(hidden: Collection[str] = ()) -> dict[str, str]:
-    """Return the environment variables for a child.
-
-    The child gets the variables of this process, except those that `hidden` and `SYSTEMD_VARIABLES`
-    name.
-    """
+    """Return this process's environment variables, without `hidden` and `SYSTEMD_VARIABLES`."""
     return {
         key: value for key, value in os.environ.items() if key not in (*SYSTEMD_VARIABLES, *hidden)
     }
 
 
 class Limits(Struct, frozen=True):
-    """Limits of a child whose work is less important than the daemon's.
-
-    `nice` is the nice value, and `memory_bytes` is the limit of `RLIMIT_DATA`, bytes.
-    """
+    """Limits of a child whose work is less important than the daemon's."""
 
     nice: int
     memory_bytes: int
 
 
 def limit(pid: int, limits: Limits) -> None:
-    """Set the limits of the child with the process id `pid`.
+    """Set the limits of the child `pid`, and let the kernel kill it first if memory runs out.
 
-    If the child's hard limit of memory is already lower than `limits.memory_bytes`, the lower limit
-    remains. If the computer runs out of memory, the kernel kills this child before other processes.
+    A hard limit of memory that is lower already remains.
     """
     try:
         with suppress(OSError):
@@ -118,15 +97,12 @@ def limit(pid: int, limits: Limits) -> None:
 
 
 def how_it_ended(code: int) -> str:
-    """Return in words how a process ended, such as "ended with exit code 1".
-
-    `code` is its exit code, or the negative number of the signal that ended it.
-    """
+    """Return how a process ended, such as "ended with exit code 1"; `code` < 0 is a signal."""
     return f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
 
 
 def end(process: subprocess.Popen[bytes], timeout_s: float) -> None:
-    """End a child with SIGTERM, and with SIGKILL if it still runs after `timeout_s` seconds."""
+    """End a child with SIGTERM, and with SIGKILL after `timeout_s`."""
     process.terminate()
     try:
         process.wait(timeout_s)
@@ -144,11 +120,7 @@ async def running(
     stdout: int | None = None,
     stderr: int | None = None,
 ) -> AsyncIterator[Process]:
-    """Start a child process for the duration of an `async with` block, and yield it.
-
-    If the child still runs at the end of the block, it is killed. `stdin`, `stdout` and `stderr`
-    have the same meaning as in `subprocess`. Raises `OSError` if the child cannot be started.
-    """
+    """Yield a child process, which is killed at the end of the block. Raises `OSError`."""
     child = await asyncio.create_subprocess_exec(
         *command,
         stdin=stdin,
@@ -174,23 +146,19 @@ async def running(
 
 
 class Child:
-    """A child process, as its parent sees it. `run` kills the child if it sends no signs of life.
-
-    `command` is the program and its arguments. The program must use the class `Parent`.
-    """
+    """A child process, as its parent sees it. The program must use the class `Parent`."""
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
         self._parent_end: socket.socket | None = None
         self._over = False
-        self.silent = ""
-        """The reason why the child was killed, in words; "" if it was not killed."""
+        self.silent = ""  # why the child was killed, in words
 
     def run(self) -> int:
-        """Start the child, wait until it ends, and return its exit code.
+        """Run the child until it ends, and return its exit code, or minus the signal that ended it.
 
-        If the child falls silent meanwhile, kill it and set `silent`. If a signal ended the child,
-        return the negative number of the signal. Raises `OSError` if the child cannot be started.
+        If the child falls silent, kill it and set `silent`. Raises `OSError` if it cannot be
+        started.
         """
         parent_end, child_end = socket.socketpair()
         with parent_end:
@@ -210,11 +178,7 @@ class Child:
             return process.wait()
 
     def _falls_silent(self, parent_end: socket.socket) -> bool:
-        """Wait until the child falls silent, and return True.
-
-        Return False if the child ends first, or if `release` is called first. `parent_end` is the
-        parent's end of the socket.
-        """
+        # False: the child ended, or `release` was called.
         silence, before_ns, alive = Silence(START_TIMEOUT_NS), clock.mono_ns(), False
         while True:
             beat = (
@@ -248,16 +212,14 @@ class Child:
 
 
 class Parent:
-    """The connection of a child process to the parent process that started it as a `Child`.
+    """The connection of a child to the parent that started it as a `Child`.
 
-    `fd` is the child's standard input. If the process has no such parent, for example because a
-    person started it at a terminal, the method `beat` does nothing.
+    `fd` is the child's standard input. If a person started this process, `beat` does nothing.
     """
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
-        # If a person has started this process, `fd` may be a pipe or a terminal. Neither takes
-        # signs of life.
+        # `fd` is a pipe or terminal if a person started this.
         self._listens = stat.S_ISSOCK(os.fstat(fd).st_mode)
         if self._listens:
             os.set_blocking(fd, False)
@@ -269,7 +231,7 @@ class Parent:
                 os.write(self.fd, b".")  # fails if the buffer is full or the parent has gone
 
     def is_gone(self) -> bool:
-        """Return whether the parent has closed the socket. Call this only if `fd` is readable."""
+        """Return whether the parent has closed the socket; call this only if `fd` is readable."""
         try:
             return not os.read(self.fd, 64)
         except BlockingIOError:
@@ -279,20 +241,12 @@ class Parent:
 
 
 def end_signals() -> tuple[signal.Signals, ...]:
-    """Return the signals that end a program that runs for a long time.
-
-    SIGHUP, which a closed terminal sends, is left out if it is ignored: `nohup` has started this
-    program so that it runs on.
-    """
+    """Return the signals that end a daemon; SIGHUP only if `nohup` does not ignore it."""
     signals = (signal.SIGTERM, signal.SIGINT, signal.SIGQUIT)
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     return signals if ignored else (*signals, signal.SIGHUP)
 
 
 def end_with_parent(number: signal.Signals) -> None:
-    """Let the kernel send the signal `number` to this process when its parent ends.
-
-    The kernel also sends the signal if the parent crashes, or if only the thread that started this
-    process ends.
-    """
+    """Let the kernel send `number` when the parent, or the thread that started this one, ends."""
     ctypes.CDLL(None).prctl(1, number)  # PR_SET_PDEATHSIG in linux/prctl.h

@@ -1,9 +1,8 @@
 """Errors with an external cause that a person can fix, and the exit codes of acsard.
 
-Each error class derives from `AcsardError`. Most also derive from the built-in exception for the
-same case (for example `FileNotFoundError`), so a caller may catch either. The text says what is
-wrong and how to fix it. Bugs have no error class here, and neither have states of the robot such as
-a lost port.
+Most classes also derive from the built-in exception for the same case (`FileNotFoundError`), so a
+caller may catch either. The text says what is wrong and how to fix it. Bugs have no class here, and
+neither have states of the robot such as a lost port.
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ import msgspec
 
 from acsard.core.values import AcsardError
 
+# Only the first one is documented.
 MSGSPEC_ERRORS = msgspec.MsgspecError, UnicodeDecodeError, RecursionError
-"""Exceptions that msgspec raises for damaged data. Only the first one is documented."""
 
 
 class Exit(IntEnum):
@@ -43,14 +42,12 @@ EXIT_TEXTS: dict[int, str] = {
     Exit.NO_PERMISSION: "no permission",
     Exit.BAD_CONFIG: "bad configuration",
 }
-"""Maps each exit code to its meaning in words, for messages to the user."""
 
 
 class MendableError(AcsardError):
-    """Base class of errors whose cause a person can fix. The text of each error says how."""
+    """An error whose cause a person can fix. Its text says how."""
 
-    code: Exit = Exit.FAILURE
-    """Exit code of a subcommand that ends with this error."""
+    code: Exit = Exit.FAILURE  # exit code of a subcommand that ends with this error
 
 
 class UsageError(MendableError, ValueError):
@@ -76,10 +73,7 @@ class ReplyError(MendableError, RuntimeError):
 
 
 class NotDrivenError(MendableError, RuntimeError):
-    """The robot does not follow this client's commands. The text of the error says why.
-
-    For example, the client may have sent no command for some time.
-    """
+    """The robot does not follow this client's commands, for a reason that the text names."""
 
 
 class InUseError(MendableError, OSError):
@@ -117,10 +111,7 @@ class RecordingError(MendableError, ValueError):
 
 
 class ExitError(MendableError):
-    """Error that ends acsard with the exit code `code`.
-
-    `text` says what is wrong and how to fix it.
-    """
+    """Ends acsard with the exit code `code`; `text` says what is wrong and how to fix it."""
 
     def __init__(self, code: Exit, text: str) -> None:
         super().__init__(text)

@@ -1,10 +1,8 @@
 """Logs events as lines on standard error or in the systemd journal, and never blocks the caller.
 
-A thread writes the lines from a bounded queue, so that a full disk, a closed pipe or a stopped
-terminal does not delay the control loop. Lines that do not fit in the queue are dropped.
-
-In the journal, each value of an event is also a separate field. For example, the command
-`journalctl ACSARD_EVENT=link_down` finds all events with the name `link_down`.
+A thread writes the lines from a bounded queue, so a full disk, a closed pipe or a stopped terminal
+does not delay the control loop. Lines that do not fit are dropped. In the journal, each value of an
+event is also a field: `journalctl ACSARD_EVENT=link_down` finds the events `link_down`.
 """
 
 from __future__ import annotations
@@ -34,16 +32,11 @@ import structlog  # noqa: E402
 if sys.modules["rich"] is None:
     del sys.modules["rich"]
 
-_PRIORITIES = {"debug": 7, "info": 6, "warning": 4, "error": 3}
-"""Priority of each log level in syslog."""
+_PRIORITIES = {"debug": 7, "info": 6, "warning": 4, "error": 3}  # of syslog
 
 
 def is_journal(stream: TextIO, environ: Mapping[str, str]) -> bool:
-    """Return whether systemd has connected the stream to its journal.
-
-    systemd writes the device and inode of the journal's stream to the variable JOURNAL_STREAM of
-    the environment `environ`.
-    """
+    """Return whether the stream is the journal that JOURNAL_STREAM names (device and inode)."""
     try:
         status = os.fstat(stream.fileno())
     except (OSError, ValueError):
@@ -52,10 +45,7 @@ def is_journal(stream: TextIO, environ: Mapping[str, str]) -> bool:
 
 
 def render(logger: object, method: str, line: MutableMapping[str, Any]) -> str:
-    """Return a log entry in the journal's protocol: one line NAME=VALUE for each field.
-
-    structlog calls this function as a processor. `line` contains the fields of the entry.
-    """
+    """Return a log entry in the journal's protocol (a processor of structlog)."""
     fields = {
         "MESSAGE": _message(line),
         "PRIORITY": str(_PRIORITIES.get(str(line.get("level")), 6)),
@@ -76,7 +66,7 @@ def _message(line: Mapping[str, Any]) -> str:
 class JournalStream(io.StringIO):
     """Stream whose `write` sends each text to the systemd journal as a datagram.
 
-    `path` is the socket of the journal. Raises `OSError` if there is no journal at `path`.
+    Raises `OSError` if there is no journal at `path`.
     """
 
     def __init__(self, path: str = "/run/systemd/journal/socket") -> None:
@@ -93,29 +83,23 @@ class JournalStream(io.StringIO):
         return len(text)
 
 
-CLOSE_TIMEOUT_S = 0.2
-"""Longest time for which the end of the process waits until the queued lines are written, s."""
+CLOSE_TIMEOUT_S = 0.2  # longest time for which the end of the process waits for queued lines
 
+# Longest time for which a tool with a screen waits for a slow terminal at its end.
 MAX_LAST_OUTPUT_S = 10.0
-"""Longest time for which a tool with a screen waits at its end until a slow terminal has shown the
-last output, s."""
 
+# Bytes written to a terminal at once, and their limit in s: at 9600 baud they take 1.1 s.
 MAX_PART, PART_TIMEOUT_S = 1024, 1.5
-"""Number of bytes that are written to a terminal at once, and longest time for which a tool with a
-screen waits for them at its end, s. At 9600 baud, they take 1.1 s."""
 
 Form = Literal["console", "json", "logfmt", "journal"]
 
-MAX_VALUE_LENGTH = 500
-"""Largest number of characters of a logged value. The rest of a longer value is cut off, because a
-value from another program may have any length."""
+MAX_VALUE_LENGTH = 500  # characters: a value from another program may have any length
 
 
 class Writer:
-    """Stream whose `write` never blocks and never raises an error.
+    """Stream whose `write` never blocks and never raises.
 
-    `write` only queues the text, and a thread writes the text to the real stream. If the queue is
-    full, the text is dropped.
+    A thread writes to the real stream. A text that does not fit into the queue is dropped.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -123,8 +107,7 @@ class Writer:
         # In a minute the daemon logs fewer lines than this queue holds, even with all faults at
         # once (`event_throttle.py`).
         self._lines: queue.Queue[str | None] = queue.Queue(1000)
-        self._parts = 0
-        """Number of parts of texts that were written."""
+        self._parts = 0  # written so far
         self._thread = threading.Thread(target=self._work, name="log", daemon=True)
         self._thread.start()
 
@@ -136,8 +119,7 @@ class Writer:
             pass
         return len(text)
 
-    def flush(self) -> None:
-        """Do nothing: the thread flushes each line."""
+    def flush(self) -> None: ...
 
     def isatty(self) -> bool:
         return self._stream.isatty()
@@ -151,14 +133,13 @@ class Writer:
 
     @property
     def is_idle(self) -> bool:
-        """Whether everything is written. It stays False while the reader of the stream stalls."""
+        """Return whether everything is written; False while the reader of the stream stalls."""
         return not self._lines.unfinished_tasks
 
     def close(self, timeout: float, most: float | None = None) -> None:
-        """Wait until the queued lines are written, but no longer than `timeout` s.
+        """Wait until the queued lines are written, at most `timeout` s.
 
-        If `most` is not None, the wait also ends after `most` s, and `timeout` is the longest time
-        without progress, s. If the queue is full, return immediately.
+        If `most` is given, it is the limit, and `timeout` limits a pause without progress.
         """
         try:
             self._lines.put_nowait(None)
@@ -181,11 +162,8 @@ class Writer:
             self._lines.task_done()
 
     def _write_through(self, text: str) -> None:
-        """Write a text directly to the stream's file descriptor, without the stream's buffer.
-
-        A thread that hung in a write through the buffer would keep the buffer's lock. Python could
-        then not flush the stream when the process ends.
-        """
+        # Not through the stream's buffer: a thread that hung in there would keep the buffer's lock,
+        # and Python could not flush the stream at the end of the process.
         stream = self._stream
         try:
             fd = stream.fileno()
@@ -203,13 +181,9 @@ class Writer:
 
 @contextmanager
 def output_in_threads(most: float | None = None) -> Iterator[None]:
-    """Let `sys.stdout` and `sys.stderr` never block during a `with` block.
+    """Let `sys.stdout` and `sys.stderr` never block during a `with` block, for all Python code.
 
-    At the end of the block, wait until all output is written, but at most `CLOSE_TIMEOUT_S`. If
-    `most` is not None, wait for up to `most` s while the reader goes on reading.
-
-    A `Writer` replaces each of the two streams. This holds for everything that Python code writes:
-    `print`, warnings, tracebacks, and the log records of libraries such as aiohttp.
+    At its end, wait for the output as `Writer.close` does.
     """
     output, errors = Writer(sys.stdout), Writer(sys.stderr)
     try:
@@ -235,10 +209,7 @@ class Log:
         self.use(settings)
 
     def use(self, settings: LogConfig) -> None:
-        """Use the log level in `settings` from now on.
-
-        The destination and the format of the log stay as they were at the start.
-        """
+        """Use the log level of `settings`; the destination and the format stay."""
         self._logger: Any = structlog.wrap_logger(
             structlog.WriteLogger(self._writer),  # type: ignore[arg-type]
             processors=[
@@ -255,11 +226,7 @@ class Log:
         )
 
     def event(self, event: Event) -> None:
-        """Log an event.
-
-        The log entry also contains the client that caused the event, if known, and the number of
-        occurrences if the event occurred several times.
-        """
+        """Log an event, with the client that caused it and the number of occurrences."""
         fields: dict[str, object] = {"text": event.text}
         if event.by:
             fields["by"] = event.by
@@ -268,16 +235,11 @@ class Log:
         self._logger.log(_LEVELS[event.level], event.name, **fields)
 
     def info(self, name: EventName, **fields: object) -> None:
-        """Log the event `name` of the daemon itself, at the level "info".
-
-        `fields` are the values in the log entry, by name.
-        """
+        """Log an event of the daemon itself."""
         self._logger.info(name, **fields)
 
     def close(self) -> None:
-        """Wait for at most `CLOSE_TIMEOUT_S` until the queued lines are written. Call this before
-        the process ends.
-        """
+        """Wait at most `CLOSE_TIMEOUT_S` for the queued lines, before the process ends."""
         self._writer.close(CLOSE_TIMEOUT_S)
 
 
@@ -292,7 +254,7 @@ def _in_order(logger: object, method: str, line: MutableMapping[str, Any]) -> di
 def _printable(
     logger: object, method: str, line: MutableMapping[str, Any]
 ) -> MutableMapping[str, Any]:
-    """Replace characters that would move the cursor or begin a new line, and cut long values."""
+    # Escape sequences and line ends of other programs must not reach the terminal.
     for key, value in line.items():
         if isinstance(value, str) and not (value.isprintable() and len(value) <= MAX_VALUE_LENGTH):
             line[key] = printable(value[:MAX_VALUE_LENGTH])

@@ -28,10 +28,7 @@ def own_name() -> str:
 
 
 def sender_id(name: str, secret: str = "") -> str:
-    """Return a sender id for commands, in the form `NAME/SECRET`.
-
-    If `secret` is "", the id contains a new random secret. A long name is cut off.
-    """
+    """Return a sender id `NAME/SECRET`, with a new random secret if there is none."""
     return f"{name[:MAX_NAME_LENGTH]}/{secret or new_secret()}"
 
 
@@ -41,10 +38,7 @@ def new_secret() -> str:
 
 
 def own_addresses() -> list[str]:
-    """Return this machine's IP addresses, except loopback and link-local addresses.
-
-    The list is empty if the command `ip` fails.
-    """
+    """Return this machine's IP addresses that others can reach; none if the command `ip` fails."""
     try:
         links = json.loads(run_command(("ip", "-json", "address"), 5.0).stdout or "[]")
     except (OSError, ValueError, subprocess.TimeoutExpired):

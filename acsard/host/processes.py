@@ -1,8 +1,7 @@
 """Finds the processes that have a device open, and runs commands.
 
-The module reads the open files of each process from /proc, and does not open any device. It
-examines only files below /dev: a call for a file on a network disk might hang and block this
-process.
+It reads the open files of each process from /proc, and examines only those below /dev: a call for a
+file on a network disk might hang.
 """
 
 from __future__ import annotations
@@ -15,16 +14,16 @@ from pathlib import Path
 
 from msgspec import Struct
 
+from acsard.core.values import Ns
+
 PROC = Path("/proc")
 
+# Of ptys (Documentation/admin-guide/devices.txt); no serial port has one.
 PTY_MAJORS = range(136, 144)
-"""Major device numbers of ptys. Each number stands for 256 ptys. No serial port has any of these
-numbers."""
 
 
+# "-Pm" or "-mNAME" on Python's command line. An argument that is not in this word is the next one.
 OPTION_WITH_ARGUMENT = re.compile(r"-[^-cmWX]*(?P<letter>[cmWX])(?P<argument>.*)", re.DOTALL)
-"""Matches a word of Python's command line with an option that takes an argument, such as "-Pm" or
-"-mNAME". If the argument is not in this word, it is the next word."""
 
 
 class Holder(Struct, frozen=True):
@@ -33,8 +32,6 @@ class Holder(Struct, frozen=True):
 
 
 class _Open(Struct, frozen=True):
-    """A device that a process has open. `process` is the directory of the process in /proc."""
-
     process: Path
     fd: str
 
@@ -53,10 +50,7 @@ def holders(path: str) -> Iterator[Holder]:
 
 
 def holder_of(path: str) -> Holder | None:
-    """Return another process that has the device at `path` open, or None if there is none.
-
-    If there are several, prefer a process that has locked the device.
-    """
+    """Return another process that has the device open, one that locked it first, or None."""
     last = None
     for descriptor in _having_open(path):
         holder = _holder(descriptor.process)
@@ -69,10 +63,7 @@ def holder_of(path: str) -> Holder | None:
 
 
 def master_of(path: str) -> Holder | None:
-    """Return the process at the other end of the pty `path`, such as a simulator.
-
-    Return None if `path` is not a pty, or if the process is not found.
-    """
+    """Return the process at the other end of the pty `path`, such as a simulator, or None."""
     wanted = _number(path)
     if os.major(wanted) not in PTY_MAJORS:
         return None
@@ -84,18 +75,12 @@ def master_of(path: str) -> Holder | None:
 
 
 def name_of(pid: int) -> str:
-    """Return the program name of a process.
-
-    Return "" if the process does not exist, or if the kernel hides it from this user.
-    """
+    """Return the program name of a process; "" if it does not exist or is hidden from this user."""
     return _name(PROC / str(pid))
 
 
-def waited_ns(pid: int) -> int:
-    """Return the total time for which the first thread of a process waited for a processor, ns.
-
-    Return 0 if this time is unknown.
-    """
+def waited_ns(pid: int) -> Ns:
+    """Return how long the first thread of a process has waited for a processor; 0 if unknown."""
     try:
         return int((PROC / str(pid) / "schedstat").read_text().split()[1])
     except (OSError, IndexError, ValueError):
@@ -135,7 +120,6 @@ def _having_open(path: str) -> Iterator[_Open]:
 
 
 def _number(path: str | Path) -> int:
-    """Return the number of the device at `path`; 0 if there is no device."""
     try:
         return os.stat(path).st_rdev
     except OSError:
@@ -148,11 +132,7 @@ def _holder(process: Path) -> Holder | None:
 
 
 def _name(process: Path) -> str:
-    """Return the program name of a process, whose directory in /proc is `process`.
-
-    The name of `python -m acsard` and of `python /usr/bin/acsard` is "acsard", not "python". The
-    name is "" if the process has ended.
-    """
+    # `python -m acsard` and `python /usr/bin/acsard` are "acsard".
     command = _text(process / "cmdline").split("\0")
     return "acsard" if _executed(command) == "acsard" else _comm(process)
 
@@ -162,7 +142,6 @@ def _comm(process: Path) -> str:
 
 
 def _text(file: Path) -> str:
-    """Return the content of a file in /proc; "" if its process has ended."""
     try:
         return os.fsdecode(file.read_bytes())
     except OSError:
@@ -170,10 +149,6 @@ def _text(file: Path) -> str:
 
 
 def _executed(command: Sequence[str]) -> str:
-    """Return the base name of the program, Python script or Python module that a command executes.
-
-    Return "" for a Python interpreter that executes neither a script nor a module.
-    """
     program = Path(command[0]).name
     if not program.startswith(("python", "pypy")):
         return program
@@ -191,9 +166,5 @@ def _executed(command: Sequence[str]) -> str:
 
 
 def run_command(words: tuple[str, ...], within_s: float) -> subprocess.CompletedProcess[str]:
-    """Run a command until it ends, and return its output and exit code.
-
-    `words` are the program and its arguments. Raises `OSError` if the program cannot be started,
-    and `subprocess.TimeoutExpired` if it still runs after `within_s` s.
-    """
+    """Run a command. Raises `OSError`, and `subprocess.TimeoutExpired` after `within_s`."""
     return subprocess.run(words, capture_output=True, text=True, timeout=within_s, check=False)

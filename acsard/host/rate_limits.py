@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Ns
 
 
 class Rate(NamedTuple):
@@ -22,27 +22,22 @@ class Rate(NamedTuple):
 
 
 class Bucket:
-    """A token bucket that limits a rate. It is full at first.
-
-    All times are monotonic times in ns.
-    """
+    """A token bucket, full at first, that limits a rate."""
 
     def __init__(self, rate: Rate) -> None:
         self._unit_ns = round(NS_PER_S / rate.hz)
         self._burst_ns = round((rate.burst - 1.0) * self._unit_ns)
         self._full_at_ns = 0
-        """Time at which the bucket is full again, ns. Taking a unit makes this time later by
-        `_unit_ns`."""
 
-    def room(self, now_ns: int) -> bool:
-        """Return whether the bucket contains at least one unit now."""
+    def room(self, now_ns: Ns) -> bool:
+        """Return whether a unit can be taken."""
         return self._full_at_ns <= now_ns + self._burst_ns
 
-    def full(self, now_ns: int) -> bool:
+    def full(self, now_ns: Ns) -> bool:
         return self._full_at_ns <= now_ns
 
-    def take(self, now_ns: int) -> bool:
-        """Take one unit from the bucket and return True. Return False if the bucket is empty."""
+    def take(self, now_ns: Ns) -> bool:
+        """Take one unit; return False if there is none."""
         if not self.room(now_ns):
             return False
         self._full_at_ns = max(self._full_at_ns, now_ns) + self._unit_ns
@@ -50,26 +45,18 @@ class Bucket:
 
 
 class Buckets:
-    """A token bucket for each name, and optionally a bucket that all names share."""
+    """A token bucket for each name, and optionally one that all names share."""
 
     def __init__(self, per_name: Rate, shared: Rate | None = None) -> None:
-        """Create the buckets.
-
-        `per_name` is the permitted rate of each name. `shared` is the permitted rate of all names
-        together; None means that this rate is not limited.
-        """
         self._per_name = per_name
         self._shared = None if shared is None else Bucket(shared)
         self._buckets: dict[str, Bucket] = {}
 
-    def room(self, name: str, now_ns: int) -> bool:
+    def room(self, name: str, now_ns: Ns) -> bool:
         return name not in self._buckets or self._buckets[name].room(now_ns)
 
-    def take(self, name: str, now_ns: int) -> bool:
-        """Take a unit from the bucket of `name` and from the shared bucket, and return True.
-
-        If either bucket is empty, take no unit and return False.
-        """
+    def take(self, name: str, now_ns: Ns) -> bool:
+        """Take a unit from the bucket of `name` and from the shared one, or return False."""
         if name not in self._buckets:
             # Drop the full buckets, which equal new ones, so that many names do not fill the
             # memory.
@@ -84,10 +71,7 @@ class Buckets:
 
 
 class Places:
-    """A limit on the number of simultaneous uses, such as connections. Each use takes a place.
-
-    At most `most` places may be in use in total, and at most `per_name` of them for the same name.
-    """
+    """Limits the number of simultaneous uses, such as connections, in total and for each name."""
 
     def __init__(self, most: int, per_name: int) -> None:
         self._most, self._per_name = most, per_name
@@ -101,7 +85,7 @@ class Places:
         return self._counts[name] < self._per_name and self.taken < self._most
 
     def enter(self, name: str) -> bool:
-        """Take a place for `name` and return True. Return False if no place is free."""
+        """Take a place; return False if none is free."""
         if not self.room(name):
             return False
         self._counts[name] += 1
@@ -114,10 +98,7 @@ class Places:
 
     @contextmanager
     def place(self, name: str = "") -> Iterator[bool]:
-        """Take a place for `name` during a `with` block, and yield True.
-
-        If no place is free, yield False.
-        """
+        """Take a place during a `with` block; yield False if none is free."""
         free = self.enter(name)
         try:
             yield free

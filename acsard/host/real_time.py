@@ -11,32 +11,26 @@ import os
 import resource
 from pathlib import Path
 
-PRIORITY = 10
-"""Real-time priority of the control loop. The kernel's interrupt threads have the higher priority
-50."""
+PRIORITY = 10  # the kernel's interrupt threads have 50
 
+# Seconds after which the kernel ends a loop that hangs, which would block all ordinary programs. A
+# step takes a thousandth. systemd's watchdog does this for the service.
 MAX_SPIN_S = 1
-"""Longest time for which the control loop may run without a pause, s. After this time, the kernel
-ends the process. Otherwise a loop that hangs would block all ordinary programs, because the loop
-has priority over them. A step takes a thousandth of this time. The systemd service has no such
-limit: systemd's watchdog ends a daemon that hangs."""
 
+# With a lower hard limit of RLIMIT_RTTIME, the kernel could end the daemon during its start.
 MIN_SPIN_S = 0.5
-"""Smallest hard limit of RLIMIT_RTTIME with which the daemon uses real-time scheduling, s. With a
-lower limit, the kernel could end the daemon during its start."""
 
-WAKE_UP_LATENCY = "/dev/cpu_dma_latency"
-"""Device file with which a process limits the time that a processor takes to wake up."""
+WAKE_UP_LATENCY = "/dev/cpu_dma_latency"  # limits the time that a processor takes to wake up
 
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
 def request() -> str:
-    """Ask the kernel for real-time scheduling, locked memory and a processor that stays awake.
+    """Ask for real-time scheduling, locked memory and a processor that stays awake.
 
-    Return "" if the kernel grants all three requests. Otherwise return a text for the user that
-    names the refused requests and the ways to get permission.
+    Return "", or a text for the user that names the refused requests and the ways to get
+    permission.
     """
     asked = {
         "real-time scheduling": _schedule(),
@@ -55,10 +49,9 @@ def request() -> str:
 
 
 def is_real_time(pid: int) -> bool | None:
-    """Return whether the first thread of a process has real-time scheduling.
+    """Return whether a process's first thread (the control loop) is real-time; None if unknown.
 
-    In the daemon, the first thread runs the control loop. `pid` 0 stands for the calling thread.
-    Returns None if the kernel does not say which scheduling the thread has.
+    `pid` 0 stands for the calling thread.
     """
     try:
         policy = os.sched_getscheduler(pid)
@@ -68,10 +61,9 @@ def is_real_time(pid: int) -> bool | None:
 
 
 def allowed() -> bool:
-    """Return whether a daemon started by this user would get real-time scheduling.
+    """Return whether a daemon of this user would get real-time scheduling.
 
-    It would if this process has the capability CAP_SYS_NICE, or if its limit RLIMIT_RTPRIO is at
-    least `PRIORITY`. In a container, even root may lack this capability.
+    In a container, even root may lack CAP_SYS_NICE.
     """
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     return _capable(_CAP_SYS_NICE) or limit == resource.RLIM_INFINITY or limit >= PRIORITY
@@ -102,10 +94,7 @@ def _schedule() -> bool:
 
 
 def _stay_awake() -> bool:
-    """Keep the processors out of deep sleep until this process ends. Return False if refused.
-
-    A processor in deep sleep wakes late and with cold caches.
-    """
+    # A processor in deep sleep wakes late and with cold caches.
     try:
         wish = os.open(WAKE_UP_LATENCY, os.O_WRONLY | os.O_CLOEXEC)
     except FileNotFoundError:

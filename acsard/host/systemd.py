@@ -11,11 +11,10 @@ from collections.abc import Mapping
 
 from acsard.core.values import NS_PER_S, Outputs
 
-FEEDS_PER_WATCHDOG = 4
-"""Number of times that the control loop feeds systemd's watchdog within the watchdog's timeout."""
+FEEDS_PER_WATCHDOG = 4  # within the watchdog's timeout
 
+# Each call of `waiting` adds this before systemd ends a process that is still starting.
 START_EXTENSION_S = 30
-"""Time that each call of `waiting` adds before systemd ends a process that is still starting, s."""
 
 
 class Systemd:
@@ -51,11 +50,7 @@ class Systemd:
         self._send("STOPPING=1\nSTATUS=ramping to zero")
 
     def waiting(self, why: str) -> None:
-        """Report why the start takes longer, so that systemd goes on waiting.
-
-        Call this again within `START_EXTENSION_S`. Otherwise systemd ends this process. `why` is
-        the reason, in words.
-        """
+        """Report why the start takes longer; repeat it within `START_EXTENSION_S`."""
         self._send(f"EXTEND_TIMEOUT_USEC={START_EXTENSION_S * 1_000_000}\nSTATUS={why}")
 
     def status(self, text: str) -> None:
@@ -65,10 +60,7 @@ class Systemd:
         self._send("WATCHDOG=1")
 
     def step(self, outputs: Outputs) -> None:
-        """Feed systemd's watchdog if that is due, and report the robot's status if it has changed.
-
-        Call this after each control step, with the outputs of the step.
-        """
+        """Feed systemd's watchdog if due, and report a changed status, after each control step."""
         if self._socket is None:
             return
         now_ns = outputs.now.mono_ns

@@ -12,21 +12,17 @@ from typing import TextIO
 
 
 def may_use_color(stream: TextIO) -> bool:
-    """Return whether output to a stream may contain colors.
-
-    The output may contain colors if the stream is a terminal, TERM is not "dumb", and the
-    environment variable NO_COLOR is not set.
-    """
+    """Return whether the stream is a terminal with colors, and NO_COLOR is not set."""
     wanted = not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
     return wanted and stream.isatty()
 
 
 @contextmanager
 def single_key_mode() -> Iterator[None]:
-    """Make the terminal deliver each key press immediately, without Enter, during a `with` block.
+    """Make the terminal deliver each key immediately during a `with` block.
 
-    In the block, Ctrl-S is an ordinary key. Otherwise Ctrl-S would stop the output of the terminal,
-    and so block a program that drives the robot.
+    Ctrl-S is an ordinary key there: it would stop the output, and so a program that drives the
+    robot.
     """
     before = termios.tcgetattr(sys.stdin)
     tty.setcbreak(sys.stdin)

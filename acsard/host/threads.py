@@ -23,14 +23,10 @@ class NoThreadError(TimeoutError):
 async def in_thread(
     call: Callable[[], T], timeout: float | None, late: Callable[[T], None] | None = None
 ) -> T:
-    """Call `call` in a new thread, and return its result.
+    """Call `call` in a new thread, and return its result or raise its error.
 
-    If the caller stops waiting before it has the result, the thread passes the result to `late`.
-    For example, `late` closes a file that `call` has opened. An error that `call` raises is raised
-    here too.
-
-    Raises `TimeoutError` if `call` has not returned after `timeout` s; None means no time limit.
-    Raises `NoThreadError` if no thread can be started.
+    If the caller no longer waits, the thread passes the result to `late`, which closes for example
+    a file that `call` opened. Raises `TimeoutError` after `timeout` s, and `NoThreadError`.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
@@ -71,10 +67,9 @@ async def in_thread(
 
 
 def future_of(call: Callable[[], T], wake: Callable[[], object]) -> Future[T]:
-    """Call `call` in a new thread, and return the future of its result or its error.
+    """Return the future of `call` in a new thread, which then calls `wake`.
 
-    The thread calls `wake` when the future is done. Raises `NoThreadError` if no thread can be
-    started.
+    Raises `NoThreadError`.
     """
     future: Future[T] = Future()
 

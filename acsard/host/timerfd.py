@@ -12,7 +12,7 @@ import os
 import sys
 from typing import Final
 
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Ns
 from acsard.host import clock
 
 CLOCK_MONOTONIC: Final = 1
@@ -29,8 +29,7 @@ class _Itimerspec(ctypes.Structure):
 class TimerFd:
     """A timer whose file descriptor becomes readable when the timer expires.
 
-    The daemon's clock is CLOCK_MONOTONIC_RAW, and the kernel has no timerfd for this clock.
-    Therefore `set` passes the remaining time to the kernel, not the time of the expiration.
+    The kernel has no timerfd for CLOCK_MONOTONIC_RAW, so `set` passes the remaining time.
     """
 
     def __init__(self) -> None:
@@ -45,8 +44,8 @@ class TimerFd:
     def fileno(self) -> int:
         return int(self._fd)
 
-    def set(self, at_ns: int) -> None:
-        """Let the timer expire once, at the time `at_ns` of the clock `clock.mono_ns`, ns."""
+    def set(self, at_ns: Ns) -> None:
+        """Let the timer expire once, at a time of `clock.mono_ns`."""
         wait_ns = max(1, at_ns - clock.mono_ns())
         value = self._spec.it_value
         value.tv_sec, value.tv_nsec = divmod(wait_ns, NS_PER_S)

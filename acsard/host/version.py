@@ -12,28 +12,22 @@ from acsard import __version__
 
 _PACKAGE = Path(__file__).parents[1]
 
-COMMIT_FILE = "commit"
-"""Name of a file that `deploy/build_hook.py` adds to the package. It contains the git commit."""
+COMMIT_FILE = "commit"  # made by `deploy/build_hook.py`; it contains the git commit
 
 HASH_DIGITS = 9
-"""Number of hexadecimal digits of the commit's hash that the version contains."""
 
 
 @lru_cache(1)
 def version() -> str:
-    """Return the version of acsard, such as `0.1.0+g1a2b3c4d5`.
-
-    If the commit of the source is not known, the version is like `0.1.0`.
-    """
+    """Return the version, such as `0.1.0+g1a2b3c4d5`, or `0.1.0` if the commit is not known."""
     commit = _text(_PACKAGE / COMMIT_FILE) or commit_of(_PACKAGE.parent)
     return f"{__version__}+g{commit[:HASH_DIGITS]}" if commit else __version__
 
 
 def commit_of(clone: Path) -> str:
-    """Return the commit that is checked out in `clone`; "" if `clone` is not a git clone.
+    """Return the commit that is checked out in `clone`; "" if it is no git clone.
 
-    This function reads git's files itself, because a computer that runs the daemon may have no git.
-    The files do not show whether the source has changed since the commit.
+    This reads git's files, because a computer that runs the daemon may have no git.
     """
     git = clone / ".git"
     if git.is_file():  # the directory is a worktree
