@@ -8,7 +8,7 @@ from typing import Any
 from jsonschema import Draft202012Validator
 
 from acsard.web.app import ROUTES
-from acsard.web.openapi import FROM_ROBOT, GUIDED_PREFIX, document
+from acsard.web.openapi import FROM_ROBOT, document
 
 DOCUMENT = document("1", ROUTES)
 
@@ -30,8 +30,6 @@ def _judges(kinds: Iterable[dict[str, Any]]) -> dict[str, Draft202012Validator]:
 
 FRAMES = _judges(SCHEMAS[FROM_ROBOT]["oneOf"])
 
-GUIDES = _judges(SCHEMAS[GUIDED_PREFIX]["properties"]["guide"]["oneOf"])
-
 _FRAME = _judge({"$ref": f"#/components/schemas/{FROM_ROBOT}"})
 
 
@@ -51,9 +49,6 @@ def kinds(frames: Iterable[Any]) -> set[str]:
         (kind,) = [name for name, judge in FRAMES.items() if judge.is_valid(frame)] or [frame]
         assert _FRAME.is_valid(frame), frame
         names.add(kind)
-        if kind == GUIDED_PREFIX:
-            (line,) = [name for name, judge in GUIDES.items() if judge.is_valid(frame["guide"])]
-            names.add(line)
     return names
 
 

@@ -43,14 +43,14 @@ import msgspec
 from acsard.bus.address import address_of
 from acsard.calibration.calibration_report import CalibrationRefusal, keys, parts, report
 from acsard.calibration.guided.drive_plan import NEEDS, GuideError
-from acsard.calibration.guided.guided_drive import DriveOptions, guided_drive, other_robot
+from acsard.calibration.guided.guided_drive import DriveOptions, guided_drive
 from acsard.calibration.guided.robot_on_bus import SOURCE
 from acsard.calibration.log_table import LogError, NoCalibrationError
 from acsard.calibration.multipliers import Tape
 from acsard.calibration.recorded_drive import calibrated
 from acsard.calibration.ros_bag_log import AXES, Choice
 from acsard.calibration.solve import Calibration
-from acsard.cli.common import add_outcome, load, require_asking
+from acsard.cli.common import add_outcome, load
 from acsard.cli.connection import add_bus, require_one
 from acsard.client import connect
 from acsard.core.config.settings import Config
@@ -58,12 +58,10 @@ from acsard.core.messages.keys_and_roles import full_key
 from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.terminal_modes import single_key_mode
-from acsard.terminal.json_prompt import JsonPrompt
-from acsard.terminal.output import MAX_TEXT_WIDTH, plain, show
-from acsard.terminal.prompt import NobodyError, Prompt, ended_by_signals
-from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
+from acsard.terminal.output import MAX_TEXT_WIDTH, show
+from acsard.terminal.prompt import NobodyError, Prompt, TerminalPrompt, ended_by_signals
 
-DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_lines")
+DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes")
 """Names of the options for a guided drive. They cannot be used together with `--log`."""
 
 
@@ -106,14 +104,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    if not args.json_lines or args.log:
-        return _calibrate(args, None)
-    require_asking(args)
-    with JsonPrompt() as lines:
-        return _calibrate(args, lines)
-
-
-def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     _require_fitting(args)
     where, local_config = load(args.config)
     if args.write:
@@ -125,7 +115,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
             calibration = calibrated(args.log, local_config, args.distance, _choice(args))
             config = local_config
         else:
-            calibration, config = _guided(args, where, local_config, lines)
+            calibration, config = _guided(args, where, local_config)
     except (LogError, NoCalibrationError, GuideError, NobodyError) as error:
         notes = tuple(getattr(error, "__notes__", ()))
         if args.json:
@@ -144,17 +134,10 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
             # Print the result of the long drive before the error.
             trouble = error
     result = report(source, calibration, config.drive, written)
-    words = parts(result, calibration, where, guided=not args.log)
-    if lines is None:
-        if args.json:
-            print(msgspec.json.encode(result).decode())
-        else:
-            show(*words, most=MAX_TEXT_WIDTH)
+    if args.json:
+        print(msgspec.json.encode(result).decode())
     else:
-        lines.result(plain(*words, width=MAX_TEXT_WIDTH))
-        differing = other_robot(config, local_config, where)
-        if not args.write and lines.offer(args.config, keys(calibration), differing):
-            written = where
+        show(*parts(result, calibration, where, guided=not args.log), most=MAX_TEXT_WIDTH)
     if trouble is not None:
         raise trouble
     if written and not args.log:
@@ -229,16 +212,14 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _guided(
-    args: argparse.Namespace, file: str, file_config: Config, lines: JsonPrompt | None
-) -> tuple[Calibration, Config]:
+def _guided(args: argparse.Namespace, file: str, file_config: Config) -> tuple[Calibration, Config]:
     require_one(args)
     endpoint, robot_id, tls = address_of(file_config, args.connect, args.id, args.tls)
     _usable(args, full_key(robot_id, "odom"))
     options = DriveOptions(args.method, args.positions, args.positions_at, args.imu, args.yes)
     with connect(endpoint, robot_id=robot_id, source=SOURCE, tls=tls) as client:
         return guided_drive(
-            client, options, file, file_config, _prompt(args, lines), must_write=args.write
+            client, options, file, file_config, _prompt(args), must_write=args.write
         )
 
 
@@ -262,7 +243,7 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
             "--positions-at names the bus address of the key of --positions: give --positions KEY "
             "as well"
         )
-    if not (args.yes or args.json_lines or sys.stdin.isatty()):
+    if not (args.yes or sys.stdin.isatty()):
         raise UsageError(
             "`acsard calibrate` drives the robot, and a person at the terminal starts and stops "
             "each leg: run `acsard calibrate` in a terminal. Without a terminal, use --yes (only "
@@ -271,13 +252,9 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
 
 
 @contextmanager
-def _prompt(args: argparse.Namespace, lines: JsonPrompt | None) -> Iterator[Prompt]:
+def _prompt(args: argparse.Namespace) -> Iterator[Prompt]:
     if args.yes:
-        yield NoPrompt(args.json)
+        yield Prompt(args.json)
         return
-    with ended_by_signals():
-        if lines is not None:
-            yield lines
-            return
-        with single_key_mode():
-            yield TerminalPrompt(args.json)
+    with ended_by_signals(), single_key_mode():
+        yield TerminalPrompt(args.json)

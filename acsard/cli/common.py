@@ -17,7 +17,7 @@ from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import RECORD_VARIABLE, Config
 from acsard.core.formatting import many
 from acsard.host.config_file import find
-from acsard.host.errors import Exit, ExitError, UsageError
+from acsard.host.errors import Exit, ExitError
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
@@ -30,33 +30,17 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 
 
 def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
-    """Add the options --json, --json-lines and --write to the subcommand of `parser`.
+    """Add the options --json and --write to the subcommand of `parser`.
 
     `result` names the values that --write stores, such as "the result", for the help text.
     """
-    form = parser.add_mutually_exclusive_group()
-    form.add_argument("--json", action="store_true", help="print one JSON object")
-    form.add_argument(
-        "--json-lines",
-        action="store_true",
-        help="let another program ask the operator the questions: acsard writes messages and "
-        "questions to standard output as JSON, one object per line, and reads the answers from "
-        "standard input in the same form (deploy/web/README.md)",
-    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument(
         "--write",
         action="store_true",
         help=f"also write {result} into the configuration file and keep its comments (needs the "
         "library tomlkit; if it is missing, a message gives the command that installs it)",
     )
-
-
-def require_asking(args: argparse.Namespace) -> None:
-    if args.yes and args.json_lines:
-        raise UsageError(
-            "--yes cannot be used with --json-lines: with --yes acsard asks no questions, with "
-            "--json-lines a program asks them. Leave one of the two options out"
-        )
 
 
 def count(text: str) -> int:

@@ -14,7 +14,7 @@ from acsard.checkup import procedure
 from acsard.checkup.board import Wire
 from acsard.checkup.checkup_report import changes, report, summary, withheld
 from acsard.checkup.findings import Finding
-from acsard.cli.common import add_config, add_outcome, load, require_asking
+from acsard.cli.common import add_config, add_outcome, load
 from acsard.core.config.settings import SIMULATOR, Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
@@ -24,9 +24,7 @@ from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.processes import master_of
 from acsard.host.terminal_modes import single_key_mode
-from acsard.terminal.json_prompt import JsonPrompt
-from acsard.terminal.prompt import Prompt, ended_by_signals
-from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
+from acsard.terminal.prompt import Prompt, TerminalPrompt, ended_by_signals
 
 DESCRIPTION = """\
 Test the microcontroller on your own robot with its wheels lifted. The tool finds the protocol of
@@ -100,7 +98,7 @@ def _checked(
         prompt.show_finding(finding)
 
     words = " (the built-in SIMULATOR, in simulated time)" if simulated else ""
-    prompt.begin(f"port {port}{words}, configuration {where}", simulated=simulated)
+    prompt.begin(f"port {port}{words}, configuration {where}")
     trouble: MendableError | None = None
     try:
         with (
@@ -115,7 +113,7 @@ def _checked(
             raise
         # With --json, print the report before the error.
         trouble = error
-    named = args.port if args.write or (args.json_lines and not simulated) else ""
+    named = args.port if args.write else ""
     why = withheld(simulated, configured)
     found_changes = {} if why else changes(findings, configured, named)
     written = ""
@@ -130,12 +128,10 @@ def _checked(
     prompt.result(msgspec.json.encode(result).decode() if args.json else summary(result, where))
     if trouble is not None:
         raise trouble
-    if found_changes and not args.write:
-        prompt.offer(args.config, found_changes)
     return Exit.OK if result.passed else Exit.FAILURE
 
 
-def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | JsonPrompt:
+def _prompt(args: argparse.Namespace, port: str) -> Prompt:
     """Return the prompt that the options choose.
 
     Raises `UsageError` if the wheels of a board at `port` could turn without a person's consent.
@@ -146,9 +142,6 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
             '"sim"). Either find the device with `acsard ports` and run `acsard mcu check --port '
             "DEVICE`, or check the built-in simulator with `--port sim`",
         )
-    if args.json_lines:
-        require_asking(args)
-        return JsonPrompt()
     if not args.yes:
         if not sys.stdin.isatty():
             raise UsageError(
@@ -157,7 +150,7 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
             )
         return TerminalPrompt(args.json)
     if port == SIMULATOR or args.wheels_are_lifted or not os.path.exists(port):
-        return NoPrompt(args.json)
+        return Prompt(args.json)
     master = master_of(port)
     if master is None or master.name != "acsard":
         what = f"a pty of {master.name}" if master else "not a simulator of acsard"
@@ -166,7 +159,7 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
             "without a question. Either leave --yes out, or lift the wheels, stay with the robot "
             "and add --wheels-are-lifted",
         )
-    return NoPrompt(args.json)
+    return Prompt(args.json)
 
 
 def _wire(config: Config) -> Wire:

@@ -135,7 +135,6 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
         listen,
         tls,
         tokens.place(),
-        args.config or "",
         args.supervised,
     )
     log = Log(config.log)

@@ -1,23 +1,42 @@
-"""Defines how a subcommand asks a person, and which signals end a subcommand.
+"""Asks a person at a terminal, or answers questions itself, and ends a subcommand by signals.
 
-`TerminalPrompt`, `NoPrompt` and `JsonPrompt` implement the interface `Prompt`. Change all of them
-together.
+Questions and texts go to standard error. Findings and the result go to standard output, so that
+they can be redirected.
 """
 
 from __future__ import annotations
 
+import os
+import select
 import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+import termios
+import textwrap
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from types import FrameType
-from typing import Protocol
+from typing import Self
 
 from msgspec import Struct
+from rich.table import Table
+from rich.text import Text
 
 from acsard.checkup.findings import Finding
 from acsard.core.values import AcsardError
-from acsard.terminal.output import has_room
+from acsard.terminal.output import MAX_TEXT_WIDTH, has_room, show, table
+
+BAR_WIDTH = 30
+
+QUIT_KEY = "q"
+
+COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red", "SKIPPED": "bright_black"}
+
+PROMPT_END_SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
+"""The signals that end a subcommand that moves something.
+
+The signal of Ctrl-Z (SIGTSTP) is one of them, because a suspended subcommand would leave a wheel
+turning.
+"""
 
 
 class NobodyError(AcsardError):
@@ -55,66 +74,210 @@ class NumberQuestion(Struct, frozen=True):
         return number
 
 
-class Prompt(Protocol):
-    """Interface through which a subcommand informs and asks the person near the robot.
+class Prompt:
+    """Shows the output of a subcommand, and answers its questions without a person.
 
-    Every method that asks raises `KeyboardInterrupt` if the person quits.
+    It confirms each question that has only one possible answer, starts every drive without a wait,
+    and returns the default of each number. If `as_json` is true, it shows only texts and questions,
+    because the subcommand prints one JSON object as its result.
     """
 
-    def begin(self, subject: str, *, simulated: bool) -> None:
-        """Show `subject`, the name of the robot or board that is checked or calibrated.
+    def __init__(self, as_json: bool = False) -> None:
+        self._as_json = as_json
+        self._on = sys.stderr.isatty() and not as_json
+        self._visible = False
 
-        `simulated` says whether this robot or board is simulated.
-        """
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._clear()
+
+    def begin(self, subject: str) -> None:
+        if not self._as_json:
+            print(subject, flush=True)
 
     def show_text(self, text: str) -> None:
-        """Show a text that stays on the screen."""
+        self._print(f"\n{_wrapped(text)}\n")
 
     def doing(self, text: str) -> None:
-        """Show the present activity. The text replaces the text of the previous call."""
-
-    def progress(self, share: float) -> None:
-        """Show the completed share of the present drive or check, from 0 to 1."""
+        if self._on and has_room(sys.stderr):
+            # Cut the line and never wrap it, because a wrapped line cannot be overwritten.
+            self._print(f"\r\033[K{f'   ... {text}'[: _columns() - 1]}")
+            self._visible = True
 
     def show_finding(self, finding: Finding) -> None:
-        """Show one finding of a check. Call this as soon as the finding is known."""
+        if not self._as_json:
+            self._clear()
+            show(row(finding), most=MAX_TEXT_WIDTH)
 
     def result(self, text: str) -> None:
-        """Show the result. Call this only when nothing moves any more."""
-
-    def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
-        """Offer to write settings into the configuration file, and return whether this was done.
-
-        `config` is the path of the file, or None to search for the file. `keys` maps dotted keys of
-        the configuration to values. `trouble` is a reason not to write, or "".
-        """
+        self._clear()
+        print(text)
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """Ask a question. Return one of `answers`, or None if no person can choose an answer."""
+        """Return one of `answers`, or None if no person can choose an answer."""
+        return answers[0] if len(answers) == 1 else None
 
-    def start(self, text: str, by_key: bool = False) -> None:
-        """Show a text, and wait until the person starts a drive.
-
-        After the start, any key press stops the drive. If `by_key` is true, the person is expected
-        to end the drive this way. Otherwise the drive ends by itself, and a key press aborts it.
-        """
+    def start(self, text: str) -> None:
+        """Show a text, and wait until the person starts a drive, which any key press then stops."""
+        self.show_text(text)
 
     def number(self, ask: NumberQuestion) -> float:
-        """Ask for a number, and return it. Return the default of `ask` if no person can be asked.
-
-        Raises `NobodyError` if there is neither a person nor a default.
-        """
+        """Raise `NobodyError` if there is neither a person nor a default."""
+        if ask.usual is None:
+            raise NobodyError(
+                "this calibration method needs a person who measures: run it without --yes"
+            )
+        return ask.usual
 
     def keys(self, wait_s: float) -> str:
-        """Wait up to `wait_s` s for a key press. Return the pressed keys, or "" without a press."""
+        """Wait for a key press. Return the pressed keys, or "" without a press."""
+        select.select([], [], [], wait_s)
+        return ""
+
+    def progress(self, share: float) -> None:
+        """Show the completed share of the present drive, from 0 to 1."""
+
+    def _clear(self) -> None:
+        if self._visible:
+            self._print("\r\033[K")
+            self._visible = False
+
+    def _print(self, text: str) -> None:
+        print(text, end="", file=sys.stderr, flush=True)
 
 
-PROMPT_END_SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
-"""The signals that end a subcommand that moves something.
+class TerminalPrompt(Prompt):
+    """Prompt that asks a person on standard error and reads the answers from standard input.
 
-The signal of Ctrl-Z (SIGTSTP) is one of them, because a suspended subcommand would leave a wheel
-turning.
-"""
+    Outside the context `host.terminal_modes.single_key_mode`, a key press takes effect only after
+    Enter. Use that context if a single key press must stop the robot.
+    """
+
+    def ask(self, question: str, answers: Sequence[str]) -> str:
+        """Ask a question until the person types one of `answers`, and return this answer.
+
+        Raises `KeyboardInterrupt` if the person types "q", or if standard input ends.
+        """
+        self._clear()
+        choice = f" [{'/'.join((*answers, QUIT_KEY))}]" if len(answers) > 1 else ""
+        with _lines() if sys.stdin.isatty() else nullcontext():
+            # A line that was typed before the question appeared must not answer it.
+            _forget_input()
+            while True:
+                self._print(f"\n{question}{choice} ")
+                line = _line()
+                word = line.strip().lower()
+                if not line or word == QUIT_KEY:
+                    raise KeyboardInterrupt
+                if word in answers:
+                    return word
+                self._print(f"   please type {' or '.join(answers)}; {QUIT_KEY} quits\n")
+
+    def start(self, text: str) -> None:
+        self.show_text(text)
+        # Keys that were pressed before the text appeared must not start anything.
+        _forget_input()
+        self.show_text("Enter starts this drive, then any key stops it; q quits.")
+        while True:
+            pressed = _read()
+            if not pressed.strip("\r\n"):
+                return
+            if QUIT_KEY in pressed:
+                raise KeyboardInterrupt
+
+    def number(self, ask: NumberQuestion) -> float:
+        with _lines():
+            _forget_input()
+            while True:
+                self._print(f"\n{_wrapped(ask.words)}\n{ask.unit}: ")
+                line = _read().strip()
+                if line == QUIT_KEY:
+                    raise KeyboardInterrupt
+                try:
+                    return ask.number(line)
+                except ValueError as error:
+                    self.show_text(f"{error} (q quits)")
+
+    def keys(self, wait_s: float) -> str:
+        return _read() if select.select([sys.stdin], [], [], wait_s)[0] else ""
+
+    def progress(self, share: float) -> None:
+        # A terminal that does not read, for example over a connection that hangs, must not keep a
+        # key from stopping the robot.
+        if sys.stderr.isatty() and has_room(sys.stderr):
+            done = round(BAR_WIDTH * share)
+            bar = "#" * done + "." * (BAR_WIDTH - done)
+            self._print(f"\r[{bar}] any key stops {'' if share < 1.0 else chr(10)}")
+
+
+def row(finding: Finding) -> Table:
+    """Return a table that shows a finding: verdict, name, measurement, meaning and remedy."""
+    verdict = Text(f"{finding.verdict:<7}", COLOURS[finding.verdict])
+    below = [finding.text, f"-> {finding.mend}" if finding.mend else ""]
+    head = f"{finding.name:<22} {finding.figure}"
+    return table([(verdict, head), *(("", text) for text in below if text)], gap=1)
+
+
+@contextmanager
+def _quits_if_closed() -> Iterator[None]:
+    """Raise `KeyboardInterrupt` if the terminal has been closed."""
+    try:
+        yield
+    except (OSError, termios.error):
+        raise KeyboardInterrupt from None
+
+
+@_quits_if_closed()
+def _read() -> str:
+    read = os.read(sys.stdin.fileno(), 256)
+    if not read:
+        raise KeyboardInterrupt
+    return read.decode(errors="replace")
+
+
+@_quits_if_closed()
+def _line() -> str:
+    try:
+        return sys.stdin.readline()
+    except UnicodeDecodeError:
+        return "?\n"  # not an answer to any question
+
+
+@_quits_if_closed()
+def _forget_input() -> None:
+    if sys.stdin.isatty():
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)
+
+
+@contextmanager
+def _lines() -> Iterator[None]:
+    """Let the terminal deliver and echo whole lines of input in the `with` block."""
+    with _quits_if_closed():
+        before = termios.tcgetattr(sys.stdin)
+        cooked = list(before)
+        # Python 3.12.0 and 3.12.1 clear ICRNL in `tty.setcbreak`. Then Enter would not end a line.
+        cooked[0] |= termios.ICRNL
+        cooked[3] |= termios.ICANON | termios.ECHO
+        termios.tcsetattr(sys.stdin, termios.TCSANOW, cooked)
+    try:
+        yield
+    finally:
+        # The terminal may have been closed.
+        with suppress(OSError, termios.error):
+            termios.tcsetattr(sys.stdin, termios.TCSANOW, before)
+
+
+def _columns() -> int:
+    """Return the width of the terminal at stderr, or 80 if stderr is not a terminal."""
+    with suppress(OSError):
+        return os.get_terminal_size(sys.stderr.fileno()).columns or 80
+    return 80
+
+
+def _wrapped(text: str) -> str:
+    return "\n".join(textwrap.wrap(text, min(_columns(), MAX_TEXT_WIDTH)))
 
 
 @contextmanager

@@ -44,11 +44,10 @@ from acsard.web.answers import (
 )
 from acsard.web.callers import PROTOCOL, RequestRefusedError, cookie_name, tokens_offered
 from acsard.web.camera import SEND_TIMEOUT_S, Camera
-from acsard.web.guide import SLOW_PORTS, Choices
 from acsard.web.limits import OPENINGS, PICTURES, STOPS, WebSocketLimits
 from acsard.web.recordings import POLICY, BlackBox, Recording, Reports, ReportState, State
 from acsard.web.routes import FORM, JSON, RECORDINGS_ROLE, Body, Problem, Route, services, values
-from acsard.web.socket_messages import MAX_MESSAGE_BYTES, Begin
+from acsard.web.socket_messages import MAX_MESSAGE_BYTES
 from acsard.web.streams import as_json
 from acsard.web.tasks import shared
 from acsard.web.tokens import Vault
@@ -276,13 +275,6 @@ class Page:
     async def settings(self, request: web.Request) -> web.StreamResponse:
         return reply(settings_in(msgspec.json.decode(await self._value("config"))))
 
-    async def guide(self, request: web.Request) -> web.StreamResponse:
-        try:
-            choices = await self._parts.guide.choices(simulated=self._robots.about.simulated)
-        except TimeoutError:
-            raise TroubleError(503, SLOW_PORTS) from None
-        return reply(choices)
-
     async def service(self, request: web.Request) -> web.StreamResponse:
         """Call the robot's service that the path names.
 
@@ -470,9 +462,6 @@ ROUTES: tuple[Route, ...] = (
         "the settings that srv/set accepts: values, ranges, and whether each may change while the "
         "robot moves",
         gives={200: Body("A list.", list[Setting])}),
-    Route("GET", "/api/guide", Begin.least, Page.guide,
-        "the values that the WebSocket message `begin` accepts: calibration methods, serial ports",
-        gives={200: Body("The choices.", Choices)}),
     Route("GET", "/api/camera", "viewer", Page.picture,
         "the newest picture of the camera; the headers give its age (`Age-Ms`) and how long the "
         "request waited here (`Waited-Ms`), in ms; a request that has the last picture's `ETag` "

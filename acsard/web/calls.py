@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Hashable, Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from acsard.bus import robot_discovery
 from acsard.bus.address import require_id
@@ -49,30 +49,15 @@ T = TypeVar("T")
 Stop = Callable[[], Awaitable[ServiceReply]]
 
 
-class Ending(NamedTuple):
-    """The result of interrupting the check or calibration that the page's server runs."""
-
-    words: str = ""
-    """The result in words; "" if nothing was running."""
-    ended: bool = True
-    """False if the interrupted process has not exited yet."""
-
-
 class Calls:
     """Sends service calls and queries to robots, within the limits of this module."""
 
-    def __init__(
-        self,
-        robots: Robots,
-        interrupt_guide: Callable[[], Awaitable[Ending]],
-        is_known: Callable[[str], bool],
-    ) -> None:
+    def __init__(self, robots: Robots, is_known: Callable[[str], bool]) -> None:
         """Create an instance that has no running calls.
 
-        `interrupt_guide` interrupts the running check or calibration, if any. `is_known` returns
-        whether the server has found the robot with the given id on the bus.
+        `is_known` returns whether the server has found the robot with the given id on the bus.
         """
-        self._robots, self._interrupt_guide, self._is_known = robots, interrupt_guide, is_known
+        self._robots, self._is_known = robots, is_known
         self._stops, self._merged = Stops(), StopMerger()
         self._unknown = Buckets(REMOTE_STOP_RATE)
         self._answered: set[str] = set()
@@ -85,29 +70,14 @@ class Calls:
     ) -> ServiceReply:
         """Call the service `verb` for the client `identity`, and return the reply.
 
-        A stop of the page's own robot also interrupts the running check or calibration. `robot` is
-        the id of the robot, or "" for the page's own robot. Only `stop` may be called for another
-        robot. Raises `RequestRefusedError` if the client may not make this call, or sends too many
-        stops to robots that may not exist.
+        `robot` is the id of the robot, or "" for the page's own robot. Only `stop` may be called
+        for another robot. Raises `RequestRefusedError` if the client may not make this call, or
+        sends too many stops to robots that may not exist.
         """
         require(identity, verb)
         other = "" if robot == self._robots.id else robot
         if other:
             _require_stop(verb, other)
-        if verb != "stop" or other:
-            return await self._called(identity, verb, payload, other)
-        # A running check turns the wheels, and has opened the serial port in place of the daemon.
-        # The daemon cannot stop the wheels then, so interrupt the check too.
-        ending, reply = await asyncio.gather(
-            self._interrupt_guide(), self._called(identity, verb, payload, other)
-        )
-        if not ending.words:
-            return reply
-        return ServiceReply(reply.success and ending.ended, f"{ending.words}; {reply.message}")
-
-    async def _called(
-        self, identity: AdmittedClient, verb: str, payload: Mapping[str, Any], other: str
-    ) -> ServiceReply:
         client = self._robots.client
         if client is None:
             return ServiceReply(False, self._robots.gone)

@@ -14,7 +14,6 @@ from msgspec import Meta, Struct
 
 from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.keys_and_roles import FOLLOWED
-from acsard.terminal import json_prompt
 from acsard.web import socket_messages
 from acsard.web.routes import Body, Problem, Route
 from acsard.web.socket_messages import MESSAGE_TYPES
@@ -31,20 +30,11 @@ WebSocket messages that the server sends (`FROM_ROBOT`)."""
 VALUE_PREFIX = "Value."
 """Prefix of the names of the schemas that describe the values of subscribed keys."""
 
-GUIDED_PREFIX = "Guided"
-
 SENT_MESSAGES = (
     socket_messages.Hello, socket_messages.DrivenPath, socket_messages.LastMinute,
     socket_messages.Answer, socket_messages.Rows, socket_messages.Pong, socket_messages.Refused,
     socket_messages.DaemonUnreachable,
 )  # fmt: skip
-
-GUIDE_MESSAGES = (
-    socket_messages.Running, socket_messages.Ended, json_prompt.Subject,
-    json_prompt.JobMessage, json_prompt.Doing, json_prompt.Progress, json_prompt.Question,
-    json_prompt.FindingMessage, json_prompt.Result,
-)  # fmt: skip
-"""Types of the field `guide` of a WebSocket message, which reports on a check or calibration."""
 
 KEYS = {topic.key: topic.type for topic in FOLLOWED}
 """Name of the message type of each key to which clients can subscribe, by key."""
@@ -102,7 +92,7 @@ def document(version: str, routes: Sequence[Route]) -> Described:
     bodies += [row.takes for row in described if row.takes is not None]
     own = [kind for kind in bodies if not isinstance(kind, str)]
     schemas, refs = _components(
-        [Problem, *own, *MESSAGE_TYPES.values(), *SENT_MESSAGES, *VALUE_MESSAGES, *GUIDE_MESSAGES]
+        [Problem, *own, *MESSAGE_TYPES.values(), *SENT_MESSAGES, *VALUE_MESSAGES]
     )
     for kind in MESSAGE_TYPES.values():
         schemas[kind.__name__]["x-least-role"] = kind.least
@@ -213,15 +203,9 @@ def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
 
 
 def _of_the_socket(refs: Refs) -> Described:
-    guided = msgspec.defstruct(
-        GUIDED_PREFIX,
-        [("guide", _raw({"oneOf": [refs[kind] for kind in GUIDE_MESSAGES]}))],
-        namespace={"__doc__": socket_messages.Guided.__doc__},
-    )
-    components, own = _components([guided])
-    from_robot = [*(refs[kind] for kind in (*SENT_MESSAGES, *VALUE_MESSAGES)), own[guided]]
+    from_robot = [refs[kind] for kind in (*SENT_MESSAGES, *VALUE_MESSAGES)]
     to_robot = [refs[kind] for kind in MESSAGE_TYPES.values()]
-    return components | {
+    return {
         TO_ROBOT: {"title": TO_ROBOT, "oneOf": to_robot},
         FROM_ROBOT: {"title": FROM_ROBOT, "oneOf": from_robot},
     }

@@ -29,7 +29,6 @@ from acsard.host.threads import NoThreadError, in_thread
 from acsard.web.acceptor import READ_BYTES, Acceptor, Reader
 from acsard.web.app import Page
 from acsard.web.callers import is_loopback
-from acsard.web.guide import Guide
 from acsard.web.listen import Listen, open_sockets, own_name, require_certificate
 from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
@@ -60,8 +59,6 @@ class ServerOptions(Struct, frozen=True):
     """Directory of the robot's certificate, for HTTPS; "" without a certificate."""
     state: Path
     """Directory that contains the file with the access tokens."""
-    file: str = ""
-    """Path of the configuration file from the command line; "" if the command line names none."""
     supervised: bool = False
     """True if the daemon started this server. Such a server uses a later TCP port if the requested
     port is in use, and ends when its standard input closes."""
@@ -90,8 +87,7 @@ async def serve(
     files = CertificateFiles(*files_in(options.tls))
     secure, names = _certified(options)
     robots = Robots(options.address, lambda: _connected(options.address), _about(options), counts)
-    guide = Guide(options.address, options.file, options.config.mcu.port)
-    parts = Parts(robots, guide, counts)
+    parts = Parts(robots, counts)
     vault, acceptor = Vault(options.state, options.address.robot_id), Acceptor(counts)
     page = Page(parts, vault, names, acceptor, options.config.web)
     runner = web.AppRunner(
@@ -104,7 +100,6 @@ async def serve(
     async with AsyncExitStack() as stack:
         await runner.setup()
         stack.push_async_callback(runner.cleanup)
-        stack.push_async_callback(guide.close)
         places = open_sockets(options.listen, options.supervised)
         for address, opened in places:
             tls = secure if address.secure else None

@@ -11,7 +11,7 @@ keys are built in `socket_sender.py`, because these values are JSON already.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, get_args
 
 import msgspec
 from msgspec import Meta, Struct
@@ -37,7 +37,6 @@ DEFAULT_SOURCE = "app"
 """Command source of a command that names no source. The page in the browser names `teleop`."""
 
 Short = Annotated[str, Meta(max_length=80)]
-Device = Annotated[str, Meta(max_length=200)]
 
 
 class FrameError(AcsardError):
@@ -127,35 +126,7 @@ class Ping(_Frame, frozen=True):
     ping: float
 
 
-class Begin(_Frame, frozen=True):
-    """Start a check of the board at `port`, or a calibration with `method` ("" for the default)."""
-
-    # A check and a calibration turn the wheels and write configuration files.
-    least: ClassVar[Role] = "maintainer"
-    begin: Literal["check", "calibrate"]
-    port: Device = ""
-    method: Short = ""
-    positions: Short = ""
-    """Zenoh key on which the robot's positions are published; only for the method `positions`."""
-
-
-class Reply(_Frame, frozen=True):
-    """Answer the question number `reply`. If `value` is null, the default is the answer."""
-
-    reply: Annotated[int, Meta(ge=0, le=1 << 31)]
-    value: float | Short | None = None
-
-
-class Press(_Frame, frozen=True):
-    """Control the running check or calibration.
-
-    "key" presses a key in the check or calibration, and "leave" interrupts it.
-    """
-
-    press: Literal["key", "leave"]
-
-
-Frame = Subscribe | Unsubscribe | Command | Call | Ping | Begin | Reply | Press
+Frame = Subscribe | Unsubscribe | Command | Call | Ping
 
 MESSAGE_TYPES: dict[str, type[Frame]] = {
     kind.__struct_fields__[0]: kind for kind in get_args(Frame)
@@ -237,7 +208,7 @@ class Greeting(Struct, frozen=True):
     """Rate of the key `state`, Hz."""
     barred: Mapping[str, str]
     """The actions that the client's role does not allow, each with the reason in words. An action
-    is the name of a service, "drive", "recordings" or "begin" (a check or calibration)."""
+    is the name of a service, "drive" or "recordings"."""
     camera: bool
     """True if a camera is configured. The path `/api/camera` then returns its pictures."""
 
@@ -320,33 +291,3 @@ class DaemonUnreachable(Struct, frozen=True):
     """Report that the daemon is not reachable. `gone` is the reason."""
 
     gone: str
-
-
-class Running(Struct, frozen=True, omit_defaults=True):
-    """Report that a check or calibration is running, or that none is running.
-
-    `running` is "check" or "calibrate", or "" if none is running. `by` is the name of the user who
-    started the check or calibration. `yours` is true if this WebSocket has started it.
-    """
-
-    running: str
-    by: str = ""
-    yours: bool | None = None
-
-
-class Ended(Struct, frozen=True):
-    """Report that a check or calibration has ended.
-
-    `ended` is the exit code, `meaning` is its meaning in words, and `text` is the error text. If a
-    signal ended the process, the exit code is 128 plus the number of the signal.
-    """
-
-    ended: int
-    meaning: str
-    text: str
-
-
-class Guided(Struct, frozen=True):
-    """Report about a check or calibration: that it runs, a line that it printed, or its end."""
-
-    guide: Running | msgspec.Raw | Ended

@@ -28,20 +28,16 @@ from acsard.web import socket_messages
 from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.calls import Calls
 from acsard.web.fleet_rows import FleetTracker
-from acsard.web.guide import Guide
 from acsard.web.limits import COMMAND_RATE, MAX_OVERRUNS, MESSAGE_RATE
 from acsard.web.metrics import Counts
 from acsard.web.robots import Robots
 from acsard.web.routes import RECORDINGS_ROLE
 from acsard.web.socket_messages import (
-    Begin,
     Call,
     Command,
     Frame,
     FrameError,
     Ping,
-    Press,
-    Reply,
     Subscribe,
     Unsubscribe,
     asks_to_stop,
@@ -54,7 +50,6 @@ ACTIONS: dict[str, Role] = {
     **{str(verb): role for verb, role in SERVICE_ROLES.items()},
     "drive": COMMAND_ROLE,
     "recordings": RECORDINGS_ROLE,
-    "begin": Begin.least,
 }
 """Maps the name of each action to the lowest role that may use the action. The page disables the
 controls of those actions that its user may not use."""
@@ -124,11 +119,11 @@ class ViewerCommands:
 class Parts:
     """The objects that `Page` and all viewers share, such as the connection to the daemon."""
 
-    def __init__(self, robots: Robots, guide: Guide, counts: Counts) -> None:
-        self.robots, self.guide, self.counts = robots, guide, counts
+    def __init__(self, robots: Robots, counts: Counts) -> None:
+        self.robots, self.counts = robots, counts
         self.commands = ViewerCommands(lambda: robots.client, counts)
         self.fleet = FleetTracker(robots)
-        self.calls = Calls(robots, guide.stop, self.fleet.sees)
+        self.calls = Calls(robots, self.fleet.sees)
 
 
 class Viewer:
@@ -145,7 +140,7 @@ class Viewer:
     ) -> None:
         self.who, self._camera = who, camera
         self._robots, self._commands, self._calls = parts.robots, parts.commands, parts.calls
-        self._fleet, self._guide, self._counts = parts.fleet, parts.guide, parts.counts
+        self._fleet, self._counts = parts.fleet, parts.counts
         whole = sender_id(who.name)
         self._sender, self._commanders = CommandSigner(whole), dict[str, Commander]()
         self.sender = public_name(whole, parts.robots.certificate)
@@ -168,7 +163,6 @@ class Viewer:
         self._greet()
         self._out.enqueue(socket_messages.DrivenPath(**self._robots.paths()))
         self._out.enqueue(socket_messages.LastMinute(self._robots.minute()))
-        self._guide.join(self, self._out.enqueue)
         pump = asyncio.create_task(self._out.pump(self._look_around))
         try:
             async for message in self._socket:
@@ -176,7 +170,6 @@ class Viewer:
         finally:
             # Stop the robot first, because this viewer may have been driving.
             self._release()
-            self._guide.leave(self)
             pump.cancel()
             for task in list(self._tasks):
                 task.cancel()
@@ -192,7 +185,6 @@ class Viewer:
             return
         self._ended = True
         self._release()
-        self._guide.leave(self)
         self._start(self._out.close(why))
 
     # Incoming messages.
@@ -220,10 +212,8 @@ class Viewer:
                 self._obey(Call("stop"))
         else:
             # A message that ends a drive or stops the robot is obeyed even beyond the limit.
-            urgent = (
-                isinstance(frame, Press)
-                or (isinstance(frame, Call) and frame.call == "stop")
-                or (isinstance(frame, Command) and not frame.moves)
+            urgent = (isinstance(frame, Call) and frame.call == "stop") or (
+                isinstance(frame, Command) and not frame.moves
             )
             if room or urgent:
                 self._obey(frame)
@@ -244,7 +234,6 @@ class Viewer:
             self._out.pong(message.data)
 
     def _obey(self, frame: Frame) -> None:
-        self._guide.on_message(self)
         try:
             self.who.require(frame.least, frame.kind)
         except RequestRefusedError as error:
@@ -262,14 +251,6 @@ class Viewer:
                 self._subscribe(frame)
             case Unsubscribe():
                 self._unsubscribe(frame)
-            case Begin():
-                if why := self._guide.begin(self, self.who.name, frame):
-                    self._out.refuse("begin", "too_many", why)
-            case Reply():
-                if why := self._guide.reply(self, frame):
-                    self._out.refuse("reply", "malformed", why)
-            case Press():
-                self._guide.press(self, frame)
 
     def _command(self, frame: Command) -> None:
         if frame.source not in self._robots.about.timeouts:

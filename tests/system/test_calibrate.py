@@ -33,7 +33,7 @@ from acsard.core.config.settings import Config, JointsConfig
 from acsard.core.link.link_diagnosis import blames_host
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
-from acsard.terminal.terminal_prompt import NoPrompt
+from acsard.terminal.prompt import Prompt
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,
@@ -437,7 +437,7 @@ def test_an_unreadable_state_ends_the_leg_with_the_reason(free: str) -> None:
         publisher = threading.Thread(target=publish)
         publisher.start()
         try:
-            robot = RobotOnBus(client, Config(), NoPrompt())
+            robot = RobotOnBus(client, Config(), Prompt())
             with pytest.raises(GuideError, match="state cannot be read"):
                 robot.ride(Leg("ahead", "", (Move(1.0, 0.1),)))
         finally:

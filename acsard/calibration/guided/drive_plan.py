@@ -33,14 +33,6 @@ NEEDS: dict[str, str] = {
 }
 """Equipment that the person needs for each method, by the name of the method in `--method`."""
 
-SIMULATED = (
-    "positions",
-    "The simulator has no floor to measure with a tape. Use either the method positions with the "
-    "Zenoh key sim/pose (the true position), or the method gyro if [odometry] gyro is on; the "
-    "method gyro asks for a distance, which you leave empty. The method tape is for a real robot.",
-)
-"""Method of calibration to try first on the simulator, and the reason for this choice."""
-
 
 class GuideError(AcsardError):
     """The guided drive cannot continue. The text says why and what to do. No file was changed."""

@@ -83,7 +83,7 @@ def guided_drive(
     true = info.simulated and options.positions in (TRUE_POSE, full_key(robot_id, TRUE_POSE))
     with ExitStack() as stack:
         asker = stack.enter_context(prompt)
-        asker.begin(f"robot {robot_id} at {client.where.endpoint}", simulated=info.simulated)
+        asker.begin(f"robot {robot_id} at {client.where.endpoint}")
         robot = RobotOnBus(client, config, asker)
         if method == "gyro":
             robot.gyro(options.imu or IMU)

@@ -121,7 +121,7 @@ def guide(
     ask_for("", method.asks)
     while number < len(legs := method.legs(setup, track)):
         leg = legs[number]
-        prompt.start(f"{number + 1}. {leg.words} ({leg.seconds:.0f} s)", leg.by_key)
+        prompt.start(f"{number + 1}. {leg.words} ({leg.seconds:.0f} s)")
         try:
             rides[leg.name] = ride(leg)
         except DisturbedError as error:

@@ -1,15 +1,13 @@
-// Keeps the screen on while this page moves something. When the screen locks, the browser hides the page, which
-// releases the stick and ends a drive of a calibration.
+// Keeps the screen on while the stick is held. When the screen locks, the browser hides the page, which releases the
+// stick.
 
-const movers = new Set();
+let held = false;
 let lock = null;
 let turn = Promise.resolve();
 
-/** Register that `mover` starts (`on`) or stops moving something. */
-export function awake(mover, on) {
-  if (on === movers.has(mover)) return;
-  if (on) movers.add(mover);
-  else movers.delete(mover);
+/** Register that the stick is held (`on`) or released. */
+export function awake(on) {
+  held = on;
   take();
 }
 
@@ -17,10 +15,9 @@ export function awake(mover, on) {
  *  requested cannot be released. */
 function take() {
   turn = turn.then(async () => {
-    const wanted = movers.size > 0 && !document.hidden;
     try {
-      if (wanted && (lock?.released ?? true)) lock = await navigator.wakeLock?.request("screen");
-      else if (!movers.size) await lock?.release();
+      if (held && !document.hidden && (lock?.released ?? true)) lock = await navigator.wakeLock?.request("screen");
+      else if (!held) await lock?.release();
     } catch {
       // Without HTTPS or with a low battery the browser refuses, and the screen locks as usual.
     }

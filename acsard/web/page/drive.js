@@ -73,7 +73,7 @@ export class Drive {
     this.#told("");
     this.#commander.press(performance.now());
     this.stick.classList.add("held");
-    awake("stick", true);
+    awake(true);
     this.#timer = setInterval(() => this.#look(), LOOK);
     this.#look();
   }
@@ -103,7 +103,7 @@ export class Drive {
     const last = performance.now() + 3 * TWICE;
     this.#again = setTimeout(() => !document.hidden && performance.now() < last && this.#send(ZERO), TWICE);
     this.stick.classList.remove("held", "follows");
-    awake("stick", false);
+    awake(false);
     this.#told(why);
   }
 

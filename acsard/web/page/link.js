@@ -15,7 +15,6 @@ export class Link extends EventTarget {
   #heard = 0;
   #ahead = null; // lead of the wall clock over performance.now() at the last ping, ms
   #asked = null; // send time of the ping that has no answer yet
-  #timer = null;
   #refused;
   #shut = false; // closed for good
   open = false;
@@ -29,7 +28,8 @@ export class Link extends EventTarget {
 
   start() {
     this.#connect();
-    this.beat();
+    setInterval(() => this.#ping(), BEAT);
+    this.#ping();
     document.addEventListener("visibilitychange", () => document.hidden || this.open || this.#connect());
     // A browser may freeze a page with its open connection when the user leaves it, and resume it later. The
     // robot would count the frozen page as a viewer.
@@ -40,13 +40,6 @@ export class Link extends EventTarget {
   /** Possible age of the shown data in ms: the last round trip, or the time that a ping has waited. */
   get lag() {
     return Math.max(this.way ?? 0, this.#asked === null ? 0 : performance.now() - this.#asked);
-  }
-
-  /** Send a ping every `every` ms. The pings are also the signs of life of this page. */
-  beat(every = BEAT) {
-    clearInterval(this.#timer);
-    this.#timer = setInterval(() => this.#ping(), every);
-    this.#ping();
   }
 
   /** Subscribe to a key with at most `rate` messages a second, again after each reconnection. `robot` is the id of a
@@ -122,7 +115,7 @@ export class Link extends EventTarget {
       this.#asked = null;
     } else if ("answer" in message) this.#answer(message);
     else if ("key" in message) this.#tell(`key:${message.key}`, message);
-    else for (const kind of ["hello", "path", "minute", "fleet", "refused", "gone", "guide"]) if (kind in message) this.#tell(kind, message);
+    else for (const kind of ["hello", "path", "minute", "fleet", "refused", "gone"]) if (kind in message) this.#tell(kind, message);
   }
 
   #answer(message) {

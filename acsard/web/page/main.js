@@ -3,7 +3,6 @@
 import { barred, hint, invited, permit, refusal } from "./access.js";
 import { Camera } from "./camera.js";
 import { Drive, SOURCE } from "./drive.js";
-import { Guide } from "./guide.js";
 import { boarded, driving, objection, still } from "./commander.js";
 import { Link } from "./link.js";
 import { PathMap } from "./map.js";
@@ -42,7 +41,6 @@ const link = new Link(refused);
 const map = new PathMap($("map"));
 const drive = new Drive(link, $("stick"), $("knob"), told);
 const camera = new Camera($("camera"));
-const guide = new Guide(link);
 const settings = new Settings($("settings"), set);
 const recordings = new Recordings($("recordings"), $("no-recordings"));
 const plots = new Minute();
@@ -85,7 +83,6 @@ function open(name) {
   if (view === "set") {
     said({ ok: true, text: "" }); // the note of an earlier button is outdated
     configured();
-    guided();
   }
   map.redraw();
 }
@@ -157,11 +154,6 @@ async function configured() {
   const rows = await got("api/settings");
   if (rows.error) return views.text("set-told", rows.error);
   settings.show(rows);
-}
-
-async function guided() {
-  const why = hello && barred(hello, "set"); // both need the same role
-  guide.choices(why ? { error: `checks and calibrations are ${why}` } : await got("api/guide"));
 }
 
 function limited() {
@@ -386,7 +378,6 @@ link.addEventListener("fleet", ({ detail }) => {
   views.text("fleet-note", detail.note);
 });
 link.addEventListener("refused", ({ detail }) => {
-  if (["begin", "reply"].includes(detail.refused)) return guide.refused(detail.reason);
   told((detail.refused === "cmd" && objection(state, SOURCE, hello?.sender)) || detail.reason);
 });
 link.addEventListener("gone", ({ detail }) => {
@@ -457,7 +448,6 @@ stopping.after = (told) => {
 stopping.before = () => {
   complain("");
   drive.release();
-  guide.leave();
 };
 stopping.complete();
 // Opening an invitation where this page is already open only changes the part behind the #, so reload.

@@ -347,8 +347,6 @@ def driving(*words: str) -> int:
         (["--topic", "/imu"], "--topic and --yaw-axis need --log"),
         (["--yaw-axis=x"], "--topic and --yaw-axis need --log"),
         (["--log", "drive.csv", "--yes"], "--yes is for a guided drive"),
-        (["--log", "drive.csv", "--json-lines"], "--json-lines is for a guided drive"),
-        (["--yes", "--json-lines"], "with --json-lines a program asks them"),
     ],
 )
 def test_contradictory_options_are_refused_before_a_connection_is_made(

@@ -24,8 +24,7 @@ from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.host.errors import Exit, MendableError, NoPortError, UsageError
-from acsard.terminal.prompt import ended_by_signals
-from acsard.terminal.terminal_prompt import TerminalPrompt
+from acsard.terminal.prompt import TerminalPrompt, ended_by_signals
 from tests.unit.checkup.robots import Busy, Robot
 
 
@@ -273,12 +272,6 @@ def test_progress_does_not_go_into_a_pipe(
     assert "   ..." not in out
     check = ("--port", "sim", "--yes", "--json")
     assert on_terminal(80, lambda: called(tmp_path, *check), monkeypatch) == ""
-
-
-def test_yes_and_json_lines_exclude_each_other(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="--json-lines") as end:
-        called(tmp_path, "--port", "sim", "--yes", "--json-lines")
-    assert end.value.code == Exit.USAGE
 
 
 @pytest.mark.parametrize("typed", ["", "q\n", "what?\nQ\n"])

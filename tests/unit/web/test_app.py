@@ -14,7 +14,6 @@ from aiohttp import StreamReader, web
 from aiohttp.test_utils import make_mocked_request
 from msgspec.structs import replace
 
-from acsard.bus.address import Address
 from acsard.client import Client
 from acsard.core.config.live import LIVE
 from acsard.core.config.parsing import effective
@@ -29,7 +28,6 @@ from acsard.web.admission import IDENTITY_KEY
 from acsard.web.app import Page, settings_in
 from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.camera import Camera
-from acsard.web.guide import Guide
 from acsard.web.metrics import Counts
 from acsard.web.tokens import FILE, Vault
 from acsard.web.viewer import Parts
@@ -57,7 +55,7 @@ class Phone:
 
 def page_with_phone(directory: Path, ends: list[str]) -> Page:
     counts = Counts()
-    parts = Parts(robots(None), Guide(Address("", "", ""), "", ""), counts)
+    parts = Parts(robots(None), counts)
     page = Page(parts, Vault(directory, "acsar"), frozenset(), Acceptor(counts), WebConfig())
     page._viewers.add(Phone(ends))  # type: ignore[arg-type]
     return page
@@ -104,7 +102,7 @@ async def test_the_age_of_a_picture_counts_a_suspend(
 ) -> None:
     """The age must include the suspend, in which the monotonic clock stands still."""
     counts, headers = Counts(), dict[str, str]()
-    parts = Parts(robots(None), Guide(Address("", "", ""), "", ""), counts)
+    parts = Parts(robots(None), counts)
     page = Page(parts, Vault(tmp_path, "acsar"), frozenset(), Acceptor(counts), WebConfig())
     page._camera = Camera("http://127.0.0.1:1/")
 
@@ -142,7 +140,7 @@ class Daemon:
 def page_with_daemon(directory: Path) -> tuple[Page, list[tuple[str, str]]]:
     """Return a page, and the list of the calls that reach a robot: verb and robot."""
     counts, calls = Counts(), list[tuple[str, str]]()
-    parts = Parts(robots(cast(Client, Daemon(calls))), Guide(Address("", "", ""), "", ""), counts)
+    parts = Parts(robots(cast(Client, Daemon(calls))), counts)
     vault = Vault(directory, "acsar")
     return Page(parts, vault, frozenset(), Acceptor(counts), WebConfig()), calls
 

@@ -6,7 +6,7 @@ import asyncio
 import threading
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
@@ -22,7 +22,6 @@ from acsard.web.calls import (
     MAX_STOPS,
     MIN_STOP_INTERVAL_S,
     Calls,
-    Ending,
     StopMerger,
     Stops,
 )
@@ -36,17 +35,12 @@ from tests.unit.web.test_metrics import STATE
 PATIENCE_S = 20.0
 
 
-async def nothing() -> Ending:
-    return Ending()
-
-
 def calls_of(
     known: Robots,
-    interrupt_guide: Callable[[], Awaitable[Ending]] = nothing,
     is_known: Callable[[str], bool] = lambda robot: False,
 ) -> Calls:
     """Return the calls of a page's server that runs no board check and knows no other robot."""
-    return Calls(known, interrupt_guide, is_known)
+    return Calls(known, is_known)
 
 
 async def test_stops_beyond_the_limit_share_the_reply_of_a_stop_sent_after_them() -> None:
@@ -110,36 +104,6 @@ async def test_only_stop_may_be_called_on_another_robot_and_only_with_a_valid_id
     assert error.value.reason == "malformed"
     # Naming the page's own robot counts as its own.
     assert not (await calls.call(MAINTAINER, "clear", {}, "acsar")).success
-
-
-@pytest.mark.parametrize("ended", [True, False])
-def test_a_stop_succeeds_when_the_check_has_ended_and_the_daemon_has_replied(
-    ended: bool,
-) -> None:
-    async def interrupt_guide() -> Ending:
-        return Ending("the check started by phone has ended", ended)
-
-    def served(query: zenoh.Query) -> None:
-        with query:
-            answer = encode(ServiceReply(True, "stopped"), "msgpack")
-            kind = encoding_name("msgpack", "ServiceReply")
-            query.reply(query.key_expr, answer, encoding=kind)
-
-    async def story(client: Client | None) -> ServiceReply:
-        calls = calls_of(robots(client), interrupt_guide)
-        assert not (
-            await calls_of(robots(None), interrupt_guide).call(MAINTAINER, "clear", {})
-        ).success
-        return await calls.call(replace(MAINTAINER, role="viewer"), "stop", {})
-
-    outcome = asyncio.run(story(None))
-    assert not outcome.success, "no daemon has confirmed anything"
-    assert outcome.message.startswith("the check started by phone has ended; ")
-    with zenoh.open(quiet()) as session:
-        session.declare_queryable("acsard/acsar/srv/stop", served)
-        outcome = asyncio.run(story(Client(session, "acsar", "teleop")))
-    assert outcome.success == ended
-    assert outcome.message == "the check started by phone has ended; stopped"
 
 
 async def test_a_stop_of_another_robot_is_sent_however_many_replies_are_pending() -> None:

@@ -120,7 +120,6 @@ def test_each_path_names_the_least_role_that_may_use_it() -> None:
     for key in ("state", "config", "info"):
         assert role(f"/api/{key}", "get") == least_role(key)
     assert role("/api/recordings/{name}", "get") == "operator"
-    assert role("/api/guide", "get") == "maintainer"
     assert WHOLE["paths"]["/token"]["post"]["security"] == [{}]
 
 
@@ -128,4 +127,4 @@ def test_each_message_to_the_robot_names_the_least_role_that_may_send_it() -> No
     schemas = WHOLE["components"]["schemas"]
     least = {kind: schemas[kind.__name__]["x-least-role"] for kind in MESSAGE_TYPES.values()}
     assert least == {kind: kind.least for kind in MESSAGE_TYPES.values()}
-    assert set(least.values()) == {"viewer", "operator", "maintainer"}
+    assert set(least.values()) == {"viewer", "operator"}

@@ -16,13 +16,10 @@ from acsard.core.messages.signature import Signature, unpack
 from acsard.core.values import NS_PER_S
 from acsard.web.socket_messages import (
     MAX_STAMP_MS,
-    Begin,
     Call,
     Command,
     FrameError,
     Ping,
-    Press,
-    Reply,
     Subscribe,
     Unsubscribe,
     Wish,
@@ -41,12 +38,6 @@ def test_each_kind_of_message_is_recognized_by_its_field() -> None:
     assert decode('{"call": "stop", "id": 7}') == Call("stop", 7)
     assert decode('{"call": "set", "payload": {"a": 1}, "id": "x"}') == Call("set", "x", {"a": 1})
     assert decode('{"ping": 12.5}') == Ping(12.5)
-    assert decode('{"begin": "check", "port": "sim"}') == Begin("check", "sim")
-    assert decode('{"begin": "calibrate", "method": "tape"}') == Begin("calibrate", "", "tape")
-    assert decode('{"reply": 3, "value": 1.5}') == Reply(3, 1.5)
-    assert decode('{"reply": 3, "value": "start"}') == Reply(3, "start")
-    assert decode('{"reply": 3}') == Reply(3)
-    assert decode('{"press": "key"}') == Press("key")
 
 
 def test_a_stamp_keeps_its_tenth_of_a_ms_in_ns() -> None:
@@ -99,13 +90,6 @@ def test_a_command_of_two_zeros_moves_nothing() -> None:
         ('{"subscribe": "odom", "rate": 51}', "subscribe"),
         ('{"subscribe": 1}', "subscribe"),
         ('{"call": "stop", "payload": []}', "call"),
-        ('{"begin": "run"}', "begin"),
-        ('{"begin": "check", "port": "sim", "options": ["--yes"]}', "begin"),
-        ('{"begin": "check", "port": ["sim", "--yes"]}', "begin"),
-        ('{"reply": "3"}', "reply"),
-        ('{"reply": 3, "value": {"a": 1}}', "reply"),
-        ('{"reply": 3, "value": true}', "reply"),
-        ('{"press": "any"}', "press"),
         ("[" * 5000 + "]" * 5000, "message"),
     ],
 )

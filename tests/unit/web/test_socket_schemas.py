@@ -8,18 +8,16 @@ import msgspec
 import pytest
 from msgspec import Struct
 
-from acsard.checkup.findings import Finding
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.report import Report
 from acsard.core.values import Role
-from acsard.terminal import json_prompt
 from acsard.web import socket_messages
 from acsard.web.last_minute import Minute
-from acsard.web.openapi import GUIDE_MESSAGES, KEYS, SENT_MESSAGES, VALUE_PREFIX
+from acsard.web.openapi import KEYS, SENT_MESSAGES, VALUE_PREFIX
 from acsard.web.socket_sender import Following
 from acsard.web.streams import VIEWER_KEYS as FOLLOWED
-from tests.described import FRAMES, GUIDES, SCHEMAS, is_described_frame, kinds, spoilt
+from tests.described import FRAMES, SCHEMAS, is_described_frame, kinds, spoilt
 from tests.each import each
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
 
@@ -37,18 +35,6 @@ SAID: tuple[Struct, ...] = (
     socket_messages.Pong(12.5, 1e12),
     socket_messages.Refused("cmd", "why"),
     socket_messages.DaemonUnreachable("why"),
-)
-
-GUIDED: tuple[Struct, ...] = (
-    socket_messages.Running("check", "here", True),
-    socket_messages.Ended(0, "success", ""),
-    json_prompt.Subject("port sim", True),
-    json_prompt.JobMessage("so"),
-    json_prompt.Doing("so"),
-    json_prompt.Progress(0.5),
-    json_prompt.Question(question=1, words="How far?", unit="m", least=0.5, most=3.0),
-    json_prompt.FindingMessage(Finding("watchdog", "PASS", keys={"mcu.port": "sim"})),
-    json_prompt.Result("all"),
 )
 
 
@@ -70,19 +56,8 @@ def test_each_sent_message_matches_its_schema_only_if_it_is_complete(message: St
     assert [variant for variant in spoilt(frame) if is_described_frame(variant)] == []
 
 
-@each("line", GUIDED)
-def test_each_line_of_a_check_or_calibration_is_as_described(line: Struct) -> None:
-    assert kinds([as_sent({"guide": line})]) == {"Guided", type(line).__name__}
-    assert not is_described_frame({"guide": {}})
-    assert not is_described_frame(
-        {"guide": as_sent(line) | {next(iter(as_sent(line))): {"of": "nothing"}}}
-    )
-
-
 def test_each_kind_of_sent_message_has_an_example() -> None:
     assert {type(message) for message in SAID} == set(SENT_MESSAGES)
-    assert {type(message) for message in GUIDED} == set(GUIDE_MESSAGES)
-    assert len(GUIDES) == len(GUIDE_MESSAGES)
 
 
 @pytest.mark.parametrize("role", get_args(Role))

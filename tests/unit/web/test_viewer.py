@@ -19,7 +19,6 @@ from acsard.core.messages.signature import unpack
 from acsard.core.values import NS_PER_S, Role, Twist
 from acsard.host import clock
 from acsard.web.callers import AdmittedClient
-from acsard.web.guide import Guide
 from acsard.web.limits import COMMAND_RATE
 from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
@@ -108,7 +107,7 @@ async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
     fake: Any = Fake()
     robots = Robots(Address("tcp/127.0.0.1:1", "acsar", ""), lambda: fake, about, counts)
     robots.client = fake
-    parts = Parts(robots, Guide(Address("", "", ""), "", ""), counts)
+    parts = Parts(robots, counts)
     request: Any = SimpleNamespace(transport=None)
     socket: Any = SimpleNamespace()
     viewer = Viewer(
@@ -141,14 +140,14 @@ class Page:
         counts = Counts()
         about = About("1", True, 1.0, 4.0, 10.0, "", {})
         robots = Robots(Address("tcp/127.0.0.1:1", "r1", ""), Mock(), about, counts)
-        parts = Parts(robots, Guide(Address("", "", ""), "", ""), counts)
-        parts.calls._called = self._called  # type: ignore[assignment, method-assign]
+        parts = Parts(robots, counts)
+        parts.calls.call = self._call  # type: ignore[method-assign, assignment]
         who = AdmittedClient(role, "bob", "token", "1.2.3.4")
         socket, request = cast(Any, SimpleNamespace()), cast(Any, SimpleNamespace(transport=None))
         self.viewer, self.counts = Viewer(socket, request, who, parts, camera=False), counts
 
-    async def _called(self, who: object, verb: str, payload: object, other: str) -> ServiceReply:
-        assert (verb, payload, other) == ("stop", {}, "")
+    async def _call(self, who: object, verb: str, payload: object, robot: str) -> ServiceReply:
+        assert (verb, payload) == ("stop", {})
         self.stops.append(ServiceReply(True, "stopped"))
         return self.stops[-1]
 

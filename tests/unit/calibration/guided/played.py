@@ -18,8 +18,7 @@ from acsard.calibration.log_table import Table
 from acsard.calibration.runs import Run, runs
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config
-from acsard.terminal.prompt import NumberQuestion
-from acsard.terminal.terminal_prompt import NoPrompt
+from acsard.terminal.prompt import NumberQuestion, Prompt
 from tests.unit.calibration.robots import Drive, Plan, Robot, drive
 
 LENGTH = 0.25
@@ -109,7 +108,7 @@ class Player:
         raise AssertionError(words)
 
 
-class PlayedPrompt(NoPrompt):
+class PlayedPrompt(Prompt):
     """A prompt that passes every question to the simulated person."""
 
     def __init__(self, player: Player) -> None:

@@ -137,7 +137,7 @@ class Talk(PlayedPrompt):
     def show_text(self, text: str) -> None:
         self.shown.append(text)
 
-    def start(self, text: str, by_key: bool = False) -> None:
+    def start(self, text: str) -> None:
         self.shown.append(text)
 
     def number(self, ask: NumberQuestion) -> float:

@@ -32,7 +32,7 @@ from acsard.core.messages.schema import (
 from acsard.core.values import NS_PER_S
 from acsard.core.values import Twist as Command
 from acsard.host import clock
-from acsard.terminal.terminal_prompt import NoPrompt
+from acsard.terminal.prompt import Prompt
 from tests.unit.calibration.guided.test_leg_driver import US, telling
 from tests.unit.top.screens import sample_of
 
@@ -143,7 +143,7 @@ def test_a_leg_without_wheel_speeds_for_a_minute_is_disturbed() -> None:
         recorder.log()
 
 
-class Laptop(NoPrompt):
+class Laptop(Prompt):
     """A computer that drives a robot. The computer is suspended 2 s after a leg has begun."""
 
     source, sender, session, unreadable = "app", US, None, 0

@@ -16,8 +16,7 @@ import pytest
 from acsard.checkup.findings import Finding
 from acsard.host.terminal_modes import single_key_mode
 from acsard.terminal.output import plain
-from acsard.terminal.prompt import NobodyError, NumberQuestion
-from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt, row
+from acsard.terminal.prompt import NobodyError, NumberQuestion, Prompt, TerminalPrompt, row
 
 DISTANCE = NumberQuestion("How far?", "m", 0.5, 3.0)
 OPTIONAL = NumberQuestion("How far, if you like?", "m", 0.0, 3.0, 0.0)
@@ -129,16 +128,16 @@ def test_keys_are_read_singly_and_the_terminal_mode_is_restored(types: Types) ->
 
 
 def test_without_a_prompt_an_optional_number_is_0_and_a_required_one_is_an_error() -> None:
-    assert NoPrompt().number(OPTIONAL) == 0.0
+    assert Prompt().number(OPTIONAL) == 0.0
     with pytest.raises(NobodyError, match=re.escape("run it without --yes")):
-        NoPrompt().number(DISTANCE)
+        Prompt().number(DISTANCE)
 
 
 @pytest.mark.parametrize(("as_json", "output"), [(False, "robot acsar\n"), (True, "")])
 def test_the_subject_is_not_printed_if_the_output_is_one_json_object(
     as_json: bool, output: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    TerminalPrompt(as_json).begin("robot acsar", simulated=False)
+    TerminalPrompt(as_json).begin("robot acsar")
     assert capsys.readouterr().out == output
 
 
