@@ -1,20 +1,11 @@
-"""Makes Zenoh's access rules from the table of keys and roles, and from the ROS names.
+"""Makes Zenoh's access rules (what none allows is denied) from the keys, roles and ROS names.
 
-Zenoh denies every message that no rule allows.
-
-- The session that accepts a client's link checks the rules. It belongs to the daemon or, over TLS,
-  to the TLS gateway.
-- This session sees only the certificate of the program at the other end of the link. So a client
-  that connects through a router has the permissions of the router.
-- A rule allows a message only if one of the rule's key expressions includes the whole key
-  expression of the message. A query with a wildcard therefore needs a rule with a wildcard.
-- A client over TLS may use exact keys only, unless `access.wildcards` is set, because a few
-  wildcards can take all of Zenoh's processor time.
-- The daemon checks the exact key, the kind (PUT) and the source of each command again.
-
-Zenoh does not tell the daemon the certificate of a sample's sender. Therefore each certificate that
-may command has its own command keys, which end with the name of the certificate. The rules let
-only a client with that certificate put on these keys.
+The session that accepts a link checks them: the daemon's or, over TLS, the TLS gateway's. It sees
+only the certificate at the other end, so a client behind a router has the router's permissions. A
+rule must include the whole key expression of a message. Over TLS only exact keys are allowed unless
+`access.wildcards` is set: a few wildcards take all of Zenoh's time. Zenoh does not tell the daemon
+the sender's certificate, so each certificate has its own command keys, which end with its name. The
+daemon checks the exact key, the kind and the source of each command again.
 """
 
 from __future__ import annotations
@@ -38,6 +29,7 @@ from acsard.core.messages.permissions import COMMAND_ROLE, Use, has, keys_for, l
 from acsard.core.ros.transports import PARAMETERS_PREFIX, Endpoint, claims, endpoints, left_out
 from acsard.core.values import ROLES, ROOT_KEY, Role
 
+# What a daemon sends, except `put` (data), which has separate rules.
 DECLARATIONS = (
     "declare_subscriber",
     "declare_queryable",
@@ -46,11 +38,10 @@ DECLARATIONS = (
     "declare_liveliness_subscriber",
     "liveliness_query",
 )
-"""Zenoh's names of the message types that a daemon sends, except `put` (data). Separate access
-rules allow `put`."""
 
 DRIVERS: tuple[Role, ...] = tuple(role for role in ROLES if has(role, COMMAND_ROLE))
 
+# Names of rules that `_rules` defines.
 GRANTS: dict[Role, tuple[str, ...]] = {
     role: (
         "speak",
@@ -65,16 +56,16 @@ GRANTS: dict[Role, tuple[str, ...]] = {
     )
     for role in ROLES
 }
-"""Maps each role to the names of its access rules. `_rules` defines these rules."""
 
+# Further rules if `access.wildcards` is true.
 WIDE_SUBSCRIPTIONS: dict[Role, tuple[str, ...]] = {
     "viewer": ("roam", "recall"),
     "operator": ("roam", "recall"),
     "maintainer": ("roam", "recall", "browse", "attend"),
 }
-"""Maps each role to the names of the additional access rules that the role gets if
-`access.wildcards` is true."""
 
+# A local client may also use any wildcard, and put on any key that the robot does not publish: the
+# daemon counts and refuses a command for an unknown source, and says why.
 LOCAL_RULES = (
     *GRANTS["maintainer"],
     *WIDE_SUBSCRIPTIONS["maintainer"],
@@ -85,19 +76,10 @@ LOCAL_RULES = (
     "err",
     "forge",
 )
-"""The names of the access rules for a client on the robot's own machine.
-
-They are the rules of a maintainer, and more. A local client may also subscribe with any wildcard,
-and receive the commands of other clients. It may put on any key except those on which the robot
-publishes. So a command for an unknown source, or on a key with a wildcard, reaches the daemon. The
-daemon counts and refuses this command, and gives the reason.
-"""
 
 Flow = Literal["ingress", "egress"]
 
-Permission = Literal["allow", "deny"]
-"""Effect of an access rule. If one rule allows a message and another rule denies it, Zenoh denies
-the message."""
+Permission = Literal["allow", "deny"]  # for one message, deny wins
 
 
 class Rule(TypedDict):
@@ -111,19 +93,15 @@ class Rule(TypedDict):
 
 
 class _Keys:
-    """The key expressions of one robot, native and ROS, in groups for the access rules."""
-
     def __init__(self, config: Config) -> None:
         robot = config.robot.id
         self._robot, self._sources = robot, [source.name for source in config.commands.sources]
         self._ros = ros = endpoints(config.ros, "*", left_out(config) & {IMU, DESCRIPTION})
         topics, outgoing = offered(config), published(config)
+        # The gyro's row is not here with the simulator, because the daemon then publishes its key.
         self._incoming = [topic for topic in topics if topic not in outgoing]
-        """Rows of the table of keys that the daemon does not publish: inputs, queries and services.
-        With the simulator, the gyro's row is missing here, because the daemon itself then publishes
-        the gyro's key."""
+        # Keys that clients may subscribe to or query.
         self._readable = [*outgoing, *(t for t in self._incoming if t.direction != "in")]
-        """Rows of the table of keys that clients may subscribe to or query."""
         self.all = full_key(robot, "**")
         self.alive = full_key(robot, "alive")
         self.claims = claims(config.ros)
@@ -133,20 +111,19 @@ class _Keys:
         self.published += [e.key for e in ros if e.direction == "out"]
         latched = [full_key(robot, topic.key) for topic in outgoing if topic.latched]
         latched += [e.key for e in ros if e.latched]
+        # Where advanced publishers keep samples for late subscribers.
         self.kept = [f"{key}/@adv/**" for key in latched]
-        """Keys under which Zenoh's advanced publishers keep samples for late subscribers."""
         self.subscribed = [full_key(robot, t.pattern) for t in topics if t.direction == "in"]
         self.subscribed += [e.key for e in ros if e.direction == "in"]
         """Key expressions to which the daemon subscribes."""
+        # For clients that connect without a certificate.
         self.commands = [full_key(robot, key) for key in source_keys(self._sources)]
-        """Command keys of the configured sources, for clients that connect without a
-        certificate."""
+        # What every client may query.
         self.viewer_queries = [
             full_key(robot, t.pattern)
             for t in topics
             if t.direction == "query" and t.query == "viewer"
         ]
-        """Key expressions of the queries that every client may send."""
         queries = [
             full_key(robot, t.pattern) for t in topics if t.direction in ("query", "service")
         ]
@@ -155,11 +132,7 @@ class _Keys:
         """Key expressions on which the daemon publishes, or whose queries it answers."""
 
     def of(self, role: Role, use: Use) -> list[str]:
-        """Return the keys that `role` may use and lower roles may not use.
-
-        `use` is the kind of use: publish, subscribe or query. The result does not contain the
-        command keys that end with a certificate's name. The method `commands_by` returns those.
-        """
+        """Return the keys that `role` may use and lower roles may not (see `commands_by`)."""
         rows = self._incoming if use == "publish" else self._readable
         keys = [full_key(self._robot, key) for key in keys_for(role, use, rows)]
         return keys + [e.key for e in self._ros if use in _uses(e) and self._least(e) == role]
@@ -167,17 +140,12 @@ class _Keys:
     def commands_by(self, certificate: str) -> list[str]:
         """Return the command keys of all sources for one certificate.
 
-        For "*", return key expressions that match every certificate. A router needs them, because
-        it forwards the commands of every client.
+        "*" stands for every certificate: a router forwards the commands of every client.
         """
         return [full_key(self._robot, key) for key in source_keys(self._sources, certificate)]
 
     def _least(self, endpoint: Endpoint) -> Role | None:
-        """Return the lowest role that may use a ROS endpoint.
-
-        Return None for the commands of a source that is not configured, because no role may send
-        them.
-        """
+        # None: the source is not configured, so no role may command.
         native = endpoint.native
         if native.startswith(PARAMETERS_PREFIX):
             return least_role("config")
@@ -201,31 +169,24 @@ def _uses(endpoint: Endpoint) -> tuple[Use, ...]:
 
 
 def access_control(config: Config) -> dict[str, object]:
-    """Return the value of Zenoh's setting `access_control` for the session of the daemon.
+    """Return Zenoh's `access_control` for the session of the daemon.
 
-    Every TLS link of that session leads to a router. The router checks the certificate of each
-    client. So the rules let the router forward the commands of every certificate.
+    Its TLS links lead to routers, which check the certificate of each client, so the rules let them
+    forward the commands of every certificate.
     """
     return _access(config, gateway=False)
 
 
 def gateway_access(config: Config) -> dict[str, object]:
-    """Return the value of Zenoh's setting `access_control` for the session of the TLS gateway.
+    """Return Zenoh's `access_control` for the session of the TLS gateway.
 
-    Zenoh assigns access rules to "subjects". Each role is a subject. Each certificate that may
-    command is a further subject, which may publish on the command keys of this certificate. The
-    gateway's link to the daemon is its only link without a certificate. The rules allow all
-    messages on this link.
+    Each role is a subject, and each certificate that may command is one more, for its own command
+    keys. The link to the daemon is the only one without a certificate; it carries all messages.
     """
     return _access(config, gateway=True)
 
 
 def _access(config: Config, *, gateway: bool) -> dict[str, object]:
-    """Return the value of Zenoh's setting `access_control` for one session.
-
-    `gateway` is true for the session of the TLS gateway. Only this session limits each certificate
-    to its own command keys.
-    """
     keys, access = _Keys(config), config.access
     rules = _rules(keys)
     # Only a link between two programs on this machine needs no certificate, unless `bus.insecure`

@@ -16,12 +16,9 @@ from acsard.host.errors import UsageError
 
 
 class Address(NamedTuple):
-    """The address of a robot for a client: endpoint, robot id, and the client's TLS directory."""
-
     endpoint: str
     robot_id: str
-    tls: str
-    """Directory with the client's certificate; "" if the link needs no certificate."""
+    tls: str  # directory of the client's certificate; "" without TLS
 
 
 def address_of(
@@ -30,17 +27,9 @@ def address_of(
     robot_id: str | None = None,
     tls: str | None = None,
 ) -> Address:
-    """Return the address of a robot from its configuration and from the options of a tool.
+    """Return a robot's address from its configuration; options that are given win.
 
-    An option that is None is taken from the configuration. Raises `UsageError` if `robot_id` does
-    not have the form of a robot's id.
-
-    Args:
-        config: the robot's configuration.
-        connect: the endpoint.
-        robot_id: the robot's id.
-        tls: the directory with the client's certificate. It is ignored if the endpoint needs no
-            certificate.
+    `tls` is ignored if the endpoint needs no certificate. Raises `UsageError` for a malformed id.
     """
     robot_id = config.robot.id if robot_id is None else robot_id
     require_id(robot_id)
@@ -56,10 +45,8 @@ def address_of(
 def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str | None) -> Address:
     """Return a robot's address for a program that uses the client library.
 
-    An argument that is None is taken from the configuration file that $ACSARD_CONFIG names. If
-    $ACSARD_CONFIG is not set, this argument has its default value. $ACSARD_TLS has priority over
-    the certificate directory in the file. Raises `UsageError` if `robot_id` does not have the form
-    of a robot's id, or if the file is unusable.
+    An argument that is None comes from the file that $ACSARD_CONFIG names, or is the default.
+    $ACSARD_TLS wins over the file. Raises `UsageError` for a malformed id or an unusable file.
     """
     complete = endpoint is not None and robot_id is not None
     if complete and (tls is not None or not is_tls(endpoint or "")):

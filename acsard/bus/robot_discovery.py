@@ -1,7 +1,6 @@
-"""Finds, follows or stops the robots that the option `--id` names, and explains a robot's silence.
+"""Finds, follows or stops the robots that `--id` names, and explains a robot's silence.
 
-Over TLS the access rules allow only exact keys, because a few wildcards can take all the
-processor time of a router. So a client over TLS must name each robot.
+Over TLS a client must name each robot, because the access rules allow only exact keys.
 """
 
 from __future__ import annotations
@@ -22,15 +21,13 @@ from acsard.core.values import ROOT_KEY
 from acsard.host.errors import NoAnswerError, UsageError
 
 ALL_ROBOTS = "*"
-DISCOVERY_S = 2.0
-"""Longest wait for the liveliness tokens of the daemons, s."""
+DISCOVERY_S = 2.0  # longest wait for the liveliness tokens of the daemons
 
 
 def parse_ids(text: str) -> tuple[str, ...]:
-    """Return the robot ids in the text of an option `--id` that names several robots.
+    """Return the ids in an option `--id` that names several robots, and () if it names only one.
 
-    Return ("*",) for all robots, and () if the text names only one robot. Raises `UsageError` for a
-    text with commas that is not a list of robot ids.
+    ("*",) stands for all robots. Raises `UsageError` for an invalid list.
     """
     if text == ALL_ROBOTS:
         return (ALL_ROBOTS,)
@@ -49,10 +46,9 @@ def parse_ids(text: str) -> tuple[str, ...]:
 
 
 def running_robots(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[str]:
-    """Return the sorted ids of those robots in `ids` whose daemon is running.
+    """Return the sorted ids of those robots in `ids` ("*" for all) whose daemon is running.
 
-    The id "*" stands for all robots. Raises `NoAnswerError` if `ids` contains "*" and no robot is
-    visible. `endpoint` is the client's endpoint, for the text of this error.
+    Raises `NoAnswerError`, which names `endpoint`, if `ids` contains "*" and no robot is visible.
     """
     running_ids = set()
     for robot_id in ids:
@@ -67,10 +63,7 @@ def running_robots(session: zenoh.Session, ids: Sequence[str], endpoint: str) ->
 
 
 def presence(session: zenoh.Session, robot_id: str, endpoint: str) -> Presence | None:
-    """Return whether a robot is visible on the bus, and the other visible robots if it is not.
-
-    `endpoint` is the client's endpoint. Return None if the session is closing.
-    """
+    """Return whether a robot is visible on the bus, and the others if not; None if closing."""
     try:
         if not session.info.links():
             return Presence(linked=False, here=False)
@@ -84,13 +77,7 @@ def presence(session: zenoh.Session, robot_id: str, endpoint: str) -> Presence |
 
 
 def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
-    """Send a stop to each of these robots, without waiting for an answer.
-
-    Args:
-        session: the Zenoh session of the caller.
-        ids: the ids of the robots; "*" stands for all robots.
-        sender: the caller's sender id, `NAME/SECRET`.
-    """
+    """Send a stop to these robots ("*" for all), without waiting for an answer."""
     by = Signature(sender).pack()
     for robot_id in ids:
         session.put(full_key(robot_id, "stop"), b"", attachment=by, express=True)
@@ -116,15 +103,9 @@ def no_robot_text(endpoint: str) -> str:
 
 
 def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscription:
-    """Subscribe to a key of several robots, and return the subscription.
+    """Subscribe to the key `name`, such as `state`, of these robots ("*" for all).
 
-    The subscription receives the samples of all these robots. `robot_of` returns the robot's id
-    from a sample's key. Raises `UsageError` if `name` is not a key.
-
-    Args:
-        session: the Zenoh session of the caller.
-        ids: the ids of the robots; "*" stands for all robots.
-        name: the part of the key after the robot's id, such as `state`.
+    `robot_of` returns the robot's id of a sample's key. Raises `UsageError` if `name` is not a key.
     """
     topic = by_key(name)
     latched = topic is not None and topic.latched
@@ -136,39 +117,25 @@ def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscriptio
 
 
 def robot_of(key: str) -> str:
-    """Return the robot id in a full key, such as `acsard/robot1/state`.
-
-    Return "" for any other key, and for a key with a wildcard.
-    """
+    """Return the robot id in a full key, or "" for any other key and for one with a wildcard."""
     root, _, rest = key.partition("/")
     return rest.partition("/")[0] if root == ROOT_KEY and not set(key) & set("*$") else ""
 
 
-MAX_NAMED = 5
-"""Largest number of other robots that a message of `explain_silence` names."""
+MAX_NAMED = 5  # other robots in a message
 
 
 class Presence(Struct, frozen=True):
-    """The result of `presence`: the robots that a client sees on the bus."""
+    """The robots that a client sees on the bus."""
 
-    linked: bool
-    """True if the client has a connection to its endpoint."""
-    here: bool
-    """True if the requested robot is present."""
+    linked: bool  # to the client's endpoint
+    here: bool  # the requested robot is present
+    # Visible robots if not `here`; over TLS only with `access.wildcards`.
     others: tuple[str, ...] = ()
-    """The ids of the other visible robots if the requested robot is absent, else (). Over
-    TLS, a client sees other robots only if `access.wildcards` is set."""
 
 
 def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) -> str:
-    """Return a text that says why no sample arrives on a key of a robot, and how to fix this.
-
-    Args:
-        key: the part of the key after the robot's id, such as `state`.
-        robot_id: the robot's id.
-        endpoint: the client's endpoint.
-        presence: the result of the function `presence` for this robot.
-    """
+    """Return why no sample arrives on the key `key` of a robot, and how to fix this."""
     if not presence.linked:
         return (
             f"the connection to {endpoint} is lost: the daemon or router there has ended "

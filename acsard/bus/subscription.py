@@ -14,9 +14,7 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
-MAX_QUEUED_SAMPLES = 1000
-"""Largest number of samples that wait for a slow reader. A newer sample displaces the oldest
-one."""
+MAX_QUEUED_SAMPLES = 1000  # a newer sample displaces the oldest one
 
 
 def direct(callback: Callable[[Any], None]) -> Any:
@@ -29,14 +27,10 @@ class Arrivals(Mailbox[zenoh.Sample]):
 
     def __init__(self) -> None:
         super().__init__(MAX_QUEUED_SAMPLES)
-        self.declared: list[Any] = []
-        """The Zenoh subscribers that fill this queue."""
+        self.declared: list[Any] = []  # the Zenoh subscribers that fill this queue
 
     def try_recv(self) -> zenoh.Sample | None:
-        """Return the next sample, or None if no sample waits.
-
-        Raises `ZError` if the session has closed and no sample waits.
-        """
+        """Return the next sample, or None; raise `ZError` if the session has closed."""
         sample = self.pop()
         if sample is None and self.closed and not self.waiting:
             raise zenoh.ZError("the Zenoh session has been closed")
@@ -51,18 +45,11 @@ class Subscription:
     """The samples of the keys to which a client has subscribed, in the order of their arrival."""
 
     def __init__(self, queue: Any, key: str = "") -> None:
-        """Read the samples from `queue`.
-
-        If `key` is not "", skip each sample that was not put on exactly this key, for example a
-        sample on a key with a wildcard.
-        """
+        # Samples that were not put on exactly `key`, as with a wildcard, are skipped.
         self._queue, self._key = queue, key
 
     def try_recv(self) -> zenoh.Sample | None:
-        """Return the next sample, or None if no sample waits.
-
-        Raises `ZError` if the session has closed and no sample waits.
-        """
+        """Return the next sample, or None; raise `ZError` if the session has closed."""
         # The loop is bounded, because a flood of samples on other keys must not block the caller.
         for _ in range(MAX_QUEUED_SAMPLES):
             sample: zenoh.Sample | None = self._queue.try_recv()
@@ -71,7 +58,7 @@ class Subscription:
         return None
 
     def wakes(self, wake: Callable[[], object]) -> None:
-        """Let Zenoh's thread call `wake` whenever a sample arrives or the subscription ends."""
+        """Let Zenoh's thread call `wake` when a sample arrives or the subscription ends."""
         self._queue.wakes(wake)
 
     def add(self, sample: zenoh.Sample) -> None:
@@ -79,10 +66,7 @@ class Subscription:
         self._queue.put(sample)
 
     def until_silence(self, timeout: float | None) -> Iterator[zenoh.Sample]:
-        """Yield samples until the session closes, or until no sample has arrived for `timeout` s.
-
-        None means no time limit. When the iteration ends, the Zenoh subscribers are undeclared.
-        """
+        """Yield samples until the session closes or none came for `timeout` s; then undeclare."""
         quiet_since_ns = clock.mono_ns()
         try:
             while True:
@@ -103,7 +87,7 @@ class Subscription:
             self.undeclare()
 
     async def arriving(self) -> AsyncGenerator[zenoh.Sample, None]:
-        """Yield samples until the session closes. Then undeclare the Zenoh subscribers."""
+        """Yield samples until the session closes; then undeclare."""
         arrived, loop = asyncio.Event(), asyncio.get_running_loop()
 
         def wake() -> None:
@@ -127,7 +111,7 @@ class Subscription:
             self.undeclare()
 
     def undeclare(self) -> None:
-        """Undeclare the Zenoh subscribers. If the session has closed, do nothing."""
+        """Undeclare the Zenoh subscribers, unless the session has closed."""
         try:
             self._queue.undeclare()
         except zenoh.ZError:
@@ -145,9 +129,9 @@ def encoded(sample: zenoh.Sample) -> tuple[str, bytes]:
 
 
 def queue_on(session: zenoh.Session, *keys: str, latched: bool) -> Arrivals:
-    """Subscribe to the full keys `keys`, and return the queue of their samples.
+    """Subscribe to full keys, and return the queue of their samples.
 
-    If `latched` is true, the queue first gets the last sample that was published on each key.
+    With `latched`, the last sample that was published on each key comes first.
     """
     arrivals = Arrivals()
     handler = zenoh.handlers.Callback(arrivals.put, arrivals.close)

@@ -1,8 +1,7 @@
 """Checks and reads the certificate files, and explains why a TLS endpoint cannot be reached.
 
-Zenoh reports the same error for every cause. `trouble` therefore repeats the connection step by
-step with Python's own TLS, and returns a message for each cause. This module needs a library
-from the optional extra `tls` only to read the expiry times of certificates.
+Zenoh reports the same error for every cause, so `trouble` repeats the connection step by step with
+Python's own TLS. Only expiry times need the library `cryptography`.
 """
 
 from __future__ import annotations
@@ -19,20 +18,17 @@ from pathlib import Path
 from typing import Any
 
 from acsard.core.config.settings import is_tls
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, WallNs
 from acsard.host import clock
 from acsard.host.errors import CertificateError, NotPermittedError
 
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
-"""File names in a TLS directory: the certificate of the authority, the certificate of the
-directory's owner, and the owner's private key."""
 
 
 def require_usable(directory: str) -> None:
     """Check that the files of a TLS directory can be read and belong together.
 
-    Raises `CertificateError` for a missing or unusable file, and `NotPermittedError` for a file
-    that this user may not read. The error's message says how to fix the problem.
+    Raises `CertificateError` or `NotPermittedError`, whose text says how to fix the problem.
     """
     try:
         is_there = Path(directory).is_dir()
@@ -75,7 +71,7 @@ def files_in(directory: str) -> tuple[Path, Path, Path]:
 
 
 def unusable(authority: Path, certificate: Path, key: Path) -> str:
-    """Return the reason why OpenSSL cannot use these files together, or "" if it can use them."""
+    """Return why OpenSSL cannot use these files together, or ""."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_verify_locations(authority)
@@ -97,22 +93,18 @@ def common_name(directory: str) -> str:
 
 
 def shown_at(endpoint: str, directory: str) -> str:
-    """Return the common name of the certificate that this client shows to an endpoint.
-
-    Return "" if the endpoint needs no certificate, or if the certificate cannot be read.
-    `directory` is the TLS directory of the client, or "".
-    """
+    """Return the common name of the certificate that this client shows to an endpoint, or ""."""
     return common_name(directory) if directory and is_tls(endpoint) else ""
 
 
 def names_in(directory: str) -> list[str]:
-    """Return the host names and IP addresses for which the certificate in `directory` is valid."""
+    """Return the host names and IP addresses for which the certificate is valid."""
     alternative: Any = _decoded(directory).get("subjectAltName", ())
     return [_plain(str(name)) for _, name in alternative]
 
 
 def _plain(name: str) -> str:
-    """Shorten an IPv6 address, because `ssl` writes it with all its zeros."""
+    # `ssl` writes an IPv6 address with all its zeros.
     try:
         return str(ipaddress.ip_address(name))
     except ValueError:
@@ -120,7 +112,6 @@ def _plain(name: str) -> str:
 
 
 def _decoded(directory: str) -> dict[str, Any]:
-    """Return the decoded certificate in `directory`, or {} if it cannot be read."""
     # The standard library decodes only the certificate of a connected peer. So connect a client and
     # a server in memory, both of which use this certificate.
     server_context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -142,18 +133,15 @@ def _decoded(directory: str) -> dict[str, Any]:
     return dict(server.getpeercert() or {})
 
 
-NO_CHECK_TIME = 0x200000
-"""OpenSSL's flag X509_V_FLAG_NO_CHECK_TIME, which Python's `ssl` does not name."""
+NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME, which `ssl` does not name
 
-AUTHORITY = "the authority"
-"""Key of the authority's certificate in the dict that `expiry_times()` returns."""
+AUTHORITY = "the authority"  # key of `ca.pem` in `expiry_times()`
 
 
-def expiry_times(directory: str) -> dict[str, int]:
-    """Return the expiry times of the certificates in a TLS directory, ns since 1970.
+def expiry_times(directory: str) -> dict[str, WallNs]:
+    """Return when the certificates in a TLS directory expire, or {} if they cannot be read.
 
-    In the returned dict, the key "" stands for `certificate.pem`, and `AUTHORITY` for `ca.pem`.
-    Return {} if a file cannot be read, or if the library `cryptography` is missing.
+    The key "" stands for `certificate.pem`, and `AUTHORITY` for `ca.pem`.
     """
     try:
         from cryptography import x509
@@ -171,9 +159,7 @@ def expiry_times(directory: str) -> dict[str, int]:
 
 
 def is_signed(directory: str) -> bool:
-    """Return whether an authority in `ca.pem` has signed `certificate.pem`.
-
-    The certificate may also be signed by the next one in `certificate.pem`, and so on.
+    """Return whether an authority in `ca.pem` has signed `certificate.pem`, maybe via a chain.
 
     Return True, too, if a file cannot be read, or if the library `cryptography` is missing.
     """
@@ -205,17 +191,10 @@ def is_signed(directory: str) -> bool:
     return False
 
 
-def peer_ends_ns(endpoint: str, directory: str) -> int | None:
-    """Return the expiry time of the certificate that a TLS endpoint uses, ns since 1970.
+def peer_ends_ns(endpoint: str, directory: str) -> WallNs | None:
+    """Return when the certificate at an endpoint expires, without verifying it; None if unknown.
 
-    The certificate is not verified, so the function also works if the certificate has expired.
-    Return None if no program answers at the endpoint, or if the library `cryptography` is missing.
-    Each wait for the program lasts at most `HANDSHAKE_TIMEOUT_S`.
-
-    Args:
-        endpoint: the endpoint, such as "tls/robot.local:7449".
-        directory: the TLS directory of this machine, whose certificate the program may
-            require.
+    Each wait for its program lasts at most `HANDSHAKE_TIMEOUT_S`.
     """
     try:
         from cryptography import x509
@@ -243,8 +222,7 @@ def _load(context: ssl.SSLContext, directory: str) -> None:
     context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}", password="")
 
 
-def _ends_ns(certificate: Any) -> int:
-    """Return the expiry time of a certificate, which is an object of `cryptography`."""
+def _ends_ns(certificate: Any) -> WallNs:
     return int(certificate.not_valid_after_utc.timestamp()) * NS_PER_S
 
 
@@ -256,16 +234,12 @@ def host_and_port(endpoint: str) -> tuple[str, str]:
     return host.strip("[]"), port
 
 
-HANDSHAKE_TIMEOUT_S = 2.0
-"""Longest wait for the server to accept the TCP connection, s. It is also the longest wait for each
-answer of the server in the TLS handshake."""
+HANDSHAKE_TIMEOUT_S = 2.0  # for the TCP connection, and for each answer in the handshake
 
+# A server that rejects the client's certificate says so within this time after the handshake.
 REFUSAL_WAIT_S = 0.5
-"""Time for which this client waits after the TLS handshake, s. A server that rejects the client's
-certificate reports that within this time. A server that accepts the certificate sends nothing."""
 
 UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
-"""Error numbers of the operating system that mean that no machine answers at the address."""
 
 RENEW_ADVICE = (
     "run `acsard tls renew` on the machine that has ca-key.pem (with `--name NAME` for a robot of "
@@ -281,10 +255,9 @@ class DateError(IntEnum):
 
 
 def trouble(endpoint: str, directory: str) -> str:
-    """Return why this machine cannot connect to a TLS endpoint, and how to fix that.
+    """Return why this machine cannot connect to a TLS endpoint, and how to fix that, or "".
 
-    Return "" if the connection succeeds. `directory` is the TLS directory of this machine. Blocks
-    for a few seconds, or longer if the lookup of the host name is slow.
+    Blocks for a few seconds, or longer if the lookup of the host name is slow.
     """
     host, port = host_and_port(endpoint)
     try:
@@ -349,7 +322,6 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
 
 
 def _wrong_date(certificate: Mapping[str, Any]) -> int:
-    """Return OpenSSL's error code if a decoded certificate is not valid now, or 0 if it is."""
     now = clock.now().wall_ns / NS_PER_S
     if now > ssl.cert_time_to_seconds(certificate["notAfter"]):
         return DateError.EXPIRED
@@ -359,10 +331,6 @@ def _wrong_date(certificate: Mapping[str, Any]) -> int:
 
 
 def _server_certificate_error(code: int, reason: str, host: str, directory: str) -> str:
-    """Return the error message for a certificate of the server that this client rejects.
-
-    `code` and `reason` are OpenSSL's error code (X509_V_ERR_...) and its text.
-    """
     now = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
     match code:
         case DateError.EXPIRED:
@@ -401,11 +369,7 @@ def _server_certificate_error(code: int, reason: str, host: str, directory: str)
 
 
 def _client_certificate_error(reason: str, host: str, directory: str) -> str:
-    """Return the error message for a TLS handshake that the server rejects.
-
-    The server usually rejects this client's certificate. `reason` is OpenSSL's name of the error,
-    usually of an alert that the server sent.
-    """
+    # `reason` is OpenSSL's name of the error, usually of an alert that the server sent.
     certificate = f"{directory}/{CERTIFICATE}"
     if "CERTIFICATE_EXPIRED" in reason:
         return (

@@ -1,6 +1,6 @@
 """Opens the Zenoh sessions of the daemon, of the TLS gateway and of the client tools.
 
-This module contains all settings of these sessions, each with its reason.
+All settings of these sessions are here, each with its reason.
 """
 
 from __future__ import annotations
@@ -36,27 +36,20 @@ from acsard.host.errors import (
 )
 from acsard.host.terminal_modes import may_use_color
 
+# Per key. It lets a zero 1 ms after another command pass, and a flood costs no control period. The
+# gateway may drop a stop, but it has passed one less than 1 ms before.
 COMMAND_RATE_HZ = 1000.0
-"""Largest number of commands per second that a session accepts on each key. The limit is high
-enough for a zero command 1 ms after another command. It is low enough that a flood of commands does
-not make the daemon miss a control period. The TLS gateway also applies this limit to stops. If the
-gateway drops a stop, it has passed another stop less than a millisecond before, so the robot stops
-anyway."""
 
-MAX_SESSIONS = 256
-"""Largest number of connections of the daemon's session, and of the TLS gateway's session."""
+MAX_SESSIONS = 256  # connections
 
-MAX_MESSAGE_BYTES = 65536
-"""Largest size of a message that a link accepts, bytes. Commands have a far lower limit."""
+MAX_MESSAGE_BYTES = 65536  # commands have a far lower limit
 
 
 def daemon_session(config: Config) -> zenoh.Session:
     """Open the daemon's session: a Zenoh peer or client without multicast discovery.
 
-    In client mode this call blocks until the router answers, so call it in a thread. Raises
-    `InUseError` if the session cannot listen, for example on an address that is in use. Raises
-    `MendableError` if Zenoh cannot open the session in client mode. Raises `CertificateError` if
-    Zenoh refuses the certificate files that a TLS router requires.
+    It blocks in client mode until the router answers. Raises `InUseError` if it cannot listen,
+    `CertificateError` if Zenoh refuses the files for a TLS router, and `MendableError`.
     """
     bus = config.bus
     settings = _base(bus.mode) | {
@@ -89,10 +82,9 @@ def daemon_session(config: Config) -> zenoh.Session:
 
 
 def gateway_session(config: Config) -> zenoh.Session:
-    """Open the session of the TLS gateway, which is a Zenoh router.
+    """Open the session of the TLS gateway, a Zenoh router.
 
-    Raises `CertificateError` if Zenoh refuses the certificate files. Raises `InUseError` if the
-    session cannot listen for another reason, for example on an address that is in use.
+    Raises `CertificateError` if Zenoh refuses the files, and `InUseError` if it cannot listen.
     """
     bus = config.bus
     settings = _base("router") | RETRY_SETTINGS | _tls(bus.tls) | _listening()
@@ -118,7 +110,6 @@ def gateway_session(config: Config) -> zenoh.Session:
 
 
 def _require_accepted(directory: str) -> None:
-    """Raise `CertificateError` if Zenoh refuses the certificate files in a TLS directory."""
     why = certificate_trouble(*files_in(directory))
     if why:
         raise CertificateError(
@@ -129,10 +120,10 @@ def _require_accepted(directory: str) -> None:
 
 
 def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
-    """Return the reason why Zenoh cannot listen with these certificate files, or "" if it can.
+    """Return why Zenoh cannot listen with these files, or ""; this takes some milliseconds.
 
-    OpenSSL accepts some files that Zenoh refuses: certificates without extensions (X.509 version
-    1), and keys of the curves P-521 and Ed448. This call takes some milliseconds.
+    OpenSSL accepts some that Zenoh refuses: X.509 version 1 (without extensions), and keys of the
+    curves P-521 and Ed448.
     """
     files = {
         "root_ca_certificate": str(authority),
@@ -154,20 +145,15 @@ def certificate_trouble(authority: Path, certificate: Path, key: Path) -> str:
 
 
 def reachable(endpoint: str) -> str:
-    """Return the endpoint to which a program on this machine can connect.
+    """Return where a program on this machine reaches what listens at `endpoint`.
 
-    `endpoint` is the endpoint at which another program on this machine listens. An address that
-    stands for all addresses of the machine (0.0.0.0 or [::]) is replaced by the loopback address.
-    Any other endpoint is returned unchanged.
+    All addresses (0.0.0.0 or [::]) become the loopback address.
     """
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
 def no_endpoint(text: str) -> UsageError:
-    """Return the error for a `text` that is not a Zenoh endpoint.
-
-    The error's text says how an endpoint is written.
-    """
+    """Return the error for a `text` that is no Zenoh endpoint, which says how to write one."""
     lack = ", because its port is missing" if _lacks_port(text) else ""
     return UsageError(f'{text} is not an endpoint{lack}; write it like "tcp/127.0.0.1:7448"')
 
@@ -177,10 +163,7 @@ def _lacks_port(endpoint: str) -> bool:
 
 
 def answers(endpoint: str) -> bool:
-    """Return whether a program accepts TCP connections at `endpoint`.
-
-    Raises `UsageError` if `endpoint` is not a valid endpoint.
-    """
+    """Return whether a program accepts TCP connections at `endpoint`. Raises `UsageError`."""
     host, _, port = reachable(endpoint).partition("/")[2].rpartition(":")
     if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
         raise no_endpoint(endpoint)
@@ -193,15 +176,12 @@ def answers(endpoint: str) -> bool:
     return True
 
 
+# Try until it succeeds.
 RETRY_SETTINGS = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
-"""Settings with which a session tries to connect again and again until it succeeds."""
 
 
 def _listening() -> dict[str, object]:
-    """Return the settings that protect a session that listens.
-
-    They protect it from clients that send nothing, send too much, or do not read.
-    """
+    # Against clients that send nothing, send too much, or do not read.
     return {
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
         "transport/unicast/accept_timeout": 1000,
@@ -232,20 +212,10 @@ def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Sessio
 
 
 def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
-    """Open a session in Zenoh's client mode to the daemon or router at `endpoint`.
+    """Open a session in client mode, because a peer reaches no program behind a router.
 
-    Peer mode would be wrong, because a peer reaches no program behind a router.
-
-    Args:
-        endpoint: the endpoint, such as "tcp/127.0.0.1:7448".
-        tls: the directory with the client's certificate. Only a TLS endpoint, such as
-            "tls/robot.local:7449", needs it.
-
-    Raises:
-        UsageError: `endpoint` is not an endpoint.
-        NotPermittedError: this user may not read a certificate file.
-        CertificateError: a certificate is missing or unusable.
-        UnreachableError: no daemon or router answers at the endpoint.
+    Only a TLS endpoint needs `tls`, the directory of the client's certificate. Raises `UsageError`,
+    `NotPermittedError`, `CertificateError` or `UnreachableError`.
     """
     if "/" not in endpoint or _lacks_port(endpoint):
         raise no_endpoint(endpoint)
@@ -316,12 +286,8 @@ def _tls(directory: str) -> dict[str, object]:
 
 
 def _command_limits(config: Config) -> dict[str, object]:
-    """Return the setting that limits the rate of messages on each input key.
-
-    Zenoh counts the messages of each connection separately. On one connection, the keys of all
-    certificates of a source share one limit. The keys of all unconfigured sources also share one
-    limit.
-    """
+    # Zenoh counts for each connection. There, the keys of all certificates of a source share one
+    # limit, and so do the keys of all unconfigured sources.
     names = [*(source.name for source in config.commands.sources), "*"]
     below = [*source_keys(names), *source_keys(names, "*"), IMU, SPEED_LIMIT]
     keys = [full_key(config.robot.id, key) for key in below]
@@ -345,13 +311,13 @@ def _config(settings: dict[str, object]) -> zenoh.Config:
 
 
 def first_line(error: Exception) -> str:
-    """Return the first line of Zenoh's error text, without the paths of Zenoh's source files."""
+    """Return the first line of Zenoh's error text, without the paths of its source files."""
     text = re.sub(r"(?: at)? /\S+\.rs:\d+\.?", "", str(error)).splitlines()
     return text[0][:200].strip() if text else type(error).__name__
 
 
 def log_from_environment() -> None:
-    """Start Zenoh's own log on standard output if the environment variable RUST_LOG is set."""
+    """Start Zenoh's own log on standard output if RUST_LOG is set."""
     if "RUST_LOG" not in os.environ:
         return
     before = os.environ.get("NO_COLOR")
