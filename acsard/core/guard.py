@@ -1,23 +1,10 @@
-"""Checks every outgoing line a second time, independently of the code that made the line.
+"""Checks every outgoing line a second time, with no code of the parts that made it.
 
-The guard shares no code with `limits.py`, `codec.py` or `checked_line.py`. It parses the finished
-bytes in the same way as the MCU, and passes a line only if all of these conditions hold:
-
-- The line has the complete format, no wheel exceeds `limits.wheel_speed`, and the checksum is
-  correct if the line has a checksum. With `link_check = "require"`, a line that moves a wheel must
-  have a checksum.
-- No wheel is faster than in the last line sent, and no wheel has changed its direction since that
-  line. This does not apply if there is a fresh command, the link is up and the mode is `driving`
-  (rule 2 of `acsard/README.md`).
-- Without a link, all wheel speeds are zero.
-- All wheel speeds are zero before the first fresh command, and when the last fresh command is older
-  than the longest ramp to rest plus `RAMP_MARGIN_NS`.
-- All wheel speeds are zero when a stop, a fault or a shutdown began longer ago than the duration of
-  the longest stop plus `RAMP_MARGIN_NS`.
-
-If a condition does not hold, the guard replaces the line with the stop line, and the robot latches
-a fault. The guard keeps the times of the last fresh command and of the last stop in its `Memory`. A
-recording stores the `Memory`, so that the guard makes the same decisions in a replay.
+It parses the bytes as the MCU does. The format, the checksum and `limits.wheel_speed` must be
+right. No wheel gets faster or turns round without a fresh command, the link and the mode `driving`.
+All wheels are zero without the link, before the first fresh command, and `RAMP_MARGIN_NS` after the
+longest ramp to rest since the last fresh command or since a stop began. Zeros replace a line that
+breaks a rule, and the robot latches a fault.
 """
 
 from __future__ import annotations
@@ -28,65 +15,48 @@ from functools import lru_cache
 from msgspec import Struct
 
 from acsard.core.config.settings import Config
-from acsard.core.values import NS_PER_S, Outputs
+from acsard.core.values import NS_PER_S, Ns, Outputs
 
-Wheels = tuple[int, int, int, int]
-"""Speeds of the motors a to d, in hundredths of rad/s."""
+Wheels = tuple[int, int, int, int]  # speeds of the motors a to d, in hundredths of rad/s
 
 _ZERO: Wheels = (0, 0, 0, 0)
 _COLUMNS = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
 _SEAL = re.compile(rb"#[0-9A-F]{2}[SH]?\*[0-9A-F]{4}\r\n")
 
-HALTED = ("stopped", "fault", "shutdown")
-"""Modes in which the robot brakes at the stop deceleration."""
+HALTED = ("stopped", "fault", "shutdown")  # modes with the stop deceleration
 
+# Like the watchdog of the board, which stops the motors by itself without lines.
 RAMP_MARGIN_NS = 300_000_000
-"""Extra time after the computed end of a ramp to rest, ns, in which the guard still passes lines
-that move a wheel. It equals the watchdog time of the board, after which a board without lines stops
-the motors by itself."""
 
 
 class Memory(Struct, frozen=True):
-    """The state that a guard keeps from one line to the next."""
+    """The state that a guard keeps from one line to the next; a recording stores it for replays."""
 
-    last: bytes = b""
-    """The last line that was written to the serial port; b"" before the first line."""
-    commanded_ns: int | None = None
-    """Monotonic time of the last control step that had a fresh command in mode `driving`, ns. None
-    before the first such step."""
-    halted_ns: int | None = None
-    """Monotonic time at which the robot began to brake for a stop, a fault or a shutdown, ns. None
-    if the mode is not one of `HALTED`."""
-    ramp_ns: int = 0
-    """Duration of a ramp from full speed to rest, ns. If the limits have changed since the robot
-    was last at rest, this is the longest duration under any of these limits."""
-    stop_ramp_ns: int = 0
-    """Duration of a stop from full speed, ns. If the limits have changed since the robot was last
-    at rest, this is the longest duration under any of these limits."""
+    last: bytes = b""  # written to the serial port
+    commanded_ns: Ns | None = None  # last step with a fresh command in mode `driving`
+    halted_ns: Ns | None = None  # begin of the present mode of `HALTED`
+    # From full speed to rest, the longest under any limits since the robot was last at rest.
+    ramp_ns: Ns = 0
+    stop_ramp_ns: Ns = 0  # from full speed to rest in a stop, likewise
 
 
 class Guard:
     """Checks each line to the board, and replaces a forbidden line with the stop line (zeros)."""
 
     def __init__(self, stop: bytes, config: Config, memory: Memory | None = None) -> None:
-        """Start with the state `memory` of an earlier guard, or with an empty `Memory`.
-
-        `stop` is the line that the guard sends instead of a forbidden line. It contains zeros and
-        no checksum, and the board accepts it in any state of the link.
-        """
+        # `stop` has zeros and no checksum: the board accepts it in any state of the link.
         self._stop = stop
         memory = memory or Memory()
         self._last, self._wheels = memory.last, _wheels(memory.last[:31])
-        """The last line that was written to the port, and its wheel speeds."""
         self._commanded_ns, self._halted_ns = memory.commanded_ns, memory.halted_ns
         self._longest = memory.ramp_ns, memory.stop_ramp_ns
         self.use(config)
 
     def use(self, config: Config) -> None:
-        """Use the configuration `config` from now on.
+        """Use other settings from now on.
 
-        A moving robot may still brake by the old limits. Therefore the guard allows the longer one
-        of the old and the new braking time until the robot is at rest.
+        A moving robot may still brake by the old limits, so until it is at rest the longer braking
+        time of both is allowed.
         """
         self._require_check = config.mcu.link_check == "require"
         self._most = int(config.limits.wheel_speed * 100 + 1)
@@ -100,7 +70,6 @@ class Guard:
 
     @property
     def memory(self) -> Memory:
-        """The state of this guard. A new `Guard` that starts with it makes the same decisions."""
         return Memory(self._last, self._commanded_ns, self._halted_ns, *self._longest)
 
     def record_written(self, line: bytes) -> None:
@@ -110,11 +79,7 @@ class Guard:
             self._longest = self._ramps
 
     def check(self, outputs: Outputs) -> tuple[bytes | None, str]:
-        """Return the line to send, and the reason why the guard replaced the robot's line.
-
-        The guard replaces a forbidden line with the stop line. The reason is "" if the guard did
-        not replace the line. If `outputs` does not contain a line, the result is (None, "").
-        """
+        """Return the line to send (None if `outputs` has none), and why it is not the robot's."""
         if outputs.mode == "driving":
             if self._commanded(outputs):
                 self._commanded_ns = outputs.now.mono_ns
@@ -153,7 +118,7 @@ class Guard:
             return "the line still moves a wheel although the longest ramp to zero has ended"
         return ""
 
-    def _late(self, now_ns: int) -> bool:
+    def _late(self, now_ns: Ns) -> bool:
         (ramp_ns, stop_ramp_ns), since_ns = self._longest, self._commanded_ns
         if since_ns is None or now_ns - since_ns > ramp_ns + RAMP_MARGIN_NS:
             return True
@@ -169,17 +134,8 @@ class Guard:
         return abs(outputs.now.mono_ns - arrived) <= timeout
 
     def _sealed(self, line: bytes) -> bool:
-        """Return whether a line ends with a sequence number and a correct checksum.
-
-        After the four speeds (the first 31 characters), the line must consist of these parts, in
-        this order:
-
-        - a comma, if the board needs a comma at the end of the speeds
-        - `#`, and the sequence number of the line as two hexadecimal digits
-        - at most one request letter: `S` or `H`
-        - `*`, and the CRC-16/XMODEM of all characters before `*` as four hexadecimal digits
-        - a carriage return and a line feed
-        """
+        # The end is: a comma if the board needs one, `#` and the sequence number (two hexadecimal
+        # digits), at most one request letter, `*` and the CRC-16/XMODEM of all before it.
         comma = self._stop[31:-2]
         return (
             line[31:].startswith(comma)
@@ -188,12 +144,8 @@ class Guard:
         )
 
 
-def _ramp_ns(config: Config, *, stop: bool) -> int:
-    """Return the time to brake from the highest speed to rest, ns.
-
-    If `stop` is true, the robot brakes at the stop deceleration, otherwise at the normal
-    deceleration. Jerk limits do not affect braking.
-    """
+def _ramp_ns(config: Config, *, stop: bool) -> Ns:
+    # From the highest speed to rest. Jerk limits do not affect braking.
     limits, drive = config.limits, config.drive
     sides = drive.left_wheel_radius_multiplier + drive.right_wheel_radius_multiplier
     rim = limits.wheel_speed * drive.wheel_radius * sides / 2
@@ -210,10 +162,7 @@ def _ramp_ns(config: Config, *, stop: bool) -> int:
 # A steady command repeats the same columns in each line, so a cache of a few lines saves most work.
 @lru_cache(4)
 def _wheels(columns: bytes) -> Wheels | None:
-    """Return the speeds of the motors a to d, in 0.01 rad/s, or None if a column is malformed.
-
-    `columns` are the first 31 bytes of a line, without sequence number and checksum.
-    """
+    # In 0.01 rad/s; None if a column is malformed. `columns` are the first 31 bytes of a line.
     match = _COLUMNS.match(columns)
     if match is None:
         return None
@@ -225,7 +174,7 @@ def _wheels(columns: bytes) -> Wheels | None:
 
 
 def _crc(data: bytes) -> int:
-    """Return the CRC-16/XMODEM of `data`."""
+    # CRC-16/XMODEM
     crc = 0
     for byte in data:
         crc = (crc << 8 & 0xFFFF) ^ _CRC_OF_BYTE[crc >> 8 ^ byte]
@@ -233,7 +182,7 @@ def _crc(data: bytes) -> int:
 
 
 def _crc_of(byte: int) -> int:
-    """Return the CRC-16/XMODEM of one byte, computed by shifts as in the notes of avr-libc."""
+    # One byte, computed by shifts as in the notes of avr-libc.
     x = byte ^ byte >> 4
     return (x << 12 ^ x << 5 ^ x) & 0xFFFF
 
