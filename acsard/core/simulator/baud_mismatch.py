@@ -1,8 +1,7 @@
 """Computes the bytes that a receiver gets if the sender uses another baud rate.
 
-For each byte, the sender puts a start bit, eight data bits with the lowest first, and a stop bit
-on the wire. The receiver waits for a falling edge. Then it samples the wire ten times, in the
-middle of each bit as its own baud rate defines it.
+A byte is a start bit, eight data bits with the lowest first, and a stop bit. The receiver waits for
+a falling edge and samples ten times, in the middle of each bit at its own baud rate.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ BITS = 10
 
 
 def garbled(data: bytes, sent: int, received: int) -> bytes:
-    """Return the bytes that a receiver at `received` baud gets if `data` is sent at `sent` baud.
+    """Return what a receiver at `received` baud gets of `data` that is sent at `sent` baud.
 
     A byte with a wrong stop bit becomes a zero byte, as the Linux kernel delivers it.
     """

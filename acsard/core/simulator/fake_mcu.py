@@ -1,8 +1,7 @@
 """Simulates the board: its side of the serial protocol, with the time of each byte on the wire.
 
-The simulated board does not use the daemon's parser. So an error in that parser makes tests fail.
-A test switches a fault on for a `with` block, such as `with mcu.mute():` (`faults.py`). The faults
-that `[sim] faults` lists are always on.
+It does not use the daemon's parser, so an error there makes tests fail. A test switches a fault on
+for a `with` block, such as `with mcu.mute():` (`faults.py`); those of `[sim] faults` are always on.
 """
 
 from __future__ import annotations
@@ -21,59 +20,45 @@ from acsard.core.simulator import protocol
 from acsard.core.simulator.faults import USB_PACKET, Fault, Faults
 from acsard.core.simulator.faults import WATCHDOG_NS as WATCHDOG_NS
 from acsard.core.simulator.vehicle import Vehicle
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Ns
 
 MS = 1_000_000
 
-RESET_NS = 2 * NS_PER_S
-"""Time for which a board with a bootloader ignores its input after a reset, ns."""
+RESET_NS = 2 * NS_PER_S  # a board with a bootloader ignores its input after a reset
 
+# A reply within this time after the last computation from encoder counts repeats its speeds.
 MIN_WINDOW_NS = 4 * MS
-"""Shortest time over which the board computes speeds from encoder counts, ns. If the last
-computation is more recent, a reply repeats the speeds of that computation."""
 
-OUTPUT_BYTES = 255
-"""Size of the board's output buffer, bytes. The board drops a line that does not fit into the
-buffer. The firmware in `deploy/firmware` does the same."""
+OUTPUT_BYTES = 255  # bytes; a line that does not fit is dropped, as by `deploy/firmware`
 
 STATUS_NS = NS_PER_S // 10
-"""Time between two status lines, ns."""
 
+# Six cells: V of the empty battery, additional V of a full one, ohm.
 EMPTY_VOLTS, CHARGED_VOLTS, RESISTANCE = 21.0, 4.2, 0.2
-"""Properties of the simulated battery, which has six cells: the voltage of the empty battery, V;
-the additional voltage of a full battery, V; and the internal resistance, ohm."""
 
-REST_AMPS, AMPS_PER_SPEED = 0.5, 0.05
-"""Battery current while the robot stands still, A, and the additional current for each rad/s of
-each wheel, A."""
+REST_AMPS, AMPS_PER_SPEED = 0.5, 0.05  # A at rest, and A for each rad/s of each wheel
 
-START_AMPS, START_NS = 10.0, 300 * MS
-"""Additional battery current while the motors start, A, and the duration of the start, ns. The
-current lowers the battery voltage by 2 V."""
+START_AMPS, START_NS = 10.0, 300 * MS  # while the motors start; it lowers the voltage by 2 V
 
 NEVER_NS = 2**62
 
+# From the arrival of a line to the start of the reply, in turn.
 PROCESSING_MS = (2.1, 1.3, 3.7, 1.0, 4.9, 2.6, 1.8, 3.2)
-"""Delays from the arrival of a line at the board to the start of the reply, ms. The board uses the
-delays in turn."""
 
 
 class FakeMcu(Faults):
-    """The simulated board.
+    """The simulated board: `receive()` takes the host's bytes, `advance()` returns its own.
 
-    Pass the bytes that the host sends to `receive()`. Call `advance()` at the times that
-    `next_ns()` returns. `advance()` returns the bytes that the host receives.
+    Call `advance()` at the times that `next_ns()` returns.
     """
 
-    def __init__(self, config: Config, now_ns: int = 0) -> None:
+    def __init__(self, config: Config, now_ns: Ns = 0) -> None:
         super().__init__()
         self._vehicle = Vehicle(config.sim, config.drive)
         self.baud_rate = config.mcu.baud_rate
         self._counts = config.sim.encoder_counts
         self._wiring = _wiring(config.mcu.wheels)
-        self._now_ns = self._moved_ns = now_ns
-        """`_now_ns` is the monotonic time of the last event or of the last call of `advance()`, ns.
-        `_moved_ns` is the monotonic time up to which the vehicle is simulated, ns."""
+        self._now_ns = self._moved_ns = now_ns  # last event or `advance()`; time of the vehicle
         self._events: list[tuple[int, int, str, bytes]] = []
         self._order = count()
         self._processing = cycle(PROCESSING_MS)
@@ -83,37 +68,26 @@ class FakeMcu(Faults):
         self._fed_ns = now_ns
         self._on_ns = self._boot_until_ns
         self._angles: list[float] = []
-        self._seen: list[int] = []
-        """Encoder counts of the motors a to d at the wheel angles in `self._angles`."""
+        self._seen: list[int] = []  # counts of the motors a to d at `self._angles`
         self._window = (now_ns, self._encoders())
         self._measured = [0.0] * 4
         self._moved = [0] * 4
         self._counted = [0.0] * 4
         self._replied_ns = now_ns - NS_PER_S
+        # Lines of the host with the time of their last byte, valid or not, obeyed or not.
         self.heard: deque[tuple[int, bytes]] = deque(maxlen=4096)
-        """The last lines that the host sent, valid or not. Each item is a pair: the monotonic time
-        at which the last byte of the line arrived, ns, and the line. Lines that arrive while the
-        board boots, and lines that the fault `lost_commands` drops, are included."""
         self.valid_lines = 0
         self._watchdog_trips = 0
-        self._checks = False
-        """True if the host has sent a valid line with a checksum. The board then also adds a
-        checksum to its status lines."""
-        self._bumpers = "." * (len(config.safety.bumpers) or 4)
-        """Field `bumpers` of the status line while no bumper is pressed: one dot per bumper."""
+        self._checks = False  # the host has sent a valid checksum: status lines have one, too
+        self._bumpers = "." * (len(config.safety.bumpers) or 4)  # while none is pressed
+        # Begin, end, field of the status line, value. `silent` leaves the field out. The last fault
+        # of a field decides, except that each pressed bumper is reported.
         self._inputs: tuple[tuple[int, int, str, str], ...] = ()
-        """The input faults that are on, as tuples: begin and end (monotonic, ns), the name of a
-        field in the status line, and the value of this field. The value `silent` leaves the field
-        out of the line. If several faults of the same field are on, the last fault decides. For
-        the field `bumpers`, each bumper that at least one fault presses is reported as pressed."""
         self._inputs_clock = b""
         self._battery_clock = b""
-        self._charge = self._capacity = 1.0
-        """`_charge` is the state of charge of the battery, 0 to 1. `_capacity` is the capacity of
-        the battery, ampere seconds."""
+        self._charge = self._capacity = 1.0  # 0 to 1, and ampere seconds
+        # When the charge was computed, and when all set points were zero.
         self._drained_ns = self._rested_ns = now_ns
-        """`_drained_ns` is the monotonic time at which the charge was last computed, ns.
-        `_rested_ns` is the last monotonic time at which all set points were zero, ns."""
         if config.sim.boot_time:
             self._schedule(self._boot_until_ns, "booted", b"")
         self._lasting = ExitStack()
@@ -122,10 +96,7 @@ class FakeMcu(Faults):
 
     @property
     def vehicle(self) -> Vehicle:
-        """The simulated robot at the time of the last call of `advance()`.
-
-        Reading this property computes the motion of the robot up to that time.
-        """
+        """The simulated robot, moved to the time of the last call of `advance()`."""
         self._catch_up()
         return self._vehicle
 
@@ -137,11 +108,8 @@ class FakeMcu(Faults):
 
     # Time.
 
-    def receive(self, now_ns: int, data: bytes) -> None:
-        """Accept bytes that the host wrote at the monotonic time `now_ns`, ns.
-
-        The bytes reach the board later, at the speed of the wire.
-        """
+    def receive(self, now_ns: Ns, data: bytes) -> None:
+        """Accept bytes that the host writes now; they reach the board at the speed of the wire."""
         start, offset = max(self._in_free_ns, now_ns), 0
         data = self._damaged(data)
         *lines, rest = data.split(b"\n")
@@ -153,18 +121,12 @@ class FakeMcu(Faults):
         self._held = (self._held + rest)[-256:]
         self._in_free_ns = start + wire_ns(len(data), self.baud_rate)
 
-    def next_ns(self) -> int | None:
-        """Return the monotonic time at which to call `advance()` next, ns.
-
-        Return None if nothing will happen before the next call of `receive()`.
-        """
+    def next_ns(self) -> Ns | None:
+        """Return when to call `advance()` next; None: not before `receive()`."""
         return self._events[0][0] if self._events else None
 
-    def advance(self, now_ns: int) -> bytes:
-        """Simulate the board until `now_ns`. Return the bytes that the host receives until then.
-
-        `now_ns` is a monotonic time, ns.
-        """
+    def advance(self, now_ns: Ns) -> bytes:
+        """Simulate the board until `now_ns`, and return what the host receives until then."""
         out = b""
         while self._events and self._events[0][0] <= now_ns:
             due_ns, _, what, data = heapq.heappop(self._events)
@@ -196,11 +158,10 @@ class FakeMcu(Faults):
         self._now_ns = now_ns
         return out
 
-    def reset(self, now_ns: int, deaf_ns: int = RESET_NS) -> None:
-        """Reset the board at the monotonic time `now_ns`, ns.
+    def reset(self, now_ns: Ns, deaf_ns: Ns = RESET_NS) -> None:
+        """Reset the board: it stops the motors, and ignores its input for `deaf_ns`.
 
-        The motors stop, and the board ignores its input for `deaf_ns` ns. After half of this time,
-        the board sends some noise, as a bootloader does.
+        After half of this time it sends noise, as a bootloader does.
         """
         self._now_ns = now_ns
         self._events.clear()
@@ -222,7 +183,7 @@ class FakeMcu(Faults):
         for begin_ns, end_ns, _, _ in self._inputs:
             self._schedule_changes(begin_ns, end_ns)
 
-    def _schedule(self, due_ns: int, what: str, data: bytes) -> None:
+    def _schedule(self, due_ns: Ns, what: str, data: bytes) -> None:
         heapq.heappush(self._events, (due_ns, next(self._order), what, data))
 
     def _catch_up(self) -> None:
@@ -241,7 +202,7 @@ class FakeMcu(Faults):
 
     # Lines.
 
-    def _act(self, now_ns: int, line: bytes) -> None:
+    def _act(self, now_ns: Ns, line: bytes) -> None:
         if line.rstrip(b"\r\n") == b"?":
             self._send_identity(now_ns)
             return
@@ -263,13 +224,13 @@ class FakeMcu(Faults):
         if not self.unprompted_ns:
             self._reply(now_ns, command)
 
-    def _send_identity(self, now_ns: int) -> None:
+    def _send_identity(self, now_ns: Ns) -> None:
         if self.understand is protocol.reference:
             self._send(
                 now_ns, protocol.identity(self._counts, self.watchdog_ns // MS, self.samples)
             )
 
-    def _reply(self, now_ns: int, command: protocol.Command) -> None:
+    def _reply(self, now_ns: Ns, command: protocol.Command) -> None:
         if self.muted or now_ns - self._replied_ns < self.reply_gap_ns:
             return
         self._replied_ns = now_ns
@@ -285,7 +246,7 @@ class FakeMcu(Faults):
         data = self._damaged(self.noise_bytes + text + end)
         self._send(now_ns, data[: len(data) // 2] if self.cut_replies else data)
 
-    def _send(self, now_ns: int, data: bytes) -> None:
+    def _send(self, now_ns: Ns, data: bytes) -> None:
         begin_ns = max(self._out_free_ns, now_ns)
         end_ns = begin_ns + wire_ns(len(data), self.baud_rate)
         if begin_ns > now_ns and end_ns - now_ns > wire_ns(OUTPUT_BYTES, self.baud_rate):
@@ -293,12 +254,8 @@ class FakeMcu(Faults):
         self._out_free_ns = end_ns
         self._schedule(self._out_free_ns, "sent", data)
 
-    def _handed_over(self, now_ns: int, what: str, data: bytes) -> bytes:
-        """Return the bytes that the USB adapter passes to the host; b"" during a stall.
-
-        `what` is "batch" if the adapter's timer has expired, or "sent" if `data` has arrived from
-        the board.
-        """
+    def _handed_over(self, now_ns: Ns, what: str, data: bytes) -> bytes:
+        # "batch": the adapter's timer has expired; "sent": `data` has come from the board.
         until_ns = self._stalled_until(now_ns)
         if until_ns > now_ns:
             self._schedule(until_ns, what, data)
@@ -321,7 +278,7 @@ class FakeMcu(Faults):
             self._seen = [floor(f * angles[w] / tau * per_turn + 0.5) for w, f in self._wiring]
         return self._seen
 
-    def _speeds(self, now_ns: int) -> list[float]:
+    def _speeds(self, now_ns: Ns) -> list[float]:
         since, before = self._window
         gains = self.gains
         if self.stuck is not None:
@@ -351,11 +308,11 @@ class FakeMcu(Faults):
         return [speed if abs(speed) >= 0.005 else 0.0 for speed in speeds]
 
     def _sample(self) -> tuple[int, ...]:
-        """Return the time of the last encoder reading, ms since boot, and the four counts."""
+        # ms since boot, and the four counts
         read_ns, _ = self._window
         return (read_ns - self._on_ns) // MS, *(round(count) for count in self._counted)
 
-    def _send_inputs(self, now_ns: int) -> None:
+    def _send_inputs(self, now_ns: Ns) -> None:
         fields: dict[str, str] = {}
         for begin_ns, end_ns, name, value in self._inputs:
             before = fields.setdefault(name, self._bumpers if name == "bumpers" else "ok")
@@ -366,11 +323,11 @@ class FakeMcu(Faults):
         if fields:
             self._send_status(now_ns, fields)
 
-    def _send_status(self, now_ns: int, fields: dict[str, str]) -> None:
+    def _send_status(self, now_ns: Ns, fields: dict[str, str]) -> None:
         if not self.muted and now_ns >= self._boot_until_ns:
             self._send(now_ns, self._damaged(protocol.status(fields, self._checks)))
 
-    def _send_battery(self, now_ns: int) -> None:
+    def _send_battery(self, now_ns: Ns) -> None:
         seconds, self._drained_ns = (now_ns - self._drained_ns) / NS_PER_S, now_ns
         turning = sum(map(abs, self.vehicle.set_points))
         if not turning:
@@ -384,7 +341,7 @@ class FakeMcu(Faults):
         fields = {"volts": f"{volts:.2f}", "amps": f"{-amps:.2f}", "charge": charge}
         self._send_status(now_ns, fields)
 
-    def _schedule_changes(self, begin_ns: int, end_ns: int) -> None:
+    def _schedule_changes(self, begin_ns: Ns, end_ns: Ns) -> None:
         for change_ns in (begin_ns, end_ns):
             if self._now_ns <= change_ns < NEVER_NS:
                 self._schedule(change_ns, "status", b"")
@@ -396,63 +353,41 @@ class FakeMcu(Faults):
         return self._input("estop", "ok")
 
     def estop_pressed(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report a press of the emergency stop.
+        """Make the board report a press of the emergency stop; 0 s is a press without end.
 
-        The press begins `after_s` s after this fault is switched on, and lasts `length_s` s. If
-        `length_s` is 0, the press does not end. Before and after the press, the board reports a
-        released emergency stop. The motors keep their power.
+        It reports a released one before and after. The motors keep their power.
         """
         return self._input("estop", "pressed", after_s, length_s)
 
     def estop_silent(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report a released emergency stop, with a pause in these reports.
-
-        The pause begins `after_s` s after this fault is switched on, and lasts `length_s` s. If
-        `length_s` is 0, the pause does not end.
-        """
+        """Make the board report a released emergency stop, with a pause; 0 s is one without end."""
         return self._input("estop", "silent", after_s, length_s)
 
     def bumpers(self) -> Fault:
-        """Make the board report that all bumpers are released.
-
-        There is one bumper for each place in `safety.bumpers`. If that list is empty, there are
-        four.
-        """
+        """Make the board report `safety.bumpers`, or four, all released."""
         return self._input("bumpers", self._bumpers)
 
     def bumper_pressed(self, number: float, after_s: float, length_s: float) -> Fault:
-        """Make the board report a press of the bumper `number`, counted from 1.
+        """Make the board report a press of a bumper, counted from 1; 0 s is a press without end.
 
-        The press begins `after_s` s after this fault is switched on, and lasts `length_s` s. If
-        `length_s` is 0, the press does not end. Before and after the press, the board reports
-        released bumpers. The motors keep their power.
+        It reports released ones before and after. The motors keep their power.
         """
         marks = ["X" if i == number else mark for i, mark in enumerate(self._bumpers, 1)]
         return self._input("bumpers", "".join(marks), after_s, length_s)
 
     def bumpers_silent(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report released bumpers, with a pause in these reports.
-
-        The pause begins `after_s` s after this fault is switched on, and lasts `length_s` s. If
-        `length_s` is 0, the pause does not end.
-        """
+        """Make the board report released bumpers, with a pause; 0 s is one without end."""
         return self._input("bumpers", "silent", after_s, length_s)
 
     def driver_fault(self, after_s: float, length_s: float) -> Fault:
-        """Make the board report a fault of the motor driver.
-
-        The driver's fault begins `after_s` s after this simulated fault is switched on, and lasts
-        `length_s` s. If `length_s` is 0, it does not end. Before and after it, the board reports
-        that the motor driver is ok.
-        """
+        """Make the board report a fault of the motor driver; 0 s is one without end."""
         return self._input("driver", "fault", after_s, length_s)
 
     @contextmanager
     def battery(self, percent: float, minutes: float) -> Iterator[None]:
         """Make the board report a battery ten times per second. Its charge begins at `percent` %.
 
-        While the robot stands still, a full battery lasts `minutes` minutes. It drains faster
-        while the robot drives.
+        A full one lasts `minutes` at rest, and less while the robot drives.
         """
         clock = b"battery %d" % next(self._order)
         self._schedule(self._now_ns + STATUS_NS, "battery", clock)
@@ -483,7 +418,7 @@ class FakeMcu(Faults):
 
     @contextmanager
     def free_running(self, period_s: float = 0.1) -> Iterator[None]:
-        """Make the board send a report every `period_s` s, instead of one reply to each line.
+        """Make the board report every `period_s`, not in reply to each line.
 
         The reports end with a comma, and their speeds are not padded (`3.14` instead of `03.14`).
         """
@@ -498,11 +433,7 @@ class FakeMcu(Faults):
 
 
 def _wiring(wheels: WheelMap) -> list[tuple[int, int]]:
-    """Return the wheel and the sign of each of the motors a to d.
-
-    The wheel is an index in `WHEELS`. The sign is -1 if a positive speed of the motor turns the
-    wheel backward, else 1.
-    """
+    # For the motors a to d: an index in `WHEELS`, and -1 if a positive speed turns it backward.
     motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
     place = {motor[1]: (index, -1 if motor[0] == "-" else 1) for index, motor in enumerate(motors)}
     return [place[letter] for letter in "abcd"]

@@ -1,7 +1,7 @@
-"""The switches for the faults of the simulated board and of its serial wire.
+"""The switches for the faults of the simulated board and of its serial wire (`fake_mcu.py`).
 
-`fake_mcu.py` implements the effects of the faults. No fault is random: a fault that affects only
-some of the lines affects every n-th line.
+No fault is random: one that affects only some lines affects every n-th. Motors and encoders are
+numbered 0 to 3 for a to d, an encoder by its motor even if encoders are swapped.
 """
 
 from __future__ import annotations
@@ -11,21 +11,16 @@ from contextlib import AbstractContextManager, contextmanager
 
 from acsard.core.config.named_faults import NamedFault
 from acsard.core.simulator import protocol
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Ns
 
 Fault = AbstractContextManager[None]
 
-USB_PACKET = 62
-"""Size of a full USB packet, bytes. An FTDI adapter sends a full packet without waiting for its
-timer."""
+USB_PACKET = 62  # bytes; an FTDI adapter sends a full packet without waiting for its timer
 
-WATCHDOG_NS = 300_000_000
-"""Time without a valid line from the host after which the board stops the motors, ns."""
+WATCHDOG_NS = 300_000_000  # without a valid line, the board stops the motors
 
 
 class Faults:
-    """The switches of all faults. A fault is on inside the `with` block of its method."""
-
     def __init__(self) -> None:
         self.muted = False
         self.noise_bytes = b""
@@ -40,31 +35,19 @@ class Faults:
         self.unprompted_ns = 0
         self.watchdog = True
         self.watchdog_ns = WATCHDOG_NS
-        self.any_feeds = False
-        """True if invalid lines also reset the watchdog."""
+        self.any_feeds = False  # invalid lines also reset the watchdog
         self.baud_rate = 115200
         self.reply_gap_ns = 0
-        self.drivers = [0, 1, 2, 3]
-        """The motor that each output drives. The outputs 0 to 3 are a to d of the board."""
-        self.drives = [1.0] * 4
-        """For each of the motors a to d, the factor from its command to its set point: 1, or -1 if
-        the motor is reversed, or 0 if the motor is dead."""
-        self.push: float | None = None
-        """Speed at which a person pushes the robot, m/s, or None if nobody pushes it."""
-        self.encoders = [0, 1, 2, 3]
-        """The motor whose encoder is connected to each of the board's inputs a to d."""
-        self.encoder_signs = [1, 1, 1, 1]
-        """For the encoder of each of the motors a to d, the sign of its counts: 1, or -1 if the
-        encoder is reversed."""
+        self.drivers = [0, 1, 2, 3]  # motor of each output a to d
+        self.drives = [1.0] * 4  # of each motor, from command to set point: -1 reversed, 0 dead
+        self.push: float | None = None  # m/s, by a person
+        self.encoders = [0, 1, 2, 3]  # motor whose encoder is at each input a to d
+        self.encoder_signs = [1, 1, 1, 1]  # -1: the motor's encoder is reversed
         self.understand: Callable[[bytes], protocol.Command | None] = protocol.reference
         self.samples = True
-        self.latency_ns = 0
-        """Interval of the USB adapter's timer, ns. When the timer expires, the adapter sends its
-        packet even if the packet is not full. 0 means no adapter."""
+        self.latency_ns = 0  # of the USB adapter, which sends its packet then; 0: none
         self.stall_every_ns = self.stall_ns = 0
-        self.lose_reply = self.lose_command = self.bit_error = 0
-        """Each of these three faults affects every n-th line. The value is n, or 0 if the fault is
-        off."""
+        self.lose_reply = self.lose_command = self.bit_error = 0  # every n-th line is hit; 0: off
         self._passed = {"reply": 0, "command": 0, "bit": 0}
         self._clock = b""
 
@@ -84,13 +67,10 @@ class Faults:
             setattr(self, name, value)
 
     def _catch_up(self) -> None:
-        """Simulate the vehicle up to now with the present switches, before a switch changes.
-
-        `FakeMcu` implements this.
-        """
+        # Implemented by `FakeMcu`: simulate up to now, before a switch changes.
+        ...
 
     def _hit(self, what: str, every: int) -> bool:
-        """Count an event. Return True for every n-th event, where n is `every`."""
         self._passed[what] += 1
         return every > 0 and self._passed[what] % every == 0
 
@@ -108,12 +88,12 @@ class Faults:
     def mute(self) -> Fault:
         """Make the board obey lines but send no replies and no status lines.
 
-        The board still identifies itself after a boot, and when the host asks it to.
+        It still identifies itself after a boot and on request.
         """
         return self._with(muted=True)
 
     def noise(self, data: bytes = b"\x00\xff~") -> Fault:
-        """Make the board send the bytes `data` in front of each reply."""
+        """Make the board send `data` in front of each reply."""
         return self._with(noise_bytes=data)
 
     def partial_line(self) -> Fault:
@@ -121,79 +101,63 @@ class Faults:
         return self._with(cut_replies=True)
 
     def bias(self, wheel: int, gain: float) -> Fault:
-        """Multiply the speed and counts that the board reports for motor `wheel` by `gain`.
-
-        `wheel` is 0 to 3 for the motors a to d, even if encoders are swapped.
-        """
+        """Multiply the reported speed and counts of a motor by `gain`."""
         return self._with(gains=[gain if i == wheel else g for i, g in enumerate(self.gains)])
 
     def stuck_encoder(self, wheel: int) -> Fault:
-        """Make the board report that motor `wheel` stands still, even while it turns.
-
-        `wheel` is 0 to 3 for the motors a to d, even if encoders are swapped.
-        """
+        """Make the board report that a motor stands still, even while it turns."""
         return self._with(stuck=wheel)
 
     def frozen_encoder(self, wheel: int) -> Fault:
-        """Make the board repeat the last speed that it has reported for motor `wheel`.
-
-        `wheel` is 0 to 3 for the motors a to d, even if encoders are swapped.
-        """
+        """Make the board repeat the last reported speed of a motor."""
         return self._with(frozen=wheel)
 
     @contextmanager
     def swapped_wheels(self, wheel: int, other: int) -> Iterator[None]:
-        """Exchange two wheels, so that both their motors and their encoders are swapped.
-
-        `wheel` and `other` are the numbers of the motors, 0 to 3 for a to d.
-        """
+        """Swap two wheels, motors and encoders."""
         with self.swapped_motors(wheel, other), self.swapped_encoders(wheel, other):
             yield
 
     def swapped_motors(self, wheel: int, other: int) -> Fault:
-        """Exchange the wires of the motors `wheel` and `other` (0 to 3 for a to d)."""
+        """Swap the wires of two motors."""
         return self._with(drivers=_swapped(self.drivers, wheel, other))
 
     def swapped_encoders(self, wheel: int, other: int) -> Fault:
-        """Exchange the wires of the encoders `wheel` and `other` (0 to 3 for a to d)."""
+        """Swap the wires of two encoders."""
         return self._with(encoders=_swapped(self.encoders, wheel, other))
 
     @contextmanager
     def reversed_wheel(self, wheel: int) -> Iterator[None]:
-        """Reverse both the motor and the encoder `wheel` (0 to 3 for a to d)."""
+        """Reverse a motor and its encoder."""
         with self.reversed_motor(wheel), self.reversed_encoder(wheel):
             yield
 
     def reversed_motor(self, wheel: int) -> Fault:
-        """Swap the two leads of motor `wheel` (0 to 3 for a to d), so that it turns backward."""
+        """Swap the two leads of a motor, so that it turns backward."""
         return self._with(drives=[-d if i == wheel else d for i, d in enumerate(self.drives)])
 
     def reversed_encoder(self, wheel: int) -> Fault:
-        """Swap the signals A and B of encoder `wheel` (0 to 3 for a to d), which reverses it."""
+        """Swap the signals A and B of an encoder, which reverses it."""
         signs = enumerate(self.encoder_signs)
         return self._with(encoder_signs=[-s if i == wheel else s for i, s in signs])
 
     def dead_motor(self, wheel: int) -> Fault:
-        """Make the motor `wheel` (0 to 3 for a to d) ignore its commands."""
+        """Make a motor ignore its commands."""
         return self._with(drives=[0.0 if i == wheel else d for i, d in enumerate(self.drives)])
 
     def pushed(self, speed: float) -> Fault:
-        """Simulate a person who pushes the robot straight at `speed` m/s.
-
-        The motors have no effect while the person pushes.
-        """
+        """Simulate a person who pushes the robot straight at `speed` m/s, against the motors."""
         return self._with(push=speed)
 
     def slow_reply(self, delay_s: float = 0.03) -> Fault:
-        """Make the board obey and answer each line with an additional delay of `delay_s` s."""
+        """Make the board obey and answer each line later by `delay_s`."""
         return self._with(extra_delay_ns=int(delay_s * NS_PER_S))
 
     def sparse_replies(self, period_s: float = 0.1) -> Fault:
-        """Make the board send at most one reply every `period_s` s."""
+        """Make the board send at most one reply every `period_s`."""
         return self._with(reply_gap_ns=int(period_s * NS_PER_S))
 
     def wrong_baud(self, baud_rate: int) -> Fault:
-        """Make the board use `baud_rate` instead of the configured baud rate."""
         return self._with(baud_rate=baud_rate)
 
     def unpadded(self) -> Fault:
@@ -209,10 +173,7 @@ class Faults:
         return self._with(ending=",\r\n")
 
     def comma_latched(self) -> Fault:
-        """Make the board obey each speed that is followed by a comma, and ignore checksums.
-
-        Some old firmware behaves like this.
-        """
+        """Make the board obey each speed with a comma, and ignore checksums, as old firmware."""
         return self._with(understand=protocol.latched)
 
     def no_check(self) -> Fault:
@@ -224,15 +185,14 @@ class Faults:
         return self._with(understand=protocol.plain_only)
 
     def no_sample(self) -> Fault:
-        """Make the board reply with checksums, but never with its time and encoder counts."""
+        """Make the board reply with checksums, but without its time and encoder counts."""
         return self._with(samples=False)
 
     def no_watchdog(self) -> Fault:
-        """Make the board keep the motors running when the host sends no lines."""
         return self._with(watchdog=False)
 
     def late_watchdog(self, time_s: float = 1.0) -> Fault:
-        """Make the board stop the motors only after `time_s` s without a valid line."""
+        """Make the board stop the motors only after `time_s` without a valid line."""
         return self._with(watchdog_ns=int(time_s * NS_PER_S))
 
     def watchdog_fed_by_bad_lines(self) -> Fault:
@@ -248,23 +208,21 @@ class Faults:
         return self._with(lose_command=every)
 
     def bit_errors(self, every: int = 7) -> Fault:
-        """Flip one bit in one of every `every` transmissions.
+        """Flip one bit, always another one, in one of every `every` transmissions.
 
-        A transmission is one line from the board, or all bytes of one write by the host.
-        Transmissions in both directions are counted together. The position of the bit changes each
-        time.
+        A transmission is a line from the board or one write of the host, counted together.
         """
         return self._with(bit_error=every)
 
     def ftdi(self, latency_s: float = 0.016) -> Fault:
-        """Send replies through a USB adapter that delays them by up to `latency_s` s."""
+        """Send replies through a USB adapter that delays them by up to `latency_s`."""
         return self._with(latency_ns=int(latency_s * NS_PER_S))
 
     def stalls(self, every_s: float, length_s: float) -> Fault:
-        """Hold back all bytes to the host for `length_s` s. A stall begins every `every_s` s."""
+        """Hold back all bytes to the host for `length_s`, every `every_s`."""
         return self._with(stall_every_ns=int(every_s * NS_PER_S), stall_ns=int(length_s * NS_PER_S))
 
-    def _stalled_until(self, now_ns: int) -> int:
+    def _stalled_until(self, now_ns: Ns) -> int:
         if not self.stall_every_ns:
             return now_ns
         began_ns = now_ns // self.stall_every_ns * self.stall_every_ns

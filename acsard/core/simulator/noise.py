@@ -1,8 +1,7 @@
-"""Generates repeatable random numbers.
+"""Generates repeatable random numbers: the n-th of a seed, in any order, without a state.
 
-The n-th number of a seed is always the same, in any order of calls, so the module keeps no state.
-The numbers come from the mixing function of SplitMix64 (Steele, Lea & Flood, Fast splittable
-pseudorandom number generators, 2014), applied to n.
+They come from the mixing function of SplitMix64 (Steele, Lea & Flood, Fast splittable pseudorandom
+number generators, 2014), applied to n.
 """
 
 from __future__ import annotations
@@ -14,16 +13,13 @@ _STEP = 0x9E3779B97F4A7C15
 
 
 def uniform(seed: int, n: int) -> float:
-    """Return the n-th random number of `seed`, uniformly distributed in [0, 1)."""
+    """Return the n-th random number of `seed`, uniform in [0, 1)."""
     z = (_mixed(seed & _MASK) + n * _STEP) & _MASK
     return (_mixed(z) >> 11) / (1 << 53)
 
 
 def gauss(seed: int, n: int) -> float:
-    """Return the n-th random number of `seed`, normally distributed with mean 0 and variance 1.
-
-    The method is the Box-Muller transform.
-    """
+    """Return the n-th random number of `seed`, normal with variance 1 (Box-Muller transform)."""
     radius = math.sqrt(-2.0 * math.log(1.0 - uniform(seed, 2 * n)))
     return radius * math.cos(math.tau * uniform(seed, 2 * n + 1))
 

@@ -1,8 +1,7 @@
 """The serial protocol on the side of the board: the commands that it obeys, and its replies.
 
-There is one decoder for each kind of firmware. `reference` is the decoder of the reference
-firmware. A checked line is a plain line with a suffix that contains a sequence number and a
-checksum. The module shares no code with the host.
+There is one decoder for each kind of firmware. A checked line is a plain one with a suffix of a
+sequence number and a checksum. The module shares no code with the host.
 """
 
 from __future__ import annotations
@@ -20,27 +19,19 @@ HEX = b"0123456789ABCDEF"
 
 _LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d),?")
 
-PLAIN_LENGTH = 31
-"""Length of a plain line in bytes, without a trailing comma and the line end."""
+PLAIN_LENGTH = 31  # bytes, without a trailing comma and the line end
 
 
 class Command(Struct, frozen=True):
-    """A valid command line from the host, decoded."""
+    """A valid command line from the host."""
 
-    values: dict[int, float]
-    """Commanded speeds, rad/s, by motor (0 to 3 for a to d)."""
-    sequence: bytes = b""
-    """The two digits of the sequence number of a checked line, or b"" for a plain line."""
-    wants_sample: bool = False
-    """True if the reply must contain the board's time and its encoder counts."""
+    values: dict[int, float]  # rad/s, by motor (0 to 3 for a to d)
+    sequence: bytes = b""  # two digits of a checked line
+    wants_sample: bool = False  # the reply must contain the board's time and its encoder counts
 
 
 def reference(line: bytes) -> Command | None:
-    """Decode a line as the reference firmware does.
-
-    The line may be plain or checked (with a sequence number and a checksum). Return None if it is
-    not valid.
-    """
+    """Decode a plain or checked line as the reference firmware does; None if it is not valid."""
     text = line.removesuffix(b"\n").removesuffix(b"\r")
     if b"#" not in text and b"*" not in text:
         return _plain(text)
@@ -58,22 +49,19 @@ def reference(line: bytes) -> Command | None:
 
 
 def plain_only(line: bytes) -> Command | None:
-    """Decode a line as firmware without checksums does. Return None if the line is not plain."""
+    """Decode a line as firmware without checksums does; None if it is not plain."""
     return _plain(line.removesuffix(b"\n").removesuffix(b"\r"))
 
 
 def prefix(line: bytes) -> Command | None:
-    """Decode a line, but ignore all text after the four speeds, as some firmware does.
-
-    Return None if the four speeds are not valid.
-    """
+    """Decode a line and ignore all after the four speeds, as some firmware does, or return None."""
     return _plain(line[:PLAIN_LENGTH])
 
 
 def latched(line: bytes) -> Command:
     """Decode a line as old firmware does: obey each speed that is followed by a comma.
 
-    Such firmware obeys these speeds even if the rest of the line is not valid.
+    The rest of the line need not be valid.
     """
     values = {}
     for token in line.split(b",")[:-1]:
@@ -107,11 +95,7 @@ def _value(word: bytes) -> float:
 
 @lru_cache(1024)
 def speeds_text(speeds: tuple[float, ...], separator: str, unpadded: bool) -> bytes:
-    """Return the plain part of a reply: the speeds of the motors a to d, rad/s.
-
-    `separator` is the text between two speeds, such as ",". If `unpadded` is true, a speed below
-    ten has only one digit before the decimal point.
-    """
+    """Return the plain part of a reply; unpadded speeds below ten have one integer digit."""
     form = "%s%s%.2f" if unpadded else "%s%s%05.2f"
     words = [
         form % (motor, "n" if speed < 0 else "p", min(abs(speed), 99.99))
@@ -121,13 +105,9 @@ def speeds_text(speeds: tuple[float, ...], separator: str, unpadded: bool) -> by
 
 
 def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
-    """Return the suffix of a checked reply.
+    """Return the suffix of a checked reply to the command with these two digits of `sequence`.
 
-    Args:
-        text: the plain part of the reply.
-        sequence: the two digits of the sequence number.
-        sample: the board's time in ms and the four encoder counts, or an empty sequence for a
-            reply without these values.
+    `sample` is the board's time in ms and the four counts, or empty.
     """
     body = b"#" + sequence
     if sample:
@@ -139,10 +119,7 @@ def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
 
 
 def status(fields: Mapping[str, str], check: bool) -> bytes:
-    """Return a status line with the given fields, such as `{"estop": "ok"}`.
-
-    If `check` is true, the line has a checksum.
-    """
+    """Return a status line with fields such as `{"estop": "ok"}`, with a checksum if `check`."""
     text = "".join(["!status", *(f" {name}={value}" for name, value in fields.items())]).encode()
     return text + (b"*%04X" % _crc(text) if check else b"") + b"\r\n"
 
@@ -150,17 +127,14 @@ def status(fields: Mapping[str, str], check: bool) -> bytes:
 def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
     """Return the line with which the firmware identifies itself.
 
-    Args:
-        counts: the number of encoder counts per wheel turn.
-        watchdog_ms: the time without a valid line after which the board stops the motors, ms.
-        sample: True if replies can contain the board's time and encoder counts.
+    `sample` says that replies can contain the board's time and encoder counts.
     """
     text = f"!acsard-mcu 1 counts={counts} watchdog_ms={watchdog_ms} check=1 sample={int(sample)}"
     return text.encode() + b"\r\n"
 
 
 def _crc(data: bytes, crc: int = 0) -> int:
-    """Return the CRC-16/XMODEM of `data`: polynomial x^16 + x^12 + x^5 + 1, initial value `crc`."""
+    # CRC-16/XMODEM: x^16 + x^12 + x^5 + 1
     table = _CRC_OF
     for byte in data:
         crc = (crc << 8 & 0xFFFF) ^ table[crc >> 8 ^ byte]

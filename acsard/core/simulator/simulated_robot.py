@@ -1,7 +1,6 @@
 """Observes the true motion of the simulated robot 100 times per second, and simulates a gyro.
 
-The simulated board does not use these observations. It reports only the measurements of its
-encoders.
+The simulated board does not use this: it reports only what its encoders measure.
 """
 
 from __future__ import annotations
@@ -14,46 +13,37 @@ from msgspec import Struct
 from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.noise import gauss
-from acsard.core.values import NS_PER_S, Pose
+from acsard.core.values import NS_PER_S, Ns, Pose
 
-OBSERVATION_PERIOD_NS = NS_PER_S // 100
-"""Interval at which the simulated robot is observed, ns. The gyro has the same interval."""
+OBSERVATION_PERIOD_NS = NS_PER_S // 100  # of the gyro, too
 
 
 class Observation(Struct, frozen=True):
-    """An observation of the simulated robot's true motion."""
+    """The true motion of the simulated robot at one time, and what its gyro reports."""
 
-    at_ns: int
-    """Monotonic time of the observation, ns."""
+    at_ns: Ns
     pose: Pose
+    # rad/s: the mean since the last observation, late by `[sim] gyro_delay`, with bias and noise.
     gyro: float
-    """Turn rate that the gyro reports, rad/s. It is the mean turn rate between two observations,
-    delayed by `[sim] gyro_delay`, plus the bias and the noise of the gyro."""
 
 
 class WatchedMcu(FakeMcu):
     """A `FakeMcu` that passes an `Observation` to a callback every 10 ms of simulated time."""
 
-    def __init__(self, config: Config, now_ns: int, see: Callable[[Observation], None]) -> None:
+    def __init__(self, config: Config, now_ns: Ns, see: Callable[[Observation], None]) -> None:
         super().__init__(config, now_ns)
         self._sim, self._see = config.sim, see
         self._delay_ns = int(config.sim.gyro_delay * NS_PER_S)
         self._looks = 0
         self._look_ns = now_ns + OBSERVATION_PERIOD_NS
+        # Not reported yet: time, and rad turned until then.
         self._history: deque[tuple[int, float]] = deque([(now_ns, 0.0)])
-        """The motion that the delayed gyro has not reported yet, oldest first. Each item is a
-        pair: a monotonic time, ns, and the angle by which the robot had turned until then, rad."""
 
-    def next_ns(self) -> int:
-        """Return the monotonic time at which to call `advance()` next, ns."""
+    def next_ns(self) -> Ns:
         due_ns = super().next_ns()
         return self._look_ns if due_ns is None else min(due_ns, self._look_ns)
 
-    def advance(self, now_ns: int) -> bytes:
-        """Simulate the board until `now_ns`. Return the bytes that the host receives until then.
-
-        `now_ns` is a monotonic time, ns.
-        """
+    def advance(self, now_ns: Ns) -> bytes:
         out = b""
         while self._look_ns <= now_ns:
             out += super().advance(self._look_ns)
@@ -73,7 +63,7 @@ class WatchedMcu(FakeMcu):
         self._looks += 1
         self._see(Observation(now_ns, self.vehicle.pose, rate))
 
-    def _turned(self, at_ns: int) -> float:
+    def _turned(self, at_ns: Ns) -> float:
         before_ns, before = self._history[0]
         if at_ns <= before_ns:
             return before

@@ -1,18 +1,10 @@
 """Simulates the robot: four motors with lag, and the motion of the base on the floor.
 
-A motor follows its set point as a first-order system. The true speeds of the wheels, their true
-radii and the true effective track determine the motion of the base. Settings in `[sim]` can make
-the true radii and the true track differ from the values in `[drive]`. Wheels are in the order
-`values.WHEELS`.
-
-The true effective track depends on the turn rate. Let L be the configured effective track, m the
-setting `track_multiplier`, and k the setting `track_rate_dependence`. With the track m L, the
-wheels would give the turn rate w, rad/s. The base turns at the rate
-
-    w / (1 + 2 k |w| / (1 + |w|))
-
-The true track is therefore m L at very low turn rates and (1 + k) m L at 1 rad/s. At high turn
-rates, it approaches (1 + 2 k) m L.
+A motor is a first-order system. The true radii and the true track, which `[sim]` can make different
+from `[drive]`, give the motion. With L the configured effective track, m `track_multiplier`, k
+`track_rate_dependence`, and w the turn rate that the wheels give with the track m L, rad/s, the
+base turns at w / (1 + 2 k |w| / (1 + |w|)). So the true track is m L at very low turn rates, (1 +
+k) m L at 1 rad/s, and approaches (1 + 2 k) m L.
 """
 
 from __future__ import annotations
@@ -24,16 +16,13 @@ from acsard.core.motion.path import arc
 from acsard.core.simulator.noise import uniform
 from acsard.core.values import Pose
 
-GRIP_CHANGE_S = 0.25
-"""Time after which the random grip of the wheels on the floor changes, s."""
+GRIP_CHANGE_S = 0.25  # the random grip of the wheels on the floor changes so often
 
-PUSH_TIME_CONSTANT_S = 0.1
-"""Time constant, s, with which the wheel speeds approach the speed of a person who pushes the
-robot."""
+PUSH_TIME_CONSTANT_S = 0.1  # of the wheel speeds, towards a person's who pushes the robot
 
 
 class Vehicle:
-    """The true state of the robot: wheel speeds in rad/s, wheel angles in rad, and the pose."""
+    """The true state: wheel speeds in rad/s and angles in rad, in `WHEELS` order, and the pose."""
 
     def __init__(self, sim: SimConfig, drive: DriveConfig) -> None:
         self._lag = sim.motor_time_constant
@@ -47,23 +36,13 @@ class Vehicle:
         self.set_points = [0.0] * 4
         self.speeds = [0.0] * 4
         self.angles = [0.0] * 4
-        self.pose = Pose()
-        """The true pose of base_link relative to its start."""
-        self.turned = 0.0
-        """Total angle by which the robot has turned left since its start, rad. Each full turn adds
-        2 pi."""
-        self.turn_slip = 0.0
-        """Fraction of each turn that is lost because the wheels skid, 0 to 1."""
-        self.load = 0.0
-        """Load of the motors, 0 to 1. The motors reach only the fraction 1 - `load` of each set
-        point."""
+        self.pose = Pose()  # of base_link, relative to its start
+        self.turned = 0.0  # rad to the left, beyond pi
+        self.turn_slip = 0.0  # fraction of each turn that skidding loses
+        self.load = 0.0  # 0 to 1; the motors reach 1 - `load` of each set point
 
     def advance(self, dt: float, push: float | None = None) -> None:
-        """Simulate the motion of the robot for `dt` s.
-
-        The motors follow their set points. If `push` is not None, a person pushes the robot at
-        `push` m/s, and the set points have no effect.
-        """
+        """Move the robot for `dt` s, by its set points, or at `push` m/s by a person."""
         if dt <= 0.0:
             return
         if push is None and not (any(self.set_points) or any(self.speeds)):
@@ -98,7 +77,7 @@ class Vehicle:
         self.pose = arc(self.pose, (left + right) / 2, turn)
 
     def _grip(self) -> float:
-        """Return the fraction of a turn that remains although the wheels skid, 0 to 1."""
+        # The fraction of a turn that remains although the wheels skid.
         grip = 1.0 - self.turn_slip
         if self._floor:
             grip *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_CHANGE_S))
