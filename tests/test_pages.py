@@ -204,12 +204,8 @@ def test_settings_for_zenoh_are_accepted(block: Block) -> None:
 
 
 def test_every_python_block_is_on_a_page_whose_examples_are_run() -> None:
-    """`test_client.py` and `test_web.py` in `tests/system/` and `tests/unit/cli/test_calibrate.py`
-    run these blocks.
-    """
-    calibration = "deploy/calibration/README.md"
-    pages = {"README.md", "deploy/web/README.md", calibration}
-    assert {block.page for block in blocks("python")} == pages
+    """`test_client.py` and `test_web.py` in `tests/system/` run these blocks."""
+    assert {block.page for block in blocks("python")} == {"README.md", "deploy/web/README.md"}
 
 
 @each("language", ["html", "js"])
@@ -303,10 +299,6 @@ READS_KEYS = {"calibration/error_budget/daemon_messages.py", "web/page/main.js"}
 """Files that follow only some of the published keys."""
 
 
-READS_BAGS = {"calibration/ros_bag_log.py", "deploy/calibration/README.md"}
-"""Files that read some types of ROS from bags, which this robot need not have recorded."""
-
-
 @each(
     ("part", "pattern", "some", "beyond"),
     [
@@ -315,7 +307,7 @@ READS_BAGS = {"calibration/ros_bag_log.py", "deploy/calibration/README.md"}
         ("simulated fault", "stuck_encoder", "core/config/named_faults.py", set()),
         ("setting", "angular_jerk", "core/config/motion_rules.py", {"core/motion/limits.py"}),
         ("ROS topic", "cmd_vel_teleop", "core/ros/transports.py", set()),
-        ("ROS topic", "sensor_msgs/(msg/)?JointState", "core/ros/channels.py", READS_BAGS),
+        ("ROS topic", "sensor_msgs/(msg/)?JointState", "core/ros/channels.py", set()),
         ("firmware dialect", "trailing_comma", "core/link/codec.py", set()),
     ],
 )

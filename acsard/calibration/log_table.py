@@ -1,16 +1,13 @@
-"""Reads the bytes of a CSV file into columns of numbers, and finds the run of each row.
+"""Reads the one CSV format of a log into columns of numbers, and finds the run of each row.
 
-The header names the columns in any order, and may give units, such as "t [ms]" and "yaw_rate
-(deg/s)". A cell may be empty, so that sensors of different rates share a file. Rows that cannot be
-read and impossible values are left out, counted and reported. A file with more than a few
-unreadable rows is refused.
+The first line names the columns. Every other line has a cell for each of them, with numbers in SI
+units, and a cell may be empty, so that sensors of different rates share a file. A file in another
+format is refused. Impossible values are left out, counted and reported.
 """
 
 from __future__ import annotations
 
-import csv
 import math
-import re
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
@@ -18,60 +15,22 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.core.config.nearest import nearest
 from acsard.core.formatting import many, printable
 from acsard.core.messages.schema import Imu, JointState, Message, PoseStamped
 from acsard.core.values import NS_PER_S, AcsardError
 
-TIME = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-TIME |= {"\N{MICRO SIGN}s": 1e-6, "\N{GREEK SMALL LETTER MU}s": 1e-6}
-LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3}
-ANGLE = {"rad": 1.0, "deg": math.radians(1.0), "°": math.radians(1.0), "mrad": 1e-3}
-RATE = {f"{unit}/s": size for unit, size in ANGLE.items()}
-RATE |= {"rpm": math.tau / 60, "rps": math.tau, "dps": math.radians(1.0)}
+Floats = npt.NDArray[np.float64]
 
-SPEED = {f"{unit}/s": size for unit, size in LENGTH.items()}
+FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
+"""Columns of wheel speeds, rad/s.
+
+`FOUR` has a column for each wheel. `TWO` has a column for the mean speed of each side.
+"""
+
 APPLIED = "applied_linear", "applied_angular"
 """Columns with the twist that the daemon commands to the wheels, in m/s and rad/s."""
 
-UNITS = {"t": TIME, "x": LENGTH, "y": LENGTH, "yaw": ANGLE, APPLIED[0]: SPEED}
-"""Units that each column can have, by the name of the column.
-
-The table of a column maps the name of a unit to the factor that converts this unit to SI. Columns
-that are not listed here have the units of `RATE`.
-"""
-
-SI = {"t": "s", "x": "m", "y": "m", "yaw": "rad", APPLIED[0]: "m/s"}
-
-_NAME = re.compile(r"(?P<name>[^\[(]*)[\[(]?(?P<unit>[^\])]*)")
-
-
-def parted(cell: str) -> tuple[str, str]:
-    """Return the name and the unit of a column from its header cell, such as "t [ms]".
-
-    The name is in snake case. The unit is the text in brackets up to a comma, or "" if the cell has
-    no brackets.
-    """
-    match = _NAME.match(cell.strip().lower())
-    assert match is not None
-    name = re.sub(r"[\s-]+", "_", match["name"].strip())
-    return name, re.sub(r"[\s^]", "", match["unit"].partition(",")[0])
-
-
-def factor(name: str, unit: str) -> float | None:
-    """Return the factor that converts `unit` to SI, or None if the unit is unknown.
-
-    `name` is the name of the column. An empty unit means SI.
-    """
-    known = UNITS.get(name, RATE)
-    return known.get(unit.replace("degrees", "deg").replace("/sec", "/s"), None if unit else 1.0)
-
-
-Floats = npt.NDArray[np.float64]
-
-WHEEL_COLUMNS = ("fr", "fl", "rl", "rr", "left", "right")
-
-BOUNDS = dict.fromkeys(WHEEL_COLUMNS, 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
+BOUNDS = dict.fromkeys((*FOUR, *TWO), 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
 DEFAULT_BOUND = 1e9
 """Largest plausible absolute value in a column that `BOUNDS` does not list, in SI units.
 
@@ -79,7 +38,7 @@ This limit and those in `BOUNDS` also allow values in degrees or nanoseconds, so
 can name the wrong unit.
 """
 
-SPIKE_COLUMNS = frozenset((*WHEEL_COLUMNS, "yaw_rate"))
+SPIKE_COLUMNS = frozenset((*FOUR, *TWO, "yaw_rate"))
 """Columns of wheel speeds and turn rates. Spikes are removed only from these columns."""
 
 SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
@@ -141,37 +100,11 @@ def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
     return mask
 
 
-FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
-"""Columns of wheel speeds, rad/s.
-
-`FOUR` has a column for each wheel. `TWO` has a column for the mean speed of each side.
-"""
-
-COLUMNS = ("t", *FOUR, *TWO, "yaw_rate", "x", "y", "yaw", *APPLIED, "run")
-"""Columns that a log can have. The column `run` contains names, and the others contain numbers."""
-
-EMPTY_CELLS = frozenset(("", "nan", "-nan(ind)", "null", "none", "na", "n/a", "#n/a", "-", "--"))
-"""Contents of a cell without a value, in lower case."""
-
-COUNT_COLUMN = re.compile(r"tick|count|(?:^|_)enc")
-"""Pattern for names of columns with encoder counts, which the user must convert to speeds."""
-
-TRAILING_COMMENT = re.compile(r"(?:^|\s)#")
-"""Pattern for the start of a comment after a number.
-
-It does not match the "#" in "1.#QNAN", which means NaN.
-"""
-
-MAX_BAD_ROWS, MAX_BAD_FRACTION = 3, 0.01
-"""Limits for the number of unreadable rows in a log.
-
-At most `MAX_BAD_ROWS` rows may be unreadable, or the fraction `MAX_BAD_FRACTION` of the readable
-rows if that is more.
-"""
-
-EXAMPLE = '"t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y"'
-
-CSV_ADVICE = f"export the drive as a CSV file whose first line names the columns, like {EXAMPLE}"
+CSV_ADVICE = (
+    "write a CSV file with commas, decimal points and SI units, whose first line names the columns "
+    'like "t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y" (deploy/calibration/README.md explains '
+    "the columns, and bag_to_csv.py there converts a ROS bag)"
+)
 
 
 class LogError(AcsardError):
@@ -218,233 +151,56 @@ class Table(Struct, frozen=True):
 
 
 def read(data: bytes) -> Table:
-    """Parse the bytes of a CSV file. Raises `LogError` if the file cannot be used."""
-    lines = _text(data).splitlines()
-    number, header, separator = _header(lines)
-    names = _columns([name for name, _ in header], number)
-    if separator != ",":
-        lines = [line.replace(",", ".") for line in lines]
-    reader = _Reader(names, separator, [factor(name, unit) or 1.0 for name, unit in header])
-    for at in range(number, len(lines)):
-        reader.take(lines[at], at + 1)
-    return reader.table([*_ignored(header, names), *_unknown_units(header, names)])
-
-
-def _text(data: bytes) -> str:
-    for mark, coding in ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16")):
-        if data.startswith(mark):
-            return data.decode(coding, errors="replace")
-    if b"\0" in data[:4096]:
-        raise LogError(f"the file is not text (perhaps a ROS bag): {CSV_ADVICE}")
-    return data.decode("utf-8-sig", errors="replace")
-
-
-def _header(lines: Sequence[str]) -> tuple[int, list[tuple[str, str]], str]:
-    """Return the number of lines above the data, the (name, unit) pairs, and the separator."""
-    comment = ""
-    for at, line in enumerate(lines):
-        text = line.strip()
-        if text.startswith(("#", "%")):
-            comment = text.strip("#% \t") or comment
-        elif text and not text.lower().startswith("sep="):  # `sep=` is a hint for spreadsheets
-            separator = _separator(text)
-            cells = _cut(text, separator)
-            if not all(_is_number(cell) for cell in cells):
-                return at + 1, _names(text, separator), separator
-            # numpy writes the header as the last comment above the numbers.
-            separator = _separator(comment)
-            names = _names(comment, separator)
-            if 1 < len(names) == len(cells) or "t" in [name for name, _ in names]:
-                return at, names, separator
-            raise LogError(
-                f"line {at + 1} contains numbers instead of the names of the columns: "
-                f"write a first line like {EXAMPLE}"
-            )
-    raise LogError(f"the file is empty: its first line must name the columns, like {EXAMPLE}")
-
-
-def _separator(text: str) -> str:
-    return max(",;\t", key=text.count)
-
-
-def _cut(line: str, separator: str) -> list[str]:
+    """Parse the bytes of a CSV file. Raises `LogError` if the file has another format."""
     try:
-        cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
-    except csv.Error:
-        return line.split(separator)
-    return [cell.strip() for cell in cells]
-
-
-def _names(text: str, separator: str) -> list[tuple[str, str]]:
-    return [parted(cell) for cell in _cut(text, separator)]
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return cell.lower() in EMPTY_CELLS
-    return True
-
-
-def _columns(header: list[str], number: int) -> list[str]:
-    where = f"line {number} (the header)"
-    twice = {name for name in header if name in COLUMNS and header.count(name) > 1}
-    if twice:
-        raise LogError(f"{where}: column {min(twice)} exists twice; leave one out")
-    wheels = FOUR if set(FOUR) <= set(header) else TWO
-    wanted = ["t", *wheels]
-    if len(header) == 1 and "t" in header[0].split("_"):
-        raise LogError(f"{where}: there are no commas between the names: write {EXAMPLE}")
-    if missing := [name for name in wanted if name not in header]:
-        raise LogError(
-            f"{where}: no column {', '.join(missing)}{_column_hint(missing, header)}; the header "
-            f"must name t, and either fr, fl, rl and rr, or left and right, for example {EXAMPLE}"
-        )
-    sensors: list[str] = [name for name in ("yaw_rate", "yaw") if name in header]
-    if {"x", "y"} <= set(header):
-        sensors += ["x", "y"]
-    if not sensors:
-        raise LogError(
-            f"{where}: no column with which to compare the wheels: the header must name yaw_rate "
-            "(a gyro, rad/s), or x and y (positions, m)"
-            f"{_column_hint(['yaw_rate', 'x', 'y'], header)}"
-        )
-    commands = APPLIED if set(APPLIED) <= set(header) else ()
-    used = {*wanted, *sensors, *commands, "run"}
-    return [name if name in used else "" for name in header]
-
-
-def _column_hint(names: Sequence[str], header: Sequence[str]) -> str:
-    others = [name for name in header if name and name not in COLUMNS]
-    if "t" in names and (times := [name for name in others if "time" in name or "stamp" in name]):
-        return f" (if column {times[0][:40]} is the time, rename it to t and convert it to seconds)"
-    if counts := [name for name in others if COUNT_COLUMN.search(name)]:
-        return (
-            f" (column {counts[0][:40]} has counts, not speeds: convert the counts of each row to "
-            "rad/s with 2 pi x counts / (counts per turn x seconds))"
-        )
-    near = [other for name in names for other in nearest(name, others)]
-    return f" (if column {near[0]} is the missing one, rename it)" if near else ""
-
-
-def _ignored(header: list[tuple[str, str]], names: list[str]) -> list[str]:
-    left = [
-        f'"{cell[:40]}"' for (cell, _), name in zip(header, names, strict=True) if cell and not name
-    ]
-    if not left:
-        return []
-    return [f"columns not used: {', '.join(left[:8])}{', ...' if len(left) > 8 else ''}"]
-
-
-def _unknown_units(header: list[tuple[str, str]], names: list[str]) -> list[str]:
-    return [
-        f"column {name} has the unknown unit ({unit[:20]}): the values were read as "
-        f"{SI.get(name, 'rad/s')}; correct the header if they have another unit"
-        for (_, unit), name in zip(header, names, strict=True)
-        if name and name != "run" and factor(name, unit) is None
-    ]
-
-
-class _Reader:
-    """Parser of the lines below the header. It must be fast: a log may have a million lines."""
-
-    def __init__(self, names: list[str], separator: str, factors: list[float]) -> None:
-        self._names, self._separator, self._factors = names, separator, factors
-        self._run = names.index("run") if "run" in names else -1
-        # Parse as numbers only the columns that the calibration uses, without the name of the run.
-        self._picks = [i for i, name in enumerate(names) if name and name != "run"]
-        self._last = max(*self._picks, self._run)
-        self._values = array("d")  # a list of lists would take ten times the memory
-        self._runs: list[int] = []
-        self._known: dict[str, int] = {}
-        self._bad, self._first = 0, ""
-
-    def take(self, line: str, number: int) -> None:
-        if not line or line.isspace():
-            return
-        special = "#" in line or '"' in line
-        cells = self._cells(line) if special else line.split(self._separator)
-        short = len(self._names) - len(cells)
-        if short > 0:
-            if not cells:
-                return
-            cells += [""] * short
-        elif short < 0 and any(cell.strip() for cell in cells[short:]):
-            self._refuse(
-                f"line {number} has {len(cells)} cells, but the header has {len(self._names)}"
-            )
-            return
+        lines = data.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise LogError(f"the file is not text: {CSV_ADVICE}") from None
+    header = lines[0].split(",") if lines else []
+    names = _used(header)
+    picks = [header.index(name) for name in names]
+    run = header.index("run") if "run" in header else -1
+    values, runs = array("d"), array("q")  # lists would take ten times the memory
+    labels: dict[str, int] = {}
+    for number, line in enumerate(lines[1:], 2):
+        if not line:
+            continue
+        cells = line.split(",")
         try:
-            row = [float(cells[i] or "nan") for i in self._picks]
+            if len(cells) != len(header):
+                raise ValueError
+            values.extend(float(cells[i] or "nan") for i in picks)
         except ValueError:
-            row = self._slowly(cells, number)
-            if not row:
-                return
-        self._values.extend(row)
-        name = cells[self._run].strip() if self._run >= 0 else ""
-        self._runs.append(self._known.setdefault(name, len(self._known)))
-
-    def _cells(self, line: str) -> list[str]:
-        """Return the cells of a line without its comment; [] if the line is only a comment."""
-        cells = _cut(line, self._separator)
-        if line.lstrip().startswith("#") and not self._begins_with_its_run(cells):
-            return []
-        for i, cell in enumerate(cells):
-            # The name of a run, or an unused column, may contain a "#".
-            if i == self._run or (i < self._last and i not in self._picks):
-                continue
-            if cell.lower() not in EMPTY_CELLS and (comment := TRAILING_COMMENT.search(cell)):
-                return [*cells[:i], cell[: comment.start()]]
-        return cells
-
-    def _begins_with_its_run(self, cells: list[str]) -> bool:
-        return (
-            self._run == 0
-            and len(cells) > self._last
-            and all(_is_number(cells[i]) for i in self._picks)
-        )
-
-    def _slowly(self, cells: list[str], number: int) -> list[float]:
-        row = []
-        for i in self._picks:
-            cell = cells[i].strip()
-            if cell.lower() in EMPTY_CELLS:
-                row.append(math.nan)
-                continue
-            try:
-                row.append(float(cell))
-            except ValueError:
-                if parted(cell)[0] == self._names[i]:
-                    return []  # the line repeats the header, because several logs were concatenated
-                text = printable(cell if len(cell) <= 30 else cell[:27] + "...")
-                date = self._names[i] == "t" and ":" in cell
-                why = "a date, but t must be in seconds" if date else "not a number"
-                self._refuse(f'line {number}, column {self._names[i]}: "{text}" is {why}')
-                return []
-        return row
-
-    def _refuse(self, why: str) -> None:
-        self._bad += 1
-        self._first = self._first or why
-
-    def table(self, notes: list[str]) -> Table:
-        rows = len(self._runs)
-        if self._bad > max(MAX_BAD_ROWS, MAX_BAD_FRACTION * rows) or (self._bad and not rows):
             raise LogError(
-                f"{self._first}, and {self._bad} of {self._bad + rows} rows have such errors: "
-                "write numbers with a decimal point, or leave a cell empty if it has no value"
-            )
-        if not rows:
-            raise LogError("there are no rows below the header: record a drive")
-        if self._bad:
-            notes = [*notes, f"{many(self._bad, 'row')} left out: {self._first}"]
-        values = np.frombuffer(self._values).reshape(rows, len(self._picks))
-        columns = {
-            self._names[i]: values[:, at] * self._factors[i] for at, i in enumerate(self._picks)
-        }
-        runs = np.array(self._runs, dtype=np.int64)
-        return Table(columns, runs, tuple(self._known), (*notes, *bounded(columns)))
+                f'line {number} is "{printable(line[:60])}", which is not a number or an empty '
+                f"cell for each of the {len(header)} columns: {CSV_ADVICE}"
+            ) from None
+        runs.append(labels.setdefault(cells[run] if run >= 0 else "", len(labels)))
+    if not runs:
+        raise LogError("there are no rows below the header: record a drive")
+    matrix = np.frombuffer(values).reshape(len(runs), len(picks))
+    columns = {name: matrix[:, at].copy() for at, name in enumerate(names)}
+    others = [printable(name) for name in header if name not in (*names, "run")]
+    notes = [f"columns not used: {', '.join(others)}"] if others else []
+    return Table(
+        columns, np.frombuffer(runs, dtype=np.int64), tuple(labels), (*notes, *bounded(columns))
+    )
+
+
+def _used(header: Sequence[str]) -> list[str]:
+    wheels = FOUR if set(FOUR) <= set(header) else TWO
+    places = ("x", "y") if {"x", "y"} <= set(header) else ()
+    sensors = [name for name in ("yaw_rate", "yaw") if name in header] + [*places]
+    missing = [name for name in ("t", *wheels) if name not in header]
+    if not sensors:
+        missing.append("yaw_rate (of a gyro) or x and y (positions)")
+    if missing:
+        raise LogError(f"the first line does not name {', '.join(missing)}: {CSV_ADVICE}")
+    commands = APPLIED if set(APPLIED) <= set(header) else ()
+    used = [name for name in header if name in ("t", *wheels, *sensors, *commands)]
+    if len(set(used)) < len(used) or header.count("run") > 1:
+        raise LogError(f"the first line names a column twice: {CSV_ADVICE}")
+    return used
 
 
 HEADER = f"t,{','.join(FOUR)},yaw_rate,x,y,yaw"

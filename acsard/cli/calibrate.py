@@ -8,19 +8,20 @@ starts each leg with Enter, stops it with any key, and types the tape measuremen
 that the tool asks for. The robot drives for at most 90 s.
 
 With --log the tool uses a recorded drive: a black-box recording of a robot with a
-gyro, a ROS 2 bag in MCAP (its file or directory), or a CSV file with a header.
+gyro, or a CSV file with commas and decimal points, whose first line names the
+columns, in any order:
 
-A bag must contain the wheels as JointState messages. It must also contain Imu,
-PoseStamped or Odometry messages, with which the tool compares the wheels. The tool
-reads the topics that have these types, or those that --topic names.
+    t                     time, s
+    fr,fl,rl,rr           speed of each wheel, rad/s; or the mean of each side:
+    left,right
+    yaw_rate              turn rate of a gyro, rad/s, positive to the left
+    x,y                   position from another source than the wheels, m
+    yaw                   heading from that source, rad; may be missing
+    applied_linear,applied_angular   commands, m/s and rad/s; may be missing
+    run                   name of the drive of this row; may be missing
 
-The CSV file has the column t (s) and the columns of the wheel speeds (rad/s),
-"fr,fl,rl,rr" or "left,right". It also has yaw_rate (rad/s, from a gyro), or x and
-y (m, from any source of positions), or all three. With x and y, yaw (rad) is
-optional. If the file contains several drives, the column run names the drive of
-each row. The columns applied_linear (m/s) and applied_angular (rad/s) contain the
-commands, and show how fast the wheels respond. The columns may be in any order,
-and a cell is empty if its sensor has no value at that time.
+The file needs t, the wheels, and yaw_rate or x and y. A cell is empty if its sensor
+has no value at that time. deploy/calibration/bag_to_csv.py converts a ROS bag.
 
 A good log begins with 3 s of standing still. Then it contains 60 s or more of
 straight drives, slow and fast turns to both sides, and curves.
@@ -48,7 +49,6 @@ from acsard.calibration.guided.robot_on_bus import SOURCE
 from acsard.calibration.log_table import LogError, NoCalibrationError
 from acsard.calibration.multipliers import Tape
 from acsard.calibration.recorded_drive import calibrated
-from acsard.calibration.ros_bag_log import AXES, Choice
 from acsard.calibration.solve import Calibration
 from acsard.cli.common import add_outcome, load
 from acsard.cli.connection import add_bus, require_one
@@ -73,24 +73,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--log",
         type=Path,
         metavar="FILE",
-        help="calibrate from a recorded drive, without driving: FILE is a CSV file, a recording of "
-        "`acsard recording` or a ROS 2 bag in MCAP",
-    )
-    parser.add_argument(
-        "--topic",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="with --log and a ROS 2 bag: the ROS topic to read if several topics of the bag "
-        "are suitable; repeat the option to name several. If you name topics with Imu, "
-        "PoseStamped or Odometry messages, acsard compares the wheels only with those topics",
-    )
-    parser.add_argument(
-        "--yaw-axis",
-        choices=AXES,
-        default="",
-        help="with --log and a ROS 2 bag: the axis of the IMU that points up (default: z). -x "
-        "means that x points down; write --yaw-axis=-x",
+        help="calibrate from a recorded drive, without driving: FILE is a CSV file or a recording "
+        "of `acsard recording`",
     )
     parser.add_argument(
         "--distance",
@@ -112,7 +96,7 @@ def main(args: argparse.Namespace) -> int:
     source = str(args.log) if args.log else "the drive"
     try:
         if args.log:
-            calibration = calibrated(args.log, local_config, args.distance, _choice(args))
+            calibration = calibrated(args.log, local_config, args.distance)
             config = local_config
         else:
             calibration, config = _guided(args, where, local_config)
@@ -152,8 +136,6 @@ def _require_fitting(args: argparse.Namespace) -> None:
         raise UsageError(
             "--distance needs --log: without --log, acsard asks for the distances that it needs"
         )
-    if not args.log and _choice(args) != Choice():
-        raise UsageError("--topic and --yaw-axis need --log: they select data in a ROS 2 bag")
     for name in DRIVE_OPTIONS if args.log else ():
         if getattr(args, name):
             option = "--" + name.replace("_", "-")
@@ -161,10 +143,6 @@ def _require_fitting(args: argparse.Namespace) -> None:
                 f"{option} is for a guided drive, but --log reads a recorded drive: leave one of "
                 "the two options out"
             )
-
-
-def _choice(args: argparse.Namespace) -> Choice:
-    return Choice(tuple(args.topic), args.yaw_axis)
 
 
 def _distance(text: str) -> Tape:

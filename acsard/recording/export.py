@@ -121,26 +121,24 @@ def _quoted(text: str) -> str:
 
 
 MEASURED_COLUMNS = (
-    "t [s]",
-    "fr [rad/s]",
-    "fl [rad/s]",
-    "rl [rad/s]",
-    "rr [rad/s]",
-    "yaw_rate [rad/s]",
+    "t",
+    "fr",
+    "fl",
+    "rl",
+    "rr",
+    "yaw_rate",
 )
 """Columns that a calibration reads: the wall-clock time (s since 1970), the speeds of the front
-right, front left, rear left and rear right wheel, and the yaw rate from a gyro."""
+right, front left, rear left and rear right wheel (rad/s), and the yaw rate from a gyro (rad/s)."""
 
 OUTPUT_COLUMNS = (
-    "odom_x [m]", "odom_y [m]", "odom_yaw [rad]", "linear [m/s]", "angular [rad/s]",
-    "applied_linear [m/s]", "applied_angular [rad/s]", "mode", "link", "source",
+    "odom_x", "odom_y", "odom_yaw", "linear", "angular",
+    "applied_linear", "applied_angular", "mode", "link", "source",
 )  # fmt: skip
-"""Columns with outputs of the robot. The row of a gyro sample has no values in these columns."""
+"""Columns with outputs of the robot, in SI units. The row of a gyro sample has no values here."""
 
 CSV_HEADER = ",".join([*MEASURED_COLUMNS, *OUTPUT_COLUMNS])
-MEASURED_CSV_HEADER = ",".join(
-    [*MEASURED_COLUMNS, "applied_linear [m/s]", "applied_angular [rad/s]"]
-)
+MEASURED_CSV_HEADER = ",".join([*MEASURED_COLUMNS, "applied_linear", "applied_angular"])
 
 _NO_WHEELS = "," * 4
 _NO_OUTPUTS = "," * len(OUTPUT_COLUMNS)

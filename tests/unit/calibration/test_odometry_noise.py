@@ -25,10 +25,10 @@ import numpy as np
 import pytest
 from msgspec import Struct, structs
 
-from acsard.calibration import odometry_noise, ros_bag_log
+from acsard.calibration import odometry_noise
 from acsard.calibration.calibration_report import keys, parts, report
 from acsard.calibration.fit import Parameter
-from acsard.calibration.log_table import LogError, NoCalibrationError, Table
+from acsard.calibration.log_table import NoCalibrationError, Table
 from acsard.calibration.multipliers import Deviations
 from acsard.calibration.odometry_noise import (
     INITIAL_NOISE,
@@ -40,15 +40,13 @@ from acsard.calibration.odometry_noise import (
 )
 from acsard.calibration.plausibility import RATIO, TRACK
 from acsard.calibration.positions import path, wheel_steps
-from acsard.calibration.ros_bag_log import Choice
 from acsard.calibration.solve import Calibration, calibrate
-from acsard.core.config.settings import DriveConfig, JointsConfig, OdometryConfig
+from acsard.core.config.settings import DriveConfig, OdometryConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.odometry import Odometry
 from acsard.core.values import WheelSpeeds
 from acsard.terminal.output import MAX_TEXT_WIDTH, plain
-from tests.unit.calibration.bags import imu, in_order, joint_states
 from tests.unit.calibration.cut import BASE, log_of_runs, table
 from tests.unit.calibration.robots import (
     RADIUS,
@@ -107,20 +105,6 @@ def log_with_repeats(trip: Drive, *, gyro: bool, places: bool) -> Table:
     rows = {"t": t, "left": left, "right": right, "x": place.real, "y": place.imag}
     turns = [{"t": trip.gyro_t, "yaw_rate": trip.gyro}] if gyro else []
     return Table.joined([rows, *turns])
-
-
-def lying(trip: Drive, *, gyro: bool, places: bool) -> Table:
-    """Return the log of a bag whose IMU lies on its side.
-
-    The refusal of the bag proposes an axis, and the log is made with that axis.
-    """
-    assert gyro
-    assert not places
-    messages = in_order(joint_states(trip), imu(trip, axis=0, sign=-1.0))
-    joints = JointsConfig().as_tuple()
-    with pytest.raises(LogError, match="Give --yaw-axis=-x") as refused:
-        ros_bag_log.table(messages, joints, Choice())
-    return ros_bag_log.table(messages, joints, Choice(axis=str(refused.value)[-2:]))
 
 
 class Set(Struct, frozen=True):
@@ -182,7 +166,6 @@ ONE_WAY = {
     ("skid, held positions of 10 Hz", "positions"): Set(
         replace(SKID, place_hz=10.0), recorded=log_with_repeats
     ),
-    ("skid, IMU on its side", "gyro"): Set(SKID, recorded=lying),
     ("skid, five minutes", "positions"): Set(SKID, seconds=300.0),
     ("differential, five minutes", "positions"): Set(DIFFERENTIAL, seconds=300.0),
     ("differential, five minutes", "both"): Set(DIFFERENTIAL, seconds=300.0),

@@ -225,7 +225,7 @@ def drive(*parts: tuple[float, float, float]) -> str:
     """Return a log of parts (from, to, rad/s) at 100 Hz; the right side turns backward."""
     lines = []
     for begin, end, speed in parts:
-        lines += [f"{t:.2f},{speed},{-speed}," for t in np.arange(begin, end, 0.01)]
+        lines += [f"{t:.2f},{speed},{-speed},," for t in np.arange(begin, end, 0.01)]
     return HEADER + "\n".join(lines)
 
 

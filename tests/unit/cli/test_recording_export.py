@@ -97,7 +97,7 @@ def test_export_takes_a_number_and_a_name_and_overwrites_no_file(
     )
     assert (here / "mine").read_bytes() == before
     assert export(where, "7", "mine", "--csv", "--force") == 0
-    assert (here / "mine").read_bytes().startswith(b"t [s],")
+    assert (here / "mine").read_bytes().startswith(b"t,")
 
 
 def test_a_range_of_seconds_exports_only_that_part(where: Path, here: Path) -> None:
