@@ -1,20 +1,11 @@
 """Decodes the board's status line: emergency stop, bumpers, motor driver, battery, temperature.
 
-An example of a status line is:
-
     !status estop=ok bumpers=..X. driver=ok volts=24.31 amps=-1.20 charge=87% temp=41.5*HHHH
 
-Every field is optional. The fields may come in any order, and each at most once. The board sends
-status lines in addition to its replies, never instead of a reply. A status line contains no wheel
-speeds and does not count as a reply. One invalid field makes the line invalid. The format of the
-values makes damage detectable:
-
-- An input has two words, such as `pressed` and `ok`. They differ in many bits, so a few flipped
-  bits cannot turn one word into the other.
-- Each number has a fixed number of decimals or ends with `%`, so a truncated number is refused.
-
-`*` and four hexadecimal digits may end the line: the CRC-16/XMODEM of all characters before `*`. On
-a checked link (a link whose lines have checksums), the line must have this checksum.
+Fields are optional, in any order, each at most once, and one invalid field makes the line invalid.
+The line is sent in addition to replies. The words of an input differ in many bits, and a number has
+fixed decimals or ends with `%`, so damage is detectable. `*` and the CRC-16/XMODEM of all before it
+may end the line, and must on a checked link.
 """
 
 from __future__ import annotations
@@ -28,9 +19,7 @@ from msgspec.structs import astuple
 
 from acsard.core.link.codec import FrameError
 
-STATUS = b"!status"
-"""First bytes of every status line. No other line begins like this: a reply begins with a letter,
-and the line in which a board identifies itself begins with `!acsard-mcu`."""
+STATUS = b"!status"  # no other line begins like this
 
 _LINE = re.compile(STATUS + rb"((?: [a-z]+=[^ *]+)+)(?:\*([0-9A-F]{4}))?")
 
@@ -46,35 +35,25 @@ _FORMS = {
 
 
 class BoardStatus(Struct, frozen=True):
-    """The fields of one status line. A field that the line does not contain is None."""
+    """The fields of one status line; None if it does not contain the field."""
 
     estop: bool | None = None
-    """Whether the emergency stop is pressed."""
     bumpers: tuple[bool, ...] | None = None
-    """Whether each bumper is pressed: 1 to 4 values, in the order in which the board sends them."""
     driver_fault: bool | None = None
-    volts: float | None = None
-    """Battery voltage, V."""
-    amps: float | None = None
-    """Battery current, A. It is negative while the battery discharges."""
-    charge: float | None = None
-    """State of charge of the battery, 0 to 1."""
-    temperature: float | None = None
-    """Temperature of the board, degrees Celsius."""
+    volts: float | None = None  # V
+    amps: float | None = None  # A, negative while the battery discharges
+    charge: float | None = None  # 0 to 1
+    temperature: float | None = None  # degrees Celsius
 
 
 def merged(status: BoardStatus, newer: BoardStatus) -> BoardStatus:
-    """Return a copy of `status`, updated with those fields of `newer` that are not None."""
+    """Return `status` with those fields of `newer` that are not None."""
     pairs = zip(astuple(status), astuple(newer), strict=True)
     return BoardStatus(*[old if new is None else new for old, new in pairs])
 
 
 def as_text(status: BoardStatus) -> dict[str, str]:
-    """Return the fields of `status` as text, under the names that users see.
-
-    The result maps names such as "motor_driver" to words or numbers such as "fault" or "24.31". It
-    does not contain the fields that are None.
-    """
+    """Return the fields that are not None as text, under names that users see ("motor_driver")."""
     bumpers = status.bumpers
     values = {
         "emergency_stop": _flag_text(status.estop, "pressed", "released"),
@@ -93,10 +72,9 @@ def as_text(status: BoardStatus) -> dict[str, str]:
 # A board at rest repeats the same line, so the last lines are cached.
 @lru_cache(8)
 def decode_status(line: bytes, check: bool) -> BoardStatus:
-    """Return the fields of a status line. Raise `FrameError` if the line is not valid.
+    """Return the fields of a status line without its line end. Raises `FrameError`.
 
-    `line` begins with `!status` and has no line end. If `check` is true, a line without a checksum
-    is not valid. A line with a wrong checksum is never valid.
+    If `check` is true, the line needs a checksum; a wrong one is never valid.
     """
     match = _LINE.fullmatch(line)
     if match is None:

@@ -3,11 +3,9 @@
     command  ap12.50,bn08.75,cp15.00,dn10.25#07S*HHHH
     reply    ap12.50,bn08.75,cp15.00,dn10.25#07@TTTTAAAABBBBCCCCDDDD*HHHH
 
-After `#` come the two digits of the sequence number. In a command, request letters may follow. In a
-reply, `@` and the sample fields (the board's clock and its encoder counts) follow if the command
-asked for them. After `*` comes the CRC-16/XMODEM of all characters before `*`. All digits after `#`
-are upper-case hexadecimal, so a line can be written in only one way. `codec.py` handles the plain
-part, which comes before `#`.
+`codec.py` handles the part before `#`. Then come the sequence number, request letters (a command)
+or `@` and the sample fields (a reply to `S`), and `*` with the CRC-16/XMODEM of all before it. All
+digits are upper-case hexadecimal, so a line can be written in only one way.
 """
 
 from __future__ import annotations
@@ -20,15 +18,12 @@ from msgspec import Struct
 
 from acsard.core.link.codec import FrameError
 
-SEQUENCES = 256
-"""Number of different sequence numbers. The number after 255 is 0."""
+SEQUENCES = 256  # the number after 255 is 0
 
-SAMPLE_REQUEST = b"S"
-"""The request letter that asks for the sample fields."""
+SAMPLE_REQUEST = b"S"  # asks for the sample fields
 
+# Ignored by the board; replies have no request letters, so a line with it is an echo.
 ECHO_MARK = b"H"
-"""A request letter that the board ignores. The letter marks a line as a line of the daemon. Replies
-contain no request letters, so a received line with this letter is an echo."""
 
 # The pattern also restricts the characters of the plain part, because the CRC does not detect zero
 # bytes in front of a line.
@@ -40,10 +35,10 @@ _SAMPLE = struct.Struct(">5H")
 
 
 class Reading(Struct, frozen=True):
-    """The sample fields of a reply: the board's clock and its encoder counts at the same moment.
+    """The sample fields of a reply: the board's clock, ms, and its encoder counts at that moment.
 
-    `mcu_ms` is the board's clock, ms. `counts` are the encoder counts of the motors a to d. A count
-    rises when its motor turns in the positive (`p`) direction. All five numbers are modulo 65536.
+    A count of the motors a to d rises when its motor turns in the direction `p`. All are modulo
+    65536.
     """
 
     mcu_ms: int
@@ -51,12 +46,7 @@ class Reading(Struct, frozen=True):
 
 
 class Checked(Struct, frozen=True):
-    """A reply with a correct CRC, split into its parts.
-
-    `plain` is the part before `#`, which contains the wheel speeds. `sequence` is the sequence
-    number of the command that the board answers with this reply. `reading` is None if the reply has
-    no sample fields.
-    """
+    """A reply with a correct CRC: the part before `#`, its command's number, the sample if any."""
 
     plain: bytes
     sequence: int
@@ -64,17 +54,13 @@ class Checked(Struct, frozen=True):
 
 
 def seal(line: bytes, sequence: int, letters: bytes = b"") -> bytes:
-    """Return a plain command as a checked line: with sequence number, CRC and CR LF.
-
-    `line` is the plain command, with or without CR LF. `sequence` is the sequence number, 0 to 255.
-    `letters` are the request letters; b"" means none.
-    """
+    """Return a plain command (with or without CR LF) as a checked line with CR LF."""
     body = b"%b#%02X%b" % (line.removesuffix(b"\r\n"), sequence, letters)
     return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
 
 
 def has_request(line: bytes) -> bool:
-    """Return whether a line without its line end is a correct checked line with request letters.
+    """Return whether a line without its end is a correct checked line with request letters.
 
     Only the daemon sends such lines, so a received one is an echo.
     """
@@ -83,10 +69,7 @@ def has_request(line: bytes) -> bool:
 
 
 def unseal(line: bytes) -> Checked:
-    """Split a checked reply into its parts. Raise `FrameError` if the reply is not valid.
-
-    `line` is the reply without its line end.
-    """
+    """Split a checked reply without its line end into its parts. Raises `FrameError`."""
     match = _REPLY.fullmatch(line)
     if match is None:
         has_suffix = b"#" in line or b"*" in line

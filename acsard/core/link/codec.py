@@ -1,11 +1,9 @@
-"""Encodes four wheel speeds as one line of the board's plain protocol, and decodes such a line.
+"""Encodes four wheel speeds as one plain line, and decodes such a line.
 
-An example is `ap12.50,bn08.75,cp15.00,dn10.25`. Each value consists of a motor letter, `p`
-(positive) or `n` (negative) for the direction, and a speed in rad/s. The encoder writes exactly
-this form, with a trailing comma if the configuration asks for one. The decoder also accepts spaces
-after commas, a trailing comma, one or two integer digits, and one to three decimals.
-One invalid value makes the line invalid. In the daemon, only this module maps motor letters
-and signs to wheels. The simulator has its own code for this.
+In `ap12.50,bn08.75,cp15.00,dn10.25`, a value is a motor letter, `p` (positive) or `n` (negative),
+and a speed in rad/s. The decoder also accepts spaces after commas, a trailing comma, one or two
+integer digits, and one to three decimals. One invalid value makes the line invalid. In the daemon,
+only this module maps motor letters and signs to wheels.
 """
 
 from __future__ import annotations
@@ -22,9 +20,7 @@ LETTERS = "abcd"
 
 Motors = tuple[float, float, float, float]
 
-MAX_SPEED = 99.99
-"""Largest speed that a line can contain, rad/s. A speed in a line has two digits before the decimal
-point and two after it."""
+MAX_SPEED = 99.99  # rad/s, two digits before the point and two after it
 
 Reason = Literal[
     "malformed", "duplicate_wheel", "over_range", "without_crc", "crc_error", "stale_sequence",
@@ -32,16 +28,12 @@ Reason = Literal[
 ]  # fmt: skip
 
 _TOKEN = rb"([abcd][pn])([0-9]{1,2}\.[0-9]{1,3})"
-TOKENS = _TOKEN + (rb", *" + _TOKEN) * 3
-"""Regular expression for the four values in a plain line, without a trailing comma."""
+TOKENS = _TOKEN + (rb", *" + _TOKEN) * 3  # the four values, without a trailing comma
 _LINE = re.compile(TOKENS + rb"(?:, *)?")
 
 
 class FrameError(AcsardError):
-    """The error for an invalid line from the board.
-
-    `reason` is the kind of error, such as "crc_error".
-    """
+    """An invalid line from the board; `reason` is the kind of error, such as "crc_error"."""
 
     def __init__(self, reason: Reason, line: bytes) -> None:
         super().__init__(reason, line)
@@ -54,7 +46,7 @@ class FrameError(AcsardError):
 
 
 class Codec:
-    """An encoder and decoder of plain lines, for one assignment of the motors to the wheels."""
+    """Plain lines for one assignment of the motors to the wheels."""
 
     def __init__(self, wheels: WheelMap, trailing_comma: bool = False) -> None:
         motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
@@ -69,15 +61,13 @@ class Codec:
             for direction, way in ((b"p", 1.0), (b"n", -1.0))
         }
         self._end = b",\r\n" if trailing_comma else b"\r\n"
-        self.stop = self._written(STILL)
-        """The line, with its line end, that commands speed zero for all wheels."""
+        self.stop = self._written(STILL)  # zero for all wheels, with line end
         self._last = (STILL, self.stop)
 
     def encode(self, speeds: WheelSpeeds) -> bytes:
-        """Return the line, with its line end, that commands these wheel speeds.
+        """Return the line, with its end, for speeds clamped to 99.99 and rounded to 0.01 rad/s.
 
-        Each speed is clamped to 99.99 rad/s and rounded to 0.01 rad/s. Raises `ValueError` for a
-        speed that is not finite, because that is a bug of the caller.
+        Raises `ValueError` for a speed that is not finite, because that is a bug of the caller.
         """
         last, line = self._last
         if speeds != last:  # a steady command repeats its line in each period
@@ -91,11 +81,7 @@ class Codec:
         return ",".join(tokens).encode() + self._end
 
     def wheels(self, motors: Motors) -> Motors:
-        """Convert four values of the motors a to d, such as speeds, to values of the wheels.
-
-        The result is in the order front right, front left, rear left, rear right. A value is
-        positive if its wheel turns forward.
-        """
+        """Return values of the motors a to d as values of the wheels, forward positive."""
         wheel = [0.0] * 4
         for motor, (_, index, sign) in zip(motors, self._wiring, strict=True):
             wheel[index] = motor * sign
@@ -103,10 +89,7 @@ class Codec:
         return front_right, front_left, rear_left, rear_right
 
     def decode(self, line: bytes) -> WheelSpeeds:
-        """Return the wheel speeds in a plain line. Raise `FrameError` if the line is not valid.
-
-        `line` has no line end.
-        """
+        """Return the wheel speeds in a plain line without its end. Raises `FrameError`."""
         words = _parse_tokens(line)
         if words is None:
             raise FrameError("malformed", line)
@@ -126,11 +109,7 @@ class Codec:
 # A robot at rest repeats the same line, so the last lines are cached.
 @lru_cache(16)
 def _parse_tokens(line: bytes) -> tuple[tuple[bytes, float], ...] | None:
-    """Return a motor token and a speed, such as `(b"ap", 12.5)`, for each of the four motors.
-
-    The token is the motor letter and the direction. The speed is in rad/s. Return None if `line` is
-    malformed.
-    """
+    # Pairs such as `(b"ap", 12.5)`; None if `line` is malformed.
     match = _LINE.fullmatch(line)
     if match is None:
         return None

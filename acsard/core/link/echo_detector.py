@@ -1,9 +1,8 @@
 """Detects echoes: lines that the daemon writes to the serial port and then receives back.
 
-Lines come back if TX and RX are connected to each other, or if a device at the far end sends all
-bytes back. A board may be connected behind such a device. The daemon then receives both the echo
-and the replies of the board. This module detects the echo of plain lines. It also detects the echo
-of checked lines (lines with a checksum), if they do not ask for a sample of the encoders.
+TX and RX are connected, or a device at the far end sends all bytes back, maybe with a board behind
+it, whose replies come too. This detects the echo of plain lines, and of checked ones that ask for
+no sample.
 """
 
 from __future__ import annotations
@@ -14,79 +13,49 @@ from msgspec import Struct
 
 from acsard.core.values import WheelSpeeds
 
-MIN_REPEATED_LINES = 20
-"""Least number of successive sent lines that must come back to count as an echo. 20 lines take 0.2
-s at 100 Hz."""
+MIN_REPEATED_LINES = 20  # successive lines that come back, 0.2 s at 100 Hz
 
+# Genuine replies between two lines of an echo; a free-running board may send two.
 MAX_OTHER_REPORTS = 2
-"""Largest number of genuine replies between two lines of an echo. If a board is connected behind an
-adapter that echoes, the daemon receives both the echo and the replies of the board. A board that
-reports by its own clock may send two replies in a row."""
 
+# Rad/s, summed over pairs of lines (the largest of four changes each). With coarse encoders, a
+# smaller total may be a coincidence.
 MIN_TOTAL_CHANGE = 2.0
-"""Least total change of the wheel speeds in an echo, rad/s. The total is a sum over all pairs of
-successive lines that came back. Each pair adds the largest of its four speed changes, one per
-wheel. With coarse encoders, a smaller total may be a coincidence."""
 
+# Rad/s between successive changes of a speed, as at the ends of a ramp. Rounding to 0.01 gives
+# 0.02. Gentler ramps (0.125 m/s2 at 100 Hz and 0.05 m radius) show no echo.
 MIN_BEND = 0.025
-"""Least bend in an echo, rad/s. A bend is the difference between two successive changes of a
-wheel's speed, as at the start or the end of a ramp. An echo needs at least one bend above this
-limit. Speeds in lines are rounded to 0.01 rad/s, so on a straight ramp two speed changes differ by
-up to 0.02 rad/s. Therefore an echo may stay undetected while all ramps are gentler than 0.025 rad/s
-per line. For a wheel radius of 0.05 m, this is 0.125 m/s2 at 100 Hz."""
 
-COMPARED_LINES = 8
-"""Number of the newest sent lines with which `EchoDetector` compares each received reply. At 100
-Hz, an echo that comes back within 70 ms is detected."""
+COMPARED_LINES = 8  # newest sent lines: at 100 Hz, an echo within 70 ms is detected
 
 _Wheels = tuple[float, float, float, float]
 NO_CHANGE: _Wheels = (0.0, 0.0, 0.0, 0.0)
-"""Change of the four wheel speeds between two lines with equal speeds, rad/s."""
 
 
 class _Run(Struct, gc=False):
-    """A series of successive sent lines that came back."""
-
-    report: int
-    """Number of the last received reply that equals the last line of the run. Replies are numbered
-    from 1."""
-    wheels: _Wheels
-    """Wheel speeds in the last line of the run, rad/s."""
-    slope: _Wheels | None = None
-    """Change of each wheel's speed between the last two lines of the run, rad/s. None if the run
-    has only one line."""
-    lines: int = 1
-    """Number of lines in the run."""
-    change: float = 0.0
-    """Sum of the speed changes between successive lines, rad/s, as `MIN_TOTAL_CHANGE` defines
-    it."""
-    corner: float = 0.0
-    """Largest bend in the run, rad/s. A bend is the difference between two successive speed
-    changes."""
+    report: int  # number of the reply that equals the last line
+    wheels: _Wheels  # in the last line
+    slope: _Wheels | None = None  # change between the last two lines
+    lines: int = 1  # in the run
+    change: float = 0.0  # as `MIN_TOTAL_CHANGE` sums it
+    corner: float = 0.0  # largest difference of successive changes
 
 
 class EchoDetector:
-    """Detector of an echo: received lines that only repeat the daemon's own lines.
+    """Detects that received lines only repeat the daemon's own.
 
-    A report is a received reply that contains no encoder counts. A report has the same form as a
-    command, so an echo looks like a board that reports exactly the commanded speeds. The received
-    lines are an echo if all of these conditions hold:
+    An echo looks like a board that reports exactly the commanded speeds. It is one if all of these
+    hold:
 
-    - At least `MIN_REPEATED_LINES` successive sent lines came back in order, byte for byte.
-    - Between two of these lines, at most `MAX_OTHER_REPORTS` other reports came. Their speeds do
-      not lie between the speeds in the two lines, as the speeds of a real motor would.
-    - The speed changes from line to line add up to at least `MIN_TOTAL_CHANGE`.
-    - One speed change differs by more than `MIN_BEND` from the previous speed change, as at the
-      start or the end of a ramp. A motor that lags by a whole number of lines repeats a steady ramp
-      exactly, but it rounds off the start and the end of the ramp.
+    - `MIN_REPEATED_LINES` successive lines came back in order, byte for byte.
+    - Between two of them came at most `MAX_OTHER_REPORTS` others, with speeds that do not lie
+      between theirs, as a real motor's would.
+    - The changes of the speeds sum up to `MIN_TOTAL_CHANGE`: at rest every board looks like an
+      echo.
+    - One change differs from the previous one by `MIN_BEND`. A motor that lags by whole lines
+      repeats a steady ramp exactly, but rounds off its ends.
 
-    At rest every board looks like an echo, so lines without speed changes prove nothing. While all
-    ramps are gentle (see `MIN_BEND`), no echo is detected. Some devices echo and also pass on the
-    replies of a board, such as an RS-485 adapter. They are detected just as quickly as a device
-    that only echoes.
-
-    A board that reports its set points instead of measured speeds looks exactly like an echo. A
-    simulator whose wheels have no lag may look like an echo too. The daemon then does not drive
+    A board that reports its set points looks exactly like an echo, so the daemon does not drive
     until the port is opened again, and reports the reason.
     """
 
@@ -94,28 +63,22 @@ class EchoDetector:
         self.forget()
 
     def forget(self) -> None:
-        """Forget all lines and reports, because the port has been opened."""
+        """Forget everything, because the port has been opened."""
+        # `COMPARED_LINES` lines, and the one before them, with which a series may end that the next
+        # reply continues.
         self._sent: deque[bytes] = deque(maxlen=COMPARED_LINES + 1)
-        """The last `COMPARED_LINES` sent lines, and the line before them. The older line is needed
-        because a series of lines that came back may end with it, and the next reply may continue
-        this series."""
+        # For each line in `_sent`, the run that ends with it, if it came back.
         self._runs: deque[_Run | None] = deque(maxlen=COMPARED_LINES + 1)
-        """For each line in `_sent`, the run that ends with this line: the series of successive sent
-        lines that came back. None if this line did not come back."""
         self._reports = 0
-        self._last: deque[_Wheels] = deque(maxlen=MAX_OTHER_REPORTS + 1)
-        """Wheel speeds in the last received replies, rad/s."""
+        self._last: deque[_Wheels] = deque(maxlen=MAX_OTHER_REPORTS + 1)  # of the last replies
 
     def written(self, line: bytes) -> None:
-        """Record that `line`, with its line end, was written to the port."""
+        """Record a line, with its end, that was written to the port."""
         self._sent.append(line.removesuffix(b"\r\n"))
         self._runs.append(None)
 
     def report(self, line: bytes, speeds: WheelSpeeds) -> bool:
-        """Process a reply without encoder counts. Return whether the last replies are an echo.
-
-        `line` is the reply without its line end, and `speeds` are the speeds in the reply.
-        """
+        """Process a reply (no counts, no line end); return whether the last replies are an echo."""
         self._reports += 1
         wheels = speeds.as_tuple()
         self._last.append(wheels)
@@ -142,7 +105,6 @@ class EchoDetector:
         return is_echo
 
     def _continued(self, run: _Run | None, wheels: _Wheels) -> _Run:
-        """Return `run` extended by the present reply, or a new run if the reply does not fit."""
         others = MAX_OTHER_REPORTS + 1 if run is None else self._reports - run.report - 1
         if run is None or others > MAX_OTHER_REPORTS:
             return _Run(self._reports, wheels)

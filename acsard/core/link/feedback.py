@@ -1,15 +1,10 @@
 """Adds to each good line its sample time and the motion since the previous good line.
 
-The sample time is the time at which the board read its encoders. The time between two samples comes
-from the best of these clocks that is available:
-
-- the board's own clock, if its replies contain the time of this clock and the encoder counts;
-- the times at which the commands were written, if the board answers each line (`PromptedTimes`);
-- the period of the board, if the board reports by its own clock (`FreeRunningTimes`);
-- otherwise the times at which the host read the lines, spread evenly if one read has several lines.
-
-`ReplyStyle` detects whether the board answers each command or reports by its own clock. The sample
-times do not affect the state of the link, which depends only on arrival times.
+The sample time is when the board read its encoders. It comes from the best clock that is available:
+the board's own (with its counts); the times of the commands, if the board answers each line
+(`PromptedTimes`); the period of the board, if it reports by its own clock (`FreeRunningTimes`); or
+the times of the reads, spread evenly over their lines. `ReplyStyle` finds out which kind of board
+it is. The state of the link depends only on arrival times.
 """
 
 from __future__ import annotations
@@ -24,61 +19,39 @@ from acsard.core.link.codec import Codec, Motors
 from acsard.core.link.encoders import Encoders, Turned
 from acsard.core.link.link_state import WATCHDOG_NS
 from acsard.core.link.sample_time import MAX_FILLED_GAP_S, FreeRunningTimes, Placed, PromptedTimes
-from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
+from acsard.core.values import NS_PER_S, Instant, Ns, WheelSpeeds
 
-MIN_INTERVAL_NS = 1000
-"""Least difference between the sample times of two successive lines, ns. Two lines with equal
-sample times would look like a single line."""
+MIN_INTERVAL_NS = 1000  # two lines with equal sample times would look like one
 
-DIFFERENCE_GAIN = 0.05
-"""Gain of the filter for a mean difference: the time that `PromptedTimes` gives to a line, minus
-the time that `FreeRunningTimes` gives to the same line."""
+DIFFERENCE_GAIN = 0.05  # of the mean difference between the two clocks of a line
 
-FULL_READ_BYTES = 1024
-"""Least number of bytes in a full read of the port. After a full read, the kernel may hold more
-data."""
+FULL_READ_BYTES = 1024  # after a full read, the kernel may hold more data
 
+# Least difference of reply periods and commands in a read with which `ReplyStyle` begins to
+# evaluate; scheduling alone causes less.
 EVALUATION_START = 1.5
-"""Least difference between the number of reply periods and the number of written commands since the
-previous read of the port. If a read reaches this difference, `ReplyStyle` begins to evaluate reads,
-because scheduling alone causes a smaller difference."""
 
+# The same difference, summed over the evaluated reads, at which it decides.
 DECISION_DIFFERENCE = 2.5
-"""Least difference between the number of reply periods and the number of commands at which
-`ReplyStyle` decides. It decides whether the board reports by its own clock. Both numbers are sums
-over the reads of the port that `ReplyStyle` evaluates."""
 
-MAX_READ_PERIODS = 100.0
-"""If more reply periods than this lie between two reads of the port, `ReplyStyle` does not evaluate
-the later read."""
+MAX_READ_PERIODS = 100.0  # a read after more reply periods than this is not evaluated
 
+# With n lines, p reply periods and c commands: ||p - n| - |c - n|| must reach this times |p - c|,
+# so that n is clearly nearer to p or to c.
 CLEAR_FRACTION = 0.5
-"""Limit for how clearly the lines must favor one kind of board before `ReplyStyle` decides. Let n
-be the number of received lines, p the number of reply periods, and c the number of commands, summed
-over the reads of the port that `ReplyStyle` evaluates. Then |p - n| and |c - n| must differ by at
-least `CLEAR_FRACTION` times |p - c|. This means that n is clearly nearer to p or to c."""
 
-EXTRA_READS = 3
-"""Number of further reads that `ReplyStyle` evaluates after a read of the port that reaches
-`EVALUATION_START`."""
+EXTRA_READS = 3  # evaluated after a read that reaches `EVALUATION_START`
 
+# The smaller of |p - n| and |c - n| must be at most this times n, or 1.5: some lines get lost.
 NEAR_FRACTION = 0.35
-"""Limit for the number of lines that may be missing when `ReplyStyle` decides. Let n be the number
-of received lines, p the number of reply periods, and c the number of commands, summed over the
-reads of the port that `ReplyStyle` evaluates. The smaller of |p - n| and |c - n| must be at most
-`NEAR_FRACTION` times n, or at most 1.5. The limit is not 0, because some lines get lost."""
 
 
 class Feedback(Struct, frozen=True, gc=False):
     """A good line from the board, with its sample time and the motion since the previous good line.
 
-    `at` is the time at which the board read its encoders, and `dt` is the time since the previous
-    sample, s. If the motion since the previous sample is unknown, `dt` is 0, and `gap` is the time
-    since the previous line, s. Otherwise `gap` is 0. For the first line of the board, both are 0.
-
-    `turned` is the angle by which each wheel turned since the previous line, rad, in `WHEELS`
-    order. It is computed from the encoder counts in the lines, so it is valid even after a gap. It
-    is None if the angles are unknown.
+    `dt` and `gap` are times since the previous line, s: `gap` if the motion is unknown, else `dt`;
+    both are 0 in the first line. `turned` is the angle of each wheel by encoder counts, rad, valid
+    even after a gap.
     """
 
     at: Instant
@@ -86,54 +59,35 @@ class Feedback(Struct, frozen=True, gc=False):
     dt: float
     gap: float = 0.0
     turned: Motors | None = None
+    # Part of `dt` in which lines were lost, s. It comes first, and the odometry fills it with the
+    # speeds of the lines before and after it.
     bridged: float = 0.0
-    """The part of the time since the previous sample in which lines were lost, s; 0 if no line was
-    lost. This part comes first. The odometry fills it with the speeds of the last line before it
-    and of the first line after it."""
-    asked_ns: int | None = None
-    """Monotonic time at which the daemon wrote the command that this line answers, ns. None if
-    unknown."""
+    asked_ns: Ns | None = None  # when the answered command was written
+    # s since the previous line, for plausibility: the board's clock or arrivals; 0 after a gap.
     since: float = 0.0
-    """Time since the previous line for the plausibility checks, s. It comes from the board's clock
-    if the line contains the time of that clock, else from the arrival times. It is 0 after a
-    silence or a gap."""
-    heard_ns: int = 0
-    """Monotonic time at which the host had received the complete line, ns."""
+    heard_ns: Ns = 0  # the host had the complete line
+    # Whole counts as angles, rad, without the time of `bridged` (`whole_counts.py`). None if the
+    # counts per turn are unknown or the firmware does not report whole counts.
     counted: Motors | None = None
-    """Angle that each wheel turned since the previous sample, rad, in `WHEELS` order, without the
-    time in which lines were lost (`bridged`). `whole_counts.py` recovers the angle from the speeds.
-    None if the counts per turn are not configured, or if the firmware does not report whole
-    counts."""
-    steps: Motors = (0.0, 0.0, 0.0, 0.0)
-    """Quantization step of each wheel's reported speed, rad/s, `math.inf` if unknown."""
-    count: float = 0.0
-    """Angle of one encoder count, rad, 0 if the counts per turn are not configured."""
+    steps: Motors = (0.0, 0.0, 0.0, 0.0)  # quantization of the speeds, rad/s; inf if unknown
+    count: float = 0.0  # rad of one encoder count; 0 if unknown
+    # From the previous sample to the end of the last command to move, s: the first line of zeros,
+    # or the board's watchdog. It is negative if that was before the sample.
     driven: float = 0.0
-    """Time from the previous sample to the end of the last command to move, s. A command to move
-    ends with the first line of zeros. It also ends when the watchdog of the board stops the motors
-    because no line has reached the board. The value is negative if the command ended before the
-    previous sample, and 0 in the first line."""
 
 
 class ReplyStyle:
-    """Detector of whether the board reports by its own clock or answers the daemon's lines.
+    """Detects whether the board reports by its own clock or answers the daemon's lines.
 
-    While the daemon sends one line per period, both kinds of boards look alike. Sometimes the
-    daemon sends more or fewer lines, because the host did not run or because a new command did not
-    wait for the next period. Then a board that reports by its own clock sends as many lines as
-    periods have passed. A board that answers sends as many lines as it received commands. The class
-    compares the number of received lines with both numbers.
+    At one line per period, both look alike. When a stall or an early command changes that, a board
+    with a clock sends as many lines as periods passed, and one that answers as many as it got
+    commands. Both numbers are compared with the received lines.
     """
 
     def __init__(self, free_running: bool) -> None:
-        """Start before the first read of the port.
-
-        `free_running` is true if `mcu.reply_period` is set, so that the board certainly reports by
-        its own clock. If `free_running` is false, the kind of the board is unknown at first.
-        """
+        # `free_running`: `mcu.reply_period` is set.
+        # True: by its own clock; False: answers each command; None: unknown.
         self.speaks: bool | None = free_running or None
-        """True if the board reports by its own clock, False if it answers each command, None while
-        unknown."""
         self._known = free_running
         self._left = self._after = 0
         self._came = self._periods = self._asked = 0.0
@@ -143,11 +97,7 @@ class ReplyStyle:
         self._left += 1
 
     def process_read(self, lines: int, periods: float) -> None:
-        """Process a read of the port that completed `lines` lines.
-
-        `periods` is the time since the previous read that completed a line, in reply periods of the
-        board.
-        """
+        """Process a read that completed `lines`, `periods` reply periods after the previous one."""
         left, self._left = self._left, 0
         if self._known or periods > MAX_READ_PERIODS:
             return
@@ -177,19 +127,12 @@ class ReplyStyle:
 class Timeline:
     """Assigns a sample time to each good line, in order.
 
-    For each read of the port, call `process_read`. Then, for each line of the read in order, call
-    `place` if the line is good and `skip_bad` if it is bad.
+    For each read call `process_read`, then for each line `place` if it is good, or `skip_bad`.
     """
 
     def __init__(
-        self, mcu: McuConfig, codec: Codec, wheel_speed: float, quiet_ns: int, rate_hz: float
+        self, mcu: McuConfig, codec: Codec, wheel_speed: float, quiet_ns: Ns, rate_hz: float
     ) -> None:
-        """Start before the first line from the board.
-
-        `codec` maps the motors to the wheels. `wheel_speed` is the highest speed that a wheel can
-        have, rad/s. `quiet_ns` is the duration of silence after which the link is stale, ns.
-        `rate_hz` is the daemon's control rate.
-        """
         self._codec, self._baud_rate, self._quiet_ns = codec, mcu.baud_rate, quiet_ns
         self._encoders = Encoders(mcu.encoder_counts, wheel_speed, quiet_ns)
         self._counts = mcu.encoder_counts
@@ -201,51 +144,31 @@ class Timeline:
         self._last: Instant | None = None
         self._heard_ns = self._end_ns = 0
         self._forgotten = True
-        self._rest_ns = 0
-        """Monotonic time at which the last command to move ends, ns: the time of the first line of
-        zeros, or of the stop by the board's watchdog if that is earlier."""
-        self._last_placed = Placed("reads", 0)
-        """The time of the last good line, by the clock that was chosen for this line."""
-        self._spoilt = False
-        """Whether a bad or ignored line came since the last good line."""
+        self._rest_ns = 0  # the last command to move ended: zeros, or the board's watchdog
+        self._last_placed = Placed("reads", 0)  # by the clock that was chosen
+        self._spoilt = False  # a bad or ignored line came since the last good one
+        # Mean of the time by `PromptedTimes` minus that by `FreeRunningTimes`, ns.
         self._later = 0.0
-        """Mean difference between two times of the same line, ns: the time that `PromptedTimes`
-        gives minus the time that `FreeRunningTimes` gives."""
+        # Whether `_later` includes the last difference; if not, the next one replaces it.
         self._compared = False
-        """Whether the mean in `_later` includes the last difference. If it does not, the next
-        difference becomes the new mean."""
-        self.leaps = 0
-        """Number of lines with impossible encoder counts. For such a line, the angle that a wheel
-        turned is computed as speed times time."""
-        self.restarted = False
-        """Whether the board's clock in the last line shows that the board has restarted."""
+        self.leaps = 0  # lines with impossible counts, for which speed times time is used
+        self.restarted = False  # by the board's clock in the last line
 
     def forget(self) -> None:
-        """Forget the previous line, because a new session begins.
-
-        The motion between the previous line and the next one is then unknown.
-        """
+        """Forget the previous line, because a new session begins."""
         self._encoders.forget()
         self._slots.forget()
         self._prompts.forget()
         self._forgotten = True
 
-    def written(self, at_ns: int, moves: bool = True) -> None:
-        """Record that a command was written at the monotonic time `at_ns`, ns.
-
-        `moves` is true if the command contains a speed other than zero.
-        """
+    def written(self, at_ns: Ns, moves: bool = True) -> None:
+        """Record a command that was written; `moves` if a speed in it is not zero."""
         self._prompts.written(at_ns)
         self._style.written()
         self._rest_ns = at_ns + WATCHDOG_NS if moves else min(self._rest_ns, at_ns)
 
     def process_read(self, at: Instant, size: int, lines: int, following: int) -> None:
-        """Process a read of the port that completes at least one line.
-
-        `at` is the time of the read, `size` is its number of bytes, and `lines` is the number of
-        lines that it completes. `following` is the number of bytes in the read after the end of the
-        last of these lines.
-        """
+        """Process a read that completes `lines`, with `following` bytes after them."""
         before, end_ns = self._end_ns, at.mono_ns
         if following:
             end_ns -= wire_ns(following, self._baud_rate)
@@ -265,10 +188,7 @@ class Timeline:
         self._prompts.process_read(end_ns, lines, following > 0)
 
     def skip_bad(self) -> None:
-        """Skip the next line of the read, because this line is bad.
-
-        Also skip the command that this line may answer, unless the board reports by its own clock.
-        """
+        """Skip a bad line, and the command that it may answer if the board has no own clock."""
         self._rest -= 1
         self._spoilt = True
         if not self._style.speaks:
@@ -281,18 +201,12 @@ class Timeline:
         following: int,
         length: int,
         silent: bool,
-        asked_ns: int | None = None,
+        asked_ns: Ns | None = None,
     ) -> Feedback:
-        """Return the feedback for the next line of the read, which must be a good line.
+        """Return the feedback for the next line of the read, which must be a good one.
 
-        Args:
-            speeds: wheel speeds in the line.
-            reading: sample fields of a checked reply; None if the line has no sample fields.
-            following: number of bytes in the read after the end of the line.
-            length: number of bytes of the line with its line end.
-            silent: whether the line ends a silence of more than `quiet_ns`, or is the first good
-                line since the port was opened or the board restarted.
-            asked_ns: monotonic time at which the answered command was written, ns; None if unknown.
+        `following` bytes of the read come after it, and `length` is its own with its end. `silent`
+        says that it ends a silence, or is the first since the opening or a restart.
         """
         self._rest -= 1
         # Bytes that followed in the same read were on the wire after this line was complete.
@@ -328,8 +242,7 @@ class Timeline:
             at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns, driven=driven
         )
 
-    def _placed(self, asked_ns: int | None, came_ns: int) -> Placed:
-        """Return the time of the next line by the best available clock."""
+    def _placed(self, asked_ns: Ns | None, came_ns: Ns) -> Placed:
         speaks, answered = self._style.speaks, None
         if asked_ns is not None or not speaks:
             answered = self._prompts.place(asked_ns)
@@ -357,10 +270,7 @@ class Timeline:
         return Placed("reads", int(self._end_ns - self._share_ns * self._rest))
 
     def _since_last(self, placed: Placed) -> tuple[float, float]:
-        """Return the time since the last good line, and the part of it in which lines were lost.
-
-        Both are in s. `placed` is the time of the present line.
-        """
+        # s since the last good line, and the part of it in which lines were lost
         last = self._last_placed
         back = placed.due_ns < last.due_ns
         self._last_placed = replace(placed, due_ns=last.due_ns) if back else placed
@@ -392,11 +302,7 @@ class Timeline:
         self._later += DIFFERENCE_GAIN * (later_ns - self._later)
 
     def _late_ns(self, clock: str) -> float:
-        """Return by how much a clock gives later times than `FreeRunningTimes`, on average, ns.
-
-        `clock` is "reads", "prompts" or "slots". The caller needs this offset to subtract the times
-        of two lines that come from different clocks.
-        """
+        # Mean offset of a clock to `FreeRunningTimes`, to subtract times of different clocks.
         if clock == "reads":
             return self._slots.late_ns
         return self._later if clock == "prompts" else 0.0
@@ -405,12 +311,8 @@ class Timeline:
     def _usual_ns(self) -> float:
         return self._slots.usual or self._period_ns
 
-    def _sampled(self, came_ns: int, placed: Placed, length: int) -> Instant:
-        """Return the sample time of the line: the time at which the board began to send it.
-
-        `placed` is the time at which the host should have received the line, and `came_ns` the time
-        at which the line came. `length` is the number of bytes of the line.
-        """
+    def _sampled(self, came_ns: Ns, placed: Placed, length: int) -> Instant:
+        # When the board began to send the line, which came at `came_ns`.
         mono_ns = min(came_ns, placed.due_ns) - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns
@@ -423,7 +325,7 @@ class Timeline:
         self._last = Instant(mono_ns, wall_ns)
         return self._last
 
-    def _turned(self, reading: Reading | None, at_ns: int) -> Turned | None:
+    def _turned(self, reading: Reading | None, at_ns: Ns) -> Turned | None:
         self.restarted = False
         if reading is None or not self._counts:
             self._encoders.forget()

@@ -1,36 +1,29 @@
-"""Splits the bytes from the serial port into lines, with bounded memory.
+"""Splits the bytes from the serial port into lines that end with LF or CR LF, in bounded memory.
 
-Lines end with LF or CR LF. This module does not interpret their content. After noise, the next LF
-ends the damaged line, and a new line begins. Empty lines are dropped silently: the daemon starts
-every session with a bare line end, and a board that echoes may send it back.
+After noise, the next LF ends the damaged line. Empty lines are dropped: the daemon starts every
+session with a bare line end, and a board that echoes may send it back.
 """
 
 from __future__ import annotations
 
-MAX_LINE_BYTES = 128
-"""Largest number of bytes in a line, including its line end. A reply has about 62 bytes, and a
-status line with all fields about 100."""
+MAX_LINE_BYTES = 128  # a reply has about 62, a status line with all fields about 100
 
 
 class LineReader:
-    """A splitter that turns a stream of received bytes, in pieces of any size, into lines."""
-
     def __init__(self) -> None:
         self._held = b""
         self._discarding = False
         self.too_long = 0
 
     def clear(self) -> None:
-        """Forget the beginning of an incomplete line, because the port has been reopened."""
+        """Forget an incomplete line, because the port has been reopened."""
         self._held = b""
         self._discarding = False
 
     def feed(self, data: bytes) -> list[tuple[bytes, int]]:
-        """Add the received bytes `data`, and return the lines that they complete, in order.
+        """Return the lines that `data` completes, each with the number of bytes of `data` after it.
 
-        Each item is a pair: the line without its line end, and the number of bytes in `data` after
-        the line. The wire needs a known time for these bytes, so the caller can compute when the
-        line was complete.
+        From this number the caller computes when the line was complete on the wire.
         """
         lines = []
         ends = data.split(b"\n")

@@ -1,12 +1,8 @@
 """Adds to each good line the angles in whole encoder counts, and the quantization of its speeds.
 
-A coarse encoder quantizes the reported speed of its wheel. If the counts per turn are configured,
-`whole_counts.py` recovers the counts from the speeds. Otherwise the pose uses speed times time.
-
-If the counts per turn are not configured, the module does not try to find them from the speeds.
-They can be found only if the firmware divides its counts by a fixed period. In this case they would
-not help: the time between the lines is known, so speed times time is wrong only by the rounding of
-the speeds.
+`whole_counts.py` recovers the counts from the speeds if the counts per turn are configured;
+otherwise the pose uses speed times time. They are not learned from the speeds: that works only if
+the firmware divides by a fixed period, and then speed times time is wrong only by rounding.
 """
 
 from __future__ import annotations
@@ -19,49 +15,32 @@ from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.whole_counts import WholeCounts
 
-MIN_CHANGE = 0.0105
-"""Smallest change of a wheel's reported speed that is more than rounding, rad/s."""
+MIN_CHANGE = 0.0105  # rad/s; less may be rounding
 
-BLOCK_STEPS = 64
-"""Number of steps (changes of a reported speed) in a block. At the end of each block, `Steps.size`
-is computed again from the steps of the block. Even if counts are rare and the firmware filters the
-speeds, at least three counts fall into a block."""
+BLOCK_STEPS = 64  # steps: even rare counts and filtered speeds give three counts in a block
 
+# For the first value of `Steps.size`, which may still grow until the end of the block.
 FIRST_STEPS = 24
-"""Number of steps (changes of a reported speed) after which `Steps.size` gets its first value.
-Until the end of the block, this value may still grow."""
 
-STEP_RANK = 3
-"""Rank of the change of a reported speed that becomes `Steps.size`: the third largest change of a
-block. The largest change would be wrong, because a single damaged line causes two large changes."""
+STEP_RANK = 3  # the third largest, because one damaged line causes two large changes
 
+# Times the second largest among the wheels: random jumps look like quantization.
 MAX_STEP_RATIO = 3.0
-"""Upper bound on the quantization step of a wheel, as a multiple of the second largest step among
-the four wheels. The bound is needed because random jumps of a speed look like quantization too."""
 
+# Mean jump, rad per line, of an encoder with 200 counts a turn, above which it is coarse; gain.
 COARSE, JUMP_GAIN = 0.015, 0.06
-"""`COARSE` is the mean jump of a wheel's speed above which its encoder is treated as coarse, rad
-per line. A jump is half of the difference between two successive speed changes, times the time
-between the lines. An encoder with about 200 counts a turn reaches this value. `JUMP_GAIN` is the
-gain of the filter for the mean jump."""
 
-MAX_INTERVAL_S = 0.03
-"""Longest time between two lines whose speeds `Coarseness` compares, s. Over a longer time, the
-accelerations of the motors look like jumps."""
+MAX_INTERVAL_S = 0.03  # over a longer time, accelerations look like jumps
 
 NO_STEPS = (0.0, 0.0, 0.0, 0.0)
 
 
 class Steps:
-    """The size of the steps that an encoder causes in the reported speed of its wheel.
+    """The size of the steps that an encoder causes in the reported speed of its wheel, rad/s.
 
-    One count more or less in a period T changes the reported speed by 2 pi / (counts per turn x T).
-    This is 31 rad/s at 20 counts per turn and 100 Hz. Such a step does not show an acceleration of
-    the wheel. The class learns the size from the reported speeds. Therefore the size is correct for
-    any firmware, even if the firmware filters the speeds or divides the counts by its nominal
-    period instead of the measured time.
-
-    `size` is in rad/s. It is `math.inf` until `FIRST_STEPS` steps have occurred.
+    One count in a period T changes the speed by 2 pi / (counts per turn x T): 31 rad/s at 20 counts
+    and 100 Hz. It is learned from the speeds, so it is right even if the firmware filters them or
+    divides by its nominal period. It is inf before `FIRST_STEPS` steps.
     """
 
     def __init__(self) -> None:
@@ -93,26 +72,20 @@ class Steps:
 
 
 class Coarseness:
-    """Detector of wheel speeds that jump back and forth from line to line, as with coarse encoders.
+    """Detects wheel speeds that jump back and forth from line to line, as with coarse encoders.
 
-    Let v0, v1 and v2 be the speeds of a wheel in the last three lines, and dt the time since the
-    previous line. Then the jump of the wheel is |v0 - 2 v1 + v2| dt / 2. A change of the
-    acceleration causes a jump too, but only in one line.
+    The jump of speeds v0, v1, v2 in successive lines is |v0 - 2 v1 + v2| dt / 2. A change of the
+    acceleration causes one, too, but only in one line.
     """
 
     def __init__(self) -> None:
         self._rows = NO_STEPS, NO_STEPS
-        self._jumps, self._wheel = [0.0] * 4, 0
-        """`_jumps` is the mean jump of each wheel, rad per line. `_wheel` is the index of the wheel
-        that was examined in the last line."""
+        self._jumps, self._wheel = [0.0] * 4, 0  # rad per line; the wheel of the last line
 
     def add(self, speeds: Motors, elapsed_s: float) -> bool:
-        """Process the speeds of a line, and return whether the examined encoder is coarse.
+        """Return whether the encoder is coarse that it is the turn of, by the speeds of a line.
 
-        Each call examines the encoder of one wheel, and the wheels take turns. `speeds` are the
-        speeds of the four wheels, rad/s. `elapsed_s` is the time since the previous line. Return
-        False without an examination if `elapsed_s` exceeds `MAX_INTERVAL_S`, or if all speeds of
-        this line and of the previous line are 0.
+        Return False after more than `MAX_INTERVAL_S`, or if all speeds were and are 0.
         """
         (older, before), self._rows = self._rows, (self._rows[1], speeds)
         if speeds == NO_STEPS == before or elapsed_s > MAX_INTERVAL_S:
@@ -125,17 +98,11 @@ class Coarseness:
 
 
 class CountRecovery:
-    """Adds the angles in whole counts and the quantization steps to each good line of a port."""
-
     def __init__(self, counts: int = 0) -> None:
-        """Start before the first line.
-
-        `counts` is the configured number of encoder counts per wheel turn, 0 if unknown.
-        """
+        # `counts` per wheel turn, 0 if unknown.
         self._configured, self._whole = counts, WholeCounts(counts)
+        # Lines with a coarse encoder, if the counts per turn are not configured.
         self.coarse_lines = 0
-        """Number of lines for which `Coarseness` found the examined encoder coarse. Such lines are
-        counted only if the counts per turn are not configured."""
         self.forget()
 
     def forget(self) -> None:
@@ -143,25 +110,17 @@ class CountRecovery:
         self._whole.forget()
         self._coarseness = Coarseness()
         self._wheels = tuple(Steps() for _ in NO_STEPS)
-        self._reported, self._steps = NO_STEPS, NO_STEPS
-        """Quantization step of each wheel, rad/s. `_reported` are the steps that were learned from
-        the speeds. `_steps` are the same steps, limited by `MAX_STEP_RATIO`."""
+        self._reported, self._steps = NO_STEPS, NO_STEPS  # learned, and limited by `MAX_STEP_RATIO`
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Configured encoder counts per turn of each wheel.
-
-        All are 0 if no counts are configured, or if the reported speeds contradict the configured
-        counts.
-        """
+        """Configured counts per turn; all 0 without them, or if the speeds contradict them."""
         return (self._configured if self._whole.believed else 0,) * 4
 
     def recover_counts(self, line: Feedback) -> Feedback:
-        """Return a copy of a good line with the fields `counted`, `steps` and `count` set.
+        """Return a good line with `counted`, `steps` and `count`.
 
-        `counted` is None if the angles in whole counts are unknown. If these angles include the
-        motion of a missing line before this line, this motion need not be estimated. The field
-        `bridged` of the copy is then 0.
+        If the counts include the motion of a missing line before it, `bridged` becomes 0.
         """
         elapsed_s, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
         if self._whole.angle:

@@ -1,11 +1,9 @@
 """Estimates when the board read its encoders (the sample time), for two kinds of boards.
 
-The host reads a line later than its sample time, because an adapter, the scheduler or a stall of
-the host may delay the line. `FreeRunningTimes` finds the period of a board that reports by its own
-clock. For a board that answers each command, `PromptedTimes` uses the times at which the commands
-were written. Each class serves as a clock: after every read of the port, call `process_read` on
-both objects, and then `place` to get the time of each line of the read. `feedback.py` chooses the
-better clock for each line.
+An adapter, the scheduler or a stall may delay a line. `FreeRunningTimes` finds the period of a
+board that reports by its own clock, and `PromptedTimes` takes the times of the commands that a
+board answers. After every read of the port, call `process_read` on both, and then `place` for each
+line. `feedback.py` chooses the better one.
 """
 
 from __future__ import annotations
@@ -19,149 +17,103 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Ns
 
-Read = tuple[int, int]
-"""A read of the port, as a pair: the monotonic time at which the last line of the read was
-complete, ns, and the number of lines in the read."""
+Read = tuple[int, int]  # when the last line of a read was complete, and its number of lines
 
+# The odometry fills only shorter gaps, because the board may have been reset meanwhile.
 MAX_FILLED_GAP_S = 1.0
-"""Shortest gap without a line that the odometry does not fill, s, because the board may have been
-reset meanwhile. The odometry fills only shorter gaps."""
 
 
 class Placed(Struct, frozen=True, gc=False):
-    """The time of a line according to one of three clocks.
+    """The time of a line by `FreeRunningTimes` (slots), `PromptedTimes` (prompts) or the reads.
 
-    `clock` is "slots" for `FreeRunningTimes`, "prompts" for `PromptedTimes`, and "reads" for the
-    times at which the host read the port. `due_ns` is the monotonic time at which the host should
-    have received the complete line, ns.
+    `due_ns` is when the host should have received the complete line.
     """
 
     clock: Literal["slots", "prompts", "reads"]
-    due_ns: int
+    due_ns: Ns
+    # s since the previous line by this clock; None for its first line and for reads.
     dt: float | None = None
-    """Time since the previous line by this clock, s. None for the first line of the clock, and if
-    the times of the host's reads serve as the clock."""
-    bridged: float = 0.0
-    """The part of the time since the previous line in which lines were lost, s."""
+    bridged: float = 0.0  # s of it in which lines were lost
+    # It came before the clock expected it. `due_ns` is then its arrival, and the next `dt` of the
+    # clock is wrong: the caller subtracts the two `due_ns`.
     early: bool = False
-    """Whether the line came before the clock expected it. If so, `due_ns` is the time at which the
-    line arrived, and the clock gives a wrong `dt` for the next line. The caller therefore computes
-    the `dt` of the next line as the difference between the `due_ns` of the two lines."""
 
 
 # A free-running board. A slot is one period of its clock, in which the board sends one line.
 
+# Least of a series of reads from which `FreeRunningTimes` finds or corrects a clock.
 WINDOW_NS, WINDOW_READS = NS_PER_S // 2, 12
-"""Least duration of a window, ns, and least number of reads in a window. A window is a series of
-reads of the port from which `FreeRunningTimes` finds or corrects the clock of the board."""
 
+# Final gain g, from 1. One window shows the clock's error only to a few hundredths of a period.
 LOOP_GAIN = 0.2
-"""Final value of the gain g with which `FreeRunningTimes` corrects its clock. The gain starts at 1
-and falls during the first windows. One window shows the error of the clock only to a few hundredths
-of a period, so a small gain averages over several windows."""
 
-MAX_CLOCK_ERROR = 0.01
-"""Largest relative error of a board's clock. A ceramic resonator reaches half of it."""
+MAX_CLOCK_ERROR = 0.01  # relative; a ceramic resonator reaches half of it
 
+# Relative change by rounding a period to whole ms, for the error of a quartz and of the
+# measurement; a larger one is not rounded.
 MAX_ROUNDING = 0.001
-"""Largest relative change of a measured period by rounding it to a whole number of ms. If the
-change would be larger, the period is not rounded. The limit covers the error of a quartz and of the
-measurement."""
 
+# Share of reads with a single line, from which on clocks for such reads are tried, too.
 SINGLE_READ_FRACTION = 0.7
-"""If at least this share of the reads of the port has a single line, `FreeRunningTimes` also tries
-clocks for lines that are read one by one. Otherwise it tries only clocks for lines that an adapter
-batches."""
 
+# Periods by which a line may come after its slot, read one by one or batched by an adapter.
+# `MAX_ADAPTER_DELAY_NS` limits both.
 LATE_ALONE, LATE_BATCHED = 0.6, 1.3
-"""Largest time by which a line may come after its slot, in periods of the board. A slot is the
-period in which a line is due. If a line comes later, `FreeRunningTimes` does not accept the clock.
-`LATE_ALONE` is for lines that are read one by one, and `LATE_BATCHED` for lines that an adapter
-batches. `MAX_ADAPTER_DELAY_NS` limits both."""
 
+# An FTDI chip holds a line for 16 ms. A later line probably answers a command between two periods,
+# or its board is slow and varies by more: there is no clock.
 MAX_ADAPTER_DELAY_NS = 25_000_000
-"""Longest time for which an adapter is assumed to hold a line back, ns. An FTDI chip holds a line
-for 16 ms. If a line comes later than this, `FreeRunningTimes` finds no clock. Such a line probably
-answers a command that was sent between two periods, or its board is slow and its delay varies by
-more than this time."""
 
+# A read this many periods after its slot confirms a clock, and more than one in so many must,
+# beside the earliest. Fewer are answers to commands between periods, and the clock is too early.
 MAX_CONFIRMING_LATENESS, READS_PER_CONFIRMATION = 0.55, 12
-"""Limits for the reads that confirm a clock of the board. A read confirms a clock if it comes at
-most `MAX_CONFIRMING_LATENESS` periods after its slot. The earliest read always confirms the clock.
-`FreeRunningTimes` accepts the clock only if, in addition to the earliest read, more than one in
-`READS_PER_CONFIRMATION` reads confirm it. If fewer reads do, these reads probably contain answers
-to commands that were sent between two periods, and the clock is too early for all other lines."""
 
-COMPLETE_PERIODS = 1.4
-"""If the time between two reads with a single line each is below this limit, no line is missing
-between them. The unit is the period of the board."""
+COMPLETE_PERIODS = 1.4  # between two reads of one line: below it, no line is missing
 
+# An adapter delays only up to a limit. A line later by one period and this margin shows a loss.
 LATENESS_MARGIN = 0.15
-"""Margin on the lateness of a line, in periods. An adapter delays a line only up to a limit. If the
-lateness exceeds this limit by more than one period plus the margin, an earlier line is missing."""
 
+# A line that comes more periods before its slot shows a wrong clock.
 MAX_EARLY_PERIODS = 0.25
-"""Largest time by which a line may come before its slot, in periods of the board. If a line comes
-even earlier, `FreeRunningTimes` gives up its clock as wrong."""
 
+# Mean share, over two windows, of reads that follow missing lines, above which the period is wrong.
 LOSSY_READ_FRACTION = 0.45
-"""If a larger share of the reads of the port follows missing lines, the period of the clock is
-wrong. The share is a mean over two successive windows."""
 
 
 class FreeRunningTimes:
     """The sample times of a free-running board, from the times at which its lines were read.
 
-    The board makes one line in each period T of its clock. Such a period is called a slot. The time
-    of a read alone does not show to which slot a line belongs: an adapter holds lines back, and
-    during a host stall they wait in the kernel. Let a be the time of a read, k the number of the
-    slot of its last line, and c the time of slot 0. Then the lateness of this line in slots is
+    The board makes one line in each period T of its clock, a slot. With the time a of a read, the
+    number k of the slot of its last line and the time c of slot 0, the lateness of this line in
+    slots is
 
         (1)  x = (a - c) / T - k
 
-    Each missing line adds 1 to x. There are two cases:
-
-    - Lines are read one by one. Then x is about 0, and each line shows immediately how many lines
-      are missing before it.
-    - An adapter batches lines. Then x lies between 0 and 1. If no more than the usual time has
-      passed since the previous read, a read shows even a single missing line. Any other read shows
-      a missing line only if x exceeds the greatest possible lateness.
-
-    The missing slots are spread over the lines of the read. If a line comes before its slot, the
-    class has counted too many slots as missing, so it subtracts one slot.
-
-    Twice a second, a second-order loop corrects c and T. Let x be the least lateness since the last
-    correction, n the number of slots since then, and g the gain of the loop. The corrections are
+    Each missing line adds 1. If lines are read one by one, x is about 0 and shows at once how many
+    are missing. If an adapter batches them, x is between 0 and 1: a read no later than usual shows
+    even one missing line, any other only if x exceeds the greatest possible lateness. The missing
+    slots are spread over the lines of the read, and one is taken back if a line comes before its
+    slot. Twice a second, with the least lateness x and the number n of slots since then, and the
+    gain g,
 
         (2)  c += g x T                 (3)  T += g^2 / 2 x T / n
 
-    The class finds no clock if the lines have no regular period. It gives up a clock that the lines
-    contradict.
+    The class finds no clock without a regular period, and gives up one that the lines contradict.
     """
 
     def __init__(self, known: tuple[float, ...]) -> None:
-        """Start before the period T and the time c of the board's slots are known.
-
-        `known` contains the values of T that the configuration suggests, s.
-        """
+        # `known` are the values of T that the configuration suggests, s.
         self._known = known
-        self.usual = 0.0
-        """The last measured period T of the board, ns. 0 until a clock has been found."""
-        self._stretch = 1.0
-        """Number of slots per line of the last read: 1, or more if lines are missing before the
-        read."""
+        self.usual = 0.0  # last measured T, ns; 0 before a clock was found
+        self._stretch = 1.0  # slots per line of the last read: more than 1 if lines are missing
         self._before = 0
-        self._first, self._slot = 0.0, 0
-        """The time c of slot 0, ns, and the number k of the slot of the last line."""
-        self._given = 0
-        """Number of slots that recent reads counted as slots of missing lines. If later lines show
-        that no line was missing, these slots are taken back."""
+        self._first, self._slot = 0.0, 0  # c in ns, and k of the last line
+        self._given = 0  # slots counted as missing by recent reads, to be taken back if none was
+        # In slots: usual lateness of a read, and time between two. Then the gain, and the share of
+        # reads in the last window that follow missing lines.
         self._lag = self._batch = self._gain = self._share = 0.0
-        """`_lag` is the usual lateness of a read after its slot, and `_batch` the usual time
-        between two reads, both in slots. `_gain` is the gain of the loop that corrects the clock.
-        `_share` is the share of the reads in the last window that follow missing lines."""
         self._batched: bool = False
         self._alone: bool = False
         self._least: float
@@ -169,20 +121,17 @@ class FreeRunningTimes:
         self.forget()
 
     def forget(self) -> None:
-        """Give up the clock, because the lines contradict it or may come from another board."""
+        """Give up the clock: the lines contradict it or may come from another board."""
+        # Nominal s by which the firmware divides its counts; None without a clock.
         self.period: float | None = None
-        """Nominal period by which the firmware divides its counts, s. None while no clock of the
-        board is known."""
         self._reads: list[Read] = []
-        self._last: float | None = None
-        """Slot of the last line that the present clock has placed. None before the first line."""
+        self._last: float | None = None  # of the last line that this clock has placed
 
-    def process_read(self, at_ns: int, lines: int, drained: bool) -> int:
-        """Process a read of the port, and return the number of missing lines before its last line.
+    def process_read(self, at_ns: Ns, lines: int, drained: bool) -> int:
+        """Process a read; return the number of missing lines before its last line.
 
-        The result is -1 if the count of missing lines in earlier reads was too high by one. `at_ns`
-        is the monotonic time at which the last line of the read was complete. `lines` is the number
-        of lines in the read. `drained` is true if the read took all data from the kernel.
+        The result is -1 if earlier reads counted one too many. `drained`: the kernel holds no more
+        data.
         """
         self._stretch = 1.0
         since, self._before = at_ns - self._before, at_ns
@@ -218,15 +167,11 @@ class FreeRunningTimes:
 
     @property
     def late_ns(self) -> float:
-        """Mean time from the beginning of the period in which a line is due to the read of the
-        line, ns."""
+        """Mean time from the beginning of the period in which a line is due to its read, ns."""
         return self._lag * self.usual
 
     def place(self, behind: int) -> Placed | None:
-        """Return the time of a line of the last read, or None if no clock of the board is known.
-
-        `behind` is the number of lines that follow the line in the read.
-        """
+        """Return the time of a line of the last read, `behind` lines before its end, or None."""
         period, last = self.period, self._last
         if period is None:
             return None
@@ -239,13 +184,8 @@ class FreeRunningTimes:
         return Placed("slots", due_ns, passed * period, missing * period)
 
     def _missing(self, ahead: float, since: float, lines: int, drained: bool) -> int:
-        """Return the number of missing lines that the last read proves.
-
-        Return -1 if the clock is wrong, or an earlier read counted one slot too many as missing.
-        `ahead` is the lateness x of the last line, and `since` the time since the previous read,
-        both in slots. `lines` is the number of lines in the last read. `drained` is true if the
-        read took all data from the kernel.
-        """
+        # -1: the clock is wrong, or an earlier read counted one too many. `ahead` is x, `since` the
+        # time since the previous read in slots.
         lag = self._lag if self._lag < 0.5 else 0.5
         if ahead < -0.5 + 0.6 * lag:
             return -1
@@ -264,7 +204,7 @@ class FreeRunningTimes:
 
     # Finding the clock and following it.
 
-    def _seek(self, at_ns: int, lines: int) -> None:
+    def _seek(self, at_ns: Ns, lines: int) -> None:
         reads = self._reads
         reads.append((at_ns, lines))
         if len(reads) <= WINDOW_READS or at_ns - reads[0][0] < WINDOW_NS:
@@ -290,12 +230,8 @@ class FreeRunningTimes:
     def _clocks(
         self, reads: list[Read], gaps: list[int]
     ) -> Iterator[tuple[list[int], float, float]]:
-        """Yield possible clocks of the board, the likelier ones first.
-
-        Each clock is a triple: a list of slots, the largest allowed lateness in slots, and the
-        period in ns. The list of slots contains, for each read, the slot of its last line. `gaps`
-        are the times between successive reads in `reads`, ns.
-        """
+        # The likelier ones first: the slot of each read's last line, the allowed lateness in slots,
+        # and the period in ns.
         # The configured periods come before the measured period, because for jittery lines they are
         # more reliable than half a second of data.
         plain, known = _slots(reads), [period * NS_PER_S for period in self._known]
@@ -319,16 +255,16 @@ class FreeRunningTimes:
         elif all(abs(slope / period - 1) > MAX_CLOCK_ERROR for period in known):
             yield own, LATE_BATCHED, slope
 
-    def _begin(self, at_ns: int) -> None:
-        self._window_ns: int = at_ns
+    def _begin(self, at_ns: Ns) -> None:
+        self._window_ns: Ns = at_ns
         self._least = math.inf
         self._count: int = 0
         self._passed: int = 0
         # Number of reads that follow missing lines.
         self._lossy: int = 0
 
-    def _follow(self, at_ns: int) -> None:
-        """Correct the clock by equations (2) and (3) of the class, or give up a wrong clock."""
+    def _follow(self, at_ns: Ns) -> None:
+        # Equations (2) and (3) of the class.
         least, slots = self._least, self._passed
         lossy, self._share = self._share, self._lossy / self._count
         if (
@@ -358,12 +294,8 @@ class FreeRunningTimes:
 
 
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
-    """Return the slot (the number of the board's period) of the last line of each read.
-
-    The last line of the first read has the slot 0. By default, only received lines have slots. If
-    `period`, ns, is finite, missing lines have slots too: a time of several periods between two
-    reads shows that lines are missing.
-    """
+    # The slot of each read's last line, from 0. With a finite `period`, ns, missing lines have
+    # slots.
     slots = [0]
     for (before, _), (at, lines) in pairwise(reads):
         slots.append(slots[-1] + max(lines, round((at - before) / period)))
@@ -371,7 +303,7 @@ def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
 
 
 def _slope(reads: list[Read], slots: list[int]) -> float:
-    """Return the period in ns that fits the reads and their slots by least squares."""
+    # ns, by least squares
     origin = reads[0][0]
     times = [at - origin for at, _ in reads]
     middle, centre = fmean(slots), fmean(times)
@@ -381,11 +313,8 @@ def _slope(reads: list[Read], slots: list[int]) -> float:
 
 
 def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, list[float]]:
-    """Return the time of slot 0, ns, and the lateness of each read, in slots.
-
-    The time of slot 0 is the latest one for which no read comes before its slot. So the least late
-    read has the lateness 0.
-    """
+    # The latest time of slot 0, ns, for which no read comes before its slot, and each lateness in
+    # slots.
     offsets = [at - slot * period for (at, _), slot in zip(reads, slots, strict=True)]
     first = min(offsets)
     return first, [(offset - first) / period for offset in offsets]
@@ -393,94 +322,66 @@ def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, 
 
 # A prompted board.
 
-MAX_OPEN_COMMANDS = 64
-"""Largest number of commands that `PromptedTimes` remembers because replies may still come."""
+MAX_OPEN_COMMANDS = 64  # replies to them may still come
 
+# Gain for the usual delay, its spread, the times between commands and batches, and their share.
 FAST_GAIN = 0.05
-"""Gain of several filters: for the usual reply delay and its spread, for the usual time between
-commands, for the usual time between batches, and for the share of batches among the reads."""
 
-SLOW_GAIN = 0.0125
-"""Gain per read of the filter that decides whether the board itself varies the reply delay."""
+SLOW_GAIN = 0.0125  # per read, for whether the board itself varies the delay
 
+# Rise of the long-term least delay per reply: an outdated one is forgotten after 500.
 LEAST_DELAY_GAIN = 0.002
-"""Gain per reply with which the long-term least reply delay rises toward the usual reply delay.
-With this gain, an outdated least delay is forgotten after about 500 replies."""
 
+# Rate at which the least delay of the last replies rises with the time since the last read, which
+# counts as 1 to this many command intervals: a board may stall and then answer all lines.
 LEAST_DELAY_RISE, MAX_RISE_PERIODS = 0.05, 3
-"""`LEAST_DELAY_RISE` is the rate at which the least delay of the last replies rises, so that
-`PromptedTimes` forgets older replies. With each read of the port, the least delay rises by
-`LEAST_DELAY_RISE` times the time since the previous read. For this purpose, the time since the
-previous read counts as at least 1 and at most `MAX_RISE_PERIODS` times the usual time between two
-commands. The upper limit is for a board that stalls and then answers all lines."""
 
+# Command intervals of the last replies' least delay over the long-term one: more means lost
+# replies. 1 is too low: the delay may rise by almost an interval for good.
 LOST_REPLY_PERIODS = 1.25
-"""Largest excess of the least delay of the last replies over the long-term least delay. The unit is
-the usual time between two commands. A larger excess means that replies were lost. A limit of 1 is
-too low, because the delay may permanently rise by almost the time between two commands."""
 
+# Share of lost replies below which a late reply after a stall proves no loss: two commands are then
+# close together, and the first reply is late anyway.
 RARE_LOSS_FRACTION = 0.002
-"""Share of lost replies below which a late reply after a host stall does not prove that a reply was
-lost. After a host stall, two commands are written close together, so the reply to the first command
-is late even if no reply was lost."""
 
+# Support for the usual delay: +1 with each reply near it, -1 with each much later one. At the lower
+# bound, stalls no longer explain them: it was measured on an early reply.
 MAX_SUPPORT, MIN_SUPPORT = 200, -8
-"""Bounds of the support for the usual reply delay. Each reply with about this delay adds 1. Each
-reply that comes much later, as after a stall, subtracts 1. At `MIN_SUPPORT`, stalls no longer
-explain the late replies: the usual delay was measured on a reply that came unusually early."""
 
-MAX_USB_JITTER_NS = 350_000
-"""Largest mean deviation of the reply delay that USB and the scheduler explain, ns."""
+MAX_USB_JITTER_NS = 350_000  # mean deviation of the delay that USB and the scheduler explain
 
+# Above this mean deviation, which USB and the scheduler rarely cause, the board varies it.
 MIN_BOARD_JITTER_NS = 800_000
-"""Mean deviation of the reply delay above which the board itself varies the delay, ns. USB and the
-scheduler rarely cause a deviation above this limit."""
 
-DELAY_RISE_NS = 20_000
-"""Rise of the least reply delay with each read on a batched link, ns. The rise makes
-`PromptedTimes` forget an outdated value. A link is batched if an adapter holds replies back, so
-that a read contains several replies."""
+DELAY_RISE_NS = 20_000  # per read of a batched link, so that an outdated least delay is forgotten
 
-LOSS_GAIN = 0.005
-"""Gain of the filter for the share of lost replies. With a gain of 1/20 instead, two lost replies
-would be enough to reach `LOSSY_FRACTION`."""
+LOSS_GAIN = 0.005  # with 1/20, two lost replies would be enough to reach `LOSSY_FRACTION`
 
+# Above this share of lost replies, the reply to any command on a batched link may be missing.
 LOSSY_FRACTION = 0.03
-"""Share of lost replies above which a batched link counts as lossy. On a lossy link, the reply to
-any command may be missing. A link is batched if an adapter holds replies back."""
 
+# Share of reads with several lines. Host stalls alone cause fewer, so an adapter batches.
 BATCH_READ_FRACTION = 0.15
-"""Share of the reads of the port with several lines above which an adapter must be batching lines.
-Host stalls alone cause fewer such reads."""
 
+# Share of reads with a varied delay, above which the board varies it. An adapter whose packets fill
+# line by line does so, too, but only for a quarter of a second.
 BOARD_JITTER_FRACTION = 0.6
-"""Share of the reads with a varied reply delay above which the board itself varies the delay. An
-adapter whose packets fill line by line also varies the delay, but only for a quarter of a
-second."""
 
+# Above this mean deviation, an adapter and not the board varies the delay.
 MIN_ADAPTER_JITTER_NS = 2_000_000
-"""Mean deviation of the reply delay above which an adapter and not the board varies the delay,
-ns."""
 
 
 class PromptedTimes:
     """The sample times of a prompted board, from the commands that its replies answer.
 
-    A plain reply does not say which command it answers. However, a board that answers each command
-    takes its sample when the command arrives. So the sample times are the times at which the
-    commands were written, plus a usual delay. The time between two samples is the time between the
-    two commands that the board answered, even if the host reads the replies late.
-
-    Replies come in the order of the commands. A reply may seem later than usual by more than half
-    of the time to the next command. Then it answers the next command, and the reply to the earlier
-    command was lost.
+    A board that answers takes its sample when the command arrives, so the time between two samples
+    is that between the two commands, even if the host reads the replies late. Replies come in the
+    order of the commands. One that seems later than usual by more than half of the time to the next
+    command answers that one, and the reply to the earlier command was lost.
     """
 
-    def __init__(self, soonest_ns: int) -> None:
-        """Start before the first command to the board.
-
-        `soonest_ns` is the time that a command and its reply take on the wire together, ns.
-        """
+    def __init__(self, soonest_ns: Ns) -> None:
+        # `soonest_ns`: a command and its reply on the wire.
         self._soonest = soonest_ns
         self._left: deque[int] = deque(maxlen=MAX_OPEN_COMMANDS)
         self.forget()
@@ -491,88 +392,62 @@ class PromptedTimes:
         self.restart()
 
     def restart(self) -> None:
-        """Forget which command was answered last, and the usual delay of the replies.
+        """Forget the last answered command and the usual delay, but not the open commands.
 
-        The next reply is then assigned to the newest command that it can answer. The commands are
-        not forgotten, because replies to the last commands may still come.
+        The next reply belongs to the newest command that it can answer.
         """
         self._delay: float | None = None
-        self._first = False
-        """Whether the usual delay was measured on the first reply alone."""
+        self._first = False  # the usual delay was measured on the first reply alone
+        # Mean deviation from the usual delay, and long-term least delay, ns.
         self._spread = self._least = 0.0
-        """`_spread` is the mean deviation from the usual reply delay, ns. `_least` is the long-term
-        least reply delay, ns."""
-        self._soon = 0.0
-        """Least delay of the last replies, ns."""
-        self._support = 0
-        """Support for the usual reply delay (see `MAX_SUPPORT`)."""
+        self._soon = 0.0  # least delay of the last replies, ns
+        self._support = 0  # of the usual delay (`MAX_SUPPORT`)
         self._sent: int | None = None
+        # Usual ns between two commands, and share of lost replies.
         self._apart = self._missing = 0.0
-        """`_apart` is the usual time between two commands, ns. `_missing` is the share of lost
-        replies."""
+        # Last answered command, with the estimate by which the board itself was late or early.
         self._last: int | None = None
-        """Time at which the last answered command was written, ns. If the board itself answered
-        later or sooner than usual, an estimate of this difference is added."""
+        # Times of commands: the last one that waits for no reply (answered, skipped or given up),
+        # and the last answered one.
         self._passed = self._line = 0
-        """Both are times at which the daemon wrote a command, ns. `_line` belongs to the last
-        answered command. `_passed` belongs to the last command that was answered, skipped or given
-        up, so that it waits for no reply."""
-        self._lost = False
-        """Whether the last read with a single reply showed that an earlier reply was lost."""
+        self._lost = False  # the last read with one reply showed a loss
+        # Given up at the last read of a batched link; an adapter that stalled may still deliver.
         self._given: list[int] = []
-        """The commands that were given up at the last read of a batched link, oldest first. Each is
-        the time at which it was written, ns. An adapter that stalled may still deliver the replies
-        to these commands."""
         self._at, self._alone, self._since = 0, False, 0
+        # Batched link: least delay, usual time between reads (both ns), share of lost replies.
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
-        """These values describe a batched link. `_base` is the least reply delay, ns. `_batch` is
-        the usual time between two reads, ns. `_losses` is the share of lost replies."""
-        self._several = 0.0
-        """Filtered share of the reads that have several lines."""
-        self._batched = False
-        """Whether an adapter holds replies back, so that one read contains several."""
+        self._several = 0.0  # share of reads with several lines
+        self._batched = False  # an adapter holds replies back
+        # Share of reads whose delay varied more than by USB, and less than by an adapter.
         self._thinking = 0.0
-        """Filtered share of the reads in which the reply delay varied more than USB and the
-        scheduler cause, but less than an adapter causes."""
 
     @property
     def varies_delay(self) -> bool:
-        """Whether the board itself varies the delay of its replies.
-
-        This is assumed if the delay varies by more than this computer and its USB adapter can
-        cause.
-        """
+        """Whether the board varies the delay by more than this computer and its adapter can."""
         return self._thinking > BOARD_JITTER_FRACTION and not self._batched
 
     @property
     def lossy(self) -> bool:
-        """Whether an adapter batches the replies, and more than 3 % (`LOSSY_FRACTION`) are lost."""
+        """Whether an adapter batches the replies, and `LOSSY_FRACTION` of them are lost."""
         return self._batched and self._losses > LOSSY_FRACTION
 
     @property
-    def latest_ns(self) -> int:
-        """Monotonic time at which the reply to the last command usually comes, ns.
-
-        It is 0 before the first command, and while the usual delay is unknown.
-        """
+    def latest_ns(self) -> Ns:
+        """When the reply to the last command usually comes; 0 before it, and if unknown."""
         if self._sent is None or self._delay is None:
             return 0
         return self._sent + int(self._delay)
 
-    def written(self, at_ns: int) -> None:
-        """Record that a command was written at the monotonic time `at_ns`, ns."""
+    def written(self, at_ns: Ns) -> None:
+        """Record a command."""
         if self._sent is not None:
             apart, usual = at_ns - self._sent, self._apart
             self._apart = usual + FAST_GAIN * (min(apart, 2 * usual) - usual) if usual else apart
         self._sent = at_ns
         self._left.append(at_ns)
 
-    def process_read(self, at_ns: int, lines: int, cut: bool = False) -> None:
-        """Process a read of the port that contains `lines` complete replies.
-
-        The last complete reply was received at the monotonic time `at_ns`. `cut` is true if the
-        read also contains the first part of one more reply.
-        """
+    def process_read(self, at_ns: Ns, lines: int, cut: bool = False) -> None:
+        """Process a read of `lines` complete replies, and of a part of one more if `cut`."""
         alone, since = lines == 1, at_ns - self._at
         self._at, self._alone, self._since = at_ns, alone, since
         self._several += FAST_GAIN * ((not alone) - self._several)
@@ -587,11 +462,10 @@ class PromptedTimes:
         if self._delay is not None:
             self._base, self._losses = self._delay, 0.0
 
-    def place(self, asked_ns: int | None = None) -> Placed | None:
+    def place(self, asked_ns: Ns | None = None) -> Placed | None:
         """Return the time of the next reply, or None if no command waits for a reply.
 
-        `asked_ns` is the monotonic time at which the command that this reply answers was written,
-        ns. It is None if the reply does not say which command it answers.
+        `asked_ns` is its command, if the reply says so.
         """
         left = self._left
         if asked_ns is not None:
@@ -634,7 +508,7 @@ class PromptedTimes:
             self._passed = self._left.popleft()
 
     def _begin(self) -> None:
-        """Assign the first reply to the newest command that this reply can answer."""
+        # To the newest command that it can answer.
         left = self._left
         while len(left) > 1 and left[1] + self._soonest <= self._at:
             self._passed = left.popleft()
@@ -642,12 +516,11 @@ class PromptedTimes:
             self._start(self._at - left[0])
             self._first = True
 
-    def _start(self, delay_ns: int) -> None:
+    def _start(self, delay_ns: Ns) -> None:
         self._delay = self._least = self._soon = float(delay_ns)
         self._support = 0
 
     def _shorten(self, command: int) -> None:
-        """Correct the usual delay if it was measured on a reply that a stall had delayed."""
         # After a stall, the delay of the second reply is much shorter than the usual delay. Without
         # the correction, the usual delay would fall by only 5 % of the difference per reply. Until
         # then the delay would seem to vary much, which would hide lost replies.
@@ -658,12 +531,8 @@ class PromptedTimes:
             self._spread = 0.0
 
     def _weigh(self, lines: int, since: int, cut: bool) -> None:
-        """Stop waiting for replies that were lost, if an adapter holds replies back.
-
-        If a read shows that such a reply was only late, its command waits for the reply again.
-        `lines` is the number of complete replies in the read. `since` is the time since the
-        previous read, ns. `cut` is true if the read also contains the first part of one more reply.
-        """
+        # If an adapter holds replies back: commands stop waiting, or wait again after a stall.
+        # `cut`: the first part of one more reply is in the read.
         # The last reply of a batch shows a loss: it comes too late for the command that it would
         # answer if no reply were lost. If it comes too soon for its command, commands that were
         # given up before are taken back.
@@ -701,12 +570,8 @@ class PromptedTimes:
         self._delay = self._base
 
     def _given_up_too_early(self, delay: float) -> bool:
-        """Stop waiting for replies that seem lost. Return whether the last call did so too early.
-
-        The last call did so too early if a reply that seemed lost was only late. The present reply
-        is then this late reply. Call this only if the last read of the port contained a single
-        reply.
-        """
+        # Stop waiting for replies that seem lost. True: the last call did so too early, and this
+        # reply is that one. For a read of a single reply.
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False
         self._missing -= LOSS_GAIN * self._missing
@@ -740,19 +605,9 @@ class PromptedTimes:
         return at - left[0] - delay <= -max((left[0] - self._passed) / 2, wide)
 
     def _shift(self, command: int) -> int:
-        """Return an estimate of the extra time that the board took for the present reply, ns.
-
-        USB and the scheduler also change the delay, so the result is only a part of the difference
-        from the usual delay. The result is 0 in these cases:
-
-        - The usual delay is unknown, or an adapter delivers several replies in one read.
-        - USB and the scheduler explain the mean deviation from the usual delay.
-        - The mean deviation is so large that an adapter must cause it.
-        - A stall has probably delayed this reply.
-
-        `command` is the time at which the answered command was written, ns. The present reply must
-        be the only reply in its read of the port.
-        """
+        # Part of the difference from the usual delay, as USB and the scheduler change it, too. 0 if
+        # these explain the mean deviation, if only an adapter does, or after a probable stall. For
+        # a read of a single reply.
         delay, spread = self._delay, self._spread
         if delay is None or self._batched:
             return 0

@@ -1,13 +1,9 @@
 """Exchanges lines with the board on one serial port, which may close, reopen and fall silent.
 
-The module turns received bytes into feedback, and wheel speeds into lines for the board.
-`negotiation.py` decides whether lines are plain or checked (with a checksum), and `link_state.py`
-decides whether the robot may drive over the link. The link does not come up while the daemon asks
-the board for checked lines.
-
-When the port is opened again, another board may answer. The daemon then forgets, after `FORGET_NS`,
-each field of the status line that only the previous board reported. If a board restarts while the
-port stays open, the daemon forgets no field. The same board has the same inputs, so a field that it
+`negotiation.py` decides whether lines are plain or checked, and `link_state.py` whether the robot
+may drive; the link does not come up while the daemon asks for checked lines. Another board may
+answer after the port was opened again, so fields of the status line that only the previous one
+reported are forgotten after `FORGET_NS`. A board that restarts has the same inputs: a field that it
 no longer reports is a fault.
 """
 
@@ -27,7 +23,7 @@ from acsard.core.link.link_state import WATCHDOG_NS, WATCHDOG_S, Link
 from acsard.core.link.link_state import State as LinkState
 from acsard.core.link.negotiation import ADVICE, SILENT_BOARD_PERIOD_NS, Negotiation, Throttle
 from acsard.core.link.quantization import CountRecovery
-from acsard.core.values import NS_PER_S, STILL, Event, EventName, Instant, Received, WheelSpeeds
+from acsard.core.values import NS_PER_S, STILL, Event, EventName, Instant, Ns, Received, WheelSpeeds
 
 NAMES: dict[LinkState, EventName] = {
     "down": "link_down",
@@ -36,30 +32,21 @@ NAMES: dict[LinkState, EventName] = {
     "stale": "link_stale",
 }
 
+# Without a good line, or with no line accepted by the port, the MCU may have been reset: a new
+# session begins, and every sender must send a zero before it can drive.
 LONG_GAP_NS = 1 * NS_PER_S
-"""Least duration of a gap after which a new session with the MCU begins, ns. In a gap, the daemon
-receives no good line, or the port accepts no line, so the MCU may have been reset. After such a
-gap, every sender must send a zero before it can drive."""
 
+# With the link up and no late step. A board reports each field at least once a second. Until then a
+# pressed emergency stop stays latched over a replugged cable.
 FORGET_NS = 3 * NS_PER_S
-"""Time after the opening of the port in which a board must report each field of its status line,
-ns. The session then forgets the fields that the board did not report, because another board may be
-connected now. Only uninterrupted time with the link up counts, and steps in which this computer was
-late do not add to it. The time is long enough, because a board reports each of its fields at least
-once a second. Until a field is forgotten, it keeps its value. So a pressed emergency stop remains
-latched while the cable is unplugged and plugged in again."""
 
-IDENTITY = b"!acsard-mcu "
-"""First bytes of the line with which an MCU with acsard's firmware identifies itself after
-booting."""
+IDENTITY = b"!acsard-mcu "  # acsard's firmware, after booting
 
 
 class McuSession:
     """The exchange of lines with the MCU on one serial port.
 
-    A new session with the MCU begins when the port is opened and when the MCU restarts. It also
-    begins at the end of a gap of at least `LONG_GAP_NS` in the lines. One object of this class
-    handles all of these sessions.
+    A session begins when the port is opened, when the MCU restarts, and after `LONG_GAP_NS`.
     """
 
     def __init__(
@@ -69,41 +56,26 @@ class McuSession:
         wheel_speed: float = FeedbackConfig().wheel_speed,
         longest_reply: float = MAX_REPLY_PERIOD_S,
     ) -> None:
-        """Start with the port closed.
-
-        `wheel_speed` is the highest speed that a wheel can have, rad/s. `longest_reply` is the
-        highest value that the setting `mcu.reply_period` may have, s.
-        """
+        # `longest_reply` is the highest value that `mcu.reply_period` may have, s.
         self.codec = Codec(mcu.wheels, mcu.trailing_comma)
+        # Begin of every line with speed zero for all wheels.
         self._rest = self.codec.stop.rstrip(b",\r\n")
-        """The first bytes of every line, plain or checked, with speed zero for all wheels."""
+        # A board that answers sends nothing while it receives no line.
         self._answers = not mcu.reply_period
-        """Whether the board answers lines instead of reporting by its own clock. A board that
-        answers sends no reply while it receives no line."""
         self._lines = LineReader()
         self._needs_check = mcu.link_check == "require"
+        # Received by the last `update`, with their arrival.
         self.statuses: list[tuple[int, BoardStatus]] = []
-        """The status lines that the last `update` received. Each is a pair of the monotonic time
-        of arrival, ns, and the decoded line."""
-        self.status = BoardStatus()
-        """The last received value of each field of the status lines, until the session forgets the
-        field. A forgotten field is None."""
-        self.status_ns: int | None = None
-        """Monotonic time of arrival of the last status line that is not forgotten, ns."""
+        self.status = BoardStatus()  # last value of each field, until the session forgets it
+        self.status_ns: Ns | None = None  # arrival of the last status line
+        # Both of these, since the last opening of the port.
         self._reported: tuple[BoardStatus, int | None] = (BoardStatus(), None)
-        """The values of `status` and `status_ns`, but only from status lines received since the
-        last opening of the port."""
+        # Until the fields of another board are forgotten; how long the link was up without late
+        # steps, ns; the last update.
         self._awaiting, self._settled_ns, self._judged_ns = True, 0, 0
-        """`_awaiting` is true from the opening of the port until the session forgets the fields
-        that the board has not reported since. `_settled_ns` is the time for which the link has been
-        up, ns, without the late steps. `_judged_ns` is the monotonic time of the last update,
-        ns."""
-        self.reopened = self.forgot = False
-        """`reopened` is true if the last `update` found that the port was opened. `forgot` is true
-        if the last `update` forgot the fields that the board has not reported since the opening of
-        the port."""
+        self.reopened = self.forgot = False  # in the last `update`
+        # Silence after which the link is stale.
         self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
-        """Duration of silence after which the link is stale, ns."""
         self.negotiation = Negotiation(mcu, self.codec.stop)
         self._link = Link(self.quiet_ns)
         self.lateness = Lateness(mcu.simulated, self.quiet_ns)
@@ -112,30 +84,22 @@ class McuSession:
         self._hearing = SilenceDiagnosis()
         self._wants_samples, self._longest_reply = mcu.wants_samples, longest_reply
         self.rejects: Counter[str] = Counter()
+        # By reason, in this `update`: their number, and the last line.
         self._rejected: dict[str, tuple[int, bytes]] = {}
-        """Maps each reason to the number of lines that this `update` has rejected for this reason,
-        and to the last such line."""
         self.good_lines = 0
-        self._heard_ns: int | None = None
-        self.restarted = False
-        """True if the last `update` began a new session with the MCU. The reason is that the port
-        was opened, the MCU has restarted, or a long gap in the lines has ended."""
-        self.events: list[Event] = []
-        """Events of the last `update`, for the log."""
+        self._heard_ns: Ns | None = None
+        self.restarted = False  # the last `update` began a new session
+        self.events: list[Event] = []  # of the last `update`, for the log
         self._starting_over = False
         self._announced: tuple[LinkState, str, bool, bool]
         self._announced = ("down", self.negotiation.in_force, False, False)
         self._opened = 0
         self._blind, self._just_blind = Throttle(), False
+        # Last result of `line()`, until it is known whether it was written.
         self._made: tuple[bytes, int] | None = None
-        """A pair: the last line that `line()` returned, and the monotonic time at which it was
-        made, ns. None once it is known whether the port wrote the line."""
-        self._left_ns = 0
-        """Monotonic time at which the port last wrote a line or was opened, ns."""
-        self._held_up = False
-        """True if the port did not write the last line that was made."""
-        self.blocked = False
-        """True if the port is open, but its driver has not accepted a line for `WATCHDOG_NS`."""
+        self._left_ns = 0  # the port last wrote a line or was opened
+        self._held_up = False  # the port did not write the last line
+        self.blocked = False  # the open port's driver has accepted no line for `WATCHDOG_NS`
 
     @property
     def link(self) -> LinkState:
@@ -149,13 +113,12 @@ class McuSession:
         opened: int,
         received: tuple[Received, ...],
         unsent: bool = False,
-        late_ns: int = 0,
+        late_ns: Ns = 0,
     ) -> list[Feedback]:
         """Process the state of the port and the received bytes, and return the good lines in order.
 
-        `opened` is the number of times that the port has been opened. If this number has changed, a
-        new session starts. `unsent` is true if the port did not write the last line that `line()`
-        returned. `late_ns` is the time from the making to the writing of that line, ns.
+        `opened` counts the openings of the port. `unsent` says that the last result of `line()` was
+        not written, and `late_ns` how long after its making it was.
         """
         self.restarted, self._starting_over, self.events = False, False, []
         self.reopened = self.forgot = False
@@ -185,19 +148,18 @@ class McuSession:
         self._announce()
         return feedback
 
-    def line(self, now_ns: int, speeds: WheelSpeeds) -> bytes | None:
-        """Return the line to the board that commands `speeds`, or None if no line is due.
+    def line(self, now_ns: Ns, speeds: WheelSpeeds) -> bytes | None:
+        """Return the line that commands `speeds`, or None if no line is due.
 
-        The line has a checksum only if the board answers checked lines. Every line is a stop,
-        whatever `speeds` is, while the board does not answer, and while the daemon asks whether the
-        board supports checked lines. The first of these stops is due immediately, because the board
-        may still execute the previous line. `now_ns` is monotonic.
+        It is a stop, whatever `speeds` is, while the board does not answer or is asked for the
+        check. The first of these is due immediately, because the board may still execute the
+        previous line.
         """
         line = self._next_line(now_ns, speeds)
         self._made = None if line is None else (line, now_ns)
         return line
 
-    def _next_line(self, now_ns: int, speeds: WheelSpeeds) -> bytes | None:
+    def _next_line(self, now_ns: Ns, speeds: WheelSpeeds) -> bytes | None:
         if self.negotiation.asking:
             return self.negotiation.question(now_ns)
         if self.silent(now_ns):
@@ -208,26 +170,19 @@ class McuSession:
         line = self.codec.stop if speeds == STILL else self.codec.encode(speeds)
         return self.negotiation.seal(line, now_ns)
 
-    def silent(self, now_ns: int) -> bool:
-        """Return whether the last good line of this session is older than `quiet_ns`.
+    def silent(self, now_ns: Ns) -> bool:
+        """Return whether the last good line of this session is older than `quiet_ns`, or missing.
 
-        The result is also True if this session has no good line yet. After a late control step, the
-        board gets additional time to answer, in which the result is False. `now_ns` is monotonic.
+        The result is False in the additional time that the board gets after a late control step.
         """
         return self._link.silent(now_ns)
 
-    def feedback_age_s(self, now_ns: int) -> float | None:
-        """Return the time since the last good line, s, even if an earlier session received it.
-
-        Return None if no good line has ever come.
-        """
+    def feedback_age_s(self, now_ns: Ns) -> float | None:
+        """Return the time since the last good line of any session; None before the first one."""
         return None if self._heard_ns is None else (now_ns - self._heard_ns) / NS_PER_S
 
     def describe_link(self, port_trouble: str = "") -> str:
-        """Return a sentence for the operator about the state of the link.
-
-        `port_trouble` is the reason why the port is closed, or "" if there is none.
-        """
+        """Return a sentence about the link; `port_trouble` says why the port is closed."""
         if self.link == "down" and port_trouble:
             return port_trouble
         if self.blocked:
@@ -238,16 +193,13 @@ class McuSession:
 
     @property
     def note(self) -> str:
-        """The present form of the lines, to append to the reason of a mode.
-
-        An example is " (serial lines checked)". The text is "" if `mcu.link_check` is "off".
-        """
+        """The form of the lines, such as " (serial lines checked)"; "" without `mcu.link_check`."""
         check = self.negotiation
         return "" if check.state == "off" else f" (serial lines {check.in_force})"
 
     # sessions
 
-    def _settle(self, was_written: bool, port_open: bool, late_ns: int) -> None:
+    def _settle(self, was_written: bool, port_open: bool, late_ns: Ns) -> None:
         made = self._made
         if made is None:
             return
@@ -263,7 +215,7 @@ class McuSession:
         elif blind and port_open:
             self._blind.undo()
 
-    def _begin(self, port_open: bool, opened: int, now_ns: int) -> None:
+    def _begin(self, port_open: bool, opened: int, now_ns: Ns) -> None:
         self._link.apply("opened" if port_open else "closed")
         self.restarted = self.reopened = opened != self._opened
         if self.reopened:
@@ -279,10 +231,8 @@ class McuSession:
         self.negotiation.begin(fresh=True)
 
     def _restart(self, how: str) -> None:
-        """Start a new session, because the MCU has restarted and its motors stand still.
-
-        `how` completes the sentence "the microcontroller ..." in the log.
-        """
+        # The MCU has restarted, and its motors stand still. `how` completes "the microcontroller
+        # ...".
         if self.link == "up":
             self.events.append(Event("mcu_restarted", f"the microcontroller {how}", "warning"))
         self._link.apply("restarted")
@@ -291,7 +241,7 @@ class McuSession:
         self.count_recovery.forget()
         self.negotiation.begin()
 
-    def _judge(self, now_ns: int) -> None:
+    def _judge(self, now_ns: Ns) -> None:
         link, check = self._link, self.negotiation
         if not self._held_up:
             self.blocked = False
@@ -324,10 +274,6 @@ class McuSession:
             self.events.append(Event(NAMES[self.link], self.describe_link(), "warning"))
 
     def _reject(self, reason: str, line: bytes = b"", more: int = 1) -> None:
-        """Count `more` rejected lines.
-
-        `line` is the last of them; b"" means that its bytes are unknown.
-        """
         self.rejects[reason] += more
         before, _ = self._rejected.get(reason, (0, b""))
         self._rejected[reason] = (before + more, line)
@@ -387,7 +333,7 @@ class McuSession:
                 self._hearing.now.line(line, reply is not None)
         return feedback
 
-    def _take_statuses(self, lines: list[bytes], at_ns: int) -> None:
+    def _take_statuses(self, lines: list[bytes], at_ns: Ns) -> None:
         check = self._needs_check or self.negotiation.checked
         for line in lines:
             try:
@@ -440,12 +386,9 @@ class McuSession:
         reading: Reading | None,
         read_at: Instant,
         size: tuple[int, int],
-        asked_ns: int | None,
+        asked_ns: Ns | None,
     ) -> Feedback:
-        """Count a good line, and return its feedback.
-
-        `size` is the pair of `following` and `length`, the arguments of `Timeline.place`.
-        """
+        # `size` is `following` and `length` of `Timeline.place`.
         self.good_lines += 1
         before_ns, self._heard_ns = self._heard_ns, read_at.mono_ns
         if before_ns is not None and read_at.mono_ns - before_ns >= LONG_GAP_NS:

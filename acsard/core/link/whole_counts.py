@@ -1,31 +1,9 @@
 """Recovers whole encoder counts from the speeds of a plain line, if the counts per turn are known.
 
-Let a be the angle of one count in rad, and T the time in s in which a wheel made n counts. Firmware
-that divides counts by time reports the speed n a / T. T is the same for all four wheels, but the
-host knows it only to a few ms. With a coarse encoder, this error makes the heading wrong. At 16
-counts a turn, the wheel rolls 0.4 rad per count, and an error of 30 % in T is 30 % of that angle.
-However, n is a whole number, so T can be found from the speeds:
-
-1. Each possible n of the fastest wheel implies a time T = n a / speed. The search starts at the n
-   whose T is nearest to the host's estimate.
-2. The search ends at the first n with which the counts of the other wheels are whole numbers too.
-3. If T is longer than the host's estimate, the board took this sample later than the host thought,
-   so less time is left until the next sample. Therefore the host's estimate for the next line is
-   reduced by most of the difference, and raised if T is shorter. This also corrects the error in
-   the next line if n was wrong.
-
-With fine encoders, the host's estimate is too inaccurate to find n. Then the angle of each wheel is
-its speed times the host's estimate, which includes the correction from the previous line. So no
-time is lost or counted twice.
-
-If the previous line is missing, there are two cases. If the board answered and its reply was lost,
-T covers only the time since that reply. If the command was lost, the board did not answer, and T
-covers the whole time since the last good line. The speeds are whole counts for only one of these
-two times. If a line does not show which case applies, the module assumes the case of most earlier
-lines. If more than one line is missing, it assumes the first case.
-
-Some firmware filters its speeds, or measures the time between two encoder edges. Its speeds are not
-whole counts. The module detects this, and the caller then uses speed times time.
+Firmware that divides n counts by a time T reports the speeds n a / T, with the angle a of a count
+and one T for all wheels. The host knows T only to a few ms: at 16 counts a turn, 30 % of T are 30 %
+of 0.4 rad. But n is whole, so the search tries the n of the fastest wheel from the one nearest to
+the host's T until the counts of the other wheels are whole, too.
 """
 
 from __future__ import annotations
@@ -34,97 +12,69 @@ import math
 
 from acsard.core.link.codec import Motors
 
-ROUNDING = 0.0052
-"""Largest rounding error of a speed with two decimals (0.005 rad/s), with a small margin."""
+ROUNDING = 0.0052  # of a speed with two decimals (0.005 rad/s), with a small margin
 
-MAX_TRIES = 16
-"""Largest number of different values of n, the counts of the fastest wheel, that are tried for a
-line. This limit bounds the time of a control step."""
+MAX_TRIES = 16  # of n for a line, because the time of a control step is bounded
 
+# Probability that random speeds look like whole counts; it grows with each try. Above it, they
+# prove nothing.
 MAX_CHANCE = 0.05
-"""Largest accepted probability that random speeds look like whole counts. The probability grows
-with each number of counts that is tried for a line. If the probability exceeds this limit, speeds
-that look like whole counts prove nothing."""
 
+# Counts between the number computed by the host's estimate and a whole one, where the speeds alone
+# prove nothing (fine encoders), or to see whether a missing line is included.
 MAX_COUNT_ERROR = 0.3
-"""Largest accepted difference between a whole number of counts and a computed number. The computed
-number follows from the speed and the host's estimate of the time between two samples. This limit
-applies if the speeds alone prove nothing, as with fine encoders. It also helps to decide whether a
-line includes the counts of the missing line before it."""
 
-MAX_TIME_ERROR, MAX_TIME_ERROR_S = 0.6, 0.005
-"""Largest assumed error of the host's estimate of the time between two samples: the estimate times
-`MAX_TIME_ERROR`, plus `MAX_TIME_ERROR_S` s."""
+MAX_TIME_ERROR, MAX_TIME_ERROR_S = 0.6, 0.005  # of the host's estimate: relative, plus s
 
+# Share of an error that the next estimate carries. With 1, clocks that differ by 0.5 % would sum up
+# errors forever.
 MAX_CARRIED_ERROR = 0.95
-"""Largest share of an error that is added to the estimate for the next line. The error is that of
-the host's estimate of the time between two samples. The share must be below 1. If the share were 1
-and the clocks of the host and the board differed by 0.5 %, the sum of the errors would grow
-forever."""
 
+# Time since the line before, as a share of the firmware's counting time. Firmware that is asked
+# very soon has no new counts and repeats its speeds; from this share on it does not.
 REPEATED_FRACTION = 0.65
-"""Limit from which on a line with unchanged speeds is not a repetition of the previous line. The
-limit applies to the time since the previous line, divided by the time over which the firmware last
-counted. Firmware that is asked again very soon has no new counts, so it repeats the speeds of the
-previous line."""
 
+# Below the first share it does. In between, it does if the speeds are not whole counts, or if their
+# time differs from the host's by that of so many counts of the fastest wheel.
 REPEATED_LIMIT, REPEATED_COUNT_ERROR = 0.45, 0.25
-"""Limits for a line with unchanged speeds. Let q be the time since the previous line, divided by
-the time over which the firmware last counted. If q is less than `REPEATED_LIMIT`, the line is a
-repetition of the previous line. If q lies between `REPEATED_LIMIT` and `REPEATED_FRACTION`, the
-line is a repetition in two cases. Either its speeds are not whole counts. Or the time that its
-counts imply differs from the host's estimate by more than the time of `REPEATED_COUNT_ERROR` counts
-of the fastest wheel."""
 
+# Mean error of the host's time in counts, above which the nearest number is often wrong; a random
+# time has 0.25, and 96 counts a turn behind an adapter of 16 ms have this. Gain of the mean.
 MAX_MEAN_ERROR, MEAN_GAIN = 0.2, 0.025
-"""`MAX_MEAN_ERROR` is a limit for the mean error of the host's estimate of the time between two
-samples, in counts of the fastest wheel. Above this limit, the nearest whole number of counts is
-often wrong. A random time has a mean error of 0.25. An encoder with 96 counts a turn reaches
-`MAX_MEAN_ERROR` behind a USB adapter that batches lines for 16 ms. `MEAN_GAIN` is the gain of the
-filter for the mean."""
 
+# Gain of `_doubt` and `_cover`. Once `_doubt` reaches the share, no line counts as whole counts.
 SHARE_GAIN, MAX_BAD_SHARE = 0.1, 0.3
-"""`SHARE_GAIN` is the gain of the filters for two shares: the share of lines whose speeds are not
-whole counts, and the share of lines that include the counts of the missing line before them. If the
-first share reaches `MAX_BAD_SHARE`, no line is treated as whole counts."""
 
 
 class WholeCounts:
-    """Recovery of whole encoder counts from the speeds of four wheels, line by line."""
+    """Recovers whole encoder counts from the speeds of four wheels, line by line.
+
+    If T is longer than the host's estimate, the next estimate is reduced by most of the difference.
+    So the next line corrects a wrong n, and no time is lost or counted twice, even with fine
+    encoders, where n cannot be found. After one missing line, the speeds fit T since its reply if
+    that was lost, or T since the last good line if its command was. Firmware that filters its
+    speeds or times edges is detected.
+    """
 
     def __init__(self, counts: int) -> None:
-        """Start before the first line.
-
-        `counts` is the number of encoder counts per wheel turn, 0 if unknown.
-        """
-        self.angle = math.tau / counts if counts else 0.0
-        """Angle of one encoder count, rad, 0 if unknown."""
+        self.angle = math.tau / counts if counts else 0.0  # rad of one count, 0 if unknown
         self.forget()
 
     def forget(self) -> None:
         """Forget all earlier lines, because they may be those of another board."""
+        # s added to the next estimate, positive if the last sample was taken earlier than
+        # estimated; s over which the firmware last counted.
         self._apart = self._period = 0.0
-        """`_apart` is the time, s, that is added to the host's estimate of the time until the next
-        sample. It is positive if the board took the last sample earlier than the host estimated.
-        `_period` is the time, s, over which the firmware last counted."""
-        self._run = 0
-        """Number of lines with recovered counts since the last line without recovered counts."""
+        self._run = 0  # lines with recovered counts in a row
         self._before: Motors = (0.0, 0.0, 0.0, 0.0)
-        self.covers_gap = False
-        """Whether the last line includes the counts of the missing line before it."""
-        self._cover = 0.0
-        """Filtered share of lines that include the counts of the missing line before them, 0 to 1.
-        It is computed only from lines that follow a missing line and show whether they include its
-        counts."""
+        self.covers_gap = False  # the last line includes the counts of the missing line before it
+        self._cover = 0.0  # share of the lines after a missing one that do, 0 to 1, where it shows
+        # Share of lines that are not whole counts; error of the host's time in counts of the
+        # fastest wheel.
         self._doubt = self._unsure = 0.0
-        """`_doubt` is the filtered share of the lines whose speeds are not whole counts. `_unsure`
-        is the filtered error of the host's estimate of the time, in counts of the fastest wheel."""
 
     def pause(self) -> None:
-        """Do not add the error of the last estimated time between two samples to the next estimate.
-        The caller does this if the last line does not show the time over which the firmware
-        counted.
-        """
+        """Carry no error to the next estimate: the last line does not show its counting time."""
         self._apart, self._run = 0.0, 0
 
     @property
@@ -133,16 +83,12 @@ class WholeCounts:
         return self.angle > 0.0 and self._doubt < MAX_BAD_SHARE
 
     def turned(self, speeds: Motors, elapsed_s: float, gap: float = 0.0) -> Motors | None:
-        """Return the angle by which each wheel turned since the previous line, rad.
+        """Return the angle of each wheel since the previous line, rad, if possible as counts.
 
-        The angles are whole counts. If the line does not show the counts, the angles are speed
-        times time. Return None if the firmware does not report whole counts. Also return None if
-        the wheels turn, but no speed exceeds its rounding error.
-
-        `speeds` are in rad/s. `elapsed_s` is the host's estimate of the time since the previous
-        line, whether or not the host received that line. If that line is missing, `gap` is the time
-        from the last good line to the missing line, s. Otherwise `gap` is 0. If the call sets
-        `covers_gap` to True, the angles also include the motion during `gap`.
+        Otherwise it is speed times time. Return None if the firmware has no whole counts, or if the
+        wheels turn below the rounding. `elapsed_s` is the host's estimate since the previous line,
+        received or not, and `gap` the time from the last good line to a missing one, s. With
+        `covers_gap` the angles include it.
         """
         self.covers_gap = False
         before, self._before = self._before, speeds
@@ -212,13 +158,8 @@ class WholeCounts:
         return abs(number - expected_s * fastest / self.angle) <= MAX_COUNT_ERROR
 
     def _number(self, speeds: Motors, fastest: float, expected_s: float) -> tuple[int, bool | None]:
-        """Return the count n of the fastest wheel (0 if unknown), and whether speeds are counts.
-
-        The second value is True if the speeds are certainly whole counts, False if they certainly
-        are not, and None if it is not certain. `fastest` is the largest absolute value
-        in `speeds`, rad/s. `expected_s` is the host's estimate of the time between the two samples,
-        corrected by the error in the previous line.
-        """
+        # The count of the fastest wheel (0 if unknown), and whether the speeds are counts: True and
+        # False are certain. `expected_s` is the host's estimate, corrected by the last error.
         count = fastest / self.angle
         exact = expected_s * count  # counts if the host's time were right
         room = (MAX_TIME_ERROR * expected_s + MAX_TIME_ERROR_S) * count
