@@ -1,8 +1,7 @@
 """Change settings of the running robot: limits, timeouts, covariances, publishing rates, the log
 level. Either all given settings change or none. The daemon checks them like the configuration file,
-logs them and publishes them on the key `config`. They last until the daemon's next start. Lowered
-limits of speed, acceleration and jerk are an exception: they also survive the next start, but not
-on the simulator. With --keep the robot also writes the settings into its own configuration file,
+logs them and publishes them on the key `config`. They last until the daemon's next start.
+With --keep the robot also writes the settings into its own configuration file,
 and the answer names that file. With --write this tool writes them into the configuration file of
 this machine. --keep and --write cannot write a source's timeout: edit [[commands.sources]] in the
 file. A robot that drives faster than a new limit slows down to it.
@@ -14,9 +13,8 @@ a robot refuses, and 69 if a robot does not answer.
 from __future__ import annotations
 
 import argparse
-import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -25,8 +23,6 @@ from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, sever
 from acsard.cli.replies import of_each, print_each
 from acsard.client import Client
 from acsard.core.config.live import find_live_setting, flat
-from acsard.core.config.lowered import LIMITS_PREFIX, lowered, survives_restart
-from acsard.core.config.settings import LimitsConfig
 from acsard.core.config.validation import finite, show
 from acsard.core.formatting import json_line, lines
 from acsard.core.messages.encodings import encode
@@ -37,8 +33,7 @@ from acsard.host.config_file import change, require_changeable, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install
 
-_CHANGE = re.compile(r"([\w.-]+) = (.+?) \(was (.+?)\)(?:, |$)")
-"""Pattern of one changed setting in the daemon's answer, such as "rates.state = 5 (was 10)"."""
+UNTIL = "a set lasts until the daemon's next start"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -83,7 +78,7 @@ def main(args: argparse.Namespace) -> int:
         if many:
             return _set_all(robot, many, settings, keep=args.keep, as_json=args.json)
         reply = robot.set(settings, keep=args.keep)
-    text = reply.message if args.keep or not reply.success else _with_duration(reply.message)
+    text = reply.message if args.keep or not reply.success else f"{reply.message}; {UNTIL}"
     if reply.success and file is not None:
         try:
             change(file, settings)
@@ -130,42 +125,6 @@ def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> N
         )
 
 
-def _with_duration(message: str) -> str:
-    """Return the daemon's answer `message`, followed by how long the changes stay in force.
-
-    The answer contains text such as "KEY = NEW (was OLD)" for each change.
-    """
-    changes = {key: (new, old) for key, new, old in _CHANGE.findall(message)}
-    if not changes:
-        return message
-    limits = {key: pair for key, pair in changes.items() if survives_restart(key)}
-    try:
-        lower_limits = lowered(_limits(limits, 1), _limits(limits, 0))
-    except (TypeError, ValueError):  # a daemon of another version may have other limits
-        lower_limits = {}
-    if not lower_limits:
-        return f"{message}; in force until the daemon's next start"
-    if len(lower_limits) == len(changes):
-        return (
-            f"{message}; a lowered limit survives a restart of the daemon, except on the simulator"
-        )
-    return (
-        f"{message}; in force until the daemon's next start, except {', '.join(lower_limits)}: a "
-        "lowered limit survives a restart. On the simulator, no setting survives a restart"
-    )
-
-
-def _limits(pairs: Mapping[str, Sequence[str]], at: int) -> LimitsConfig:
-    """Return the limits after or before a change, so that the caller can find the lowered limits.
-
-    `pairs` maps the key of each changed limit to the pair (new value, old value). `at` is 0 for the
-    new values, and 1 for the old values. All other limits have their default values.
-    """
-    return LimitsConfig(
-        **{key.removeprefix(LIMITS_PREFIX): float(pair[at]) for key, pair in pairs.items()}
-    )
-
-
 def _set_all(
     robot: Client, ids: tuple[str, ...], settings: dict[str, Plain], *, keep: bool, as_json: bool
 ) -> int:
@@ -173,7 +132,7 @@ def _set_all(
         reply = client.set(settings, keep=keep)
         if as_json or keep or not reply.success:
             return reply
-        return ServiceReply(True, _with_duration(reply.message))
+        return ServiceReply(True, f"{reply.message}; {UNTIL}")
 
     replies = of_each(robot, ids, change_one)
     return print_each(replies, robot, ids, "NO ANSWER: {error}", as_json=as_json)

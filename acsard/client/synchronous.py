@@ -356,8 +356,7 @@ class Client:
         """Change settings of the daemon, for example `{"rates.state": 5.0}`, and return the reply.
 
         The daemon changes all of the settings or none. The change lasts until the next start of the
-        daemon. Unlike other settings, a lowered speed, acceleration or jerk in `limits` stays
-        lowered after the next start. If `keep` is true, the daemon also writes the settings into
+        daemon. If `keep` is true, the daemon also writes the settings into
         its configuration file. The reply names the file, or says why the settings are refused or
         not written.
         """

@@ -9,6 +9,7 @@ writes the port, and `core/guard.py` checks each line before it is written.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from typing import assert_never
@@ -16,7 +17,6 @@ from typing import assert_never
 from msgspec.structs import replace
 
 from acsard.core.config.live import changed
-from acsard.core.config.lowered import lowered, with_lowered
 from acsard.core.config.motion_rules import longest_reply
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config
@@ -61,6 +61,7 @@ from acsard.core.values import (
     Refusal,
     Request,
     Snapshot,
+    SpeedCap,
 )
 
 MAX_DT = 0.05
@@ -103,10 +104,8 @@ class Robot:
     def __init__(self, config: Config, latches: Latches = Latches()) -> None:  # noqa: B008
         """Create a robot as it is after a start of the daemon.
 
-        `latches` decides the first mode, and its lowered limits replace those in `config`.
+        `latches` decides the first mode.
         """
-        self._file_limits = config.limits
-        config, self._first_events = with_lowered(config, latches.lowered)
         self.config = config
         """The configuration in force. A step that executes a `set` request replaces it."""
         longest_s = longest_reply(config.feedback.fault_time)
@@ -123,12 +122,13 @@ class Robot:
         )
         self._arbiter = Arbiter(config.commands)
         self._limiter = Limiter(config.limits, self._kinematics)
+        self._cap = SpeedCap(None)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
         self._life = Lifecycle(config.control.auto_activate, latches)
-        self._life.lower(lowered(self._file_limits, config.limits))
+        self._first_event: Event | None = None
         if latches.in_force:
-            mode, why = self._life.mode, self._life.why
-            self._first_events.append(Event("mode", why, "warning", kind=f"start -> {mode}"))
+            kind = f"start -> {self._life.mode}"
+            self._first_event = Event("mode", self._life.why, "warning", kind=kind)
         self._choice = Choice()
         self._speeds = STILL
         self._computed = self._written = STILL
@@ -211,11 +211,12 @@ class Robot:
             bumper=self._bumpers.why,
             battery=self._battery.status,
             board=self._board(now_ns),
+            speed_limit=self._cap_text,
         )
 
     @property
     def latches(self) -> Latches:
-        """The stop, the fault and the other latches in force, and the lowered limits.
+        """The stop, the fault and the other latches in force.
 
         The value is correct even after an exception in a step.
         """
@@ -233,15 +234,17 @@ class Robot:
         """
         events = list(inputs.events)
         self._life.begin(inputs.now, stalled=self._arbiter.begin(inputs.now.mono_ns))
-        if self._first_events:
-            events += self._first_events
-            self._first_events = []
+        if self._first_event is not None:
+            events.append(self._first_event)
+            self._first_event = None
         if inputs.missed:
             self.counters["missed_periods"] += inputs.missed
             events.append(missed(inputs.missed, self.config.period_ns))
         self._settle(inputs)
         estimates = self._fold(inputs, events)
         answers = self._serve(inputs, events)
+        if inputs.speed_cap is not None:
+            self._cap_speed(inputs.speed_cap, events)
         if inputs.commands or inputs.refusals:
             self._accept_commands(inputs, events)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)
@@ -572,7 +575,6 @@ class Robot:
         except ConfigError as error:
             raise RefusedError(str(error)) from None
         self._limiter.use(self.config.limits)
-        self._life.lower(lowered(self._file_limits, self.config.limits))
         self._odometry.use(self.config.odometry)
         if self.config.commands != before.commands:
             self._arbiter.use(self.config.commands)
@@ -622,6 +624,21 @@ class Robot:
         self._refused_ns, self._refused = now_ns, refusal.text[:MAX_REFUSAL_LENGTH]
 
     # Limits and kinematics.
+
+    def _cap_speed(self, cap: SpeedCap, events: list[Event]) -> None:
+        before, self._cap = self._cap, cap
+        if cap.speed == before.speed:
+            return
+        self._limiter.cap(math.inf if cap.speed is None else cap.speed)
+        text = "the speed limit has ended" if cap.speed is None else f"{cap.speed:.3g} m/s"
+        events.append(Event("speed_limit", text, by=cap.by, news=False))
+
+    @property
+    def _cap_text(self) -> str:
+        cap, highest = self._cap, self.config.limits.linear_speed
+        if cap.speed is None or cap.speed >= highest:
+            return ""
+        return f"{cap.speed:.3g} m/s, set by {cap.by}; back to {highest:g} m/s when this limit ends"
 
     def _drive(self, inputs: Inputs) -> bytes | None:
         now_ns, twist, limiter = inputs.now.mono_ns, self._choice.twist, self._limiter

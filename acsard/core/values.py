@@ -228,6 +228,7 @@ EventName = Literal[
     "page_ended", "page_refused",
     "router_open", "router_full", "router_stuck", "router_ended",
     Verb,
+    "speed_limit",
     "mode", "commander", "commands_without_effect", "new_sender", "command_refused", "fault",
 ]  # fmt: skip
 """All names of events in the log. `deploy/systemd/README.md` explains each name."""
@@ -499,17 +500,11 @@ class Latch(Struct, frozen=True):
 
 
 class Latches(Struct, frozen=True):
-    """The latches and the lowered limits.
-
-    The daemon stores them in a file, so that they last even if its process is killed.
-    """
+    """The latches. The daemon stores them in a file, so that they last even if it is killed."""
 
     stop: Latch | None = None
     fault: Latch | None = None
     inactive: Latch | None = None
-    lowered: dict[str, float] = {}
-    """The settings in `[limits]` that `set` made lower than in the configuration file, by dotted
-    key."""
 
     @property
     def next(self) -> Latch | None:
@@ -527,7 +522,16 @@ class Latches(Struct, frozen=True):
             None if latch is None else latch.each(lambda cause: replace(cause, kept=True))
             for latch in (self.stop, self.fault, self.inactive)
         )
-        return Latches(stop, fault, inactive, self.lowered)
+        return Latches(stop, fault, inactive)
+
+
+class SpeedCap(Struct, frozen=True):
+    """A speed limit from the key `speed_limit`, which holds beside `limits.linear_speed`."""
+
+    speed: float | None
+    """Highest linear speed, m/s. None lifts the limit."""
+    by: str = ""
+    """Name of the sender, for the log."""
 
 
 class Inputs(Struct, frozen=True):
@@ -567,6 +571,8 @@ class Inputs(Struct, frozen=True):
     """Time from the start of the previous step until its line was written, ns. It is 0 if this
     time is below 1 ms, or if no line was written. A longer time means that the process has stalled
     in between."""
+    speed_cap: SpeedCap | None = None
+    """The newest speed limit that arrived since the previous step; None if none arrived."""
 
 
 class Outputs(Struct, frozen=True):
@@ -608,8 +614,8 @@ class Outputs(Struct, frozen=True):
     since the previously computed line, or the emergency stop or a bumper was pressed. If this step
     has already computed the new line, `due` is true too."""
     latches: Latches = Latches()
-    """The latches and lowered limits after the step. A latch or a lowered limit has changed if
-    this is not the same object as in the previous step."""
+    """The latches after the step. A latch has changed if this is not the same object as in the
+    previous step."""
 
 
 class Spread(Struct, frozen=True):

@@ -12,8 +12,7 @@ from collections.abc import Callable, Mapping
 
 from msgspec.structs import replace
 
-from acsard.core.config.lowered import lowered
-from acsard.core.config.settings import Config, LimitsConfig
+from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.guard import Guard
 from acsard.core.incoming.bus_interface import GATEWAY_KEY as GATEWAY
@@ -27,7 +26,7 @@ from acsard.core.incoming.bus_interface import (
 from acsard.core.incoming.commands import Receiver, caller_name, claimed_identity, parts
 from acsard.core.incoming.imu import GyroFollower
 from acsard.core.incoming.queries import Queries, Query, refused
-from acsard.core.incoming.speed_limit import SpeedLimiter
+from acsard.core.incoming.speed_limit import decode_limit
 from acsard.core.link.serial_output import Port
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.keys_and_roles import IMU, SPEED_LIMIT
@@ -49,6 +48,7 @@ from acsard.core.values import (
     Refusal,
     Request,
     Snapshot,
+    SpeedCap,
 )
 from acsard.daemon.latch_rules import MAX_ANSWER_DELAY_NS, Handover, LatchKeeper
 from acsard.daemon.latencies import Stopwatch
@@ -139,12 +139,8 @@ class ControlLoop:
         self._beside = beside
         self._config, self._adopted, self._settings_file = config, adopted, settings_file
         self._recorder, self._handover = recorder, Handover(latches, keeper)
-        self._started, self._speed = config.limits, SpeedLimiter(self.robot.config)
-        """`_started` has the limits at the daemon's start. `_speed` handles the key
-        `speed_limit`."""
-        self._latches_cache: tuple[Latches, LimitsConfig, LimitsConfig, Latches] | None = None
-        """Cache of the method `_to_keep`: the latches and the two sets of limits of its last
-        computation, and the result."""
+        self._configured_speed = config.limits.linear_speed
+        self._speed_cap: SpeedCap | None = None
         self._answers: deque[tuple[int, Answer]] = deque()
         """Answers that wait until the latch file contains the newest latches. Each answer is paired
         with the monotonic time at which it was queued, ns."""
@@ -211,9 +207,7 @@ class ControlLoop:
         except Exception:
             # Store the stops that this step has taken from the bus. The exception may have come
             # before the robot processed them.
-            self._handover.take_stops(
-                self._to_keep(self.robot.latches), _stops(self._bus_input), now
-            )
+            self._handover.take_stops(self.robot.latches, _stops(self._bus_input), now)
             raise
 
     def _step(self, now: Instant, period: Period) -> Outputs:
@@ -225,12 +219,11 @@ class ControlLoop:
         commands, refusals, requests = self._from_bus(now)
         if self._settings_file is not None and self._settings_file.pending:
             requests += self._keepable(self._settings_file, now)
-        requests, refused_sets = self._speed.requests(requests, now.mono_ns)
         port, pace = self._port, self.pace
         # Call `take` before reading `is_open`. After a suspend of the computer, `take` closes the
         # port.
         received = port.take(now if missed else None)
-        # Pass the fields by position: creating a struct by seventeen names takes three times as
+        # Pass the fields by position: creating a struct by its names takes three times as
         # long.
         inputs = Inputs(
             now,
@@ -250,16 +243,18 @@ class ControlLoop:
             pace.at_once(now.mono_ns, port.sent_ns),
             self.shutting_down,
             self._late_ns,
+            self._speed_cap,
         )
+        self._speed_cap = None
         if inputs.events:
             self._others.clear()
         if inputs.gyro:
             self._turn_rates.clear()
         before = self._config
-        outputs, answers, was_written = self._decided(inputs)
+        outputs, was_written = self._decided(inputs)
         has_input = bool(commands or refusals or requests)
         pace.record_step(inputs.tick, outputs.due, was_written, outputs.news, has_input)
-        self._publish(outputs, (*refused_sets, *answers))
+        self._publish(outputs, outputs.answers)
         # `adopted` may change the log's level, so call it after logging this step's events.
         if self._config is not before and self._adopted:
             self._adopted(self._config)
@@ -269,17 +264,11 @@ class ControlLoop:
         self._bus.flush()
         return outputs
 
-    def _decided(self, inputs: Inputs) -> tuple[Outputs, tuple[Answer, ...], bool]:
-        """Run the robot's step, and return its outputs and the answers for the clients.
-
-        The returned bool is true if the port wrote the line.
-        """
+    def _decided(self, inputs: Inputs) -> tuple[Outputs, bool]:
+        """Run the robot's step. Return its outputs, and whether the port wrote the line."""
         try:
             outputs = self.outputs = self.robot.step(inputs)
-            answers = outputs.answers
-            if answers or self.robot.config is not self._config:
-                answers = self._speed.settle(self.robot.config, answers, self._others)
-            self._handover.take(self._to_keep(outputs.latches))
+            self._handover.take(outputs.latches)
             if self.robot.config is not self._config:
                 self._adopt(self.robot.config)
             line = self._send(outputs, inputs.now, inputs.tick)
@@ -289,34 +278,7 @@ class ControlLoop:
             raise
         if self._recorder is not None:
             self._recorder.step(inputs, outputs, line, self.robot, self._guard)
-        return outputs, answers, line is not None
-
-    def _to_keep(self, latches: Latches) -> Latches:
-        """Return `latches` in the form that must be stored for the next start of the daemon.
-
-        The field `lowered` of the result contains the limits that `set` requests have lowered,
-        except decelerations. It leaves out the limit from the key `speed_limit`, because the
-        program that sent this limit may not run at the next start, and no other program would lift
-        the limit.
-        """
-        file = self._file_limits
-        if file is not self._started or self._speed.lowers:
-            # The robot compares its limits with those in the file at the start, and its limits
-            # include the limit from `speed_limit`.
-            now, cache = self._speed.settings.limits, self._latches_cache
-            if cache is None or not (cache[0] is latches and cache[1] is now and cache[2] is file):
-                result = replace(latches, lowered=lowered(file, now))
-                cache = self._latches_cache = latches, now, file, result
-            latches = cache[3]
-        last = self._handover.latches
-        # If nothing has changed, return the last object. For a new object, the latch file would be
-        # written again, even with equal content.
-        return last if latches == last else latches
-
-    @property
-    def _file_limits(self) -> LimitsConfig:
-        """The limits in the configuration file, including the changes that the daemon wrote."""
-        return self._started if self._settings_file is None else self._settings_file.limits
+        return outputs, line is not None
 
     def finish(self, now: Instant) -> None:
         """Store the stops that arrived after the last step, and send the waiting answers."""
@@ -335,7 +297,7 @@ class ControlLoop:
         self.report.use(config)
         self._queries.use(config)
         if self._settings_file is not None:
-            self._settings_file.use(self._speed.settings)
+            self._settings_file.use(config)
 
     def _from_bus(
         self, now: Instant
@@ -361,7 +323,10 @@ class ControlLoop:
                     self._turn_rates.append(sample)
                 continue
             if arrival.key == SPEED_LIMIT:
-                self._speed.receive(arrival, self._file_limits.linear_speed, refusals)
+                try:
+                    self._speed_cap = decode_limit(arrival, self._configured_speed)
+                except DecodeError as error:
+                    refusals.append(Refusal(error.reason, f"{SPEED_LIMIT}: {error}"))
                 continue
             if arrival.key == "stop":
                 if arrival.put:
@@ -530,7 +495,6 @@ class ControlLoop:
             latch_file=self._handover.trouble,
             recording=Recording() if self._recorder is None else self._recorder.status,
             settings_differ="" if self._settings_file is None else self._settings_file.differ,
-            speed_limit=self._speed.text,
         )
 
 

@@ -1,8 +1,7 @@
 """The file that stores the latches for the next start of the daemon.
 
-A latch is a stop, a fault or "inactive", which lasts until a person releases it. The file also
-stores the limits that `set` requests have lowered, except decelerations. `latch_rules.py` decides
-with which latches the robot starts.
+A latch is a stop, a fault or "inactive", which lasts until a person releases it. `latch_rules.py`
+decides with which latches the robot starts.
 
 The control loop hands the newest latches to a thread that writes the file, and never waits for the
 disk. Once this thread has renamed the new file, a kill of the process loses nothing. A second
@@ -430,7 +429,6 @@ class LatchFile(LatchKeeper):
             latches.stop,
             latches.fault or missed.fault,
             latches.inactive or missed.inactive,
-            missed.lowered | latches.lowered,
         )
 
     def _fail(self, reason: str) -> None:

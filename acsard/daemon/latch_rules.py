@@ -22,8 +22,8 @@ FORMAT = 1
 """Version of the latch file's format. A file with another version counts as unreadable."""
 
 MAX_BYTES = 65_536
-"""Largest size of a latch file, bytes. A larger file counts as unreadable. Three latches and all
-limits take about 1 kB."""
+"""Largest size of a latch file, bytes. A larger file counts as unreadable. Three latches take
+about 1 kB."""
 
 MAX_NUMBER = 1 << 52
 """Largest latch number that is accepted in the file. Later latches get higher numbers, and a
@@ -64,7 +64,7 @@ def encode(robot: str, latches: Latches) -> bytes:
         None if latch is None else latch.each(_with_safe_text)
         for latch in (latches.stop, latches.fault, latches.inactive)
     )
-    content = _Content(FORMAT, robot, Latches(stop, fault, inactive, latches.lowered))
+    content = _Content(FORMAT, robot, Latches(stop, fault, inactive))
     return msgspec.json.format(msgspec.json.encode(_plain(content)), indent=2) + b"\n"
 
 
@@ -174,7 +174,7 @@ def after_failed_write(latches: Latches, why: str, now: Instant) -> Latches:
     fault, inactive, stop = (
         latch and replace(latch, number=number + place) for place, latch in enumerate(old_latches)
     )
-    return stopped(Latches(stop, fault, inactive, latches.lowered), why, now)
+    return stopped(Latches(stop, fault, inactive), why, now)
 
 
 class LatchKeeper(Protocol):

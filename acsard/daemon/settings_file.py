@@ -16,10 +16,8 @@ from pathlib import Path
 from typing import Literal
 
 from msgspec import Struct
-from msgspec.structs import replace
 
 from acsard.core.config.live import changed, differences
-from acsard.core.config.lowered import LIMITS_PREFIX
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config
 from acsard.core.formatting import listed, printable
@@ -124,10 +122,6 @@ class SettingsFile:
         self.pending: dict[int, _Pending] = {}
         """The requests that `keep` has queued and that are not settled yet, by their ids. While
         there are such requests, each control step must call `results`."""
-        self.limits = started.limits
-        """The limits in the configuration file, as the daemon last knew them. If the daemon has
-        written a limit to the file, the limit has that value, else its value at the start of the
-        daemon. Changes of the file by other programs are not included."""
         self._thread: threading.Thread | None = None
         """The thread that compares and changes the file; None before it has started."""
         self._not_started = ""
@@ -171,12 +165,7 @@ class SettingsFile:
         return "the thread that compares and changes the file has ended"
 
     def use(self, config: Config) -> None:
-        """Compare the file with `config` now, and again whenever the file changes.
-
-        Args:
-            config: the settings in force, but without the lower speed limit that a client may have
-                set with the Zenoh key `speed_limit`.
-        """
+        """Compare the file with `config` now, and again whenever the file changes."""
         self._in_force = config
         self._wake_thread()
 
@@ -313,13 +302,6 @@ class SettingsFile:
             return Answer(
                 answer.id, False, f"{text}, but only until the daemon's next start, because {error}"
             )
-        limits = {
-            key.removeprefix(LIMITS_PREFIX): float(value)  # type: ignore[arg-type]
-            for key, value in edit.keys.items()
-            if key.startswith(LIMITS_PREFIX)
-        }
-        if limits:
-            self.limits = replace(self.limits, **limits)
         return Answer(answer.id, True, f"{text}; written to {edit.file}")
 
     def _difference(self) -> str:

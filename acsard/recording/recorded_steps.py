@@ -217,6 +217,7 @@ def input_names(inputs: Inputs, before: int) -> int:
         *[request.by for request in inputs.requests],
         *[name for refusal in inputs.refusals for name in (refusal.source, refusal.sender)],
         *[event.by for event in inputs.events],
+        *([] if inputs.speed_cap is None else [inputs.speed_cap.by]),
     ]
     # Most steps contain no names. The JSON encoding shows where each name ends.
     return zlib.crc32(msgspec.json.encode(names), before) if names else before

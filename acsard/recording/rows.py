@@ -27,6 +27,7 @@ from acsard.core.values import (
     Received,
     Refusal,
     Request,
+    SpeedCap,
 )
 from acsard.recording.recorded_steps import (
     FinishedStep,
@@ -82,6 +83,7 @@ class OccasionalFields(Struct, frozen=True, omit_defaults=True):
     requests: tuple[Request, ...] = ()
     refusals: tuple[Refusal, ...] = ()
     gyro: tuple[GyroSample, ...] = ()
+    speed_cap: SpeedCap | None = None
     events_in: tuple[Event, ...] = ()
     events_out: tuple[Event, ...] = ()
 
@@ -236,6 +238,7 @@ def _rares(steps: Sequence[FinishedStep]) -> Iterator[OccasionalFields]:
             requests=inputs.requests,
             refusals=inputs.refusals,
             gyro=inputs.gyro,
+            speed_cap=inputs.speed_cap,
             events_in=inputs.events,
             events_out=outputs.events,
         )
@@ -300,6 +303,7 @@ def _steps(batch: Batch) -> Iterator[RecordedStep]:
             requests=rare.requests,
             refusals=rare.refusals,
             gyro=rare.gyro,
+            speed_cap=rare.speed_cap,
             guard_trip=rare.guard_trip,
             superseded=row.superseded,
             missed=rare.missed,
@@ -340,7 +344,7 @@ def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
 
 
 def _require_finite(rare: OccasionalFields) -> None:
-    """Raise `ValueError` if a pose in a request, or a gyro sample, is not finite.
+    """Raise `ValueError` if a pose in a request, a speed limit or a gyro sample is not finite.
 
     The robot itself checks the numbers in commands.
     """
@@ -348,6 +352,9 @@ def _require_finite(rare: OccasionalFields) -> None:
         pose = request.pose
         if pose is not None and not all(map(math.isfinite, (pose.x, pose.y, pose.yaw))):
             raise ValueError("a pose is not finite")
+    cap = rare.speed_cap
+    if cap is not None and cap.speed is not None and not math.isfinite(cap.speed):
+        raise ValueError("a speed limit is not finite")
     for sample in rare.gyro:
         if not (math.isfinite(sample.rate) and math.isfinite(sample.variance)):
             raise ValueError("a gyro sample is not finite")

@@ -16,7 +16,7 @@ from acsard.core.messages.cdr import Cdr
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.messages.signature import public_name
 from acsard.core.ros.attachments import Attachment
-from acsard.core.values import NS_PER_S, Latches
+from acsard.core.values import NS_PER_S
 from tests.scenarios.speakers import Speaker, moved
 from tests.scenarios.world import World
 
@@ -311,13 +311,3 @@ def test_a_restarted_robot_stays_stopped_until_clear() -> None:
     assert call(world, "clear", "ann", world.state.latch).success
     world.drive(0.5, seconds=0.5)
     assert world.state.mode == "driving"
-
-
-def test_a_limit_lowered_before_the_restart_holds_for_the_line_and_is_published() -> None:
-    world = World(latches=Latches(lowered={"limits.linear_speed": 0.3}))
-    world.run(0.2)
-    world.drive(0.9, seconds=2.0)
-    assert world.loop.outputs is not None
-    assert world.loop.outputs.applied.linear == 0.3
-    (reply,) = world.ask("config")
-    assert msgspec.json.decode(reply.payload)["limits"]["linear_speed"] == 0.3

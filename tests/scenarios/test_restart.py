@@ -7,15 +7,12 @@ after every start, so only the latch can keep the robot at rest.
 from __future__ import annotations
 
 import random
-import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Literal
 
 import msgspec
 import pytest
 
-from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
 from acsard.core.incoming.commands import Arrival
 from acsard.core.messages.signature import public_name
@@ -23,7 +20,6 @@ from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, Event, Instant, Latch, Latches
 from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_rules import LatchFileError, decode, encode, stopped, unreadable
-from acsard.daemon.settings_file import SettingsFile
 from tests.each import each
 from tests.scenarios.speakers import Speaker, moved
 from tests.scenarios.test_diagnostics import row
@@ -237,42 +233,12 @@ def test_a_plain_clear_waits_two_seconds_after_a_reboot_wherever_its_clock_is(aw
     assert world.state.mode == "ready"
 
 
-@pytest.mark.slow
-def test_a_limit_that_was_lowered_stays_lowered_until_it_is_raised() -> None:
+def test_a_set_lasts_until_the_restart() -> None:
     host = Host(random.Random(4))
-    for speed in (0.2, 1.0):
-        payload = msgspec.json.encode({"settings": {"limits.linear_speed": speed}})
-        assert host.world.call("set", payload).success
-        host.restart()
-        applied: list[float] = []
-        host.world.watch = lambda outputs: applied.append(outputs.applied.linear)  # noqa: B023
-        host.patrols(2 * CYCLE_S)
-        assert max(applied) == min(speed, 0.5)
-
-
-@pytest.mark.slow
-def test_a_limit_lowered_after_a_higher_one_was_written_stays_lowered(tmp_path: Path) -> None:
-    configuration, latches = tmp_path / "acsard.toml", MemoryFile()
-    configuration.write_text("[limits]\nlinear_speed = 0.5\n")
-    config = parse(configuration.read_bytes())
-    settings_file = SettingsFile(configuration, parse, config)
-    settings_file.start()
-    try:
-        world = World(config, keeper=latches, settings_file=settings_file)
-        wishes = {"settings": {"limits.linear_speed": 0.8}, "keep": True}
-        world.ask("srv/set", payload=msgspec.json.encode(wishes))
-        # The file's thread needs real time, and on a busy machine far more than the robot's steps.
-        deadline = time.monotonic() + 60.0
-        while not world.bus.replies and time.monotonic() < deadline:
-            time.sleep(0.2)
-            world.run(0.01)
-        assert parse(configuration.read_bytes()).limits.linear_speed == 0.8
-        lower = msgspec.json.encode({"settings": {"limits.linear_speed": 0.6}})
-        assert world.call("set", lower).success
-    finally:
-        settings_file.close()
-    again = World(parse(configuration.read_bytes()), latches=latches.read(world.instant))
-    assert again.loop.robot.config.limits.linear_speed == 0.6
+    payload = msgspec.json.encode({"settings": {"limits.linear_speed": 0.2}})
+    assert host.world.call("set", payload).success
+    host.restart()
+    assert host.world.loop.robot.config == Config()
 
 
 def test_a_stop_is_obeyed_immediately_and_answered_after_the_file_is_written() -> None:

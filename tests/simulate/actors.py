@@ -584,10 +584,10 @@ class Run:
             witness.ended(self.true_ns, moving)
         self._take_answers()
         for call, arrived_ns, _ in self._calls.values():
-            witness.unanswered(call["verb"], call.get("settings", {}), arrived_ns)
+            witness.unanswered(call["verb"], arrived_ns)
         self._calls.clear()
         for arrived_ns in self._puts_ns:
-            witness.unanswered("stop", {}, arrived_ns)
+            witness.unanswered("stop", arrived_ns)
         self._puts_ns.clear()
         if product.disk.behind:
             witness.file_is_behind()

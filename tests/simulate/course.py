@@ -53,7 +53,7 @@ class Course:
             return
         enough = self._lines * witness.period_ns > 0.8 * (true_ns - self._since_ns)
         self._since_ns, self._lines = true_ns, 0
-        if not enough or witness.unsure:
+        if not enough:
             return
         witness.counts["settled speeds"] += 1
         goal, twist = witness.clamped(*wish, witness.limits), witness.twist(wheels)
@@ -79,7 +79,7 @@ class Course:
         goal, limits = (wish, witness.changed_ns, witness.mode_ns), witness.limits
         # A speed changes by that much time at most from one line to the next.
         late = late_ns > max(NS // 20, 3 * witness.period_ns // 2)
-        if wish is None or late or goal != self._goal or witness.unsure:
+        if wish is None or late or goal != self._goal:
             self._begin(goal, true_ns, wheels)
             return
         if wheels == self._reached:

@@ -361,8 +361,6 @@ class Liveness:
         )
         if takes_s > 2.5 or limits.get("linear_jerk") or limits.get("angular_jerk"):
             return
-        if witness.unsure:
-            return
         room = witness.radius * 0.02, witness.radius * 0.02 / witness.half
         if any(abs(a - b) > r for a, b, r in zip(twist, target, room, strict=True)):
             raise BrokenError("the robot drives as told", run.true_ns, f"{twist} for {target}")

@@ -24,9 +24,9 @@ from tests.simulate.planted_faults import (
 CASES = (
     fault(
         "case 1",
-        "a restart releases a stop, a fault and `inactive`, and lowered limits jump back",
+        "a restart releases a stop, a fault and `inactive`",
         VALUES,
-        "return Latches(stop, fault, inactive, self.lowered)",
+        "return Latches(stop, fault, inactive)",
         "return Latches()",
     ),
     fault(

@@ -763,18 +763,11 @@ FAULTS = (
         "                pass",
     ),
     fault(
-        "latches lowered",
-        "limits that were lowered are back after a restart",
-        VALUES,
-        "return Latches(stop, fault, inactive, self.lowered)",
-        "return Latches(stop, fault, inactive)",
-    ),
-    fault(
         "latches fault",
         "a fault is gone after a restart",
         VALUES,
-        "return Latches(stop, fault, inactive, self.lowered)",
-        "return Latches(stop, None, inactive, self.lowered)",
+        "return Latches(stop, fault, inactive)",
+        "return Latches(stop, None, inactive)",
     ),
     # inputs of the board
     fault(

@@ -118,9 +118,6 @@ class Witness:
         ]
         self.file = dict(config["limits"])
         self.limits = dict(config["limits"])
-        """The limits in force, or the highest value that an unsure one can have."""
-        self.unsure: set[str] = set()
-        """Limits that may be lower: a `set` had no answer, or the latch file was behind."""
         commands = config["commands"]
         self.neutral_first = commands.get("neutral_first", True)
         self.priority = {s["name"]: s["priority"] for s in commands["sources"]}
@@ -216,11 +213,7 @@ class Witness:
         """When a clear last released a fault."""
         self.timeout = dict(self.file_timeout)
         self.pause_ns = self.file_pause_ns
-        for name, value in self.file.items():
-            capped = not name.endswith("_deceleration") and "jerk" not in name
-            self.limits[name] = min(value, self.limits[name]) if capped else value
-            if not capped:
-                self.unsure.discard(name)
+        self.limits = dict(self.file)
         self.before = dict(self.limits)
         self.changed_ns = at_ns
         self.softest = dict(self.limits)
@@ -381,7 +374,6 @@ class Witness:
             parts = key.split(".")
             if parts[0] == "limits":
                 self.limits[parts[1]] = value
-                self.unsure.discard(parts[1])
                 low = self.softest.get(parts[1], value)
                 self.softest[parts[1]] = (
                     min(low, value) if "deceleration" in key else max(low, value)
@@ -395,7 +387,7 @@ class Witness:
             if before_ns != (self.pause_ns, self.timeout):
                 self.arming(asked_ns)
 
-    def unanswered(self, verb: str, settings: dict[str, float], arrived_ns: int) -> None:
+    def unanswered(self, verb: str, arrived_ns: int) -> None:
         """Note a call whose answer did not come before the daemon ended.
 
         After the restart the call may have an effect or not.
@@ -414,12 +406,6 @@ class Witness:
                     self.fault_ns = None
             case "activate":
                 self.offs = [at_ns for at_ns in self.offs if at_ns > arrived_ns]
-            case "set":
-                for key, value in settings.items():
-                    name = key.removeprefix("limits.")
-                    if name != key:
-                        self.unsure.add(name)
-                        self.limits[name] = max(value, self.limits[name])
 
     def file_is_behind(self) -> None:
         """Note that the daemon ended before it could store its newest latches."""
@@ -428,12 +414,10 @@ class Witness:
         self.offs.clear()
         self.faults.clear()
         self.fault_ns = None
-        self.limits, self.unsure = dict(self.file), set(self.file)
 
     def file_is_damaged(self, at_ns: int) -> None:
         """Note that a daemon cannot read the latch file, so it starts stopped."""
         self.file_is_behind()
-        self.unsure.clear()
         self.stops.append(at_ns)
 
     # the steps and lines of the daemon
@@ -715,7 +699,7 @@ class Witness:
         axes = zip(("linear", "angular"), self.twist(wheels), (room, room / self.half), strict=True)
         for name, speed, rounded in axes:
             up, jerk = self._most(f"{name}_acceleration", at_ns), f"{name}_jerk"
-            unsure = lost or not self.limits.get(jerk) or jerk in self.unsure
+            unsure = lost or not self.limits.get(jerk)
             for sign in (1.0, -1.0):
                 slope = next(slopes)
                 if unsure or at_ns - self.changed_ns < MARGIN_NS + self.period_ns:

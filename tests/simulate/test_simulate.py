@@ -22,7 +22,7 @@ from acsard.core.config.settings import DriveConfig, JointsConfig
 from acsard.core.incoming.commands import Arrival, Receiver
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.ros.parameters import requested_values
-from acsard.core.values import Latches
+from acsard.core.values import Latch, Latches
 from tests.scenarios.world import START
 from tests.simulate import __main__ as main
 from tests.simulate import pairs, shrink
@@ -1126,31 +1126,21 @@ def test_a_robot_does_not_learn_the_delay_of_a_command_that_the_inbox_dropped(
     assert witness.wishes[-1][1].fresh is dropped
 
 
-def test_a_set_that_had_no_answer_may_be_in_force_after_a_restart_or_not() -> None:
-    witness = witnessed()
-    limit = witness.file["wheel_speed"]
-    witness.unanswered("set", {"limits.wheel_speed": 0.5 * limit}, 4 * NS)
-    witness.new_life(5 * NS)
-    assert (witness.limits["wheel_speed"], witness.unsure) == (limit, {"wheel_speed"})
-    witness.set_limits(6 * NS, {"limits.wheel_speed": 0.7 * limit}, 6 * NS)
-    assert (witness.limits["wheel_speed"], witness.unsure) == (0.7 * limit, set())
-
-
 def test_a_daemon_that_has_ended_writes_nothing_when_the_disk_has_room_again() -> None:
     disk = Disk()
     disk.fill(True)
-    disk.keep(Latches(lowered={"limits.wheel_speed": 1.0}))
+    disk.keep(Latches(stop=Latch(1, 0, "ann", "stopped by ann")))
     assert disk.behind
     disk.end()
     disk.fill(False)
-    assert disk.read(START).lowered == {}
+    assert disk.read(START) == Latches()
     assert not disk.behind
 
 
 def test_a_stop_that_had_no_answer_may_be_gone_after_a_restart() -> None:
     witness = witnessed()
     witness.stops += [2 * NS, 4 * NS]
-    witness.unanswered("stop", {}, 4 * NS)
+    witness.unanswered("stop", 4 * NS)
     assert witness.stops == [2 * NS]
 
 
@@ -1161,7 +1151,7 @@ def test_a_clear_without_an_answer_releases_no_stop_that_came_behind_it(pending:
     if pending:
         witness.pending = {"clear": 3 * NS}
     else:
-        witness.unanswered("clear", {}, 3 * NS)
+        witness.unanswered("clear", 3 * NS)
     with pytest.raises(BrokenError, match="nothing moves after a stop"):
         moves(witness, 6.0)
 
@@ -1438,12 +1428,6 @@ def with_a_set_before_sigterm(settings: dict[str, float]) -> Plan:
         {"at": 1.505, "do": "restart", "way": "term", "for": 0.2},
     ]
     return quiet() | {"seconds": 3.0, "events": events}
-
-
-@pytest.mark.slow
-def test_a_limit_that_was_lowered_on_the_way_down_is_no_finding() -> None:
-    lowered = {"limits.wheel_speed": 0.1 * PLAIN["config"]["limits"]["wheel_speed"]}
-    assert played(with_a_set_before_sigterm(lowered)).finding == ""
 
 
 def quiet_with(*events: dict[str, Any]) -> Plan:

@@ -415,13 +415,12 @@ class RobotState(Message, frozen=True):
     settings_differ: str = ""
     """Settings in force that differ from the configuration file, in words; else empty.
 
-    If the daemon could not start with the present file, the text gives the reason. A setting that
-    only a speed limit has lowered is not listed.
+    If the daemon could not start with the present file, the text gives the reason.
     """
     speed_limit: str = ""
-    """The speed limit that lowers `limits.linear_speed` at present, with its sender, in words.
+    """The speed limit in force below `limits.linear_speed`, with its sender, in words.
 
-    It is empty if no speed limit lowers it.
+    It is empty if there is none.
     """
     certificate_days: float | None = None
     """Number of days until the first of the certificates that TLS needs expires.

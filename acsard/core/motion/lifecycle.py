@@ -300,11 +300,6 @@ class Lifecycle:
         self._latch(inactive=self._new_latch(now, by, f"switched off by {by or 'request'}"))
         return "inactive: the robot brakes to rest; call srv/activate to switch it on again"
 
-    def lower(self, limits: dict[str, float]) -> None:
-        """Store the settings of `[limits]` that `set` has lowered, so that a restart keeps them."""
-        if limits != self.latches.lowered:
-            self.latches = replace(self.latches, lowered=limits)
-
     @property
     def why(self) -> str:
         """The reason of the mode `fault`, `stopped` or `inactive`, and the call that ends it."""

@@ -40,6 +40,7 @@ class Limiter:
         """The allowed twist and the accelerations of the last step. If a line with wheel speeds
         could not be written to the port, `Robot` resets `state` to its value at the last line that
         was written."""
+        self._cap = math.inf
         self.use(limits)
 
     def use(self, limits: LimitsConfig) -> None:
@@ -70,6 +71,15 @@ class Limiter:
         self._arrived: _State | None = None
         """The state in which the robot has reached `_goal` and keeps this speed; None before
         that."""
+
+    def cap(self, speed: float) -> None:
+        """Allow at most the linear speed `speed`, m/s, beside the configured limit.
+
+        A faster robot slows down at the configured deceleration.
+        """
+        self._cap = speed
+        self._wished = self._goal = REST
+        self._arrived = None
 
     @property
     def twist(self) -> Twist:
@@ -148,11 +158,12 @@ class Limiter:
         return REST
 
     def _within_speed(self, wished: Twist) -> Twist:
-        linear = wished.linear if self._linear.speed else 0.0
+        most = min(self._linear.speed, self._cap)
+        linear = wished.linear if most else 0.0
         angular = wished.angular if self._angular.speed else 0.0
         scale = 1.0
-        if abs(linear) > self._linear.speed:
-            scale = self._linear.speed / abs(linear)
+        if abs(linear) > most:
+            scale = most / abs(linear)
         if abs(angular) * scale > self._angular.speed:
             scale = self._angular.speed / abs(angular)
         return Twist(linear * scale, angular * scale)

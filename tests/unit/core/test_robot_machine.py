@@ -87,7 +87,6 @@ KEPT = [
     Latches(),
     Latches(stop=STOP),
     Latches(STOP, FAULT, OFF),
-    Latches(lowered={"limits.linear_speed": 0.6, "limits.angular_speed": 2.0}),
 ]
 """Latches that a robot starts with; usually none are set."""
 
@@ -180,8 +179,6 @@ class RobotMachine(RuleBasedStateMachine):
         self.latches = latches
         self.robot = Robot(config, latches)
         self.config, self.limits = config, self.robot.config.limits
-        for key, limit in latches.lowered.items():
-            assert getattr(self.limits, key.removeprefix("limits.")) == limit
         self.guard = Guard(self.robot.session.codec.stop, self.robot.config)
         self.quiet_ns = round(NS_PER_S * max(0.1, 4 / config.rate_hz))
         self.period_ms = 1000 / config.rate_hz
@@ -652,10 +649,6 @@ class RobotMachine(RuleBasedStateMachine):
             assert after.stop is not None
             assert before.stop is None or after.stop.number > before.stop.number
         assert (before is after) == (before == after)
-        limits, file = self.robot.config.limits, self.config.limits
-        for name in ("linear_speed", "angular_speed", "wheel_speed"):
-            lowered = getattr(limits, name) < getattr(file, name)
-            assert (after.lowered.get(f"limits.{name}") == getattr(limits, name)) == lowered
         active_latch = after.fault or after.stop or after.inactive
         assert not active_latch or outputs.mode not in ("waiting", "ready", "driving")
 

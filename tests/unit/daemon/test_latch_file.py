@@ -247,7 +247,7 @@ def same(first: Latches, other: Latches) -> bool:
             latch and replace(latch, number=0)
             for latch in (latches.stop, latches.fault, latches.inactive)
         )
-        return Latches(stop, fault, inactive, latches.lowered)
+        return Latches(stop, fault, inactive)
 
     return plain(first) == plain(other)
 
@@ -513,7 +513,6 @@ def test_the_close_waits_for_a_stuck_disk_only_until_its_timeout(
 
 OFF = Latches(
     inactive=Latch(1_800_000_000_002, NOW.wall_ns, "page", "switched off by page"),
-    lowered={"limits.linear_speed": 0.4},
 )
 
 
@@ -713,13 +712,12 @@ def test_a_file_that_was_not_read_at_the_start_is_read_before_it_is_written(
     goes.set()
     until(lambda: file.trouble == "")
     until(lambda: file.holds(latches))
-    file.keep(cleared := Latches(lowered={"limits.angular_speed": 1.0}))
+    file.keep(cleared := Latches())
     until(lambda: file.holds(cleared))
     end(file)
     monkeypatch.undo()
     _, after = started(tmp_path)
-    both = {"limits.linear_speed": 0.4, "limits.angular_speed": 1.0}
-    assert after == replace(OFF, fault=FAULT.fault, lowered=both).after_restart()
+    assert after == replace(OFF, fault=FAULT.fault).after_restart()
 
 
 def test_a_first_read_that_begins_after_the_start_gave_up_changes_nothing(

@@ -19,7 +19,6 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.lowered import lowered
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
 from acsard.core.values import Answer, Event, Plain, Request
@@ -410,21 +409,6 @@ def test_a_request_that_the_robot_received_is_not_reported_as_not_set(made: Sett
     check(made)
     assert made.results(module.REPLY_TIMEOUT_NS + 1, []) == []
     assert made.defers_answer(OBEYED)
-
-
-@pytest.mark.slow
-def test_a_limit_below_a_kept_one_is_lowered_at_the_next_start(
-    file: Path, started: Started
-) -> None:
-    config = parse(file.read_bytes())
-    made = started(file, config, {})
-    assert made.limits is config.limits
-    check(made)
-    assert made.defers_answer(OBEYED)
-    result(made)
-    assert lowered(made.limits, with_speed(config, 0.8).limits) == {}
-    # The robot itself compares with 0.5, the limit of its start.
-    assert lowered(made.limits, with_speed(config, 0.6).limits) == {"limits.linear_speed": 0.6}
 
 
 def test_keep_is_recognized_in_every_notation() -> None:

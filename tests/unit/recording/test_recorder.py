@@ -96,7 +96,7 @@ def test_a_drive_that_begins_with_kept_latches_replays_bit_by_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stop = Latch(5, START.wall_ns, "ann", "stopped by ann", kept=True)
-    latches = Latches(stop=stop, lowered={"limits.linear_speed": 0.3})
+    latches = Latches(stop=stop)
     bench = Bench(tmp_path, monkeypatch, latches=latches)
     bench.world.drive(0.5, 0.2, seconds=1.0)
     assert bench.world.call("clear").success

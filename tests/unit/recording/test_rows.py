@@ -28,6 +28,7 @@ from acsard.core.values import (
     Received,
     Refusal,
     Request,
+    SpeedCap,
     Twist,
 )
 from acsard.recording.recorded_steps import FinishedStep, micropose, status_of
@@ -85,6 +86,7 @@ PARTS: dict[str, st.SearchStrategy[object]] = {
     "at_once": st.booleans(),
     "shutting_down": st.booleans(),
     "late_ns": st.integers(0, 1 << 61),
+    "speed_cap": st.none() | st.builds(SpeedCap, st.none() | st.floats(0, 9), TEXT),
 }
 INPUTS = st.builds(Inputs, **PARTS)
 

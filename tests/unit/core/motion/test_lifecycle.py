@@ -123,10 +123,7 @@ def test_the_robot_starts_as_its_latches_say(latches: Latches, begins: Mode, why
 
 def test_after_restart_marks_every_latch_as_kept_and_changes_nothing_else() -> None:
     fresh = [Latch(x.number, x.at_ns, x.by, x.why) for x in (STOP, FAULT, OFF)]
-    lowered = {"limits.linear_speed": 0.3}
-    assert Latches(fresh[0], fresh[1], fresh[2], lowered).after_restart() == Latches(
-        STOP, FAULT, OFF, lowered
-    )
+    assert Latches(fresh[0], fresh[1], fresh[2]).after_restart() == Latches(STOP, FAULT, OFF)
     assert Latches().after_restart() == Latches()
 
 
@@ -744,16 +741,6 @@ def test_a_stop_and_a_fault_during_the_shutdown_are_latched_for_the_next_start()
     assert life.latches.fault is not None
     with pytest.raises(RefusedError, match="shutting down"):
         clear(life, 9.0, number(life))
-
-
-def test_the_limits_are_kept_beside_the_latches() -> None:
-    life = both()
-    stopped = life.latches
-    life.lower({})
-    assert life.latches is stopped
-    life.lower({"limits.linear_speed": 0.3})
-    assert life.latches.lowered == {"limits.linear_speed": 0.3}
-    assert (life.latches.stop, life.latches.fault) == (stopped.stop, stopped.fault)
 
 
 # the model check

@@ -5,6 +5,7 @@ The limits are speed, acceleration, deceleration, jerk, coasting, and the cut to
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import msgspec
@@ -620,3 +621,23 @@ def test_putting_the_state_back_undoes_a_step(limits: LimitsConfig) -> None:
     ramp.state = before
     assert ramp.twist == before.twist
     assert ramp.follow(Twist(1.0, 2.0), DT) == once
+
+
+SPEEDS = st.floats(0.0, 3.0)
+
+
+@given(
+    st.lists(st.tuples(SPEEDS | st.just(math.inf), SPEEDS, st.floats(-4.0, 4.0)), max_size=40),
+)
+def test_the_speed_never_exceeds_both_the_limit_and_the_cap_but_on_the_way_down(
+    steps: list[tuple[float, float, float]],
+) -> None:
+    limits = LimitsConfig()
+    limiter = Limiter(limits, KINEMATICS)
+    for cap, setting, wish in steps:
+        limiter.use(msgspec.structs.replace(limits, linear_speed=setting))
+        limiter.cap(cap)
+        for _ in range(5):
+            before = abs(limiter.twist.linear)
+            speed = abs(limiter.follow(Twist(wish), DT).linear)
+            assert speed <= max(min(cap, setting), before - limits.linear_deceleration * DT) + 1e-9
