@@ -120,14 +120,14 @@ def test_every_wheel_has_the_radius_and_lies_on_its_side() -> None:
 
 
 def test_lidar_and_footprint_frames_agree_with_the_configuration() -> None:
-    lidar, footprint = CONFIG.lidar, CONFIG.footprint
+    lidar = CONFIG.lidar
     for link, xyz, rpy in (
         (
             lidar.lidar_frame,
-            [lidar.lidar_x_offset, lidar.lidar_y_offset, lidar.lidar_z_offset],
-            [lidar.lidar_roll, lidar.lidar_pitch, lidar.lidar_yaw],
+            [lidar.lidar_x_offset, lidar.lidar_y_offset, 0],
+            [0, 0, lidar.lidar_yaw],
         ),
-        (footprint.footprint_frame, [0, 0, footprint.footprint_z_offset], [0, 0, 0]),
+        ("base_footprint", [0, 0, 0], [0, 0, 0]),
     ):
         fixed_joint = joint_to(link)
         assert find_only(fixed_joint, "parent").get("link") == CONFIG.odometry.base_frame
@@ -244,13 +244,12 @@ def test_nav2_commands_often_enough() -> None:
 
 def test_nav2_knows_the_frames_and_topics() -> None:
     odom, base = CONFIG.odometry.odom_frame, CONFIG.odometry.base_frame
-    footprint = CONFIG.footprint.footprint_frame
     allowed = {
         "odom_frame_id": {odom},
         "local_frame": {odom},
         "global_frame": {odom, "map"},
         "robot_base_frame": {base},
-        "base_frame_id": {footprint},
+        "base_frame_id": {"base_footprint"},
         "odom_topic": {"odom"},
     }
     keys = set()

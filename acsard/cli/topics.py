@@ -6,7 +6,7 @@ import argparse
 
 from acsard.cli.common import add_config, load
 from acsard.core.config.settings import Config
-from acsard.core.incoming.queries import note_of, topic_table
+from acsard.core.incoming.queries import topic_table
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.keys_and_roles import COMMANDS, by_key, source_keys
 from acsard.core.messages.schema import TopicInfo, Topics
@@ -43,7 +43,7 @@ def ros_table(config: Config) -> Topics:
     rows = []
     for row in ros_names(ros, left_out(config)) if ros.bridge or ros.rmw else ():
         native = by_key(row.native)
-        note = f"as {row.native}" + (f": {note_of(config, native)}" if native else "")
+        note = f"as {row.native}" + (f": {native.note}" if native else "")
         if row.direction == "query":
             sets = row.name.endswith(SETTING_SERVICES)
             note = (

@@ -232,8 +232,6 @@ def _frame_problems(config: Config) -> list[str]:
     }
     if config.lidar.publish_tf:
         frames["lidar.lidar_frame"] = config.lidar.lidar_frame
-    if config.footprint.publish_tf:
-        frames["footprint.footprint_frame"] = config.footprint.footprint_frame
     return _repeated("frame", frames)
 
 

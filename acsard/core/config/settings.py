@@ -324,16 +324,7 @@ class LidarConfig(Struct, frozen=True):
     lidar_frame: Frame = "lidar_link"
     lidar_x_offset: Offset = 0.0
     lidar_y_offset: Offset = 0.0
-    lidar_z_offset: Offset = 0.0
-    lidar_roll: Angle = 0.0
-    lidar_pitch: Angle = 0.0
     lidar_yaw: Angle = 0.0
-
-
-class FootprintConfig(Struct, frozen=True):
-    publish_tf: bool = False
-    footprint_frame: Frame = "base_footprint"
-    footprint_z_offset: Offset = 0.0
 
 
 class RatesConfig(Struct, frozen=True):
@@ -465,7 +456,6 @@ class Config(Struct, frozen=True):
     commands: CommandsConfig = CommandsConfig()
     odometry: OdometryConfig = OdometryConfig()
     lidar: LidarConfig = LidarConfig()
-    footprint: FootprintConfig = FootprintConfig()
     rates: RatesConfig = RatesConfig()
     bus: BusConfig = BusConfig()
     access: AccessConfig = AccessConfig()

@@ -16,6 +16,7 @@ from msgspec import inspect
 from msgspec.structs import FieldInfo, fields
 
 from acsard.core.config.nearest import nearest
+from acsard.core.config.removed import why_removed
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -59,7 +60,9 @@ def build_partly(
     known = {field.encode_name: field for field in fields(cls)}
     prefix, complete = f"{path}." if path else "", True
     for key in table:
-        if key not in known:
+        if key not in known and (advice := why_removed(prefix + key)):
+            problems.append(f"{prefix}{key} = {show(table[key])}: {advice}")
+        elif key not in known:
             near = nearest(key, known)
             problems.append(_unknown(key, table[key], path, near, list(known)))
             # The user may have meant the similar key, so treat the value of that key as invalid.

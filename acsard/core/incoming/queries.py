@@ -30,7 +30,6 @@ from acsard.core.messages.keys_and_roles import (
     SERVICES,
     VERBS,
     WHOAMI,
-    Topic,
     full_key,
     offered,
     whoami_key,
@@ -351,22 +350,11 @@ def topic_table(config: Config) -> Topics:
     robot, silent = config.robot.id, left_out(config)
     return Topics(
         [
-            TopicInfo(full_key(robot, t.key), t.direction, t.type, t.rate, note_of(config, t))
+            TopicInfo(full_key(robot, t.key), t.direction, t.type, t.rate, t.note)
             for t in offered(config)
             if t.direction != "out" or t.key not in silent
         ]
     )
-
-
-def note_of(config: Config, topic: Topic) -> str:
-    """Return the description of a key.
-
-    The description of `tf_static` lists the transforms that `config` enables.
-    """
-    if topic.key != "tf_static":
-        return topic.note
-    frames = {"lidar": config.lidar.publish_tf, "base_footprint": config.footprint.publish_tf}
-    return "transform " + ", ".join(f"base -> {name}" for name, on in frames.items() if on)
 
 
 def interfaces(config: Config, outputs: Outputs | None) -> Interfaces:

@@ -202,20 +202,14 @@ class Report:
                 return build(outputs, get_snapshot()) if build and outputs else None
 
     def tf_static(self) -> TFMessage:
-        """Return one message with all static transforms that the configuration switches on."""
+        """Return the message with the transform of the lidar, empty if it is switched off."""
+        lidar = self._config.lidar
+        if not lidar.publish_tf:
+            return TFMessage([])
         base = Header(Time.from_ns(self._start.wall_ns), self._config.odometry.base_frame)
-        lidar, footprint = self._config.lidar, self._config.footprint
-        transforms = []
-        if lidar.publish_tf:
-            place = Vector3(lidar.lidar_x_offset, lidar.lidar_y_offset, lidar.lidar_z_offset)
-            turn = from_rpy(lidar.lidar_roll, lidar.lidar_pitch, lidar.lidar_yaw)
-            transforms.append(TransformStamped(base, lidar.lidar_frame, Transform(place, turn)))
-        if footprint.publish_tf:
-            place = Vector3(z=footprint.footprint_z_offset)
-            transforms.append(
-                TransformStamped(base, footprint.footprint_frame, Transform(place, Quaternion()))
-            )
-        return TFMessage(transforms)
+        place = Vector3(lidar.lidar_x_offset, lidar.lidar_y_offset)
+        pose = Transform(place, from_yaw(lidar.lidar_yaw))
+        return TFMessage([TransformStamped(base, lidar.lidar_frame, pose)])
 
     def robot_description(self) -> String | None:
         """Return the message with the robot's URDF, or None if the daemon has no URDF."""
@@ -353,16 +347,3 @@ def _twist(twist: BodyTwist) -> Twist:
 def from_yaw(yaw: float) -> Quaternion:
     """Return the rotation by `yaw` rad about z."""
     return Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))
-
-
-def from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Return the rotation by roll, pitch and yaw, rad, about the fixed axes x, y, z (REP-103)."""
-    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
-    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
-    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
-    return Quaternion(
-        x=sr * cp * cy - cr * sp * sy,
-        y=cr * sp * cy + sr * cp * sy,
-        z=cr * cp * sy - sr * sp * cy,
-        w=cr * cp * cy + sr * sp * sy,
-    )

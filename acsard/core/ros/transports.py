@@ -139,7 +139,7 @@ def left_out(config: Config) -> frozenset[str]:
     # The simulated robot has its own gyro, so the daemon does not subscribe to another one.
     if not config.odometry.gyro or config.mcu.simulated:
         silent.add(IMU)
-    if not (config.lidar.publish_tf or config.footprint.publish_tf):
+    if not config.lidar.publish_tf:
         silent.add("tf_static")
     if not config.ros.urdf:
         silent.add(DESCRIPTION)

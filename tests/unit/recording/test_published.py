@@ -40,7 +40,6 @@ def test_a_transform_that_is_switched_off_is_not_published() -> None:
         config,
         odometry=replace(config.odometry, publish_tf=False),
         lidar=replace(config.lidar, publish_tf=False),
-        footprint=replace(config.footprint, publish_tf=False),
     )
     assert names(published_messages(tape, config)) - names(published_messages(tape, quiet)) == {
         "tf",

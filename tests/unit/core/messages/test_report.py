@@ -9,22 +9,19 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.core.config.settings import (
     BusConfig,
     Config,
     DriveConfig,
-    FootprintConfig,
     LidarConfig,
     OdometryConfig,
     RatesConfig,
     RobotConfig,
 )
 from acsard.core.messages.keys_and_roles import PUBLISHED
-from acsard.core.messages.report import Report, from_rpy, from_yaw
+from acsard.core.messages.report import Report, from_yaw
 from acsard.core.messages.schema import (
     Battery,
     BatterySummary,
@@ -220,23 +217,6 @@ YAWS = [
 ]
 """Worked by hand: a turn by a about z is sin(a/2) k + cos(a/2)."""
 
-RPYS = [
-    ((0, 0, 0), Quaternion(0, 0, 0, 1)),
-    ((1, 0, 0), Quaternion(HALF, 0, 0, HALF)),
-    ((0, 1, 0), Quaternion(0, HALF, 0, HALF)),
-    ((0, 0, 1), Quaternion(0, 0, HALF, HALF)),
-    ((2, 0, 0), Quaternion(1, 0, 0, 0)),
-    ((1, 1, 0), Quaternion(0.5, 0.5, -0.5, 0.5)),
-    ((1, 0, 1), Quaternion(0.5, 0.5, 0.5, 0.5)),
-    ((0, 1, 1), Quaternion(-0.5, 0.5, 0.5, 0.5)),
-    ((1, 1, 1), Quaternion(0, HALF, 0, HALF)),
-    ((-1, 1, 0), Quaternion(-0.5, 0.5, 0.5, 0.5)),
-]
-"""Quarter turns about x, y, z with their quaternions, worked by hand as qz qy qx.
-
-The rules are i j = k, j k = i, k i = j.
-"""
-
 
 def close(q: Quaternion, r: Quaternion) -> bool:
     return all(
@@ -248,43 +228,6 @@ def close(q: Quaternion, r: Quaternion) -> bool:
 @each(("yaw", "turn"), YAWS)
 def test_a_yaw_is_converted_to_the_right_quaternion(yaw: float, turn: Quaternion) -> None:
     assert close(from_yaw(yaw), turn)
-    assert close(from_rpy(0.0, 0.0, yaw), turn)
-
-
-@each(("quarters", "turn"), RPYS)
-def test_quarter_turns_about_fixed_axes_give_the_right_quaternion(
-    quarters: tuple[int, int, int], turn: Quaternion
-) -> None:
-    roll, pitch, yaw = (n * math.pi / 2 for n in quarters)
-    assert close(from_rpy(roll, pitch, yaw), turn)
-
-
-angle = st.floats(-math.pi, math.pi)
-
-
-def rotated(q: Quaternion, v: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return the vector v rotated by the quaternion (w, u): v + w t + u x t, with t = 2 u x v."""
-    (a, b, c), u = v, (q.x, q.y, q.z)
-    t = tuple(
-        2 * component
-        for component in (u[1] * c - u[2] * b, u[2] * a - u[0] * c, u[0] * b - u[1] * a)
-    )
-    return (
-        a + q.w * t[0] + u[1] * t[2] - u[2] * t[1],
-        b + q.w * t[1] + u[2] * t[0] - u[0] * t[2],
-        c + q.w * t[2] + u[0] * t[1] - u[1] * t[0],
-    )
-
-
-@given(angle, angle, angle)
-def test_a_quaternion_rotates_a_vector_like_roll_pitch_and_yaw_in_sequence(
-    roll: float, pitch: float, yaw: float
-) -> None:
-    x, y, z = 1.0, 2.0, 3.0
-    y, z = y * math.cos(roll) - z * math.sin(roll), y * math.sin(roll) + z * math.cos(roll)
-    x, z = x * math.cos(pitch) + z * math.sin(pitch), z * math.cos(pitch) - x * math.sin(pitch)
-    x, y = x * math.cos(yaw) - y * math.sin(yaw), x * math.sin(yaw) + y * math.cos(yaw)
-    assert rotated(from_rpy(roll, pitch, yaw), (1.0, 2.0, 3.0)) == pytest.approx((x, y, z))
 
 
 # transforms that never change
@@ -293,39 +236,24 @@ LIDAR = LidarConfig(
     lidar_frame="eye",
     lidar_x_offset=0.1,
     lidar_y_offset=-0.2,
-    lidar_z_offset=0.3,
-    lidar_roll=0.4,
-    lidar_pitch=0.5,
     lidar_yaw=0.6,
 )
-FOOTPRINT = FootprintConfig(publish_tf=True, footprint_frame="floor", footprint_z_offset=-0.05)
 
 
-def static(lidar: LidarConfig, footprint: FootprintConfig) -> TFMessage:
-    return Report(replace(CONFIG, lidar=lidar, footprint=footprint), START).tf_static()
+def static(lidar: LidarConfig) -> TFMessage:
+    return Report(replace(CONFIG, lidar=lidar), START).tf_static()
 
 
-def test_the_static_transforms_have_the_poses_of_lidar_and_footprint() -> None:
-    lidar, floor = static(LIDAR, FOOTPRINT).transforms
-    assert (lidar.header.frame_id, lidar.child_frame_id) == ("r7/base", "eye")
-    assert lidar.transform.translation == Vector3(0.1, -0.2, 0.3)
-    assert lidar.transform.rotation == from_rpy(0.4, 0.5, 0.6)
-    assert (floor.header.frame_id, floor.child_frame_id) == ("r7/base", "floor")
-    assert floor.transform.translation == Vector3(0.0, 0.0, -0.05)
-    assert floor.transform.rotation == Quaternion()
+def test_the_static_transform_has_the_pose_of_the_lidar_and_the_time_of_the_start() -> None:
+    (lidar,) = static(LIDAR).transforms
+    assert lidar.header == Header(Time(1_700_000_000, 0), "r7/base")
+    assert lidar.child_frame_id == "eye"
+    assert lidar.transform.translation == Vector3(0.1, -0.2, 0.0)
+    assert lidar.transform.rotation == from_yaw(0.6)
 
 
-def test_the_static_transforms_carry_the_time_of_the_start() -> None:
-    stamps = {t.header.stamp for t in static(LIDAR, FOOTPRINT).transforms}
-    assert stamps == {Time(1_700_000_000, 0)}
-
-
-@each("lidar", [True, False])
-@each("footprint", [True, False])
-def test_each_static_transform_has_its_own_switch(lidar: bool, footprint: bool) -> None:
-    message = static(replace(LIDAR, publish_tf=lidar), replace(FOOTPRINT, publish_tf=footprint))
-    names = [transform.child_frame_id for transform in message.transforms]
-    assert names == ["eye"] * lidar + ["floor"] * footprint
+def test_a_lidar_that_is_switched_off_has_no_transform() -> None:
+    assert static(replace(LIDAR, publish_tf=False)).transforms == []
 
 
 def test_by_default_only_the_lidar_transform_is_published() -> None:

@@ -7,7 +7,6 @@ import pytest
 from acsard.core.config.settings import (
     CommandsConfig,
     Config,
-    FootprintConfig,
     LidarConfig,
     McuConfig,
     OdometryConfig,
@@ -181,13 +180,6 @@ def test_transforms_that_are_switched_off_have_no_endpoint() -> None:
         "tf",
         "tf_static",
     }
-
-
-def test_either_static_transform_keeps_tf_static() -> None:
-    assert "tf_static" not in left_out(Config())
-    footprint = FootprintConfig(publish_tf=True)
-    config = Config(lidar=LidarConfig(publish_tf=False), footprint=footprint)
-    assert "tf_static" not in left_out(config)
 
 
 def test_a_robot_without_a_urdf_has_no_robot_description() -> None:

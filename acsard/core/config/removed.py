@@ -1,0 +1,24 @@
+"""The settings of earlier versions that acsard no longer has, with what to do instead.
+
+To be dropped after 0.3.
+"""
+
+from __future__ import annotations
+
+_LIDAR = "describe the lidar in the URDF and set lidar.publish_tf = false"
+
+REMOVED = {
+    "footprint": "remove this table, and give the URDF a fixed joint base_link -> base_footprint",
+    "lidar.lidar_z_offset": _LIDAR,
+    "lidar.lidar_roll": _LIDAR,
+    "lidar.lidar_pitch": _LIDAR,
+}  # One line each: the advice completes the sentence "This setting no longer exists: ..."
+
+
+def why_removed(key: str) -> str | None:
+    """Return one sentence that says what to do instead of `key`, a dotted key or a table.
+
+    Return None if the key was not removed.
+    """
+    advice = REMOVED.get(key) or REMOVED.get(key.partition(".")[0])
+    return f"this setting no longer exists; {advice}" if advice else None
