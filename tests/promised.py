@@ -29,7 +29,6 @@ PROMISED = (
     Promise("odom", "out", "Odometry", "viewer", "odom"),
     Promise("tf", "out", "TFMessage", "viewer", "tf"),
     Promise("tf_static", "out", "TFMessage", "viewer", "tf_static"),
-    Promise("robot_description", "out", "String", "viewer", "robot_description", always=False),
     Promise("wheel_states", "out", "JointState", "viewer", "joint_states"),
     Promise("battery", "out", "Battery", "viewer", "battery_state"),
     Promise("cmd_vel_out", "out", "TwistStamped", "viewer", "cmd_vel_out"),

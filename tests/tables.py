@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import get_args
 
-from acsard.core.config.settings import Config, RosConfig
+from acsard.core.config.settings import Config
 from acsard.core.messages.keys_and_roles import (
     PLAIN_SERVICES,
     PUBLISHED,
@@ -146,7 +146,7 @@ def _rule_keys() -> dict[str, list[str]]:
 
 def bridge_file(text: str) -> str:
     """Return the bridge's configuration with the ROS names of the daemon."""
-    names = ros_names(RosConfig())
+    names = ros_names()
     lists = {
         "publishers": [row.name for row in names if row.direction == "in"],
         "subscribers": [row.name for row in names if row.direction == "out"],

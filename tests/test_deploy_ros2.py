@@ -86,7 +86,7 @@ def bridge_setting(path: str) -> Any:
 
 
 def published_names(direction: str) -> set[str]:
-    return {f"/{row.name}" for row in ros_names(RosConfig()) if row.direction == direction}
+    return {f"/{row.name}" for row in ros_names() if row.direction == direction}
 
 
 # acsar.urdf
@@ -390,7 +390,7 @@ def test_ros2_control_uses_the_robot_s_joint_topics_in_the_right_direction(
     """Check the remappings of ros2_control_node, because the controller runs inside its process."""
     nodes = launched(namespace, monkeypatch)
     manager, parameters = nodes["ros2_control_node"], hardware(nodes)
-    ours = {f"{prefix}/{row.name}": row.direction for row in ros_names(RosConfig())}
+    ours = {f"{prefix}/{row.name}": row.direction for row in ros_names()}
     for parameter, direction in (("joint_states_topic", "out"), ("joint_commands_topic", "in")):
         topic = resolved(str(parameters[parameter]), namespace, manager["remappings"])
         assert ours.get(topic) == direction, topic
@@ -426,9 +426,7 @@ def test_the_bridge_connects_as_a_client_to_the_daemon_s_endpoints() -> None:
 
 def test_the_bridge_passes_exactly_the_topics_and_services_of_the_daemon() -> None:
     allow = bridge_setting("plugins/ros2dds/allow")
-    services = {
-        f"/{row.name}" for row in ros_names(RosConfig()) if row.direction in ("service", "query")
-    }
+    services = {f"/{row.name}" for row in ros_names() if row.direction in ("service", "query")}
     wanted = {
         "publishers": published_names("in"),
         "subscribers": published_names("out"),
@@ -516,7 +514,7 @@ def test_the_readme_has_every_ros_key_with_its_default() -> None:
 
 def test_the_readme_names_every_topic_and_service() -> None:
     text = (FILES / "README.md").read_text()
-    for row in ros_names(RosConfig()):
+    for row in ros_names():
         if not row.type.startswith("rcl_interfaces/"):
             assert f"`{row.name}`" in text, row.name
 

@@ -16,7 +16,6 @@ from typing import Literal, TypedDict
 from acsard.core.config.settings import Config
 from acsard.core.messages.keys_and_roles import (
     COMMANDS,
-    DESCRIPTION,
     IMU,
     full_key,
     json_key,
@@ -96,7 +95,7 @@ class _Keys:
     def __init__(self, config: Config) -> None:
         robot = config.robot.id
         self._robot, self._sources = robot, [source.name for source in config.commands.sources]
-        self._ros = ros = endpoints(config.ros, "*", left_out(config) & {IMU, DESCRIPTION})
+        self._ros = ros = endpoints(config.ros, "*", left_out(config) & {IMU})
         topics, outgoing = offered(config), published(config)
         # The gyro's row is not here with the simulator, because the daemon then publishes its key.
         self._incoming = [topic for topic in topics if topic not in outgoing]

@@ -169,8 +169,6 @@ def _silent(key: str) -> str:
         return f"no program sends on the Zenoh key {key} now"
     if row.simulated:
         return f"only the simulator publishes {key}"
-    if row.urdf:
-        return f"{key} is published only if urdf in [ros] of the robot's acsard.toml names a file"
     if row.key == "battery":
         return NO_BATTERY
     return _unpublished(key, row)

@@ -14,7 +14,6 @@ from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import effective
 from acsard.core.config.toml_text import document
 from acsard.core.formatting import json_line
-from acsard.daemon.robot_description import robot_description
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +23,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     where, config = load(args.config)
-    robot_description(config.ros.urdf)
     plain = effective(config)
     if args.json:
         print(json_line(msgspec.json.encode(plain).decode()))

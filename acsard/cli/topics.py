@@ -41,7 +41,7 @@ def ros_table(config: Config) -> Topics:
     ros = config.ros
     known = source_keys(source.name for source in config.commands.sources)
     rows = []
-    for row in ros_names(ros, left_out(config)) if ros.bridge or ros.rmw else ():
+    for row in ros_names(left_out(config)) if ros.bridge or ros.rmw else ():
         native = by_key(row.native)
         note = f"as {row.native}" + (f": {native.note}" if native else "")
         if row.direction == "query":

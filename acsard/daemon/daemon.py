@@ -23,13 +23,11 @@ from acsard.bus.tls import expiry_times, require_usable
 from acsard.bus.zenoh_sessions import log_from_environment
 from acsard.core.config.settings import Config
 from acsard.core.link.codec import Codec
-from acsard.core.messages.keys_and_roles import DESCRIPTION
 from acsard.core.messages.schema import Info
 from acsard.core.values import NS_PER_S, Event, Latches
 from acsard.daemon.bus.bus import ZenohBus
 from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_file import LatchFile
-from acsard.daemon.robot_description import robot_description
 from acsard.daemon.serial.port import SerialPort
 from acsard.daemon.serial.simulator_pty import Simulated
 from acsard.daemon.settings_file import SettingsFile
@@ -158,7 +156,6 @@ async def run(
             log.info("real_time", text=refused)
         totals: dict[str, object] = {}
         stack.callback(lambda: log.info("ended", **totals))  # runs after `totals` is filled
-        urdf = robot_description(config.ros.urdf)
         events, start = list[Event](), clock.now()
         recorder = _recorder(config, events.append, start.wall_ns, stack)
         simulated = stack.enter_context(Simulated(config)) if config.mcu.simulated else None
@@ -194,11 +191,6 @@ async def run(
             keeper,
             settings_file,
         )
-        control.report.description = urdf
-        if (description := control.report.robot_description()) is not None:
-            # Publish the description only once, because RViz and the controller manager load the
-            # robot again with each message.
-            bus.publish(DESCRIPTION, description)
         if settings_file is not None:
             settings_file.start()
             stack.callback(settings_file.close)

@@ -25,7 +25,7 @@ from acsard.core.messages.encodings import DecodeError, Decoder, encode
 from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.keys_and_roles import PLAIN_SERVICES, SERVICES
 from acsard.core.messages.schema import MESSAGES, ServiceReply
-from acsard.core.ros.names import full_name
+from acsard.core.ros.names import NODE, full_name
 from acsard.core.values import NS_PER_S, AcsardError, Verb
 from acsard.foxglove.drives import DrivingViewers
 from acsard.foxglove.notices import Notices
@@ -362,7 +362,7 @@ EMPTY_SCHEMA = {"type": "object", "title": "std_srvs/srv/Trigger_Request", "prop
 
 def services(robot: Robot, ros: RosConfig, verbs: Iterable[Verb]) -> list[foxglove.Service]:
     """Return the services `verbs` of the robot under their ROS names, such as `/acsard/stop`."""
-    return [_service(robot, verb, full_name(ros.namespace, f"{ros.node}/{verb}")) for verb in verbs]
+    return [_service(robot, verb, full_name(ros.namespace, f"{NODE}/{verb}")) for verb in verbs]
 
 
 def _service(robot: Robot, verb: Verb, name: str) -> foxglove.Service:

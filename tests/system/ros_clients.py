@@ -44,7 +44,6 @@ ODOMETRY, TF = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 JOINTS, DIAGNOSTICS = "sensor_msgs/msg/JointState", "diagnostic_msgs/msg/DiagnosticArray"
 BATTERY = "sensor_msgs/msg/BatteryState"
 TRIGGER = "std_srvs/srv/Trigger"
-STRING = "std_msgs/msg/String"
 SPEED_LIMIT = "nav2_msgs/msg/SpeedLimit"
 LIST, GET = "rcl_interfaces/srv/ListParameters", "rcl_interfaces/srv/GetParameters"
 
@@ -54,7 +53,6 @@ HASHES = {
     ODOMETRY: "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
     TF: "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
     SPEED_LIMIT: "83d8e4e842559f4d9a988b19d31b162216ec738536389f98438d1a166f91845a",
-    STRING: "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
     JOINTS: "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
     DIAGNOSTICS: "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
     BATTERY: "4bee5dfce981c98faa6828b868307a0a73f992ed0789f374ee96c8f840e69741",

@@ -35,7 +35,7 @@ from tests.system.harness import (
 )
 from tests.system.strangers import DELETES, command_line
 
-PUBLISHED = {row.key: row.type for row in promised.PUBLISHED if row.key != "robot_description"}
+PUBLISHED = {row.key: row.type for row in promised.PUBLISHED}
 """The type of each key that a simulated robot publishes without a URDF file."""
 
 FIELDS = {

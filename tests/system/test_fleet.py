@@ -83,8 +83,7 @@ TURNING = json.dumps({"angular_velocity": {"z": 0.1}}).encode()
 FORGED = b"forged"
 SOURCES = tuple(source.name for source in Config().commands.sources)
 VALUES = tuple(key for topic in PUBLISHED for key in (topic.key, f"json/{topic.key}"))
-OFTEN = tuple(key for key in VALUES if not key.endswith(("tf_static", "robot_description")))
-URDF = "deploy/ros2/acsar.urdf"
+OFTEN = tuple(key for key in VALUES if not key.endswith("tf_static"))
 TOO_SLOW = json.dumps({"speed_limit": -1.0}).encode()
 """A speed limit that the robot refuses and counts."""
 EVERY_REPLY = zenoh.ConsolidationMode.NONE
@@ -126,7 +125,7 @@ def _puts() -> Iterator[Try]:
         yield Try(key, NOBODY, TWIST)
     yield Try(f"{ONE}/speed_limit", DRIVERS, TOO_SLOW)
     yield Try(f"{TWO}/speed_limit", DRIVERS | ITSELF, TOO_SLOW)
-    latched = ("tf_static", "robot_description", "tf_static/@adv/x")
+    latched = ("tf_static", "tf_static/@adv/x")
     for key in (*OFTEN, *latched, "alive", "info", "config", "srv/stop"):
         yield Try(f"{ONE}/{key}", NOBODY, FORGED)
     for key in ("robot1/cmd_vel", "cmd_vel", "acsard/robot3/state", "@/*/router/config/mode"):
@@ -135,7 +134,7 @@ def _puts() -> Iterator[Try]:
 
 def _queries() -> Iterator[Try]:
     described = ("info", "topics", "interfaces", "schema/Twist")
-    for key in (*OFTEN, "tf_static", "robot_description", "json/robot_description", *described):
+    for key in (*OFTEN, "tf_static", *described):
         yield Try(f"{ONE}/{key}", ANYBODY)
     yield Try(f"{TWO}/info", ANYBODY | ITSELF)
     for key in ("tf_static/@adv/**?_anyke", "schema/*"):
@@ -268,7 +267,6 @@ class Fleet:
         tables["rates"] = {"state": 100.0, "diagnostics": 100.0}
         tables["sim"] = {"faults": ["battery=80:600"]}
         tables["limits"] = {"linear_acceleration": 5.0, "linear_stop_deceleration": 5.0}
-        tables.setdefault("ros", {})["urdf"] = str(ROBOT_FILE.parents[2] / URDF)
         return Daemon(self.where, config=tables, name=name or robot_id, ready=ready)
 
     def member(self, name: str, robot_id: str = "robot1") -> Member:

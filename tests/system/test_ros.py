@@ -32,7 +32,6 @@ from tests.system.ros_clients import (
     REQUESTS,
     SPEED_LIMIT,
     STAMPED,
-    STRING,
     TF,
     TRIGGER,
     TWIST,
@@ -134,32 +133,6 @@ def test_a_late_subscriber_gets_the_static_transforms_immediately(ros: Client) -
             sample = samples.first("tf_static", within=2.0)
         assert [t.child_frame_id for t in decode(TF, sample.payload).transforms] == ["lidar_link"]
         assert time.monotonic() - begun < 1.0
-
-
-URDF_TEXT = '<?xml version="1.0"?>\n<robot name="r7"><link name="base_link"/></robot>\n'
-
-
-@pytest.fixture(scope="module")
-def described(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """A robot with a URDF."""
-    where = tmp_path_factory.mktemp("described")
-    (where / "robot.urdf").write_text(URDF_TEXT)
-    with Daemon(where, config={"ros": {"urdf": str(where / "robot.urdf")}}) as daemon:
-        yield daemon
-
-
-@pytest.mark.parametrize("transport", NETWORK)
-def test_the_urdf_is_latched_and_sent_once(described: Daemon, transport: str) -> None:
-    """A late subscriber gets the URDF once, because RViz reloads the robot with each message."""
-    with Bus(described.endpoint) as bus:
-        assert bus.get("robot_description") == {"data": URDF_TEXT}
-        ros = EMULATED[transport](bus.session)
-        with ros.follow_late("robot_description", STRING) as samples:
-            sample = samples.first("the description", within=2.0)
-            assert decode(STRING, sample.payload).data == URDF_TEXT
-            with ros.follow_late("tf_static", TF) as repeated:
-                until(lambda: len(repeated.seen) >= 2, 7.0, "the transforms are repeated")
-            assert len(samples.seen) == 1
 
 
 # speed limits

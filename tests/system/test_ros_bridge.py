@@ -21,7 +21,6 @@ from tests.system.ros_clients import (
     SERVICES,
     SPEED_LIMIT,
     TWIST,
-    TWISTS,
     BridgeHalf,
     RmwClient,
     changes,
@@ -122,7 +121,7 @@ ALIVE = "acsard/acsar/alive"
 """Declared last: when it has come, all tokens have come."""
 
 
-def announced(zid: str, namespace: str, twists: bool) -> set[str]:
+def announced(zid: str, namespace: str) -> set[str]:
     """Return the liveliness keys with which a bridge announces everything that it can announce."""
     head = f"@/{zid}/@ros2_lv"
     prefix = f"{namespace}§" if namespace else ""
@@ -131,8 +130,6 @@ def announced(zid: str, namespace: str, twists: bool) -> set[str]:
         qos = f":1:{int(late)}:0,{depth}:typehash=RIHS01_{HASHES[kind]};"
         keys.add(f"{head}/MP/{prefix}{name}/{kind.replace('/', '§')}/{qos}")
     topics = {"joint_commands": JOINTS, "speed_limit": SPEED_LIMIT}
-    if twists:
-        topics |= dict.fromkeys(TWISTS, TWIST)
     for name, kind in topics.items():
         qos = f":1:0:0,10:typehash=RIHS01_{HASHES[kind]};"
         keys.add(f"{head}/MS/{prefix}{name}/{kind.replace('/', '§')}/{qos}")
@@ -141,29 +138,18 @@ def announced(zid: str, namespace: str, twists: bool) -> set[str]:
     return keys
 
 
-@pytest.mark.parametrize(
-    ("namespace", "kind"), [("", "auto"), ("robot1", "twist")], ids=["plain", "named"]
-)
+@pytest.mark.parametrize("namespace", ["", "robot1"], ids=["plain", "named"])
 def test_the_daemon_announces_the_liveliness_tokens_of_a_bridge(
-    tmp_path: Path, namespace: str, kind: str
+    tmp_path: Path, namespace: str
 ) -> None:
-    ros = {"announce": True, "namespace": namespace, "cmd_vel_type": kind}
+    ros = {"namespace": namespace}
     with Daemon(tmp_path, config={"ros": ros}) as daemon, session_at(daemon.endpoint) as session:
         (zid,) = map(str, session.info.peers_zid())
-        expected = announced(zid, namespace, twists=kind == "twist")
+        expected = announced(zid, namespace)
         with listed(session, "@/*/@ros2_lv/**") as tokens:
             until(lambda: len(tokens) >= len(expected), 5.0, "all tokens")
             assert set(tokens) == expected
             assert len(tokens) == len(expected)
-
-
-def test_no_token_is_announced_unless_ros_announce_is_set(tmp_path: Path) -> None:
-    config = {"ros": {"announce": False}}
-    with Daemon(tmp_path, config=config) as daemon, session_at(daemon.endpoint) as session:
-        with listed(session, "@/*/@ros2_lv/**") as tokens, listed(session, ALIVE) as alive:
-            until(lambda: alive, 5.0, "the alive token")
-            assert tokens == []
-        BridgeHalf(session).call("acsard/clear").trigger()
 
 
 def test_a_ros_transport_that_is_switched_off_has_no_keys_and_no_tokens(tmp_path: Path) -> None:

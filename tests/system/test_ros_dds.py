@@ -28,16 +28,16 @@ from tests.system.ros_clients import (
     PUBLISHED,
     ROUTE_S,
     SERVICES,
+    SPEED_LIMIT,
     STAMPED,
-    STRING,
     TF,
     TWIST,
-    TWISTS,
     Relay,
     Samples,
     changes,
     decode,
     encode,
+    header,
     make,
     over_router,
     refused_without_motion,
@@ -84,29 +84,11 @@ def test_a_bridge_that_starts_before_the_robot_joins_it_and_joins_it_again(
                 assert called._replace(replies=called.replies[:1]).trigger()[0]
 
 
-def test_a_late_node_gets_the_urdf_that_was_sent_once(tmp_path: Path, dds: NewDomain) -> None:
-    text = '<robot name="r7"><link name="base_link"/></robot>'
-    (tmp_path / "robot.urdf").write_text(text)
-    described = {"ros": {"urdf": str(tmp_path / "robot.urdf")}}
-    with (
-        Daemon(tmp_path, config=described) as daemon,
-        dds(tmp_path) as domain,
-        domain.bridge(daemon.endpoint),
-    ):
-        for _ in range(2):
-            with (
-                domain.node() as node,
-                node.follow_late("robot_description", STRING) as samples,
-            ):
-                assert decode(STRING, samples.first("it", within=10.0).payload).data == text
-
-
 def test_announced_topics_have_routes_and_no_topic_is_sent_without_subscribers(
     tmp_path: Path, dds: NewDomain
 ) -> None:
-    announced = {"ros": {"announce": True, "cmd_vel_type": "twist"}}
     with (
-        Daemon(tmp_path, config=announced) as daemon,
+        Daemon(tmp_path) as daemon,
         Bus(daemon.endpoint) as bus,
         Relay(daemon.endpoint) as relay,
         dds(tmp_path) as domain,
@@ -114,7 +96,7 @@ def test_announced_topics_have_routes_and_no_topic_is_sent_without_subscribers(
     ):
         for name in PUBLISHED:
             bridge.logs(f"Route Subscriber (Zenoh:{name} -> ROS:/{name}) created")
-        for name in (*TWISTS, "joint_commands", "speed_limit"):
+        for name in ("joint_commands", "speed_limit"):
             bridge.logs(f"Route Publisher (ROS:/{name} -> Zenoh:{name}) created")
         for name in SERVICES:
             bridge.logs("Route Service Client", f"Zenoh:{name}) created")
@@ -243,8 +225,8 @@ def test_a_publisher_of_a_type_that_is_no_command_moves_nothing(
     with domain.node() as node:
         node.publish_until_accepted(driven, "cmd_vel", TWIST, twist(0.0))
     with domain.node() as node:
-        text = encode(make("std_msgs/msg/String", data="forward"))
-        send = lambda: node.put("cmd_vel", "std_msgs/msg/String", text)  # noqa: E731
+        limit = encode(make(SPEED_LIMIT, header=header(), percentage=False, speed_limit=0.3))
+        send = lambda: node.put("cmd_vel", SPEED_LIMIT, limit)  # noqa: E731
         refused_without_motion(driven, send, "malformed", "")
 
 

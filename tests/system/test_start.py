@@ -181,9 +181,7 @@ def test_a_second_daemon_with_the_same_id_behind_one_router_ends_with_75(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "ros", [{"rmw": False, "announce": False}, {"bridge": False, "namespace": "lab/robot"}]
-)
+@pytest.mark.parametrize("ros", [{"rmw": False}, {"bridge": False, "namespace": "lab/robot"}])
 @pytest.mark.nightly
 def test_a_second_robot_with_the_ros_names_of_another_behind_one_router_ends_with_75(
     tmp_path: Path, peer: Peer, ros: dict[str, object]

@@ -104,10 +104,8 @@ async def test_every_message_of_the_socket_is_described_and_every_described_one_
     tmp_path: Path,
 ) -> None:
     messages: list[Any] = []
-    (tmp_path / "robot.urdf").write_text('<robot name="acsar"/>')
     config: dict[str, dict[str, object]] = {
         "odometry": {"gyro": True},
-        "ros": {"urdf": str(tmp_path / "robot.urdf")},
         "sim": {"faults": ["battery=80:600"]},
     }
     with (

@@ -9,7 +9,6 @@ and response.
 from __future__ import annotations
 
 MESSAGES = """
-std_msgs/msg/String: string data
 nav2_msgs/msg/SpeedLimit: std_msgs/msg/Header header, bool percentage, float64 speed_limit
 sensor_msgs/msg/Imu: \
     std_msgs/msg/Header header, \

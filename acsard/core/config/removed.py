@@ -12,6 +12,10 @@ REMOVED = {
     "lidar.lidar_z_offset": _LIDAR,
     "lidar.lidar_roll": _LIDAR,
     "lidar.lidar_pitch": _LIDAR,
+    "ros.announce": "remove the key: the topics of the bridge are always announced",
+    "ros.node": 'remove the key: the node is "acsard", and ros.namespace tells robots apart',
+    "ros.urdf": "remove the key: robot_state_publisher publishes robot_description",
+    "ros.cmd_vel_type": "remove the key: cmd_vel accepts Twist and TwistStamped",
 }  # One line each: the advice completes the sentence "This setting no longer exists: ..."
 
 

@@ -55,16 +55,6 @@ CommonName = Annotated[
         },
     ),
 ]
-RosNode = Annotated[
-    str,
-    Meta(
-        pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,63}\Z",
-        extra={
-            "unit": "a ROS name: letters, digits and _, but no digit at the beginning",
-            "example": "acsard",
-        },
-    ),
-]
 RosNamespace = Annotated[
     str,
     Meta(
@@ -391,15 +381,8 @@ class AccessConfig(Struct, frozen=True):
 class RosConfig(Struct, frozen=True):
     bridge: bool = True
     rmw: bool = True
-    announce: bool = True
     domain: Annotated[int, Meta(ge=0, le=232)] = 0
     namespace: RosNamespace = ""
-    node: RosNode = "acsard"
-    urdf: Annotated[
-        str,
-        Meta(pattern=r"^[^\x00]{0,256}\Z", extra={"unit": "a file, or empty"}),
-    ] = ""
-    cmd_vel_type: Literal["auto", "twist", "twist_stamped"] = "auto"
 
 
 class LogConfig(Struct, frozen=True):

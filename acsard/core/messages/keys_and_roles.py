@@ -57,8 +57,6 @@ class Topic(Struct, frozen=True):
     """True for a key that exists only with the built-in simulator."""
     gyro: bool = False
     """True for a key that exists only with `[odometry] gyro = true`."""
-    urdf: bool = False
-    """True for a key that exists only with a file in `[ros] urdf`."""
 
     @property
     def pattern(self) -> str:
@@ -129,8 +127,6 @@ IMU = "imu"
 SPEED_LIMIT = "speed_limit"
 """Key on which a client, such as Nav2's speed filter, lowers the robot's highest speed."""
 
-DESCRIPTION = "robot_description"
-
 WHOAMI = "whoami/<role>"
 """Pattern of the keys with which a client finds out its role. There is one key for each role.
 Zenoh's access rules let a client query only the keys of its own role and of lower roles. So a
@@ -170,11 +166,10 @@ def _out(
     *,
     latched: bool = False,
     simulated: bool = False,
-    urdf: bool = False,
 ) -> Topic:
     return Topic(
         key, "out", kind, rate, note,
-        subscribe="viewer", query="viewer", latched=latched, simulated=simulated, urdf=urdf,
+        subscribe="viewer", query="viewer", latched=latched, simulated=simulated,
     )  # fmt: skip
 
 
@@ -197,10 +192,6 @@ TOPICS: tuple[Topic, ...] = (
     _out("odom", "Odometry", "every feedback", "pose of base in odom, twist, covariances"),
     _out("tf", "TFMessage", "with odom", "transform odom -> base"),
     _out("tf_static", "TFMessage", "latched", "transform base -> lidar", latched=True),
-    _out(
-        DESCRIPTION, "String", "latched", "the URDF, if `[ros] urdf` names a file",
-        latched=True, urdf=True,
-    ),
     _out("wheel_states", "JointState", "every feedback", "wheel angles and speeds"),
     _out("battery", "Battery", "1 Hz, on change", "voltage, current and state of charge"),
     _out(
@@ -269,17 +260,13 @@ not included."""
 def offered(config: Config) -> tuple[Topic, ...]:
     """Return the rows of `TOPICS` whose keys exist on the bus with the configuration `config`.
 
-    `TOPICS` has a row for each Zenoh key. Some keys exist only with the built-in simulator, with
-    `[odometry] gyro = true`, or with a file in `[ros] urdf`. The result leaves out the rows whose
-    condition `config` does not fulfill.
+    `TOPICS` has a row for each Zenoh key. Some keys exist only with the built-in simulator or with
+    `[odometry] gyro = true`. The result leaves out the rows whose condition `config` does not
+    fulfill.
     """
-    simulated, gyro, urdf = config.mcu.simulated, config.odometry.gyro, bool(config.ros.urdf)
+    simulated, gyro = config.mcu.simulated, config.odometry.gyro
     return tuple(
-        topic
-        for topic in TOPICS
-        if (simulated or not topic.simulated)
-        and (gyro or not topic.gyro)
-        and (urdf or not topic.urdf)
+        topic for topic in TOPICS if (simulated or not topic.simulated) and (gyro or not topic.gyro)
     )
 
 

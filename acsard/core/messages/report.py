@@ -31,7 +31,6 @@ from acsard.core.messages.schema import (
     RobotState,
     SourceState,
     Spread,
-    String,
     TFMessage,
     Time,
     Transform,
@@ -92,8 +91,6 @@ class Report:
         """Maps the owner of each TLS certificate to the time at which it expires, wall-clock ns
         since 1970. The owner of the robot's own certificate is "". If the daemon may not read this
         certificate, its time comes from a report of the TLS gateway."""
-        self.description = ""
-        """The robot's URDF; "" if `[ros] urdf` names no file."""
         self._names = list(config.joints.as_tuple())
         self._start = start
         self._estimate: Estimate | None = None
@@ -179,8 +176,6 @@ class Report:
         match key:
             case "tf_static":
                 return self.tf_static()
-            case "robot_description":
-                return self.robot_description()
             case "odom":
                 return (
                     self._odom(estimate, get_snapshot().measured is not None) if estimate else None
@@ -210,10 +205,6 @@ class Report:
         place = Vector3(lidar.lidar_x_offset, lidar.lidar_y_offset)
         pose = Transform(place, from_yaw(lidar.lidar_yaw))
         return TFMessage([TransformStamped(base, lidar.lidar_frame, pose)])
-
-    def robot_description(self) -> String | None:
-        """Return the message with the robot's URDF, or None if the daemon has no URDF."""
-        return String(self.description) if self.description else None
 
     def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
         """Return the message `odom`.

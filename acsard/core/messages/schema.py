@@ -449,12 +449,6 @@ class GatewayState(Message, frozen=True):
     if the Python library that reads certificates is missing."""
 
 
-class String(Message, frozen=True):
-    """A text, such as the robot's URDF on `robot_description`."""
-
-    data: str
-
-
 class KeyValue(Message, frozen=True):
     """A diagnostic value as text."""
 
@@ -617,7 +611,6 @@ MESSAGES: dict[str, type[Message]] = {
         Imu,
         Battery,
         SpeedLimit,
-        String,
         Twist,
         TwistStamped,
         RobotState,

@@ -35,8 +35,6 @@ TYPE_HASHES: dict[str, str] = {
         "RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b",
     "nav2_msgs/msg/SpeedLimit":
         "RIHS01_83d8e4e842559f4d9a988b19d31b162216ec738536389f98438d1a166f91845a",
-    "std_msgs/msg/String":
-        "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
     "rcl_interfaces/msg/Log":
         "RIHS01_e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac",
     "diagnostic_msgs/msg/DiagnosticArray":
@@ -59,6 +57,10 @@ TYPE_HASHES: dict[str, str] = {
 # fmt: on
 """RIHS01 hashes of the ROS types in use, for Jazzy, Kilted and Lyrical. They are literals because
 the hashes are part of the wire format. A test recomputes them from the message definitions."""
+
+
+NODE = "acsard"
+"""Name of the robot's ROS node, which is also the prefix of its services."""
 
 
 def full_name(namespace: str, name: str) -> str:

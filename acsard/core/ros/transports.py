@@ -16,7 +16,6 @@ from msgspec import Struct
 from acsard.core.config.settings import Config, RosConfig
 from acsard.core.messages.encodings import encoding_name
 from acsard.core.messages.keys_and_roles import (
-    DESCRIPTION,
     IMU,
     PLAIN_SERVICES,
     SPEED_LIMIT,
@@ -24,6 +23,7 @@ from acsard.core.messages.keys_and_roles import (
     service_key,
 )
 from acsard.core.ros.names import (
+    NODE,
     Kind,
     Node,
     Qos,
@@ -107,7 +107,7 @@ PUBLISHED = (
     RosName("cmd_vel_out", "cmd_vel_out", "out", "geometry_msgs/msg/TwistStamped"),
 )
 
-TWISTS = {"twist": "geometry_msgs/msg/Twist", "twist_stamped": "geometry_msgs/msg/TwistStamped"}
+TWISTS = ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped")
 
 SOURCES = {
     "cmd_vel": "nav",
@@ -116,10 +116,6 @@ SOURCES = {
     "joint_commands": "ros2_control",
 }
 """Maps each ROS topic that commands the robot to the name of its command source."""
-
-URDF_TOPIC = RosName(DESCRIPTION, DESCRIPTION, "out", "std_msgs/msg/String", Qos(1, transient=True))
-"""The topic of the robot's URDF. It is not in `PUBLISHED`, because the topics in `PUBLISHED`
-are recorded and the URDF is not."""
 
 SPEED_LIMIT_TOPIC = RosName(SPEED_LIMIT, SPEED_LIMIT, "in", "nav2_msgs/msg/SpeedLimit")
 """Subscription to the speed limits of Nav2's speed filter."""
@@ -141,27 +137,21 @@ def left_out(config: Config) -> frozenset[str]:
         silent.add(IMU)
     if not config.lidar.publish_tf:
         silent.add("tf_static")
-    if not config.ros.urdf:
-        silent.add(DESCRIPTION)
     return frozenset(silent)
 
 
-def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...]:
-    """Return the ROS topics and services of a robot.
+def ros_names(silent: Container[str] = ()) -> tuple[RosName, ...]:
+    """Return the ROS topics and services of a robot, without its namespace.
 
-    A topic that accepts Twist and TwistStamped appears twice, once for each type.
-
-    Args:
-        ros: the table `[ros]` of the configuration.
-        silent: the native keys to leave out, as `left_out` returns them.
+    A topic that accepts Twist and TwistStamped appears twice, once for each type. `silent` has the
+    native keys to leave out, as `left_out` returns them.
     """
-    kinds = [kind for kind in TWISTS if ros.cmd_vel_type in ("auto", kind)]
     return (
-        *(row for row in (*PUBLISHED, URDF_TOPIC) if row.native not in silent),
+        *(row for row in PUBLISHED if row.native not in silent),
         *(
-            RosName(name, f"cmd/{SOURCES[name]}", "in", TWISTS[kind])
+            RosName(name, f"cmd/{SOURCES[name]}", "in", type_name)
             for name in ("cmd_vel", "cmd_vel_dock", "cmd_vel_teleop")
-            for kind in kinds
+            for type_name in TWISTS
         ),
         RosName(
             "joint_commands",
@@ -172,11 +162,11 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
         SPEED_LIMIT_TOPIC,
         *(row for row in (GYRO_TOPIC,) if row.native not in silent),
         *(
-            RosName(f"{ros.node}/{verb}", service_key(verb), "service", "std_srvs/srv/Trigger")
+            RosName(f"{NODE}/{verb}", service_key(verb), "service", "std_srvs/srv/Trigger")
             for verb in PLAIN_SERVICES
         ),
         *(
-            RosName(f"{ros.node}/{name}", PARAMETERS_PREFIX + name, "query", type_name)
+            RosName(f"{NODE}/{name}", PARAMETERS_PREFIX + name, "query", type_name)
             for name, type_name in PARAMETER_SERVICES.items()
         ),
     )
@@ -187,7 +177,7 @@ def in_ros_words(text: str, ros: RosConfig) -> str:
 
     For example, `srv/clear` becomes `/acsard/clear`.
     """
-    return _NAMED.sub(lambda match: full_name(ros.namespace, f"{ros.node}/{match[1]}"), text)
+    return _NAMED.sub(lambda match: full_name(ros.namespace, f"{NODE}/{match[1]}"), text)
 
 
 def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[Endpoint, ...]:
@@ -198,7 +188,7 @@ def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[En
         zid: the id of the Zenoh session.
         silent: the native keys to leave out, as `left_out` returns them.
     """
-    names = ros_names(ros, silent)
+    names = ros_names(silent)
     ros_endpoints: list[Endpoint] = []
     if ros.bridge:
         ros_endpoints += _bridge(ros, zid, names)
@@ -214,7 +204,7 @@ def node_tokens(ros: RosConfig, zid: str) -> tuple[str, ...]:
     of the daemon's Zenoh session.
     """
     tokens = []
-    if ros.bridge and ros.announce:
+    if ros.bridge:
         tokens.append(bridge_presence(zid))
     if ros.rmw:
         tokens.append(_node(ros, zid).token)
@@ -231,8 +221,7 @@ def claims(ros: RosConfig) -> tuple[str, ...]:
 
     Two daemons with the same token would follow the same `cmd_vel`, so the second daemon does not
     start. The tokens begin with `acsard/@ros/`. The tokens that announce endpoints to ROS cannot
-    serve as claims: not every daemon announces its endpoints, and other ROS nodes may use the same
-    names.
+    serve as claims, because other ROS nodes may use the same names.
     """
     name = full_name(ros.namespace, "cmd_vel")
     trees = (("bridge", ros.bridge), (f"rmw/{ros.domain}", ros.rmw))
@@ -240,7 +229,7 @@ def claims(ros: RosConfig) -> tuple[str, ...]:
 
 
 def _node(ros: RosConfig, zid: str) -> Node:
-    return Node(ros.domain, zid, ros.namespace, ros.node)
+    return Node(ros.domain, zid, ros.namespace, NODE)
 
 
 def _bridge(ros: RosConfig, zid: str, names: tuple[RosName, ...]) -> Iterator[Endpoint]:
@@ -254,7 +243,7 @@ def _bridge(ros: RosConfig, zid: str, names: tuple[RosName, ...]) -> Iterator[En
             continue
         name = full_name(ros.namespace, row.name)
         token = ""
-        if ros.announce and len(twins) == 1:
+        if len(twins) == 1:
             token = bridge_token(zid, KINDS[row.direction], name, row.type, row.qos)
         yield _endpoint("bridge", row, bridge_key(name), token)
 

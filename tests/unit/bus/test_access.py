@@ -85,11 +85,10 @@ class Access:
         return {subject for subject in EVERYBODY if self.lets(subject, message, key)}
 
 
-DESCRIBED = RosConfig(urdf="/etc/acsard/robot.urdf")
-DEFAULT, GATEWAY = Access(ros=DESCRIBED), Access(gateway_access, ros=DESCRIBED)
+DEFAULT, GATEWAY = Access(), Access(gateway_access)
 REAL, GYRO = McuConfig(port="/dev/ttyACM0"), OdometryConfig(gyro=True)
 SENSING = Access(mcu=REAL, odometry=GYRO)
-TRUSTING = Access(access=AccessConfig(wildcards=True), ros=DESCRIBED)
+TRUSTING = Access(access=AccessConfig(wildcards=True))
 FROM: dict[Role, set[str]] = {
     "viewer": {"viewer", "operator", "maintainer", "local"},
     "operator": {"operator", "maintainer", "local"},
@@ -232,17 +231,6 @@ def test_an_unused_gyro_key_is_granted_to_no_role() -> None:
         assert not any(DEFAULT.lets(role, "put", key) for role in ROLES)
 
 
-def test_without_a_urdf_the_description_belongs_to_the_programs_of_ros() -> None:
-    """ROS's robot_state_publisher publishes this topic, and the access rules must allow it."""
-    without = Access()
-    ros = [e.key for e in endpoints(RosConfig(), ZID) if e.native == "robot_description"]
-    assert len(ros) == 2
-    for key in (without.key("robot_description"), *ros):
-        assert not without.lets("viewer", "query", key)
-        assert without.lets("local", "put", key)
-        assert not DEFAULT.lets("local", "put", key)
-
-
 def test_only_a_local_client_may_put_on_the_simulated_gyro() -> None:
     simulated = Access(odometry=GYRO)
     # received so that the daemon can refuse and report it
@@ -383,7 +371,7 @@ def test_every_ros_name_is_for_its_least_role_and_the_roles_above(
     transport: str, namespace: str
 ) -> None:
     other = "rmw" if transport == "bridge" else "bridge"
-    ros = RosConfig(**{other: False}, namespace=namespace, urdf=DESCRIBED.urdf)  # type: ignore[arg-type]
+    ros = RosConfig(**{other: False}, namespace=namespace)
     access = Access(ros=ros, mcu=REAL, odometry=GYRO)
     endpoint_list = endpoints(ros, ZID)
     assert {endpoint.direction for endpoint in endpoint_list} == {"in", "out", "query", "service"}

@@ -10,7 +10,6 @@ import pytest
 
 from acsard.cli.check import main
 from acsard.core.config.parsing import from_builtins, parse
-from acsard.host.errors import MendableError
 
 
 def test_a_good_file_is_printed_with_its_place_and_its_warnings(
@@ -32,11 +31,3 @@ def test_a_good_file_is_printed_as_json_on_request(
     file.write_text('[robot]\nid = "r7"\n')
     assert main(argparse.Namespace(config=str(file), json=True)) == 0
     assert from_builtins(msgspec.json.decode(capsys.readouterr().out)) == parse(file.read_bytes())
-
-
-def test_a_missing_urdf_ends_with_the_code_for_bad_configuration(tmp_path: Path) -> None:
-    file = tmp_path / "robot.toml"
-    file.write_text(f'[ros]\nurdf = "{tmp_path}/nothing.urdf"\n')
-    with pytest.raises(MendableError, match="no such file") as caught:
-        main(argparse.Namespace(config=str(file), json=False))
-    assert int(caught.value.code) == 78

@@ -20,7 +20,7 @@ from acsard.core.ros.transports import PARAMETERS_PREFIX, left_out, ros_names
 def test_every_ros_name_is_listed_with_what_it_stands_for() -> None:
     table = ros_table(Config(ros=RosConfig(namespace="robot1")))
     rows = [(row.key, row.direction, row.type) for row in table.topics]
-    names = ros_names(RosConfig(namespace="robot1"), left_out(Config()))
+    names = ros_names(left_out(Config()))
     assert rows == [(f"/robot1/{n.name}", n.direction, n.type) for n in names]
     for row, name in zip(table.topics, names, strict=True):
         if not name.native.startswith(PARAMETERS_PREFIX):

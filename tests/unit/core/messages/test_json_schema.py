@@ -122,7 +122,7 @@ def test_patterns_are_ecmascript_regular_expressions() -> None:
 # messages that the daemon publishes
 
 
-@each("topic", [t for t in PUBLISHED if not (t.simulated or t.urdf)])
+@each("topic", [t for t in PUBLISHED if not t.simulated])
 def test_a_published_message_is_valid_and_invalid_without_any_of_its_fields(topic: Any) -> None:
     report = Report(Config(), START)
     list(report.due(OUTPUTS, {topic.key}, lambda: SNAPSHOT))

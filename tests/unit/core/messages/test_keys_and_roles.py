@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.settings import Config, McuConfig, OdometryConfig, RosConfig
+from acsard.core.config.settings import Config, McuConfig, OdometryConfig
 from acsard.core.messages.keys_and_roles import (
     PUBLISHED,
     SERVICES,
@@ -44,8 +44,8 @@ def test_the_published_topics_are_all_outgoing_ones_except_token_and_json_copies
     assert all(topic.type in MESSAGES for topic in PUBLISHED)
 
 
-def test_only_the_static_transforms_and_the_urdf_are_latched() -> None:
-    assert [topic.key for topic in TOPICS if topic.latched] == ["tf_static", "robot_description"]
+def test_only_the_static_transforms_are_latched() -> None:
+    assert [topic.key for topic in TOPICS if topic.latched] == ["tf_static"]
 
 
 GYRO = OdometryConfig(gyro=True)
@@ -55,12 +55,6 @@ REAL = Config(mcu=McuConfig(port="/dev/ttyACM0"))
 def test_the_true_pose_is_offered_only_by_a_simulated_robot() -> None:
     simulated = {topic.key for topic in offered(Config())}
     assert simulated - {topic.key for topic in offered(REAL)} == {"sim/pose"}
-
-
-def test_the_robot_description_is_offered_only_with_a_urdf_file() -> None:
-    described = replace(REAL, ros=RosConfig(urdf="/etc/acsard/robot.urdf"))
-    more = {topic.key for topic in offered(described)} - {topic.key for topic in offered(REAL)}
-    assert more == {"robot_description"}
 
 
 @pytest.mark.parametrize("config", [Config(), REAL, replace(REAL, odometry=GYRO)])

@@ -38,7 +38,6 @@ from acsard.core.messages.schema import (
     RobotState,
     SourceState,
     Spread,
-    String,
     TFMessage,
     Time,
     TwistStamped,
@@ -61,13 +60,13 @@ from acsard.core.values import (
 from tests.each import each
 from tests.unit.core.messages.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, later
 
-ALL = {topic.key for topic in PUBLISHED if not (topic.simulated or topic.urdf)}
+ALL = {topic.key for topic in PUBLISHED if not topic.simulated}
 """Keys that a report publishes.
 
 The simulator publishes the true values of a simulated robot itself.
 """
 SUMMARIES = ALL - {
-    "odom", "tf", "tf_static", "robot_description", "wheel_states", "cmd_vel_out", "events",
+    "odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "events",
 }  # fmt: skip
 """Keys with their own rate, which are built from a `Snapshot`."""
 FRAMES = OdometryConfig(
@@ -514,16 +513,6 @@ def test_a_topic_has_no_current_value_before_the_first_step(key: str) -> None:
 def test_the_static_transforms_are_available_before_the_first_step() -> None:
     report = Report(CONFIG, START)
     assert report.current("tf_static", never) == report.tf_static()
-
-
-def test_the_urdf_is_available_before_the_first_step_if_the_robot_has_one() -> None:
-    report = Report(CONFIG, START)
-    assert report.current("robot_description", never) is None
-    report.description = '<robot name="r7"/>'
-    assert report.current("robot_description", never) == String('<robot name="r7"/>')
-    assert "robot_description" not in dict(
-        report.due(OUTPUTS, ALL | {"robot_description"}, get_snapshot)
-    )
 
 
 @each("key", sorted(ALL - {"tf_static"}))

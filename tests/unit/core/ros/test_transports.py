@@ -28,7 +28,6 @@ from tests.promised import PROMISED
 
 ZID = "abc"
 REAL = McuConfig(port="/dev/ttyACM0")
-DESCRIBED = RosConfig(urdf="/etc/acsard/robot.urdf")
 
 
 def all_endpoints(ros: RosConfig) -> list[Endpoint]:
@@ -61,11 +60,11 @@ def test_the_keys_of_the_bridge_are_the_bare_names() -> None:
 
 
 def test_every_key_has_the_namespace_and_every_service_the_node_name() -> None:
-    ros = RosConfig(namespace="lab/robot1", node="base")
+    ros = RosConfig(namespace="lab/robot1")
     bridge = keys(ros, "bridge")
     assert all(key.startswith("lab/robot1/") for key in bridge.values())
     assert bridge["tf"] == "lab/robot1/tf"
-    assert bridge["srv/stop"] == "lab/robot1/base/stop"
+    assert bridge["srv/stop"] == "lab/robot1/acsard/stop"
     assert keys(ros, "rmw")["tf"].startswith("0/lab/robot1/tf/tf2_msgs::msg::dds_::TFMessage_/")
 
 
@@ -77,16 +76,6 @@ def test_over_rmw_a_topic_with_two_types_has_a_key_for_each_type() -> None:
         "geometry_msgs::msg::dds_::Twist_",
         "geometry_msgs::msg::dds_::TwistStamped_",
     ]
-
-
-@pytest.mark.parametrize(
-    ("kind", "types"),
-    [("twist", ["Twist_"]), ("twist_stamped", ["TwistStamped_"])],
-)
-def test_one_type_of_twist_can_be_chosen(kind: str, types: list[str]) -> None:
-    ros = RosConfig(cmd_vel_type=kind)  # type: ignore[arg-type]
-    rmw = [e for e in all_endpoints(ros) if e.transport == "rmw" and e.native.startswith("cmd/")]
-    assert [e.key.split("/")[2].rpartition("::")[2] for e in rmw] == types * 3
 
 
 @pytest.mark.parametrize(("bridge", "rmw"), [(True, False), (False, True), (False, False)])
@@ -104,7 +93,7 @@ def test_two_robots_share_a_claim_if_one_topic_would_drive_both() -> None:
         return bool({*claims(first)} & {*claims(two)})
 
     usual, named = RosConfig(), RosConfig(namespace="lab/robot1")
-    assert shared(usual, RosConfig(node="other", announce=False))
+    assert shared(usual, RosConfig(domain=7))
     assert shared(named, RosConfig(namespace="lab/robot1", domain=7)), "the bridge knows no domain"
     assert not shared(usual, named)
     assert not shared(RosConfig(bridge=False), RosConfig(bridge=False, domain=7))
@@ -115,7 +104,7 @@ def test_two_robots_share_a_claim_if_one_topic_would_drive_both() -> None:
 def test_every_ros_name_belongs_to_a_row_of_the_topic_table() -> None:
     patterns = {topic.key.replace("<source>", ""): topic for topic in TOPICS}
     sources = {source.name for source in CommandsConfig().sources}
-    for row in ros_names(RosConfig()):
+    for row in ros_names():
         if row.native.startswith(PARAMETERS_PREFIX):
             continue
         if row.direction == "in" and row.native not in ("imu", "speed_limit"):
@@ -131,7 +120,6 @@ def test_every_ros_name_belongs_to_a_row_of_the_topic_table() -> None:
 def test_only_the_latched_topics_of_the_native_tree_are_latched() -> None:
     assert {e.native for e in all_endpoints(RosConfig()) if e.latched} == {
         "tf_static",
-        "robot_description",
     }
 
 
@@ -151,17 +139,6 @@ def test_every_bridge_endpoint_with_a_single_type_is_announced() -> None:
         e.native for e in all_endpoints(RosConfig()) if e.transport == "bridge" and not e.token
     }
     assert silent == {"cmd/nav", "cmd/dock", "cmd/teleop"}
-    chosen = RosConfig(cmd_vel_type="twist_stamped")
-    assert all(e.token for e in all_endpoints(chosen))
-    assert "/MS/cmd_vel/geometry_msgs§msg§TwistStamped/" in "".join(
-        e.token for e in all_endpoints(chosen)
-    )
-
-
-def test_no_bridge_endpoint_is_announced_if_announcing_is_off() -> None:
-    ros = RosConfig(announce=False)
-    assert not any(e.token for e in all_endpoints(ros) if e.transport == "bridge")
-    assert node_tokens(ros, ZID) == ("@ros2_lv/0/abc/0/0/NN/%/%/acsard",)
 
 
 def test_the_command_keys_are_the_incoming_keys_of_both_trees() -> None:
@@ -172,7 +149,7 @@ def test_the_command_keys_are_the_incoming_keys_of_both_trees() -> None:
 
 def test_transforms_that_are_switched_off_have_no_endpoint() -> None:
     odometry = OdometryConfig(publish_tf=False, gyro=True)
-    off = Config(mcu=REAL, odometry=odometry, lidar=LidarConfig(publish_tf=False), ros=DESCRIBED)
+    off = Config(mcu=REAL, odometry=odometry, lidar=LidarConfig(publish_tf=False))
     assert left_out(off) == {"tf", "tf_static"}
     endpoint_list = endpoints(RosConfig(), ZID, left_out(off))
     assert not {e.native for e in endpoint_list} & {"tf", "tf_static"}
@@ -182,20 +159,12 @@ def test_transforms_that_are_switched_off_have_no_endpoint() -> None:
     }
 
 
-def test_a_robot_without_a_urdf_has_no_robot_description() -> None:
-    config = Config(mcu=REAL, odometry=OdometryConfig(gyro=True))
-    assert left_out(config) == {"robot_description"}
-    native_keys = {e.native for e in endpoints(RosConfig(), ZID, left_out(config))}
-    assert {e.native for e in all_endpoints(RosConfig())} - native_keys == {"robot_description"}
-
-
 def test_a_gyro_from_ros_is_used_if_configured_on_a_robot_that_is_not_simulated() -> None:
     wanted = OdometryConfig(gyro=True)
-    assert left_out(Config(mcu=REAL, odometry=wanted, ros=DESCRIBED)) == set()
+    assert left_out(Config(mcu=REAL, odometry=wanted)) == set()
     for other in (
-        Config(mcu=REAL, ros=DESCRIBED),
-        Config(ros=DESCRIBED),
-        Config(odometry=wanted, ros=DESCRIBED),
+        Config(mcu=REAL),
+        Config(odometry=wanted),
     ):
         assert left_out(other) == {"imu"}
         assert not [e for e in endpoints(RosConfig(), ZID, left_out(other)) if e.native == "imu"]

@@ -145,7 +145,7 @@ def test_each_role_may_use_the_same_keys_as_at_the_gateway_of_a_robot(
     gateway = gateway_access(
         Config(
             robot=RobotConfig(id="robot1"),
-            ros=RosConfig(bridge=False, rmw=False, urdf="/etc/acsard/robot.urdf"),
+            ros=RosConfig(bridge=False, rmw=False),
             mcu=McuConfig(port="/dev/ttyACM0"),
             odometry=OdometryConfig(gyro=True),
         )
