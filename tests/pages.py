@@ -388,11 +388,6 @@ COMMANDS: dict[str, How] = {
     ),
     f"acsard web {_AWAY} --invite operator --name phone --days 30": INVITED,
     "acsard web --tls tls --address https://0.0.0.0:8443": INVITED,
-    "acsard web --connect tcp/127.0.0.1:7447 --id robot1": Elsewhere(
-        "tests/system/test_web_others.py",
-        "test_another_robot_can_be_followed_and_stopped_and_nothing_else",
-        "by a router on loopback",
-    ),
     "acsard web --tokens": COOKIE,
     "acsard web --revoke phone": COOKIE,
     "sudo /opt/acsard/venv/bin/acsard tls init": BY_THE_SERVICE,

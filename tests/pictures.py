@@ -25,7 +25,7 @@ from tests.system.chromium import DESKTOP, PHONE, SIDEWAYS, Browser, browsing
 from tests.system.harness import PLAIN, Bus, Daemon, Peer, acsard, finish, until
 from tests.unit.report.driven import two_drivers
 
-VIEWS = ("drive", "status", "events", "set", "robots")
+VIEWS = ("drive", "status", "events", "set")
 
 SIZES = {"phone": PHONE, "sideways": SIDEWAYS, "desktop": DESKTOP}
 
@@ -73,7 +73,7 @@ def _drive(bus: Bus) -> None:
 def show(browser: Browser, view: str) -> None:
     """Open this view of the page, and wait until it has contents."""
     browser.js(f"document.getElementById('tab-{view}').click()")
-    rows = {"robots": "#cards a", "set": "#settings div", "status": "#parts li"}
+    rows = {"set": "#settings div", "status": "#parts li"}
     if row := rows.get(view):
         there = f"document.querySelector({row!r}) !== null"
         until(lambda: browser.js(there), 5.0, row)
@@ -174,7 +174,7 @@ class _States:
             self.seen(browser, "stop-unconfirmed")
 
     def look_as_others(self) -> None:
-        """Show a camera, a viewer's page, a robot without a daemon, and a daemon that ends."""
+        """Show a camera, a viewer's page, an incomplete page, and a daemon that ends."""
         browser, look, tls = self.browser, self.capture, self.there / "tls"
         Authority.make(tls, "test", 1, [NAME]).issue(tls, "robot", [NAME], 1)
         with closing(Stream()) as stream:
@@ -195,8 +195,6 @@ class _States:
                 browser.tap("stop")
                 until(lambda: "invitation" in browser.text("alarm"), 5.0, "STOP is refused")
                 look("invitation-ended", "NO CONNECTION")
-                browser.open(f"{page.here}/?robot=r2")
-                look("another-robot", "WAITING")
                 browser.ask("Network.enable")
                 browser.ask("Network.setCacheDisabled", cacheDisabled=True)
                 browser.ask("Network.setBlockedURLs", urls=["*/page/map.js"])

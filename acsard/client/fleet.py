@@ -35,9 +35,8 @@ class Row(Struct, frozen=True):
     """A robot on the bus, with its id, its newest state and its version."""
 
     robot_id: str
-    here: bool | None
-    """Whether the liveliness token of the robot's daemon is present; None before any token was
-    seen."""
+    here: bool
+    """Whether the liveliness token of the robot's daemon is present."""
     state: RobotState | None
     age: float
     """Age of `state`, s; infinite before the first state that proves that the daemon runs."""
@@ -48,7 +47,7 @@ class Row(Struct, frozen=True):
 
 class _TrackedRobot:
     def __init__(self) -> None:
-        self.here: bool | None = None
+        self.here = False
         self.version = ""
         self.newest = Mailbox[tuple[zenoh.Sample, float]](1)
         """The newest published state, undecoded, with its time of arrival, s."""
@@ -63,9 +62,7 @@ class _TrackedRobot:
 class Fleet:
     """Follows several robots, or all robots on the bus, and returns a row for each."""
 
-    def __init__(
-        self, robot: Client, ids: Sequence[str], most: int = MAX_ROBOTS, forget_s: float = math.inf
-    ) -> None:
+    def __init__(self, robot: Client, ids: Sequence[str], most: int = MAX_ROBOTS) -> None:
         """Subscribe to the states and liveliness tokens of the robots. This may wait for the bus.
 
         Raises `ZError` if the session cannot subscribe.
@@ -76,10 +73,8 @@ class Fleet:
             most: Maximum number of robots. When it is reached, a new robot replaces a robot that
                 `ids` does not name and whose liveliness token is absent. If there is no such robot,
                 the new robot is left out.
-            forget_s: Time without a state, s, after which a robot is dropped. A robot that `ids`
-                names, or whose liveliness token is present, is never dropped.
         """
-        self._robot, self._ids, self._most, self._forget_s = robot, ids, most, forget_s
+        self._robot, self._ids, self._most = robot, ids, most
         self._lock = Lock()
         self.left_out = False
         """Whether a robot was left out because there were already `most` robots."""
@@ -99,14 +94,11 @@ class Fleet:
             raise
 
     def rows(self) -> list[Row]:
-        """Return a row for each robot. First drop robots that have been silent for `forget_s` s."""
+        """Return a row for each robot."""
         now = clock.steady_s()
         with self._lock:
-            for name, robot in list(self._known.items()):
+            for robot in self._known.values():
                 self._take(robot)
-                last_active = max(robot.since, robot.follower.last_seen)
-                if not robot.here and name not in self._ids and now - last_active > self._forget_s:
-                    del self._known[name]
             return [self._row(name, robot, now) for name, robot in self._known.items()]
 
     def due(self) -> list[tuple[str, str]]:
@@ -132,11 +124,6 @@ class Fleet:
             self._robot.sibling(name).start_query(
                 key, self._answer if key == "state" else self._info
             )
-
-    def is_present(self, robot_id: str) -> bool:
-        """Return whether the liveliness token of this robot's daemon is present."""
-        robot = self._known.get(robot_id)
-        return robot is not None and bool(robot.here)
 
     def end(self) -> None:
         """Unsubscribe from all robots. This may wait for the bus. Raises `ZError`."""

@@ -6,8 +6,6 @@ import math
 import time
 from collections.abc import Sequence
 
-from msgspec.structs import replace
-
 from acsard.bus.robot_discovery import ALL_ROBOTS, count_text, no_robot_text
 from acsard.client.fleet import Fleet, Row
 from acsard.core.formatting import printable, rough, signed
@@ -146,12 +144,9 @@ class Roster(Fleet):
     """The robots that `acsard fleet` shows, and the reason why robots may be missing."""
 
     def rows(self) -> list[Row]:
-        """Send the queries that are due, and return one row per robot.
-
-        If a robot was never present, `here` is False in its row. (`Fleet` sets it to None.)
-        """
+        """Send the queries that are due, and return one row per robot."""
         self.send_queries(self.due())
-        return [replace(row, here=bool(row.here)) for row in super().rows()]
+        return super().rows()
 
     def gather(self) -> list[Row]:
         """Wait for the first reports of the robots, and return one row per robot.
@@ -183,7 +178,7 @@ class Roster(Fleet):
     def presence_text(self) -> str:
         """A sentence with the number of present robots; "" if the user named robots."""
         with self._lock:
-            here = sum(bool(robot.here) for robot in self._known.values())
+            here = sum(robot.here for robot in self._known.values())
         return count_text(self._robot.where.endpoint, here) if ALL_ROBOTS in self._ids else ""
 
     @property

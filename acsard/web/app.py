@@ -22,7 +22,6 @@ from acsard.core.config.live import WHEN_TEXTS, find_live_setting, flat
 from acsard.core.config.settings import WebConfig
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.permissions import least_role
-from acsard.core.messages.schema import ServiceReply
 from acsard.core.ros.parameters import kind_of
 from acsard.core.values import Role
 from acsard.host import clock
@@ -49,16 +48,11 @@ from acsard.web.recordings import POLICY, BlackBox, Recording, Reports, ReportSt
 from acsard.web.routes import FORM, JSON, RECORDINGS_ROLE, Body, Problem, Route, services, values
 from acsard.web.socket_messages import MAX_MESSAGE_BYTES
 from acsard.web.streams import as_json
-from acsard.web.tasks import shared
 from acsard.web.tokens import Vault
 from acsard.web.viewer import PING_INTERVAL_S, Parts, Viewer
 
 BODY_TIMEOUT_S = 5.0
 """Time limit for receiving the body of a request, s. Most bodies have a few hundred bytes."""
-
-STOP_BODY_TIMEOUT_S = 0.3
-"""Time after which a stop whose body has not arrived stops the page's own robot, s. A body that
-arrives later still stops the robot that it names."""
 
 REPORT_TIMEOUT_S = 300.0
 """Time limit for sending a report to a client that does not accept gzip, s."""
@@ -280,25 +274,10 @@ class Page:
 
         The arguments of the service are the fields of the JSON object in the request's body.
         """
-        verb, who = request.path.removeprefix("/api/srv/"), request[IDENTITY_KEY]
-        call, reading = self._parts.calls.call, asyncio.create_task(_arguments_in(request))
-        own: asyncio.Task[ServiceReply] | None = None
-        try:
-            if verb == "stop":
-                await asyncio.wait([reading], timeout=STOP_BODY_TIMEOUT_S)
-                if not reading.done() or reading.exception() is not None:
-                    # No body names another robot, and a stop of the page's own robot is never
-                    # refused.
-                    own = shared(call(who, verb, {}))
-            robot, arguments = await reading
-            if own is not None and robot in ("", self._robots.id):
-                answer = await own
-            else:
-                answer = await call(who, verb, arguments, robot)
-        finally:
-            reading.cancel()
-            if own is not None:
-                await asyncio.wait([own])
+        verb, call = request.path.removeprefix("/api/srv/"), self._parts.calls.call
+        # A stop has no arguments, so it does not wait for a body.
+        arguments = {} if verb == "stop" else await _arguments_in(request)
+        answer = await call(request[IDENTITY_KEY], verb, arguments)
         return reply(answer, 200 if answer.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
@@ -357,7 +336,7 @@ class Page:
 
     async def _value(self, key: str) -> bytes:
         try:
-            return as_json(*await self._parts.calls.get(self._robots.id, key))
+            return as_json(*await self._parts.calls.get(key))
         except NoAnswerError as error:
             raise TroubleError(504, str(error)) from None
         except (MendableError, DecodeError, TimeoutError) as error:
@@ -402,21 +381,12 @@ async def _body_of(request: web.Request) -> bytes:
         ) from None
 
 
-async def _arguments_in(request: web.Request) -> tuple[str, dict[str, Any]]:
-    """Return the id of the robot ("" for the page's own robot), and the service's arguments."""
+async def _arguments_in(request: web.Request) -> dict[str, Any]:
     body = await _body_of(request)
     try:
-        arguments = msgspec.json.decode(body, type=dict[str, Any]) if body.strip() else {}
+        return msgspec.json.decode(body, type=dict[str, Any]) if body.strip() else {}
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise RequestRefusedError("malformed", f"the body must be a JSON object: {error}") from None
-    robot = arguments.pop("robot", "")
-    if not isinstance(robot, str):
-        text = (
-            "`robot` must be the id of a robot as a JSON string; for robots other than its own, "
-            "this page accepts only the service stop"
-        )
-        raise RequestRefusedError("malformed", text)
-    return robot, arguments
 
 
 async def _token_posted(request: web.Request) -> TokenForm:

@@ -1,4 +1,4 @@
-"""Sends the service calls and queries of the page's clients to robots.
+"""Sends the service calls and queries of the page's clients to the robot.
 
 Each call blocks a thread of its own. Calls of the service `stop` ("stops") have their own limits,
 so a stop never waits for other calls. If clients request several stops in quick succession, the
@@ -9,23 +9,19 @@ after the last of these requests has arrived.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Hashable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, TypeVar
 
-from acsard.bus import robot_discovery
-from acsard.bus.address import require_id
 from acsard.client import Client
 from acsard.core.incoming.queries import BUSY
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.keys_and_roles import SERVICES
 from acsard.core.messages.permissions import SERVICE_ROLES
 from acsard.core.messages.schema import ServiceReply
-from acsard.host import clock
-from acsard.host.errors import MendableError, UsageError
-from acsard.host.rate_limits import Buckets, Places
+from acsard.host.errors import MendableError
+from acsard.host.rate_limits import Places
 from acsard.host.threads import in_thread
 from acsard.web.callers import AdmittedClient, RequestRefusedError
-from acsard.web.limits import REMOTE_STOP_RATE
 from acsard.web.robots import Robots
 from acsard.web.tasks import shared
 
@@ -33,12 +29,8 @@ MAX_CALLS, MAX_STOPS = 16, 32
 """`MAX_CALLS` is the maximum number of simultaneous queries and service calls; stops do not count.
 `MAX_STOPS` is the maximum number of simultaneous stops of the page's own robot."""
 
-MAX_REMOTE_STOPS = 8
-"""The server waits for the replies to at most this many stops of other robots at the same time. It
-sends any further stop without waiting for the reply."""
-
 MIN_STOP_INTERVAL_S = 0.02
-"""Shortest interval between two stops that the server sends to one robot for one client, s."""
+"""Shortest interval between two stops that the server sends for one client, s."""
 
 ANSWER_TIMEOUT_S = 8.0
 """Time limit for an answer over the bus, s. `Client` has a shorter limit, and raises an error with
@@ -50,51 +42,34 @@ Stop = Callable[[], Awaitable[ServiceReply]]
 
 
 class Calls:
-    """Sends service calls and queries to robots, within the limits of this module."""
+    """Sends service calls and queries to the robot, within the limits of this module."""
 
-    def __init__(self, robots: Robots, is_known: Callable[[str], bool]) -> None:
-        """Create an instance that has no running calls.
-
-        `is_known` returns whether the server has found the robot with the given id on the bus.
-        """
-        self._robots, self._is_known = robots, is_known
+    def __init__(self, robots: Robots) -> None:
+        self._robots = robots
         self._stops, self._merged = Stops(), StopMerger()
-        self._unknown = Buckets(REMOTE_STOP_RATE)
-        self._answered: set[str] = set()
-        """Ids of other robots that have answered a stop, and therefore exist."""
         self._asks = Places(MAX_CALLS, MAX_CALLS)
-        self._elsewhere = Places(MAX_REMOTE_STOPS, MAX_REMOTE_STOPS)
 
     async def call(
-        self, identity: AdmittedClient, verb: str, payload: Mapping[str, Any], robot: str = ""
+        self, identity: AdmittedClient, verb: str, payload: Mapping[str, Any]
     ) -> ServiceReply:
         """Call the service `verb` for the client `identity`, and return the reply.
 
-        `robot` is the id of the robot, or "" for the page's own robot. Only `stop` may be called
-        for another robot. Raises `RequestRefusedError` if the client may not make this call, or
-        sends too many stops to robots that may not exist.
+        Raises `RequestRefusedError` if the client may not make this call.
         """
         require(identity, verb)
-        other = "" if robot == self._robots.id else robot
-        if other:
-            _require_stop(verb, other)
         client = self._robots.client
         if client is None:
             return ServiceReply(False, self._robots.gone)
 
         def request() -> ServiceReply:
-            return _named(client, other or self._robots.id, identity).request(verb, payload)
+            return _named(client, identity).request(verb, payload)
 
         async def stop() -> ServiceReply:
-            if other:
-                return await self._stop(other, client, identity, request)
             return await self._stops.send_stop(request)
 
-        if verb == "stop" and other and other not in self._answered and not self._is_known(other):
-            self._require_few(identity)
         try:
             if verb == "stop":
-                reply = await self._merged.send_stop((identity.token, other), stop)
+                reply = await self._merged.send_stop(identity.token, stop)
             else:
                 reply = await self._run_call(request)
         except (MendableError, DecodeError, TimeoutError) as error:
@@ -103,58 +78,17 @@ class Calls:
             self._robots.refresh_about()
         return reply
 
-    async def get(self, robot: str, name: str) -> tuple[str, bytes]:
-        """Query the last value of a robot's key as JSON, and return the pair (encoding, payload).
+    async def get(self, name: str) -> tuple[str, bytes]:
+        """Query the last value of a key as JSON, and return the pair (encoding, payload).
 
-        `robot` is the robot's id, and `name` is the key without the id. Raises `MendableError` if
-        there is no connection to the bus, if no answer arrives, or if `MAX_CALLS` calls and queries
-        are running already. Raises `TimeoutError` if the bus is stuck for `ANSWER_TIMEOUT_S`.
+        Raises `MendableError` if there is no connection to the bus, if no answer arrives, or if
+        `MAX_CALLS` calls and queries are running already. Raises `TimeoutError` if the bus is stuck
+        for `ANSWER_TIMEOUT_S`.
         """
         client = self._robots.client
         if client is None:
             raise MendableError(self._robots.gone)
-        return await self._run_call(lambda: client.sibling(robot).reply(f"{name}?fmt=json"))
-
-    async def _stop(
-        self,
-        robot: str,
-        client: Client,
-        identity: AdmittedClient,
-        request: Callable[[], ServiceReply],
-    ) -> ServiceReply:
-        # A robot that does not exist never replies, so the number of waiting calls is limited.
-        with self._elsewhere.place() as free:
-            if free:
-                reply = await in_thread(request, ANSWER_TIMEOUT_S)
-                if len(self._answered) < 200:
-                    self._answered.add(robot)
-                return reply
-        await in_thread(
-            lambda: robot_discovery.stop(
-                client.session, [robot], _named(client, robot, identity).caller
-            ),
-            ANSWER_TIMEOUT_S,
-        )
-        return ServiceReply(
-            False,
-            f"the stop was sent to {robot}, but the page's server does not wait for its answer, "
-            "because it already waits for the answers to too many other stops: check that the "
-            "robot has stopped",
-        )
-
-    def _require_few(self, identity: AdmittedClient) -> None:
-        """Raise `RequestRefusedError` if a client exceeds the limit `REMOTE_STOP_RATE`.
-
-        Call this for each stop of a robot that may not exist.
-        """
-        if not self._unknown.take(identity.token or identity.name, clock.mono_ns()):
-            rate = REMOTE_STOP_RATE
-            raise RequestRefusedError(
-                "too_fast",
-                "the stop was not sent: you have sent too many stops to robots that have not "
-                f"answered ({rate.burst:g} at once and {rate.hz:g} a second are allowed); send it "
-                "again",
-            )
+        return await self._run_call(lambda: client.reply(f"{name}?fmt=json"))
 
     async def _run_call(self, call: Callable[[], T]) -> T:
         with self._asks.place() as free:
@@ -164,25 +98,25 @@ class Calls:
 
 
 class StopMerger:
-    """Merges the stops that one client requests for one robot in quick succession.
+    """Merges the stops that one client requests in quick succession.
 
     The server sends the first stop immediately. All stops that the client requests within
     `MIN_STOP_INTERVAL_S` after a sent stop share the next stop. So none of them is lost.
     """
 
     def __init__(self) -> None:
-        self._rests: dict[Hashable, asyncio.Event] = {}
-        """Maps (client, robot) to an event. `MIN_STOP_INTERVAL_S` after the last sent stop, the
+        self._rests: dict[str, asyncio.Event] = {}
+        """Maps a client to an event. `MIN_STOP_INTERVAL_S` after the last sent stop, the
         event is removed from this dict and set."""
-        self._next: dict[Hashable, asyncio.Task[ServiceReply]] = {}
-        """Maps (client, robot) to the task that waits for the event in `_rests` and then sends a
+        self._next: dict[str, asyncio.Task[ServiceReply]] = {}
+        """Maps a client to the task that waits for the event in `_rests` and then sends a
         stop."""
 
-    async def send_stop(self, name: Hashable, stop: Stop) -> ServiceReply:
+    async def send_stop(self, name: str, stop: Stop) -> ServiceReply:
         """Send a stop by calling `stop`, and return the reply.
 
         If another stop with the same `name` still waits to be sent, return the reply to that stop
-        instead. `name` identifies the client and the robot.
+        instead. `name` identifies the client.
         """
         if name in self._next:
             return await asyncio.shield(self._next[name])
@@ -193,13 +127,13 @@ class StopMerger:
         self._next[name] = shared(self._later(name, rest, stop))
         return await asyncio.shield(self._next[name])
 
-    def _begin_pause(self, name: Hashable) -> None:
+    def _begin_pause(self, name: str) -> None:
         self._rests[name] = asyncio.Event()
         asyncio.get_running_loop().call_later(
             MIN_STOP_INTERVAL_S, lambda: self._rests.pop(name).set()
         )
 
-    async def _later(self, name: Hashable, rest: asyncio.Event, stop: Stop) -> ServiceReply:
+    async def _later(self, name: str, rest: asyncio.Event, stop: Stop) -> ServiceReply:
         # If the event loop is late, `rest` may be set and gone from `_rests` before this starts.
         await rest.wait()
         del self._next[name]  # later callers share the next stop
@@ -245,24 +179,8 @@ def require(caller: AdmittedClient, verb: str) -> None:
     caller.require(SERVICE_ROLES[verb], verb)
 
 
-def _require_stop(verb: str, robot: str) -> None:
-    try:
-        require_id(robot)
-    except UsageError as error:
-        raise RequestRefusedError("malformed", str(error)) from None
-    if verb != "stop":
-        raise RequestRefusedError(
-            "role",
-            f"{robot} is not this page's robot: here you can only see it and stop it; to call "
-            f"{verb}, open that robot's own page",
-        )
-
-
-def _named(client: Client, robot: str, identity: AdmittedClient) -> Client:
-    """Return a bus client for a robot, with a name that contains the name of `identity`.
-
-    The robot's daemon logs the calls of the bus client under this name.
-    """
-    other = client.sibling(robot)
+def _named(client: Client, identity: AdmittedClient) -> Client:
+    # The robot's daemon logs the calls of this client under its name.
+    other = client.sibling(client.where.robot_id)
     other.name = f"{identity.name}@page"
     return other

@@ -5,7 +5,7 @@ A network is an IPv4 address, or the /64 network of an IPv6 address (`callers.ne
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Collection, Hashable
 from typing import Generic, TypeVar
 
@@ -53,11 +53,6 @@ MAX_LOCAL_WEBSOCKETS = 20
 """Maximum number of WebSockets from the robot itself. WebSockets from other machines do not count
 here."""
 
-STREAMS, STREAMS_OF_ONE = 200, 50
-"""Maximum number of subscribed keys of other robots: in total (`STREAMS`), and per token
-(`STREAMS_OF_ONE`). The keys of the page's own robot are few and do not count."""
-
-
 REQUEST_RATE = Rate(50.0, 200.0)
 """Limit on HTTP requests per token, as a rate per second and a largest burst. The page's static
 files are exempt."""
@@ -89,11 +84,6 @@ COMMAND_RATE = Rate(60.0, 120.0)
 largest burst. The page's stick sends 20 commands a second, and the daemon accepts 1000 a second
 from this server. Before this limit existed, 24 WebSockets with 180 commands a second each made the
 daemon drop half of the commands of a client that was driving."""
-
-REMOTE_STOP_RATE = Rate(4.0, 16.0)
-"""Limit on stops of robots that may not exist, per token, as a rate per second and a largest burst.
-A robot certainly exists if this server has found it on the bus, or has received its answer to a
-stop."""
 
 GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
 """Limits on wrong tokens, from one network and in total, as rates per second and largest bursts."""
@@ -290,43 +280,3 @@ class WebSocketLimits:
             (self._tokens, token, spread),
             (self._networks, network, full),
         ]
-
-
-class Shares:
-    """Limits the number of resources in use, in total and per holder.
-
-    A resource that several holders share counts once in the total. In this server, a resource is a
-    subscription to a key of another robot. A holder is a token, or the name of a client without a
-    token.
-    """
-
-    def __init__(self, most: int, of_one: int) -> None:
-        self._most, self._of_one = most, of_one
-        self._acquired: defaultdict[Hashable, Counter[str]] = defaultdict(Counter)
-        """For each resource, the number of times that each holder has acquired it."""
-
-    def enter(self, holder: str, thing: Hashable) -> bool:
-        """Acquire the resource `thing` for `holder`, and return True.
-
-        Return False if the limits forbid it. A holder may acquire the same resource several times,
-        and must then call `leave` the same number of times.
-        """
-        holders = self._acquired.get(thing)
-        if holders is None and len(self._acquired) >= self._most:
-            return False
-        if not (holders and holder in holders) and self._of(holder) >= self._of_one:
-            return False
-        self._acquired[thing][holder] += 1
-        return True
-
-    def leave(self, holder: str, thing: Hashable) -> None:
-        """Release the resource `thing`. This undoes one successful call of `enter`."""
-        holders = self._acquired[thing]
-        holders[holder] -= 1
-        if not holders[holder]:
-            del holders[holder]
-        if not holders:
-            del self._acquired[thing]
-
-    def _of(self, holder: str) -> int:
-        return sum(holder in holders for holders in self._acquired.values())

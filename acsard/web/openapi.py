@@ -32,7 +32,7 @@ VALUE_PREFIX = "Value."
 
 SENT_MESSAGES = (
     socket_messages.Hello, socket_messages.DrivenPath, socket_messages.LastMinute,
-    socket_messages.Answer, socket_messages.Rows, socket_messages.Pong, socket_messages.Refused,
+    socket_messages.Answer, socket_messages.Pong, socket_messages.Refused,
     socket_messages.DaemonUnreachable,
 )  # fmt: skip
 
@@ -58,7 +58,6 @@ def _value(key: str, kind: str) -> type[Struct]:
         [
             ("value", _raw({"anyOf": [_ref(kind), {"type": "null"}]})),
             ("age", Annotated[float, Meta(ge=0, description="ms")]),
-            ("robot", Annotated[str, Meta(description="absent for the page's own robot")], ""),
         ],
         namespace={
             "__doc__": "The newest message of this Zenoh key; null if the message is not readable."

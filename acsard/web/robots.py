@@ -215,7 +215,7 @@ class Robots:
         Return None if no viewer is subscribed to `cmd_vel_out`, if the newest twist is older than
         2 s, or if it cannot be decoded.
         """
-        stream = self.streams.followed(self.id, "cmd_vel_out")
+        stream = self.streams.followed("cmd_vel_out")
         raw = None if stream is None else stream.raw()
         # A twist that is older than 2 s does not belong to the row that is plotted now.
         if stream is None or raw is None or now_ns - stream.at_ns > 2 * NS_PER_S:
@@ -227,7 +227,7 @@ class Robots:
 
     async def _truth(self) -> Stream:
         assert self.client is not None
-        return await self.streams.follow(self.client, self.id, "sim/pose")
+        return await self.streams.follow(self.client, "sim/pose")
 
     def _take_truth(self, truth: Stream, now_ns: int) -> None:
         raw = truth.raw()

@@ -34,12 +34,6 @@ matches any text without a slash."""
 _PARAMETER = re.compile(r"{(\w+)}")
 
 
-class Which(Struct, frozen=True):
-    """The robot to stop, by its id; "" is the page's own robot."""
-
-    robot: str = ""
-
-
 class Problem(Struct, frozen=True):
     """Why a request was not fulfilled, in words."""
 
@@ -118,7 +112,7 @@ def services(handler: Handler) -> Iterator[Route]:
     notes = {topic.key: topic.note for topic in TOPICS}
     for key, verb in VERBS.items():
         # The daemon decodes the payload, so a refusal contains the daemon's message.
-        takes = Which if verb == "stop" else SERVICES[verb].payload or None
+        takes = SERVICES[verb].payload or None
         gives = {
             200: Body("The service call succeeded.", "ServiceReply"),
             409: Body("The service call failed; the reason is in the answer.", "ServiceReply"),

@@ -62,21 +62,19 @@ class _Frame(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Subscribe(_Frame, frozen=True):
-    """Subscribe to a key of a robot.
+    """Subscribe to a key of the robot.
 
     The server then sends each new value of this key, but at most `rate` values per second.
     """
 
     subscribe: Short
     rate: float = USUAL_RATE
-    robot: Short = ""
 
 
 class Unsubscribe(_Frame, frozen=True):
-    """End the subscription to a key of a robot."""
+    """End the subscription to a key of the robot."""
 
     unsubscribe: Short
-    robot: Short = ""
 
 
 class Wish(_Frame, frozen=True):
@@ -112,12 +110,11 @@ class Command(_Frame, frozen=True):
 
 
 class Call(_Frame, frozen=True):
-    """Call a service of a robot. The server's answer contains the `id` of the call."""
+    """Call a service of the robot. The server's answer contains the `id` of the call."""
 
     call: Short
     id: int | Short = 0
     payload: dict[str, Any] = {}
-    robot: Short = ""
 
 
 class Ping(_Frame, frozen=True):
@@ -156,20 +153,16 @@ def decode(text: str) -> Frame:
     return frame
 
 
-def asks_to_stop(text: str, robot: str) -> bool:
-    """Return whether a message asks the robot with the id `robot` to stop, even if it is not valid.
+def asks_to_stop(text: str) -> bool:
+    """Return whether a message asks the robot to stop, even if it is not valid.
 
-    The message must be a JSON object with `call` = "stop". Every other defect is ignored. The
-    message asks another robot if its field `robot` is a text that is neither empty nor `robot`.
+    The message must be a JSON object with `call` = "stop". Every other defect is ignored.
     """
     try:
-        # Decode only the two fields that matter, because any other field may be invalid.
-        fields = _heads.decode(text)
-        call, other = bytes(fields.get("call", b"")), bytes(fields.get("robot", b""))
-        named = other.startswith(b'"') and msgspec.json.decode(other) not in ("", robot)
+        # Decode only the field that matters, because any other field may be invalid.
+        return bytes(_heads.decode(text).get("call", b"")) == b'"stop"'
     except (msgspec.MsgspecError, ValueError, RecursionError):
         return False
-    return call == b'"stop"' and not named
 
 
 def _require(frame: Frame) -> None:
@@ -239,38 +232,6 @@ class Answer(Struct, frozen=True):
     answer: int | str
     ok: bool
     text: str
-
-
-class Row(Struct, frozen=True):
-    """One robot of the fleet."""
-
-    robot: str
-    mode: str | None
-    """Mode of the robot, as in `state`. It is "gone" after the daemon has ended, and None while the
-    robot is silent."""
-    reason: str
-    speed: float | None
-    """Measured forward speed, m/s."""
-    link: str
-    age: float | None
-    """Time since the last state of the robot arrived, s; None before the first state."""
-    version: str
-    """Version of the daemon; "" until it is reported."""
-    warnings: Sequence[str] = ()
-    """Warnings of the robot, in words. A robot with warnings may still be ready."""
-    place: Sequence[float] | None = None
-    """Pose in the odom frame: x and y, m, and yaw, rad. None while the robot is silent or gone."""
-    battery: str = ""
-    """State of charge or, if it is unknown, the voltage, in words; "" if neither is known."""
-
-
-class Rows(Struct, frozen=True):
-    """List of all robots that this server has found on the bus."""
-
-    fleet: Sequence[Row]
-    note: str
-    """Reason why the list of robots may be incomplete, in words. It is "" if the page's server is
-    connected to a router, because the list then contains all robots of this router."""
 
 
 class Pong(Struct, frozen=True):

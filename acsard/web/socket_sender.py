@@ -15,13 +15,11 @@ import aiohttp
 import msgspec
 from aiohttp import web
 
-from acsard.bus.address import require_id
 from acsard.host import clock
-from acsard.host.errors import UsageError
 from acsard.host.rate_limits import Buckets, Rate
 from acsard.web.answers import cut
 from acsard.web.callers import Reason
-from acsard.web.limits import MAX_UNREAD_BYTES, STREAMS, STREAMS_OF_ONE, Shares
+from acsard.web.limits import MAX_UNREAD_BYTES
 from acsard.web.metrics import Counts
 from acsard.web.robots import RETRY_DELAY_S, Robots
 from acsard.web.socket_messages import Refused, Subscribe, Unsubscribe
@@ -35,14 +33,10 @@ limit applies to each kind of message and each reason separately."""
 class Following:
     """A key to which the client is subscribed, and the time at which to send its next value."""
 
-    def __init__(self, robot: str, name: str, own: str, period: float) -> None:
-        """Create a subscription to the key `name` of the robot with the id `robot`.
-
-        The client gets at most one value per `period` s. `own` is the id of the page's own robot.
-        """
-        self.robot, self.name, self.period = robot, name, period
-        head = {"key": name} if robot == own else {"key": name, "robot": robot}
-        self.head = msgspec.json.encode(head)[:-1] + b',"value":'
+    def __init__(self, name: str, period: float) -> None:
+        """Create a subscription to the key `name`, with at most one value per `period` s."""
+        self.name, self.period = name, period
+        self.head = msgspec.json.encode({"key": name})[:-1] + b',"value":'
         self.stream: Stream | None = None
         self.sent = 0
         self.due = 0.0
@@ -60,8 +54,8 @@ class Outgoing:
         """
         self._socket, self._transport, self._counts = socket, request.transport, counts
         self._origin = origin
-        self.following: dict[tuple[str, str], Following] = {}
-        """Subscribed keys by (robot, key)."""
+        self.following: dict[str, Following] = {}
+        """Subscriptions by key."""
         # The queue is limited, because the client may have stopped reading.
         self._out: deque[bytes] = deque(maxlen=200)
         self._pong: bytes | None = None
@@ -179,8 +173,6 @@ class Outgoing:
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
 
 
-MAX_SUBSCRIBED_KEYS = 32
-
 MAX_FRAMES_HZ = 300.0
 """Maximum sum of the message rates of all keys of one WebSocket, Hz. A higher sum would take
 processor time from the commands."""
@@ -189,9 +181,7 @@ processor time from the commands."""
 class Keys:
     """The subscriptions of one WebSocket, which its outgoing side `out` stores.
 
-    The function `start` starts a task, which ends with the WebSocket. `holder` is the name under
-    which the limits count the subscriptions: the client's token, or the name of a client without a
-    token.
+    The function `start` starts a task, which ends with the WebSocket.
     """
 
     def __init__(
@@ -199,38 +189,27 @@ class Keys:
         out: Outgoing,
         robots: Robots,
         start: Callable[[Coroutine[Any, Any, None]], None],
-        holder: str,
     ) -> None:
-        self._out, self._robots, self._start, self._holder = out, robots, start, holder
+        self._out, self._robots, self._start = out, robots, start
 
     def subscribe(self, frame: Subscribe) -> None:
         """Subscribe to a key, or change the rate of a key that is subscribed already.
 
         If the message is not valid or exceeds a limit, report the reason to the client instead.
         """
-        robot, key = frame.robot or self._robots.id, frame.subscribe
-        known = self._out.following.get((robot, key))
-        if (refusal := self._enter(robot, key, frame.rate, known)) is not None:
+        key = frame.subscribe
+        known = self._out.following.get(key)
+        if (refusal := self._refusal(key, frame.rate, known)) is not None:
             self._out.refuse("subscribe", *refusal)
         elif known is not None:
             known.period, known.due = 1.0 / frame.rate, 0.0
             self._out.wake()
         else:
-            subscription = Following(robot, key, self._robots.id, 1.0 / frame.rate)
-            self._out.following[robot, key] = subscription
+            subscription = Following(key, 1.0 / frame.rate)
+            self._out.following[key] = subscription
             self._start(self._join(subscription))
 
-    def _enter(
-        self, robot: str, key: str, rate: float, known: Following | None
-    ) -> tuple[Reason, str] | None:
-        """Count a subscription. If it is not valid or exceeds a limit, return the refusal instead.
-
-        `known` is the present subscription to the key, if there is one. It is not counted again.
-        """
-        try:
-            require_id(robot)
-        except UsageError as error:
-            return "malformed", str(error)
+    def _refusal(self, key: str, rate: float, known: Following | None) -> tuple[Reason, str] | None:
         if key not in VIEWER_KEYS:
             keys = ", ".join(sorted(VIEWER_KEYS))
             return "malformed", f"{key!r} is not a key to follow; choose one of {keys}"
@@ -241,23 +220,11 @@ class Keys:
                 f"the rates of your keys add up to more than {MAX_FRAMES_HZ:g} messages a second: "
                 "lower some of them"
             )
-        if known is not None:
-            return None
-        if len(following) >= MAX_SUBSCRIBED_KEYS:
-            return "too_many", (
-                f"you already follow {MAX_SUBSCRIBED_KEYS} keys: unsubscribe from some"
-            )
-        if robot != self._robots.id and not self._shares.enter(self._holder, (robot, key)):
-            return "too_many", (
-                f"one token may follow at most {STREAMS_OF_ONE} keys of other robots, and all "
-                f"tokens together at most {STREAMS}: unsubscribe from some"
-            )
         return None
 
     def unsubscribe(self, frame: Unsubscribe) -> None:
-        name = frame.robot or self._robots.id, frame.unsubscribe
         # Remove the key immediately, because the client's next message may subscribe to it again.
-        subscription = self._out.following.pop(name, None)
+        subscription = self._out.following.pop(frame.unsubscribe, None)
         if subscription is not None:
             self._leave(subscription)
 
@@ -266,15 +233,9 @@ class Keys:
         for subscription in followed.values():
             self._leave(subscription)
 
-    @property
-    def _shares(self) -> Shares:
-        return self._robots.streams.shares
-
     def _leave(self, subscription: Following) -> None:
-        if subscription.robot != self._robots.id:
-            self._shares.leave(self._holder, (subscription.robot, subscription.name))
         if subscription.stream is not None:
-            self._robots.streams.leave(subscription.robot, subscription.name)
+            self._robots.streams.leave(subscription.name)
 
     async def _join(self, subscription: Following) -> None:
         stream = None
@@ -283,7 +244,7 @@ class Keys:
         if stream is None:
             return
         if not self._is_followed(subscription):  # the viewer unsubscribed during the wait
-            self._robots.streams.leave(subscription.robot, subscription.name)
+            self._robots.streams.leave(subscription.name)
             return
         subscription.stream = stream
         self._out.wake()
@@ -294,7 +255,7 @@ class Keys:
             await asyncio.sleep(0.2)
             return None
         try:
-            return await self._robots.streams.follow(client, subscription.robot, subscription.name)
+            return await self._robots.streams.follow(client, subscription.name)
         except NOT_READY_ERRORS:
             self._out.refuse(
                 "subscribe", "stuck", "the Zenoh bus is stuck; the page tries again by itself"
@@ -303,4 +264,4 @@ class Keys:
             return None
 
     def _is_followed(self, subscription: Following) -> bool:
-        return self._out.following.get((subscription.robot, subscription.name)) is subscription
+        return self._out.following.get(subscription.name) is subscription

@@ -22,26 +22,21 @@ from acsard.core.messages.keys_and_roles import FOLLOWED
 from acsard.host import clock
 from acsard.host.errors import UsageError
 from acsard.host.threads import in_thread
-from acsard.web.limits import STREAMS, STREAMS_OF_ONE, Shares
 from acsard.web.tasks import start
 
 Take = Callable[[zenoh.Sample], None]
 
 VIEWER_KEYS = frozenset(topic.key for topic in FOLLOWED)
-"""Keys of a robot to which a viewer may subscribe."""
+"""Keys to which a viewer may subscribe."""
 
 DECLARE_TIMEOUT_S = 3.0
-
-STORED_KEYS = ("state", "odom")
-"""Keys that the server queries only for the page's own robot. For another robot, a router's storage
-could answer with an old value, even a week after the robot was switched off."""
 
 NOT_READY_ERRORS = (TimeoutError, zenoh.ZError, UsageError)
 """Errors that mean that the bus is stuck or the session is closed. A later attempt may succeed."""
 
 
 class Stream:
-    """The newest message on one key of one robot."""
+    """The newest message on one key of the robot."""
 
     def __init__(self) -> None:
         self._taking = threading.Lock()
@@ -94,69 +89,59 @@ class Stream:
 
 
 class Streams:
-    """Subscriptions to keys of robots.
+    """Subscriptions to keys of the robot.
 
     All users of a key share one subscription on the bus, which ends when the last user leaves.
     """
 
     def __init__(self) -> None:
-        self._streams: dict[tuple[str, str], Stream] = {}
+        self._streams: dict[str, Stream] = {}
         self._ending: set[asyncio.Task[None]] = set()
-        self.shares = Shares(STREAMS, STREAMS_OF_ONE)
-        """Limits on the subscriptions to keys of other robots. For such a key, the caller must call
-        `shares.enter()` before each `follow()`, and `shares.leave()` together with each `leave()`.
-        """
 
-    async def follow(self, client: Client, robot: str, key: str) -> Stream:
-        """Return the stream of a robot's key. Subscribe to the key if it has no user yet.
+    async def follow(self, client: Client, key: str) -> Stream:
+        """Return the stream of a key. Subscribe to the key if it has no user yet.
 
         The caller must call `leave` after use. Raises one of `NOT_READY_ERRORS` if the bus is stuck
         or closed.
         """
-        name = robot, key
-        stream = self._streams.get(name)
+        stream = self._streams.get(key)
         if stream is None:
-            stream = self._streams[name] = Stream()
+            stream = self._streams[key] = Stream()
         stream.users += 1
         try:
             async with stream.lock:
                 if stream.declared is None:
-                    stream.declared = await self._declare(client, robot, key, stream)
+                    stream.declared = await self._declare(client, key, stream)
         except BaseException:
-            self.leave(robot, key)
+            self.leave(key)
             raise
         return stream
 
-    def followed(self, robot: str, key: str) -> Stream | None:
-        """Return the stream of a robot's key, or None if the key has no user."""
-        return self._streams.get((robot, key))
+    def followed(self, key: str) -> Stream | None:
+        """Return the stream of a key, or None if the key has no user."""
+        return self._streams.get(key)
 
-    def leave(self, robot: str, key: str) -> None:
-        """Remove one user of the stream of a robot's key.
+    def leave(self, key: str) -> None:
+        """Remove one user of the stream of a key.
 
         If no user is left, end the subscription in the background.
         """
-        stream = self._streams.get((robot, key))
+        stream = self._streams.get(key)
         if stream is None:
             return
         stream.users -= 1
         if stream.users:
             return
-        del self._streams[robot, key]
+        del self._streams[key]
         if stream.declared is not None:
             start(attempt(stream.declared.undeclare), self._ending)
 
-    async def _declare(self, own: Client, robot: str, key: str, stream: Stream) -> Any:
-        client = own.sibling(robot)
-        asks = key not in STORED_KEYS or own.key(key) == client.key(key)
-
+    async def _declare(self, client: Client, key: str, stream: Stream) -> Any:
         def of_it(take: Take) -> Take:
             return lambda sample: take(sample) if has_exact_key(client.key(key), sample) else None
 
         def declare() -> Any:
             subscription = client.listen(key, of_it(stream.take))
-            if not asks:
-                return subscription
             try:
                 # The query gives a first value soon, even if the key is published rarely.
                 client.start_query(key, of_it(stream.answered))

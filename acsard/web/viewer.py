@@ -27,7 +27,6 @@ from acsard.host.rate_limits import Bucket, Buckets
 from acsard.web import socket_messages
 from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.calls import Calls
-from acsard.web.fleet_rows import FleetTracker
 from acsard.web.limits import COMMAND_RATE, MAX_OVERRUNS, MESSAGE_RATE
 from acsard.web.metrics import Counts
 from acsard.web.robots import Robots
@@ -59,11 +58,6 @@ PING_INTERVAL_S = 10.0
 a ping within half of this time."""
 
 MAX_OPEN_CALLS = 8
-
-FLEET, FLEET_S, FLEET_FIRST_S = "fleet", 1.0, 0.2
-"""`FLEET` is the name to which a client subscribes for the list of all robots. The server sends the
-list every `FLEET_S` s, and for the first time `FLEET_FIRST_S` s after the subscription. Without
-this delay, the first list would be empty."""
 
 
 class ViewerCommands:
@@ -122,8 +116,7 @@ class Parts:
     def __init__(self, robots: Robots, counts: Counts) -> None:
         self.robots, self.counts = robots, counts
         self.commands = ViewerCommands(lambda: robots.client, counts)
-        self.fleet = FleetTracker(robots)
-        self.calls = Calls(robots, self.fleet.sees)
+        self.calls = Calls(robots)
 
 
 class Viewer:
@@ -140,7 +133,7 @@ class Viewer:
     ) -> None:
         self.who, self._camera = who, camera
         self._robots, self._commands, self._calls = parts.robots, parts.commands, parts.calls
-        self._fleet, self._counts = parts.fleet, parts.counts
+        self._counts = parts.counts
         whole = sender_id(who.name)
         self._sender, self._commanders = CommandSigner(whole), dict[str, Commander]()
         self.sender = public_name(whole, parts.robots.certificate)
@@ -150,14 +143,13 @@ class Viewer:
         self._bucket = Bucket(MESSAGE_RATE)
         self._overruns = self._calling = 0
         self._out = Outgoing(socket, request, parts.counts, who.origin)
-        self._keys = Keys(self._out, parts.robots, self._start, who.token or who.name)
+        self._keys = Keys(self._out, parts.robots, self._start)
         self._tasks: set[asyncio.Task[None]] = set()
         self._stops: set[asyncio.Task[None]] = set()
         self._ended = False
         self._stamp_ns = -1
         """Stamp of the last command, ns since 1970; -1 before the first command."""
         self._unreachable_reason, self._about = "", parts.robots.about
-        self._fleet_due: float | None = None
 
     async def run(self) -> None:
         self._greet()
@@ -174,7 +166,6 @@ class Viewer:
             for task in list(self._tasks):
                 task.cancel()
             self._keys.leave_all()
-            self._fleet.leave(self)
 
     def end(self, why: str) -> None:
         """Stop the robot if this viewer may still be driving it, and close the connection.
@@ -208,7 +199,7 @@ class Viewer:
             frame = decode(message.data)
         except FrameError as error:
             self._out.refuse(error.about, "malformed", str(error))
-            if asks_to_stop(message.data, self._robots.id):
+            if asks_to_stop(message.data):
                 self._obey(Call("stop"))
         else:
             # A message that ends a drive or stops the robot is obeyed even beyond the limit.
@@ -248,9 +239,9 @@ class Viewer:
                 now = clock.now().wall_ns / 1e6
                 self._out.enqueue(socket_messages.Pong(frame.ping, now))
             case Subscribe():
-                self._subscribe(frame)
+                self._keys.subscribe(frame)
             case Unsubscribe():
-                self._unsubscribe(frame)
+                self._keys.unsubscribe(frame)
 
     def _command(self, frame: Command) -> None:
         if frame.source not in self._robots.about.timeouts:
@@ -307,7 +298,7 @@ class Viewer:
 
     async def _answer(self, frame: Call) -> None:
         try:
-            reply = await self._calls.call(self.who, frame.call, frame.payload, frame.robot)
+            reply = await self._calls.call(self.who, frame.call, frame.payload)
             ok, text = reply.success, reply.message
         except RequestRefusedError as error:
             self._counts.refuse(error.reason, self.who.origin)
@@ -316,20 +307,6 @@ class Viewer:
             if frame.call != "stop":
                 self._calling -= 1
         self._out.enqueue(socket_messages.Answer(frame.id, ok, text))
-
-    def _subscribe(self, frame: Subscribe) -> None:
-        if frame.subscribe == FLEET:
-            self._fleet_due = asyncio.get_running_loop().time() + FLEET_FIRST_S
-            self._fleet.join(self)
-        else:
-            self._keys.subscribe(frame)
-
-    def _unsubscribe(self, frame: Unsubscribe) -> None:
-        if frame.unsubscribe == FLEET:
-            self._fleet_due = None
-            self._fleet.leave(self)
-        else:
-            self._keys.unsubscribe(frame)
 
     # Outgoing messages.
 
@@ -363,9 +340,6 @@ class Viewer:
                 self._out.enqueue(socket_messages.DaemonUnreachable(self._unreachable_reason))
         if self._robots.about is not self._about:
             self._greet()
-        if self._fleet_due is not None and now >= self._fleet_due:
-            self._fleet_due = now + FLEET_S
-            self._out.enqueue(socket_messages.Rows(self._fleet.rows(), self._fleet.note))
         return now + 0.25
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:

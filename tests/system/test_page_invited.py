@@ -156,13 +156,3 @@ def test_a_link_with_fewer_permissions_is_used_only_after_a_question(
         assert browser.js("location.hash") == ""
     finally:
         browser.ask("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])
-
-
-def test_the_link_of_another_robot_still_names_it_after_the_invitation_was_accepted(
-    stranger: Stranger,
-) -> None:
-    """The page reads the robot from the URL, and STOP over HTTP must reach that robot."""
-    browser, token = stranger.browser, stranger.server.invite("operator", "phone")
-    browser.open(f"{stranger.server.away}/?robot=other#token={token}")
-    until(lambda: "token" not in browser.js("location.href"), 15.0, "the token is used")
-    assert browser.js("location.search") == "?robot=other"

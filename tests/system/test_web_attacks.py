@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import aiohttp
 import pytest
@@ -40,10 +40,8 @@ from tests.system.harness import (
     Bus,
     Daemon,
     Periods,
-    cpu_seconds,
     resident_kb,
     until,
-    waited_for_a_core,
 )
 
 pytestmark = pytest.mark.network
@@ -656,63 +654,6 @@ async def test_a_connection_with_a_valid_cookie_is_kept_from_its_first_file_on(
         for tcp_socket in idle:
             tcp_socket.close()
         writer.transport.abort()
-
-
-TICK_S = 0.01
-VIEWERS, A_SECOND, LASTS_S = 6, 190, 3.0
-
-
-class Cost(NamedTuple):
-    """The cost of the messages that all clients send in one part of the test."""
-
-    cpu_s: float
-    """Processor time of the page and the daemon."""
-    missed: int
-    """Periods that the control loop missed."""
-    waited: float
-    """Periods for which the control loop waited for a core."""
-
-
-@pytest.mark.nightly
-async def test_stops_of_robots_that_do_not_exist_cost_no_more_than_pings_and_no_periods(
-    table: Table, bus: Bus, tokens: dict[str, str]
-) -> None:
-    """Viewers send nothing, then pings, then stops, each as often as their rate limit allows."""
-    page, daemon = table.page.pid, table.daemon.pid
-
-    async def told(number: int, what: str) -> None:
-        async with hands(table.page, tokens["viewer"]) as theirs:
-            reading = asyncio.create_task(_drained(theirs))
-            begun = time.monotonic()
-            for n in range(round(A_SECOND * LASTS_S)):
-                if what == "stops":
-                    await theirs.say(call="stop", id=n, robot=f"nobody{number}{n}")
-                elif what == "pings":
-                    await theirs.say(ping=n)
-                await asyncio.sleep(max(0.0, begun + n / A_SECOND - time.monotonic()))
-            reading.cancel()
-
-    async def wave(what: str) -> Cost:
-        before, waited = bus.state(), waited_for_a_core(daemon)
-        spent = cpu_seconds(page) + cpu_seconds(daemon)
-        await asyncio.gather(*(told(number, what) for number in range(VIEWERS)))
-        spent = cpu_seconds(page) + cpu_seconds(daemon) - spent
-        waited = waited_for_a_core(daemon) - waited
-        return Cost(spent, Periods.between(before, bus.state()).missed, waited / TICK_S)
-
-    kinds = ("nothing", "pings", "stops")
-    waves = [(kind, await wave(kind)) for kind in kinds * 2]
-    quiet, pings, stops = (
-        Cost(*map(sum, zip(*(cost for kind, cost in waves if kind == wanted), strict=True)))
-        for wanted in kinds
-    )
-    for kind, cost in zip(kinds, (quiet, pings, stops), strict=True):
-        print(f"\nviewers send {kind}: {50 * cost.cpu_s / LASTS_S:.0f} % of a core, "
-              f"{cost.missed} periods missed, {cost.waited:.1f} waited for a core")  # fmt: skip
-    assert stops.cpu_s < 2 * pings.cpu_s
-    assert stops.missed <= pings.missed + 2
-    # Other work on the machine may come in one wave and not in the other.
-    assert stops.missed <= quiet.missed + stops.waited + 2
 
 
 async def _drained(ours: Hands) -> None:

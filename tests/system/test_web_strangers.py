@@ -263,30 +263,6 @@ async def test_a_client_with_too_many_connections_shuts_out_no_other_at_its_addr
     assert page.refused()["too_many"] == counted + refused
 
 
-async def test_a_client_with_the_most_subscriptions_does_not_take_those_of_others(
-    page: Page, bus: Bus, viewer: str, operator: str
-) -> None:
-    async with AsyncExitStack() as stack:
-        refused = 0
-        for n in range(MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK):
-            greedy = await stack.enter_async_context(hands(page, viewer))
-            for k in range(30):
-                await greedy.say(subscribe="state", robot=f"r{n}_{k}", rate=1)
-            await greedy.say(subscribe="state")
-            await greedy.say(ping=n)
-            await greedy.find(lambda frame: "pong" in frame)
-            refused += any(reply.get("refused") == "subscribe" for reply in greedy.heard)
-        # Of 50, the second connection had the last 20.
-        assert refused == MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK - 1
-        ours = await stack.enter_async_context(hands(page, operator))
-        await ours.say(subscribe="state", robot="r9")
-        await ours.say(subscribe="state")
-        await ours.state(lambda state: state["mode"])
-        await ours.say(ping=1)
-        await ours.find(lambda frame: "pong" in frame)
-        assert not [reply for reply in ours.heard if "refused" in reply]
-
-
 def test_bytes_that_are_not_a_request_get_a_json_error(page: Page, bus: Bus) -> None:
     counted = page.refused()
     port = int(page.here.rpartition(":")[2])

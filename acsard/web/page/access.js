@@ -14,7 +14,7 @@ export async function invited(waiting) {
   for (let replace = false; ; ) {
     const { status, error } = await shown(token, replace);
     if (status === 409 && !replace && (replace = confirm(`${error}. Use the link anyway?`))) continue;
-    if (status && status < 500 && status !== 429) history.replaceState(null, "", location.pathname + location.search);
+    if (status && status < 500 && status !== 429) history.replaceState(null, "", location.pathname);
     if (status === 409) return "";
     if (status === 401) return "this invitation is not valid: it has expired, was revoked, or is incomplete. Ask for a new one (acsard web --invite)";
     if (status && status < 500) return error;
@@ -53,20 +53,18 @@ export function barred(hello, what) {
   return hello ? (hello.barred[what] ?? "") : "no connection yet";
 }
 
-/** Return the hint at the stick while it is not held: how to drive, or why this user cannot. `other` is the
- *  id of a robot that is not the page's own. */
-export function hint(hello, other) {
-  if (other) return `To drive ${other}, open its own page.`;
+/** Return the hint at the stick while it is not held: how to drive, or why this user cannot. */
+export function hint(hello) {
   return barred(hello, "drive") ? "You may watch and stop, but not drive." : "Hold and push to drive; release to stop.";
 }
 
-/** Disable the controls that this client may not use and explain why, on the control and in its description. If
- *  `reason` is not "", all controls are disabled for this reason. `needless` maps each control that would change
- *  nothing now to the reason. `hello` is undefined while no robot has answered. */
-export function permit(hello, reason = "", needless = {}) {
-  document.getElementById("barred").textContent = reason || barred(hello, "drive");
+/** Disable the controls that this client may not use and explain why, on the control and in its description.
+ *  `needless` maps each control that would change nothing now to the reason. `hello` is undefined while no robot has
+ *  answered. */
+export function permit(hello, needless = {}) {
+  document.getElementById("barred").textContent = barred(hello, "drive");
   for (const one of document.querySelectorAll("[data-does]")) {
-    const why = reason || barred(hello, one.dataset.does) || needless[one.dataset.does] || "";
+    const why = barred(hello, one.dataset.does) || needless[one.dataset.does] || "";
     if ("disabled" in one) one.disabled = Boolean(why);
     else one.setAttribute("aria-disabled", String(Boolean(why)));
     one.title = why;

@@ -42,17 +42,15 @@ export class Link extends EventTarget {
     return Math.max(this.way ?? 0, this.#asked === null ? 0 : performance.now() - this.#asked);
   }
 
-  /** Subscribe to a key with at most `rate` messages a second, again after each reconnection. `robot` is the id of a
-   *  robot other than the page's own. */
-  subscribe(key, rate, robot) {
-    const asked = { subscribe: key, rate, robot };
+  /** Subscribe to a key with at most `rate` messages a second, again after each reconnection. */
+  subscribe(key, rate) {
+    const asked = { subscribe: key, rate };
     this.#wanted.set(key, asked);
     this.send(asked);
   }
 
   unsubscribe(key) {
-    const asked = this.#wanted.get(key);
-    if (this.#wanted.delete(key)) this.send({ unsubscribe: key, robot: asked.robot });
+    if (this.#wanted.delete(key)) this.send({ unsubscribe: key });
   }
 
   /** Send a message if the connection is open and not congested, and return whether it was sent. Nothing is
@@ -68,14 +66,13 @@ export class Link extends EventTarget {
     if (this.open) this.#socket.send(JSON.stringify(message));
   }
 
-  /** Call a service of the page's robot, or of `robot` if it is given. Resolves to the answer; if there is none, to an
-   *  answer with `lost` and the reason. */
-  call(verb, payload, robot) {
+  /** Call a service of the robot. Resolves to the answer; if there is none, to an answer with `lost` and the reason. */
+  call(verb, payload) {
     const id = ++this.#number;
     return new Promise((done) => {
       const given = setTimeout(() => this.#unanswered(id, "no answer within 3 s"), 3000);
       this.#answers.set(id, (told) => (clearTimeout(given), done(told)));
-      if (this.open) this.urge({ call: verb, payload, id, robot });
+      if (this.open) this.urge({ call: verb, payload, id });
       else this.#unanswered(id, "no connection to the robot");
     });
   }
@@ -115,7 +112,7 @@ export class Link extends EventTarget {
       this.#asked = null;
     } else if ("answer" in message) this.#answer(message);
     else if ("key" in message) this.#tell(`key:${message.key}`, message);
-    else for (const kind of ["hello", "path", "minute", "fleet", "refused", "gone"]) if (kind in message) this.#tell(kind, message);
+    else for (const kind of ["hello", "path", "minute", "refused", "gone"]) if (kind in message) this.#tell(kind, message);
   }
 
   #answer(message) {

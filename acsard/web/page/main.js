@@ -10,7 +10,7 @@ import { Minute } from "./plots.js";
 import { Recordings } from "./recordings.js";
 import { Settings } from "./settings.js";
 import * as views from "./views.js";
-import { RELEASE, figure, milliseconds, named, person, said as clickable, spot, yaw } from "./words.js";
+import { RELEASE, figure, named, person, said as clickable, spot, yaw } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 const { stopping } = window; // of stop.js, which has run before
@@ -19,11 +19,8 @@ if (!stopping) {
   views.text("alarm", "STOP does not work here, because a part of this page did not run. Reload the page.");
   throw new Error("stop.js did not run, and a page without STOP does not drive");
 }
-/** Id of another robot that this page shows. It can be watched and stopped here; its own page drives and
- *  configures it. */
-const OTHER = new URLSearchParams(location.search).get("robot") || undefined;
-const VIEWS = ["drive", "status", "events", "set", "robots"];
-const words = (told) => clickable(named(told), OTHER);
+const VIEWS = ["drive", "status", "events", "set"];
+const words = (told) => clickable(named(told));
 const READ = 8000; // time that a person needs to read a message, ms
 const LATCHED = ["stopped", "fault"];
 const ON = { activate: "the robot is already on" };
@@ -59,13 +56,10 @@ let complaint = { why: "", at: 0 }; // the message about a button and its time, 
 let offer = ""; // the mode and the latch that the release button ends, "" while it is hidden
 let settling = 0; // time at which `offer` changed or the release button was last clicked, by performance.now()
 let down = null; // time at which a finger came down on the release button
-let period = 0; // usual seconds between two states of another robot
-let before = 0; // seconds between the last two of them
 
-/** Return whether this page has the view Settings. The settings of another robot are on that robot's own page, and a
- *  user with the role viewer may not change any. */
+/** Return whether this page has the view Settings. A user with the role viewer may not change any. */
 function settable() {
-  return !OTHER && (!hello || !barred(hello, "activate"));
+  return !hello || !barred(hello, "activate");
 }
 
 function open(name) {
@@ -77,19 +71,14 @@ function open(name) {
   }
   drive.shown = view === "drive";
   if (!drive.shown) drive.release();
-  followed("diagnostics", 1, view === "status");
-  followed("fleet", 2, view === "robots");
+  if (view === "status") link.subscribe("diagnostics", 1);
+  else link.unsubscribe("diagnostics");
   if (view === "events") listed();
   if (view === "set") {
     said({ ok: true, text: "" }); // the note of an earlier button is outdated
     configured();
   }
   map.redraw();
-}
-
-function followed(key, rate, wanted) {
-  if (wanted) link.subscribe(key, rate, key === "fleet" ? undefined : OTHER);
-  else link.unsubscribe(key);
 }
 
 async function asked(verb, payload) {
@@ -143,7 +132,6 @@ async function got(path) {
 }
 
 async function listed() {
-  if (OTHER) return recordings.show([], "", `the recordings of ${OTHER} are listed on its own page`);
   const files = await got("api/recordings");
   recordings.show(files.error ? [] : files, barred(hello, "recordings"), files.error);
 }
@@ -163,7 +151,7 @@ function limited() {
 
 /** Return for how long a state counts as fresh, ms. This time grows with the interval between two states. */
 function lasts() {
-  return Math.max(500, OTHER ? 2500 * (period || 1) : 2500 / (hello?.state_rate || 10));
+  return Math.max(500, 2500 / (hello?.state_rate || 10));
 }
 
 /** Return whether the state that this page shows is not fresh any more. */
@@ -215,13 +203,13 @@ function readied() {
   $("stick").setAttribute("aria-disabled", String(off));
   const driver = driving(state, SOURCE, hello?.sender);
   const over = driver && `${driver} drives. Hold and push to take over. It drives on when you release: STOP ends that.`;
-  views.text("hint", ((drive.allowed || !link.open) && (drive.barred || over)) || hint(hello, OTHER));
+  views.text("hint", ((drive.allowed || !link.open) && (drive.barred || over)) || hint(hello));
 }
 
 /** Show the button that ends the mode. While no new state confirms the mode, the button stays in place and does
  *  nothing. If the button disappeared, STOP would grow into its place under a finger. */
 function releasable() {
-  const shown = !OTHER && state && state.mode in RELEASE;
+  const shown = state && state.mode in RELEASE;
   $("clear").hidden = !shown;
   const before = offer;
   offer = shown ? `${state.mode} ${state.latch}` : "";
@@ -248,9 +236,6 @@ async function pressed(event) {
 function stated({ detail }) {
   // A state from long before this page opened says nothing about the present.
   if (!state && detail.age > 2 * lasts()) return;
-  const since = state ? (milliseconds(detail.value.stamp) - milliseconds(state.stamp)) / 1000 : 0;
-  // After a single pause of the network, the shorter of two intervals is the usual one.
-  if (since > 0) [period, before] = [Math.min(since, before || since, 10), since];
   const other = state?.mode !== detail.value.mode;
   if (state && other) outdated();
   seen = true;
@@ -258,7 +243,7 @@ function stated({ detail }) {
   if (other) permitted();
   heard = drive.heard = performance.now() - detail.age;
   silent = "";
-  views.banner(state, Boolean(hello?.barred.clear), OTHER, hello?.sender);
+  views.banner(state, Boolean(hello?.barred.clear), hello?.sender);
   releasable();
   readied();
   map.lose(!boarded(state));
@@ -298,39 +283,28 @@ function converted() {
 
 function greeted({ detail }) {
   hello = detail.hello;
-  if (OTHER === hello.robot) return location.replace("./");
-  $("robot").textContent = OTHER ?? hello.robot;
+  $("robot").textContent = hello.robot;
   // A viewer may do nothing in the settings.
   $("tab-set").hidden = !settable();
   if (view === "set" && !settable()) open("drive");
-  if (!OTHER) $("simulated").hidden = !hello.simulated;
+  $("simulated").hidden = !hello.simulated;
   $("role").textContent = hello.role;
   drive.sender = hello.sender;
-  camera.show(!OTHER && hello.camera);
+  camera.show(hello.camera);
   drive.limits = hello.limits;
-  drive.allowed = !OTHER && !barred(hello, "drive");
+  drive.allowed = !barred(hello, "drive");
   permitted();
   $("limit").max = String(hello.limits.linear);
   limited();
   readied();
   if (uninvited) views.text("told", uninvited); // an earlier token still gave access
   uninvited = "";
-  if (hello.simulated || OTHER) link.subscribe("sim/pose", 5, OTHER);
-  if (OTHER) elsewhere();
+  if (hello.simulated) link.subscribe("sim/pose", 5);
 }
 
 /** Disable the controls that the robot would refuse to this client or that would change nothing. */
 function permitted() {
-  permit(hello, OTHER ? `only on the own page of ${OTHER}` : "", NEEDLESS[state?.mode]);
-}
-
-/** Explain that this page shows a robot other than its own. */
-function elsewhere() {
-  const back = views.made("a", "", `Back to ${hello.robot}`);
-  back.href = "./";
-  const words = `This is ${OTHER} on the page of ${hello.robot}. You may watch and stop it here.`;
-  $("other").replaceChildren(words, back);
-  $("other").hidden = false;
+  permit(hello, NEEDLESS[state?.mode]);
 }
 
 /** Show why the robot rejects the connection. Returns true if another attempt is pointless. */
@@ -359,10 +333,7 @@ link.addEventListener("key:odom", ({ detail: { value } }) => {
   const { position, orientation } = value.pose.pose;
   map.pose(position.x, position.y, yaw(orientation));
 });
-link.addEventListener("key:sim/pose", ({ detail: { value } }) => {
-  $("simulated").hidden = false;
-  map.truth(value.pose.position.x, value.pose.position.y);
-});
+link.addEventListener("key:sim/pose", ({ detail: { value } }) => map.truth(value.pose.position.x, value.pose.position.y));
 link.addEventListener("key:cmd_vel_out", ({ detail: { value, age } }) => {
   wished = { linear: value.twist.linear.x, angular: value.twist.angular.z };
   plots.speed.add(performance.now() - age, null, wished.linear);
@@ -370,18 +341,13 @@ link.addEventListener("key:cmd_vel_out", ({ detail: { value, age } }) => {
 });
 link.addEventListener("key:wheel_states", ({ detail: { value, age } }) => plots.wheels.add(performance.now() - age, ...value.velocity));
 link.addEventListener("key:diagnostics", ({ detail }) => views.parts($("parts"), detail.value));
-link.addEventListener("key:events", ({ detail }) => views.happened($("happened"), detail.value, OTHER));
-link.addEventListener("path", ({ detail }) => OTHER || map.trail(detail.path));
-link.addEventListener("minute", ({ detail }) => OTHER || plots.begin(performance.now(), detail.minute));
-link.addEventListener("fleet", ({ detail }) => {
-  views.cards($("cards"), detail.fleet, hello?.robot, OTHER ? "" : hello?.robot);
-  views.text("fleet-note", detail.note);
-});
+link.addEventListener("key:events", ({ detail }) => views.happened($("happened"), detail.value));
+link.addEventListener("path", ({ detail }) => map.trail(detail.path));
+link.addEventListener("minute", ({ detail }) => plots.begin(performance.now(), detail.minute));
 link.addEventListener("refused", ({ detail }) => {
   told((detail.refused === "cmd" && objection(state, SOURCE, hello?.sender)) || detail.reason);
 });
 link.addEventListener("gone", ({ detail }) => {
-  if (OTHER) return;
   silent = detail.gone;
   views.text("reason", silent);
 });
@@ -429,19 +395,17 @@ for (const name of ["pointerup", "click", "change"])
   $("limit").addEventListener(name, ({ target }) => target.matches(":focus-visible") || target.blur());
 $("again").addEventListener("click", () => location.reload());
 
-permit("");
+permit();
 limited();
 $("tab-set").hidden = !settable();
-if (OTHER) $("stop").dataset.robot = ` ${OTHER}`;
-if (OTHER) views.text("stop-words", `STOP ${OTHER}`);
 open("drive");
 for (const [key, rate] of [["state", 10], ["odom", 20], ["cmd_vel_out", 10], ["wheel_states", 5], ["events", 5]])
-  link.subscribe(key, rate, OTHER);
+  link.subscribe(key, rate);
 setInterval(looked, 100);
 // Refresh the list, because recordings grow and new ones begin while it is visible.
 setInterval(() => view === "events" && !document.hidden && listed(), 5000);
 const post = stopping.send;
-stopping.send = () => (link.open ? hedged(link.call("stop", undefined, OTHER), post) : post());
+stopping.send = () => (link.open ? hedged(link.call("stop"), post) : post());
 stopping.after = (told) => {
   if (state?.mode === "fault") answered({ ok: false, text: "STOP is latched, too: when Release fault has ended the fault, the mode is STOPPED" });
 };

@@ -12,7 +12,6 @@
 const URGENT = 30000;
 const PAUSE = 300; // ms between two attempts
 const SLOW = 10000; // ms after which a page whose modules do not run says so
-const ROBOT = new URLSearchParams(location.search).get("robot") ?? undefined; // the robot that this page shows
 const BARRED = [401, 403]; // HTTP statuses of a page without a valid invitation
 const NOT_HERE = "STOP needs an invitation to this page: use the robot's own switch";
 const UNSURE = "STOP was not confirmed: look at the robot, and press STOP again";
@@ -121,8 +120,7 @@ function expiring(ms) {
  *  request even if the person leaves the page. */
 async function posted() {
   try {
-    const body = JSON.stringify({ robot: ROBOT });
-    const answer = await fetch("api/srv/stop", { method: "POST", body, keepalive: true, signal: expiring(3000) });
+    const answer = await fetch("api/srv/stop", { method: "POST", keepalive: true, signal: expiring(3000) });
     const told = await answer.json();
     return { ok: answer.ok, barred: BARRED.includes(answer.status), text: told.message ?? told.error ?? `${answer.status}` };
   } catch {

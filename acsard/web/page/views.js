@@ -1,7 +1,7 @@
 // Fills the views from the messages of the bus. Text is inserted as text, never as HTML.
 
 import { boarded } from "./commander.js";
-import { RELEASE, age, ago, clock, logged, person, reason, said, signed, spot } from "./words.js";
+import { RELEASE, age, ago, clock, logged, person, reason, said, signed } from "./words.js";
 
 const DOUBTFUL = "STOP may not reach the robot from here: use its own switch.";
 const BATTERY = {
@@ -60,60 +60,23 @@ export function folded(events) {
   return rows;
 }
 
-export function happened(list, told, elsewhere) {
+export function happened(list, told) {
   const rows = folded([...told.events].reverse()).map((one) => {
     const by = `${one.by && !one.text.endsWith(one.by) ? ` — ${logged(one.by)}` : ""}${one.equal > 1 ? ` ×${one.equal}` : ""}`;
     const head = made("strong", "", one.name.replaceAll("_", " "));
-    return made("li", one.level, made("span", "quiet", clock(one.stamp, new Date())), " ", head, ` ${said(logged(one.text), elsewhere)}${by}`);
+    return made("li", one.level, made("span", "quiet", clock(one.stamp, new Date())), " ", head, ` ${said(logged(one.text))}${by}`);
   });
   list.replaceChildren(...rows);
 }
 
-/** Show a card with a link for each robot. Existing cards are updated in place, because a card that is replaced during
- *  a click cannot be clicked. `own` is the id of the page's own robot. `here` is the id of the robot whose stop or
- *  fault this page can release. */
-export function cards(list, robots, own, here) {
-  const before = new Map([...list.children].map((card) => [card.dataset.robot, card]));
-  const shown = robots.map((one) => {
-    const fine = ["driving", "ready"].includes(one.mode) && !one.warnings?.length;
-    const bad = ["fault", "stopped"].includes(one.mode) ? "error" : fine ? "" : "warning";
-    const facts = [
-      typeof one.speed === "number" ? `${signed(one.speed, 2)} m/s` : "",
-      one.link ? `link ${one.link}` : "",
-      one.version ? `version ${one.version}` : "",
-      typeof one.age === "number" ? `seen ${ago(one.age)}` : "",
-      one.battery ? `battery ${one.battery}` : "",
-      one.place ? spot(...one.place) : "",
-    ];
-    const card = before.get(one.robot) ?? empty(one.robot, own);
-    const [, mode, warned, why, what] = card.children;
-    card.className = bad;
-    mode.textContent = one.mode ?? "silent";
-    warned.textContent = (one.warnings ?? []).join("; ");
-    why.textContent = reason({ mode: one.mode, reason: one.reason ?? "" }, one.robot === here ? "" : one.robot);
-    what.textContent = facts.filter(Boolean).join(" · ");
-    return card;
-  });
-  if (!shown.length) shown.push(made("li", "warning", "no robot is visible yet"));
-  if (shown.length !== list.children.length || shown.some((card, n) => card !== list.children[n])) list.replaceChildren(...shown);
-}
-
-function empty(robot, own) {
-  const link = made("a", "", robot === own ? `${robot} (this page's own)` : robot);
-  link.href = robot === own ? "./" : `./?robot=${encodeURIComponent(robot)}`;
-  const card = made("li", "", link, made("span", "mode"), made("div", "warn"), made("div", "quiet"), made("div", "quiet"));
-  card.dataset.robot = robot;
-  return card;
-}
-
 /** Show the mode, its reason and the warnings. `locked` is true for a client that may not release a stop. `own` is the
  *  public name of this page. */
-export function banner(state, locked, elsewhere, own) {
+export function banner(state, locked, own) {
   const alone = !boarded(state);
   const words = state.mode.toUpperCase();
   if (alone && state.mode === "waiting") mode("noboard", "NO BOARD");
   else mode(state.mode, alone ? `${words} · NO BOARD` : words);
-  const why = state.mode === "driving" && state.sender ? `Driven by ${person(state.sender, own)}.` : reason(state, elsewhere);
+  const why = state.mode === "driving" && state.sender ? `Driven by ${person(state.sender, own)}.` : reason(state);
   const button = RELEASE[state.mode];
   const does = state.mode === "inactive" ? "an operator switches it on" : "an operator releases it";
   text("reason", locked && button ? why.replace(`press ${button}`, does) : why);
@@ -165,9 +128,8 @@ export function complain(words) {
 function mode(name, words) {
   document.body.dataset.mode = name;
   text("mode", words);
-  const stop = document.getElementById("stop");
-  stop.setAttribute("aria-pressed", String(name === "stopped"));
-  text("stop-words", `${name === "stopped" ? "STOPPED" : "STOP"}${stop.dataset.robot ?? ""}`);
+  document.getElementById("stop").setAttribute("aria-pressed", String(name === "stopped"));
+  text("stop-words", name === "stopped" ? "STOPPED" : "STOP");
   if (RELEASE[name]) text("clear", RELEASE[name]);
   document.title = `${words} · ${document.getElementById("robot").textContent}`;
 }

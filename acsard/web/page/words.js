@@ -28,7 +28,7 @@ export function clock(stamp, now) {
   return at.toDateString() === now.toDateString() ? at.toLocaleTimeString() : at.toLocaleString();
 }
 
-export function milliseconds(stamp) {
+function milliseconds(stamp) {
   return stamp.sec * 1000 + stamp.nanosec / 1e6;
 }
 
@@ -75,10 +75,10 @@ export function person(sender, own = "") {
 }
 
 /** Return the reason of the mode without the name of the mode, which the banner shows above the reason. */
-export function reason(state, elsewhere) {
+export function reason(state) {
   if (state.mode === "ready" && state.reason.startsWith("waiting for a command")) return "Nobody drives.";
   const before = `${state.mode}: `;
-  const words = said(named(state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason), elsewhere);
+  const words = said(named(state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason));
   return words.replace("press Release", `press ${RELEASE[state.mode] ?? "Release"}`);
 }
 
@@ -97,13 +97,15 @@ export function logged(text) {
   return text.replace(/\b([0-9a-f]{4})[0-9a-f]{12}\b/g, "$1");
 }
 
-/** Replace the names of services by those of buttons, and times in UTC by local times. The buttons are those of this
- *  page or, if `elsewhere` is the id of another robot, those of that robot's own page. */
-export function said(text, elsewhere = "", now = new Date()) {
-  const there = `on the own page of ${elsewhere}`;
-  const buttons = elsewhere
-    ? { "call srv/clear": `Release is ${there}`, "srv/clear": `Release ${there}`, "call srv/activate": `Switch on is ${there}` }
-    : { "call srv/clear": "press Release", "srv/clear": "Release", "then call srv/activate": "then press Switch on", "call srv/activate": "press Switch on" };
+const BUTTONS = {
+  "call srv/clear": "press Release",
+  "srv/clear": "Release",
+  "then call srv/activate": "then press Switch on",
+  "call srv/activate": "press Switch on",
+};
+
+/** Replace the names of services by those of this page's buttons, and times in UTC by local times. */
+export function said(text, now = new Date()) {
   const local = text.replace(UTC, (_, day, time) => clock({ sec: Date.parse(`${day}T${time}Z`) / 1000, nanosec: 0 }, now));
-  return Object.entries(buttons).reduce((words, [call, button]) => words.replace(call, button), local);
+  return Object.entries(BUTTONS).reduce((words, [call, button]) => words.replace(call, button), local);
 }

@@ -14,6 +14,7 @@ from aiohttp import StreamReader, web
 from aiohttp.test_utils import make_mocked_request
 from msgspec.structs import replace
 
+from acsard.bus.address import Address
 from acsard.client import Client
 from acsard.core.config.live import LIVE
 from acsard.core.config.parsing import effective
@@ -26,15 +27,23 @@ from acsard.web import app
 from acsard.web.acceptor import Acceptor
 from acsard.web.admission import IDENTITY_KEY
 from acsard.web.app import Page, settings_in
-from acsard.web.callers import AdmittedClient, RequestRefusedError
+from acsard.web.callers import RequestRefusedError
 from acsard.web.camera import Camera
 from acsard.web.metrics import Counts
+from acsard.web.robots import About, Robots
 from acsard.web.tokens import FILE, Vault
 from acsard.web.viewer import Parts
 from tests.each import each
 from tests.unit.web.hanging_disk import threads_named
 from tests.unit.web.test_callers import MAINTAINER
-from tests.unit.web.test_fleet_rows import robots
+
+ABOUT = About("1", True, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
+
+
+def robots(client: Client | None) -> Robots:
+    result = Robots(Address("tcp/127.0.0.1:1", "acsar", ""), Mock(), ABOUT, Counts())
+    result.client = client
+    return result
 
 
 def fails(error: Exception) -> Callable[..., Awaitable[Any]]:
@@ -122,24 +131,25 @@ async def test_the_age_of_a_picture_counts_a_suspend(
 
 
 class Daemon:
-    """A client of the page's own robot that records the calls, and of other robots."""
+    """A client of the robot that records the calls."""
 
-    certificate, session, name = "", None, ""
+    name, where = "", Address("", "acsar", "")
 
-    def __init__(self, calls: list[tuple[str, str]], robot: str = "acsar") -> None:
-        self._calls, self._robot = calls, robot
+    def __init__(self, calls: list[str]) -> None:
+        self._calls = calls
 
     def sibling(self, robot: str) -> Daemon:
-        return Daemon(self._calls, robot)
+        assert robot == "acsar"
+        return Daemon(self._calls)
 
     def request(self, verb: str, payload: object) -> ServiceReply:
-        self._calls.append((verb, self._robot))
+        self._calls.append(verb)
         return ServiceReply(True, "stopped")
 
 
-def page_with_daemon(directory: Path) -> tuple[Page, list[tuple[str, str]]]:
-    """Return a page, and the list of the calls that reach a robot: verb and robot."""
-    counts, calls = Counts(), list[tuple[str, str]]()
+def page_with_daemon(directory: Path) -> tuple[Page, list[str]]:
+    """Return a page, and the list of the calls that reach the robot."""
+    counts, calls = Counts(), list[str]()
     parts = Parts(robots(cast(Client, Daemon(calls))), counts)
     vault = Vault(directory, "acsar")
     return Page(parts, vault, frozenset(), Acceptor(counts), WebConfig()), calls
@@ -157,17 +167,16 @@ def posted(verb: str, *body: bytes, end: bool = True, role: Role = "viewer") -> 
     return request
 
 
-UNREADABLE = [b"{", b"[]", b'{"robot": null}', b'{"robot": 1}', b'{"robot": ["r2"]}']
+UNREADABLE = [b"{", b"[]", b"1"]
 
 
-@each("body", UNREADABLE)
-async def test_a_stop_whose_body_names_no_other_robot_stops_this_robot_and_is_refused(
-    body: bytes, tmp_path: Path
-) -> None:
+@each("body", [b"", *UNREADABLE])
+@each("end", [True, False])
+async def test_a_stop_does_not_wait_for_a_body(body: bytes, end: bool, tmp_path: Path) -> None:
     page, calls = page_with_daemon(tmp_path)
-    with pytest.raises(RequestRefusedError):
-        await page.service(posted("stop", body))
-    assert calls == [("stop", "acsar")]
+    async with asyncio.timeout(20.0):
+        assert (await page.service(posted("stop", body, end=end))).status == 200
+    assert calls == ["stop"]
 
 
 @each("body", UNREADABLE)
@@ -178,50 +187,6 @@ async def test_another_service_with_an_unreadable_body_is_only_refused(
     with pytest.raises(RequestRefusedError):
         await page.service(posted("clear", body, role="maintainer"))
     assert calls == []
-
-
-async def test_a_stop_of_another_robot_does_not_stop_this_robot(tmp_path: Path) -> None:
-    page, calls = page_with_daemon(tmp_path)
-    await page.service(posted("stop", b'{"robot": "r2"}'))
-    with pytest.raises(RequestRefusedError):
-        await page.service(posted("stop", b'{"robot": "r 2/**"}'))
-    assert calls == [("stop", "r2")]
-
-
-@each("named", ["r2", "acsar"])
-async def test_a_stop_whose_body_is_late_stops_this_robot_first_and_then_the_named_one(
-    named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The stop of the named robot does not wait until the page's own robot has answered."""
-    monkeypatch.setattr(app, "STOP_BODY_TIMEOUT_S", 0.01)
-    page, calls = page_with_daemon(tmp_path)
-    call, own_answer = page._parts.calls.call, asyncio.Event()
-
-    async def slow(
-        who: AdmittedClient, verb: str, payload: dict[str, object], robot: str = ""
-    ) -> ServiceReply:
-        answer = await call(who, verb, payload, robot)
-        if not robot:
-            await own_answer.wait()
-        return answer
-
-    monkeypatch.setattr(page._parts.calls, "call", slow)
-    request = posted("stop", b'{"robot"', end=False)
-    answer = asyncio.create_task(page.service(request))
-    async with asyncio.timeout(20.0):
-        while not calls:
-            await asyncio.sleep(0.01)
-    assert calls == [("stop", "acsar")]
-    assert not answer.done()
-    request.content.feed_data(f': "{named}"}}'.encode())
-    request.content.feed_eof()
-    expected = [("stop", robot) for robot in dict.fromkeys(("acsar", named))]
-    async with asyncio.timeout(20.0):
-        while calls != expected:
-            await asyncio.sleep(0.01)
-    own_answer.set()
-    assert (await answer).status == 200
-    assert calls == expected
 
 
 ROWS = {row.key: row for row in settings_in(effective(Config()))}

@@ -30,7 +30,6 @@ from acsard.web.limits import (
     RESERVED_TCP_OF_TOKEN,
     STOPS,
     STRANGER_RATE,
-    Shares,
     Sockets,
     WebSocketLimits,
     sockets_for,
@@ -103,25 +102,6 @@ def test_local_browsers_have_reserved_connections() -> None:
     assert "on the robot itself" in refusals[-1]
     limits.leave("127.0.0.1", "")
     assert not limits.enter("::1", "")
-
-
-def test_one_holder_has_a_share_and_leaves_room_for_others() -> None:
-    shares = Shares(10, 4)
-    assert [shares.enter("a", n) for n in range(6)] == [True] * 4 + [False] * 2
-    assert shares.enter("b", 9)
-
-
-def test_a_shared_item_takes_room_once_until_all_holders_have_released_it() -> None:
-    shares = Shares(2, 1)
-    assert [shares.enter("a", "state") for _ in range(3)] == [True] * 3
-    assert shares.enter("b", "state")
-    assert shares.enter("c", "odom")
-    assert not shares.enter("d", "tf")
-    for _ in range(3):
-        shares.leave("a", "state")
-    assert not shares.enter("d", "tf")
-    shares.leave("b", "state")
-    assert shares.enter("d", "tf")
 
 
 def test_the_manual_states_the_limits_of_the_connections() -> None:

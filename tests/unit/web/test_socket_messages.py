@@ -34,7 +34,7 @@ COMMAND = {"cmd": {"linear_x": 0.2, "angular_z": -0.1}, "stamp": 1763700000123.4
 def test_each_kind_of_message_is_recognized_by_its_field() -> None:
     assert decode(json.dumps(COMMAND)) == Command(Wish(0.2, -0.1), 1763700000123.4)
     assert decode('{"subscribe": "odom"}') == Subscribe("odom", 10.0)
-    assert decode('{"unsubscribe": "odom", "robot": "b"}') == Unsubscribe("odom", "b")
+    assert decode('{"unsubscribe": "odom"}') == Unsubscribe("odom")
     assert decode('{"call": "stop", "id": 7}') == Call("stop", 7)
     assert decode('{"call": "set", "payload": {"a": 1}, "id": "x"}') == Call("set", "x", {"a": 1})
     assert decode('{"ping": 12.5}') == Ping(12.5)
@@ -100,39 +100,35 @@ def test_an_invalid_message_is_refused_with_the_kind_it_was_meant_as(text: str, 
     assert str(caught.value)
 
 
-STOPS_OF_R1 = [
+INVALID_STOPS = [
     '{"call": "stop", "id": null}',
     '{"call": "stop", "id": 1e999}',
-    '{"call": "stop", "id": 1, "robot": null}',
-    '{"call": "stop", "id": 1, "robot": 1e999}',
-    '{"call": "stop", "id": true, "robot": ""}',
-    '{"call": "stop", "id": 1, "robot": "r1", "payload": []}',
+    '{"call": "stop", "id": true}',
+    '{"call": "stop", "id": 1, "payload": []}',
     '{"call": "stop", "id": 1, "payload": null}',
     '{"call": "stop", "id": 1, "extra": 1}',
     '{"call": "stop", "id": 1, "subscribe": "odom"}',
 ]
-"""Invalid messages that ask the robot `r1` to stop."""
+"""Invalid messages that ask the robot to stop."""
 
 
-@each("text", STOPS_OF_R1)
+@each("text", INVALID_STOPS)
 def test_an_invalid_message_that_asks_for_a_stop_is_recognized(text: str) -> None:
-    assert asks_to_stop(text, "r1")
-    assert not asks_to_stop(text.replace('"stop"', '"clear"'), "r1")
+    assert asks_to_stop(text)
+    assert not asks_to_stop(text.replace('"stop"', '"clear"'))
 
 
 @each(
     "text",
     [
-        '{"call": "stop", "id": null, "robot": "r2"}',
-        '{"call": "stop", "id": null, "robot": "r1/**"}',
         '{"call": ["stop"]}',
         '{"subscribe": "stop"}',
         '"stop"',
         "",
     ],
 )
-def test_a_message_for_another_robot_or_without_a_call_asks_for_no_stop(text: str) -> None:
-    assert not asks_to_stop(text, "r1")
+def test_a_message_without_the_call_asks_for_no_stop(text: str) -> None:
+    assert not asks_to_stop(text)
 
 
 @given(st.text())
@@ -141,7 +137,7 @@ def test_any_text_decodes_or_raises_a_frame_error(text: str) -> None:
         decode(text)
     except FrameError:
         pass
-    assert not asks_to_stop(text, "r1")
+    assert not asks_to_stop(text)
 
 
 @given(st.integers(0, len(json.dumps(COMMAND)) - 1), st.characters())

@@ -31,7 +31,6 @@ SAID: tuple[Struct, ...] = (
     socket_messages.DrivenPath([(0.0, 1.5)], []),
     socket_messages.LastMinute(Minute().plotted(0)),
     socket_messages.Answer(7, True, "stopped"),
-    socket_messages.Rows([socket_messages.Row("acsar", None, "", None, "", None, "")], ""),
     socket_messages.Pong(12.5, 1e12),
     socket_messages.Refused("cmd", "why"),
     socket_messages.DaemonUnreachable("why"),
@@ -67,22 +66,16 @@ def test_a_greeting_may_have_only_an_existing_role(role: Role) -> None:
     assert not is_described_frame({"hello": hello["hello"] | {"role": "king"}})
 
 
-@pytest.mark.parametrize("robot", ["acsar", "robot2"])
-def test_a_message_of_a_key_has_its_type_by_reference(robot: str) -> None:
+def test_a_message_of_a_key_has_its_type_by_reference() -> None:
     report = Report(Config(), START)
     list(report.due(OUTPUTS, {"odom"}, lambda: SNAPSHOT))
     odom = report.current("odom", lambda: SNAPSHOT)
     assert odom is not None
-    head = Following(robot, "odom", "acsar", 0.1).head
+    head = Following("odom", 0.1).head
     frame = as_sent(msgspec.Raw(b'%b%b,"age":1.5}' % (head, encode(odom, "json"))))
     assert kinds([frame, frame | {"value": None}]) == {"Value.odom"}
-    assert [variant for variant in spoilt(frame) if is_described_frame(variant)] == _without(frame)
+    assert [variant for variant in spoilt(frame) if is_described_frame(variant)] == []
     assert not is_described_frame(frame | {"key": "state"})
     assert SCHEMAS["Value.odom"]["properties"]["value"]["anyOf"][0] == {
         "$ref": "#/components/schemas/Odometry"
     }
-
-
-def _without(frame: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the frame without `robot`, which is optional."""
-    return [{k: v for k, v in frame.items() if k != "robot"}] if "robot" in frame else []

@@ -14,7 +14,7 @@ from acsard.web.streams import Stream
 
 async def test_earlier_messages_do_not_delay_a_key_that_is_due_soon() -> None:
     out = Outgoing(web.WebSocketResponse(), make_mocked_request("GET", "/ws"), Counts(), "")
-    subscription = Following("acsar", "state", "acsar", 0.1)
+    subscription = Following("state", 0.1)
     subscription.stream = Stream()
     due = await out._send_due(subscription, 100.03)
     assert abs(due - 100.1) < 1e-6

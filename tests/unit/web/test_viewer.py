@@ -23,7 +23,7 @@ from acsard.web.limits import COMMAND_RATE
 from acsard.web.metrics import Counts
 from acsard.web.robots import About, Robots
 from acsard.web.viewer import Parts, Viewer, ViewerCommands
-from tests.unit.web.test_socket_messages import STOPS_OF_R1
+from tests.unit.web.test_socket_messages import INVALID_STOPS
 
 PATIENCE_S = 20.0
 
@@ -133,7 +133,7 @@ async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
 
 
 class Page:
-    """A viewer of the robot r1, and the stops of this robot that it has called."""
+    """A viewer, and the stops that it has called."""
 
     def __init__(self, role: Role) -> None:
         self.stops: list[ServiceReply] = []
@@ -146,7 +146,7 @@ class Page:
         socket, request = cast(Any, SimpleNamespace()), cast(Any, SimpleNamespace(transport=None))
         self.viewer, self.counts = Viewer(socket, request, who, parts, camera=False), counts
 
-    async def _call(self, who: object, verb: str, payload: object, robot: str) -> ServiceReply:
+    async def _call(self, who: object, verb: str, payload: object) -> ServiceReply:
         assert (verb, payload) == ("stop", {})
         self.stops.append(ServiceReply(True, "stopped"))
         return self.stops[-1]
@@ -162,15 +162,14 @@ async def test_an_invalid_message_that_asks_for_a_stop_is_refused_and_stops_this
     role: Role,
 ) -> None:
     page = Page(role)
-    for count, text in enumerate(STOPS_OF_R1, 1):
+    for count, text in enumerate(INVALID_STOPS, 1):
         await page.take(text)
         assert len(page.stops) == count, text
         assert page.counts.refused() == {"malformed": count}
 
 
-async def test_an_invalid_message_without_a_stop_of_this_robot_is_only_refused() -> None:
+async def test_an_invalid_message_without_a_stop_is_only_refused() -> None:
     page = Page("maintainer")
-    for text in ('{"call": "stop", "id": null, "robot": "r2"}', '{"call": "clear", "id": null}'):
-        await page.take(text)
+    await page.take('{"call": "clear", "id": null}')
     assert page.stops == []
-    assert page.counts.refused() == {"malformed": 2}
+    assert page.counts.refused() == {"malformed": 1}
