@@ -282,8 +282,12 @@ COMMANDS: dict[str, How] = {
         "test_a_row_whose_seed_finds_nothing_any_more_is_listed",
     ),
     ".venv/bin/python -m tests.firmware.unchanged HEAD~1": UntestedCommand("needs the history"),
-    ".venv/bin/python -m tests.mutation": UntestedCommand("takes long, for changes of the core"),
-    ".venv/bin/python -m tests.mutation --safety": UntestedCommand("takes long, for the same"),
+    ".venv/bin/python -m tests.power compare": Elsewhere(
+        "tests/power/test_compare.py", "test_a_test_that_is_deleted_is_a_loss"
+    ),
+    ".venv/bin/python -m tests.power baseline --anew": UntestedCommand("takes hours"),
+    ".venv/bin/python -m tests.power mutants": UntestedCommand("takes long"),
+    ".venv/bin/python -m tests.power mutants --safety": UntestedCommand("takes long"),
     ".venv/bin/python -m tests.pictures pictures": Elsewhere(
         "tests/system/test_page.py",
         "test_every_view_is_drawn_on_a_phone_in_both_orientations_and_on_a_desktop",

@@ -10,12 +10,11 @@ Strings are not changed, because they are messages for people. Annotations, `zip
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast
-
-from acsard.core.motion.modes import Mode
 
 COMPARE: dict[type, tuple[type, ...]] = {
     ast.Lt: (ast.LtE, ast.GtE),
@@ -42,7 +41,8 @@ LARGE = 20
 """A whole number above this is changed by a quarter unless it is an index."""
 
 NAMES = {"min": "max", "max": "min", "any": "all", "all": "any", "sin": "cos", "cos": "sin"}
-MEMBERS = {"Mode": list(Mode.__members__)}
+FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
+MEMBERS = {"Mode": ["SHUTDOWN", "FAULT", "STOPPED", "INACTIVE", "WAITING", "DRIVING", "READY"]}
 
 
 class Mutant(NamedTuple):
@@ -52,15 +52,15 @@ class Mutant(NamedTuple):
         path: The module, relative to the project.
         line: The line of the fault.
         statement: The first line of the statement with the fault, or 0 outside of functions.
-        key: The description that `equivalent.py` uses. It has no line number.
-        text: The source of the module with the fault in it.
+        key: The description that `equivalent.py` and `baseline.json` use. It has no line number.
+        text: Returns the source of the module with the fault in it.
     """
 
     path: str
     line: int
     statement: int
     key: str
-    text: str
+    text: Callable[[], str]
 
 
 def variants(node: ast.AST, parent: ast.AST, field: str) -> Iterator[ast.AST]:
@@ -132,25 +132,26 @@ def variants(node: ast.AST, parent: ast.AST, field: str) -> Iterator[ast.AST]:
 
 
 def places(
-    node: ast.AST, scope: str = "", statement: int = 0, inside: bool = False
-) -> Iterator[tuple[ast.AST, str, ast.AST, str, int]]:
+    node: ast.AST, scope: str = "", statement: int = 0, part: ast.AST | None = None
+) -> Iterator[tuple[ast.AST, str, ast.AST, str, int, ast.AST]]:
     """Yield every place in the syntax tree where a mutant may differ.
 
-    Each item is the parent node, its field, the node, its scope, and the first line of its
-    statement.
+    Each item is the parent node, its field, the node, its scope, the first line of its statement,
+    and the part of the module that contains it: a function, or a statement outside of functions.
 
     Args:
         node: The root of the searched tree.
         scope: The names of the classes and functions around it.
         statement: The first line of the statement around it, or 0 outside of functions.
-        inside: Whether the node is part of a function.
+        part: The part of the module around it, if any.
     """
-    if isinstance(node, ast.FunctionDef | ast.ClassDef):
+    function = isinstance(node, FUNCTION)
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
         scope += f".{node.name}" if scope else node.name
     for field, value in ast.iter_fields(node):
         if field in ("annotation", "returns", "decorator_list", "bases"):
             continue
-        within = inside or (isinstance(node, ast.FunctionDef) and field == "body")
+        within = statement > 0 or (function and field == "body")
         for child in value if isinstance(value, list) else [value]:
             match child:
                 case ast.JoinedStr() | ast.keyword(arg="strict" | "frozen"):
@@ -158,27 +159,12 @@ def places(
                 case ast.AST():
                     starts = within and isinstance(child, ast.stmt)
                     line: int = getattr(child, "lineno", 0) if starts else statement
-                    yield node, field, child, scope, line
-                    yield from places(child, scope, line, within)
-
-
-def traced(root: Path, path: str) -> str:
-    """Return the source of a module that records its executed lines in the set `executed`.
-
-    It records the first line of each statement inside a function.
-    """
-    tree = ast.parse((root / path).read_text(encoding="utf-8"))
-    inside = {line for *_, line in places(tree)} - {0}
-    for node in ast.walk(tree):
-        for field in ("body", "orelse", "finalbody"):
-            statements = getattr(node, field, None)
-            if not isinstance(statements, list):
-                continue
-            for place in range(len(statements) - 1, -1, -1):
-                line = statements[place].lineno
-                if line in inside:
-                    statements.insert(place, ast.parse(f"executed.add({line})").body[0])
-    return ast.unparse(tree)
+                    whole = part
+                    if not part and isinstance(child, ast.stmt) and type(child) is not ast.ClassDef:
+                        whole = child
+                    if whole:
+                        yield node, field, child, scope, line, whole
+                    yield from places(child, scope, line, whole)
 
 
 def put(parent: ast.AST, field: str, old: ast.AST, new: ast.AST) -> None:
@@ -193,17 +179,28 @@ def put(parent: ast.AST, field: str, old: ast.AST, new: ast.AST) -> None:
 def mutants(root: Path, path: str) -> Iterator[Mutant]:
     """Yield all mutants of one module."""
     tree = ast.parse((root / path).read_text(encoding="utf-8"))
-    original = ast.unparse(tree)
-    for parent, field, node, scope, statement in list(places(tree)):
+    whole, original = None, ""
+    for parent, field, node, scope, statement, part in list(places(tree)):
         for variant in variants(node, parent, field):
+            if part is not whole:
+                whole, original = part, ast.unparse(part)
             new = deepcopy(variant)
             put(parent, field, node, new)
-            text = ast.unparse(tree)
+            text = ast.unparse(new if part is node else part)
             put(parent, field, new, node)
             if text != original:
                 line: int = getattr(node, "lineno", getattr(parent, "lineno", 0))
                 key = f"{path} {scope}: {change(original, text)}"
-                yield Mutant(path, line, statement, key, text)
+                make = partial(replaced, tree, parent, field, node, new)
+                yield Mutant(path, line, statement, key, make)
+
+
+def replaced(tree: ast.AST, parent: ast.AST, field: str, node: ast.AST, new: ast.AST) -> str:
+    """Return the source of the tree with the node `new` in place of `node`."""
+    put(parent, field, node, new)
+    text = ast.unparse(tree)
+    put(parent, field, new, node)
+    return text
 
 
 def change(before: str, after: str) -> str:

@@ -1,0 +1,220 @@
+"""Measures which faults of the product the tests notice, and what they noticed once.
+
+    python -m tests.power compare [--minutes M] [--jobs 2]
+    python -m tests.power baseline [--anew] [--minutes M] [--jobs 2]
+    python -m tests.power mutants [--sample 240] [--seed 1] [--jobs 2]
+    python -m tests.power mutants --safety
+    python -m tests.power mutants --only PATH [PATH ...] [--sample N]
+
+`compare` lists each item of `baseline.json` that tests noticed and do not notice any more. Its exit
+status is 1 if there is one. There are three scales: a fixed sample of mutants of the whole product,
+each hunk of the last commits that can still be undone, and the planted faults of `PLANTED.md`. An
+item whose code was deleted or rewritten is gone, not lost. `baseline` measures the items without a
+result, and `--anew` all items of this tree. `--scales` and `--only` choose some of them. A run that
+is ended loses at most the items under way, and the next run goes on.
+
+A mutant is the source with one small fault. The first form of `mutants` tries a random sample of
+all mutants of the core. Tests must notice 95 % of them. `--safety` tries every mutant of the
+modules in `SAFETY`, and tests must notice 98 %. `--only` does the same for the modules whose path
+contains a PATH. The output lists each mutant that no test noticed, with the reason if
+`equivalent.py` says that no test can notice it. The exit status is 1 if the tests noticed too few.
+
+All tests that run in this process take part (`TESTS` in `trials.py`). Run it as a user or in a
+container that can destroy nothing: a fault may be in code that deletes files or ends processes.
+
+The tools mutmut and cosmic-ray are not suitable. mutmut (3.8) leaves out all code outside
+functions, which is every table and constant. Most mutants of cosmic-ray (8.7) are like `a << b` for
+two floats, which every test notices. Neither tool draws a sample.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+from tests.power.equivalent import EQUIVALENT
+from tests.power.mutants import mutants
+from tests.power.scales import (
+    Results,
+    drawn,
+    is_measured,
+    load,
+    present,
+    report,
+    save,
+    trial,
+    was_noticed,
+)  # fmt: skip
+from tests.power.trials import UNDECIDED, Trial, Trials, digest
+
+ROOT = Path(__file__).parents[2]
+BASELINE = Path(__file__).with_name("baseline.json")
+CACHE = ROOT / ".pytest_cache" / "power"
+SCALES = ("planted", "mutants", "hunks")
+CORE = (
+    "acsard/core/motion/",
+    "acsard/core/guard.py",
+    "acsard/core/link/board_status.py",
+    "acsard/core/link/checked_line.py",
+    "acsard/core/link/encoders.py",
+    "acsard/core/link/codec.py",
+    "acsard/core/link/negotiation.py",
+    "acsard/core/link/minimum_delay.py",
+    "acsard/core/robot.py",
+    "acsard/daemon/latch_rules.py",
+)
+SAFETY = (
+    "acsard/core/guard.py",
+    "acsard/core/motion/neutral.py",
+    "acsard/core/motion/freshness.py",
+    "acsard/core/motion/lifecycle.py",
+    "acsard/core/motion/modes.py",
+    "acsard/core/motion/sanity.py",
+    "acsard/core/motion/wheel_witness.py",
+    "acsard/daemon/latch_rules.py",
+)
+ENOUGH, ENOUGH_OF_ALL = 0.95, 0.98
+"""Share of the mutants that tests must notice: of a sample, and of every mutant of some modules."""
+
+
+class Run:
+    """One call of this program."""
+
+    def __init__(self, asked: argparse.Namespace) -> None:
+        self.asked, self.began = asked, time.monotonic()
+
+    def minutes(self) -> float:
+        return (time.monotonic() - self.began) / 60
+
+    def in_time(self, items: Iterable[Trial]) -> Iterator[Trial]:
+        for item in items:
+            if self.minutes() > self.asked.minutes:
+                return
+            yield item
+
+    def tried(
+        self, items: list[Trial], results: Results, keep: Callable[[Trial, str], None]
+    ) -> None:
+        """Try the items that have no result yet. Call `keep` after each."""
+
+        def work(trials: Trials) -> None:
+            for final in (False, True):
+                open_ones = (None, UNDECIDED) if final else (None,)
+                todo = [i for i in items if results[i.scale].get(i.name) in open_ones]
+                if final and todo and self.minutes() < self.asked.minutes:
+                    trials.measure(self.asked.jobs, CACHE)
+                    for test in sorted(trials.failed):
+                        print(f"left out, because it fails without any fault: {test}")
+                    print(f"all tests measured, {self.minutes():.1f} min", flush=True)
+                left = len(todo)
+                for item, verdict in trials.verdicts(self.in_time(todo), self.asked.jobs):
+                    left -= 1
+                    results[item.scale][item.name] = verdict
+                    keep(item, verdict)
+                    print(f"{self.minutes():.1f} min, {left} left", file=sys.stderr, flush=True)
+
+        if not any(results[item.scale].get(item.name) in (None, UNDECIDED) for item in items):
+            return
+        # The copy may not change while its tests run.
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+            ignored = shutil.ignore_patterns(".*", "__pycache__")
+            shutil.copytree(ROOT, folder, ignore=ignored, dirs_exist_ok=True)
+            Trials(Path(folder), work).run()
+
+    def mutants(self) -> int:
+        """Draw the mutants, try each, and print the result."""
+        asked = self.asked
+        only = [*asked.only, *(SAFETY if asked.safety else ())]
+        paths = sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("acsard/**/*.py"))
+        paths = [path for path in paths if any(part in path for part in only or CORE)]
+        pool = drawn([mutant for path in paths for mutant in mutants(ROOT, path)], asked.seed)
+        chosen = pool[: asked.sample or (len(pool) if only else 240)]
+        where = dict(chosen)
+        enough = ENOUGH_OF_ALL if only else ENOUGH
+        print(f"{len(chosen)} of {len(pool)} mutants, seed {asked.seed}", flush=True)
+        tried, equivalent, holes = 0, 0, 0
+
+        def keep(item: Trial, verdict: str) -> None:
+            nonlocal tried, equivalent, holes
+            if verdict == UNDECIDED:
+                return
+            tried += 1
+            mutant = where[item.name]
+            why = EQUIVALENT.get(mutant.key, "")
+            if was_noticed(verdict):
+                if why:
+                    print(f"not equivalent, {verdict} notices it: {mutant.key}", flush=True)
+                return
+            equivalent += bool(why)
+            holes += not why
+            print(f"line {mutant.line} of {mutant.key}\n    {why or verdict.upper()}", flush=True)
+
+        self.tried([trial(*pair) for pair in chosen], {"mutants": {}}, keep)
+        killed = tried - equivalent - holes
+        score = killed / max(1, killed + holes)
+        print(
+            f"noticed {killed} of {tried}, {score:.1%} without the {equivalent} equivalent, "
+            f"{holes} not noticed, {enough:.0%} is enough; {self.minutes():.1f} min"
+        )
+        return 0 if score >= enough else 1
+
+    def baseline(self) -> int:
+        """Measure the items of the baseline that have no result yet."""
+        commit = subprocess.run(
+            ["git", "-C", ROOT, "rev-parse", "HEAD"], capture_output=True, text=True
+        ).stdout.strip()
+        before, results = ("", {}) if self.asked.anew else load(BASELINE)
+        if before not in ("", commit):
+            sys.exit(f"{BASELINE.name} is of {before}: check that out, or give --anew")
+        items = present(ROOT, self.asked.scales, results, self.asked.only)
+        for item in items:
+            results.setdefault(item.scale, {}).setdefault(item.name, None)
+        save(BASELINE, commit, results)
+        self.tried(items, results, lambda item, verdict: save(BASELINE, commit, results))
+        for scale, verdicts in sorted(results.items()):
+            measured = [verdict for verdict in verdicts.values() if is_measured(verdict)]
+            noticed = sum(map(was_noticed, measured))
+            print(f"{scale}: {len(verdicts)}, measured {len(measured)}, noticed {noticed}")
+        return 0
+
+    def compare(self) -> int:
+        """Print what the tests noticed once and do not notice any more."""
+        commit, known = load(BASELINE)
+        known = {scale: known[scale] for scale in self.asked.scales if scale in known}
+        items = present(ROOT, known, known, self.asked.only)
+        file = CACHE / f"compared-{digest(ROOT)}.json"
+        _, now = load(file)
+        now = {scale: dict(now.get(scale, {})) for scale in known}
+        before = [(item, known[item.scale].get(item.name)) for item in items]
+        todo = [item._replace(first=test) for item, test in before if test and was_noticed(test)]
+        self.tried(todo, now, lambda item, verdict: save(file, commit, now))
+        print(f"compared with {commit}")
+        return int(report(known, now, items))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.power", description=__doc__)
+    parser.add_argument("command", choices=("compare", "baseline", "mutants"))
+    parser.add_argument("--jobs", type=int, default=2, help="how many processes")
+    parser.add_argument("--minutes", type=float, default=1e9, help="start nothing after this time")
+    parser.add_argument("--scales", nargs="+", default=SCALES, choices=SCALES)
+    parser.add_argument("--anew", action="store_true", help="a new baseline of this tree")
+    parser.add_argument("--only", nargs="+", default=[], metavar="PATH", help="parts of paths")
+    parser.add_argument("--safety", action="store_true", help="the modules that stop the robot")
+    parser.add_argument("--sample", type=int, help="how many mutants (240; all of named modules)")
+    parser.add_argument("--seed", type=int, default=1, help="which mutants")
+    asked = parser.parse_args()
+    os.nice(19)
+    command: Callable[[Run], int] = getattr(Run, asked.command)
+    return command(Run(asked))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

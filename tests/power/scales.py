@@ -1,0 +1,167 @@
+"""Three scales of the tests' power, their results in a file, and what a later tree has lost.
+
+A result is the test that noticed the item, `NOBODY`, `UNREACHED`, `UNDECIDED`, or None if it
+was never tried.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Collection, Iterator
+from functools import partial
+from itertools import islice
+from pathlib import Path
+
+from tests.power.equivalent import EQUIVALENT
+from tests.power.history import hunks
+from tests.power.mutants import Mutant, mutants
+from tests.power.trials import NOBODY, UNDECIDED, UNREACHED, Trial
+
+SAMPLE = 1000
+Results = dict[str, dict[str, str | None]]
+
+
+def drawn(pool: list[Mutant], seed: int) -> list[tuple[str, Mutant]]:
+    """Return all mutants with their names, in a random order that depends on the seed.
+
+    The order follows from each mutant's key. So an edit of the source moves only its own mutants.
+    """
+    met: Counter[str] = Counter()
+    lots: list[tuple[bytes, str, Mutant]] = []
+    for mutant in pool:
+        met[mutant.key] += 1
+        lot = f"{seed} {met[mutant.key]} {mutant.key}".encode()
+        name = mutant.key + (f" #{met[mutant.key]}" if met[mutant.key] > 1 else "")
+        lots.append((hashlib.sha256(lot).digest(), name, mutant))
+    return [(name, mutant) for _, name, mutant in sorted(lots)]
+
+
+def trial(name: str, mutant: Mutant) -> Trial:
+    lines = frozenset({mutant.statement} - {0})
+    return Trial("mutants", name, mutant.path, lines, mutant.text)
+
+
+def planted(root: Path) -> Iterator[Trial]:
+    """Yield the faults that can be planted and that a recorded seed found."""
+    from tests.simulate.planted import edited, read
+    from tests.simulate.planted_cases import CASES
+    from tests.simulate.planted_faults import FAULTS
+
+    rows = read()
+    for fault in (*FAULTS, *CASES):
+        if fault.name in rows and rows[fault.name].seed:
+            with contextlib.suppress(OSError, ValueError):  # its code is not as it was
+                edited(fault)
+                play = partial(again, root, fault.name, rows[fault.name].seed)
+                yield Trial("planted", fault.name, "", frozenset(), str, run=play)
+
+
+def again(root: Path, name: str, seed: str) -> str:
+    """Play the recorded seed of a planted fault."""
+    words = [sys.executable, "-m", "tests.simulate.planted", "--again", "--only", name]
+    done = subprocess.run(words, cwd=root, capture_output=True, text=True, check=False)
+    if " rows hold;" not in done.stdout:
+        raise RuntimeError(done.stdout + done.stderr)
+    return NOBODY if f"\n{name}: seed " in f"\n{done.stdout}" else f"seed {seed}"
+
+
+def sample(root: Path, known: Collection[str], only: Collection[str]) -> Iterator[Trial]:
+    """Yield the mutants with these names, or a sample if there are none.
+
+    Args:
+        root: The tree.
+        known: The names. A mutant whose function is in another module now keeps its name.
+        only: Parts of the modules' paths; all modules without any.
+    """
+    paths = sorted(path.relative_to(root).as_posix() for path in root.glob("acsard/**/*.py"))
+    paths = [path for path in paths if not only or any(part in path for part in only)]
+    pool = drawn([mutant for path in paths for mutant in mutants(root, path)], seed=1)
+    if not known:
+        new = (pair for pair in pool if pair[1].key not in EQUIVALENT)
+        yield from (trial(*pair) for pair in islice(new, SAMPLE))
+        return
+    gone = set(known) - {name for name, _ in pool}
+    moved = {name.partition(" ")[2]: name for name in gone}
+    for name, mutant in pool:
+        if name in known:
+            yield trial(name, mutant)
+        elif old := moved.pop(name.partition(" ")[2], ""):
+            yield trial(old, mutant)
+
+
+def present(
+    root: Path, scales: Collection[str], known: Results, only: Collection[str]
+) -> list[Trial]:
+    """Return the items of this tree in the order in which to try them: the scales take turns."""
+    found: list[list[Trial]] = []
+    if "mutants" in scales:
+        found.append(list(sample(root, known.get("mutants", ()), only)))
+    if "hunks" in scales:
+        found.append(list(hunks(root)))
+    if "planted" in scales:
+        found.append(list(planted(root)))
+    turns = [(at / len(items), item) for items in found for at, item in enumerate(items)]
+    return [item for _, item in sorted(turns, key=lambda turn: turn[0])]
+
+
+def load(file: Path) -> tuple[str, Results]:
+    """Return the commit and the results of a file, or nothing if there is none."""
+    if not file.exists():
+        return "", {}
+    content = json.loads(file.read_text(encoding="utf-8"))
+    return content.pop("commit"), content
+
+
+def save(file: Path, commit: str, results: Results) -> None:
+    """Write one line for each item, so that a change of it is readable."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps({"commit": commit} | results, indent=0, sort_keys=True, ensure_ascii=False)
+    part = file.with_suffix(".part")
+    part.write_text(text + "\n", encoding="utf-8")
+    os.replace(part, file)
+
+
+def report(known: Results, now: Results, items: list[Trial]) -> bool:
+    """Print what was noticed once and is not now. Return whether there is anything.
+
+    Args:
+        known: The results of the older tree.
+        now: Those of this tree, as far as they were measured.
+        items: The items that this tree still has.
+    """
+    here = {(item.scale, item.name) for item in items}
+    any_lost = False
+    for scale, results in sorted(known.items()):
+        noticed = {name: test for name, test in results.items() if was_noticed(test)}
+        gone = [name for name in noticed if (scale, name) not in here]
+        tried = {name: now.get(scale, {}).get(name) for name in noticed if name not in gone}
+        lost = [name for name, test in tried.items() if is_measured(test) and not was_noticed(test)]
+        for name in lost:
+            print(f"LOST {scale}: {name}\n    {tried[name]}; before: {noticed[name]}")
+        modules = Counter(re.findall(r"acsard/\S+\.py|$", name)[0] or name for name in gone)
+        for module, count in sorted(modules.items()):
+            print(f"gone {scale}: {count} with code of {module}")
+        untried = sum(not is_measured(test) for test in tried.values())
+        never = sum(not is_measured(test) for test in results.values())
+        print(
+            f"{scale}: of {len(noticed)} that were noticed {len(tried) - untried - len(lost)} "
+            f"still are, {len(lost)} are lost, {len(gone)} are gone with their code, and "
+            f"{untried} were not tried; {never} of {len(results)} were never measured before"
+        )
+        any_lost = any_lost or bool(lost)
+    return any_lost
+
+
+def was_noticed(test: str | None) -> bool:
+    return is_measured(test) and test not in (NOBODY, UNREACHED)
+
+
+def is_measured(test: str | None) -> bool:
+    return test not in (None, UNDECIDED)
