@@ -23,8 +23,7 @@ Where to look: each package may import only the packages below it in this list.
     report/          `acsard recording report`: turns a recording into an HTML page
     top/             `acsard top`, `acsard drive` and `acsard fleet`: the robot in a terminal
     web/             `acsard web`: the robot's page, in a separate process
-    calibration/     `acsard calibrate`: calibrates from a recorded drive or a new one;
-                     `acsard accuracy`: how much each cause contributes to the odometry's error
+    calibration/     `acsard calibrate`: calibrates from a recorded drive or a new one
     machine/         tools for the administrator of the computer: `acsard doctor`, certificates for
                      other machines, the serial ports, the system service
     client/          follows and drives a robot from Python, synchronously or with asyncio; its

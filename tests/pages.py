@@ -358,7 +358,6 @@ COMMANDS: dict[str, How] = {
     "acsard echo wheel_states imu --csv > drive.csv": Elsewhere(
         SIMULATED, "test_calibrate_reads_a_drive_that_echo_recorded_as_csv"
     ),
-    "acsard accuracy": Run("based on|stands still"),
     "acsard calibrate": Elsewhere(
         GUIDED, "test_a_person_with_a_gyro_is_guided_from_the_start_to_the_written_file"
     ),

@@ -49,7 +49,6 @@ VERBS = {
     "doctor": "find problems on this machine and say how to fix them",
     "ports": "list the serial ports, the processes that use them, and the likely MCU",
     "mcu": "test the microcontroller on your own robot with its wheels lifted",
-    "accuracy": "measure what causes the odometry error, and say how to reduce it",
     "calibrate": "measure wheel radii and effective track width, from a guided or a recorded drive",
     "recording": "list, show, replay, export and draw recordings",
     "tls": "make the certificates that other machines need to connect to the robot",
@@ -65,7 +64,7 @@ The name of a subcommand is also the name of its module in this package.
 """
 
 MUST_FINISH = {
-    "call", "set", "bench", "doctor", "mcu", "accuracy", "calibrate", "tls", "service",
+    "call", "set", "bench", "doctor", "mcu", "calibrate", "tls", "service",
 }  # fmt: skip
 """Subcommands whose exit code says whether something was done or judged. If the reader of their
 output ends early, they have failed. An action of another subcommand, such as `recording replay`,

@@ -407,7 +407,7 @@ def test_echo_for_many_waits_for_each_and_says_which_is_missing(shared: Daemon) 
     assert "following acsar; not present: other" in ended.err
 
 
-@each("verb", ["top", "hz", "whoami", "drive", "accuracy", "calibrate"])
+@each("verb", ["top", "hz", "whoami", "drive", "calibrate"])
 @each("ids", ["*", "robot1,robot2"])
 def test_a_verb_for_one_robot_refuses_several_ids_and_names_the_verb_for_many(
     shared: Daemon, verb: str, ids: str

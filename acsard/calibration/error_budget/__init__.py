@@ -1,1 +1,0 @@
-"""`acsard accuracy`: the odometry error of a running robot, cause by cause."""
