@@ -18,7 +18,6 @@ Where to look: each package may import only the packages below it in this list.
 `pyproject.toml` states this order as contracts, and `lint-imports` checks the contracts.
 
     cli/             one file per subcommand: its options, a call into another package, output
-    bench/           `acsard bench`: measures a daemon from outside
     foxglove/        `acsard foxglove`: a live server for Foxglove
     report/          `acsard recording report`: turns a recording into an HTML page
     top/             `acsard top`, `acsard drive` and `acsard fleet`: the robot in a terminal

@@ -292,10 +292,7 @@ COMMANDS: dict[str, How] = {
         "tests/system/test_page.py",
         "test_every_view_is_drawn_on_a_phone_in_both_orientations_and_on_a_desktop",
     ),
-    "acsard bench": Elsewhere(
-        "tests/system/test_bench.py",
-        "test_bench_measures_the_simulator_and_moves_nothing_on_a_real_port",
-    ),
+    ".venv/bin/pytest -s -m bench tests/bench/test_figures.py": UntestedCommand("is a test"),
     # deploy/clients
     "python deploy/clients/python/follow.py": Elsewhere(
         CLIENTS, "test_the_python_example_follows_the_robot"

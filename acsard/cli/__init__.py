@@ -45,7 +45,6 @@ VERBS = {
     "call": "call a service of the robot, such as stop or clear",
     "whoami": "show your role on this robot, your certificate and your sender id",
     "set": "change a setting of the running robot, or list the changeable settings",
-    "bench": "measure how fast the daemon is on this machine",
     "doctor": "find problems on this machine and say how to fix them",
     "ports": "list the serial ports, the processes that use them, and the likely MCU",
     "mcu": "test the microcontroller on your own robot with its wheels lifted",
@@ -64,7 +63,7 @@ The name of a subcommand is also the name of its module in this package.
 """
 
 MUST_FINISH = {
-    "call", "set", "bench", "doctor", "mcu", "calibrate", "tls", "service",
+    "call", "set", "doctor", "mcu", "calibrate", "tls", "service",
 }  # fmt: skip
 """Subcommands whose exit code says whether something was done or judged. If the reader of their
 output ends early, they have failed. An action of another subcommand, such as `recording replay`,

@@ -70,13 +70,6 @@ def between(least: float, most: float, units: str) -> Callable[[str], float]:
     return number
 
 
-seconds = between(1.0, 600.0, "seconds")
-"""Argparse type for the duration of a measurement, from 1 to 600 s.
-
-The limit is 600 s because all measured values stay in memory, and need 60 MB after 600 s at 100 Hz.
-"""
-
-
 def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
     """Return an argparse type: a function that parses a whole number from 1 to `most`.
 
@@ -126,7 +119,6 @@ OPTIONS = {
     "record.directory": "--record",
     "bus.listen": "--listen",
     "bus.connect": "--connect",
-    "control.rate": "--rate",
     "bus.tls": "--tls",
 }
 """Maps dotted keys of the configuration to the command-line option that sets the key."""

@@ -1,8 +1,9 @@
-"""Helpers of the benchmarks: run a program on the rig of `acsard bench`, and compute statistics."""
+"""Helpers of the benchmarks: run a program on the rig, and compute statistics."""
 
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,10 +14,21 @@ from tempfile import TemporaryDirectory
 
 from msgspec.structs import replace
 
-from acsard.bench.matching import Record, command_waits, feedback_fates, staircase
-from acsard.bench.measure import bench_config, free_endpoint, write
-from acsard.bench.rig import ACSARD, Rig
-from acsard.core.config.settings import BusConfig, Config, ControlConfig, McuConfig, RobotConfig
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import (
+    BusConfig,
+    CommandsConfig,
+    Config,
+    ControlConfig,
+    FeedbackConfig,
+    LimitsConfig,
+    McuConfig,
+    RobotConfig,
+    Source,
+)
+from acsard.core.config.toml_text import document
+from tests.bench.matching import Record, command_waits, feedback_fates, staircase
+from tests.bench.rig import ACSARD, Rig
 
 POLLED = (sys.executable, "-m", "tests.bench.polled")
 """The original driver's method."""
@@ -42,9 +54,34 @@ def trees() -> dict[str, Sequence[str]]:
 
 
 def config(rate: float = 100.0, reply_period: float = 0.0) -> Config:
-    """Return the configuration with which `acsard bench` measures."""
-    wanted = Config(control=ControlConfig(rate=rate), mcu=McuConfig(reply_period=reply_period))
-    return bench_config(wanted, simulated=True)
+    """Return the configuration of a measured daemon, with its own robot id and bus.
+
+    The limits are so high that the line after a command has exactly the speeds of the command, and
+    feedback that contradicts the commands is not a fault.
+    """
+    return Config(
+        robot=RobotConfig(f"bench-{os.getpid()}"),
+        bus=BusConfig(listen=(free_endpoint(),)),
+        commands=CommandsConfig(sources=(Source("bench", 100),)),
+        control=ControlConfig(rate=rate),
+        mcu=McuConfig(reply_period=reply_period),
+        feedback=FeedbackConfig(fault_time=0.0),
+        limits=LimitsConfig(
+            linear_acceleration=100.0,
+            linear_deceleration=100.0,
+            linear_stop_deceleration=100.0,
+            angular_acceleration=500.0,
+            angular_deceleration=500.0,
+            angular_stop_deceleration=500.0,
+        ),
+    )
+
+
+def free_endpoint() -> str:
+    """Return an endpoint on the loopback interface on which no process listens."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def sibling(settings: Config, number: int) -> Config:
@@ -64,7 +101,8 @@ def rig(
 ) -> Iterator[Rig]:
     """Start a program and a simulated board. The body runs when the link between them is up."""
     with TemporaryDirectory(prefix="acsard-bench-") as where:
-        file = write(settings, Path(where))
+        file = Path(where) / "acsard.toml"
+        file.write_text("\n".join(document(effective(settings))) + "\n", encoding="utf-8")
         with Rig(
             settings,
             file,

@@ -23,8 +23,8 @@ from typing import NamedTuple
 import pytest
 from msgspec.structs import replace
 
-from acsard.bench.matching import staircase
 from acsard.core.config.settings import Config
+from tests.bench.matching import staircase
 from tests.bench.rigs import all_cores_busy, config, delays_us, rig, schedule, share, waits_us
 from tests.system.strangers import FLOOD, command_line
 

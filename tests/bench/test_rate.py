@@ -15,7 +15,7 @@ import sys
 
 import pytest
 
-from acsard.bench.rig import Rig
+from tests.bench.rig import Rig
 from tests.bench.rigs import all_cores_busy, config, rig, schedule
 from tests.bench.unlimited import BAUD_RATE
 

@@ -22,8 +22,8 @@ from statistics import median
 
 import pytest
 
-from acsard.bench.matching import feedback_fates, staircase
-from acsard.bench.rig import ACSARD, SPACING_S
+from tests.bench.matching import feedback_fates, staircase
+from tests.bench.rig import ACSARD, SPACING_S
 from tests.bench.rigs import (
     BY_EVENTS,
     DRAINING,

@@ -20,7 +20,6 @@ from statistics import median
 
 import pytest
 
-from acsard.bench.rig import Rig, processor_ns
 from acsard.bus.subscription import direct
 from acsard.bus.zenoh_sessions import client_session
 from acsard.core.config.settings import SIMULATOR, Config
@@ -30,6 +29,7 @@ from acsard.core.messages.schema import Message
 from acsard.daemon.bus import outlets
 from acsard.daemon.bus.bus import ZenohBus
 from acsard.host import clock
+from tests.bench.rig import Rig, processor_ns
 from tests.bench.rigs import config, in_turns, rig, sibling
 from tests.unit.core.messages.test_cdr import odometry
 

@@ -9,7 +9,6 @@ import array
 import errno
 import fcntl
 import os
-import stat
 import termios
 import threading
 from collections.abc import Iterator
@@ -205,16 +204,3 @@ def refusal(path: str, error: OSError) -> MendableError:
 
 
 _LISTED = "`acsard ports` lists the serial ports"
-
-
-def require(path: str) -> None:
-    """Raise a `MendableError` that says what is wrong if `path` is not a character device.
-
-    Only the tools call this function. The daemon does not call it, because the daemon waits for an
-    absent device.
-    """
-    try:
-        if not stat.S_ISCHR(os.stat(path).st_mode):
-            raise OSError(errno.ENOTTY, "not a character device")
-    except OSError as error:
-        raise refusal(path, error) from None

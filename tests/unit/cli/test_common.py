@@ -146,7 +146,6 @@ def test_every_problem_is_printed_with_the_file_it_is_in(
         ("run --connect foo", '--connect: bus.connect = "foo": not an endpoint'),
         ("run --namespace /", '--namespace: ros.namespace = "/": expected'),
         ("run --port=", '--port: mcu.port = "": expected'),
-        ("bench --rate 5000", "--rate: control.rate = 5000.0: expected"),
     ],
 )
 def test_a_value_of_an_option_is_blamed_on_the_option_and_not_on_the_file(

@@ -10,14 +10,13 @@ import pty
 import termios
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from serial import SerialException
 
-from acsard.daemon.serial.device import close, draining, open_raw, refusal, require, unsent
+from acsard.daemon.serial.device import close, draining, open_raw, refusal, unsent
 from acsard.host import clock
-from acsard.host.errors import Exit, InUseError, NoPortError
+from acsard.host.errors import Exit, InUseError
 from tests.each import each
 
 
@@ -139,19 +138,6 @@ def test_a_file_without_an_output_queue_counts_as_drained(path: str) -> None:
     with open(os.devnull) as null:
         assert unsent(null.fileno()) == 0
         assert list(draining(null.fileno(), clock.mono_ns() + 10**9)) == []
-
-
-@pytest.mark.parametrize("name", ["nothing", "file", "."])
-def test_a_path_that_is_not_a_device_is_refused_as_a_port(tmp_path: Path, name: str) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(NoPortError, match=r"`acsard ports` lists"):
-        require(str(tmp_path / name))
-
-
-def test_a_stable_name_of_a_device_is_accepted_as_a_port(tmp_path: Path) -> None:
-    link = tmp_path / "acsar"
-    link.symlink_to("/dev/null")
-    require(str(link))
 
 
 def test_a_read_from_a_closed_port_reports_a_lost_device(path: str) -> None:

@@ -17,13 +17,13 @@ from pathlib import Path
 import msgspec
 from msgspec.structs import replace
 
-from acsard.bench.matching import RecordedTraffic, staircase
 from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.daemon.serial.simulator_pty import PtyEnd
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
+from tests.bench.matching import RecordedTraffic, staircase
 
 
 class Part(msgspec.Struct, frozen=True):

@@ -2,7 +2,7 @@
 
 Successive commands have different speeds, and so have successive feedback lines. Each output of the
 measured daemon is therefore matched with its input by the speed, not by the time. All times are
-monotonic, in ns, except the stamps of odometry samples, which are wall-clock times.
+monotonic, in ns.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from msgspec import Struct
 from acsard.core.config.settings import Config
 from acsard.core.link.codec import Codec
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.values import Instant
 
 CYCLE_LENGTH = 1000
 """Number of commands, or of feedback lines, after which the speeds repeat. Two lines with equal
@@ -30,15 +29,6 @@ LOSS_TIMEOUT_NS = 1_000_000_000
 
 Chunk = tuple[int, bytes]
 """A pair: a monotonic time, ns, and the bytes that were sent or received at that time."""
-
-
-class Summary(Struct, frozen=True):
-    """Median, 99th percentile and maximum of `count` durations, in us."""
-
-    count: int
-    p50: float
-    p99: float
-    max: float
 
 
 class MatchedLine(Struct, frozen=True):
@@ -133,20 +123,6 @@ def _key(speed: float) -> int:
     return round(speed * 1e6)
 
 
-def summary(durations_ns: Sequence[int]) -> Summary | None:
-    """Return the summary of the durations, or None for an empty list.
-
-    Each percentile is one of the durations, not an interpolation between two of them.
-    """
-    if not durations_ns:
-        return None
-    import numpy as np
-
-    us = np.asarray(durations_ns, dtype=float) / 1000
-    p50, p99 = np.percentile(us, (50, 99), method="higher")
-    return Summary(len(us), round(float(p50), 1), round(float(p99), 1), round(float(us.max()), 1))
-
-
 class RecordedTraffic(Struct, frozen=True):
     """All data that the simulated board received and sent, with monotonic times in ns."""
 
@@ -164,22 +140,16 @@ class SentCommand(Struct, frozen=True):
 
 
 class Sample(Struct, frozen=True):
-    """An odometry sample, with its time of arrival `at` and its content."""
+    """An odometry sample: its time of arrival, ns, and its linear speed, m/s."""
 
-    at: Instant
-    stamp_ns: int
-    """Stamp on the wall clock, ns since 1970."""
+    at_ns: int
     speed: float
-    """Linear speed, m/s."""
 
 
 class Record(Struct, frozen=True):
-    began_ns: int
-    """Monotonic time just before the daemon was started, ns."""
     window_ns: tuple[int, int]
     """Start and end of the evaluated time, ns. Start-up and shutdown of the daemon are excluded."""
-    seen: RecordedTraffic | None
-    """Data on the wire; None on a real port, whose wire cannot be observed."""
+    seen: RecordedTraffic
     sent: list[SentCommand]
     samples: list[Sample]
 
@@ -187,17 +157,15 @@ class Record(Struct, frozen=True):
     def feedback_lines(self) -> list[Chunk]:
         """Feedback lines that the board began to send in `window_ns`, each with its time, ns."""
         first_ns, last_ns = self.window_ns
-        lines = lines_of(self.seen.to_daemon) if self.seen else []
+        lines = lines_of(self.seen.to_daemon)
         return [line for line in lines if first_ns <= line[0] < last_ns]
 
 
 def command_waits(record: Record) -> list[int]:
     """Return the time from each command to its line on the wire, ns.
 
-    Lost commands have no entry. On a real port, the list is empty.
+    Lost commands have no entry.
     """
-    if record.seen is None:
-        return []
     sent = [(sent.at_ns, sent.line) for sent in record.sent]
     return commands_to_lines(sent, lines_of(record.seen.from_daemon))
 
@@ -210,5 +178,5 @@ def feedback_fates(config: Config, record: Record) -> list[MatchedLine]:
         (at_ns, kinematics.twist(codec.decode(line)).linear)
         for at_ns, line in record.feedback_lines
     ]
-    samples = [(sample.at.mono_ns, sample.speed) for sample in record.samples]
+    samples = [(sample.at_ns, sample.speed) for sample in record.samples]
     return lines_to_samples(lines, samples)

@@ -8,8 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.bench.far_end import NumberedMcu
-from acsard.bench.matching import (
+from acsard.core.config.settings import Config, McuConfig, WheelMap
+from acsard.core.link.codec import Codec
+from acsard.core.values import WheelSpeeds
+from tests.bench.far_end import NumberedMcu
+from tests.bench.matching import (
     CYCLE_LENGTH,
     LOSS_TIMEOUT_NS,
     MatchedLine,
@@ -17,18 +20,13 @@ from acsard.bench.matching import (
     RecordedTraffic,
     Sample,
     SentCommand,
-    Summary,
     command_waits,
     commands_to_lines,
     feedback_fates,
     lines_of,
     lines_to_samples,
     staircase,
-    summary,
 )
-from acsard.core.config.settings import Config, McuConfig, WheelMap
-from acsard.core.link.codec import Codec
-from acsard.core.values import Instant, WheelSpeeds
 
 ONE, TWO = b"ap05.00,bp05.00,cp05.00,dp05.00", b"ap05.02,bp05.02,cp05.02,dp05.02"
 
@@ -113,12 +111,6 @@ def test_a_speed_is_recognised_in_spite_of_rounding() -> None:
     assert lines_to_samples([(0, 0.1 + 0.2)], [(1, 0.3)]) == [MatchedLine(1, 0)]
 
 
-def test_percentiles_are_durations_that_were_measured() -> None:
-    assert summary([n * 1000 for n in range(1, 101)]) == Summary(100, 51.0, 100.0, 100.0)
-    assert summary([7000]) == Summary(1, 7.0, 7.0, 7.0)
-    assert summary([]) is None
-
-
 MS = 1_000_000
 
 WIRINGS = [WheelMap(), WheelMap("-d", "+c", "-b", "+a")]
@@ -153,17 +145,16 @@ def test_only_lines_between_start_and_end_count() -> None:
     lines = said_by_the_mcu(config, 10)
     first_ns, last_ns = lines[3][0], lines[7][0]
     samples = [
-        Sample(Instant(at_ns + 5, 0), 0, staircase(number) * config.drive.wheel_radius)
+        Sample(at_ns + 5, staircase(number) * config.drive.wheel_radius)
         for number, (at_ns, _) in enumerate(lines, 1)
     ]
-    record = Record(0, (first_ns, last_ns), RecordedTraffic(to_daemon=lines), [], samples)
+    record = Record((first_ns, last_ns), RecordedTraffic(to_daemon=lines), [], samples)
     assert record.feedback_lines == [(at_ns, line.strip()) for at_ns, line in lines[3:7]]
     assert feedback_fates(config, record) == [MatchedLine(5, 0)] * 4
 
 
 def test_a_command_is_found_on_the_wire() -> None:
     record = Record(
-        0,
         (0, 100),
         RecordedTraffic(from_daemon=[(5, b"\r\nap"), (9, b"1\r\n")]),
         [SentCommand(4, b"x")],
@@ -171,11 +162,4 @@ def test_a_command_is_found_on_the_wire() -> None:
     )
     assert command_waits(record) == []
     traffic = RecordedTraffic(from_daemon=[(5, b"\r\n"), (7, b"ap1,\r\n")])
-    assert command_waits(Record(0, (0, 100), traffic, [SentCommand(4, b"ap1")], [])) == [3]
-
-
-def test_a_record_of_a_real_port_has_no_lines_and_no_delays() -> None:
-    record = Record(0, (0, 100), None, [SentCommand(4, b"x")], [])
-    assert not record.feedback_lines
-    assert not command_waits(record)
-    assert not feedback_fates(Config(), record)
+    assert command_waits(Record((0, 100), traffic, [SentCommand(4, b"ap1")], [])) == [3]

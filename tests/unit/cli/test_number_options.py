@@ -1,23 +1,12 @@
-"""Tests of the durations and speeds that the options of `acsard bench` accept."""
+"""Tests of the range of numbers that options accept."""
 
 from __future__ import annotations
-
-import argparse
 
 import pytest
 
 from acsard.cli import main, parser
-from acsard.cli.common import seconds
 from acsard.host.errors import Exit
 from tests.each import each
-
-
-@each("text", ["0", "0.5", "-1", "inf", "nan", "600.1", "86400", "ten"])
-def test_a_duration_is_from_a_second_to_ten_minutes(text: str) -> None:
-    assert seconds("1") == 1.0
-    assert seconds("600") == 600.0
-    with pytest.raises(argparse.ArgumentTypeError):
-        seconds(text)
 
 
 @each(

@@ -24,8 +24,6 @@ from typing import Self, TypeVar
 import msgspec
 import zenoh
 
-from acsard.bench.far_end import Part
-from acsard.bench.matching import Record, RecordedTraffic, Sample, SentCommand
 from acsard.bus.subscription import direct, encoded
 from acsard.bus.zenoh_sessions import client_session
 from acsard.core.config.parsing import effective
@@ -36,38 +34,16 @@ from acsard.core.messages.keys_and_roles import full_key
 from acsard.core.messages.schema import Odometry, RobotState, Twist, Vector3
 from acsard.core.messages.signature import Signature
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
+from acsard.core.values import NS_PER_S, WheelSpeeds
 from acsard.host import clock
-from acsard.host.child import end, end_with_parent, environment, how_it_ended
-from acsard.host.errors import Exit, ExitError, MendableError, NoAnswerError, UnreachableError
+from acsard.host.child import end, end_with_parent, environment
+from acsard.host.errors import NoAnswerError, UnreachableError
 from acsard.host.own_identity import sender_id
+from tests.bench.far_end import Part
+from tests.bench.matching import Record, RecordedTraffic, Sample, SentCommand
 
 END_TIMEOUT_S = 5.0
 """Time limit for a process to end after the request to end, s. It usually takes 0.2 s."""
-
-
-def ended(name: str, code: int, text: str = "") -> MendableError:
-    """Return an error which says that the process named `name` ended, and how.
-
-    `code` is its exit code, or the negative number of the signal that ended the process. `text` is
-    the last message of the process; "" if it left none.
-    """
-    return MendableError(f"{name} {how_it_ended(code)}" + (f": {text}" if text else ""))
-
-
-def daemon_ended(code: int, log: Path) -> MendableError:
-    """Return an error that says why the daemon ended by itself.
-
-    `code` is its exit code. The error quotes the daemon's last message in the file `log`. If the
-    file contains a message, and `code` is an error code in `Exit`, the benchmark ends with the same
-    code.
-    """
-    lines = log.read_text(errors="replace").splitlines()
-    # The daemon's log lines are JSON; its reason for ending is plain text.
-    messages = [line for line in lines if line.strip() and not line.startswith("{")]
-    if code in Exit.__members__.values() and code and messages:
-        return ExitError(Exit(code), messages[-1].removeprefix("acsard: "))
-    return ended("the daemon", code, messages[-1] if messages else "")
 
 
 def processor_ns(pid: int) -> int:
@@ -76,11 +52,6 @@ def processor_ns(pid: int) -> int:
         int(task.joinpath("schedstat").read_text().split()[0])
         for task in Path(f"/proc/{pid}/task").iterdir()
     )
-
-
-def resident_mb(pid: int) -> float:
-    status = Path(f"/proc/{pid}/status").read_text()
-    return int(status.partition("VmRSS:")[2].split()[0]) * 1024 / 1e6  # from KiB
 
 
 T = TypeVar("T")
@@ -113,7 +84,8 @@ class Rig:
         config: the configuration in `file`.
         file: the configuration file of the measured program.
         command_line: the command line that starts the measured program.
-        port: the serial port; "" starts a process that simulates the board on a pty.
+        port: the option `--port` of the program; "" starts a process that simulates the board on a
+            pty, without which `end()` has no record to return.
         free_running: period at which the simulated board reports by its own clock, s; 0 simulates a
             board that answers each line.
         wire_baud_rate: baud rate of the simulated board; 0 means the configured baud rate.
@@ -139,9 +111,9 @@ class Rig:
         self._stack = ExitStack()
         self._far_end: subprocess.Popen[bytes] | None = None
         self._session: zenoh.Session | None = None
-        self._arrived: list[tuple[Instant, bytes]] = []
+        self._arrived: list[tuple[int, bytes]] = []
         self._sent: list[SentCommand] = []
-        self._began_ns = self._settled_ns = 0
+        self._settled_ns = 0
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
@@ -174,7 +146,7 @@ class Rig:
         part = where / "part.json"
         part.write_bytes(msgspec.json.encode(self._part))
         far_end = self._far_end = subprocess.Popen(
-            [sys.executable, "-m", "acsard.bench.far_end", str(part)],
+            [sys.executable, "-m", "tests.bench.far_end", str(part)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,
@@ -182,8 +154,7 @@ class Rig:
         stack.callback(end, far_end, END_TIMEOUT_S)
         assert far_end.stdout is not None
         device = far_end.stdout.readline().decode().strip()
-        if not device:
-            raise ended(SIMULATOR_PROCESS, far_end.wait())
+        assert device, f"{SIMULATOR_PROCESS} ended with {far_end.wait()}"
         return device
 
     def _start_program(self, stack: ExitStack, port: str) -> None:
@@ -194,7 +165,6 @@ class Rig:
         # directory.
         env["XDG_STATE_HOME"] = str(self._log.parent)
         with self._log.open("wb") as log:
-            self._began_ns = clock.mono_ns()
             self.process = subprocess.Popen(
                 words,
                 stdin=subprocess.DEVNULL,
@@ -221,7 +191,7 @@ class Rig:
             if result is not None:
                 return result
             if clock.mono_ns() > deadline_ns:
-                raise MendableError(f"no {what} within {START_TIMEOUT_S:g} s{self._why()}")
+                raise TimeoutError(f"no {what} within {START_TIMEOUT_S:g} s{self._why()}")
             time.sleep(0.01)
 
     def _why(self) -> str:
@@ -232,15 +202,15 @@ class Rig:
 
     def _alive(self) -> None:
         if self._far_end is not None and self._far_end.poll() is not None:
-            raise ended(SIMULATOR_PROCESS, self._far_end.returncode)
+            raise ChildProcessError(f"{SIMULATOR_PROCESS} ended with {self._far_end.returncode}")
         code = self.process.poll()
         if code is not None:
-            raise daemon_ended(code, self._log)
+            raise ChildProcessError(f"the daemon ended with {code}: {self._log.read_text()}")
 
     # Measuring
 
     def _odometry(self, sample: zenoh.Sample) -> None:
-        self._arrived.append((clock.now(), sample.payload.to_bytes()))
+        self._arrived.append((clock.mono_ns(), sample.payload.to_bytes()))
 
     def follow(self, seconds: float) -> float:
         """Receive odometry for `seconds` s, and return the daemon's processor use.
@@ -326,16 +296,15 @@ class Rig:
         time.sleep(0.1)
         self._alive()
         self.end_program()
-        wire_data = None if self._far_end is None else _recorded_data(self._far_end)
+        assert self._far_end is not None
+        wire_data = _recorded_data(self._far_end)
         decoder = Decoder(Odometry)
         samples = []
-        for at, payload in self._arrived:
-            if at.mono_ns < self._settled_ns:
-                continue
-            odometry = decoder.decode(encoding_name("msgpack"), payload)
-            stamp_ns = odometry.header.stamp.to_ns()
-            samples.append(Sample(at, stamp_ns, odometry.twist.twist.linear.x))
-        return Record(self._began_ns, window_ns, wire_data, self._sent, samples)
+        for at_ns, payload in self._arrived:
+            if at_ns >= self._settled_ns:
+                odometry = decoder.decode(encoding_name("msgpack"), payload)
+                samples.append(Sample(at_ns, odometry.twist.twist.linear.x))
+        return Record(window_ns, wire_data, self._sent, samples)
 
 
 def _recorded_data(far_end: subprocess.Popen[bytes]) -> RecordedTraffic:
@@ -343,6 +312,5 @@ def _recorded_data(far_end: subprocess.Popen[bytes]) -> RecordedTraffic:
     assert far_end.stdout is not None
     far_end.stdin.close()
     output = far_end.stdout.read()
-    if far_end.wait(END_TIMEOUT_S):
-        raise ended(SIMULATOR_PROCESS, far_end.returncode)
+    assert far_end.wait(END_TIMEOUT_S) == 0, SIMULATOR_PROCESS
     return msgspec.msgpack.decode(output, type=RecordedTraffic)
