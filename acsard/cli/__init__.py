@@ -54,8 +54,6 @@ VERBS = {
     "gateway": "run the TLS gateway, which admits clients from other machines",
     "router": "run a fleet's Zenoh router and restart it when a client blocks it",
     "service": "install acsard as a system service, remove it, or show its status",
-    "completion": "print the script that lets a shell complete acsard commands with Tab",
-    "man": "print the text of every --help as a man page",
 }
 """Maps each subcommand to its description in `acsard --help`, in the order in which they appear.
 
