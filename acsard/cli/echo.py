@@ -1,18 +1,22 @@
 """Print each message on a key as one line of JSON, until Ctrl-C. Every key below the robot's id
 works, for example `cmd/teleop`. --csv prints wheel speeds, gyro and position as one table for
 `acsard calibrate --log`, for example: acsard echo wheel_states imu --csv > drive.csv. --short
-prints pose, speeds and warnings as text, for example: acsard echo odom -n 1 --short. If --id names
-several robots, each line names its robot, and -n N prints N messages of each robot.
+prints pose, speeds and warnings as text, for example: acsard echo odom -n 1 --short. --rate prints
+each second the message rate, and the times from one message to the next. If --id names several
+robots, each line names its robot, and -n N prints N messages of each robot.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
+import numpy as np
 import zenoh
 
 from acsard.bus.robot_discovery import ALL_ROBOTS, follow, robot_of, running_robots
@@ -39,6 +43,9 @@ from acsard.core.messages.short_texts import SHORT_TEXTS, short
 from acsard.host import clock
 from acsard.host.errors import Exit, NoAnswerError, UsageError
 
+RATE_SPAN_S = 10.0
+"""Largest age of the messages that a line of `--rate` describes, s."""
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
@@ -56,7 +63,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="print a CSV log for `acsard calibrate --log` (for one or more of the keys "
         "wheel_states, imu and sim/pose)",
     )
-    parser.add_argument("-n", type=count, metavar="N", help="end after N messages of each robot")
+    form.add_argument(
+        "--rate",
+        action="store_true",
+        help="print one line per second about the messages of the last 10 s: their rate, and the "
+        "shortest, median, 99 %% and longest time between two of them",
+    )
+    parser.add_argument(
+        "-n",
+        type=count,
+        metavar="N",
+        help="end after N messages of each robot; with --rate, after N lines",
+    )
     parser.add_argument(
         "--timeout",
         type=between(0.01, 86400, "seconds"),
@@ -68,11 +86,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     topic = args.topic[0]
+    if (args.csv or args.rate) and several_ids(args):
+        raise UsageError("with --csv or --rate, name one robot in --id")
     if args.csv:
-        if several_ids(args):
-            raise UsageError(
-                "a CSV log can contain only one robot: with --csv, name one robot in --id"
-            )
         for key in args.topic:
             if key not in KEYS:
                 raise UsageError(f"{key} cannot be in a CSV log; --csv takes {', '.join(KEYS)}")
@@ -84,6 +100,9 @@ def main(args: argparse.Namespace) -> int:
         )
     short_form = _shortened(topic) if args.short else None
     require_followed(topic)
+    if args.rate:
+        with connected(args) as robot, silence_explained(robot, topic) as on_message:
+            return _print_rates(robot, topic, args.n, on_message)
     with connected_to_many(args) as (robot, many):
         samples = robot.samples(topic, args.timeout)
         unexplained = topic
@@ -150,6 +169,42 @@ def _print(
     except KeyboardInterrupt:
         return Exit.OK
     return Exit.FAILURE
+
+
+def _print_rates(
+    robot: Client, topic: str, most: int | None, on_message: Callable[[], None]
+) -> int:
+    # Python receives fewer than a million messages in `RATE_SPAN_S`. So the limit takes effect only
+    # while the output is blocked.
+    times: deque[float] = deque(maxlen=1_000_000)
+
+    def take(_: zenoh.Sample) -> None:
+        times.append(time.monotonic())
+        on_message()
+
+    subscriber = robot.listen(topic, take)
+    try:
+        for _ in itertools.count() if most is None else range(most):
+            time.sleep(1.0)
+            while times and time.monotonic() - times[0] > RATE_SPAN_S:
+                times.popleft()
+            print(rate_text(list(times)), flush=True)
+    except KeyboardInterrupt:
+        pass
+    subscriber.undeclare()
+    return Exit.OK
+
+
+def rate_text(times: list[float]) -> str:
+    """Return the rate of messages with these times of arrival, s, and the gaps between them."""
+    if len(times) < 2 or times[-1] <= times[0]:
+        return "no messages yet" if not times else f"{len(times)} messages, no rate yet"
+    gaps_ms = np.diff(times) * 1e3
+    least, p50, p99, most = np.percentile(gaps_ms, (0, 50, 99, 100))
+    return (
+        f"{1e3 / gaps_ms.mean():8.2f} Hz   gaps ms: min {least:.2f}  p50 {p50:.2f}  p99 {p99:.2f}  "
+        f"max {most:.2f}  std {gaps_ms.std():.2f}   n {len(times)}"
+    )
 
 
 def _shortened(key: str) -> Decoder[Any]:

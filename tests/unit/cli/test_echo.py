@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,8 +11,8 @@ import msgspec
 import pytest
 
 from acsard.calibration.log_table import HEADER
-from acsard.cli import main
-from acsard.cli.echo import Quota, _message_text, _print, _record
+from acsard.cli import echo, main
+from acsard.cli.echo import Quota, _message_text, _print, _record, rate_text
 from acsard.cli.replies import json_line
 from acsard.core.messages.encodings import Decoder, Format, encode, encoding_name
 from acsard.core.messages.schema import (
@@ -207,3 +208,56 @@ def test_a_message_that_does_not_fit_into_the_csv_log_is_left_out_and_reported_o
     assert "\x1b" not in imu
     assert "`acsard echo imu` prints" in imu
     assert "a message on acsard/acsar/wheel_states is left out" in joints
+
+
+@each("times", [[], [3.0], [1.0, 1.0]])
+def test_messages_without_a_time_between_them_have_no_rate(times: list[float]) -> None:
+    assert "Hz" not in rate_text(times)
+
+
+def test_the_rate_of_three_messages_equals_the_one_computed_by_hand() -> None:
+    # The gaps are 10 and 20 ms: mean 15, deviation 5, and the 99th percentile lies 99 % of the way
+    # up.
+    assert rate_text([1.0, 1.01, 1.03]).split() == (
+        [
+            "66.67",
+            "Hz",
+            "gaps",
+            "ms:",
+            "min",
+            "10.00",
+            "p50",
+            "15.00",
+            "p99",
+            "19.90",
+            "max",
+            "20.00",
+            "std",
+            "5.00",
+            "n",
+            "3",
+        ]
+    )
+
+
+def test_a_line_of_the_rate_covers_ten_seconds_of_a_fast_stream(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The clock is virtual, and 2000 messages arrive in each second."""
+    now, takes = [0.0], list[Callable[[Any], None]]()
+
+    def sleep(seconds: float) -> None:
+        for _ in range(round(2000 * seconds)):
+            now[0] += 1 / 2000
+            takes[0](None)
+
+    def listen(_: str, take: Callable[[Any], None]) -> SimpleNamespace:
+        takes.append(take)
+        return SimpleNamespace(undeclare=lambda: None)
+
+    robot: Any = SimpleNamespace(listen=listen)
+    monkeypatch.setattr(echo, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
+    assert echo._print_rates(robot, "odom", 12, lambda: None) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith(" 2000.00 Hz")
+    assert int(last.split()[-1]) == pytest.approx(20_000, abs=1)
