@@ -94,7 +94,7 @@ def no_robot_text(endpoint: str) -> str:
         return (
             "no robot is visible. Over TLS, name the robots (--id robot1,robot2), or set [access] "
             "wildcards = true on the robots. If that does not help, your certificate may have no "
-            "role at any robot; `acsard whoami --id robot1` checks this"
+            "role at any robot; `acsard doctor --id robot1` checks this"
         )
     return (
         f"no robot is visible at {endpoint}; is a daemon running there, or is a daemon connected "
@@ -152,7 +152,7 @@ def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) 
     if is_tls(endpoint):
         return (
             f"robot {robot_id} is not visible: no robot at {endpoint} has this robot.id, or your "
-            f"certificate does not permit you to see the robot; `acsard whoami --id {robot_id}` "
+            f"certificate does not permit you to see the robot; `acsard doctor --id {robot_id}` "
             "shows the role of your certificate"
         )
     return (
@@ -190,6 +190,6 @@ def _unpublished(key: str, row: Topic) -> str:
                 "state -n 1 --short` shows whether it does"
             )
     return (
-        f"{key} does not arrive: either your role lacks the permission to read it (`acsard whoami` "
-        "shows your role), or the daemon has a fault (`acsard doctor` on the robot checks it)"
+        f"{key} does not arrive: either your role lacks the permission to read it, or the daemon "
+        "has a fault; `acsard doctor` shows your role and checks the daemon"
     )

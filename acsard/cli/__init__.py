@@ -42,7 +42,6 @@ VERBS = {
     "drive": "drive the robot with the keyboard",
     "web": "serve the robot's page: see, stop and drive the robot in a browser",
     "call": "call a service of the robot, such as stop or clear",
-    "whoami": "show your role on this robot, your certificate and your sender id",
     "set": "change a setting of the running robot, or list the changeable settings",
     "doctor": "find problems on this machine and say how to fix them",
     "ports": "list the serial ports, the processes that use them, and the likely MCU",
@@ -50,7 +49,6 @@ VERBS = {
     "calibrate": "measure wheel radii and effective track width, from a guided or a recorded drive",
     "recording": "list, show, replay, export and draw recordings",
     "tls": "make the certificates that other machines need to connect to the robot",
-    "gateway": "run the TLS gateway, which admits clients from other machines",
     "router": "run a fleet's Zenoh router and restart it when a client blocks it",
     "service": "install acsard as a system service, remove it, or show its status",
 }
@@ -58,6 +56,9 @@ VERBS = {
 
 The name of a subcommand is also the name of its module in this package.
 """
+
+UNLISTED = ("gateway",)
+"""Programs that only systemd and `acsard run` start, so `acsard --help` does not list them."""
 
 MUST_FINISH = {
     "call", "set", "doctor", "mcu", "calibrate", "tls", "service",
@@ -133,8 +134,9 @@ def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
     )
     whole.add_argument("--version", action="version", version=f"acsard {version()}")
     verbs = whole.add_subparsers(title="subcommands", metavar="SUBCOMMAND", dest="verb")
-    for name, text in VERBS.items():
-        verb = verbs.add_parser(name, help=text)
+    for name in (*VERBS, *UNLISTED):
+        # argparse lists only subcommands that have a help.
+        verb = verbs.add_parser(name, help=VERBS[name]) if name in VERBS else verbs.add_parser(name)
         if name in called:
             module = import_module(f"acsard.cli.{name}")
             verb.description = module.__doc__

@@ -560,7 +560,7 @@ class Client:
                 return NoAnswerError(f"{no_answer}: {NO_BATTERY}")
             return NoAnswerError(
                 f"{no_answer}; is the daemon of robot.id {where.robot_id!r} stuck, does it have "
-                "this key (`acsard topics`), and may you query it (`acsard whoami`)?"
+                "this key (`acsard topics`), and may you query it (`acsard doctor`)?"
             )
         return NoAnswerError(
             f"{no_answer}: {explain_silence(key, where.robot_id, where.endpoint, visibility)}"

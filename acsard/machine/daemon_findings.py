@@ -116,6 +116,8 @@ class Running(Struct, frozen=True):
     """Rows of the daemon's diagnostics."""
     is_local: bool = True
     """Whether the daemon runs on this machine."""
+    role: str = ""
+    """The role, certificate and name that this client has at the daemon, in words."""
 
 
 def query(config: Config, address: Address) -> Running:
@@ -135,7 +137,9 @@ def query(config: Config, address: Address) -> Running:
         state, answered = robot.get("state"), clock.now()
         round_trip_ns = answered.mono_ns - sent.mono_ns
         queried_ns = sent.wall_ns + round_trip_ns // 2
-        return Running(info, runs, before, state, queried_ns, round_trip_ns, rows, is_local)
+        us = robot.whoami()
+        role = f"{us.describe()}; your sender id is {us.sender}"
+        return Running(info, runs, before, state, queried_ns, round_trip_ns, rows, is_local, role)
 
 
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
@@ -472,6 +476,7 @@ def daemon(running: Running) -> Iterator[Finding]:
         )
     mend = mend if level == "failure" else ""
     yield Finding("daemon", level, f"{state.mode}: {state.reason}", mend)
+    yield Finding("role", "ok", running.role)
     yield from link(running)
     yield from clocks(running)
     yield from gyro(state.gyro, state.counters)

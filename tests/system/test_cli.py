@@ -66,7 +66,6 @@ VERBS = (
     "drive",
     "web",
     "call",
-    "whoami",
     "set",
 )
 
@@ -82,6 +81,7 @@ def tool(shared: Daemon, *words: str) -> Finished:
 def test_help_lists_the_verbs_the_exit_codes_and_examples(tmp_path: Path) -> None:
     ended = finish(acsard("--help"), tmp_path)
     assert (ended.code, ended.err) == (0, "")
+    assert "gateway" not in ended.out
     for word in (*VERBS, "69", "75", "78", "try:"):
         assert word in ended.out
     print(f"--help: {ended.seconds:.2f} s")
@@ -377,9 +377,6 @@ def test_a_robot_of_another_id_is_not_reached_and_that_is_reported(shared: Daemo
     assert (ended.code, ended.out) == (69, "")
     assert "other" in ended.err
     assert "Robots here: acsar; use --id acsar" in ended.err
-    ended = tool(shared, "whoami", "--id", "other")
-    assert ended.code == 69
-    assert "no daemon answers as 'other'" in ended.out
 
 
 @each("endpoint", ["tcp/127.0.0.1", "tls/robot.local", "tcp/[::1]"])
@@ -407,7 +404,7 @@ def test_echo_for_many_waits_for_each_and_says_which_is_missing(shared: Daemon) 
     assert "following acsar; not present: other" in ended.err
 
 
-@each("verb", ["top", "whoami", "drive", "calibrate"])
+@each("verb", ["top", "drive", "calibrate"])
 @each("ids", ["*", "robot1,robot2"])
 def test_a_verb_for_one_robot_refuses_several_ids_and_names_the_verb_for_many(
     shared: Daemon, verb: str, ids: str

@@ -135,7 +135,7 @@ def test_no_help_and_no_usage_error_has_a_colour_if_no_color_is_set(tmp_path: Pa
     [
         ["doctor"], ["top"], ["fleet"], ["echo", "state", "-n1", "--short"],
         ["echo", "odom", "-n1"],
-        ["whoami"], ["topics"], ["check"], ["set"], ["echo", "odom", "--rate", "-n2"],
+        ["topics"], ["check"], ["set"], ["echo", "odom", "--rate", "-n2"],
         ["get", "nonsense"], ["call", "nonsense"],
         ["set", "limits.linear_speed", "-1"], ["drive"],
     ],

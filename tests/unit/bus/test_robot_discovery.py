@@ -57,8 +57,8 @@ def test_over_tls_the_message_asks_for_the_names_of_the_robots() -> None:
 
 
 def test_over_tls_the_message_names_the_command_that_shows_the_role() -> None:
-    assert "`acsard whoami --id robot1` checks" in no_robot_text("tls/router.local:7447")
-    assert "whoami" not in no_robot_text("tcp/127.0.0.1:7448")
+    assert "`acsard doctor --id robot1` checks" in no_robot_text("tls/router.local:7447")
+    assert "doctor" not in no_robot_text("tcp/127.0.0.1:7448")
 
 
 HERE, PLAIN, TLS = Presence(linked=True, here=True), "tcp/127.0.0.1:7448", "tls/router:7447"
@@ -82,7 +82,7 @@ def test_only_a_few_robots_of_a_large_fleet_are_named() -> None:
 
 def test_if_no_robot_is_visible_the_message_names_the_endpoint() -> None:
     assert f"no robot is visible at {PLAIN}" in explain_silence("state", "acsar", PLAIN, absent())
-    assert "`acsard whoami --id robot1`" in explain_silence("state", "robot1", TLS, absent())
+    assert "`acsard doctor --id robot1`" in explain_silence("state", "robot1", TLS, absent())
 
 
 def test_a_lost_connection_is_reported_before_all_other_reasons() -> None:
