@@ -16,9 +16,12 @@ PACKAGE = Path(__file__).parents[1] / "acsard"
 NOT_YET = (
     "calibration", "checkup", "cli", "client", "core/config", "core/formatting.py",
     "core/incoming", "core/link/link_diagnosis.py", "core/link/negotiation.py", "core/messages",
-    "core/motion", "core/robot.py", "core/ros", "core/thinning.py", "core/values.py", "daemon",
-    "foxglove", "host/config_edit_process.py", "host/config_file.py", "host/kernel_counters.py",
-    "machine", "recording", "report", "terminal", "top", "web",
+    "core/motion/consistency.py", "core/motion/error_model.py", "core/motion/odometry.py",
+    "core/motion/gyro.py", "core/motion/gyro_bias.py", "core/motion/gyro_match.py",
+    "core/motion/gyro_trial.py", "core/motion/learned_track.py", "core/motion/limits.py",
+    "core/robot.py", "core/ros", "core/thinning.py", "core/values.py", "daemon", "foxglove",
+    "host/config_edit_process.py", "host/config_file.py", "host/kernel_counters.py", "machine",
+    "recording", "report", "terminal", "top", "web",
 )  # fmt: skip
 
 TYPES_OF_USERS = ("core/config/settings.py", "core/messages/schema.py", "web/socket_messages.py")

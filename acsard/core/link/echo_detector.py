@@ -18,11 +18,11 @@ MIN_REPEATED_LINES = 20  # successive lines that come back, 0.2 s at 100 Hz
 # Genuine replies between two lines of an echo; a free-running board may send two.
 MAX_OTHER_REPORTS = 2
 
-# Rad/s, summed over pairs of lines (the largest of four changes each). With coarse encoders, a
+# rad/s, summed over pairs of lines (the largest of four changes each). With coarse encoders, a
 # smaller total may be a coincidence.
 MIN_TOTAL_CHANGE = 2.0
 
-# Rad/s between successive changes of a speed, as at the ends of a ramp. Rounding to 0.01 gives
+# rad/s between successive changes of a speed, as at the ends of a ramp. Rounding to 0.01 gives
 # 0.02. Gentler ramps (0.125 m/s2 at 100 Hz and 0.05 m radius) show no echo.
 MIN_BEND = 0.025
 

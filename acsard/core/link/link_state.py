@@ -49,7 +49,7 @@ GOOD_LINES = 3  # in a row: a board may print anything after a reset
 
 BAD_LINES = 5  # in a row on a checked link: the check is negotiated again
 
-# With one good line between two: the lines are too sparse. One silence is a lost link.
+# Silences with one good line between two that show too sparse lines. One shows a lost link.
 SPARSE_SILENCES = 2
 
 

@@ -1,19 +1,11 @@
 """Chooses the command that the robot follows: first the source, then a sender of this source.
 
-A sender is live while its last accepted command is not older than the timeout of its source. A
-source is live while one of its senders is live. A sender is armed if it has sent a zero command
-(`neutral.py`).
-
-- The robot follows the live source of the highest priority. Among sources of equal priority, the
-  robot follows the source that began to send first, until this source falls silent. The same rule
-  applies to the senders of one source.
-- A live source without an armed sender keeps its priority, and the robot stands still. Otherwise a
-  source of lower priority would drive the robot instead.
-- A source that sends only zero commands keeps the robot at rest for any length of time. The arbiter
-  cannot tell whether an operator wants that or a controller has failed, so `state` and the log
-  report it.
-- A sender whose commands have doubtful stamps still takes part in the choice for a short time
-  (`Sender.present`). If the arbiter chooses such a sender, the robot stands still.
+A sender is live until its last accepted command is older than the source's timeout. The live source
+of the highest priority wins, among equals the one that began first, until it falls silent; so do
+senders. A source without an armed sender keeps its priority, and the robot stands still: a lower
+one must not drive instead. Zeros alone keep the robot at rest for any time, which `state` and the
+log report. A sender with doubtful stamps is chosen for a short time (`Sender.present`), and the
+robot stands still.
 """
 
 from __future__ import annotations
@@ -27,41 +19,32 @@ from acsard.core.config.settings import CommandsConfig, Source
 from acsard.core.motion.emergency_stop import CATCH_UP_NS, LATE_STEP_NS
 from acsard.core.motion.freshness import MAX_PROOF_NS, Freshness
 from acsard.core.motion.neutral import Sender, is_zero
-from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
+from acsard.core.values import NS_PER_S, REST, Command, Ns, SourceStatus, Twist, Wait
 
+# Limit per source. A sender that may keep control (`Sender.holds`) is never replaced by a new one.
 MAX_SENDERS = 16
-"""Largest number of senders that one source remembers. If the source is full, a new sender replaces
-a known sender. A sender that may keep control of the robot (`Sender.holds`), such as a live, armed
-sender, is never replaced."""
 
+# "": accepted.
 Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
-"""The reason for which the arbiter refuses a command; "" if the command is accepted."""
 
+# Durations of zeros only, or of speeds without being armed, to which `state` rounds down.
 REPORTED_DURATIONS_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
-"""Durations, s, that `state` can report for a sender that sends only zero commands, or only speeds
-without being armed. The true duration is rounded down to one of these values."""
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
 
 
 class Choice(Struct, frozen=True):
-    """The decision of the arbiter in one control step: the twist to follow, or None.
-
-    If `twist` is None, `wait` is the reason why the robot follows no command. `source` and `sender`
-    are the names of the chosen source and sender. `arrived_ns` is the monotonic time at which the
-    command with `twist` arrived, ns.
-    """
+    """The twist to follow, or None and the reason `wait`; the chosen source and sender."""
 
     source: str = ""
     twist: Twist | None = None
     wait: Wait = COMMAND
-    arrived_ns: int | None = None
+    arrived_ns: Ns | None = None
     sender: str = ""
 
 
+# No source has sent within its timeout. A command that its stamp made unacceptable has a `wait`.
 IDLE = Choice()
-"""The choice if no source has sent a command within its timeout. If a command of a known sender was
-not accepted because of its stamp, the arbiter instead returns a choice whose `wait` says so."""
 
 
 class _Source:
@@ -80,13 +63,8 @@ class _Source:
         for sender in self.senders.values():
             sender.use(self.timeout_ns, self.pause_ns)
 
-    def add(self, name: str, now_ns: int) -> Sender | None:
-        """Add the sender `name` and return it, or return None if no sender can make room for it.
-
-        A source remembers at most `MAX_SENDERS` senders. A further sender replaces the sender with
-        the lowest rank (`_account`). However, a sender that may keep control of the robot is never
-        replaced. If all remembered senders are of this kind, the result is None.
-        """
+    def add(self, name: str, now_ns: Ns) -> Sender | None:
+        """Return a new sender (it may replace the one of the lowest rank), or None."""
         if len(self.senders) >= MAX_SENDERS:
             least = min(self.senders, key=lambda other: self._account(other, now_ns))
             if self._account(least, now_ns)[0]:
@@ -95,33 +73,25 @@ class _Source:
         added = self.senders[name] = Sender(self.timeout_ns, self.pause_ns, self.neutral_first)
         return added
 
-    def _account(self, name: str, now_ns: int) -> tuple[bool, bool, int]:
-        """Return the rank of the sender `name`. `add` replaces the sender with the lowest rank.
-
-        Senders that may keep control of the robot have the highest ranks, and armed senders the
-        next. Among equal senders, the one that sent the newest message has the highest rank.
-        """
+    def _account(self, name: str, now_ns: Ns) -> tuple[bool, bool, int]:
+        # The rank: senders that may keep control, then armed ones, then the newest message.
         sender = self.senders[name]
         holds = sender.holds(now_ns)
         return holds, holds or sender.armed(now_ns), sender.noticed_ns
 
-    def cancel_zeros(self, at_ns: int) -> None:
-        """Cancel the zeros of all senders whose identity several programs may share.
+    def cancel_zeros(self, at_ns: Ns) -> None:
+        """Cancel the zeros of identities that several programs share: one may have sent a speed.
 
-        One of these programs may have sent a speed. A canceled zero does not arm its sender. A zero
-        is not canceled if its `commands.neutral_pause` was already over at the monotonic time
-        `at_ns`, ns.
+        A zero whose `commands.neutral_pause` was over at `at_ns` stays.
         """
         for sender in self.senders.values():
             sender.cancel_zero(at_ns)
 
     def undo_zeros(self, command: Command, was_set: bool) -> None:
-        """Undo the effect of earlier zeros of the sender of `command`.
+        """Undo earlier zeros of the sender of `command`, whose clock is in doubt.
 
-        The clock of this sender is in doubt. If `was_set` is true, the clock was set. All zeros of
-        the sender lose their effect, and it must send a zero again. If `was_set` is false, the
-        clock is not proven yet. Only zeros in commands that the arbiter did not accept lose their
-        effect.
+        If the clock was set, all of them; if it is not proven yet, only those that were not
+        accepted.
         """
         sender = self.senders.get(command.sender)
         # Behind a bridge, several programs with clocks of their own share one identity. Therefore a
@@ -134,12 +104,8 @@ class _Source:
         else:
             sender.unlearn()
 
-    def present(self, now_ns: int) -> list[Sender]:
-        """Return the senders that take part in the choice of the arbiter.
-
-        Armed senders come first, then live ones, then the others. Within each of these groups, the
-        sender that began to send first comes first.
-        """
+    def present(self, now_ns: Ns) -> list[Sender]:
+        """Return the senders that may be chosen: armed, live, others; the oldest first."""
         present = []
         for sender in self.senders.values():
             if sender.present(now_ns):
@@ -151,11 +117,8 @@ class _Source:
             key=lambda sender: (not sender.armed(now_ns), *sender.rank(now_ns)),
         )
 
-    def latest_ns(self) -> int | None:
-        """Return the monotonic time at which the last accepted command arrived, ns.
-
-        Return None if no command was accepted since the last call of `require_neutral`.
-        """
+    def latest_ns(self) -> Ns | None:
+        """Return when the last accepted command since `require_neutral` arrived."""
         times = [s.arrived_ns for s in self.senders.values() if s.arrived_ns is not None]
         return max(times, default=None)
 
@@ -164,27 +127,18 @@ class _Source:
             sender.require_neutral()
 
     def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
-        """Return the `Wait` which says that `sender` must send a zero before it drives the robot.
-
-        `lasts` is the time, s, for which the sender has sent only speeds, rounded down to one of
-        `REPORTED_DURATIONS_S`. If `lasts` is 0, the result does not report this time.
-        """
+        """Return the `Wait` for a zero; `lasts` is how long the sender has sent only speeds, s."""
         pause = self.pause_ns / NS_PER_S
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
-    def doubt_wait(self, now_ns: int) -> Wait | None:
-        """Return why a sender with doubtful stamps does not drive the robot.
-
-        The arbiter did not accept the recent commands of this sender because of their stamps. If
-        the source has several such senders, the result is about the one with the newest message;
-        without any, None.
-        """
+    def doubt_wait(self, now_ns: Ns) -> Wait | None:
+        """Return why the newest sender with doubtful stamps does not drive, or None without any."""
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
         if not doubtful:
             return None
         return self.stale_wait(max(doubtful, key=lambda sender: sender.noticed_ns), now_ns)
 
-    def stale_wait(self, sender: Sender, now_ns: int) -> Wait:
+    def stale_wait(self, sender: Sender, now_ns: Ns) -> Wait:
         """Return why `sender`, which is not live, does not drive the robot."""
         if not sender.doubtful(now_ns):
             return self.stalled
@@ -192,12 +146,8 @@ class _Source:
             return self.late
         return self.proof if sender.armed(now_ns) else self.neutral(sender)
 
-    def wait_of(self, sender: Sender, now_ns: int, lasting: bool = True) -> Wait:
-        """Return why `sender` does not drive the robot.
-
-        If `lasting` is true, and the sender is live but not armed, the result also says for how
-        long the sender has sent speeds.
-        """
+    def wait_of(self, sender: Sender, now_ns: Ns, lasting: bool = True) -> Wait:
+        """Return why `sender` does not drive; if `lasting`, for how long it has sent speeds."""
         if not sender.is_live(now_ns):
             return self.stale_wait(sender, now_ns)
         since_ns = sender.speeds_ns if lasting else None
@@ -222,34 +172,27 @@ class Arbiter:
         self._freshness = Freshness()
 
     def use(self, commands: CommandsConfig) -> None:
-        """Use the timeouts and the `neutral_pause` of `commands` from now on.
-
-        Armed senders stay armed. The names and priorities of the sources must not change.
-        """
+        """Use other timeouts and `neutral_pause`. Armed senders stay armed."""
         for settings in commands.sources:
             self._sources[settings.name].use(settings, commands.neutral_pause)
 
-    def require_neutral(self, since_ns: int = 0) -> None:
-        """Forget all commands. Each sender must send a zero command before it drives again.
+    def require_neutral(self, since_ns: Ns = 0) -> None:
+        """Forget all commands: each sender must send a zero that arrives from `since_ns` on.
 
-        Only a zero command that arrives at the monotonic time `since_ns`, ns, or later arms a
-        sender. An older zero command, for example from before a stop was cleared, does not show
-        that the sender wants the robot to rest now. After several calls, the latest `since_ns`
-        counts. If `commands.neutral_first` is false, senders need not send a zero command.
+        An older zero, for example from before a stop was cleared, does not show that the sender
+        wants rest now. The latest `since_ns` counts. Without `commands.neutral_first` no zero is
+        needed.
         """
         self._since_ns = max(self._since_ns, since_ns)
         for source in self._ranking:
             source.require_neutral()
         self._holder = self._followed = None
 
-    def begin(self, now_ns: int) -> bool:
-        """Begin a control step at the monotonic time `now_ns`, ns. Call this before `accept`.
+    def begin(self, now_ns: Ns) -> bool:
+        """Begin a control step, and return whether the daemon stood still before (True at first).
 
-        If the previous step was more than `LATE_STEP_NS` ago, the daemon stood still, and the bus
-        may not have delivered the commands of that time yet. Therefore each sender takes part in
-        the choice for a short additional time. The time of the stall does not count toward a
-        running `commands.neutral_pause` (see `Sender.resume`). Return whether the daemon stood
-        still; the result is also True in the first step.
+        After `LATE_STEP_NS`, the bus may not have delivered all commands, so senders stay in the
+        choice for a short time, and a running `neutral_pause` does not advance (`Sender.resume`).
         """
         before_ns, self._begun_ns = self._begun_ns, now_ns
         if now_ns - before_ns <= LATE_STEP_NS:
@@ -292,18 +235,11 @@ class Arbiter:
         sender.take(command, self._since_ns, verdict, self._watched_ns)
         return "" if verdict in ("fresh", "set") else "unproven"
 
-    def notice(self, source: str, sender: str, arrived_ns: int, shared: bool = False) -> None:
-        """Record that a message to `source` was lost or unusable.
+    def notice(self, source: str, sender: str, arrived_ns: Ns, shared: bool = False) -> None:
+        """Record that a message to `source` was lost or unusable; it may have been a speed.
 
-        The message may have been a speed. If `shared` is true or `sender` is "" (unknown), any
-        program that shares its identity with others may have sent it. The method then cancels the
-        zeros of all shared identities of the source, so that these zeros do not arm their senders.
-        A zero is not canceled if its `commands.neutral_pause` was already over at the monotonic
-        time `arrived_ns`, ns.
-
-        The sender and the time of a lost message are unknown: pass "" as `sender` and 0 as
-        `arrived_ns`. Then the method cancels each zero of a shared identity that has not armed its
-        sender yet.
+        If any program that shares its identity may have sent it, the zeros of all shared identities
+        of the source are canceled (`cancel_zeros`). For a lost message, pass "" and 0.
         """
         known = self._sources.get(source)
         if known is None:
@@ -314,7 +250,7 @@ class Arbiter:
         if shared or not sender:
             known.cancel_zeros(arrived_ns)
 
-    def choose(self, now_ns: int) -> Choice:
+    def choose(self, now_ns: Ns) -> Choice:
         """Return the command that the robot follows now, or the reason why it follows none."""
         first: tuple[_Source, Sender] | None = None
         previous = self._followed
@@ -356,12 +292,9 @@ class Arbiter:
             )
         return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
 
-    def _blocked_source(self, holder: _Source, now_ns: int) -> str:
-        """Return the name of a source whose speeds have no effect because `holder` sends zeros.
-
-        If another sender of `holder` itself sends these speeds, the text begins with "another
-        sender of". The text is "" if no source sends speeds.
-        """
+    def _blocked_source(self, holder: _Source, now_ns: Ns) -> str:
+        # The source whose speeds have no effect because `holder` sends zeros; maybe another sender
+        # of it.
         for source in self._ranking:
             senders = (each for each in source.present(now_ns) if each is not self._followed)
             if any(sender.twist != REST for sender in senders):
@@ -369,25 +302,20 @@ class Arbiter:
         return ""
 
     @property
-    def clock_adjustment_ns(self) -> int:
-        """Sum of the increases of command delays that the daemon has trusted, ns.
-
-        The daemon trusts a larger delay if the clock of the sender may have been set. The part of
-        an increase that the stamps show to be an adjustment of the clock does not count. A budget
-        in `freshness.py` limits the rest, except after a pause of the sender.
-        """
+    def clock_adjustment_ns(self) -> Ns:
+        """Sum of the trusted increases of delays that no stamps explain (`freshness.py`)."""
         return self._freshness.forgiven_ns
 
-    def sources(self, now_ns: int) -> tuple[SourceStatus, ...]:
+    def sources(self, now_ns: Ns) -> tuple[SourceStatus, ...]:
         """Return the status of each source, the highest priority first."""
         return tuple(self._status(source, now_ns) for source in self._ranking)
 
-    def _status(self, source: _Source, now_ns: int) -> SourceStatus:
+    def _status(self, source: _Source, now_ns: Ns) -> SourceStatus:
         latest = source.latest_ns()
         age_s = None if latest is None else max(0, now_ns - latest) / NS_PER_S
         return SourceStatus(source.name, source.priority, age_s, self._waits_for(source, now_ns))
 
-    def _waits_for(self, source: _Source, now_ns: int) -> Wait:
+    def _waits_for(self, source: _Source, now_ns: Ns) -> Wait:
         holder, present = self._holder, source.present(now_ns)
         if not present:
             return source.doubt_wait(now_ns) or COMMAND
@@ -399,7 +327,7 @@ class Arbiter:
         return Wait("equal" if holder.priority == source.priority else "higher", holder.name)
 
 
-def _reported_duration_s(ns: int) -> float:
+def _reported_duration_s(ns: Ns) -> float:
     if ns < REPORTED_DURATIONS_S[0] * NS_PER_S:
         return 0.0  # Nearly every step ends here.
     return max(seconds for seconds in REPORTED_DURATIONS_S if ns >= seconds * NS_PER_S)

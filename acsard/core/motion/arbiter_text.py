@@ -1,15 +1,11 @@
-"""Creates the sentences and events about modes, commands and the senders that drive the robot.
-
-The sentences go into `state` and `diagnostics`, and the events go into the log. `event_throttle.py`
-limits the number of lines in the log.
-"""
+"""Creates the sentences and events about modes, commands and the senders that drive the robot."""
 
 from __future__ import annotations
 
 from acsard.core.formatting import lasting, many
 from acsard.core.motion.arbiter import MAX_SENDERS, Choice
 from acsard.core.motion.modes import Mode
-from acsard.core.values import NS_PER_S, Event, Refusal, Wait
+from acsard.core.values import NS_PER_S, Event, Ns, Refusal, Wait
 
 REFUSED = {
     "unknown_source": "this source is not in commands.sources",
@@ -21,10 +17,8 @@ REFUSED = {
     "robot has already accepted: the network delayed it, or the sender's clock was set",
 }
 
+# A public name has at most 57 characters, a certificate adds 67. A name of a Zenoh key is cut.
 MAX_SENDER_LENGTH = 124
-"""Largest number of characters of a sender's name in a log event. The public name of a program has
-at most 57 characters, and the name from its certificate adds at most 67. A name that is made from a
-Zenoh key can be longer, and is then cut to this length."""
 
 ROS_NEVER = (
     ' (`ros2 topic pub` with a speed never sends a zero; the section "After a clear" of '
@@ -33,14 +27,14 @@ ROS_NEVER = (
 
 
 def chosen(choice: Choice) -> str:
-    """Return a text that names the source that drives the robot, or says why no source does."""
+    """Return the source that drives the robot, or why no source does, as text."""
     if choice.wait.what == "command":
         return "waiting for a command: no source has sent one within its timeout"
     return waiting(choice.wait) or f"commanded by {choice.source}"
 
 
 def waiting(wait: Wait) -> str:
-    """Return the condition that a source waits for, as text; "" if it need not wait."""
+    """Return the condition that a source waits for, as text."""
     match wait.what:
         case "nothing":
             return ""
@@ -81,19 +75,15 @@ def waiting(wait: Wait) -> str:
             )
 
 
-def missed(periods: int, period_ns: int) -> Event:
-    """Return the log event for `periods` successive control periods without a step of the robot."""
+def missed(periods: int, period_ns: Ns) -> Event:
+    """Return the event for successive control periods without a step."""
     when = "one control period" if periods == 1 else f"{periods} successive control periods"
     text = f"late by {periods * period_ns / NS_PER_S:.2f} s: no control step ran in {when}"
     return Event("missed_periods", text, "warning", kind="missed", count=periods, news=False)
 
 
 def refused(refusal: Refusal) -> Event:
-    """Return the log event for a refused command.
-
-    The event is `new_sender` if the clock of the sender is not proven yet, otherwise
-    `command_refused`.
-    """
+    """Return the event `command_refused`, or `new_sender` if its clock is not proven yet."""
     by, kind = refusal.sender[:MAX_SENDER_LENGTH], refusal.reason
     if kind == "unproven":
         return Event("new_sender", refusal.text, by=by, news=False)
@@ -101,20 +91,16 @@ def refused(refusal: Refusal) -> Event:
 
 
 class CommandEvents:
-    """Creates log events for a new mode, and for a new source or sender that drives the robot."""
+    """Events for a new mode, and for a new source or sender that drives the robot."""
 
     def __init__(self, mode: Mode) -> None:
         self._mode, self._commander = mode, ("", "")
-        self._kept = ""
-        """The source whose speeds have no effect, according to the last log event about such
-        speeds. It is "" before the first event, and when the condition of the event has ended."""
+        self._kept = ""  # source whose speeds have no effect, by the last event
 
     def changes(self, mode: Mode, choice: Choice, why: str) -> list[Event]:
-        """Return the log events for the changes since the last call.
+        """Return the events for a new mode, a new commander, and speeds without effect.
 
-        The events report a new mode, a new commander (the source and the sender that drive the
-        robot), and a source whose speeds have no effect. A commander that drives again after a
-        pause is not new. `why` is the reason of the mode, as text.
+        A commander that drives again after a pause is not new. `why` is the reason of the mode.
         """
         drives, before, last = mode is Mode.DRIVING, self._mode, self._commander
         if drives:
@@ -129,11 +115,7 @@ class CommandEvents:
         return events + self._kept_waiting(mode, choice)
 
     def _kept_waiting(self, mode: Mode, choice: Choice) -> list[Event]:
-        """Return a warning if the speeds of a source have had no effect for a while.
-
-        Either the sender of the speeds is not armed, or another sender keeps the robot at rest with
-        zeros. The list is empty if there is no such source, or if the warning was already given.
-        """
+        # A warning, once, if the speeds of a source have had no effect for a while.
         wait, source = choice.wait, ""
         if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):
             self._kept = ""

@@ -1,12 +1,9 @@
 """Monitors the battery that the board reports, and decides when an empty battery stops the robot.
 
-The thresholds in `[battery]` apply to a running mean of the voltage or of the charge. They do not
-apply to single values, because starting motors make the voltage drop for some tenths of a second.
-An empty battery latches a stop, which `lifecycle.py` keeps. The call `clear` does not release the
-stop until the mean has risen above the threshold by `battery.hysteresis`.
-
-If the board stops reporting its battery, the level becomes "unknown" and the robot does not stop. A
-robot that blocks the way is the greater danger, and the voltage falls slowly.
+The thresholds of `[battery]` apply to a running mean, because starting motors make the voltage drop
+for some tenths of a second. An empty battery latches a stop, which `clear` releases only above the
+threshold by `battery.hysteresis`. If the board stops reporting, the level is "unknown" and the
+robot does not stop: one that blocks the way is the greater danger, and the voltage falls slowly.
 """
 
 from __future__ import annotations
@@ -16,34 +13,25 @@ from typing import get_args
 
 from acsard.core.config.settings import BatteryConfig
 from acsard.core.link.board_status import BoardStatus
-from acsard.core.values import NS_PER_S, BatteryLevel, BatteryStatus, Event
+from acsard.core.values import NS_PER_S, BatteryLevel, BatteryStatus, Event, Ns
 
+# Of the running mean. A drop of 2 V for 0.3 s at a motor start lowers it by 0.06 V, and a battery
+# takes minutes from one level to the next.
 TIME_CONSTANT_S = 10.0
-"""Time constant of the running mean of the voltage or charge, s. A drop of 2 V for 0.3 s at a motor
-start lowers the mean by 0.06 V. A battery takes minutes from one level to the next, so the robot
-reacts soon enough."""
 
+# Reports must cover this time (each `MAX_WEIGHT_NS` at most) before the mean decides. A motor start
+# in it lowers the mean by up to a tenth of the drop.
 SETTLE_S = 3.0
-"""Time that the reports of the battery must cover before their running mean decides the level, s.
-The covered time is the sum of the intervals between the reports, each limited to `MAX_WEIGHT_NS`. A
-silence of the board resets it to 0. A motor start in this time lowers the mean by up to a tenth of
-the voltage drop."""
 
-SILENCE_TIMEOUT_S = 5.0
-"""Largest age of a reported value of the battery, s. An older value is dropped. If the board sends
-one report a second, four consecutive reports may be lost without an effect."""
+SILENCE_TIMEOUT_S = 5.0  # at one report a second, four in a row may be lost
 
+# Longest time that one report stands for, that of a motor start, or it weighs too much after a gap.
+# At one report a second, the mean has a third of its speed.
 MAX_WEIGHT_NS = 300_000_000
-"""Largest weight of one report in the running mean, ns: the duration of a motor start. The weight
-of a report is the time since the previous report, up to this limit. Without the limit, a report
-during a motor start would weigh too much after a gap. If the board sends only one report a second,
-the limit slows the mean down to a third of its speed."""
 
-EMPTY_REASON = "battery below "
-"""First words of the text `Battery.why`, the reason for a stop by an empty battery."""
+EMPTY_REASON = "battery below "  # begins `Battery.why`
 
-LEVELS_BY_URGENCY: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]
-"""The battery levels from the best to the worst, except "unknown"."""
+LEVELS_BY_URGENCY: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]  # without "unknown"
 
 MISSING_REASON = (
     "the board has not reported its battery, but the configuration has thresholds in [battery]"
@@ -53,7 +41,7 @@ SILENT_REASON = f"the board has not reported its battery for {SILENCE_TIMEOUT_S:
 
 
 def status_text(config: BatteryConfig, status: BatteryStatus) -> str:
-    """Return a text with the battery's values and with the reason if its level is not "ok"."""
+    """Return the battery's values as text, with the reason of a level that is not "ok"."""
     forms = ((status.volts, "{:.2f} V"), (status.percent, "{:g} %"), (status.amps, "{:.2f} A"))
     values = [form.format(value) for value, form in forms if value is not None]
     if status.volts is None and status.percent is None:
@@ -83,63 +71,48 @@ class Battery:
     """The battery values that the board reports, and the battery level computed from them."""
 
     def __init__(self, config: BatteryConfig, stopped: bool = False) -> None:
-        """Start without a report.
-
-        `stopped` is true if an empty battery had stopped the robot before this daemon started.
-        """
+        # `stopped`: an empty battery had stopped the robot before this daemon started.
         self._config = config
         self._bounds = config.bounds
+        # None if the board has never reported voltage or charge.
         self.status: BatteryStatus | None = None
-        """Reported values and battery level; None if the board has never reported its voltage or
-        charge."""
-        self.stopped_now = False
-        """Whether the level fell to "stop" in the last call of `process_reports`."""
+        self.stopped_now = False  # in the last `process_reports`
+        # By "volts", "percent" and "amps", with the arrival.
         self._values: dict[str, tuple[float, int]] = {}
-        """Last value of each quantity by its name ("volts", "percent", "amps"), with its monotonic
-        time of arrival, ns."""
+        # Until the board on the newly opened port reports what `battery.measure` names.
         self._awaited = True
-        """True from the opening of the port until the board reports the value that
-        `battery.measure` names."""
+        # Last level but "unknown": silence must not end a stop.
         self._known: BatteryLevel = "stop" if stopped and "stop" in self._bounds else "ok"
-        """The last level other than "unknown". A silence of the board does not change it, because
-        silence must not end a stop."""
-        self._told: BatteryLevel | None = None
-        """The level in the last log event; None before the first event."""
+        self._told: BatteryLevel | None = None  # in the last event
         self._mean: float | None = None
+        # First report since the last silence, and newest report in `_mean`.
         self._since_ns = self._mean_ns = 0
-        """Monotonic times, ns. `_since_ns` is the arrival of the first report since the last
-        silence, and `_mean_ns` is the arrival of the newest report in `_mean`."""
-        self._stood_ns = 0
-        """Sum of the weights of all reports in `_mean`, ns (see `MAX_WEIGHT_NS`)."""
+        self._stood_ns = 0  # sum of the weights in `_mean`
 
     @property
     def refuses_clear(self) -> bool:
-        """Whether the call `clear` is refused, because the last known battery level is "stop"."""
+        """Whether `clear` is refused, because the last known level is "stop"."""
         return self._known == "stop"
 
     @property
     def why(self) -> str:
-        """Reason of a stop by an empty battery, as text without measured values."""
+        """Reason of a stop by an empty battery, without measured values."""
         return f"{EMPTY_REASON}{_threshold(self._config, 'stop')}"
 
     @property
     def mend(self) -> str:
-        """Advice on how to end the level "stop", as text without measured values."""
+        """Advice on how to end the level "stop", without measured values."""
         if self.refuses_clear and self._told is None:
             return "wait until the board has reported its battery for some seconds"
         config = self._config
         return f"charge the battery to {_with_unit(config, config.stop_below + config.hysteresis)}"
 
     def reopen(self) -> None:
-        """Record that the serial port was opened. Another board may answer from now on."""
+        """Record that the port was opened: another board may answer from now on."""
         self._awaited = True
 
     def forget(self) -> None:
-        """Forget the battery level, unless the board on the newly opened port has reported it.
-
-        The board has reported it if the value that `battery.measure` names has arrived since the
-        serial port was opened.
-        """
+        """Forget the level, unless the board on the newly opened port has reported it."""
         if self._awaited:
             self._known, self._told, self._mean = "ok", None, None
             self._values.pop(self._config.measure, None)
@@ -147,13 +120,9 @@ class Battery:
                 self.status = None
 
     def process_reports(
-        self, reports: Iterable[tuple[int, BoardStatus]], now_ns: int
+        self, reports: Iterable[tuple[int, BoardStatus]], now_ns: Ns
     ) -> list[Event]:
-        """Process the status lines since the last control step.
-
-        Return a list with one log event if the level changed, otherwise an empty list. Each item of
-        `reports` is a pair: the monotonic time of arrival, ns, and the status line.
-        """
+        """Process status lines with their arrival; return an event if the level changed."""
         self.stopped_now = False
         news = False
         for at_ns, line in reports:
@@ -178,7 +147,7 @@ class Battery:
         before, self._told = self._told, level
         return [self._event(level, before)]
 
-    def _take(self, name: str, value: float, at_ns: int) -> None:
+    def _take(self, name: str, value: float, at_ns: Ns) -> None:
         first = not self._values
         self._values[name] = value, at_ns
         if name != self._config.measure:
@@ -197,11 +166,8 @@ class Battery:
             self._mean += (value - self._mean) * stood_ns / span_ns
             self._mean_ns = at_ns
 
-    def _level(self, now_ns: int) -> BatteryLevel | None:
-        """Return the battery level, or None until the reports cover `SETTLE_S`.
-
-        The method also sets `stopped_now`, which says whether the level has just fallen to "stop".
-        """
+    def _level(self, now_ns: Ns) -> BatteryLevel | None:
+        # None until the reports cover `SETTLE_S`. Sets `stopped_now`.
         measure, values = self._config.measure, self._values
         if measure not in values:
             self._mean = None

@@ -1,14 +1,10 @@
 """Monitors the bumpers that the board reports, and decides which motion they allow.
 
-A press of a bumper sets the command to zero without a ramp. With `safety.bumper = "stop"`, the
-press also latches a stop. With `safety.bumper = "away"`, each sender must send a zero before the
-robot moves again. Until the bumper is released, the robot then drives only straight away from the
-bumper, at `AWAY_SPEED` or less. The robot may not turn, because a corner could sweep into the
-obstacle. No motion leads away from a bumper at the left or the right, because the robot cannot move
-sideways.
-
-If a board that has reported bumpers stops reporting them, a stop is latched, both with "stop" and
-with "away". A bumper is not a safety function, because the status line may be lost or late.
+A press sets the command to zero without a ramp. With `safety.bumper = "stop"` it latches a stop.
+With "away" each sender must send a zero, and until the release the robot drives only straight away,
+at `AWAY_SPEED`: in a turn, a corner could sweep into the obstacle, and no motion leads away from a
+side. A board that stops reporting them latches a stop in both cases. Bumpers are no safety
+function, because the status line may be lost or late.
 """
 
 from __future__ import annotations
@@ -21,12 +17,10 @@ from acsard.core.link.board_status import BoardStatus
 from acsard.core.motion.emergency_stop import SILENCE_TIMEOUT_S, TRANSITIONS, BoardInput
 from acsard.core.values import REST, EstopState, Twist
 
-AWAY_SPEED = 0.1
-"""Highest speed away from a pressed bumper, m/s."""
+AWAY_SPEED = 0.1  # m/s
 
+# Sign of the speed away from a bumper; 0 if no straight motion leads away.
 DIRECTIONS: dict[Place, int] = {"front": -1, "rear": 1, "left": 0, "right": 0}
-"""Sign of the linear speed that drives the robot away from a bumper at this place. The sign is 0 if
-no straight motion leads away from the bumper."""
 
 ALLOWED = {-1: "backwards", 1: "forwards"}
 
@@ -36,7 +30,6 @@ SILENT_REASON = (
 
 
 def missing_text(safety: SafetyConfig) -> str:
-    """Return the text which says that the board has not reported the configured bumpers."""
     count = len(safety.bumpers)
     return (
         f"safety.bumpers has {many(count, 'place')}, but the microcontroller has not reported "
@@ -46,11 +39,7 @@ def missing_text(safety: SafetyConfig) -> str:
 
 
 def pressed_words(places: Sequence[Place], pressed: Sequence[bool]) -> str:
-    """Return a text that lists the pressed bumpers, such as "front bumper pressed".
-
-    `pressed` says for each bumper whether it is pressed, and `places` gives the place of each
-    bumper. If `places` is empty, the text gives the numbers of the pressed bumpers, counted from 1.
-    """
+    """Return a text that names the pressed bumpers by place, or by number from 1 without places."""
     numbers = [i for i, on in enumerate(pressed) if on]
     if not places:
         joined = " and ".join(str(i + 1) for i in numbers)
@@ -60,7 +49,7 @@ def pressed_words(places: Sequence[Place], pressed: Sequence[bool]) -> str:
 
 
 class Bumpers(BoardInput):
-    """The state of all bumpers of one robot, and the motion that they allow."""
+    """The state of all bumpers, and the motion that they allow."""
 
     # In contrast to `TRANSITIONS`, silence changes the state even while a bumper is pressed,
     # because a silent board cannot report the press of another bumper.
@@ -72,8 +61,7 @@ class Bumpers(BoardInput):
         super().__init__("off" if off else "required" if safety.bumpers else "auto")
         self._places = safety.bumpers
         self._away = safety.bumper == "away" and len(safety.bumpers) > 0
-        self._count = 0
-        """Number of bumpers in the last status line that reported bumpers."""
+        self._count = 0  # in the last status line that reported bumpers
 
     @property
     def limiting(self) -> bool:
@@ -82,32 +70,22 @@ class Bumpers(BoardInput):
 
     @property
     def latching(self) -> bool:
-        """Whether a pressed bumper latches a stop, until a client calls `clear`.
-
-        If the configuration allows driving away from an obstacle (`bumper = "away"`), a real press
-        does not latch a stop. Bumpers that count as pressed because the board no longer reports
-        them still latch a stop.
-        """
+        """Whether a pressed bumper latches a stop; with "away", only if it is not reported."""
         return not self._away or self.state == "silent"
 
     @property
     def clear_refusal(self) -> str:
-        """Reason, as text, why `clear` must not release a stop now; "" if the bumpers allow it."""
+        """Why `clear` must not release a stop now; "" if the bumpers allow it."""
         return self.why if self.latching else ""
 
     def away(self, twist: Twist) -> Twist | None:
-        """Return the part of `twist` that the pressed bumpers allow; None if they allow no part.
-
-        The pressed bumpers allow rest, and straight motion away from all of them at `AWAY_SPEED` or
-        less. The turn in `twist` is dropped.
-        """
+        """Return the allowed part of `twist` (rest, or straight away at `AWAY_SPEED`), or None."""
         if twist == REST:
             return REST
         speed = twist.linear * self._direction()
         return Twist(self._direction() * min(speed, AWAY_SPEED)) if speed > 0.0 else None
 
     def note(self) -> str:
-        """Return a sentence that names the pressed bumpers and the allowed motion."""
         allowed = ALLOWED.get(self._direction())
         if allowed is None:
             return (
@@ -117,13 +95,8 @@ class Bumpers(BoardInput):
         return f"{self.why}: the robot drives only straight {allowed}, at most {AWAY_SPEED:g} m/s"
 
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
-        """Return whether each bumper is pressed; None if this status line cannot be used.
-
-        A line cannot be used if it reports no bumpers. If a line reports an unexpected number of
-        bumpers, a pressed bumper may be missing, so the line is not used either. The expected
-        number is the number of places in `safety.bumpers`. Without places, it is the number in the
-        previous report, and a line that reports a press is used with any number of bumpers.
-        """
+        # A line with an unexpected number of bumpers may lack a pressed one, so it is not used.
+        # Expected are the places, or else the last number; a press counts with any number then.
         bumpers = status.bumpers
         if bumpers is None:
             return None
@@ -137,7 +110,6 @@ class Bumpers(BoardInput):
         return pressed_words(self._places, self.pressed or ())
 
     def advice(self) -> str:
-        """Return the instruction for the log: how the robot may move, or how to end the stop."""
         return self.note().partition(": ")[2] if self.limiting else super().advice()
 
     def released(self, before: EstopState) -> str:

@@ -1,18 +1,10 @@
-"""Monitors the safety inputs that the board reports, and decides when an input counts as pressed.
+"""Monitors the safety inputs that the board reports, and decides when one counts as pressed.
 
-`BoardInput` is the common base class of `EmergencyStop` and of the bumpers (`bumpers.py`). A board
-that has reported an input once must continue to report this input. After `SILENCE_TIMEOUT_S`
-without a report, the input counts as pressed: a cable may be cut, or the emergency stop may have
-cut the board's own supply. A pressed emergency stop latches a stop (`lifecycle.py`). The stop lasts
-until a client calls `clear`.
-
-When the serial port is opened again, a different board may answer, and this board may not have the
-input. The input keeps its state until the board reports it, or until `session.py` finds that the
-board does not report it.
-
-This software is not the safety function: the hardware emergency stop cuts the power of the motors
-without the daemon. The board only reports the press to the daemon. The daemon then commands zeros,
-and keeps the robot stopped after the button is released.
+An input that was reported once counts as pressed after `SILENCE_TIMEOUT_S` without a report: a
+cable may be cut, or the emergency stop may have cut the board's own supply. A pressed emergency
+stop latches a stop until `clear`. After the port was opened, another board may answer, and the
+input keeps its state until it is reported, or until `session.py` finds that it is not. The safety
+function is the hardware, which cuts the motors' power without the daemon.
 """
 
 from __future__ import annotations
@@ -24,10 +16,11 @@ from typing import Literal
 
 from acsard.core.config.settings import EstopUse
 from acsard.core.link.board_status import BoardStatus
-from acsard.core.values import NS_PER_S, EstopState, Event, EventName
+from acsard.core.values import NS_PER_S, EstopState, Event, EventName, Ns
 
 Sign = Literal["ok", "pressed", "silence"]
 
+# `silence`: no report for `SILENCE_TIMEOUT_S`. A pair without an entry changes nothing.
 TRANSITIONS: dict[tuple[EstopState, Sign], EstopState] = {
     ("", "ok"): "released",
     ("", "pressed"): "pressed",
@@ -37,20 +30,13 @@ TRANSITIONS: dict[tuple[EstopState, Sign], EstopState] = {
     ("silent", "ok"): "released",
     ("silent", "pressed"): "pressed",
 }
-"""Maps the state of a safety input and a sign to the next state. The sign is `ok` or `pressed` if a
-status line reports the input, and `silence` if no line has reported the input for
-`SILENCE_TIMEOUT_S`. A pair without an entry does not change the state."""
 
-SILENCE_TIMEOUT_S = 0.5
-"""Time without a report after which an input counts as pressed, s: five status lines at 10 Hz."""
+SILENCE_TIMEOUT_S = 0.5  # five status lines at 10 Hz
 
-LATE_STEP_NS = 150_000_000
-"""If two control steps are farther apart than this, ns, the second step counts as late. The longest
-control period that can be configured is 100 ms."""
+LATE_STEP_NS = 150_000_000  # between two control steps; the longest control period is 100 ms
 
+# After a late step, until what arrived meanwhile is read, the board is not silent.
 CATCH_UP_NS = 100_000_000
-"""Extra time after a late control step before the board counts as silent, ns. In this time, the
-daemon reads the lines and commands that arrived while no control step ran."""
 
 PRESSED_REASON = "emergency stop pressed at the robot"
 SILENT_REASON = (
@@ -73,69 +59,55 @@ class BoardInput(ABC):
     """The state of one safety input, or of several that the board always reports together."""
 
     table = TRANSITIONS
-    silent: str
-    """Reason, as text, of a stop that is latched because the board does not report the inputs."""
-    events: tuple[EventName, EventName]
-    """Names of the two log events for a press and for a release."""
+    silent: str  # reason of a stop that is latched because the inputs are not reported
+    events: tuple[EventName, EventName]  # for a press and for a release
 
     def __init__(self, use: EstopUse) -> None:
         self.use = use
-        self.state: EstopState = ""
-        """The state of the inputs; "" if the board has never reported them."""
-        self.pressed: tuple[bool, ...] | None = None
-        """Whether each input counts as pressed; None if the board has never reported the inputs."""
-        self._awaited = True
-        """True from the opening of the port until the board reports the inputs."""
+        self.state: EstopState = ""  # "" if never reported
+        self.pressed: tuple[bool, ...] | None = None  # None if never reported
+        self._awaited = True  # until the board on the newly opened port reports the inputs
+        # Reason, if an input began to count as pressed in the last `process_reports`.
         self.pressed_now = ""
-        """Reason, as text, if an input began to count as pressed in the last call of
-        `process_reports`; otherwise an empty text."""
         self._reported_ns = self._looked_ns = 0
         self._excused = False
 
     @property
     def why(self) -> str:
-        """Why an input counts as pressed, as text; "" while no input counts as pressed."""
+        """Why an input counts as pressed; "" if none does."""
         if self.state == "silent":
             return self.silent
         return self.reason_text() if self.state == "pressed" else ""
 
     @property
     def mend(self) -> str:
-        """Advice to the operator about an input that counts as pressed, as text."""
+        """Advice to the operator about a pressed input."""
         return CHECK if self.state == "silent" else RELEASE
 
     @property
     def missing(self) -> bool:
-        """Whether the robot needs the inputs, but the board has not reported them.
+        """Whether the robot needs the inputs, but the board on the port has not reported them.
 
-        Only reports since the serial port was last opened count. While this is true, the robot
-        cannot drive.
+        While this is true, the robot cannot drive.
         """
         return self.use == "required" and self._awaited
 
     def reopen(self) -> None:
-        """Record that the serial port was opened, so that another board may answer from now on.
-
-        The inputs keep their state until the board reports them, or until `forget` is called.
-        """
+        """Record that the port was opened; the state stays until a report or `forget`."""
         self._awaited = True
 
     def forget(self) -> None:
-        """Forget the state if the board has not reported the inputs since the port was opened.
+        """Forget the state if the board is certain not to report the inputs.
 
-        Call this when it is certain that this board does not report the inputs. Otherwise, a press
-        that an earlier board has reported would prevent `clear` forever.
+        Otherwise, a press that an earlier board has reported would prevent `clear` forever.
         """
         if self._awaited:
             self.state, self.pressed = "", None
 
     def process_reports(
-        self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int
+        self, reports: Sequence[tuple[int, BoardStatus]], now_ns: Ns
     ) -> list[Event]:
-        """Process the status lines since the last control step; return the log events of changes.
-
-        Each item of `reports` is a pair: the monotonic time of arrival, ns, and the status line.
-        """
+        """Process status lines with their arrival; return the events of changes."""
         self.pressed_now = ""
         if self.use == "off":
             return []
@@ -157,21 +129,18 @@ class BoardInput(ABC):
 
     @abstractmethod
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
-        """Return whether each input is pressed; None if `status` does not report the inputs."""
+        """Return whether each input is pressed; None if `status` does not report them."""
 
     @abstractmethod
     def reason_text(self) -> str:
-        """Return the reason of a stop as text: it says which inputs are pressed."""
+        """Return which inputs are pressed, as the reason of a stop."""
 
     @abstractmethod
     def released(self, before: EstopState) -> str:
-        """Return the log text for inputs that are not pressed any more.
-
-        `before` is the state before the release; "" if this is the first report of the inputs.
-        """
+        """Return the text of a release; `before` is "" for the first report of the inputs."""
 
     def advice(self) -> str:
-        """Return the instruction that the log gives to the operator when an input is pressed."""
+        """Return the instruction to the operator when an input is pressed."""
         return f"{self.mend}, then call srv/clear"
 
     def _take(self, sign: Sign, pressed: tuple[bool, ...]) -> list[Event]:
@@ -194,23 +163,15 @@ class EmergencyStop(BoardInput):
 
     def __init__(self, use: EstopUse, unpowered: bool = False) -> None:
         super().__init__(use)
+        # Reported in the last `process_reports`, while the drivers have power.
         self.driver_fault = False
-        """Whether a status line in the last call of `process_reports` reported a fault of a motor
-        driver. Faults do not count while the drivers may be without power (`_unpowered`)."""
+        # The emergency stop cuts the power of the drivers, and one without power reports a fault.
+        # It may come back late, so no such fault counts until `clear` has released the stop.
         self._unpowered = unpowered
-        """Whether the emergency stop was pressed and its stop is still latched. The emergency stop
-        cuts the power of the motor drivers, and a driver without power reports a fault. The power
-        may come back some time after the button is released. Therefore no driver fault counts until
-        `clear` has released the stop."""
 
     def process_reports(
-        self, reports: Sequence[tuple[int, BoardStatus]], now_ns: int
+        self, reports: Sequence[tuple[int, BoardStatus]], now_ns: Ns
     ) -> list[Event]:
-        """Process the status lines since the last control step; return the log events of changes.
-
-        Each item of `reports` is a pair: the monotonic time of arrival, ns, and the status line.
-        The method also updates `driver_fault`.
-        """
         self.driver_fault, pressed = False, bool(self.why)
         self._unpowered |= self.state == "pressed"
         for _, status in reports:
@@ -224,15 +185,10 @@ class EmergencyStop(BoardInput):
         return events
 
     def powered(self) -> None:
-        """Record that `clear` has released the stop, so that driver faults count from now on.
-
-        Before that, the motor drivers may have no power, and a driver without power reports a
-        fault.
-        """
+        """Record that `clear` has released the stop, so that driver faults count from now on."""
         self._unpowered = False
 
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
-        """Return `(status.estop,)`, or None if the status line does not report `estop`."""
         return None if status.estop is None else (status.estop,)
 
     def reason_text(self) -> str:

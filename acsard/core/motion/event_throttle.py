@@ -1,8 +1,7 @@
-"""Limits the log lines about events of the same name to one per second on average.
+"""Limits the log lines of one event name to one per second, after a few without a delay.
 
-At first, a few lines of one name may be written without a delay. After that, one line per second
-may be written. Each line reports the number of events since the previous line. So neither a client
-that floods the bus nor a serial line with a loose contact can flood the log.
+Each line has the number of events since the last one, so neither a client that floods the bus nor a
+loose contact floods the log.
 """
 
 from __future__ import annotations
@@ -11,26 +10,19 @@ import re
 from collections import Counter
 from typing import get_args
 
-from acsard.core.values import NS_PER_S, Event, EventName, Level
+from acsard.core.values import NS_PER_S, Event, EventName, Level, Ns
 
-BURST = 5
-"""Number of log lines of one name that may be written without a delay between them. A person who
-presses buttons does not need more."""
+BURST = 5  # lines of one name without a delay: enough for a person who presses buttons
 
-MAX_LISTED = 8
-"""Largest number of event kinds that one log line lists, and largest number of client names in it.
-All further kinds or names appear as "others"."""
+MAX_LISTED = 8  # kinds of events, and clients; further ones are "others"
 
 LEVELS: tuple[Level, ...] = get_args(Level)
 
 
 class _Held:
-    """The events of one name that wait for their common log line."""
-
     def __init__(self) -> None:
         self.count, self.news, self._level = 0, False, 0
-        self.number = 0
-        """Position of the newest of these events in the sequence of the events of all names."""
+        self.number = 0  # of the newest, in the sequence of all names
         self._kinds: Counter[str] = Counter()
         self._by: Counter[str] = Counter()
 
@@ -56,20 +48,12 @@ class EventThrottle:
 
     def __init__(self) -> None:
         self._held: dict[EventName, _Held] = {}
-        self._number = 0
-        """Number of events of all names so far."""
+        self._number = 0  # of events of all names
+        # Next line at one per second; a burst moves it into the future.
         self._free_ns: dict[EventName, int] = {}
-        """For each event name, the monotonic time at which the next line is due, ns, at one line
-        per second. Each written line adds one second, so a burst moves this time into the
-        future."""
 
-    def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
-        """Return the events to log now.
-
-        One returned event may stand for several events of the same name. `events` are the new
-        events, and `now_ns` is the monotonic time, ns. A later call returns the events that must
-        wait.
-        """
+    def lines(self, events: list[Event], now_ns: Ns) -> tuple[Event, ...]:
+        """Return the events to log now, which may stand for several of the same name."""
         if not (events or self._held):
             return ()
         for event in events:
@@ -89,15 +73,9 @@ class EventThrottle:
             due_names.sort(key=lambda name: self._held[name].number)
         return tuple([self._held.pop(name).line() for name in due_names])
 
-    def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
-        """Return whether a line may be written now. If it may, count it as written.
-
-        Each name gets one line per second. Up to `BURST` lines may be written without a delay in
-        two cases:
-
-        - `news` is true: at least one event of the line does not only repeat an earlier event.
-        - `name` is "stop": the time of each stop matters.
-        """
+    def _may(self, name: EventName, news: bool, now_ns: Ns) -> bool:
+        # `BURST` applies if an event does not only repeat an earlier one, and to each stop, whose
+        # time matters.
         free_ns, at_once = self._free_ns.get(name, now_ns), news or name == "stop"
         if free_ns > now_ns + (BURST - 1 if at_once else 0) * NS_PER_S:
             return False
@@ -105,16 +83,12 @@ class EventThrottle:
         return True
 
 
+# Begin of the text of a line for several events.
 COMBINED_TEXT = re.compile(r"\A\d+ (?:x [^:;]*|times)(?:; the last)?: ")
-"""Pattern for the start of the text of a log line that combines several events."""
 
 
 def merge(before: Event, line: Event) -> Event:
-    """Return one log line that replaces two lines of the same event name.
-
-    `line` is later than `before`. The result has the total number of events, the higher level, the
-    names of all clients, and the text of `line`.
-    """
+    """Return one line for two of the same name: all events, the higher level, the later text."""
     count, last = before.count + line.count, COMBINED_TEXT.sub("", line.text, count=1)
     level = max(before.level, line.level, key=LEVELS.index)
     names = dict.fromkeys(filter(None, [*before.by.split(", "), *line.by.split(", ")]))

@@ -1,21 +1,17 @@
 """Decides whether a stamped command is fresh, although the sender's clock is not synchronized.
 
-The delay of a command is its time of arrival by the daemon's clock minus its stamp. This difference
-is the true delay plus the unknown offset between the two clocks. The offset cancels out when the
-daemon compares a delay with the minimum of all delays. A command is stale if its delay exceeds the
-minimum by more than the timeout of its source, or if its stamp is earlier than that of an accepted
-command.
-
-A new sender does not drive until its delays have been constant for some time. If the delay changes
-later, either the sender's clock was set or the network is congested. Both causes can look the same,
-so the daemon trusts the new delay only within limits. The comment below gives the rules.
+A delay is arrival minus stamp: the true delay plus an unknown offset, which the minimum of all
+delays cancels. A command is stale if its delay exceeds the minimum by more than the source's
+timeout, or if an accepted one has a later stamp. A new sender does not drive until its delays are
+constant. A delay that changes later is a clock that was set or a congested network, which may look
+the same, so it is trusted only within limits. The comment below gives the rules.
 """
 
 from __future__ import annotations
 
 from typing import Literal
 
-from acsard.core.values import NS_PER_S, Command
+from acsard.core.values import NS_PER_S, Command, Ns
 
 # The clock of a sender is in one of two states:
 #
@@ -41,122 +37,73 @@ from acsard.core.values import NS_PER_S, Command
 # Times of arrival are measured by the monotonic clock, because the daemon's own wall clock may be
 # set.
 
-SECONDS_PER_DRIFT = 5000
-"""Number of seconds in which two clocks may drift apart by 1 s. A bad crystal takes twice as
-long."""
+SECONDS_PER_DRIFT = 5000  # for two clocks to drift apart by 1 s; a bad crystal takes twice as long
 
+# Pause after which a clock is new, because it may have drifted by 50 ms. If the stamps do not show
+# the pause, the network held commands back, and the clock stays known.
 FORGET_NS = 250 * NS_PER_S
-"""Pause of a sender, ns, after which its clock counts as new, because the clock may have drifted by
-50 ms. If the arrival times show the pause but the stamps do not, the network held commands back,
-and the clock stays known."""
 
-MEMORY_NS = 3600 * NS_PER_S
-"""Silence of a sender, ns, after which its clock is forgotten to save memory."""
+MEMORY_NS = 3600 * NS_PER_S  # silence after which a clock is forgotten to save memory
 
+# Decrease of the delay; a larger one is the end of a backlog, or a clock that was set.
 MAX_JITTER_NS = NS_PER_S // 20
-"""Largest decrease of the delay that can be jitter, ns. After a larger decrease, a backlog has
-ended or a clock was set."""
 
+# Increase of the delay; a larger one is a network that has held commands back.
 MAX_RISE_NS = NS_PER_S
-"""Largest increase of the delay that can be jitter, ns. After a larger increase, the network has
-held commands back."""
 
+# The least delays of the halves of a proof may differ by its duration over this: 10 ms per second,
+# or 100 ms if the delay creeps. NTP slews a clock by up to 83 ms per second.
 EVEN_DIVISOR, CREEP_DIVISOR = 200, 20
-"""Divisors for a proof, which is a test whether the delay is constant. A proof compares the minimum
-delays of its two halves. The minima may differ by the duration of the proof divided by
-`EVEN_DIVISOR`, or divided by `CREEP_DIVISOR` if the delay creeps (see `CREEP`). The centers of the
-halves are half the duration apart, so the delay may change by 10 ms per second, or by 100 ms per
-second if it creeps. NTP slews a clock by up to 83 ms per second."""
 
+# A delay creeps if it changes between two commands by at most their distance over `CREEP`, plus
+# `JITTER_NS`. Otherwise it jumps.
 CREEP, JITTER_NS = 10, NS_PER_S // 200
-"""A delay creeps if it changes little between two commands: by at most the time between the two
-commands divided by `CREEP`, plus `JITTER_NS`. Otherwise the delay jumps."""
 
-MAX_PROOF_NS = 2 * NS_PER_S
-"""Nominal duration of a proof (a test whether the delay is constant), ns. The timeout of the source
-applies instead if it is shorter."""
+MAX_PROOF_NS = 2 * NS_PER_S  # nominal duration, unless the source's timeout is shorter
 
+# Shortest proof after a jump, which is more likely a backlog in bursts than a clock that was set.
 JUMP_PROOF_NS = 3 * NS_PER_S // 2
-"""Shortest time for which the delay must be constant after a jump before it is trusted, ns. The
-cause of a jump is more likely a backlog that arrives in bursts than a clock that was set."""
 
+# Silence that is a pause, if the timeout is not longer. It ends a proof. If the stamps show it, a
+# foreign clock (one that may be adjusted) may have been set by any amount in it.
 MAX_PAUSE_NS = 2 * NS_PER_S
-"""Silence of a sender that counts as a pause, ns. If the timeout of the sender's source is longer,
-this timeout applies instead, because the sender need not send more often. A pause ends a test of
-the sender's delay. If the stamps show the pause too, a foreign clock (one that may be adjusted) may
-have been set by any amount in the pause."""
 
+# Commands more than `SEPARATE_NS` apart with less between their stamps: the clock was set back.
+# Zenoh's clock never goes back, but then advances by a fraction of a microsecond per message.
 MAX_STOPPED_STAMP_NS = 10_000
-"""If two successive commands arrive more than `SEPARATE_NS` apart, but the second stamp is later
-than the first by at most this, ns, the clock was set back. The limit is not 0, because Zenoh's own
-clock never goes back: if the wall clock was set back, Zenoh's clock advances by a fraction of a
-microsecond for each message until the wall clock has caught up."""
 
-SEPARATE_NS = NS_PER_S // 500
-"""Commands that arrive within this time of each other, ns, may have been sent together."""
+SEPARATE_NS = NS_PER_S // 500  # commands this close may have been sent together
 
+# From one queue, whose last command has the least delay: no sender may exceed 1000 Hz.
 SAME_QUEUE_NS = NS_PER_S // 2000
-"""Commands that arrive within this time of each other, ns, come from one queue. A test of the delay
-waits for the last command of the queue, which has the smallest delay. No sender may send more than
-1000 commands a second."""
 
+# Budget of trusted increases without a visible adjustment, for foreign clocks: refilled by 1 s in
+# 60 s, and above this while commands are late, so that no sender is refused forever.
 FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
-"""Budget for increases of the delay that are trusted without a visible adjustment of the clock, ns.
-The budget applies to foreign clocks (clocks that may be adjusted). It is refilled by one second in
-`FORGIVE_RATE` seconds. While commands are late, the budget may rise above `FORGIVE_NS`, so that no
-sender is refused forever."""
 
+# To make the daemon forget a sender at 20 Hz, a client would need so many names within 0.05 s.
 MAX_CLOCKS = 1024
-"""Largest number of clocks that are kept. If there are more, the daemon usually forgets the clock
-that has been silent longest. To make it forget a sender that sends at 20 Hz, a client would have to
-use this many names within 0.05 s."""
 
 State = Literal["new", "known"]
+# first: begins the test of a new clock. unproven: the test is not over. Neither drives. set:
+# accepted, but the clock seems to have been set, so the sender must send a zero.
 Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
-"""The verdict on a command.
-
-- `fresh`: the command is accepted.
-- `stale`: the command is refused, because it is late or repeated, or because a newer command was
-  accepted before it.
-- `first`: the command begins the test of a new clock, and does not drive the robot.
-- `unproven`: the test of a new clock is not over, so the command does not drive the robot.
-- `set`: the command is accepted, but the clock seems to have been set. The sender must send a zero
-  before it drives the robot.
-"""
 
 
 class _Proof:
-    """A test whether the delays of a clock have become constant. It starts with one command.
-
-    The test compares the minimum delays of successive intervals. Each interval lasts half of the
-    nominal duration of the test, and is called a half. The delays are constant if the minima of the
-    first two halves are nearly equal (`EVEN_DIVISOR`, `CREEP_DIVISOR`). Otherwise the test goes on
-    with further halves.
-    """
-
+    # A test whether the delays of a clock are constant. It compares the least delays of successive
+    # halves of its duration (`EVEN_DIVISOR`, `CREEP_DIVISOR`), and goes on until two agree.
     def __init__(
-        self, delay: int, at_ns: int, timeout_ns: int, needed_ns: int, share: int, again: bool
+        self, delay: int, at_ns: Ns, timeout_ns: Ns, needed_ns: Ns, share: int, again: bool
     ) -> None:
-        self.timeout_ns = timeout_ns
-        """Timeout of the source whose command began the test, ns."""
+        self.timeout_ns = timeout_ns  # of the source whose command began the test
         self.least = self._first = self._half = delay
         self._length_ns, self._share, self._again = needed_ns // 2, share, again
         self._begun_ns = self.last_ns = at_ns
-        self._halves: list[tuple[int, int]] = []
-        """For each of the last half periods of the test: its start on the monotonic clock, and the
-        smallest delay in it, both in ns."""
+        self._halves: list[tuple[int, int]] = []  # start and least delay of the last halves
 
-    def add(self, delay: int, at_ns: int, timeout_ns: int) -> Literal["proven", "open", "failed"]:
-        """Add a command of the clock, and return the state of the test.
-
-        The test is "proven" if the delays are constant, and "open" if it needs more commands. It is
-        "failed" if the delay has changed so much that a new test must begin with this command.
-
-        Args:
-            delay: the delay of the command, ns.
-            at_ns: the monotonic time at which the command arrived, ns.
-            timeout_ns: the timeout of the command's source, ns.
-        """
+    def add(self, delay: int, at_ns: Ns, timeout_ns: Ns) -> Literal["proven", "open", "failed"]:
+        """Add a command, and return the state of the test: "failed" begins a new one with it."""
         if not -MAX_JITTER_NS <= delay - self._first <= MAX_RISE_NS:
             return "failed"
         proven = False
@@ -171,7 +118,7 @@ class _Proof:
         self.last_ns = at_ns
         return "proven" if proven and delay - self.least <= timeout_ns else "open"
 
-    def _constant(self, at_ns: int) -> bool:
+    def _constant(self, at_ns: Ns) -> bool:
         minima, count = [least for _, least in self._halves], len(self._halves)
         lasted = at_ns - self._halves[0][0]
         if count == 2:
@@ -196,60 +143,37 @@ class _Proof:
 
 
 class _Clock:
-    """A clock that stamps commands, with the estimated minimum delay of these commands."""
-
-    def __init__(self, at_ns: int) -> None:
+    def __init__(self, at_ns: Ns) -> None:
         self.state: State = "new"
-        self.at_ns = at_ns
-        """Monotonic time at which the last command of this clock arrived, ns. Repeated commands do
-        not count."""
+        self.at_ns = at_ns  # arrival of its last command that was no repetition
+        # Longest silence that is no pause: the longest timeout of its sources.
         self.gap_ns = MAX_PAUSE_NS
-        """Longest silence of the sender that is not a pause, ns: the longest timeout of the sources
-        that received the sender's commands, but at least `MAX_PAUSE_NS`."""
-        self.forgiven_ns = 0
-        """The last trusted increase of the delay, ns, minus the part that visible adjustments of
-        the clock explain."""
+        self.forgiven_ns = 0  # last trusted increase, less visible adjustments
         self._stamp_ns = 0
         self._delay = 0
-        self._number = -1
-        """Sequence number of the last command, or -1 if that command was not numbered."""
-        self._least = 0
-        """Minimum of the trusted delays, ns. It rises with time by the largest possible drift."""
-        self._early = 0
-        """Sum of the recent decreases of `_least`, ns. It falls by 1 ns for each 10 ns that
-        pass."""
+        self._number = -1  # of the last command; -1 without one
+        self._least = 0  # minimum of the trusted delays; it rises by the largest drift
+        self._early = 0  # recent decreases of `_least`; falls by 1 ns each 10 ns
+        # Lowest delay of a steady clock (never adjusted); it rises by the largest drift.
         self._floor: int | None = None
-        """Lowest delay of a steady clock (one that is never adjusted), ns. It rises with time by
-        the largest possible drift. It is None before the first command, and always None for a clock
-        that may be adjusted."""
+        # Delay before the first visible adjustment since the last command in time.
         self._before: int | None = None
-        """Delay before the first visible adjustment of the clock, ns; None if no adjustment is
-        visible. Adjustments before the last command that was on time do not count."""
-        self._shown = 0
-        """Sum of the visible adjustments of the clock since the last command that was on time,
-        ns."""
+        self._shown = 0  # sum of these adjustments
+        # An adjustment that the next command must confirm, because the network may swap or repeat
+        # commands: delay before it, its size, and the stamp before it.
         self._doubted: tuple[int, int, int] | None = None
-        """An adjustment of the clock that the next command must confirm, because the network may
-        have swapped or repeated a command. The tuple has the delay before the adjustment, the size
-        of the adjustment, and the stamp before the adjustment, all in ns."""
-        self._paused = False
-        """Whether the sender has paused since its last command that was on time, so that its clock
-        may have been set."""
+        self._paused = False  # since the last command in time, so the clock may have been set
         self._budget, self._budget_at_ns = FORGIVE_NS, at_ns
         self._proof: _Proof | None = None
+        # Stamp and number (-1: none) of the last accepted command.
         self._accepted: tuple[int, int] | None = None
-        """The stamp, ns, and the sequence number of the last accepted command; None before the
-        first accepted command. The sequence number is -1 if that command was not numbered."""
 
     @property
     def was_known(self) -> bool:
-        """Whether the daemon has already accepted a command with a stamp of this clock.
-
-        After a pause of the sender longer than `FORGET_NS`, only later commands count.
-        """
+        """Whether a command of this clock was accepted since its last pause over `FORGET_NS`."""
         return self._accepted is not None
 
-    def judge(self, command: Command, stamp_ns: int, timeout_ns: int) -> Verdict:
+    def judge(self, command: Command, stamp_ns: Ns, timeout_ns: Ns) -> Verdict:
         at_ns, delay = command.arrived_ns, command.arrived_ns - stamp_ns
         silence, departed = at_ns - self.at_ns, stamp_ns - self._stamp_ns
         number = -1 if command.sequence is None else command.sequence
@@ -276,50 +200,29 @@ class _Clock:
         return verdict
 
     def _already_accepted(self, mark: tuple[int, int]) -> bool:
-        """Return whether the last accepted command is newer than this one, or is the same command.
-
-        `mark` contains the stamp of this command, ns, and its sequence number, or -1 if it has no
-        number. A repetition of the last accepted command is recognized only by its number.
-        """
+        # `mark` is stamp and number (-1: none); only a number shows a repetition.
         last = self._accepted
         return last is not None and (mark < last or (mark == last and mark[1] >= 0))
 
-    def _repeats(self, stamp_ns: int, number: int, silence: int) -> bool:
-        """Return whether the network repeated this command, or delivered it after a later one.
-
-        A low number may also come from a restart of the sender. The method assumes a restart after
-        a pause of the sender, or if the stamp is later than both the previous and the last accepted
-        stamp.
-        """
+    def _repeats(self, stamp_ns: Ns, number: int, silence: int) -> bool:
+        # A low number may also be a restart of the sender: after a pause, or with a stamp later
+        # than both the previous and the last accepted one.
         if not 0 <= number <= self._number or silence > self.gap_ns:
             return False
         accepted = self._accepted
         return stamp_ns <= self._stamp_ns or (accepted is not None and stamp_ns <= accepted[0])
 
     def _later_than_lowest(self, delay: int, silence: int) -> int:
-        """Return by how much `delay` exceeds the lowest delay so far, ns.
-
-        The method also updates the lowest delay. Call it only for a steady clock, which is a clock
-        that is never adjusted. `silence` is the time since its last command, ns.
-        """
+        # Also updates the lowest delay, of a steady clock.
         floor = delay if self._floor is None else self._floor + silence // SECONDS_PER_DRIFT
         self._floor = min(floor, delay)
         return delay - self._floor
 
-    def _look_for_adjustment(self, stamp_ns: int, silence: int, number: int) -> None:
-        """Record a pause of the sender or an adjustment of its clock, if this command shows one.
-
-        If the stamp of a command is not later than the previous stamp, the clock was probably set
-        back. But the network may have swapped or repeated a command instead. Therefore the
-        adjustment counts only after the next command has confirmed it. That command confirms it in
-        two cases:
-
-        - Its stamp is again not later than the previous stamp.
-        - Its stamp is not later than the last stamp before the adjustment.
-
-        If commands were lost, the network may have caused the silence, so no pause is recorded. The
-        adjustment is then measured from the stamp of the last accepted command.
-        """
+    def _look_for_adjustment(self, stamp_ns: Ns, silence: int, number: int) -> None:
+        # A stamp that is not later than the previous one is a clock set back, or swapped commands.
+        # So the next command must confirm it: not later than its predecessor either, or than the
+        # last stamp before. If commands were lost, no pause counts, as the network may be the
+        # cause.
         lost = number - self._number - 1 if number >= 0 and self._number >= 0 else 0
         if lost < 0:  # the sender has restarted its numbers
             return
@@ -337,7 +240,7 @@ class _Clock:
         elif departed <= MAX_STOPPED_STAMP_NS and silence > SEPARATE_NS:
             self._doubted = self._delay, silence - departed, self._stamp_ns
 
-    def _prove(self, delay: int, at_ns: int, silence: int, timeout_ns: int) -> Verdict:
+    def _prove(self, delay: int, at_ns: Ns, silence: int, timeout_ns: Ns) -> Verdict:
         proof = self._proof
         if proof is not None and silence <= self.gap_ns:
             sign = proof.add(delay, at_ns, timeout_ns)
@@ -351,7 +254,7 @@ class _Clock:
         return "first"
 
     def _compare(
-        self, delay: int, at_ns: int, silence: int, timeout_ns: int, steady: bool
+        self, delay: int, at_ns: Ns, silence: int, timeout_ns: Ns, steady: bool
     ) -> Verdict:
         late = delay - self._least
         early = max(0, self._early - silence // CREEP) + max(0, -late)
@@ -382,16 +285,9 @@ class _Clock:
         self._proof = _Proof(delay, at_ns, timeout_ns, needed_ns, share, again=True)
         return "stale"
 
-    def _forgive(self, proof: _Proof, at_ns: int) -> bool:
-        """Return whether the new constant delay, which `proof` has found, is plausible.
-
-        If so, the clock uses this delay from now on. A smaller delay is always plausible. A larger
-        delay is plausible in two cases:
-
-        - The sender has paused, so its clock may have been set meanwhile.
-        - The increase can be explained by visible adjustments of the clock, by the budget for
-          invisible adjustments (`FORGIVE_NS`), or by both together.
-        """
+    def _forgive(self, proof: _Proof, at_ns: Ns) -> bool:
+        # A smaller delay always is plausible. A larger one is after a pause of the sender, or by
+        # visible adjustments and the budget (`FORGIVE_NS`).
         self._accrue(at_ns, FORGET_NS)
         hidden = proof.least - self._least
         if self._before is not None:
@@ -403,7 +299,7 @@ class _Clock:
         self._trust(proof)
         return True
 
-    def _accrue(self, at_ns: int, most_ns: int) -> None:
+    def _accrue(self, at_ns: Ns, most_ns: Ns) -> None:
         grown = (at_ns - self._budget_at_ns) // FORGIVE_RATE
         self._budget, self._budget_at_ns = min(self._budget + grown, most_ns), at_ns
 
@@ -417,28 +313,22 @@ class _Clock:
 
 
 class Freshness:
-    """Judges whether commands are fresh. It keeps the state of each clock that stamps commands."""
+    """Judges whether commands are fresh, with the state of each clock that stamps them."""
 
     def __init__(self) -> None:
         self._clocks: dict[str, _Clock] = {}
+        # Foreign ones without an accepted command, forgotten after a pause.
         self._newcomers: dict[str, _Clock] = {}
-        """Clocks that may be adjusted and have not stamped an accepted command yet. They are
-        forgotten after a pause."""
+        # Steady ones, for `MEMORY_NS`, because their lowest delay is valid at once.
         self._unproved: dict[str, _Clock] = {}
-        """Clocks that are never adjusted and have not stamped an accepted command yet. They are
-        forgotten only after a silence of `MEMORY_NS`, because their lowest delay is valid from the
-        first command on."""
+        # Last number and arrival of senders without stamps.
         self._numbers: dict[str, tuple[int, int]] = {}
-        """For each sender that numbers its commands but does not stamp them: the last sequence
-        number, and its monotonic time of arrival, ns."""
-        self.forgiven_ns = 0
-        """Total increase of delays that was trusted without a visible adjustment of a clock, ns."""
+        self.forgiven_ns = 0  # total of trusted increases without a visible adjustment
 
-    def judge(self, command: Command, timeout_ns: int) -> Verdict:
+    def judge(self, command: Command, timeout_ns: Ns) -> Verdict:
         """Return the verdict on a command, and remember its stamp and sequence number.
 
-        `timeout_ns` is the timeout of the command's source, ns. A command without a stamp is stale
-        only if its sequence number is out of order.
+        Without a stamp it is stale only if its sequence number is out of order.
         """
         if command.stamp_ns is None:
             return self._in_order(command, max(MAX_PAUSE_NS, timeout_ns))
@@ -457,11 +347,8 @@ class Freshness:
         self._forget(at_ns)
         return verdict
 
-    def _in_order(self, command: Command, gap_ns: int) -> Verdict:
-        """Judge a command without a stamp by its sequence number.
-
-        After a silence of more than `gap_ns`, the sender may start its sequence numbers again.
-        """
+    def _in_order(self, command: Command, gap_ns: Ns) -> Verdict:
+        # After a silence of `gap_ns` the numbers may start again.
         number, at_ns = command.sequence, command.arrived_ns
         if number is None:
             return "fresh"
@@ -474,7 +361,7 @@ class Freshness:
             del self._numbers[next(iter(self._numbers))]
         return "fresh"
 
-    def _forget(self, now_ns: int) -> None:
+    def _forget(self, now_ns: Ns) -> None:
         # The number of clocks is limited, because a recording begins with all clocks, and the
         # control loop writes all of them in one step.
         limits = (

@@ -1,14 +1,10 @@
 """Fills gaps in the feedback: estimates the motion of the wheels in a gap, and its uncertainty.
 
-`Rolling` computes the angles that the wheels rolled since the last plausible feedback line. A line
-is implausible if `sanity.py` or `Confirmation` rejects it. `Rolling` uses the first of these
-sources that exists: the encoder counts in the line, whole counts that are recovered from the speeds
-in the line, or these speeds times the time. Each time and each encoder count is used once.
-
-In a gap that no line covers, `Rolling` assumes two speeds: the speed before the gap for the first
-half, and the speed after the gap for the second half. If the motors were commanded to rest in the
-gap, the speed before the gap is assumed until that command, and an exponential decay to the speed
-after the gap from then on. An exception is a speed after the gap that may be the mean of the gap.
+`Rolling` takes the angles from encoder counts, whole counts recovered from speeds, or speed times
+time, each time and count once. In a gap that no line covers, the speed before it is assumed for its
+first half, and the speed after it for the second. If rest was commanded in it, the speed before
+lasts until then and decays exponentially to the speed after, unless this may be the mean of the
+gap.
 """
 
 from __future__ import annotations
@@ -28,118 +24,74 @@ from acsard.core.motion.gyro import REST_S
 from acsard.core.motion.sanity import SPEED_MARGIN
 from acsard.core.values import REST, Twist, WheelSpeeds
 
+# Consecutive implausible lines without counts, s and number: beyond both, their motion is
+# unknown. Otherwise the robot is assumed to have moved at the speed of the next plausible line.
 MAX_LOST_S, MAX_LOST = 0.05, 1
-"""Limits for consecutive implausible feedback lines without encoder counts: `MAX_LOST_S` for their
-total duration, s, and `MAX_LOST` for their number. If the lines exceed both limits, the motion of
-the robot during these lines is unknown. Otherwise, the robot is assumed to have moved at the speed
-of the next plausible line."""
 
 AT_REST = (0.0, 0.0, 0.0, 0.0)
 
+# Standard deviation, m/s2 and rad/s2, until it is measured: an eighth of the default limits, which
+# random driving rarely exceeds.
 ASSUMED_ACCELERATION = Twist(0.125, 0.5)
-"""Standard deviation of the acceleration, m/s2 and rad/s2, until it is measured. It is an eighth of
-the default acceleration limits. Random driving rarely exceeds it."""
 
-ACCELERATION_SPAN_S = 0.2
-"""Time over which the deviation from constant acceleration is measured, s."""
+ACCELERATION_SPAN_S = 0.2  # over which the deviation from constant acceleration is measured
 
+# Weight of `ASSUMED_ACCELERATION` in the mean of squares, in spans; and the largest weight, which
+# is a minute of driving.
 INITIAL_WEIGHT, MAX_WEIGHT = 4.0, 300.0
-"""Weights in the mean of the squared deviations from constant acceleration. Each measured span of
-`ACCELERATION_SPAN_S` s has the weight 1, and `ASSUMED_ACCELERATION` has the weight
-`INITIAL_WEIGHT`. The total weight is limited to `MAX_WEIGHT` (a minute of driving)."""
 
+# Time for which a command counts in a gap, s. Without feedback, rest is usually commanded much
+# earlier, and a board that receives nothing stops by its watchdog.
 MAX_COMMANDED_S = 1.0
-"""Longest time for which a command is assumed to have moved the robot in a gap, s. Without
-feedback, the daemon usually commands rest much earlier. If the board receives nothing, its watchdog
-stops the motors."""
 
+# Fraction of its speed at which a wheel counts as resting: a decay never reaches zero.
 MIN_DECAY = 0.02
-"""Fraction of its speed to which a wheel at rest is assumed to have slowed down after a command to
-rest. An exponential decay never reaches zero."""
 
-STEP_DECAY = 0.05
-"""Fraction of the estimated quantization step that is forgotten with each line."""
+STEP_DECAY = 0.05  # of the estimated quantization step, forgotten with each line
 
-VARIANCE_POWER = 5
-"""Exponent: the variance of the motion in a gap grows with this power of the gap's duration."""
+VARIANCE_POWER = 5  # of a gap's duration, with which the variance of its motion grows
 
 
 class Rolled(Struct, frozen=True, gc=False):
-    """The angles that the wheels rolled since the last plausible feedback line from the board.
+    """The angles that the wheels rolled since the last plausible line, rad in `WHEELS` order."""
 
-    All angles are in rad and in `WHEELS` order.
-    """
-
-    pieces: tuple[Motors, ...]
-    """Angles that are computed from the speeds, rad. Each item is one arc of the path, and has at
-    least one angle that is not zero. The items are in the order of time."""
-    turned: Motors
-    """Angles that are computed from encoder counts, rad. The odometry adds this motion to the pose
-    before the motion in `pieces`."""
-    seen: Motors
-    """Angles that the wheels rolled in the last `seconds` s, rad. Angles that were computed from
-    speeds have the rounding errors of these speeds."""
-    seconds: float
-    """Duration of the motion `seen`, s."""
-    bridged: float
-    """Part of `seconds` that no feedback line covers, s. The speeds in this part are assumed."""
-    unknown: float
-    """Time in addition to `seconds` in which the motion of the wheels is unknown, s."""
-    known: float
-    """Total duration of the motion in `pieces` and `turned`, s; 0 if a part of the motion is
-    unknown."""
+    pieces: tuple[Motors, ...]  # from speeds, one arc each, in the order of time
+    turned: Motors  # from encoder counts, before `pieces`
+    seen: Motors  # in the last `seconds`; from speeds with their rounding
+    seconds: float  # of the motion `seen`
+    bridged: float  # part of `seconds` without a line: its speeds are assumed
+    unknown: float  # s in addition to `seconds` in which the motion is unknown
+    known: float  # s of `pieces` and `turned`; 0 if a part is unknown
+    # In addition, if the MCU missed the command to rest until its watchdog stopped it.
     missed: Motors = AT_REST
-    """Angles that the wheels rolled in addition to `pieces` if the MCU did not receive the command
-    to rest, rad. The wheels then moved on until the MCU's watchdog stopped the motors."""
 
 
 class Rolling:
-    """Computes the angles that the wheels rolled from one plausible feedback line to the next.
+    """The angles that the wheels rolled from one plausible feedback line to the next.
 
-    A feedback line is a line from the board with the speeds of the wheels. It is plausible unless
-    `sanity.py` or `Confirmation` rejects it. The motion during rejected lines, and in the gaps
-    before these lines, is computed with the next plausible line.
+    The motion in lines that `sanity.py` or `Confirmation` rejects is computed with the next one.
     """
 
     def __init__(self, quiet: float = math.inf) -> None:
-        """Start without implausible feedback lines.
-
-        `quiet` is the time without feedback after which a running daemon commands rest, s.
-        """
+        # `quiet`: after so long without feedback, a running daemon commands rest, s.
         self._quiet = quiet
         self.forget()
 
     def forget(self) -> None:
-        """Forget the implausible feedback lines since the last plausible line.
-
-        The next call of `take` does not include the motion during these lines.
-        """
+        """Forget the implausible lines since the last plausible one, and their motion."""
+        # In s: implausible lines without counts (`_lost`; `_counted` with), the gaps before them
+        # that can (`_bridged`) or cannot (`_gap`) be filled, and `_bridged` until rest was
+        # commanded.
         self._lost = self._gap = self._bridged = self._counted = self._driven = 0.0
-        """Durations, s.
-
-        - `_lost`: the time that implausible feedback lines without encoder counts cover.
-        - `_counted`: the time that implausible feedback lines with encoder counts cover.
-        - `_bridged`: the total of the gaps before the lines without counts that can be filled.
-        - `_gap`: the total of the gaps before the lines without counts that cannot be filled.
-        - `_driven`: the part of `_bridged` before the motors were commanded to rest.
-        """
         self._turned, self._skipped = AT_REST, 0
 
     @property
     def skipped(self) -> float:
-        """Total time of the implausible feedback lines without encoder counts, s.
-
-        Only the lines after the last plausible line count. The total includes the gaps before these
-        lines.
-        """
+        """Time of the implausible lines without counts since the last plausible one, s."""
         return self._lost + self._gap + self._bridged
 
     def skip(self, line: Feedback) -> None:
-        """Record an implausible feedback line, so that the next call of `take` includes its motion.
-
-        If the line has encoder counts, the motion comes from these counts. Otherwise only the time
-        that the line covers is recorded.
-        """
+        """Record an implausible line; the motion comes from its counts, if it has any."""
         self._skipped += 1
         if line.turned is None:
             self._lost += line.dt - line.bridged
@@ -151,22 +103,11 @@ class Rolling:
             self._turned = plus(self._turned, line.turned)
 
     def _driven_in(self, line: Feedback) -> float:
-        """Return the part of the gaps before `line` in which the daemon still commanded motion, s.
-
-        A gap is a time without plausible feedback lines. Later in the gap, the daemon commands
-        rest.
-        """
+        # s of the gaps before `line` until rest was commanded
         return self._bridged + line.driven if line.bridged else self._driven
 
     def take(self, line: Feedback, before: WheelSpeeds) -> Rolled:
-        """Return the angles that the wheels rolled since the last plausible feedback line.
-
-        The result includes the motion during the implausible lines since then.
-
-        Args:
-            line: the present feedback line, which is plausible.
-            before: the wheel speeds in the last plausible feedback line, rad/s.
-        """
+        """Return the angles since the last plausible line, which had the speeds `before`."""
         speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged + self._bridged
         if not (self._skipped or bridged or line.gap or line.turned is not None):
             # Nearly every line takes this shortcut. The code below would give the same result.
@@ -217,12 +158,8 @@ def _some(*pieces: Motors) -> tuple[Motors, ...]:
 
 
 def _until_rest(before: Motors, driven: float, after: Motors, bridged: float, own: float) -> Motors:
-    """Return the angles that the wheels rolled in a gap, rad.
-
-    The daemon commanded rest `driven` s after the gap began. `before` and `after` are the wheel
-    speeds before and after the gap, rad/s. `bridged` is the duration of the gap, s. The line with
-    the speeds `after` covers the `own` s after the gap.
-    """
+    # Rest was commanded `driven` s into a gap of `bridged` s; the line of the speeds `after` covers
+    # the `own` s behind it.
     # A board that computes its speeds since its last reply reports the means over the whole time.
     # These means are large enough for the motion until the command to rest. A smaller speed is the
     # speed after the gap. A wheel that became faster until then has not slowed down yet.
@@ -241,7 +178,7 @@ def _until_rest(before: Motors, driven: float, after: Motors, bridged: float, ow
 
 
 def _slowing(old: float, new: float) -> float:
-    """Return the mean speed of a wheel whose speed decays exponentially from `old` to `new`."""
+    # Mean speed of an exponential decay.
     ratio = new / old if old else 1.0
     if ratio >= 0.99:
         return new
@@ -250,47 +187,34 @@ def _slowing(old: float, new: float) -> float:
 
 
 def plus(a: Motors, b: Motors) -> Motors:
-    """Return the sums of two sets of wheel angles, wheel by wheel."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]
 
 
 def times(a: Motors, factor: float) -> Motors:
-    """Return the angles or speeds of all wheels, multiplied by `factor`."""
     return a[0] * factor, a[1] * factor, a[2] * factor, a[3] * factor
 
 
 class Confirmation:
     """Holds back a feedback line that follows a gap and reports a doubtful speed.
 
-    After a gap, one damaged line would falsify the motion of the whole gap. Damage changes the
-    speed of one wheel alone, while motion changes the speeds of both wheels of a side alike. Two
-    lines agree if no wheel alone has changed its speed by more than a limit, which is smaller after
-    a longer gap.
-
-    A line with encoder counts is used immediately, and so is a line that covers the usual time
-    between two lines. A line that covers more time is used immediately if it agrees with the last
-    line that was used. Otherwise it is held, and the next line decides:
-
-    - If the next line agrees with the held line, both are used, because one wheel really changed
-      its speed alone.
-    - If the next line agrees with the last line that was used, the held line is dropped.
-    - If the next line agrees with neither, both are held, and the third line decides. A line is
-      dropped if it differs from the other two much more than these differ from each other.
-
-    The time of a dropped line counts as a gap.
+    Damage changes one wheel alone, motion both wheels of a side alike, and one damaged line would
+    falsify a whole gap. Two lines agree if no wheel alone has changed by more than a limit, which a
+    longer gap lowers. A line with counts, or of the usual time, is used at once, and so is one that
+    agrees with the last used line. Any other is held: if the next line agrees with it, both are
+    used, as one wheel really changed alone; if the next agrees with the last used one, the held
+    line is dropped; otherwise the third decides, and a line that differs much more is dropped. The
+    time of a dropped line is a gap.
     """
 
     def __init__(self, feedback: FeedbackConfig) -> None:
         self._acceleration = feedback.wheel_acceleration
-        self._period = 0.0
-        """Usual time between two feedback lines, s; 0 before the first line."""
+        self._period = 0.0  # s between two lines; 0 before the first
         self.forget()
 
     def forget(self) -> None:
         """Forget the feedback lines that are held back."""
         self._held: list[Feedback] = []
-        self._seconds = 0.0
-        """Time that the held feedback lines and the gaps before these lines cover, s."""
+        self._seconds = 0.0  # of the held lines with the gaps before them
 
     def confirm(
         self,
@@ -299,16 +223,10 @@ class Confirmation:
         before: WheelSpeeds,
         believed: Callable[[Motors], Motors],
     ) -> tuple[list[Feedback], list[Feedback]]:
-        """Return a pair: the feedback lines to use now, and the feedback lines to drop.
+        """Return the lines to use now, in the order of time, and those to drop.
 
-        The lines to use are in the order of time. If `line` is held back, both lists are empty.
-
-        Args:
-            line: The next plausible feedback line.
-            skipped: The time that the implausible lines directly before `line` cover, s. The gaps
-                before these lines are included.
-            before: The wheel speeds in the last line that was used, rad/s.
-            believed: The function that replaces the speeds of wheels that are known to be faulty.
+        `skipped` is the time of implausible lines directly before `line`, s, `before` the speeds of
+        the last used one. `believed` replaces the speeds of faulty wheels.
         """
         period, pending, seconds = self._period, self._held, line.dt + line.gap + skipped
         # A long time counts as two periods, so that a single gap changes the mean only a little.
@@ -339,11 +257,7 @@ class Confirmation:
 
 
 def _alone(a: Motors, b: Motors, steps: Motors) -> float:
-    """Return the largest speed change that one wheel of a side made without the other, rad/s.
-
-    `a` and `b` are the wheel speeds in two lines, rad/s. `steps` contains the quantization step of
-    each wheel, rad/s. The result leaves out the part of a change that one such step can explain.
-    """
+    # Rad/s by which one wheel of a side changed without the other, beyond one quantization step.
     changes, largest = tuple(map(sub, a, b)), 0.0
     # The wheels i and 3 - i in `WHEELS` order are those of one side.
     for own, other, step in zip(changes, reversed(changes), steps, strict=True):
@@ -353,19 +267,13 @@ def _alone(a: Motors, b: Motors, steps: Motors) -> float:
 
 
 class Gaps:
-    """Estimates the variances of the motion in gaps of the feedback.
+    """The variances of the motion in gaps of the feedback.
 
-    Let s be the standard deviation of the acceleration, m/s2 or rad/s2. After t s without lines,
-    the true motion deviates by s t^2 / 2 from the motion at the known speeds, so the variance of
-    the motion is s^2 t^4 / 4. The robot may change its acceleration at any time. Therefore s^2
-    itself grows with t, and the variance grows with t^5 (`VARIANCE_POWER`).
-
-    `follow` measures s while lines arrive without gaps. The configured acceleration limits are not
-    used, because robots seldom accelerate that much. The deviation is limited to the motion at the
-    highest of three speeds: the speed before the gap, the speed after the gap, and the highest
-    speed commanded in the gap. The commanded speed counts for at most `MAX_COMMANDED_S` of the gap.
-    Therefore a robot that stood still before and after a gap, and had no command to move, is
-    assumed not to have moved in the gap.
+    With the standard deviation s of the acceleration, the motion after t s is wrong by s t^2 / 2,
+    and as the acceleration may change, s^2 grows with t: `VARIANCE_POWER`. `follow` measures s
+    without gaps; the configured limits are seldom reached. The deviation is limited to the motion
+    at the highest speed before, after or commanded in the gap, the latter for `MAX_COMMANDED_S`. So
+    a robot at rest before and after a gap, without a command to move, has not moved.
     """
 
     def __init__(self) -> None:
@@ -375,19 +283,12 @@ class Gaps:
         self.interrupt(REST)
 
     def interrupt(self, twist: Twist) -> None:
-        """Discard the unfinished measurement of the acceleration, and start a new one.
-
-        `twist` is the present twist of the robot, with which the new measurement starts.
-        """
+        """Start a new measurement of the acceleration with this twist."""
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
         self._bridged, self._given = 0.0, (0.0, 0.0)
 
     def follow(self, twist: Twist, dt: float) -> None:
-        """Use a feedback line from the board to measure the acceleration of the robot.
-
-        The line reports that the robot moved with `twist` in the last `dt` s. Call this only if no
-        gap precedes the line.
-        """
+        """Measure the acceleration by a line of `dt` s without a gap before it."""
         linear, angular = twist.linear, twist.angular
         self._bridged, self._given = 0.0, (0.0, 0.0)
         self._seconds += dt
@@ -414,17 +315,10 @@ class Gaps:
         after: Twist,
         commanded: Twist,
     ) -> tuple[float, float]:
-        """Return a pair: the variances of distance (m2) and turn (rad2) that a filled gap adds.
+        """Return the variances of distance, m2, and turn, rad2, that a filled gap adds.
 
-        If the gap directly follows another gap, both count as one longer gap. The result is then
-        the increase of the variances since the earlier gap.
-
-        Args:
-            seconds: the duration of the gap, s.
-            before: the twist before the gap.
-            after: the twist after the gap.
-            commanded: the highest speeds that were commanded in the gap, m/s and rad/s, both
-                without sign.
+        A gap that follows a gap adds what makes both one longer gap. `commanded` are the highest
+        speeds in it, without sign.
         """
         bridged, previous = self._bridged + seconds, self._given
         along, yaw = self.unseen(bridged, before, after, commanded)
@@ -435,12 +329,7 @@ class Gaps:
     def unseen(
         self, seconds: float, before: Twist, after: Twist, commanded: Twist = REST
     ) -> tuple[float, float]:
-        """Return the variances of the distance (m2) and the turn (rad2) in a gap of `seconds` s.
-
-        `before` and `after` are the twists before and after the gap. `commanded` contains the
-        highest speeds that were commanded in the gap, m/s and rad/s, both without sign. The default
-        is for callers that do not know the commands.
-        """
+        """Return the variances of distance, m2, and turn, rad2, in one gap (see `fill`)."""
         scale = (seconds / ACCELERATION_SPAN_S) ** VARIANCE_POWER
         driven = min(seconds, MAX_COMMANDED_S)
         fastest = max(abs(before.linear), abs(after.linear)) * seconds
@@ -451,39 +340,26 @@ class Gaps:
 
 
 class Rounding:
-    """Estimates how much reported speeds differ from the true speeds if the encoders are coarse.
+    """How much reported speeds differ from the true ones if the encoders are coarse.
 
-    With few encoder counts, a line of a slow wheel contains one count or none, so its speed jumps
-    from line to line. Let v0, v1 and v2 be the speeds of a wheel in three consecutive lines. With
-    few counts, |v0 - 2 v1 + v2| / 2 is about one quantization step of the speed. With many counts
-    it is near 0, unless the acceleration changes or a line is damaged.
+    A line of a slow wheel then has one count or none. |v0 - 2 v1 + v2| / 2 of three speeds in a row
+    is about one quantization step; with many counts it is near 0, unless the acceleration changes
+    or a line is damaged.
     """
 
     def __init__(self) -> None:
-        self._last: Motors | None = None
-        """Speeds in the last line, rad/s; None before the first line."""
-        self._older: Motors | None = None
-        """Speeds in the line before the last line, rad/s; None if a gap lies between the two
-        lines."""
-        self._step = 0.0
-        """Estimated quantization step, rad/s: the largest recent step, which loses the fraction
-        `STEP_DECAY` with each later line."""
-        self._before = self._after = 0.0
-        """Quantization steps of the line before the last one, and of the last one, rad/s. While the
-        wheels stand still, they become smaller from line to line."""
+        self._last: Motors | None = None  # speeds in the last line
+        self._older: Motors | None = None  # in the line before it; None after a gap
+        self._step = 0.0  # largest recent one, rad/s, less `STEP_DECAY` per line
+        self._before = self._after = 0.0  # of the last two lines, rad/s; they shrink at rest
 
     def add(
         self, speeds: Motors, own: float, still: float, after_gap: bool, largest: float
     ) -> None:
-        """Use the next line from the board.
+        """Use the next line, which covers `own` s (0 if unknown) without a gap before it.
 
-        Args:
-            speeds: the wheel speeds in the line, rad/s.
-            own: the time that the line covers, s, without a gap before it; 0 if it is unknown.
-            still: the time for which all wheels have reported zero speed, s, without gaps. In this
-                time, each wheel turned by less than one count.
-            after_gap: whether a gap precedes the line.
-            largest: the largest quantization step that is possible, rad/s.
+        `still` is how long all wheels have reported zero, s without gaps, in which each turned by
+        less than one count. `largest` is the largest possible step, rad/s.
         """
         last, older = self._last, self._older
         if after_gap:
@@ -504,13 +380,8 @@ class Rounding:
     def square(self) -> float:
         """Sum of the squares of the quantization steps before and after the gap, rad2/s2.
 
-        `TwistUncertainty.rounding` converts this sum to variances of speeds, for wheels with
-        independent errors. In a gap of t s, the speed before the gap is assumed for t / 2 s, and
-        the speed after the gap for the other t / 2 s. Therefore the variances of the motion are t^2
-        / 4 times the variances of the speeds. Each of two facts doubles this result, so the caller
-        multiplies by t^2:
-
-        - Both wheels of a side turn alike, so their errors are equal and not independent.
-        - A single line can contain an encoder edge too many or too few.
+        For t s, each speed counts for t / 2, so `TwistUncertainty.rounding` times t^2 / 4 is for
+        independent errors. The caller takes t^2: both wheels of a side turn alike, which doubles
+        it, and so does an encoder edge too many or too few in one line.
         """
         return self._before**2 + self._after**2

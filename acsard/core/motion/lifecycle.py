@@ -1,23 +1,11 @@
 """Keeps the latches and the other facts that determine the mode, and derives the mode from them.
 
-A latch is set by a stop, a fault or `deactivate`. Only `clear` releases a stop or a fault, one at a
-time, and only `activate` releases the latch of a `deactivate`. Neither request may release a latch
-that its sender has not seen, even if the network delivers the request late:
-
-- A request that names a number releases the latch with exactly this number.
-- A `clear` without a number is refused if less than `LATCH_REQUIRED_S` has passed since the last
-  stop, the last fault, the last `clear` of a fault, the start of the daemon or its last stall. An
-  `activate` without a number is refused if less than this time has passed since the last
-  `deactivate`, the start of the daemon or its last stall.
-- A request that arrived before the latch was set never releases it.
-
-A pressed emergency stop at the robot, a pressed bumper (with `safety.bumper = "stop"`) and an empty
-battery also latch a stop. A fault of a motor driver latches a fault. `clear` releases nothing while
-one of these causes lasts.
-
-There is one latch for all causes of a stop, and one for all causes of a fault. Each new cause gives
-its latch a new number. The latch keeps the earlier causes, so that the operator reads all of them
-before `clear` releases it.
+Only `clear` releases a stop or a fault, one at a time, and only `activate` a `deactivate`. Neither
+releases a latch that its sender has not seen: it names the latch's number, or less recent events
+than `LATCH_REQUIRED_S` let it name none; and it must arrive after the latch was set. Inputs of the
+board and an empty battery latch a stop, a motor driver a fault, and `clear` releases nothing while
+such a cause lasts. A new cause gives its latch a new number and keeps the earlier causes, so the
+operator reads all.
 """
 
 from __future__ import annotations
@@ -29,111 +17,80 @@ from msgspec.structs import replace
 
 from acsard.core.formatting import utc
 from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError, mode_of, require_allowed
-from acsard.core.values import NS_PER_S, Instant, Latch, Latches
+from acsard.core.values import NS_PER_S, Instant, Latch, Latches, Ns
 
+# After a stop, a fault, its `clear`, a `deactivate`, the start and a stall of the daemon: an
+# earlier call may still arrive, as the network seldom delays a packet for longer.
 LATCH_REQUIRED_S = 2.0
-"""Time after an event in which a `clear` or `activate` must name the number of the latch, s. The
-events are a stop, a fault, the `clear` of a fault, a `deactivate`, the start of the daemon and the
-end of a stall of the daemon. In this time, a call that was sent before the event may still arrive,
-because the network delays some packets. It seldom delays a packet for longer."""
 
+# The first clients among the causes of a stop: a flood of stops must neither fill the reason
+# in `state` nor hide the first client. The board has only a few causes.
 MAX_CLIENTS = 4
-"""Largest number of clients among the earlier causes of a stop. If more clients stop the robot, the
-first ones are kept, so that a flood of stops neither fills the reason in `state` nor hides the
-first client. The causes from the board need no limit, because there are only a few."""
 
-MAX_FAULTS = 32
-"""Largest number of causes of a fault that are kept. The daemon knows fewer different causes, so no
-cause is lost. Further causes would be ignored until `clear`."""
+MAX_FAULTS = 32  # the daemon knows fewer different ones
 
-LONG_AGO_NS = -(2**62)
-"""Monotonic time that stands for "never", ns. It is earlier than every real time."""
+LONG_AGO_NS = -(2**62)  # "never"
 
-_VALUES = re.compile(r"[(\d]")
-"""Pattern for the digit or bracket with which the measured values in the text of a fault begin."""
+_VALUES = re.compile(r"[(\d]")  # begin of the measured values in the text of a fault
 
 
 class Lifecycle:
     """The latches and the mode of one robot. Requests that are not allowed raise `RefusedError`."""
 
     def __init__(self, active: bool, latches: Latches = Latches()) -> None:  # noqa: B008
-        """Start with `latches`. If `active` is false, the robot is off until `activate`."""
         self.latches = latches
         self.mode = Mode.WAITING
         self._shutting_down = self._linked = self._commanded = False
-        self._dormant = not active
-        """Whether the robot waits for its first call `activate` (see `control.auto_activate`)."""
+        self._dormant = not active  # until the first `activate` (`control.auto_activate`)
         old_latches = (latches.stop, latches.fault, latches.inactive)
         self._number = max([latch.number for latch in old_latches if latch is not None], default=0)
-        self._numbered = False
-        """Whether this run of the daemon has numbered a latch. `number_after_restart` returns the
-        first number of a run."""
-        self._stopped_ns = self._faulted_ns = LONG_AGO_NS
-        """Monotonic times at which the last stop and the last fault were latched, ns."""
-        self._cleared_ns = LONG_AGO_NS
-        """Monotonic time at which a fault was last cleared, ns."""
-        self._stop_asked_ns = LONG_AGO_NS
-        """Latest monotonic time at which a client's request for a stop arrived, ns."""
-        self._off_ns = LONG_AGO_NS
-        """Monotonic time at which the robot was last switched off, ns."""
-        self._held = self._mend = ""
-        """`_held` is the reason why `clear` is refused now, and `_mend` is the advice to the
-        operator about it. Both are "" while `clear` is permitted."""
+        self._numbered = False  # this run has numbered a latch (`number_after_restart`)
+        self._stopped_ns = self._faulted_ns = LONG_AGO_NS  # last latched
+        self._cleared_ns = LONG_AGO_NS  # a fault was last cleared
+        self._stop_asked_ns = LONG_AGO_NS  # latest arrival of a client's stop
+        self._off_ns = LONG_AGO_NS  # last switched off
+        self._held = self._mend = ""  # why `clear` is refused now, and advice
+        # Last step in which the cause of a latch ended or came again; no earlier `clear` counts.
         self._freed_ns = LONG_AGO_NS
-        """Monotonic time of the last step in which the cause of a latch ended or came again, ns. A
-        call `clear` that arrived before that step is refused."""
-        self._began_ns: int | None = None
-        """Monotonic time of the first step, or of the first step after the last stall of the
-        daemon, ns; None before the first step."""
+        self._began_ns: Ns | None = None  # first step, or first after the last stall
         self._derive()
 
     # facts
 
     def begin(self, now: Instant, *, stalled: bool = False) -> None:
-        """Begin a step at the time `now`. `stalled` is true if the daemon stood still before it.
+        """Begin a step; `stalled` says that the daemon stood still before it.
 
-        For `LATCH_REQUIRED_S` after the first step and after each stall, `clear` and `activate`
-        must name the number of the latch. A client may have sent its call before or during the
-        stall, when it could not see the present latch.
+        A client may have sent its call when it could not see the present latch, so for
+        `LATCH_REQUIRED_S` calls must name its number.
         """
         if stalled or self._began_ns is None:
             self._began_ns = now.mono_ns
 
     def link(self, up: bool) -> None:
-        """Record whether the board is ready to drive the robot, and derive the mode.
-
-        The board is ready if its link is up and it reports all required inputs.
-        """
+        """Record whether the board is linked and reports all required inputs; derive the mode."""
         if up is not self._linked:
             self._linked = up
             self._derive()
 
     def command(self, fresh: bool) -> None:
-        """Record whether the robot has a fresh command to follow, and derive the mode."""
+        """Record whether there is a fresh command to follow, and derive the mode."""
         if fresh is not self._commanded:
             self._commanded = fresh
             self._derive()
 
     def press(self, why: str, now: Instant) -> None:
-        """Latch a stop with a new number. `why` is the cause that the board reports, as text."""
+        """Latch a stop with a new number, for the cause that the board reports."""
         self._stopped_ns = now.mono_ns
         self._latch(stop=self._stop(now, "", why))
 
-    def refuse_clear(self, why: str, mend: str, now_ns: int) -> None:
-        """Record whether the board's reports forbid the call `clear` now.
-
-        `why` is the reason as text, and `mend` is the advice to the operator about it. Both are ""
-        if the call is allowed. `now_ns` is the monotonic time, ns.
-        """
+    def refuse_clear(self, why: str, mend: str, now_ns: Ns) -> None:
+        """Record why the board's reports forbid `clear` now, with advice, or "" and ""."""
         if self._held and not why:
             self._freed_ns = now_ns
         self._held, self._mend = why, mend
 
-    def caused_again(self, now_ns: int) -> None:
-        """Record that the cause of the fault came again at the monotonic time `now_ns`, ns.
-
-        Calls `clear` that arrived at this time or before are refused.
-        """
+    def caused_again(self, now_ns: Ns) -> None:
+        """Record that the cause of the fault came again; no earlier `clear` counts."""
         self._freed_ns = now_ns
 
     def leave(self) -> None:
@@ -142,11 +99,9 @@ class Lifecycle:
         self._derive()
 
     def fault(self, why: str, now: Instant) -> bool:
-        """Latch a fault and return True. If this cause is already latched, only return False.
+        """Latch a fault and return True, or False if its cause is latched or there is no room.
 
-        `why` is the cause of the fault, as text. Two texts name the same cause if they are equal up
-        to the first digit or bracket, where the measured values begin. If `MAX_FAULTS` causes are
-        latched, further causes are ignored, and the method returns False.
+        Texts that are equal up to the first digit or bracket have the same cause.
         """
         latch = self.latches.fault
         if latch is not None:
@@ -159,17 +114,11 @@ class Lifecycle:
 
     # requests
 
-    def stop(self, by: str, asked_ns: int, now: Instant) -> str:
+    def stop(self, by: str, asked_ns: Ns, now: Instant) -> str:
         """Latch a stop with a new number, and return a text for the client.
 
-        A repeated request does not change the latch. A request counts as repeated if the latch
-        already names this client, and if an accepted request for a stop arrived at `asked_ns` or
-        later.
-
-        Args:
-            by: the name of the client; "" if it is unknown.
-            asked_ns: the monotonic time at which the request arrived, ns.
-            now: the time of this control step.
+        A repetition changes nothing: the latch names this client, and an accepted stop arrived at
+        `asked_ns` or later.
         """
         latch, why = self.latches.stop, f"stopped by {by or 'request'}"
         named = latch is not None and any(cause.why == why for cause in latch.causes)
@@ -187,20 +136,11 @@ class Lifecycle:
             )
         return "stopped and latched; srv/clear releases it"
 
-    def clear(self, number: int | None, asked_ns: int, now: Instant) -> str:
-        """Release the fault if one is latched, otherwise the stop; return a text for the client.
+    def clear(self, number: int | None, asked_ns: Ns, now: Instant) -> str:
+        """Release the fault if there is one, otherwise the stop; return a text, or "" for neither.
 
-        The text is "" if neither a fault nor a stop is latched.
-
-        Args:
-            number: the number of the latch that the client has seen; None if the request names no
-                number.
-            asked_ns: the monotonic time at which the request arrived, ns.
-            now: the time of this control step.
-
-        Raises:
-            RefusedError: the mode or a lasting cause forbids the call, the call arrived too early,
-                or the client may not know the latch.
+        `number` is of the latch that the client has seen, if it names one. Raises `RefusedError` if
+        the mode or a lasting cause forbids it, or if the client may not know the latch.
         """
         require_allowed(self.mode, "clear")
         if self._held:
@@ -251,19 +191,11 @@ class Lifecycle:
             f"in {LATCH_REQUIRED_S:g} s"
         )
 
-    def activate(self, number: int | None, asked_ns: int, now: Instant) -> bool:
-        """Switch the robot on. Return True if it was off, and False if it was already on.
+    def activate(self, number: int | None, asked_ns: Ns, now: Instant) -> bool:
+        """Switch the robot on; return False if it was on.
 
-        Args:
-            number: the number of the latch that the client has seen; None if the request names no
-                number. 0 means that the client has seen no latch: the robot is off only because
-                `auto_activate` is False.
-            asked_ns: the monotonic time at which the request arrived, ns.
-            now: the time of this control step.
-
-        Raises:
-            RefusedError: the mode forbids the request, the request arrived too early, or the client
-                may not know the latch.
+        `number` 0 says that the client has seen no latch: only `auto_activate` keeps the robot off.
+        Raises `RefusedError` like `clear`.
         """
         require_allowed(self.mode, "activate")
         if not self._off:
@@ -291,10 +223,7 @@ class Lifecycle:
         return True
 
     def deactivate(self, by: str, now: Instant) -> str:
-        """Switch the robot off, and return a text for the client.
-
-        If the robot is already off, a latch with a new number replaces the old latch.
-        """
+        """Switch the robot off with a new latch, and return a text for the client."""
         require_allowed(self.mode, "deactivate")
         self._off_ns = now.mono_ns
         self._latch(inactive=self._new_latch(now, by, f"switched off by {by or 'request'}"))
@@ -363,18 +292,10 @@ class Lifecycle:
         return f"cleared; {zero}"
 
     def _require_latch_was_seen(
-        self, was: str, still: str, set_ns: int, asked_ns: int, call: str
+        self, was: str, still: str, set_ns: Ns, asked_ns: Ns, call: str
     ) -> None:
-        """Raise `RefusedError` if the sender of the request may not know the latch yet.
-
-        Args:
-            was: the newest cause, as text.
-            still: all causes, as text.
-            set_ns: the monotonic time of the newest cause, ns; `LONG_AGO_NS` if an earlier run of
-                the daemon set the latch.
-            asked_ns: the monotonic time at which the request arrived, ns.
-            call: the name of the service that was called.
-        """
+        # `was` is the newest cause, `still` all, `set_ns` its time (`LONG_AGO_NS`: an earlier
+        # run's).
         began_ns = LONG_AGO_NS if self._began_ns is None else self._began_ns
         since = asked_ns - max(set_ns, began_ns)
         if since >= LATCH_REQUIRED_S * NS_PER_S:
@@ -395,11 +316,9 @@ class Lifecycle:
 
 
 def with_causes(latch: Latch, before: Latch | None) -> Latch:
-    """Return `latch`, the new latch of a stop or a fault, with the earlier causes added to it.
+    """Return a new latch with the earlier causes of the one that it replaces.
 
-    `before` is the latch that `latch` replaces, or None. Its causes become the earlier causes,
-    except a cause that equals the new one. Of the earlier causes that came from clients, the oldest
-    `MAX_CLIENTS` are kept.
+    Of those from clients, the oldest `MAX_CLIENTS` are kept.
     """
     causes = () if before is None else before.causes
     earlier = [replace(cause, earlier=()) for cause in causes if cause.why != latch.why]
@@ -412,11 +331,9 @@ def _without_values(why: str) -> str:
 
 
 def number_after_restart(last_number: int, now: Instant) -> int:
-    """Return a latch number that no earlier run of the daemon has used.
+    """Return a latch number that no earlier run has used: the wall clock in ms if it is larger.
 
-    `last_number` is the largest number in the latch file. The result is the wall-clock time in ms
-    if that is above `last_number`. Otherwise the wall clock was set back, and the result is
-    `last_number` + 1 plus the time since the computer started, ms.
+    If the wall clock was set back, it is `last_number` + 1 + ms since the computer started.
     """
     # `last_number` + 1 alone is not safe: an earlier latch, which is not in the file any more, may
     # have had that number, and a late `clear` may still name it.
@@ -450,7 +367,7 @@ def _when(latch: Latch) -> str:
 
 
 def _asked_for(latch: Latch) -> bool:
-    """Return whether a client requested the latch. Otherwise, a cause such as a fault set it."""
+    # by a client
     return latch.why.endswith(f" by {latch.by or 'request'}")
 
 

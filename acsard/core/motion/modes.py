@@ -1,16 +1,8 @@
 """Derives the robot's mode from the latches, the link and the commands, by one ordered list.
 
-    shutdown  the daemon is shutting down
-    fault     a fault is latched until `clear`
-    stopped   a stop is latched until `clear`
-    inactive  the robot is switched off until `activate`
-    waiting   the robot is active, but it has no link to the board, or the board does not report a
-              required input
-    driving   the robot follows a fresh command
-    ready     the robot could drive, but there is no command to follow
-
-The first mode of this list whose condition holds is the robot's mode. The mode depends only on
-these conditions and not on the previous mode, so no transition can be forgotten.
+The first mode holds whose condition is true: shutdown; fault, stopped (each latched until `clear`);
+inactive (until `activate`); waiting (no link, or a required input is not reported); driving (a
+fresh command); ready. As it does not depend on the previous mode, no transition can be forgotten.
 """
 
 from __future__ import annotations
@@ -34,7 +26,7 @@ class Mode(StrEnum):
 
 
 class RefusedError(AcsardError):
-    """Error for a request that the robot does not allow now. Its text tells the client why."""
+    """The robot does not allow a request now; the text tells the client why."""
 
 
 def mode_of(
@@ -46,12 +38,7 @@ def mode_of(
     linked: bool,
     commanded: bool,
 ) -> Mode:
-    """Return the first mode of the ordered list in `modes.py` whose condition holds.
-
-    `linked` is true if the board is ready to drive the robot, and `commanded` is true if the robot
-    has a fresh command to follow. The other arguments say whether the daemon is shutting down, or
-    whether the robot is in fault, stopped or inactive.
-    """
+    """Return the first mode of the list whose condition holds; `linked` includes the inputs."""
     if shutting_down:
         return Mode.SHUTDOWN
     if fault:
@@ -67,6 +54,7 @@ def mode_of(
 
 SHUTDOWN_REASON = "the daemon is shutting down"
 
+# For the client.
 REFUSALS: dict[tuple[Mode, Verb], str] = {
     (Mode.SHUTDOWN, "clear"): SHUTDOWN_REASON,
     (Mode.SHUTDOWN, "activate"): SHUTDOWN_REASON,
@@ -76,7 +64,6 @@ REFUSALS: dict[tuple[Mode, Verb], str] = {
     (Mode.STOPPED, "activate"): "the robot is stopped: call srv/clear first",
     (Mode.STOPPED, "deactivate"): "the robot is stopped and cannot move: call srv/clear first",
 }
-"""Reason for the client, for each request (verb) that a mode refuses."""
 
 
 def require_allowed(mode: Mode, verb: Verb) -> None:

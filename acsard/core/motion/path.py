@@ -1,41 +1,33 @@
 """Adds arcs to a pose. Rounding errors do not build up, even over millions of arcs.
 
-Let an arc have the length d and the angle a, and start from a pose with the heading yaw. Its chord
-then has the length d sin(a / 2) / (a / 2) and the direction yaw + a / 2. The rounding error of each
-sum is kept and added to the next sum (Kahan, Further Remarks on Reducing Truncation Errors, 1965).
-When yaw is wrapped, the exact value of 2 pi is subtracted and not the nearest double (see
-`TAU_REST`). Therefore even many revolutions cause no error.
+An arc of length d and angle a from the heading yaw has a chord of length d sin(a / 2) / (a / 2) in
+the direction yaw + a / 2. The rounding error of each sum is added to the next one (Kahan, Further
+Remarks on Reducing Truncation Errors, 1965), and wrapping subtracts the exact 2 pi (`TAU_REST`).
 """
 
 from __future__ import annotations
 
 import math
 
-from acsard.core.values import Pose
+from acsard.core.values import Metres, Pose, Rad
 
-TAU_REST = 2.4492935982947064e-16
-"""2 pi minus `math.tau`, rad."""
+TAU_REST = 2.4492935982947064e-16  # 2 pi minus `math.tau`
 
 
 class Path:
-    """The pose at the end of a path of arcs. Earlier poses are not kept."""
+    """The pose at the end of a path of arcs."""
 
     def __init__(self) -> None:
         self.set(Pose())
 
     def set(self, pose: Pose) -> None:
-        """Set the pose to `pose`, from which the path continues."""
         self._x, self._x_rest = pose.x, 0.0
         self._y, self._y_rest = pose.y, 0.0
         self._yaw, self._yaw_rest = math.remainder(pose.yaw, math.tau), 0.0
-        self.pose = Pose(self._x, self._y, self._yaw)
-        """Pose of base_link in odom, yaw within [-pi, pi]."""
+        self.pose = Pose(self._x, self._y, self._yaw)  # of base_link in odom, yaw within [-pi, pi]
 
-    def advance(self, distance: float, turn: float) -> tuple[float, float, float]:
-        """Add an arc of length `distance` m through `turn` rad.
-
-        Return the chord of the arc in odom as a tuple: its x and y, m, and its direction, rad.
-        """
+    def advance(self, distance: Metres, turn: Rad) -> tuple[float, float, float]:
+        """Add an arc; return x and y, m, and the direction, rad, of its chord in odom."""
         half = turn / 2
         # sin(h)/h is accurate in doubles down to tiny h. Only h = 0 needs its limit.
         chord = distance * (math.sin(half) / half if half else 1.0)
@@ -47,8 +39,8 @@ class Path:
         self.pose = Pose(self._x, self._y, self._yaw)
         return dx, dy, heading
 
-    def turn(self, turn: float) -> None:
-        """Add a turn in place by `turn` rad."""
+    def turn(self, turn: Rad) -> None:
+        """Add a turn in place."""
         self._turn(turn)
         self.pose = Pose(self._x, self._y, self._yaw)
 
@@ -58,17 +50,14 @@ class Path:
 
 
 def plus(a: float, b: float) -> tuple[float, float]:
-    """Return a pair: the double nearest to a + b, and its exact rounding error.
-
-    This is Knuth's TwoSum.
-    """
+    """Return the double nearest to a + b, and its exact rounding error (Knuth's TwoSum)."""
     total = a + b
     of_b = total - a
     return total, (a - (total - of_b)) + (b - of_b)
 
 
-def arc(pose: Pose, distance: float, turn: float) -> Pose:
-    """Return the pose after an arc from `pose` with the length `distance` m and `turn` rad."""
+def arc(pose: Pose, distance: Metres, turn: Rad) -> Pose:
+    """Return the pose after an arc."""
     half, yaw = turn / 2, math.remainder(pose.yaw, math.tau)
     chord = distance * (math.sin(half) / half if half else 1.0)
     heading = yaw + half
@@ -79,7 +68,7 @@ def arc(pose: Pose, distance: float, turn: float) -> Pose:
 
 
 def _wrapped(yaw: float, turn: float) -> tuple[float, float]:
-    """Return a pair: yaw + turn, wrapped to [-pi, pi], and the rounding error of this sum."""
+    # yaw + turn within [-pi, pi], and its rounding error
     total, rest = plus(yaw, turn)
     wrapped = math.remainder(total, math.tau)
     if wrapped != total:

@@ -1,17 +1,11 @@
 """Checks whether feedback is physically possible.
 
-`Sanity` rejects a feedback line in which a wheel turns, or changes its speed, faster than any wheel
-can. The daemon does not use such a line, and several in a row are a fault. If more than one line in
-a hundred is impossible, the daemon logs a warning. Either the wire damages lines, or a limit in
-`[feedback]` is too low, so that true lines are rejected. `wheel_faults.py` checks whether the
-wheels follow their commands.
-
-A plain line has no checksum, so a damaged line may look possible, and then the true lines after it
-look impossible. Therefore a possible line is trusted only if it agrees with the possible line
-before it. A line that is not trusted is outvoted by two later lines that agree with each other.
-
-An encoder quantizes the reported speed of its wheel: one count in a short time looks like a high
-speed. Therefore each limit is widened by the quantization step of the wheel.
+A line in which a wheel turns, or changes its speed, faster than any wheel can is not used, and
+several in a row are a fault. More than one in a hundred is a warning: damage on the wire, or a
+limit in `[feedback]` that is too low. A damaged plain line may look possible, and then the true
+ones look impossible. So a possible line is trusted only if it agrees with the one before it, and
+two later lines that agree outvote it. Each limit is widened by the quantization step: one count in
+a short time looks like a high speed.
 """
 
 from __future__ import annotations
@@ -24,47 +18,32 @@ from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.values import WHEELS, Event, WheelSpeeds
 
-FAULT_LINES = 3
-"""Number of impossible feedback lines in a row that latch a fault: 30 ms at 100 Hz."""
+FAULT_LINES = 3  # in a row: 30 ms at 100 Hz
 
-WINDOW_LINES = 1000
-"""Number of feedback lines in a window (10 s at 100 Hz). The daemon counts the impossible lines of
-each window."""
+WINDOW_LINES = 1000  # 10 s at 100 Hz
 
-WARNING_FRACTION = 0.01
-"""If more than this fraction of the feedback lines in a window is impossible, one warning is
-logged."""
+WARNING_FRACTION = 0.01  # of a window, above which one warning is logged
 
+# rad/s beyond `feedback.wheel_acceleration`, as coarse encoders and a robot at rest cause.
 SPEED_MARGIN = 2.0
-"""Change of a wheel speed that is allowed in addition to `feedback.wheel_acceleration`, rad/s.
-Coarse encoders and a robot at rest can cause changes of this size."""
 
-COUNT_MARGIN = 2
-"""Encoder counts by which two reports of a wheel at constant speed may differ, because each report
-may be wrong by one count."""
+COUNT_MARGIN = 2  # each of two reports may be wrong by one
 
+# Angle of a count, rad, of the coarsest encoder that is expected. Until the steps are learned, it
+# excuses a speed over `feedback.wheel_speed`.
 COARSEST_COUNT = math.tau / 16
-"""Angle of one count of the coarsest encoder that is expected, rad. Until the quantization steps
-are learned, a speed over `feedback.wheel_speed` is impossible if it exceeds the speed of one such
-count in the time of the line."""
 
-MIN_COUNT_S = 0.005
-"""Shortest time that is used to convert one `COARSEST_COUNT` to a speed, s. Firmware rarely counts
-for a shorter time."""
+MIN_COUNT_S = 0.005  # for one such count: firmware rarely counts for a shorter time
 
+# 78.5 rad/s, below the default of `feedback.wheel_speed` (80): above it, only counts excuse a
+# speed.
 MAX_STEP = COARSEST_COUNT / MIN_COUNT_S
-"""Highest speed that a learned quantization step may excuse: 78.5 rad/s. It is lower than the
-default of `feedback.wheel_speed` (80 rad/s). Above this default, only encoder counts excuse a
-speed."""
 
-MAX_REPORTS = 2
-"""Largest number of successive lines that report the same encoder count. Firmware that is asked
-again very soon has no new counts, and repeats its speeds once."""
+MAX_REPORTS = 2  # of one count: firmware that is asked again very soon repeats its speeds once
 
+# Least time between two lines. While this computer catches up after a stall, one count would look
+# fast.
 MIN_INTERVAL_S = 0.004
-"""Shortest time between two feedback lines, s. Lines follow each other this quickly while this
-computer catches up after a stall. A single encoder count in so short a time looks like a high
-speed."""
 
 
 NOT_FAST, AT_REST = (0, 0, 0, 0), (0.0, 0.0, 0.0, 0.0)
@@ -73,46 +52,30 @@ NOT_FAST, AT_REST = (0, 0, 0, 0), (0.0, 0.0, 0.0, 0.0)
 class Sanity:
     """Checks whether the wheel speeds in each feedback line are physically possible.
 
-    The changes of the speeds are measured from the last possible line. If that line is not trusted,
-    a line that contradicts it may still be possible: the new line must agree with one of the
-    impossible lines that arrived in between.
+    Changes count from the last possible line. If that one is not trusted, a line that contradicts
+    it is possible if it agrees with one of the impossible lines in between.
     """
 
     def __init__(self, feedback: FeedbackConfig) -> None:
         self._settings = feedback
         self._last: WheelSpeeds | None = None
+        # The wheels can change back to the line before `_last` by the next line.
         self._trusted = False
-        """Whether the last possible line (`_last`) is trusted. It is trusted if it differs so
-        little from the possible line before it that the wheels can change back by the next line."""
+        # Newest impossible lines since `_last`, with the time since it, s; not too fast ones.
         self._rejected: list[tuple[WheelSpeeds, float]] = []
-        """The newest impossible lines since the last possible line: pairs of the speeds and the
-        time since that line, s. Lines with a speed over `feedback.wheel_speed` are not included."""
         self._since = 0.0
+        # Time that a recent line covers: its speeds are means; a line of t s is recent for t s.
         self._longest = 0.0
-        """Longest time that a recent feedback line covers, s. The speeds in a line are means over
-        the time that the line covers. A line that covers t s counts as recent for t s."""
         self._impossible = 0
-        self._fast = NOT_FAST
-        """For each wheel, the number of successive lines, up to the last line, in which the wheel
-        was over `feedback.wheel_speed`."""
+        self._fast = NOT_FAST  # successive lines of each wheel over `feedback.wheel_speed`
+        # Sums of the speeds in these lines, rad/s. A speed far above the limit is damage, so each
+        # adds the limit and a quantization step at most.
         self._totals = AT_REST
-        """For each wheel, the sum of the magnitudes of its speeds, rad/s, over the last successive
-        lines in which it was over `feedback.wheel_speed` (`_fast`). A speed far above this limit
-        comes from a damaged line, so each speed adds at most the limit plus one quantization
-        step."""
-        self._lines = self._dropped = 0
-        """Numbers of feedback lines in the present window: all lines (`_lines`), and impossible
-        lines (`_dropped`)."""
-        self.warning: Event | None = None
-        """Log event with the warning that too many lines are impossible; None unless the last line
-        caused it."""
+        self._lines = self._dropped = 0  # all lines of the window, and impossible ones
+        self.warning: Event | None = None  # only if the last line caused it
 
     def forget(self) -> None:
-        """Start over, because the link was lost or a fault was cleared.
-
-        The next feedback line is still compared with the last possible line, which is not trusted
-        any more.
-        """
+        """Start over after a lost link or a cleared fault; the last line is not trusted."""
         self._trusted, self._impossible, self._fast = False, 0, NOT_FAST
 
     @property
@@ -121,10 +84,10 @@ class Sanity:
         return self._impossible >= FAULT_LINES
 
     def impossible(self, feedback: Feedback) -> str:
-        """Return why no wheel can have the speeds in this line; "" if the line is possible.
+        """Return why no wheel can have these speeds, or "".
 
-        The allowed change of each speed grows with the time since the last possible line, so a real
-        jump is accepted after enough time. The method also updates `doubtful` and `warning`.
+        The allowed change grows with the time since the last possible line, so a real jump is
+        accepted in time. Updates `doubtful` and `warning`.
         """
         dt, since = feedback.dt, feedback.since
         since = dt if dt > since else since
@@ -175,10 +138,7 @@ class Sanity:
         )
 
     def _count(self, why: str) -> None:
-        """Count a feedback line in the present window, and update `warning`.
-
-        `why` is the reason why the line is impossible; "" for a possible line.
-        """
+        # `why` is "" for a possible line.
         self._lines += 1
         self.warning = None
         if why:
@@ -255,5 +215,5 @@ class Sanity:
 
 
 def _proven(line: Feedback) -> Motors | None:
-    """Return the wheel angles that come from encoder counts, rad; None without counts."""
+    # rad, from encoder counts
     return line.counted if line.turned is None else line.turned

@@ -1,27 +1,19 @@
 """Calculates with the errors of a planar pose, which are elements of the Lie algebra of SE(2).
 
-SE(2) is the group of planar poses (x, y, yaw). The error of an estimate is log(estimate^-1 truth):
-the constant twist that leads from the estimated pose to the true pose in one unit of time. It is a
-vector (x, y, yaw).
-
-Errors are expressed in axes that are parallel to those of odom, with the origin at the robot. When
-the robot moves, only x and y of an error in these axes change, by the yaw of the error times the
-displacement (`seen_from`). In the axes of base_link, the error would change by the adjoint of the
-displacement.
-
-A covariance is the covariance of such a vector. E[...] is an expected value, ' means transposed,
-and [a, b] is the Lie bracket of two errors.
+The error of an estimate, log(estimate^-1 truth), is the constant twist (x, y, yaw) that leads from
+the estimated to the true pose in one unit of time. Its axes are parallel to odom with the origin at
+the robot, so when the robot moves, only x and y change (`seen_from`); in base_link, it would change
+by the adjoint. A covariance is of such a vector, E[...] an expected value, ' transposed, and [a, b]
+the Lie bracket.
 """
 
 from __future__ import annotations
 
 from acsard.core.values import PoseCovariance
 
-Vector = tuple[float, float, float]
-"""x, y (m) and yaw (rad) of an error."""
+Vector = tuple[float, float, float]  # x, y (m) and yaw (rad)
 
-Planar = tuple[float, float]
-"""x and y (m) of an error whose yaw is 0."""
+Planar = tuple[float, float]  # x, y (m) of an error whose yaw is 0
 
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 
@@ -31,16 +23,12 @@ def plus(a: Vector, b: Vector) -> Vector:
 
 
 def bracket(a: Vector, b: Vector) -> Planar:
-    """Return x and y of the Lie bracket [a, b] of two pose errors. Its yaw is always 0."""
+    """Return x and y of the Lie bracket [a, b]; its yaw is always 0."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2]
 
 
 def brackets(a: Vector, p: PoseCovariance, times: float) -> tuple[Vector, Vector]:
-    """Return two rows, x and y, of the matrix E[[a, e] e'] times the number `times`.
-
-    The third row, yaw, is always 0. `a` is a fixed pose error, and e is a random pose error with
-    the covariance `p`. E is the expected value, [a, e] is the Lie bracket, and ' means transposed.
-    """
+    """Return the rows x and y of E[[a, e] e'] `times`, for a fixed a and e of covariance `p`."""
     x, y, yaw = times * a[0], times * a[1], times * a[2]
     return (
         (y * p.xyaw - yaw * p.xy, y * p.yyaw - yaw * p.yy, y * p.yawyaw - yaw * p.yyaw),
@@ -49,10 +37,7 @@ def brackets(a: Vector, p: PoseCovariance, times: float) -> tuple[Vector, Vector
 
 
 def bracket_covariance(p: PoseCovariance, q: PoseCovariance) -> Vector:
-    """Return the covariance (xx, xy, yy) of the Lie bracket [a, b] of two pose errors.
-
-    The errors a and b are independent and have the covariances `p` and `q`.
-    """
+    """Return the covariance (xx, xy, yy) of [a, b], independent, of covariances `p` and `q`."""
     return (
         p.yy * q.yawyaw - 2 * p.yyaw * q.yyaw + p.yawyaw * q.yy,
         p.yyaw * q.xyaw - p.xy * q.yawyaw - p.yawyaw * q.xy + p.xyaw * q.yyaw,
@@ -61,10 +46,9 @@ def bracket_covariance(p: PoseCovariance, q: PoseCovariance) -> Vector:
 
 
 def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
-    """Return E[[e, [e, b]] b'] plus its transpose, for independent random pose errors e and b.
+    """Return E[[e, [e, b]] b'] plus its transpose, for independent errors e and b.
 
-    E is the expected value, [e, b] is the Lie bracket, and ' means transposed. b has the covariance
-    `p`, and `a` is the yaw column of the covariance of e.
+    b has the covariance `p`, and `a` is the yaw column of the covariance of e.
     """
     x, y, yaw = a
     return PoseCovariance(
@@ -78,19 +62,13 @@ def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
 
 
 def seen_from(error: Vector, dx: float, dy: float) -> Vector:
-    """Return the pose error that `error` becomes when the robot moves by `dx`, `dy` m in odom.
-
-    Both errors are in axes parallel to odom, with the origin at the robot. Yaw does not change.
-    """
+    """Return what `error` becomes when the robot moves by `dx`, `dy` m in odom."""
     x, y, yaw = error
     return x - dy * yaw, y + dx * yaw, yaw
 
 
 def carried(p: PoseCovariance, dx: float, dy: float) -> PoseCovariance:
-    """Return the covariance that `p` becomes when the robot moves by `dx`, `dy` m in odom.
-
-    Both are covariances of the pose error in axes parallel to odom, with the origin at the robot.
-    """
+    """Return what the covariance `p` becomes when the robot moves by `dx`, `dy` m in odom."""
     return PoseCovariance(
         p.xx - 2 * dy * p.xyaw + dy * dy * p.yawyaw,
         p.xy + dx * p.xyaw - dy * p.yyaw - dx * dy * p.yawyaw,
@@ -104,15 +82,10 @@ def carried(p: PoseCovariance, dx: float, dy: float) -> PoseCovariance:
 def added(
     p: PoseCovariance, along: float, yaw: float, both: float, c: float, s: float
 ) -> PoseCovariance:
-    """Return the covariance `p` of the pose plus the covariance of the noise of a step.
+    """Return `p` plus the noise of a step in the direction of cosine `c` and sine `s` in odom.
 
-    Args:
-        p: the covariance of the pose error.
-        along: the variance of the step's distance, m2.
-        yaw: the variance of the step's turn, rad2.
-        both: the covariance of the step's distance and turn, m rad.
-        c: the cosine of the direction of the step in odom.
-        s: the sine of the direction of the step in odom.
+    The variances `along`, m2, and `yaw`, rad2, are of distance and turn, `both`, m rad, their
+    covariance.
     """
     cc, cs = along * c, along * s
     return PoseCovariance(
@@ -135,10 +108,7 @@ def stepped(
     c: float,
     s: float,
 ) -> PoseCovariance:
-    """Return the covariance of the pose after a step by `dx`, `dy` m, with the noise of the step.
-
-    The result equals `added(carried(p, dx, dy), along, yaw, both, c, s)`.
-    """
+    """Return `added(carried(p, dx, dy), along, yaw, both, c, s)`."""
     # This function runs for each feedback line, and is faster than the two calls.
     xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
     cc, cs = along * c, along * s

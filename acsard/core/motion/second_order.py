@@ -1,35 +1,8 @@
 """Adds the effects of second order to the covariance of the pose.
 
-If the true heading deviates from the estimated one, the robot gets less far in the estimated
-direction. This is so for a deviation to either side, so the effect does not average out. It is an
-effect of second order. On a straight drive, it causes nearly all of the error along the path. After
-60 m with k = 1e-5 (`error_model.py`), the first-order error is 17 mm, but the true error is 0.12 m.
-
-The path is divided into stretches. Each stretch composes the error e of the path before it with its
-own error w. The formula of Baker, Campbell and Hausdorff gives the composed error, where [a, b] is
-the Lie bracket (`se2.py`):
-
-    log(exp(e) exp(w)) = e + w + [e, w] / 2 + [e, [e, w]] / 12 + [w, [w, e]] / 12 + ...
-
-Each of the two errors has a part from noise and a part from the parameters, e = x + J p and w = n +
-W p, with these symbols:
-
-- x and n: the errors from noise on the path before and on the stretch, with covariances P and Q.
-- p: the errors of the parameters in standard deviations, independent and normal. p_i is one of
-  them.
-- J and W: the effects of the parameters on the path before and on the stretch, with one column, J_i
-  or W_i, for each parameter.
-
-The term [e, w] / 2 then adds these errors to x and y. Sums are over all stretches:
-
-    sum of [x, n] / 2           independent in each stretch, so the covariances are summed
-    sum over i of p_i M_i       M_i = sum of ([J_i, n] + [x, W_i]) / 2, where M_i correlates with x
-    sum over i <= k of p_i p_k C_ik
-                                C_ik = sum of ([J_i, W_k] + [J_k, W_i]) / 2, or half of that sum
-                                if i = k
-
-Each p_i is independent of the rest and has the mean 0, so these sums are uncorrelated with each
-other and with e. From the last two terms of the series, only the part from noise is used. Without
+A wrong heading to either side makes the robot get less far, so this does not average out. On a
+straight drive it is nearly all of the error along the path: 0.12 m after 60 m with k = 1e-5
+(`error_model.py`), of which the first order is 17 mm. `SecondOrder` has the equations. Without
 parameters the result is equation 55 of Barfoot & Furgale, Associating Uncertainty with
 Three-Dimensional Poses for Use in Estimation Problems, IEEE Transactions on Robotics 30 (2014).
 """
@@ -49,37 +22,44 @@ from acsard.core.motion.se2 import (
 )
 from acsard.core.values import PoseCovariance
 
+# rad2, before and after a stretch. Beyond it the series does not converge, and could make the
+# covariance indefinite, so the stretch adds nothing.
 MAX_HEADING_VARIANCE = 1.0
-"""Largest variance of the heading for which the second-order terms are computed, rad2. The limit
-applies before and after a stretch of the path. With a larger variance, the series does not
-converge, and its terms could make the covariance of the pose indefinite. The stretch then adds
-nothing to the terms."""
 
 NO_TERMS = PoseCovariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class SecondOrder:
-    """Computes the second-order terms in the covariance of x and y.
+    """The second-order terms in the covariance of x and y, over stretches of the path.
 
-    The symbols such as [x, n], M_i and C_ik are those of the module's docstring.
+    A stretch composes the error e of the path before it with its own error w (Baker, Campbell,
+    Hausdorff; [a, b] is the Lie bracket of `se2.py`):
+
+        log(exp(e) exp(w)) = e + w + [e, w] / 2 + [e, [e, w]] / 12 + [w, [w, e]] / 12 + ...
+
+    e = x + J p and w = n + W p have the noises x and n, of covariances P and Q, and the effects J
+    and W of the parameters p, in independent standard deviations. [e, w] / 2 adds to x and y,
+    summed over the stretches:
+
+        [x, n] / 2                  independent in each stretch, so the covariances are summed
+        sum over i of p_i M_i       M_i = sum of ([J_i, n] + [x, W_i]) / 2, correlates with x
+        sum over i <= k of p_i p_k C_ik     C_ik = sum of ([J_i, W_k] + [J_k, W_i]) / 2,
+                                            half of it if i = k
+
+    These are uncorrelated with each other and with e. From the last two terms of the series, only
+    the part from noise is used.
     """
 
     def __init__(self, columns: int) -> None:
+        # Covariance (xx, xy, yy), m2, of the sum of all [x, n] / 2 and M_i.
         self._noise: Vector = ORIGIN
-        """Covariance (xx, xy, yy), m2, of the sum of all [x, n] / 2 and all M_i (see the
-        module)."""
+        # For each parameter the covariance of M_i with x, rows x and y.
         self._with_x: list[tuple[Vector, Vector]] = []
-        """For each parameter, the covariance of M_i with the error x (see the module). The first
-        row is for the component of M_i along the x axis, and the second row for that along the y
-        axis."""
-        self._bent: dict[tuple[int, int], Planar] = {}
-        """C_ik (see the module) for each pair of parameters, m. In the key, the larger index comes
-        first."""
+        self._bent: dict[tuple[int, int], Planar] = {}  # C_ik, m; the larger index comes first
         for _ in range(columns):
             self.add_parameter()
+        # m2 in odom; a motion does not change them, as they have no yaw.
         self.xx = self.xy = self.yy = 0.0
-        """Second-order terms in the covariance of x and y, m2, in the axes of odom. A motion of the
-        robot does not change these terms, because they have no yaw (`se2.seen_from`)."""
 
     def add_parameter(self) -> None:
         """Add one more parameter, which must not have affected the pose yet."""
@@ -88,27 +68,17 @@ class SecondOrder:
         self._bent |= {(i, k): (0.0, 0.0) for k in range(i + 1)}
 
     def carry(self, dx: float, dy: float) -> None:
-        """Transform the stored covariances when the robot has moved by `dx`, `dy` m in odom."""
+        """Transform the covariances when the robot has moved by `dx`, `dy` m in odom."""
         self._with_x = [(seen_from(a, dx, dy), seen_from(b, dx, dy)) for a, b in self._with_x]
 
     def compose(
         self, p: PoseCovariance, q: PoseCovariance, j: list[Vector], w: list[Vector]
     ) -> PoseCovariance:
-        """Add a stretch of the path, and update `xx`, `xy` and `yy`.
+        """Add a stretch, update `xx`, `xy` and `yy`, and return what adds to the noise p + q.
 
-        The caller must first call `carry` with the displacement of the stretch. All arguments must
-        be expressed at the robot's position at the end of the stretch (`se2.seen_from`).
-
-        Args:
-            p: the covariance of the noise on the path before the stretch.
-            q: the covariance of the noise on the stretch itself.
-            j: the effect of each uncertain parameter, such as the track, on the path before the
-                stretch.
-            w: the effect of each of these parameters on the stretch itself.
-
-        Returns:
-            The second-order terms that the caller must add to the covariance of the noise on the
-            whole path, which is otherwise p + q.
+        First call `carry`. All arguments are at the end of the stretch (`se2.seen_from`):
+        covariances of the noise before it (`p`) and on it (`q`), and effects of the parameters
+        before (`j`) and on it (`w`).
         """
         xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
         for x, y, yaw in j:
@@ -133,10 +103,7 @@ class SecondOrder:
     def _bend_noise(
         self, i: int, p: PoseCovariance, q: PoseCovariance, column: Vector, new: Vector
     ) -> None:
-        """Add ([J_i, n] + [x, W_i]) / 2 to M_i (see the module) for the parameter `i`.
-
-        `p` and `q` are the covariances of x and of n. `column` is J_i, and `new` is W_i.
-        """
+        # Adds ([J_i, n] + [x, W_i]) / 2 to M_i; `column` is J_i, `new` is W_i.
         x, y = self._with_x[i]
         by_new_x, by_new_y = brackets(new, p, -0.5)
         by_noise_x, by_noise_y = brackets(column, q, 0.5)

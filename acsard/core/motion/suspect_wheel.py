@@ -1,13 +1,11 @@
 """Decides whether a suspect wheel has a faulty encoder, by comparison with its command or a gyro.
 
-A faulty encoder shows one of three signs. It is dead (reports no turn), reversed (reports the
-opposite of the other wheel) or stuck (repeats one speed). A wheel with such a sign is faulty if an
-independent reference differs more from this wheel than from the other wheel of its side. The
-reference is the turn according to a gyro or, without a gyro, the command. Without a reference, only
-a stuck wheel is found, because a person who pushes the robot may turn one wheel and not the other.
-
-`Suspect` tests a wheel that contradicts the other wheel of its side. `Stuck` tests every wheel,
-because a stuck encoder agrees with the other wheel until the command changes.
+A faulty encoder is dead (reports no turn), reversed (the opposite of the other wheel) or stuck (one
+speed). With such a sign a wheel is faulty if a reference differs more from it than from the other
+wheel of its side: the turn by a gyro or, without one, the command. Without both only a stuck wheel
+is found, because a push may turn one wheel and not the other. `Suspect` tests a wheel that
+contradicts the other one, `Stuck` every wheel, because a stuck encoder agrees until the command
+changes.
 """
 
 from __future__ import annotations
@@ -16,43 +14,31 @@ import math
 from typing import Literal
 
 from acsard.core.motion.wheel_witness import Expected
+from acsard.core.values import Rad
 
+# Least duration of a sign: three lines at 100 Hz, so one bad reading is not enough.
 FAULT_S, FAULT_LINES = 0.025, 2
-"""Shortest time, s (`FAULT_S`), and smallest number of feedback lines (`FAULT_LINES`) for which a
-sign of a faulty encoder must last. At 100 Hz, `FAULT_S` takes three lines, so one bad reading is
-not enough."""
 
-FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
-"""A wheel can be called faulty only if the angles of the two wheels of its side differ by at least
-`FAULT_COUNTS` encoder counts plus `FAULT_ANGLE` rad."""
+FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05  # counts plus rad by which the wheels of the side must differ
 
+# Counts plus rad by which a healthy wheel must have left the old speed after a new command.
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
-"""After a new command, a wheel that repeats its old speed counts as stuck only if a healthy wheel
-would have rolled a clearly different angle by now. The difference from the angle at the old speed
-must be at least `FOLLOWED_COUNTS` encoder counts plus `FOLLOWED_ANGLE` rad."""
 
-MIN_COMMAND_CHANGE = 0.05
-"""Smallest change of the command, rad/s, after which a healthy wheel must report a different
-speed."""
+MIN_COMMAND_CHANGE = 0.05  # rad/s, after which a healthy wheel must report a different speed
 
+# Fraction of the wheels' difference by which a reference must be nearer to one of them.
 MIN_DISTANCE_FRACTION = 1 / 3
-"""A reference (a gyro or the command) decides which of two wheels is faulty only if it is clearly
-nearer to one wheel. Its distances from the two wheels must differ by at least this fraction of the
-difference between the wheels."""
 
+# For a stuck wheel without a command or a gyro: a person cannot turn a wheel so evenly by hand.
 STUCK_TIME_S = 0.3
-"""If neither a command nor a gyro shows which wheel is right, a wheel must repeat one speed for
-this time before it is called stuck, s. A person cannot turn a wheel so evenly by hand."""
 
+# Fractions of the other wheel's angle: at most the first is dead, the opposite within the second
+# is reversed.
 DEAD_FRACTION, REVERSED_FRACTION = 0.1, 0.3
-"""Fractions of the angle that the other wheel of the side rolled. A wheel is dead if its angle is
-at most the fraction `DEAD_FRACTION`. It is reversed if it rolled in the opposite direction, and if
-the magnitudes of the two angles differ by at most the fraction `REVERSED_FRACTION`."""
 
+# Fraction of the larger angle by which a side must differ: the even wheel may be right while the
+# other one slips.
 MIN_STUCK_FRACTION = 0.3
-"""A wheel can be called stuck only if the angles of the two wheels of its side differ by at least
-this fraction of the larger angle. Otherwise the wheel with the constant speed may be healthy while
-the other wheel slips."""
 
 WheelFault = Literal["dead", "reversed", "stuck"]
 
@@ -64,11 +50,8 @@ FAULT_TEXTS: dict[WheelFault, str] = {
 
 
 class _Ballot:
-    """Sums of angles over feedback lines, rad, to decide which of two wheels is wrong.
-
-    `low` and `high` limit the angle of a healthy wheel according to the command or a gyro.
-    """
-
+    # Sums of angles, rad, that decide which of two wheels is wrong. `low` and `high` limit a
+    # healthy one's by the command or a gyro.
     def __init__(self) -> None:
         self._own = self._other = self._low = self._high = 0.0
 
@@ -102,25 +85,19 @@ class Suspect:
         self.forget()
 
     def forget(self) -> None:
-        """Start a new test, in which the wheel has shown no sign of a fault."""
+        """Start a new test."""
         self.sign: WheelFault | None = None
         self._lines = 0
         self._seconds = self._apart = 0.0
         self._command, self._gyro = _Ballot(), _Ballot()
-        self._begun: float | None = None
-        """Magnitude of the angle that the wheel rolled in the first line of the test, rad."""
-        self._known = False
-        """Whether at least one line of the test was compared with the command."""
+        self._begun: float | None = None  # rad rolled in the first line
+        self._known = False  # a line was compared with the command
 
     def looks(self, own: float, other: float, same: bool, dt: float, count: float) -> bool:
-        """Add a feedback line, and return whether the wheel now shows a sign of a faulty encoder.
+        """Add a line, and return whether the wheel now shows a sign of a faulty encoder.
 
-        Args:
-            own: the angle that this wheel rolled in the line, rad.
-            other: the angle that the other wheel of its side rolled, rad.
-            same: whether this wheel repeats the speed of the previous line.
-            dt: the time that the line covers, s.
-            count: the angle of an encoder count, rad.
+        `own` and `other` are rolled angles of the side, rad, `same` says that the speed is the
+        previous one, and `count` is the angle of an encoder count, rad.
         """
         sign = self._sign(own, other, same, count)
         if sign != self.sign:
@@ -149,16 +126,9 @@ class Suspect:
         expected: Expected,
         gyro: float | None,
     ) -> None:
-        """Compare both wheels of the side with the command and the gyro in a feedback line.
+        """Compare the side with the command and the gyro; see `looks`.
 
-        Args:
-            own: the angle that this wheel rolled in the line, rad.
-            other: the angle that the other wheel of its side rolled, rad.
-            dt: the time that the line covers, s.
-            count: the angle of an encoder count, rad.
-            expected: the speed of a healthy wheel.
-            gyro: the angle that this side rolled according to a gyro, rad; None without a trusted
-                gyro.
+        `gyro` is the angle that this side rolled by a trusted gyro, rad.
         """
         # The speed of a healthy wheel lies between its command and the speed that a wheel with
         # `feedback.response_time` has reached by now.
@@ -175,10 +145,7 @@ class Suspect:
             self._gyro.add(own, other, gyro, gyro)
 
     def is_faulty(self, count: float) -> bool:
-        """Return whether the lines so far show that this wheel is faulty and the other one is not.
-
-        `count` is the angle of an encoder count, rad.
-        """
+        """Return whether this wheel is shown to be faulty and the other one is not."""
         enough = FAULT_COUNTS * count + FAULT_ANGLE
         if self._lines < FAULT_LINES or self._seconds < FAULT_S or abs(self._apart) < enough:
             return False
@@ -189,21 +156,16 @@ class Suspect:
         return self.sign == "stuck" and not self._known and self._seconds >= STUCK_TIME_S
 
     def _plain(self, ballot: _Ballot) -> bool:
-        """Return whether only a faulty encoder can explain the sign of this wheel.
-
-        If the sign is "stuck", the wheel may also be healthy while the other wheel slips. Then the
-        result is False, unless the two wheels differ by at least `MIN_STUCK_FRACTION`.
-        """
+        # Only a faulty encoder explains the sign: a stuck wheel may be right while the other slips.
         return self.sign != "stuck" or ballot.share >= MIN_STUCK_FRACTION
 
 
 class Stuck:
     """The test of one wheel for an encoder that repeats one speed although the command has changed.
 
-    After a new command, a healthy wheel must report another speed as soon as its expected angle
-    differs by a few counts from the angle at the old speed. If only the other wheel of the side
-    reports another speed, this encoder is stuck. While the robot drives at a constant speed, no
-    test can detect a stuck encoder, but then it does not harm the pose either.
+    After a new command, a healthy wheel must report another speed once its angle differs by a few
+    counts. If only the other wheel does, this encoder is stuck. At a constant speed no test can
+    show it, but it does no harm either.
     """
 
     def __init__(self) -> None:
@@ -214,23 +176,14 @@ class Stuck:
         self._seconds = self._followed = self._other = 0.0
 
     def command_changed(self, command: float) -> bool:
-        """Return whether the command has changed since the wheel began to repeat its speed.
-
-        `command` is the present command for the wheel, rad/s. A change below `MIN_COMMAND_CHANGE`
-        does not count.
-        """
+        """Return whether the command has changed since the wheel began to repeat its speed."""
         return abs(command - self._command) >= MIN_COMMAND_CHANGE
 
     def add(self, same: bool, apart: float, dt: float, count: float, expected: Expected) -> bool:
-        """Add a feedback line, and return whether the encoder of this wheel is stuck.
+        """Add a line, and return whether the encoder of this wheel is stuck.
 
-        Args:
-            same: whether the wheel turns and repeats the speed of the previous line.
-            apart: the angle by which the other wheel of the side turned further than this wheel,
-                rad.
-            dt: the time that the line covers, s.
-            count: the angle of an encoder count, rad.
-            expected: the speed of a healthy wheel.
+        `same` says that the wheel turns and repeats its speed, and `apart` is how much further the
+        other wheel of the side turned, rad.
         """
         slow, command = expected.speed, expected.commanded
         leaves = command - self._command
@@ -251,19 +204,12 @@ class Stuck:
 
 
 def seems_still(own: float, other: float) -> bool:
-    """Return whether a wheel seems to stand still.
-
-    The wheel turned `own` rad, and the other wheel of its side turned `other` rad.
-    """
+    """Return whether a wheel that turned `own` seems to stand still beside one of `other`."""
     return own == 0.0 or abs(own) <= DEAD_FRACTION * abs(other)
 
 
-def reverses(own: float, other: float, count: float) -> bool:
-    """Return whether a wheel turned about as far as the other one, but in the opposite direction.
-
-    The wheel turned `own` rad, and the other wheel of its side turned `other` rad. `count` is the
-    angle of an encoder count, rad.
-    """
+def reverses(own: Rad, other: Rad, count: Rad) -> bool:
+    """Return whether a wheel turned about as far as the other one, but backward."""
     return (
         own * other < 0.0
         and abs(own + other) <= REVERSED_FRACTION * abs(other) + FAULT_COUNTS * count
@@ -271,10 +217,9 @@ def reverses(own: float, other: float, count: float) -> bool:
 
 
 def was_faulty(fault: WheelFault, own: float, other: float, now: float) -> bool:
-    """Return whether the fault of a wheel may already have been present in an earlier line.
+    """Return whether the fault may already have been present in an earlier line.
 
-    `own` and `other` are the speeds of the faulty wheel and of the other wheel of its side in that
-    line. `now` is the present speed of the faulty wheel. All are in rad/s.
+    `own` and `other` are speeds in that line, `now` the faulty wheel's present one, rad/s.
     """
     if fault == "reversed":
         return own * other <= 0.0

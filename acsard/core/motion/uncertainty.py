@@ -1,28 +1,9 @@
-"""Computes the covariance of the pose's error, step by step.
+"""Computes the covariance of the pose's error e = log(estimate^-1 truth) (`se2.py`), step by step.
 
-The error is e = log(estimate^-1 truth) in SE(2) (`se2.py`), with the components x, y and yaw. It
-has two parts. Noise is independent from step to step, and its covariance is P (3x3). The error of a
-parameter, such as a wheel radius, is the same in every step, so its effects add up. The matrix J
-has a column for each parameter: the error of the pose if this parameter is off by one standard
-deviation. Each step updates both parts, and their sum is published (' means transposed):
-
-    P <- F P F' + G Q G'
-    J <- F J + G_p
-    P_total = P + J J' + terms of second order (`second_order.py`)
-
-- F (3x3) transforms an error at the robot's position before the step to its position after the step
-  (`se2.seen_from`).
-- Q (2x2) is the covariance of the noise in the distance and the turn of the step
-  (`error_model.Noise`).
-- G (3x2) transforms errors of distance and turn to an error of the pose. The distance is along the
-  chord of the step.
-- G_p has a column for each parameter: the error of the pose that it causes in this step
-  (`error_model.columns`).
-
-The covariance in nav_msgs/Odometry is defined for x and y in the axes of odom, and for yaw. To
-first order it equals the covariance of e in these axes, so P_total is published. Rotated by -yaw,
-P_total is the covariance of e in the axes of base_link. This rotated covariance is right even if
-the heading is so uncertain that the possible positions form an arc and not an ellipse.
+Noise is independent from step to step, with the covariance P. The error of a parameter is the same
+in every step: J has for each parameter the error of the pose at one standard deviation. The sum is
+published: to first order it is that of nav_msgs/Odometry, for x and y in the axes of odom. Rotated
+by -yaw it is right even if the possible positions form an arc and not an ellipse.
 """
 
 from __future__ import annotations
@@ -43,104 +24,87 @@ from acsard.core.motion.se2 import (
     total,
 )
 from acsard.core.motion.second_order import SecondOrder
-from acsard.core.values import PoseCovariance
+from acsard.core.values import PoseCovariance, Rad
 
-MAX_VARIANCE = 1e9
-"""Largest variance of the pose, m2 or rad2. It means "unknown"."""
+MAX_VARIANCE = 1e9  # m2 or rad2: "unknown"
 
-ASSUMED_COUNTS = 400
-"""Number of encoder counts per revolution of a wheel that is assumed if this number is not
-configured. Few encoders have fewer counts."""
+ASSUMED_COUNTS = 400  # per revolution; few encoders have fewer
 
 UNKNOWN_POSE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
+# Cause of a motion that the pose may have missed: a gap, or doubtful wheels of a side.
 Missed = Literal["gap", "left", "right"]
-"""Cause of a motion that the pose may have missed: a gap in the feedback, or wheels of one side
-whose reports may be wrong or were ignored."""
 
 NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
 
-UPDATE_DISTANCE = 0.2
-"""Distance that the wheels roll between two updates of the second-order terms, m."""
+UPDATE_DISTANCE = 0.2  # m rolled, between two updates of the second-order terms
 
 
 class PoseUncertainty:
-    """Computes the covariance of the pose. It uses plain floats, because updates come at 100 Hz."""
+    """Computes the covariance of the pose, in plain floats, because updates come at 100 Hz.
+
+        P <- F P F' + G Q G'
+        J <- F J + G_p
+        P_total = P + J J' + terms of second order (`second_order.py`)
+
+    F moves an error from the position before the step to that after it (`se2.seen_from`), Q is the
+    noise of distance and turn (`error_model.Noise`), G makes an error of the pose of it, along the
+    chord, and G_p has that of each parameter in this step (`error_model.columns`).
+    """
 
     def __init__(self, model: ErrorModel, counts: int) -> None:
-        """Start at the origin.
-
-        `counts` is the number of encoder counts per revolution of a wheel; 0 if it is unknown.
-        """
         self._model = model
         self._parameters = self._effects = model.columns
         self._counted = counts > 0
         self._count = 0.0
         self._set_count_angle(math.tau / (counts or ASSUMED_COUNTS))
+        # Since the last update of second order, m: displacement in odom, and rolled.
         self._dx = self._dy = self._rolled = 0.0
-        """Motion since the last update of the second-order terms, m. `_dx` and `_dy` are the
-        displacement in odom, and `_rolled` is the distance that the wheels rolled."""
         self.set(0.0)
 
     def update_track(self) -> None:
-        """Read the effective track and the columns of the error model again.
-
-        Call this when they have changed. The error model must have as many columns as before.
-        """
+        """Read the effective track and the columns of the error model again; their number stays."""
         beside = self._effects[len(self._parameters) :]
         self._parameters = self._model.columns
         self._effects = (*self._parameters, *beside)
         self._set_count_angle(self._count)
 
     def _set_count_angle(self, angle: float) -> None:
-        """Set the angle of an encoder count, rad, within which a wheel's position is unknown."""
+        # The angle within which a wheel's position is unknown.
         self._count, count, track = angle, self._model.radius * angle, self._model.track
         self._play = count / track
         self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / track**2, 0.0)
 
-    def set(self, yaw: float) -> None:
-        """Reset the covariance to that of an initial pose with the heading `yaw`, rad."""
+    def set(self, yaw: Rad) -> None:
+        """Reset the covariance to that of an initial pose with this heading."""
         xx, yy, _, _, _, yawyaw = self._model.settings.pose_covariance_diagonal
         self._p = PoseCovariance(xx, 0.0, 0.0, yy, 0.0, yawyaw)
         self._cos, self._sin = math.cos(yaw), math.sin(yaw)
         if self._counted:
             self._p = added(self._p, *self._phase, self._cos, self._sin)
         self._effects = self._parameters
+        # Of J; those of the gyro's scale and of missed motions come when needed.
         self._columns: list[Vector] = [ORIGIN for _ in self._effects]
-        """The columns of the matrix J (see the module). The columns for the gyro's scale and for
-        missed motions are added when needed."""
-        self._of_gyro = -1
-        """The index in `_columns` of the column for the gyro's scale; -1 before it is added."""
-        self._of_missed: dict[Missed, int] = {}
-        """The indices in `_columns` of the columns for motions that the pose missed."""
+        self._of_gyro = -1  # index of the gyro's scale, or -1
+        self._of_missed: dict[Missed, int] = {}  # indices of missed motions
         self._columns_before = self._columns
         self._turned = self._middle = 0.0
         self._second = SecondOrder(len(self._effects))
         self._begin_stretch()
         self._lost = False
-        self.covariance = self._p
-        """The published covariance of x, y and yaw in odom."""
+        self.covariance = self._p  # published, of x, y and yaw in odom
         self._publish()
 
     def advance(
         self, distance: float, turn: float, dx: float, dy: float, heading: float,
         variance: float | None = None, slips: bool = False, scale: float | None = None,
     ) -> None:  # fmt: skip
-        """Update the covariance after a step, which is an arc of `distance` m through `turn` rad.
+        """Update the covariance after an arc of `distance` m through `turn` rad.
 
-        Args:
-            distance: the length of the arc, m.
-            turn: the turn of the step, rad.
-            dx: the displacement along the x axis of odom, m.
-            dy: the displacement along the y axis of odom, m.
-            heading: the direction of the chord of the arc in odom, rad.
-            variance: the variance of the turn, rad2, if a gyro measured the turn; None if the
-                wheels measured it. With a gyro, the errors of the parameters affect only the
-                distance.
-            slips: whether the wheels slip. The noise of the wheels is then larger by the factor
-                `SLIP_FACTOR`.
-            scale: the relative standard deviation of the gyro's scale; None for the configured one,
-                `odometry.gyro_scale_std`.
+        `dx` and `dy` are its displacement, m, and `heading` the direction of its chord in odom,
+        rad. A gyro gives `variance` of the turn, rad2, and the parameters then affect only the
+        distance; `scale` is its relative standard deviation, by default `odometry.gyro_scale_std`.
+        Wheels that slip have `SLIP_FACTOR` times the noise.
         """
         if self._lost:
             self._mark_unknown(distance, turn)
@@ -165,21 +129,15 @@ class PoseUncertainty:
         self._publish()
 
     def doubt(self, along: float, yaw: float) -> None:
-        """Increase the uncertainty of the last step, because it filled a gap in the feedback.
-
-        `along` is the additional variance of the step's distance, m2, and `yaw` that of the step's
-        turn, rad2.
-        """
+        """Add these variances of distance, m2, and turn, rad2: the last step filled a gap."""
         if not self._lost:
             self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
             self._publish()
 
     def miss(self, cause: Missed, distance: float, turn: float) -> None:
-        """Add the uncertainty of a motion that the pose may have missed in the last step.
+        """Add a motion that the pose may have missed in the last step, as standard deviations.
 
-        Motions that the pose misses for the same cause add up and do not average out. Therefore
-        they are treated like the error of a parameter. `distance`, m, and `turn`, rad, are the
-        standard deviations, with the signs of the motion.
+        Those of the same cause add up and do not average out, like the error of a parameter.
         """
         if self._lost:
             return
@@ -191,14 +149,7 @@ class PoseUncertainty:
         self._publish()
 
     def add_gap(self, distance: float, turn: float, along: float, yaw: float) -> None:
-        """Add the uncertainty of a gap in the feedback during which the pose was not updated.
-
-        Args:
-            distance: the probable distance driven in the gap, m.
-            turn: the probable turn in the gap, rad.
-            along: the variance of the distance, m2.
-            yaw: the variance of the turn, rad2.
-        """
+        """Add a gap in which the pose was not updated: probable motion, and its variances."""
         if self._lost:
             self._mark_unknown(distance, turn)
             return
@@ -220,11 +171,7 @@ class PoseUncertainty:
         return len(self._columns) - 1
 
     def _mark_unknown(self, distance: float, turn: float) -> None:
-        """Set all variances to "unknown" after a motion of `distance` m and `turn` rad.
-
-        Without a motion, nothing changes. Call this only if the position or the heading is already
-        unknown.
-        """
+        # Without a motion, nothing changes. The position or the heading is already unknown.
         if distance or turn:
             self.covariance = UNKNOWN_POSE
 
@@ -245,10 +192,7 @@ class PoseUncertainty:
     def _bend(
         self, distance: float, turn: float, dx: float, dy: float, scale: float | None
     ) -> None:
-        """Update the matrix J of the parameters' effects after an arc: J <- F J + G_p.
-
-        `scale` is the relative standard deviation of the gyro's scale, or None without a gyro.
-        """
+        # J <- F J + G_p; `scale` is None without a gyro.
         c, s, more = self._cos, self._sin, 0.0
         columns: list[Vector] = []
         # With four columns at 100 Hz, unpacking into names is faster than indexing tuples.
@@ -271,7 +215,6 @@ class PoseUncertainty:
         self._dx = self._dy = self._rolled = 0.0
 
     def _end_stretch(self) -> None:
-        """Add the second-order terms (`second_order.py`) for the path since the last update."""
         dx, dy, p = self._dx, self._dy, self._p
         before = carried(self._before, dx, dy)
         columns_before = [seen_from(column, dx, dy) for column in self._columns_before]
@@ -305,7 +248,7 @@ class PoseUncertainty:
 
 
 def _capped(p: PoseCovariance) -> PoseCovariance:
-    """Limit the variances to `MAX_VARIANCE`. The correlations do not change."""
+    # The correlations do not change.
     x, y, yaw = (
         min(1.0, math.sqrt(MAX_VARIANCE / max(v, MAX_VARIANCE))) for v in (p.xx, p.yy, p.yawyaw)
     )

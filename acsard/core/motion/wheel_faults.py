@@ -1,23 +1,12 @@
 """Decides which wheel is faulty and which side slips.
 
-The two wheels of a side are compared with each other (`wheel_residual.py`). If they contradict each
-other, one of them may have a faulty encoder. A wheel is faulty if it shows the sign of such a fault
-and its command or a gyro contradicts it (`suspect_wheel.py`). The pose then ignores this wheel and
-uses the other one in its place.
-
-- If both wheels agree again for `RECOVERY_S` of rolling, the pose uses the ignored wheel again.
-- If the ignored wheel contradicts both the other wheel and its command for `feedback.fault_time`,
-  the robot latches a fault.
-- If any wheel contradicts its command for `feedback.fault_time` (`wheel_witness.py`), the robot
-  also latches a fault, because both wheels of a side may be wrong and agree with each other.
-
-Every other contradiction counts as slip. A faulty encoder also counts as slip until the fault is
-proven. At most one wheel of each side is ignored. A wheel that is blocked or dragged looks like a
-wheel with a dead encoder, so it is ignored too. The other wheel shows the distance driven.
-
-If a wheel has rested and then turns without a command, a hand or a slope turns it. This motion is
-reported, but it is never a fault, because the daemon could only react with the zero that it already
-sends.
+The wheels of a side are compared (`wheel_residual.py`). A wheel with the sign of a faulty encoder,
+which its command or a gyro contradicts (`suspect_wheel.py`), is ignored for the other one, until
+both agree for `RECOVERY_S`. If it contradicts the other and its command for `feedback.fault_time`,
+or any wheel its command (`wheel_witness.py`: both of a side may be wrong), the robot latches a
+fault. Any other contradiction is slip. A blocked or dragged wheel looks dead and is ignored too. A
+wheel that turns after a rest without a command is reported, but no fault, as zeros are sent
+already.
 """
 
 from __future__ import annotations
@@ -35,59 +24,42 @@ from acsard.core.motion.wheel_residual import TIME_CONSTANT_S, Residual
 from acsard.core.motion.wheel_witness import MIN_FAULT_SPEED, WITNESS_TEXTS, Expected, Witness
 from acsard.core.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 
+# rad of one count that is learned if the number of counts is not configured.
 MAX_COUNT_ANGLE, MIN_COUNT_ANGLE = math.tau / 16, math.tau / 2000
-"""Largest and smallest angle of one encoder count that the daemon learns if the number of counts is
-not configured, rad."""
 
+# The count is the third smallest angle that a front wheel rolled in so many lines; the smallest may
+# come from a damaged line.
 RECURRENCES, LEARNING_LINES = 3, 1000
-"""Parameters for learning the angle of one encoder count, if the number of counts is not
-configured. The angle is the `RECURRENCES`-th smallest angle that a front wheel rolled in a feedback
-line, within `LEARNING_LINES` lines. The smallest angle alone may come from a damaged line."""
 
-MIN_COMMANDED_SPEED = 0.005
-"""Smallest commanded wheel speed that does not count as zero, rad/s. The line to the board has two
-decimals and shows a lower speed as 0.00."""
+MIN_COMMANDED_SPEED = 0.005  # rad/s: a line to the board shows a lower one as 0.00
 
+# s without a command until it is logged (less may be the rocking of a robot), and between logs.
 ROLLED_S, REPEATED_S = 0.2, 1.0
-"""`ROLLED_S` is the time for which wheels must turn without a command before the daemon logs this
-motion, s. A shorter motion may be the rocking of a robot that comes to rest. `REPEATED_S` is the
-shortest time between two such log lines, s."""
 
-SLIP_HOLD_S = 0.5
-"""Time for which a side still counts as slipping after the last contradiction of its wheels, s."""
+SLIP_HOLD_S = 0.5  # after the last contradiction
 
-SLIP_REPORTED_S = 0.1
-"""Time for which the two wheels of a side must contradict each other before slip is logged, s."""
+SLIP_REPORTED_S = 0.1  # until slip is logged
 
-RECOVERY_S = 0.5
-"""Time for which an ignored wheel must agree with the other wheel of its side while both roll, s.
-After this time, the pose uses the ignored wheel again."""
+RECOVERY_S = 0.5  # of agreement while both roll, until an ignored wheel is used again
 
 SideName = Literal["left", "right"]
 
-LATE_PERIODS = 1.5
-"""Duration of a feedback line, in usual durations, above which its speeds do not show the angle of
-an encoder count."""
+LATE_PERIODS = 1.5  # usual durations of a line, above which its speeds do not show a count
 
+# Counts that a side must miss before both encoders may be the cause. A loaded robot at a fifth of
+# its speed reports one in less time.
 UNFOLLOWED_COUNTS = 6.0
-"""Number of encoder counts that a side must miss before both of its encoders may be the cause. A
-loaded robot that drives at a fifth of its expected speed reports a count in less time."""
 
-MAX_UNFOLLOWED_LINE_S = 0.1
-"""Longest time of a feedback line for which a side counts as not following its command, s."""
+MAX_UNFOLLOWED_LINE_S = 0.1  # for which a side counts as not following
 
-Same = tuple[bool, bool, bool, bool]
-"""Whether each wheel reports the same speed as in the previous feedback line, in `WHEELS` order."""
+Same = tuple[bool, bool, bool, bool]  # the speed of the previous line
 
 NO_FAULTS: Same = (False, False, False, False)
 
-LEFT, RIGHT = (1, 2), (0, 3)
-"""Indices of the front and the rear wheel of each side in `WHEELS` order."""
+LEFT, RIGHT = (1, 2), (0, 3)  # front and rear, by `WHEELS`
 
 
 class _Side:
-    """The two wheels of one side: the ignored wheel, and the evidence of faults and slip."""
-
     def __init__(self, name: SideName, wheels: tuple[int, int]) -> None:
         self.name, self.wheels = name, wheels
         self.expected, self.residual = Expected(), Residual()
@@ -95,18 +67,12 @@ class _Side:
         self.suspected = False
         self._suspects = (Suspect(), Suspect())
         self._stuck = (Stuck(), Stuck())
-        self.out: int | None = None
-        """The wheel that the pose ignores: 0 is the front wheel, 1 is the rear wheel. None if the
-        pose uses both wheels."""
+        self.out: int | None = None  # ignored wheel: 0 is the front, 1 the rear
         self._fault: WheelFault = "dead"
-        self.late = False
-        """Whether a wheel that is not ignored turns too slowly."""
+        self.late = False  # a wheel that is not ignored turns too slowly
+        # s for which neither wheel has followed, and the further rad expected of both.
         self.unfollowed_s, self._unfollowed = 0.0, (0.0, 0.0)
-        """Time for which neither wheel has followed its command, s, and the further angles that the
-        wheels would have rolled otherwise, rad."""
-        self._out_s = 0.0
-        """Time for which the ignored wheel has contradicted both the other wheel of its side and
-        its command, s."""
+        self._out_s = 0.0  # s for which the ignored wheel contradicts the other one and its command
         self.slip_s = self._odd_s = self._agreed_s = 0.0
         self.event: Event | None = None
 
@@ -140,12 +106,10 @@ class _Side:
             part.forget()
 
     def watch(self, speeds: Motors, dt: float, most: float, count: float, still: bool) -> bool:
-        """Check both wheels of this side, and return whether one of them may be faulty.
+        """Check both wheels, and return whether one of them may be faulty.
 
-        `speeds` contains the reported speeds of all four wheels, rad/s. `dt` is the time since the
-        previous line, s. One line adds at most `most` s to the evidence of a fault. `count` is the
-        angle of an encoder count, rad, and `still` is true if all wheels are commanded to stand
-        still.
+        A line adds at most `most` s of evidence. `still` says that all wheels are commanded to
+        stand.
         """
         i, j = self.wheels
         front, rear = self.witnesses
@@ -165,10 +129,7 @@ class _Side:
         return bad_front or bad_rear or self._out_s > 0.0
 
     def spread(self, front: float, rear: float) -> Motors:
-        """Return the values of all four wheels: `front` and `rear` for this side, 0 for the other.
-
-        The values are in `WHEELS` order.
-        """
+        """Return values of the four wheels, with 0 for the other side."""
         if self.wheels == LEFT:
             return 0.0, front, rear, 0.0
         return front, 0.0, 0.0, rear
@@ -179,10 +140,8 @@ class _Side:
     def take_unfollowed(self, count: float) -> tuple[float, float]:
         """Return the further angles that the wheels may have rolled since the last call, rad.
 
-        An encoder with few counts often reports no motion although its wheel turns. Therefore the
-        angles are 0 until the expected motion, in the time in which neither wheel has followed its
-        command, is `UNFOLLOWED_COUNTS` counts. The first angles after that contain the motion of
-        this whole time. `count` is the angle of an encoder count, rad.
+        An encoder with few counts often reports none, so both are 0 until `UNFOLLOWED_COUNTS` are
+        expected; then they include all of them.
         """
         if self.unfollowed_s * abs(self.expected.speed) < UNFOLLOWED_COUNTS * count:
             return 0.0, 0.0
@@ -204,7 +163,7 @@ class _Side:
         return ""
 
     def agree(self, dt: float) -> None:
-        """Process a feedback line of `dt` s in which the two wheels of this side agree."""
+        """Process a line of `dt` s in which the wheels agree."""
         if self.suspected:
             self.suspected = False
             for suspect in self._suspects:
@@ -222,11 +181,7 @@ class _Side:
             self.out, self._out_s, self.residual.learns = None, 0.0, True
 
     def finds_stuck(self, turned: Motors, same: Same, dt: float, count: float) -> bool:
-        """Return whether this line proves an encoder stuck; the pose then ignores its wheel.
-
-        `same` is whether each wheel repeats its previous speed. `count` is the angle of an encoder
-        count, rad.
-        """
+        """Return whether this line proves an encoder stuck; the pose then ignores its wheel."""
         if self.out is not None:
             return False
         for i, stuck in enumerate(self._stuck):
@@ -247,10 +202,9 @@ class _Side:
         count: float,
         by_gyro: float | None,
     ) -> bool:
-        """Process a line in which the two wheels contradict each other.
+        """Process a contradiction; return whether it proves a wheel faulty, which is then ignored.
 
-        Return whether the line proves a wheel faulty, so that the pose now ignores it. `by_gyro` is
-        the angle that this side rolled according to a gyro, rad.
+        `by_gyro` is the angle that this side rolled by a gyro, rad.
         """
         self._agreed_s, fault = 0.0, None if self.out is None else self._fault
         if self.out is not None and self.expected.clear:
@@ -283,11 +237,7 @@ class _Side:
         return False
 
     def was_faulty(self, before: WheelSpeeds, now: WheelSpeeds) -> bool:
-        """Return whether the ignored wheel may have been wrong already in an earlier line.
-
-        `before` contains the wheel speeds in that line, and `now` the present wheel speeds, all in
-        rad/s.
-        """
+        """Return whether the ignored wheel may have been wrong at the speeds `before`."""
         if self.out is None:
             return False
         own, other = self.wheels[self.out], self.wheels[1 - self.out]
@@ -296,16 +246,15 @@ class _Side:
 
     @property
     def may_slip(self) -> bool:
-        """Whether the wheels of this side contradict each other, so that one of them may slip."""
+        """Whether the wheels contradict each other, so that one of them may slip."""
         return self.slip_s > 0.0 or self.may_be_right
 
     @property
     def may_be_right(self) -> bool:
-        """Whether the pose ignores a wheel of this side that may report its true motion.
+        """Whether the ignored wheel may report its true motion.
 
-        A wheel that reports no motion may have a dead encoder, or it may be blocked. A wheel that
-        reports the opposite motion may have a reversed encoder or a reversed motor. If the wheel is
-        right, the side moves as the mean of its two wheels, and not as the other wheel.
+        One without motion may be blocked, and an opposite one may have a reversed motor. The side
+        then moves as the mean of its wheels.
         """
         return self.out is not None and self._fault != "stuck"
 
@@ -323,40 +272,29 @@ class _Side:
 
 
 class WheelFaults:
-    """Checks all wheels. Decides which wheels the pose ignores, and which sides slip."""
+    """Decides which wheels the pose ignores, and which sides slip."""
 
     def __init__(self, kinematics: Kinematics, counts: int, feedback: FeedbackConfig) -> None:
-        """Start without evidence of a fault.
-
-        `counts` is the number of encoder counts per revolution of a wheel; 0 if it is unknown.
-        """
         self._kinematics, self._settings = kinematics, feedback
         self._count = math.tau / counts if counts else MAX_COUNT_ANGLE
-        self._most_count = self._count
-        """Largest possible angle of an encoder count, rad."""
+        self._most_count = self._count  # the largest possible one, rad
         self._seeking, self._period = not counts, ASSUMED_PERIOD_S
+        # The `RECURRENCES` smallest angles of front wheels in the last `_looked` lines.
         self._least, self._looked = [MAX_COUNT_ANGLE] * RECURRENCES, 0
-        """`_least` contains the `RECURRENCES` smallest angles that a front wheel rolled in one of
-        the last `_looked` feedback lines, rad."""
         self._sides = self._left, self._right = _Side("left", LEFT), _Side("right", RIGHT)
         self._last = STILL
         self._busy = self._leaves_out = self._stands = False
+        # The wheels of a side contradicted each other within `SLIP_HOLD_S`, or the ignored one may
+        # be right.
         self.slips = False
-        """Whether a side may slip: its wheels contradicted each other in the last `SLIP_HOLD_S`, or
-        one of them is ignored although it may be right."""
         self._rolled, self._unreported = 0.0, REPEATED_S
-        self.pushed = ""
-        """Message that wheels turn without a command, for example by hand; "" unless the last line
-        causes this message."""
+        self.pushed = ""  # wheels turn without a command, by the last line
         self._late = False
-        self._found: _Side | None = None
-        """The side on which the last feedback line proved a wheel faulty, or None."""
-        self.events: list[Event] = []
-        """Log events of the last feedback line."""
+        self._found: _Side | None = None  # the side on which the last line proved a wheel faulty
+        self.events: list[Event] = []  # of the last line
 
     @property
     def status(self) -> WheelsStatus:
-        """The state of the wheels: ignored wheels, slow wheels, and the sides that slip."""
         sides = self._sides
         return WheelsStatus(
             text="; ".join(side.text for side in sides if side.text),
@@ -367,11 +305,7 @@ class WheelFaults:
         )
 
     def believed(self, wheels: Motors) -> Motors:
-        """Return `wheels`, with the value of each faulty wheel replaced.
-
-        The new value is that of the other wheel of its side, times the learned ratio of these two
-        wheels. The values are angles (rad) or speeds (rad/s) in `WHEELS` order.
-        """
+        """Return angles or speeds; the other wheel, times their ratio, replaces a faulty one."""
         if not self._leaves_out:
             return wheels
         values = list(wheels)
@@ -383,18 +317,11 @@ class WheelFaults:
         return front_right, front_left, rear_left, rear_right
 
     def possible_motion(self, wheels: Motors) -> list[tuple[SideName, Motors]]:
-        """Return the angles that the wheels may have rolled and that the pose leaves out, rad.
+        """Return, by side, angles that may be true and that the pose leaves out, rad.
 
-        Call this once for each feedback line, after `check_line`.
-
-        - The pose ignores a wheel that may be right (`_Side.may_be_right`). The angle is the
-          difference from the angle that replaces it.
-        - Neither wheel of a side follows its command. The cause may be the encoders of this side.
-          The angle is the difference from the expected angle.
-
-        The result contains each side with such a wheel, and the angles of all wheels, in `WHEELS`
-        order. The angle of each other wheel is 0. `wheels` contains the angles that the wheels
-        reported, rad.
+        Call this once for each line, after `check_line`. They are the difference of an ignored
+        wheel that may be right, and what a side lacks that does not follow its command, where its
+        encoders may be wrong.
         """
         found: list[tuple[SideName, Motors]] = []
         if not (self._leaves_out or self._left.unfollowed_s or self._right.unfollowed_s):
@@ -409,32 +336,27 @@ class WheelFaults:
         return found
 
     def possible_motion_before(self, wheels: Motors) -> list[tuple[SideName, Motors]]:
-        """Return what `possible_motion` would have returned for an earlier line, rad.
-
-        The newly faulty wheel is included, and no other one, because it was not yet ignored then.
-        """
+        """Return `possible_motion` of an earlier line, of the newly faulty wheel only."""
         side = self._found
         if side is None or not side.may_be_right:
             return []
         return [(side.name, self._ignored(side, wheels))]
 
     def _ignored(self, side: _Side, wheels: Motors) -> Motors:
-        """Return the angle by which the ignored wheel of `side` differs from its replacement."""
         believed = self.believed(wheels)
         front, rear = (wheels[wheel] - believed[wheel] for wheel in side.wheels)
         return side.spread(front, rear)
 
     def forget(self) -> None:
-        """Drop the evidence of faults, because the link was lost or a fault was cleared."""
+        """Drop the evidence of faults: the link was lost or a fault was cleared."""
         for side in self._sides:
             side.forget()
 
     def skip(self, wheel_speeds: WheelSpeeds) -> None:
-        """Process a feedback line that waited while this computer did not run the daemon.
+        """Process a line that waited while this computer did not run the daemon.
 
-        The line is not checked, because the board may have stopped the motors meanwhile. From now
-        on, the checks expect the wheels to start again from at most the speeds `wheel_speeds`,
-        rad/s. On a side with a wheel that is already suspected, the expected speeds do not change.
+        It is not checked: the board may have stopped the motors, and the wheels may start again
+        from these speeds, but not on a side that is suspected.
         """
         self.pushed, speeds = "", wheel_speeds.as_tuple()
         for side in self._sides:
@@ -444,17 +366,10 @@ class WheelFaults:
                 side.expected.slow_down(speeds[front], speeds[rear])
 
     def watch(self, commanded: WheelSpeeds | None, wheel_speeds: WheelSpeeds, dt: float) -> str:
-        """Compare the wheel speeds in a feedback line with their commands.
+        """Compare a line with the commands; return a fault that names a wheel, or "".
 
-        If a wheel has contradicted its command for `feedback.fault_time`, return the reason of a
-        fault, which names the wheel. Otherwise return "". In both cases, the caller must call
-        `check_line` for the same line next.
-
-        Args:
-            commanded: the commanded wheel speeds, rad/s. None means that the motors may have no
-                power, because the emergency stop counts as pressed.
-            wheel_speeds: the reported wheel speeds, rad/s.
-            dt: the time since the previous line, s.
+        `commanded` is None while the emergency stop may cut the motors' power. Call `check_line`
+        next.
         """
         self.pushed, speeds = "", wheel_speeds.as_tuple()
         if commanded is None:
@@ -502,17 +417,10 @@ class WheelFaults:
     def check_line(
         self, turned: Motors, speeds: WheelSpeeds, dt: float, turn: float | None = None
     ) -> bool:
-        """Compare the wheels of each side, and return whether this line proves a wheel faulty.
+        """Compare the wheels of each side; return whether this proves a wheel faulty.
 
-        If it does, the pose ignores the faulty wheel from now on. The caller must find the earlier
-        lines in which this wheel was wrong (`was_faulty`).
-
-        Args:
-            turned: the angles that the wheels rolled in the last `dt` s, rad.
-            speeds: the reported wheel speeds, rad/s.
-            dt: the time in which the wheels rolled these angles, s.
-            turn: the turn of the robot that the wheels should show according to a gyro, rad; None
-                without a trusted gyro.
+        The pose then ignores it, and the caller finds the lines in which it was wrong
+        (`was_faulty`). `turned` in the last `dt` s is in rad, and `turn` is by a trusted gyro.
         """
         slow = self._left.late or self._right.late
         if self.events or slow != self._late:
@@ -568,18 +476,11 @@ class WheelFaults:
         return Event("wheel_fault", text, "warning", kind="slow")
 
     def was_faulty(self, before: WheelSpeeds) -> bool:
-        """Return whether the newly faulty wheel may already have been wrong in an earlier line.
-
-        `before` contains the wheel speeds in that line, rad/s.
-        """
+        """Return whether the newly faulty wheel may have been wrong in a line with these speeds."""
         return self._found is not None and self._found.was_faulty(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
-        """Learn the angle of one encoder count from the speeds in a feedback line.
-
-        A wheel that turns reports at least one count. Therefore the smallest angle that recurs in
-        the lines is the angle of a count (`RECURRENCES`).
-        """
+        # A wheel that turns reports at least one count, so the smallest angle that recurs is one.
         # A line that covers more time has a mean of several counts, which says nothing about one.
         late = dt > LATE_PERIODS * self._period
         self._period += PERIOD_GAIN * (dt - self._period)
@@ -596,12 +497,7 @@ class WheelFaults:
                 self._seeking = self._count > MIN_COUNT_ANGLE
 
     def _by_gyro(self, i: int, turned: Motors, turn: float) -> float:
-        """Return the angle that one side rolled, rad, computed from the gyro and the other side.
-
-        `i` is 0 for the left side and 1 for the right side. `turned` contains the angles that the
-        wheels rolled, and `turn` is the turn of the robot according to the gyro, both in rad. The
-        wheels of the other side must agree with each other.
-        """
+        # Rad of side `i` (0 left, 1 right) by the gyro and the other side, whose wheels agree.
         front_right, front_left, rear_left, rear_right = turned
         return self._kinematics.opposite(
             (front_left + rear_left) / 2, (front_right + rear_right) / 2, turn
@@ -617,6 +513,5 @@ class WheelFaults:
 
 
 def slow_text(slow: tuple[str, ...]) -> str:
-    """Return a text that names the slow wheels. `slow` is the value of `WheelsStatus.slow`."""
     wheels = [f"{wheel.replace(' ', ' reaches ')} of its expected speed" for wheel in slow]
     return f"wheels are slower than commanded: {', '.join(wheels)}"

@@ -1,15 +1,10 @@
 """Compares wheels with their commands, and collects the evidence that a wheel is faulty.
 
 `Expected` is the only model of a healthy wheel: its speed follows the command with a first-order
-lag. `suspect_wheel.py` uses it to decide which of two wheels is wrong, and `Witness` uses it to
-decide whether a wheel follows its command. The limits around the expected speed leave room for
-load, slip and coarse encoders. Behavior is evidence only if no healthy wheel shows it, and evidence
-proves a fault only if it lasts.
-
-A wheel that stands still, turns against its command or turns too fast is not evidence of a fault
-while its speed approaches the command. If a wheel turns in the right direction but too slowly, the
-daemon logs a warning with the ratio of the speeds. The cause may be the load, the battery or
-`feedback.response_time`.
+lag, within limits for load, slip and coarse encoders. Evidence is behavior that no healthy wheel
+shows, and proves a fault only if it lasts. A wheel that stands still, turns backward or too fast is
+none while it approaches the command. One that turns too slowly is a warning with the ratio: load,
+battery or `feedback.response_time`.
 """
 
 from __future__ import annotations
@@ -17,32 +12,22 @@ from __future__ import annotations
 import math
 from typing import Literal
 
+# rad/s; below it, coarse encoders and a robot at rest can look like any fault.
 MIN_FAULT_SPEED = 2.0
-"""Smallest wheel speed at which a fault can be recognized, rad/s. At lower speeds, coarse encoders
-and a robot at rest can look like any fault."""
 
-MIN_COMMANDED_SPEED = 0.3
-"""Smallest commanded speed at which the command can show which of two wheels is right, rad/s."""
+MIN_COMMANDED_SPEED = 0.3  # rad/s, at which the command can show which of two wheels is right
 
-SLOW_RESPONSE_FACTOR = 3.0
-"""Response time of the wheels of a slow robot, as a multiple of `feedback.response_time`."""
+SLOW_RESPONSE_FACTOR = 3.0  # of `feedback.response_time`, in a slow robot
 
+# rad/s; the measured speed is smoothed over the time in which such a wheel turns by one count.
 SMOOTHING_SPEED = 1.0
-"""Wheel speed that determines the smoothing of the measured speed, rad/s. The time constant of the
-smoothing is the time in which a wheel with this speed turns by one encoder count."""
 
-MIN_APPROACH = 1.0
-"""Approach of a wheel's speed to its command, rad/s, that excuses the wheel. A wheel may be too
-fast, stand still or turn against its command. This is not evidence of a fault if its speed has come
-closer to the command by more than this limit."""
+MIN_APPROACH = 1.0  # rad/s closer to the command: no evidence of a fault
 
-RATIO_DRIVE_S = 2.0
-"""Time of driving, s, after which the angle that a wheel rolled is compared with the expected
-angle."""
+RATIO_DRIVE_S = 2.0  # of driving, over which the rolled angle is compared
 
+# Ratios to the expected speed: too slow below the first, until the second.
 TOO_SLOW, FAST_ENOUGH = 0.7, 0.8
-"""Ratios of the measured speed of a wheel to its expected speed. A wheel becomes too slow below
-`TOO_SLOW`, and is not too slow any more from `FAST_ENOUGH` on."""
 
 FaultKind = Literal["dead", "reversed", "runaway", "stuck"]
 
@@ -57,7 +42,7 @@ WITNESS_TEXTS: dict[FaultKind, str] = {
 
 
 def faster(front: float, rear: float) -> float:
-    """Return the one of two wheel speeds that has the larger magnitude."""
+    """Return the speed of the larger magnitude."""
     return front if abs(front) > abs(rear) else rear
 
 
@@ -73,26 +58,14 @@ class Expected:
         self.commanded, self._begins, self.clear = 0.0, True, False
 
     def slow_down(self, front: float, rear: float) -> None:
-        """Limit the expected speed to the larger one of two reported speeds, rad/s.
-
-        Call this if the board may have stopped the motors. `front` and `rear` are the reported
-        speeds of the two wheels.
-        """
+        """Limit the expected speed by two reported ones: the board may have stopped the motors."""
         most = faster(front, rear)
         self.speed, self._slow = (
             min(most, old, key=abs) if most * old > 0.0 else 0.0 for old in (self.speed, self._slow)
         )
 
     def follow(self, commanded: float, front: float, rear: float, dt: float, lag: float) -> None:
-        """Update the expected speed with a feedback line.
-
-        Args:
-            commanded: the commanded speed of this side, rad/s.
-            front: the reported speed of the front wheel, rad/s.
-            rear: the reported speed of the rear wheel, rad/s.
-            dt: the time since the previous line, s.
-            lag: the response time of a healthy wheel, s.
-        """
+        """Update the expected speed with a line; `lag` is a healthy response time, s."""
         if self._begins:
             self._begins = False
             self.speed = self._slow = faster(front, rear)
@@ -102,68 +75,51 @@ class Expected:
         )
         self.commanded = commanded
         follows = speed * commanded > 0.0
+        # A healthy wheel must already turn clearly as commanded.
         self.clear = (
             follows and abs(speed) >= MIN_COMMANDED_SPEED and abs(commanded) >= MIN_COMMANDED_SPEED
         )
-        """Whether a healthy wheel must already turn clearly in the direction of the command."""
-        self.settled = follows and slow * commanded > 0.0
-        """Whether even the wheel of a slow robot must already turn in the direction of the
-        command."""
+        self.settled = follows and slow * commanded > 0.0  # so must even that of a slow robot
 
 
 class Witness:
     """The evidence that one wheel does not follow its command, or is slower than expected."""
 
     def __init__(self) -> None:
-        self.driven = False
-        """True while any of the four wheels is commanded to turn, and then until this wheel is at
-        rest."""
-        self.ratio = 1.0
-        """Angle that the wheel rolled in the last full `RATIO_DRIVE_S` of driving, divided by the
-        expected angle."""
-        self.slow = False
-        """Whether the wheel turns in the commanded direction, but too slowly."""
+        self.driven = False  # from a command to any wheel until this one is at rest
+        self.ratio = 1.0  # of the last `RATIO_DRIVE_S`: rolled over expected
+        self.slow = False  # turns as commanded, but too slowly
+        # Expected magnitude of `speed`, smoothed like it: an encoder with few counts needs much
+        # smoothing, and a healthy wheel then seems to brake too late.
         self._due = 0.0
-        """Expected magnitude of `speed`, rad/s. It is smoothed like `speed` itself: an encoder with
-        few counts needs much smoothing, and then a healthy wheel seems to brake too late."""
-        self._rested_s = 0.0
-        """Time since the last feedback line with a speed above `MIN_FAULT_SPEED`, s."""
+        self._rested_s = 0.0  # since a speed above `MIN_FAULT_SPEED`
         self.forget()
 
     def forget(self) -> None:
-        """Drop the evidence of faults, but keep `driven`, `ratio` and `slow`.
-
-        These three values describe the motion of the wheel and stay valid.
-        """
-        self.speed = 0.0
-        """Measured speed, smoothed, rad/s."""
+        """Drop the evidence of faults; `driven`, `ratio` and `slow` stay valid."""
+        self.speed = 0.0  # smoothed, rad/s
         self._seen, self._begins = 0.0, True
+        # s for which each fault was shown.
         self.evidence: dict[FaultKind, float] = dict.fromkeys(WITNESS_TEXTS, 0.0)
-        """Time for which the wheel has shown each fault, s."""
         self.suspected = False
         # Because of the infinity, the first line counts as approaching the command. With 0, a wheel
         # that was already too fast would never count as slowing down, and slow motors would latch
         # "runaway".
+        # Deviation when it last approached its command, rad/s: the magnitude of its speed if it is
+        # too fast, otherwise the speed against the command.
         self._nearest = math.inf
-        """Deviation from the command when the wheel last approached its command, rad/s. For a wheel
-        that is too fast, the deviation is the magnitude of its speed. Otherwise it is the speed of
-        the wheel in the direction opposite to the command."""
-        self._wrong = False
-        """Whether the wheel was too fast, stood still or turned in the wrong direction in the last
-        line."""
+        self._wrong = False  # too fast, still or backward in the last line
         self._seconds = self._went = self._way = 0.0
 
     def coast(self, raw_speed: float, dt: float, count: float) -> None:
-        """Process a feedback line while the motor may have no power.
+        """Process a line while the motor may have no power.
 
-        When the wheel comes to rest, `driven` becomes false: until the next command, only a push
-        can turn the wheel. `raw_speed` is the reported speed of the wheel, rad/s. `dt` is the time
-        since the previous line, s, and `count` the angle of an encoder count, rad.
+        At rest, `driven` becomes false: until the next command, only a push can turn the wheel.
         """
         self.driven = self.driven and not self._is_surely_slow(raw_speed, dt, count)
 
     def _is_surely_slow(self, raw_speed: float, dt: float, count: float) -> bool:
-        """Return whether the wheel is certainly not faster than `MIN_FAULT_SPEED`."""
+        # not faster than `MIN_FAULT_SPEED`
         # An encoder with few counts often reports 0 although the wheel turns. Therefore the
         # reported speed must stay low for the time of one count at the speed `MIN_FAULT_SPEED`.
         self._rested_s = 0.0 if abs(raw_speed) > MIN_FAULT_SPEED else self._rested_s + dt
@@ -178,15 +134,9 @@ class Witness:
         count: float,
         still: bool,
     ) -> bool:
-        """Check the wheel speed in a feedback line, and return whether it is evidence of a fault.
+        """Check the speed in a line, and return whether it is evidence of a fault.
 
-        Args:
-            raw_speed: the reported speed of the wheel, rad/s.
-            expected: the speed of a healthy wheel.
-            dt: the time since the previous line, s.
-            most: the longest time that one line can add to the evidence, s.
-            count: the angle of an encoder count, rad.
-            still: whether all wheels are commanded to stand still.
+        One line adds at most `most` s. `still` says that all wheels are commanded to stand still.
         """
         goal, command = expected.speed, expected.commanded
         if self._begins:
