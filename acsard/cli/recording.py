@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import re
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -25,7 +24,6 @@ from acsard.cli.common import load
 from acsard.core.config.settings import Config
 from acsard.core.formatting import json_line, listed, many, printable
 from acsard.core.values import NS_PER_S
-from acsard.host.child import end_with_parent
 from acsard.host.errors import Exit, ExitError, MendableError, RecordingError, UsageError
 from acsard.host.extras import missing
 from acsard.recording.atomic_output import replacing
@@ -170,7 +168,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         words = f"file to write (default: {default})"
         action.add_argument("new", nargs="?", metavar=name, help=words)
     _export_forms(exported)
-    report.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
     for action in (replay, exported):
         action.add_argument(
             "--config",
@@ -433,11 +430,6 @@ def main_report(args: argparse.Namespace) -> int:
         raise missing("plotly", "report") from None
     plotly: str = get_plotlyjs()
     for recording, part in _files_to_write(args):
-        if args.supervised:
-            end_with_parent(signal.SIGKILL)
-            text, _ = make_report(recording, plotly, part, _percent(recording))
-            sys.stdout.buffer.write(text.encode())
-            continue
         new = Path(args.new or f"{recording.path.name.partition('.')[0]}.html")
         with _written(new), replacing(new, args.force) as file, _progress(recording) as tell:
             text, notes = make_report(recording, plotly, part, tell)
@@ -613,23 +605,3 @@ def _written(new: Path) -> Iterator[None]:
     except OSError as error:
         code = Exit.NO_PERMISSION if isinstance(error, PermissionError) else Exit.FAILURE
         raise ExitError(code, f"cannot write {new}: {error.strerror}") from None
-
-
-def _percent(recording: Recording) -> Callable[[int], None]:
-    """Return a function that prints how much of the recording has been read, in percent.
-
-    The function takes the time of the last step that was read, ns since 1970. The server of the web
-    page reads the printed numbers.
-    """
-    last, began = read_end(recording.path), recording.about.wall_ns / 1e9
-    end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime
-    told = 0
-
-    def print_percent(at_ns: int) -> None:
-        nonlocal told
-        percent = int(100 * (at_ns / 1e9 - began) / max(1.0, end - began))
-        if told < percent < 100:
-            told = percent
-            print(percent, file=sys.stderr, flush=True)
-
-    return print_percent

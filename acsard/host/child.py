@@ -8,22 +8,16 @@ parent kills a child that falls silent.
 
 from __future__ import annotations
 
-import asyncio
 import ctypes
 import os
-import resource
 import select
 import signal
 import socket
 import stat
 import subprocess
 import sys
-from asyncio.subprocess import DEVNULL, Process
-from collections.abc import AsyncIterator, Collection, Sequence
-from contextlib import asynccontextmanager, suppress
-from pathlib import Path
-
-from msgspec import Struct
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 
 from acsard.core.values import NS_PER_S, Ns
 from acsard.host import clock
@@ -71,31 +65,6 @@ def environment(hidden: Collection[str] = ()) -> dict[str, str]:
     }
 
 
-class Limits(Struct, frozen=True):
-    """Limits of a child whose work is less important than the daemon's."""
-
-    nice: int
-    memory_bytes: int
-
-
-def limit(pid: int, limits: Limits) -> None:
-    """Set the limits of the child `pid`, and let the kernel kill it first if memory runs out.
-
-    A hard limit of memory that is lower already remains.
-    """
-    try:
-        with suppress(OSError):
-            Path(f"/proc/{pid}/oom_score_adj").write_bytes(b"1000")
-        os.setpriority(os.PRIO_PROCESS, pid, limits.nice)
-        memory, hard = limits.memory_bytes, resource.prlimit(pid, resource.RLIMIT_DATA)[1]
-        if hard != resource.RLIM_INFINITY:
-            # Without CAP_SYS_RESOURCE, a process cannot raise the hard limit of its child.
-            memory = min(memory, hard)
-        resource.prlimit(pid, resource.RLIMIT_DATA, (memory, memory))
-    except ProcessLookupError:
-        pass  # the child has ended already, and its output says why
-
-
 def how_it_ended(code: int) -> str:
     """Return how a process ended, such as "ended with exit code 1"; `code` < 0 is a signal."""
     return f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
@@ -109,40 +78,6 @@ def end(process: subprocess.Popen[bytes], timeout_s: float) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-
-
-@asynccontextmanager
-async def running(
-    command: Sequence[str],
-    limits: Limits | None = None,
-    *,
-    stdin: int = DEVNULL,
-    stdout: int | None = None,
-    stderr: int | None = None,
-) -> AsyncIterator[Process]:
-    """Yield a child process, which is killed at the end of the block. Raises `OSError`."""
-    child = await asyncio.create_subprocess_exec(
-        *command,
-        stdin=stdin,
-        stdout=stdout,
-        stderr=stderr,
-        limit=65536,
-        start_new_session=True,
-        env=environment(),
-    )
-    try:
-        if limits is not None:
-            limit(child.pid, limits)
-        yield child
-    finally:
-        if child.returncode is None:
-            child.kill()
-            # Read the rest of the output. asyncio sees the end of a child only after the end of its
-            # output. But asyncio stops reading a pipe while too much unread data waits.
-            for output in (child.stdout, child.stderr):
-                with suppress(RuntimeError):  # another task reads this output
-                    await output.read() if output else b""
-            await child.wait()
 
 
 class Child:

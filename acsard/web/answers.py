@@ -10,8 +10,7 @@ import asyncio
 import base64
 import gzip
 import hashlib
-import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -54,7 +53,7 @@ POLICY = (
     "default-src 'self'; connect-src 'self'{connect}; frame-ancestors 'none'; base-uri 'none'; "
     "form-action 'self'"
 )
-"""Content security policy of every answer except a report. The server replaces `{connect}` with the
+"""Content security policy of every answer. The server replaces `{connect}` with the
 page's WebSocket URLs. The policy of an error answer does not contain these URLs, so the server
 never copies a forged `Host` header into an answer."""
 
@@ -88,7 +87,7 @@ def file_answer(request: web.Request, file: File) -> web.Response:
     if request.headers.get("If-None-Match") == file.tag:
         return web.Response(status=304, headers=headers)
     body = file.body
-    if file.packed is not None and takes_gzip(request):
+    if file.packed is not None and "gzip" in request.headers.get("Accept-Encoding", ""):
         body, headers["Content-Encoding"] = file.packed, "gzip"
     return web.Response(body=body, headers=headers | {"Content-Type": file.kind})
 
@@ -104,58 +103,16 @@ async def sent_in_pieces(
         return web.Response(body=body, headers=headers)
     answer = web.StreamResponse(headers=headers)
     answer.content_length = len(body)
-    pieces = (
-        memoryview(body)[begin : begin + PIECE_BYTES] for begin in range(0, len(body), PIECE_BYTES)
-    )
-    return await _send_pieces(request, answer, pieces, within)
-
-
-async def sent_unpacked(
-    request: web.Request, packed: bytes, headers: Mapping[str, str], within: float
-) -> web.StreamResponse:
-    """Decompress the gzip data `packed` and send the result to a client that does not accept gzip.
-
-    Each piece is decompressed only after the earlier pieces were sent, so a slow client costs
-    little memory. If sending takes longer than `within` s, cut the connection. For a HEAD request,
-    send no body.
-    """
-    if request.method == "HEAD":
-        return web.Response(headers=headers)
-    return await _send_pieces(
-        request, web.StreamResponse(headers=headers), _unpacked(packed), within
-    )
-
-
-def _unpacked(packed: bytes) -> Iterator[bytes]:
-    unpack = zlib.decompressobj(zlib.MAX_WBITS | 16)
-    for begin in range(0, len(packed), PIECE_BYTES):
-        left = packed[begin : begin + PIECE_BYTES]
-        while left:
-            yield unpack.decompress(left, PIECE_BYTES)
-            left = unpack.unconsumed_tail
-    yield unpack.flush()
-
-
-async def _send_pieces(
-    request: web.Request,
-    answer: web.StreamResponse,
-    pieces: Iterable[bytes | memoryview],
-    within: float,
-) -> web.StreamResponse:
     try:
         async with asyncio.timeout(within):
             await answer.prepare(request)
-            for piece in pieces:
-                await answer.write(piece)
+            for begin in range(0, len(body), PIECE_BYTES):
+                await answer.write(memoryview(body)[begin : begin + PIECE_BYTES])
     except TimeoutError:
         cut(request.transport)
     except ConnectionError:
         pass  # the client has gone; aiohttp notices
     return answer
-
-
-def takes_gzip(request: web.Request) -> bool:
-    return "gzip" in request.headers.get("Accept-Encoding", "")
 
 
 def cut(transport: asyncio.BaseTransport | None) -> None:
@@ -178,7 +135,7 @@ def cut(transport: asyncio.BaseTransport | None) -> None:
 async def secured(request: web.Request, response: web.StreamResponse) -> None:
     """Add the security headers to an answer.
 
-    An answer that has a content security policy already, such as a file or a report, keeps it.
+    An answer that has a content security policy already, such as a file, keeps it.
     """
     response.headers.update(HEADERS)
     policy = _policy(request) if response.status < 400 else POLICY.format(connect="")

@@ -38,13 +38,11 @@ from acsard.web.answers import (
     file_answer,
     reply,
     sent_in_pieces,
-    sent_unpacked,
-    takes_gzip,
 )
 from acsard.web.callers import PROTOCOL, RequestRefusedError, cookie_name, tokens_offered
 from acsard.web.camera import SEND_TIMEOUT_S, Camera
 from acsard.web.limits import OPENINGS, PICTURES, STOPS, WebSocketLimits
-from acsard.web.recordings import POLICY, BlackBox, Recording, Reports, ReportState, State
+from acsard.web.recordings import BlackBox, Recording
 from acsard.web.routes import FORM, JSON, RECORDINGS_ROLE, Body, Problem, Route, services, values
 from acsard.web.socket_messages import MAX_MESSAGE_BYTES
 from acsard.web.streams import as_json
@@ -53,12 +51,6 @@ from acsard.web.viewer import PING_INTERVAL_S, Parts, Viewer
 
 BODY_TIMEOUT_S = 5.0
 """Time limit for receiving the body of a request, s. Most bodies have a few hundred bytes."""
-
-REPORT_TIMEOUT_S = 300.0
-"""Time limit for sending a report to a client that does not accept gzip, s."""
-
-DRAWING_STATUS: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
-"""HTTP status of the answer to a request for a recording's report, by the state of the report."""
 
 
 class TokenForm(Struct, frozen=True):
@@ -107,7 +99,7 @@ class Page:
         `names` are the robot's host names and addresses, in lower case.
         """
         self._parts, self._vault, self._acceptor = parts, vault, acceptor
-        self._robots, self._files, self._reports = parts.robots, Files(), Reports()
+        self._robots, self._files = parts.robots, Files()
         self._box = BlackBox(parts.robots)
         self._websocket_limits, self._camera = WebSocketLimits(), Camera(rules.camera)
         self._has_camera = bool(rules.camera)
@@ -122,12 +114,10 @@ class Page:
         self.app = self._admission.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:
-        """End every WebSocket, and stop all work for clients.
+        """End every WebSocket, and stop reading the camera.
 
-        The server stops reading the camera. It also discards the report that it has drawn or is
-        drawing. `why` is the reason that the clients receive, with at most 120 characters.
+        `why` is the reason that the clients receive, with at most 120 characters.
         """
-        self._reports.end()
         self._camera.close()
         for viewer in list(self._viewers):
             viewer.end(why)
@@ -135,11 +125,9 @@ class Page:
     async def tidy(self) -> None:
         """Close the connections whose token is not valid any more.
 
-        Also discard the report of a recording if no client has requested it for some time. Call
-        this method once a second. If the disk does not answer in time, no token counts as valid. If
-        no thread can be started to read the disk, all connections stay open.
+        Call this method once a second. If the disk does not answer in time, no token counts as
+        valid. If no thread can be started to read the disk, all connections stay open.
         """
-        self._reports.tidy()
         # While the disk hangs, all calls wait for the same read. Otherwise, each call would leave
         # one more blocked thread.
         if self._token_read is None or self._token_read.done():
@@ -308,31 +296,11 @@ class Page:
         return reply(await self._box.rows())
 
     async def recording(self, request: web.Request) -> web.StreamResponse:
-        path, _ = await self._box.find(request.match_info["name"])
+        path = await self._box.find(request.match_info["name"])
         disposition = {"Content-Disposition": f'attachment; filename="{path.name}"'}
         return web.FileResponse(
             path, headers=disposition | {"Content-Type": "application/octet-stream"}
         )
-
-    async def draw(self, request: web.Request) -> web.StreamResponse:
-        progress = self._reports.request(*await self._box.find(request.match_info["name"]))
-        return reply(progress, DRAWING_STATUS[progress.report])
-
-    async def report(self, request: web.Request) -> web.StreamResponse:
-        """Return the finished report of a recording as an HTML page in a sandboxed origin."""
-        name = request.match_info["name"]
-        body = self._reports.drawn(name)
-        if body is None:
-            text = f"the report is not drawn yet: POST /api/recordings/{name}/report first"
-            raise RequestRefusedError("path", text)
-        headers = {
-            "Content-Type": "text/html; charset=utf-8",
-            "Content-Security-Policy": POLICY,
-            "Vary": "Accept-Encoding",
-        }
-        if takes_gzip(request):
-            return web.Response(body=body, headers=headers | {"Content-Encoding": "gzip"})
-        return await sent_unpacked(request, body, headers, REPORT_TIMEOUT_S)
 
     async def _value(self, key: str) -> bytes:
         try:
@@ -445,15 +413,6 @@ ROUTES: tuple[Route, ...] = (
     Route("GET", "/api/recordings/{name}", RECORDINGS_ROLE, Page.recording,
         "one recording as a file",
         gives={200: Body("MCAP.", media="application/octet-stream")}),
-    Route("POST", "/api/recordings/{name}/report", RECORDINGS_ROLE, Page.draw,
-        "starts to draw the report of a recording, or returns the progress; repeat the request "
-        "until its status is 200",
-        gives={200: Body("The report is ready; get it at `href`.", ReportState),
-               202: Body("This report or another one is being drawn.", ReportState),
-               503: Body("The report cannot be drawn; the reason is in the answer.", ReportState)}),
-    Route("GET", "/report/{name}", RECORDINGS_ROLE, Page.report,
-        "the report of a recording, once it is drawn",
-        gives={200: Body("A page.", str, "text/html")}),
     *values(Page.value),
     *services(Page.service),
     Route("GET", "/metrics", "viewer", Page.metrics,

@@ -31,8 +31,8 @@ MIN_TCP_CONNECTIONS = 16
 may open only few files."""
 
 RESERVED_FILES = 128
-"""Number of open files that are reserved for uses other than TCP connections. 20 such files are
-always open. More are open while a report is drawn or a calibration runs."""
+"""Number of open files that are reserved for uses other than TCP connections. About 20 such
+files are always open."""
 
 MAX_UNREAD_BYTES = 32768
 """Number of bytes that the server buffers for a client that does not read them. Above this number,

@@ -23,7 +23,7 @@ Handler = Callable[[Any, Any], Awaitable[Any]]
 """Coroutine function that takes the `Page` and the request, and returns the answer."""
 
 RECORDINGS_ROLE: Role = "operator"
-"""Lowest role that may download recordings, and may draw and download reports of recordings."""
+"""Lowest role that may download recordings."""
 
 JSON, FORM = "application/json", "application/x-www-form-urlencoded"
 

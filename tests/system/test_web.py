@@ -212,7 +212,6 @@ async def test_each_http_answer_is_as_described(page: Page, bus: Bus) -> None:
     assert {endpoint for endpoint in statuses if statuses[endpoint] == 200} > {
         ("get", path) for path in TYPED
     }
-    assert statuses["post", "/api/recordings/{name}/report"] == 202
     assert statuses["post", "/api/srv/stop"] == 200
     assert statuses["post", "/api/srv/set"] == 409
 
@@ -241,53 +240,6 @@ async def test_recordings_are_listed_and_downloaded_as_mcap(page: Page, daemon: 
         name = await first_recording(session)
         async with session.get(f"/api/recordings/{name}") as answer:
             assert (await answer.read()).startswith(b"\x89MCAP")
-
-
-async def drawn(session: aiohttp.ClientSession) -> tuple[str, dict[str, Any]]:
-    """Request a report of the first recording and wait until it is drawn.
-
-    Returns the name of the recording, and the status and content of the answer.
-    """
-    name = await first_recording(session)
-    async with asyncio.timeout(2 * PATIENCE_S):
-        while True:
-            async with session.post(f"/api/recordings/{name}/report") as answer:
-                reply = await answer.json()
-            if answer.status != 202:
-                return name, {"status": answer.status, **reply}
-            assert reply["report"] == "drawing"
-            await asyncio.sleep(0.1)
-
-
-@pytest.mark.slow
-async def test_a_recording_s_report_is_isolated_from_the_robot_s_page(page: Page, bus: Bus) -> None:
-    async with aiohttp.ClientSession(page.here) as session:
-        name, result = await drawn(session)
-        assert result == {"status": 200, "report": "ready", "href": f"report/{name}"}
-        bodies = set()
-        for packing in ("gzip", "identity"):
-            asked = {"Accept-Encoding": packing}
-            async with session.get(f"/report/{name}", headers=asked) as answer:
-                policy = answer.headers["Content-Security-Policy"]
-                bodies.add(await answer.text())
-        (body,) = bodies
-        assert body.startswith("<!DOCTYPE html>")
-        assert "Plotly" in body
-        assert "sandbox allow-scripts;" in policy
-        assert "allow-same-origin" not in policy
-        assert "default-src 'none'" in policy
-
-
-@pytest.mark.slow
-async def test_a_report_without_plotly_is_refused_with_the_command_that_installs_it(
-    daemon: Daemon, tmp_path: Path
-) -> None:
-    (tmp_path / "plotly.py").write_text("raise ImportError('not installed')")
-    with Page(daemon, tmp_path, PYTHONPATH=str(tmp_path)) as without:
-        async with aiohttp.ClientSession(without.here) as session:
-            _, outcome = await drawn(session)
-            assert (outcome["status"], outcome["report"]) == (503, "failed")
-            assert re.search("needs the library plotly; .*pip install.*report", outcome["text"])
 
 
 @pytest.mark.slow

@@ -177,15 +177,6 @@ ASKS: dict[str, tuple[str, str, dict[str, Any], int, str]] = {
     "a token in JSON that is none": (
         "away", "/token", {"method": "POST", "data": b"{\xff",
         "headers": {"Content-Type": "application/json"}}, 400, "malformed"),
-    "a viewer who has a recording drawn": (
-        "away", "/api/recordings/x.mcap/report", {"token": "viewer", "method": "POST"}, 403,
-        "role"),
-    "a viewer at a report": ("away", "/report/x.mcap", {"token": "viewer"}, 403, "role"),
-    "another page's link to a report": (
-        "here", "/report/x.mcap", {"headers": {"Sec-Fetch-Site": "cross-site"}}, 403, "origin"),
-    "a report that nobody drew": ("here", "/report/x.mcap", {}, 404, "path"),
-    "a report of a file upwards": (
-        "here", "/api/recordings/..%2f..%2fetc%2fpasswd/report", {"method": "POST"}, 404, "path"),
     "a path upwards": ("here", "/page/../app.py", {}, 404, "path"),
     "a path upwards, encoded": ("here", "/page/%2e%2e%2fapp.py", {}, 404, "path"),
     "a recording upwards": ("here", "/api/recordings/..%2f..%2fetc%2fpasswd", {}, 404, "path"),

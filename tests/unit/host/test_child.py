@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import select
 import signal
@@ -10,8 +9,6 @@ import socket
 import subprocess
 import sys
 import threading
-from asyncio.subprocess import PIPE
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -23,16 +20,13 @@ from acsard.host import child as module
 from acsard.host import clock
 from acsard.host.child import (
     Child,
-    Limits,
     Parent,
     Silence,
     acsard,
     end,
     environment,
     how_it_ended,
-    running,
 )
-from tests.unit.host.privileges import WITHOUT_RAISING_LIMITS
 
 WAIT_S = 20.0
 
@@ -150,71 +144,6 @@ def test_the_command_runs_the_installed_package() -> None:
     command = acsard("--version")
     assert command[1] == "-P"
     assert subprocess.run(command, capture_output=True, check=True).stdout.startswith(b"acsard ")
-
-
-# a child in the event loop
-
-
-async def test_a_child_is_killed_and_collected_when_its_block_fails() -> None:
-    with suppress(ValueError):
-        async with running(program("import time; time.sleep(100)")) as child:
-            raise ValueError
-    assert child.returncode == -signal.SIGKILL
-
-
-def test_a_child_whose_output_is_not_read_is_collected() -> None:
-    flood = "import os\nwhile True: os.write(1, bytes(65536))"
-
-    async def story() -> int | None:
-        async with running(program(flood), stdout=PIPE) as child:
-            assert child.stdout is not None
-            await child.stdout.readexactly(1)
-            await asyncio.sleep(0.2)  # asyncio stops reading when its buffer is full
-        return child.returncode
-
-    assert asyncio.run(asyncio.wait_for(story(), 20)) == -signal.SIGKILL
-
-
-async def test_a_child_that_has_ended_keeps_its_exit_code_and_its_output() -> None:
-    async with running(program("print(1); raise SystemExit(3)"), stdout=PIPE) as child:
-        out, _ = await child.communicate()
-    assert (out, child.returncode) == (b"1\n", 3)
-
-
-async def test_a_running_child_gets_its_limits_and_an_ended_child_raises_no_error() -> None:
-    limits = Limits(nice=19, memory_bytes=64 << 20)
-    text = "import sys; sys.stdin.read(1); bytearray(100 << 20)"
-    async with running(program(text), limits, stdin=PIPE, stderr=PIPE) as child:
-        assert os.getpriority(os.PRIO_PROCESS, child.pid) == 19
-        _, stderr = await child.communicate(b"go")
-    assert b"MemoryError" in stderr
-    ended = subprocess.Popen(program(""))
-    ended.wait(WAIT_S)
-    module.limit(ended.pid, limits)
-
-
-LIMIT_A_CHILD = """\
-import asyncio, resource, sys
-from acsard.host.child import Limits, running
-
-async def story():
-    async with running([sys.executable, "-c", "input()"], Limits(19, 2 << 30), stdin=-1) as child:
-        print(*resource.prlimit(child.pid, resource.RLIMIT_DATA))
-
-resource.setrlimit(resource.RLIMIT_DATA, (1 << 30, 1 << 30))
-asyncio.run(story())
-"""
-
-
-def test_a_child_of_a_process_with_a_lower_memory_limit_keeps_the_lower_limit() -> None:
-    done = subprocess.run(
-        [*WITHOUT_RAISING_LIMITS, sys.executable, "-c", LIMIT_A_CHILD],
-        capture_output=True,
-        text=True,
-        timeout=WAIT_S,
-        check=False,
-    )
-    assert (done.stdout, done.stderr) == (f"{1 << 30} {1 << 30}\n", "")
 
 
 # the end by signals

@@ -22,9 +22,7 @@ from acsard.machine.authority import Authority
 from acsard.web.answers import (
     INLINED,
     PAGE_DIRECTORY,
-    PIECE_BYTES,
     Files,
-    _unpacked,
     cut,
     file_answer,
 )
@@ -141,14 +139,6 @@ def test_a_page_whose_stop_script_changed_is_read_again(page: Path) -> None:
 def test_a_page_without_its_stop_is_not_sent(page: Path) -> None:
     (page / "stop.js").unlink()
     assert Files(page).get("index.html") is None
-
-
-@pytest.mark.slow
-def test_a_report_is_decompressed_in_pieces_that_take_little_memory() -> None:
-    for body in (b"".join(b"%d " % number for number in range(300_000)), bytes(10_000_000), b""):
-        pieces = list(_unpacked(gzip.compress(body)))
-        assert b"".join(pieces) == body
-        assert max(map(len, pieces)) <= PIECE_BYTES
 
 
 @pytest.mark.parametrize("secure", [True, False])
