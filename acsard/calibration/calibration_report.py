@@ -16,123 +16,96 @@ from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import DriveConfig
 from acsard.core.config.toml_text import excerpt
 from acsard.core.formatting import many
+from acsard.core.values import Metres, RadPerS
 from acsard.terminal.output import table
 
+# Names of the settings of `[drive]` that contain the multipliers, in the order of
+# `Multipliers.values`.
 NAMES = (
     "wheel_separation_multiplier", "left_wheel_radius_multiplier", "right_wheel_radius_multiplier",
 )  # fmt: skip
-"""Names of the settings of `[drive]` that contain the multipliers, in the order of
-`Multipliers.values`."""
 
+# Number of digits of the settings that are written into `acsard.toml`.
 DIGITS = 5
-"""Number of digits of the settings that are written into `acsard.toml`.
-
-A multiplier has this number of decimals. A setting of `[odometry]` has this number of significant
-digits.
-"""
 
 
+# A smaller change would appear as 0.0 %.
 MIN_GROWTH = 0.0005
-"""Smallest change of the effective track that the text states, as a fraction.
-
-The text has one decimal of a percentage, so a smaller change would appear as 0.0 %.
-"""
 
 
 class CalibrationRefusal(Struct, frozen=True):
     """The object that `--json` prints if a log gives no calibration."""
 
     log: str
-    refused: str
-    """Text that says why the log gives no calibration, and what the user must do."""
+    refused: str  # text that says why the log gives no calibration, and what the user must do
     notes: Sequence[str] = ()
 
 
 class CalibrationReport(Struct, frozen=True):
     """The object that `--json` prints for a calibration.
 
-    A field `..._error_before` is an error of the odometry with the configured multipliers. The
-    field `..._error_after` is the same error with the new multipliers. Both errors are measured on
-    drives that the fit did not use. Both fields are None if the log does not show how large the
-    error is.
-
-    A field `..._noise_before` is a standard deviation of the random error of the odometry after
-    10 m of driving, according to the configured noise settings. The field `..._noise_after` is the
-    same deviation according to the new noise settings. The heading applies to a robot that turns as
-    much per metre as in the log. All four fields are None if the noise settings stay as configured.
+    A pair of fields `..._before` and `..._after` is the error of the odometry with the configured
+    and with the new values, on drives that the fit did not use. `..._noise_...` is the standard
+    deviation of the random error after 10 m, as the noise settings state it. Both are None if the
+    log does not show them.
     """
 
     log: str
-    reference: str
-    """Names of the sensors, or of the measuring tool, as in `Calibration.reference`."""
+    reference: str  # names of the sensors, or of the measuring tool, as in `Calibration.reference`
+    # As in `Calibration.scale`; if "", the mean radius stays as configured.
     scale: str
-    """Kind of the measurements that show the size of the wheels, as in `Calibration.scale`.
-
-    If it is "", the mean of the two wheel radii stays as configured.
-    """
     wheel_separation_multiplier: float
     left_wheel_radius_multiplier: float
     right_wheel_radius_multiplier: float
+    # Standard deviation of the multiplier; None if the track stays as configured.
     wheel_separation_multiplier_std: float | None
-    """Standard deviation of the multiplier; None if the track stays as configured."""
+    # Standard deviation of the multiplier; None if the ratio of the radii stays as configured.
     left_wheel_radius_multiplier_std: float | None
-    """Standard deviation of the multiplier; None if the ratio of the radii stays as configured."""
     right_wheel_radius_multiplier_std: float | None
+    # Of wheel separation, left radius and right radius, shape (3, 3).
     covariance: Sequence[Sequence[float]]
-    """Covariance matrix of the multipliers, shape (3, 3).
-
-    The order is wheel separation, left radius, right radius.
-    """
+    # New values for settings of `[odometry]`, as in `Calibration.odometry`, but rounded.
     odometry: dict[str, float]
-    """New values for settings of `[odometry]`, as in `Calibration.odometry`, but rounded."""
+    # New values for settings of `[feedback]`, as in `Calibration.feedback`.
     feedback: dict[str, float]
-    """New values for settings of `[feedback]`, as in `Calibration.feedback`."""
-    effective_track: float
-    """Effective track, m: the distance between left and right wheels that explains the turns."""
+    # Effective track: the distance between left and right wheels that explains the turns.
+    effective_track: Metres
     effective_track_std: float | None
+    # Fraction by which the effective track grows for each rad/s of turn rate.
     effective_track_growth: float
-    """Fraction by which the effective track grows for each rad/s of turn rate."""
     effective_track_growth_std: float
-    left_wheel_radius: float
-    """Radius of the left wheels, m."""
-    right_wheel_radius: float
-    """Radius of the right wheels, m."""
+    left_wheel_radius: Metres  # radius of the left wheels
+    right_wheel_radius: Metres  # radius of the right wheels
+    # Heading error after a turn of 360 deg with the configured multipliers, deg.
     turn_error_before: float | None
-    """Heading error after a turn of 360 deg with the configured multipliers, deg."""
     turn_error_after: float | None
+    # Heading error after 10 m straight ahead with the configured multipliers, deg.
     straight_error_before: float | None
-    """Heading error after 10 m straight ahead with the configured multipliers, deg."""
     straight_error_after: float | None
+    # RMS heading error over whole drives with the configured multipliers, deg.
     heading_error_before: float | None
-    """RMS heading error over whole drives with the configured multipliers, deg."""
     heading_error_after: float | None
-    position_error_before: float | None
-    """RMS position error over whole drives with the configured multipliers, m."""
+    # RMS position error over whole drives with the configured multipliers.
+    position_error_before: Metres | None
     position_error_after: float | None
+    # Random error of the heading with the configured noise settings, deg.
     heading_noise_before: float | None
-    """Random error of the heading with the configured noise settings, deg."""
     heading_noise_after: float | None
-    distance_noise_before: float | None
-    """Random error of the distance with the configured noise settings, m.
-
-    It is None also if the log has no positions.
-    """
+    # Random error of the distance with the configured noise settings.
+    distance_noise_before: Metres | None
     distance_noise_after: float | None
+    # Delay of each sensor's recorded times, s, by sensor name, as in `Calibration.delays`.
     time_offsets: dict[str, float]
-    """Delay of each sensor's recorded times, s, by sensor name, as in `Calibration.delays`."""
-    gyro_bias: float
-    """Gyro bias, rad/s; 0 without a gyro."""
+    gyro_bias: RadPerS  # gyro bias; 0 without a gyro
     runs: int
     seconds: float
-    distance: float
-    """Total distance driven, forwards and backwards, m."""
-    turns: float
-    """Total turning to the left and to the right, as a number of turns of 360 deg."""
+    distance: Metres  # total distance driven, forwards and backwards
+    turns: float  # total turning to the left and to the right, as a number of turns of 360 deg
+    # Names of the quantities that stay as configured, because the log does not improve them.
     kept: Sequence[str]
-    """Names of the quantities that stay as configured, because the log does not improve them."""
     notes: Sequence[str]
+    # Name of the file to which the tool wrote the new settings; None if the tool wrote no file.
     written: str | None
-    """Name of the file to which the tool wrote the new settings; None if the tool wrote no file."""
     refused: None = None
 
 
@@ -141,9 +114,8 @@ def report(
 ) -> CalibrationReport:
     """Return the object that `--json` prints for a calibration.
 
-    `log` is the path of the log file, or "the drive" for a guided drive. `drive` is the configured
-    geometry. `written` is the name of the file to which the tool wrote the new settings, or ""
-    if the tool wrote no file.
+    `log` is the path of the log file, or "the drive" for a guided drive. `written` is the name of
+    the changed file, or "".
     """
     multipliers = calibration.multipliers
     track, left, right = multipliers.values.tolist()
@@ -178,12 +150,6 @@ def report(
 
 
 def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
-    """Return the random errors of heading, deg, and of distance, m, after `REPORT_DISTANCE_M`.
-
-    Each error is given twice: for the configured and for the new noise settings. Both errors are
-    None if the noise settings stay as configured. The error of the distance is also None if the log
-    has no positions.
-    """
     noise = calibration.noise
     if noise is None or not noise.better:
         return NOT_COMPARED, NOT_COMPARED
@@ -192,16 +158,12 @@ def _noise(calibration: Calibration) -> tuple[BeforeAfter, BeforeAfter]:
 
 
 def _deviations(calibration: Calibration) -> list[float | None]:
-    """Return the standard deviation of each multiplier; None if it stays as configured."""
     named = zip((TRACK, RATIO, RATIO), calibration.multipliers.std.tolist(), strict=True)
     return [None if name in calibration.stays_configured else std for name, std in named]
 
 
 def keys(calibration: Calibration) -> dict[str, object]:
-    """Return the new value of each setting that `--write` writes.
-
-    The names include the table of the configuration, such as "odometry.wheel_slip_std".
-    """
+    """Return the new values that `--write` writes, by dotted key of the configuration."""
     wanted: dict[str, object] = {
         f"drive.{name}": round(float(value), DIGITS)
         for name, value in zip(NAMES, calibration.multipliers.values, strict=True)
@@ -211,21 +173,14 @@ def keys(calibration: Calibration) -> dict[str, object]:
 
 
 def odometry(calibration: Calibration) -> dict[str, float]:
-    """Return the new values for settings of `[odometry]`, by the name of the setting.
-
-    The values are rounded to `DIGITS` significant digits.
-    """
+    """Return the new values for settings of `[odometry]`, rounded to `DIGITS` digits."""
     return {name: float(f"{value:.{DIGITS - 1}g}") for name, value in calibration.odometry.items()}
 
 
 def parts(
     report: CalibrationReport, calibration: Calibration, where: str, *, guided: bool
 ) -> Iterator[RenderableType]:
-    """Yield the parts of the printed report: sentences, and a table of the multipliers.
-
-    `where` names the configuration file. `guided` is True if the tool guided the drive, and False
-    for a recorded drive (`--log`).
-    """
+    """Yield the parts of the printed report: sentences, and a table of the multipliers."""
     drives = calibration.drives
     yield (
         f"{report.log}: {many(drives.runs, 'run')}, {drives.seconds:.0f} s, "
@@ -256,12 +211,6 @@ def parts(
 
 
 def _row(name: str, old: float, value: float, std: float | None) -> tuple[str, str, str, str]:
-    """Return a row of the table of multipliers.
-
-    `old` is the configured value, and `value` the new one. `std` is the standard deviation of the
-    new value, or None if the log does not determine the value. A distance by tape may change such a
-    value too, because the distance shows the size of the wheels.
-    """
     now, found = f"{old:.4f}", f"{value:.4f}"
     if std is not None:
         return name, now, found, f"{std:.4f}"
@@ -336,12 +285,6 @@ def _remains(report: CalibrationReport, calibration: Calibration, *, guided: boo
 
 
 def _growth(report: CalibrationReport, fastest: float) -> tuple[str, str]:
-    """Return a verb and a sentence that say how skidding changes the track in fast turns.
-
-    The sentence is "" if the log shows neither a change nor an uncertainty of the change, for
-    example because the fit kept the track as configured. `fastest` is the turn rate of fast turns,
-    rad/s.
-    """
     growth, std = report.effective_track_growth * fastest, report.effective_track_growth_std
     limit = SURE_DEVIATIONS * std * fastest
     if abs(growth) > max(limit, MIN_GROWTH):

@@ -1,12 +1,8 @@
-"""Fits the parameters of the calibration to the measurements of all sensors.
+"""Fits the parameters of the calibration to the measurements of all sensors, by Gauss-Newton.
 
-The fit is a Gauss-Newton fit. Each sensor contributes to the normal equations of the fit. This
-contribution is called the evidence of the sensor. It is kept separately for each block (a few
-seconds of driving).
-
-The standard deviations come from a jackknife over the blocks (Quenouille and Tukey). The jackknife
-leaves out each block in turn, and computes the parameters from the other blocks with a single
-linear step. These standard deviations are right even if the errors within a block are correlated.
+Each sensor contributes its evidence to the normal equations, separately for each block (a few
+seconds of driving). The standard deviations come from a jackknife over the blocks (Quenouille and
+Tukey), so they are right even if the errors within a block are correlated.
 """
 
 from __future__ import annotations
@@ -26,39 +22,27 @@ from acsard.core.config.settings import DriveConfig
 class Parameter(IntEnum):
     """Indices of the fitted parameters in an array of `PARAMETER_COUNT` numbers."""
 
-    LEFT = 0
-    """Ratio of the left wheels' radius to the configured wheel radius."""
-    RIGHT = 1
-    """Ratio of the right wheels' radius to the configured wheel radius."""
+    LEFT = 0  # ratio of the left wheels' radius to the configured wheel radius
+    RIGHT = 1  # ratio of the right wheels' radius to the configured wheel radius
+    # Ratio of the configured wheel separation to the effective track.
     INVERSE_TRACK = 2
-    """Ratio of the configured wheel separation to the effective track.
-
-    The turns of the robot are proportional to this ratio.
-    """
-    TRACK_GROWTH = 3
-    """Fraction by which the effective track grows for each rad/s of turn rate."""
+    TRACK_GROWTH = 3  # fraction by which the effective track grows for each rad/s of turn rate
+    # Delay of the positions' recorded times relative to those of the wheels, s; later is positive.
     DELAY = 4
-    """Delay of the positions' recorded times relative to those of the wheels, s.
-
-    It is positive if a position has a later time than a wheel sample of the same moment.
-    """
-    SENSOR_X = 5
-    """Distance by which the position sensor is ahead of the robot's middle, m."""
-    SENSOR_Y = 6
-    """Distance by which the position sensor is to the left of the robot's middle, m."""
-    BIAS_ERROR = 7
-    """Gyro bias that remains after the bias measured at rest is subtracted, rad/s."""
+    SENSOR_X = 5  # distance by which the position sensor is ahead of the robot's middle, m
+    SENSOR_Y = 6  # distance by which the position sensor is to the left of the robot's middle, m
+    BIAS_ERROR = 7  # gyro bias that remains after the bias measured at rest is subtracted, rad/s
+    # Relative error of the gyro's scale: with 0.01, the gyro shows turns 1 % too large.
     SCALE_ERROR = 8
-    """Relative error of the gyro's scale: with 0.01, the gyro shows turns 1 % too large."""
 
 
 PARAMETER_COUNT = len(Parameter)
 RADII = [Parameter.LEFT, Parameter.RIGHT]
+# Indices of the parameters that describe the wheels: radii, inverse track and track growth.
 WHEEL_PARAMETERS = list(Parameter)[: Parameter.DELAY]
-"""Indices of the parameters that describe the wheels: radii, inverse track and track growth."""
 
+# If a residual exceeds this number of standard deviations, its weight is less than 1 (Huber).
 HUBER_LIMIT = 2.0
-"""If a residual exceeds this number of standard deviations, its weight is less than 1 (Huber)."""
 
 
 class Base(Struct, frozen=True):
@@ -66,12 +50,9 @@ class Base(Struct, frozen=True):
 
     radius: float
     separation: float
-    left: float
-    """Configured multiplier of the left wheels' radius."""
-    right: float
-    """Configured multiplier of the right wheels' radius."""
-    track: float
-    """Configured multiplier of the wheel separation."""
+    left: float  # configured multiplier of the left wheels' radius
+    right: float  # configured multiplier of the right wheels' radius
+    track: float  # configured multiplier of the wheel separation
 
     @classmethod
     def of(cls, drive: DriveConfig) -> Base:
@@ -81,10 +62,7 @@ class Base(Struct, frozen=True):
         )  # fmt: skip
 
     def start(self) -> Floats:
-        """Return the parameters that describe the configured robot, shape (PARAMETER_COUNT,).
-
-        The track growth and all parameters of sensors are 0.
-        """
+        """Return the parameters that describe the configured robot; those of sensors are 0."""
         parameters = np.zeros(PARAMETER_COUNT)
         parameters[: Parameter.TRACK_GROWTH] = self.left, self.right, 1 / self.track
         return parameters
@@ -95,30 +73,24 @@ class Base(Struct, frozen=True):
 
     @property
     def radius_per_separation(self) -> float:
-        """Wheel radius / wheel separation, without multipliers.
-
-        This is the robot's turn, rad, if the right wheels roll 1 rad further than the left wheels.
-        """
+        """Turn of the robot, rad, if the right wheels roll 1 rad further than the left ones."""
         return self.radius / self.separation
 
 
 class Evidence(Struct, frozen=True):
     """The contribution of one sensor to the normal equations of the fit, block by block.
 
-    A block is a few seconds of driving. J is the Jacobian of the predictions with respect to the
-    parameters, r the residuals and W their weights. `fit()` divides J^T W J and J^T W r by the
-    noise variance of the sensor.
+    J is the Jacobian of the predictions, r the residuals and W their weights. `fit()` divides J^T W
+    J and J^T W r by the noise variance of the sensor.
     """
 
+    # Left-hand sides J^T W J of the normal equations, shape (blocks, PARAMETER_COUNT,
+    # PARAMETER_COUNT).
     normal: Floats
-    """Left-hand sides J^T W J of the normal equations, shape (blocks, PARAMETER_COUNT,
-    PARAMETER_COUNT)."""
+    # Right-hand sides J^T W r of the normal equations, shape (blocks, PARAMETER_COUNT).
     score: Floats
-    """Right-hand sides J^T W r of the normal equations, shape (blocks, PARAMETER_COUNT)."""
-    squares: Floats
-    """Sum of weighted squared residuals per block."""
-    counts: Floats
-    """Number of independent residuals per block."""
+    squares: Floats  # sum of weighted squared residuals per block
+    counts: Floats  # number of independent residuals per block
 
 
 def evidence_from_measurements(
@@ -126,15 +98,7 @@ def evidence_from_measurements(
 ) -> Evidence:
     """Return the evidence of one sensor from its measurements, summed by block.
 
-    A block is a few seconds of driving.
-
-    Args:
-        jacobian: derivatives of each prediction with respect to the parameters, shape
-            (measurements, PARAMETER_COUNT).
-        residual: measured minus predicted value of each measurement.
-        weight: weight of each measurement.
-        block: index of the block of each measurement.
-        blocks: number of blocks.
+    The shape of `jacobian` is (measurements, PARAMETER_COUNT).
     """
     normal = np.zeros((blocks, PARAMETER_COUNT, PARAMETER_COUNT))
     score = np.zeros((blocks, PARAMETER_COUNT))
@@ -147,10 +111,9 @@ def evidence_from_measurements(
 
 
 def condition(normal: Floats) -> float:
-    """Return the condition number of the matrix `normal` after scaling its diagonal to 1.
+    """Return the condition number of `normal` after scaling its diagonal to 1.
 
-    Because of the scaling, the units of the parameters do not matter. The condition number is
-    infinite if a parameter does not influence the predictions (0 on the diagonal).
+    It is infinite if a parameter does not influence the predictions.
     """
     size = np.sqrt(np.diag(normal))
     if not np.all(size > 0.0):
@@ -159,74 +122,51 @@ def condition(normal: Floats) -> float:
 
 
 def huber(residuals: Floats | Complexes, least: float) -> Floats:
-    """Return Huber's weight of each residual, with which outliers have less influence on a fit.
+    """Return Huber's weight of each residual, by which outliers have less influence on a fit.
 
-    The weight is 1 for a residual of up to `HUBER_LIMIT` standard deviations, and less for a larger
-    one. The standard deviation is estimated as 1.4826 times the median absolute residual, but it is
-    at least `least`.
+    The standard deviation is 1.4826 times the median absolute residual, but at least `least`.
     """
     size = np.abs(residuals)
     scale = max(least, 1.4826 * float(np.median(size)) if len(size) else 0.0)
     return np.asarray(np.minimum(1.0, HUBER_LIMIT * scale / np.maximum(size, 1e-300)))
 
 
+# Function that returns the `Evidence` of one sensor, computed with given parameters.
 Source = Callable[[Floats], Evidence]
-"""Function that returns the `Evidence` of one sensor, computed with given parameters."""
 
 MAX_STEPS = 30
+# The fit ends after a step below `SMALL`, and has converged if its last step is below `SETTLED`. A
+# step is the largest change of a wheel parameter: 0.01 is 1 % of a radius.
 SMALL, SETTLED = 1e-5, 0.02
-"""Step sizes at which the fit ends (`SMALL`), and at which it has converged (`SETTLED`).
 
-The fit ends after a step below `SMALL`, or after `MAX_STEPS` steps. It has converged if its last
-step is below `SETTLED`. The size of a step is the largest change of the two radii, the inverse
-track and the track growth, in the units of `Parameter`. A size of 0.01 is a change by 1 % of a
-radius.
-"""
-
+# Prior standard deviations of parameters that some logs do not determine.
 PRIOR_STD = {
     Parameter.TRACK_GROWTH: 0.06,
     Parameter.DELAY: 1.0,
     Parameter.SENSOR_X: 0.5,
     Parameter.SENSOR_Y: 0.5,
 }
-"""Prior standard deviations of parameters that some logs do not determine.
 
-They are in the units of `Parameter`.
-"""
-
+# Relative standard deviation of the scale of a MEMS gyro, which only positions can show.
 GYRO_SCALE_STD = 0.005
-"""Prior relative standard deviation of the scale of a MEMS gyro.
 
-Only positions can show that the scale is wrong.
-"""
-
+# Weight of a constraint (`Held`) in the normal equations, large enough to enforce it.
 CONSTRAINT_WEIGHT = 1e9
-"""Weight of a constraint (`Held`) in the normal equations, large enough to enforce it."""
 
+# Constraint: weights of the parameters, shape (PARAMETER_COUNT,), and the value of their sum.
 Held = tuple[Floats, float]
-"""Constraint on the parameters: a weighted sum of the parameters must have a certain value.
 
-The first element contains the weights, shape (PARAMETER_COUNT,). The second element is the value.
-"""
-
+# Minimum number of blocks at which the jackknife also leaves out pairs of neighboring blocks.
 MIN_PAIR_BLOCKS = 16
-"""Minimum number of blocks at which the jackknife also leaves out pairs of neighboring blocks.
 
-A block is a few seconds of driving. The jackknife computes standard deviations.
-"""
-
+# Least number of blocks in a log, and of runs at which the jackknife leaves out whole runs.
 MIN_BLOCKS = 5
-"""Minimum number of blocks (a few seconds of driving each) that a log must have.
-
-If a log has at least this number of runs, the jackknife that computes standard deviations also
-leaves out whole runs.
-"""
 
 
 def student_factor(free: Floats | float) -> Floats:
-    """Return the factor by which to increase a variance that was estimated from few values.
+    """Return the variance of Student's t with max(`free`, 3) degrees of freedom.
 
-    The factor is the variance of Student's t with max(`free`, 3) degrees of freedom.
+    It is the factor by which to increase a variance that was estimated from few values.
     """
     free = np.maximum(3.0, free)
     return np.asarray(free / (free - 2))
@@ -236,25 +176,18 @@ class Fit(Struct, frozen=True):
     """The result of a fit: the fitted parameters, and the normal equations at these parameters."""
 
     parameters: Floats
+    # Left-hand sides of the normal equations, shape (blocks, PARAMETER_COUNT, PARAMETER_COUNT).
     normal: Floats
-    """Left-hand sides of the normal equations, shape (blocks, PARAMETER_COUNT, PARAMETER_COUNT)."""
-    score: Floats
-    """Right-hand sides of the normal equations, shape (blocks, PARAMETER_COUNT)."""
+    score: Floats  # right-hand sides of the normal equations, shape (blocks, PARAMETER_COUNT)
+    # Matrix that the constraints and the prior information add to the left-hand side of the normal
+    # equations, shape (PARAMETER_COUNT, PARAMETER_COUNT).
     prior_normal: Floats
-    """Matrix that the constraints and the prior information add to the left-hand side of the normal
-    equations, shape (PARAMETER_COUNT, PARAMETER_COUNT)."""
-    active: tuple[Parameter, ...]
-    """Indices of the parameters that were fitted."""
+    active: tuple[Parameter, ...]  # indices of the parameters that were fitted
     converged: bool
-    prior_std: Mapping[Parameter, float]
-    """Prior standard deviation of each parameter that has one."""
+    prior_std: Mapping[Parameter, float]  # prior standard deviation of each parameter that has one
 
     def without(self, blocks: Mask) -> Floats:
-        """Return approximate parameters of a fit that leaves out some blocks of the log.
-
-        A block is a few seconds of driving. The mask `blocks` is True for each block to leave out.
-        The result is one linear step away from `parameters`, so no new fit is needed.
-        """
+        """Return approximate parameters of a fit without the blocks in the mask."""
         rest = self.normal[~blocks].sum(axis=0) + self.prior_normal
         parameters = self.parameters.copy()
         parameters[list(self.active)] -= _solved(rest, self.score[blocks].sum(axis=0), self.active)
@@ -263,15 +196,9 @@ class Fit(Struct, frozen=True):
     def marginal(self) -> Floats:
         """Return the matrix of the normal equations, reduced to the wheel parameters.
 
-        Its condition number shows how well the log separates the wheel radii from the track. A
-        Schur complement eliminates the other fitted parameters. The matrix includes the constraints
-        and the prior information. There are two cases:
-
-        - If the fit used positions, the shape is (3, 3). The unknowns are the left radius, the
-          right radius and the inverse track.
-        - If the fit used no positions, the evidence does not show the mean radius of the wheels.
-          The shape is (2, 2). The unknowns are the right radius minus the left radius, and the
-          inverse track.
+        Its condition number shows how well the log separates the radii from the track. The unknowns
+        are left radius, right radius and inverse track; without positions, the difference of the
+        radii and the inverse track.
         """
         total = self.normal.sum(axis=0) + self.prior_normal
         rest = [index for index in self.active if index > Parameter.INVERSE_TRACK]
@@ -284,8 +211,8 @@ class Fit(Struct, frozen=True):
     def covariance(self, runs: Sequence[int] = ()) -> Floats:
         """Return the covariance of the parameters, from the jackknife and the prior information.
 
-        `runs` contains the index of the run of each block. If there are at least `MIN_BLOCKS`
-        runs, the jackknife also leaves out whole runs.
+        `runs` has the run of each block. The jackknife also leaves out whole runs if there are at
+        least `MIN_BLOCKS`.
         """
         alone = np.arange(len(self.score))
         change, size = self._changes(alone)
@@ -306,13 +233,6 @@ class Fit(Struct, frozen=True):
         )
 
     def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Return, for each group of blocks, how the parameters change without this group.
-
-        `group` contains the number of the group of each block. The second result contains the
-        variances of the parameters, from a jackknife over the groups. If there are few groups,
-        `student_factor()` makes the variances larger. The degrees of freedom are those of
-        Satterthwaite (An approximate distribution of estimates of variance components, 1946).
-        """
         change = np.array(
             [self.without(group == number) - self.parameters for number in np.unique(group)]
         )
@@ -326,18 +246,10 @@ def fit(
     sources: Sequence[Source], start: Floats, *, places: bool, gyro: bool = False,
     bias_std: float = 0.0, held: Sequence[Held] = (),
 ) -> Fit:  # fmt: skip
-    """Fit the parameters to the evidence of all sensors, and return the result.
+    """Fit the parameters to the evidence of all sensors, starting from nearly right ones.
 
-    Without positions, the mean of the two wheel radii stays as in `start`.
-
-    Args:
-        sources: one function for each sensor, which returns its evidence for given parameters.
-        start: the parameters to start from, which must be nearly right.
-        places: whether positions are among the sources.
-        gyro: whether a gyro is among the sources.
-        bias_std: standard deviation of the gyro bias, rad/s; 0 if the fit must not change the
-            bias.
-        held: constraints on the parameters.
+    Without positions, the mean of the two wheel radii stays as in `start`. A `bias_std` of 0 keeps
+    the gyro bias.
     """
     active = tuple(Parameter)[: Parameter.BIAS_ERROR if places else Parameter.DELAY]
     usual = dict(PRIOR_STD)
@@ -395,10 +307,6 @@ def _weight(part: Evidence) -> float:
 def _prior_terms(
     parameters: Floats, targets: Sequence[Held], usual: Mapping[Parameter, float]
 ) -> tuple[Floats, Floats]:
-    """Return the terms that constraints and prior information add to the normal equations.
-
-    `targets` contains the constraints, and `usual` the prior standard deviations of the parameters.
-    """
     normal, score = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT)), np.zeros(PARAMETER_COUNT)
     for index, deviation in usual.items():
         normal[index, index] = deviation**-2

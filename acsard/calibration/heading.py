@@ -1,13 +1,8 @@
-"""Compares turns of the robot, computed from the wheels, with turns that a heading sensor measures.
+"""Compares turns of the robot, computed from the wheels, with those of a heading sensor.
 
-The heading sensor is a gyro, or the yaw of a position source. The comparison uses the equation of
-Antonelli, Chiaverini & Fusco (A calibration method for odometry of mobile robots based on the
-least-squares technique, 2005):
-
-    turn = g_r phi_r - g_l phi_l,    g_r = R_r / L,    g_l = R_l / L
-
-Here, phi_r and phi_l are the angles by which the right and the left wheels rolled. R_r and R_l are
-their radii, and L is the effective track. The equation is linear in g_r and g_l.
+The sensor is a gyro, or the yaw of a position source. The equation is that of Antonelli, Chiaverini
+& Fusco (A calibration method for odometry of mobile robots, 2005): turn = g_r phi_r - g_l phi_l,
+with the angles phi by which the wheels rolled, and g = wheel radius / effective track.
 """
 
 from __future__ import annotations
@@ -28,132 +23,87 @@ from acsard.calibration.fit import (
 )
 from acsard.calibration.log_table import Floats, LogError
 from acsard.calibration.runs import Block, Run, gaps, inside, integral, rest_intervals
+from acsard.core.values import RadPerS, Seconds
 
+# A standstill that shows the gyro's bias lasts `REST_S` after `EDGE_S`, in which the robot may
+# shake, is cut off at both ends.
 REST_S, EDGE_S = 0.6, 0.3
-"""Limits for a standstill of the robot from which the gyro's bias is measured, s.
 
-The time `EDGE_S` is cut off at both ends of the standstill, because the robot may shake when it
-stops or starts. The remaining time must be at least `REST_S`.
-"""
-
+# Above this difference from the usual rate, rad/s, a person turned the robot in a standstill.
 MAX_RATE_AT_REST = 0.05
-"""Limit for the difference between the gyro's mean rate in a standstill and its usual rate, rad/s.
 
-The usual rate is the median over all standstills. Above the limit, a person turned the robot during
-the standstill, so the standstill is not used.
-"""
+MIN_SAMPLES = 5  # minimum number of gyro samples in a standstill from which the bias is measured
 
-MIN_SAMPLES = 5
-"""Minimum number of gyro samples in a standstill from which the bias is measured."""
-
+# A gyro sample this many median deviations from the median of a standstill is an outlier.
 OUTLIER_RATIO = 6.0
-"""Limit above which a gyro sample in a standstill is left out as an outlier.
 
-The limit applies to the sample's deviation from the median, divided by the median deviation.
-"""
-
+# Smallest random walk assumed for the gyro bias, rad/s per square root of a second.
 MIN_RANDOM_WALK = 5e-5
-"""Smallest random walk assumed for the gyro bias, rad/s per square root of a second."""
 
+# The same if no run has two standstills whose biases could be compared.
 ASSUMED_RANDOM_WALK = 2e-4
-"""Random walk assumed for the gyro bias, rad/s per square root of a second.
 
-The value is used if no run contains two standstills of the robot, whose biases could be compared.
-"""
-
+# Approximate length of the intervals in which turns of wheels and sensor are compared.
 INTERVAL_S = 1.0
-"""Approximate length of the intervals in which turns of wheels and sensor are compared, s."""
 
+# Step of the search for the heading sensor's delay, and the largest delay that is tried.
 GRID_S, FURTHEST_S = 0.02, 2.0
-"""Step of the search for the heading sensor's delay, and the largest delay that is tried, s."""
 
+# If the yaw turns this much further than the wheels, it is in degrees.
 DEGREES_RATIO = 10.0
-"""Limit for the ratio of the turns in the column yaw to the robot's turns according to the wheels.
-
-A column yaw with a larger ratio is refused, because its values are in degrees.
-"""
 
 
 class Heading(Struct, frozen=True):
     """The heading of a run as a sensor measured it."""
 
-    t: Floats
-    """Times of the sensor's samples, s."""
-    angle: Floats
-    """Heading at the times `t`, rad, without jumps by 2 pi."""
+    t: Floats  # times of the sensor's samples, s
+    angle: Floats  # heading at the times `t`, rad, without jumps by 2 pi
+    # Long intervals without a sample of the sensor, s: one row (begin, end) for each.
     gaps: Floats
-    """Long intervals without a sample of the sensor, s: one row (begin, end) for each.
-
-    `runs.gaps` defines which intervals are long.
-    """
 
 
 class Headings(Struct, frozen=True):
     """The headings of all runs, measured by one sensor, and the sensor's delay and bias."""
 
-    source: str
-    """Column of the log from which the headings come: "yaw_rate" or "yaw"."""
+    source: str  # column of the log from which the headings come: "yaw_rate" or "yaw"
     per_run: tuple[Heading, ...]
-    delay: float
-    """Delay of the sensor's recorded times relative to those of the wheels, s.
-
-    It is positive if the sensor records the same event with a later time than the wheels.
-    """
-    bias: float
-    """Median of the gyro biases that were measured in standstills of the robot, rad/s.
-
-    It is 0 if there is no gyro or no standstill.
-    """
+    # Delay of the sensor's recorded times relative to those of the wheels.
+    delay: Seconds
+    # Median of the gyro biases that were measured in standstills of the robot.
+    bias: RadPerS
+    # True if no standstill shows the gyro's bias, so that the wheels must show it.
     bias_unknown: bool
-    """True if the sensor is a gyro, and its bias was not measured in any standstill of the robot.
-
-    The bias must then be found by a comparison with the wheels.
-    """
-    bias_std: float = 0.0
-    """Standard deviation of the error of the measured gyro bias, rad/s.
-
-    The error is averaged over all runs. The deviation is 0 if no bias was measured.
-    """
+    # Standard deviation of the error of the measured gyro bias.
+    bias_std: RadPerS = 0.0
 
 
-STRAIGHT_RATE = 0.05
-"""Turn rate up to which the robot is considered to drive straight, rad/s."""
+STRAIGHT_RATE = 0.05  # turn rate up to which the robot is considered to drive straight, rad/s
 
+# Fraction of the total turned angle that the robot turned at rates below `Rates.fastest`.
 FASTEST_QUANTILE = 0.95
-"""Fraction of the total turned angle that the robot turned at rates below `Rates.fastest`."""
 
 
 class Rows(Struct, frozen=True):
-    """The motion of the robot in intervals of about a second.
+    """The motion of the robot in intervals of about a second."""
 
-    Each array has one value for each interval.
-    """
-
+    # Index of the block (a few seconds of driving) to which each interval belongs.
     block: npt.NDArray[np.int64]
-    """Index of the block (a few seconds of driving) to which each interval belongs."""
+    # Turn in each interval according to the heading sensor, rad; 0 if there is no sensor.
     turned: Floats
-    """Turn in each interval according to the heading sensor, rad; 0 if there is no sensor."""
-    left: Floats
-    """Angle by which the left wheels rolled in each interval, rad."""
+    left: Floats  # angle by which the left wheels rolled in each interval, rad
     right: Floats
+    # Integral of |w| w, rad2/s, with w the speed of right minus left wheels: `TRACK_GROWTH` scales
+    # it.
     signed_square_integral: Floats
-    """Integral of |w| w over each interval, rad2/s.
-
-    w is the speed of the right wheels minus the speed of the left wheels, rad/s. The effect of
-    `Parameter.TRACK_GROWTH` on the turn is proportional to this integral.
-    """
-    seconds: Floats
-    """Length of each interval, s."""
+    seconds: Floats  # length of each interval, s
 
 
 class Rates(Struct, frozen=True):
     """Statistics of the turn rates in a log."""
 
-    mean: float
-    """Mean turn rate, rad/s, weighted by the turned angle."""
-    fastest: float
-    """Turn rate, rad/s, below which the robot turned 95 % (`FASTEST_QUANTILE`) of its total turned
-    angle."""
+    mean: RadPerS  # mean turn rate, weighted by the turned angle
+    # Turn rate, below which the robot turned 95 % (`FASTEST_QUANTILE`) of its total turned angle.
+    fastest: RadPerS
 
 
 def of_gyro(driven: Sequence[Run]) -> Headings | None:
@@ -190,8 +140,7 @@ def of_gyro(driven: Sequence[Run]) -> Headings | None:
 def of_yaw(driven: Sequence[Run], radius_per_separation: float) -> Headings | None:
     """Return the headings in the column yaw, or None if no run has this column.
 
-    `radius_per_separation` is wheel radius / wheel separation. Raises `LogError` if the yaw is in
-    degrees.
+    Raises `LogError` if the yaw is in degrees.
     """
     if not any(len(run.yaw) for run in driven):
         return None
@@ -220,9 +169,9 @@ def _in_degrees(run: Run, radius_per_separation: float) -> bool:
     )
 
 
+# The standstills of a run: their times (s), gyro biases (rad/s) and variances of these biases
+# (rad2/s2).
 Rests = tuple[Floats, Floats, Floats]
-"""The standstills of a run: their times (s), gyro biases (rad/s) and variances of these biases
-(rad2/s2)."""
 
 
 def _biases(run: Run) -> Rests:
@@ -236,10 +185,6 @@ def _biases(run: Run) -> Rests:
 
 
 def _mean(samples: Floats) -> tuple[float, float]:
-    """Return the mean of the gyro samples of a standstill, and the variance of this mean.
-
-    Outliers are left out.
-    """
     off = np.abs(samples - np.median(samples))
     steps = np.diff(np.unique(samples))
     step = float(steps.min()) if len(steps) else 0.0
@@ -254,10 +199,6 @@ def _mean(samples: Floats) -> tuple[float, float]:
 
 
 def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
-    """Return the standard deviation of the error of the gyro bias, averaged over all runs, rad/s.
-
-    `rested` contains the standstills of each run, and `seconds` the length of each run, s.
-    """
     count = sum(len(t) for t, _, _ in rested)
     noise = sum(float(variance.sum()) for _, _, variance in rested) / max(1, count) ** 2
     walked = [np.column_stack((np.diff(v) ** 2 - n[1:] - n[:-1], np.diff(t))) for t, v, n in rested]
@@ -279,10 +220,8 @@ def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
 def offset(headings: Sequence[Heading], driven: Sequence[Run]) -> float:
     """Return the delay of a heading sensor's recorded times relative to those of the wheels, s.
 
-    `headings` contains the heading that the sensor measured in each run, and `driven` contains the
-    runs. The result is the delay for which the turns of the sensor correlate best with the robot's
-    turns according to the wheels. It is between -`FURTHEST_S` and `FURTHEST_S`. It is 0 if the
-    sensor or the wheels show no turns.
+    It is the delay, up to `FURTHEST_S`, for which the turns correlate best; 0 if there are no
+    turns.
     """
     reach = round(FURTHEST_S / GRID_S)
     scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
@@ -311,10 +250,6 @@ def offset(headings: Sequence[Heading], driven: Sequence[Run]) -> float:
 
 
 def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
-    """Return the correlation of two series for each shift from -`reach` to `reach` samples.
-
-    If the maximum is at a positive shift, `later` lags behind `earlier`.
-    """
     size = 1 << (len(later) + reach).bit_length()
     spectrum = np.fft.rfft(later, size) * np.conj(np.fft.rfft(earlier, size))
     whole = np.fft.irfft(spectrum, size)
@@ -322,12 +257,7 @@ def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
 
 
 def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block]) -> Rows:
-    """Return the motion of the robot in intervals of about `INTERVAL_S` s.
-
-    The intervals are parts of the blocks `parts`. The result contains only the intervals that the
-    heading sensor covers with samples from begin to end. If `headings` is None, it contains all
-    intervals.
-    """
+    """Return the motion in intervals of about `INTERVAL_S` that the heading sensor covers."""
     squares = [_signed_square_integral(run) for run in driven]
     pieces: list[tuple[Floats, ...]] = []
     for number, part in enumerate(parts):
@@ -352,11 +282,7 @@ def rows(headings: Headings | None, driven: Sequence[Run], parts: Sequence[Block
 
 
 def rates(rows: Rows, by_wheels: Floats) -> Rates:
-    """Return statistics of the turn rates in a log. They are 0 if the robot hardly turns.
-
-    `by_wheels` contains the turn of the robot in each interval of `rows` according to the wheels,
-    rad.
-    """
+    """Return statistics of the turn rates in a log. They are 0 if the robot hardly turns."""
     turned = np.abs(by_wheels)
     rate = turned / rows.seconds
     turning = rate > STRAIGHT_RATE
@@ -370,11 +296,9 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
 
 
 def without_constant_rate(rows: Rows) -> Rows:
-    """Subtract a constant rate from each column of `rows`, and return the result.
+    """Subtract from each column of `rows` its constant rate, fitted by least squares.
 
-    The constant rate is the change of the column per second, fitted by least squares. A constant
-    gyro bias, which is unknown, then has no effect on a comparison with the wheels. The column
-    `seconds` does not change.
+    An unknown gyro bias then has no effect on a comparison with the wheels.
     """
     share = rows.seconds / float(rows.seconds @ rows.seconds)
     turned, left, right, squares = (
@@ -390,12 +314,9 @@ def _signed_square_integral(run: Run) -> Floats:
     return integral(np.abs(apart) * apart, steps)
 
 
+# The turns of sensor and wheels usually differ by `NOISE` rad per second and by the fraction
+# `SHARE`, whose squares are added.
 NOISE, SHARE = 0.01, 0.03
-"""Usual difference between the turn of the sensor and that of the wheels in an interval of the log.
-
-It has two parts, whose squares are added: `NOISE` rad for each second of the interval, and the
-fraction `SHARE` of the wheels' turn.
-"""
 
 
 def turned(rows: Rows, base: Base, parameters: Floats) -> Floats:
@@ -406,18 +327,13 @@ def turned(rows: Rows, base: Base, parameters: Floats) -> Floats:
 
 
 def _by_growth(rows: Rows, base: Base, parameters: Floats) -> Floats:
-    """Return the derivative of each interval's turn with respect to TRACK_GROWTH, rad2/s."""
     left, right, inverse = parameters[: Parameter.TRACK_GROWTH]
     gain = base.radius_per_separation * inverse * (left + right) / 2
     return np.asarray(-gain * abs(gain) * rows.signed_square_integral)
 
 
 def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidence:
-    """Return the evidence of a heading sensor: its contribution to the normal equations of the fit.
-
-    The predictions are linearized at `parameters`. `rows` contains the turns of the sensor and of
-    the wheels. `blocks` is the number of blocks (a few seconds of driving each).
-    """
+    """Return the evidence of a heading sensor, linearized at `parameters`."""
     turn = parameters[Parameter.INVERSE_TRACK]
     by_wheels = turned(rows, base, parameters)
     jacobian = np.zeros((len(rows.turned), PARAMETER_COUNT))
@@ -444,12 +360,7 @@ def _weight(rows: Rows, residual: Floats, by_wheels: Floats) -> Floats:
 
 
 def bias(rows: Rows, by_wheels: Floats) -> float:
-    """Return the gyro's bias, rad/s, from a comparison with the wheels.
-
-    The bias is the mean difference between the turn rate of the gyro and the robot's turn rate
-    according to the wheels. `by_wheels` contains the robot's turn in each interval of `rows`
-    according to the wheels, rad.
-    """
+    """Return the gyro's mean difference from the turn rate of the wheels, rad/s."""
     seconds, estimate = rows.seconds, 0.0
     off = rows.turned - by_wheels
     for _ in range(10):
@@ -459,15 +370,10 @@ def bias(rows: Rows, by_wheels: Floats) -> float:
 
 
 def side_factors(rows: Rows, base: Base, *, in_place: bool = False) -> Floats:
-    """Return a factor for the left wheels, and a factor for the right wheels.
+    """Return the factors of left and right wheels with which their turns fit the sensor best.
 
-    With these factors, the robot's turns according to the wheels (`by_sides`) fit the heading
-    sensor best. A factor is the ratio of wheel radius to effective track, divided by the configured
-    ratio of wheel radius to wheel separation. It is negative if the wheel speeds of this side, or
-    the sensor, have the wrong sign.
-
-    If the robot only turns in place (`in_place`), the log does not show the ratio of the two
-    factors. Both factors are then equal.
+    A factor is wheel radius / effective track, divided by the configured radius / separation. It is
+    negative if a sign is wrong. Both are equal if the robot only turns in place (`in_place`).
     """
     columns = base.radius_per_separation * np.column_stack((-rows.left, rows.right))
     if in_place:
@@ -483,8 +389,5 @@ def side_factors(rows: Rows, base: Base, *, in_place: bool = False) -> Floats:
 
 
 def by_sides(rows: Rows, base: Base, sides: Floats) -> Floats:
-    """Return the robot's turn in each interval of `rows`, rad, computed from the wheels.
-
-    `sides` contains the factors of the left and the right wheels, as `side_factors()` returns them.
-    """
+    """Return the robot's turn in each interval, rad, with the factors of `side_factors()`."""
     return np.asarray(base.radius_per_separation * (sides[1] * rows.right - sides[0] * rows.left))

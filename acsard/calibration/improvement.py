@@ -1,9 +1,8 @@
 """Measures the improvement that a calibration brings, on drives that the fit did not use.
 
-This is a cross-validation. Each run (one drive in the log) is left out in turn: the parameters are
-fitted to the other runs, and the odometry error is measured on the run that was left out. If the
-log has fewer than three runs, each fifth of the log is left out instead. The configured values are
-replaced only if the new values are better by more than chance explains.
+Each run is left out in turn, or each fifth of a log with fewer than three runs. The parameters are
+fitted to the rest, and the odometry error is measured on the part that was left out. New values
+replace the configured ones only if they are better by more than chance explains.
 """
 
 from __future__ import annotations
@@ -22,27 +21,18 @@ from acsard.calibration.positions import Segment, WheelSteps, path, segments, sp
 from acsard.calibration.runs import Block, Mask, Run, cumulative
 
 FOLDS = 5
+# With fewer runs, a fifth of the log is left out at a time.
 MIN_RUNS = 3
-"""Minimum number of runs at which the cross-validation leaves out whole runs.
 
-If a log has fewer runs, the cross-validation leaves out a fifth of the log at a time (`FOLDS`).
-"""
-
+# Curvature of the path according to the wheels, rad/m, below which the path counts as straight.
 MAX_STRAIGHT_CURVATURE = 0.1
-"""Curvature of the path according to the wheels, rad/m, below which the path counts as straight."""
 
+# With less straight driving, the heading error per 10 m would be only noise.
 MIN_STRAIGHT_M = 1.0
-"""Minimum total distance of straight driving in a log, m.
-
-If a log has less, the heading error per 10 m is not computed, because it would be only noise.
-"""
 
 
 class BeforeAfter(Struct, frozen=True):
-    """An odometry error with the configured multipliers, and with the new multipliers.
-
-    Both numbers are None if the log does not show how large the error is.
-    """
+    """An odometry error with the configured and with the new multipliers; None if it is unknown."""
 
     before: float | None
     after: float | None
@@ -50,64 +40,36 @@ class BeforeAfter(Struct, frozen=True):
 
 NOT_COMPARED = BeforeAfter(None, None)
 
+# Smallest ratio of a gain to its standard deviation at which the gain counts as sure (95 %).
 SURE_DEVIATIONS = 2.0
-"""Smallest ratio of a gain to its standard deviation at which the gain counts as sure (95 %).
 
-A gain is a measure of the improvement that new settings bring, such as
-`Improvement.log_improvement`.
-"""
-
+# Half of an error. A larger gain is sure even if its deviation is large, because in a guided drive
+# one leg may show nearly all of the error.
 SURE_GAIN = float(np.log(2.0))
-"""Value of `Improvement.log_improvement` if the calibration halves one error.
 
-A larger gain counts as sure even if its standard deviation is large. In a guided drive, one leg may
-show nearly all of the error. The standard deviation of the gain is then large although the gain is
-real.
-"""
-
+# Nearer than `NEAR` deviations, the configured multipliers stay. Beyond `FAR` (one log of thirty by
+# chance), a smaller gain is enough: half of it at twice `FAR`.
 NEAR, FAR = 2.0, 3.0
-"""Limits for the distance between new and configured multipliers, in standard deviations.
 
-Up to `NEAR`, the configured multipliers are kept. Above `FAR`, a smaller
-`Improvement.log_improvement` is enough to accept the new multipliers: half of it at twice `FAR`. By
-chance alone, the distance exceeds `FAR` in one log of thirty.
-"""
-
+# Constant, m2 or deg2, added to each sum of squared errors because 0 does not have a logarithm.
 MIN_SQUARE = 1e-9
-"""Constant, m2 or deg2, added to each sum of squared errors because 0 does not have a logarithm."""
 
 
 class Improvement(Struct, frozen=True):
     """Odometry errors before and after the calibration, on data that the fit did not use."""
 
-    turn: BeforeAfter
-    """Heading error after a turn of 360 deg, deg."""
-    straight: BeforeAfter
-    """Heading error after 10 m straight ahead, deg."""
+    turn: BeforeAfter  # heading error after a turn of 360 deg, deg
+    straight: BeforeAfter  # heading error after 10 m straight ahead, deg
+    # RMS heading error over whole drives, deg.
     heading: BeforeAfter
-    """RMS heading error over whole drives, deg.
-
-    The heading of each drive is first rotated so that it fits the sensor best.
-    """
+    # RMS position error over whole drives, m.
     place: BeforeAfter
-    """RMS position error over whole drives, m.
-
-    The path of each drive is first shifted and rotated so that it fits the positions best.
-    """
+    # Size of the improvement, as a sum of logarithms; inf if it was not computed.
     log_improvement: float = np.inf
-    """Size of the improvement, as a sum of logarithms; inf if it was not computed.
-
-    Each term is ln(RMS error before / RMS error after) over whole drives. One term is for the
-    heading, and one for the position. If the log shows only one of these errors, the sum has only
-    this term.
-    """
+    # Standard deviation of `log_improvement`, from the differences between drives.
     gain_std: float = 0.0
-    """Standard deviation of `log_improvement`, from the differences between drives.
-
-    It is inf for a single drive.
-    """
+    # Distance of the new multipliers from the configured multipliers, in standard deviations.
     apart: float = FAR
-    """Distance of the new multipliers from the configured multipliers, in standard deviations."""
 
     @property
     def sure(self) -> bool:
@@ -123,17 +85,14 @@ class Fold(Struct, frozen=True):
     """One step of the cross-validation: a drive, and parameters fitted without this drive."""
 
     drive: Block
+    # Mask of the blocks (a few seconds each) that the fit leaves out, because they overlap the
+    # drive.
     blocks: Mask
-    """Mask of the blocks (a few seconds each) that the fit leaves out, because they overlap the
-    drive."""
     parameters: Floats
 
 
 def drives(driven: Sequence[Run]) -> list[Block]:
-    """Return the parts of the log that the cross-validation leaves out, one at a time.
-
-    A part is a whole run, or a fifth of the log if the log has fewer than `MIN_RUNS` runs.
-    """
+    """Return the parts of the log that the cross-validation leaves out, one at a time."""
     longest = np.inf
     if len(driven) < MIN_RUNS:
         longest = sum(float(run.t[-1]) for run in driven) / FOLDS
@@ -158,9 +117,7 @@ def positions_of(drive: Block, driven: Sequence[Run]) -> list[Segment]:
 def folds(fit: Fit, parts: Sequence[Block], driven: Sequence[Run], rate: Rates) -> list[Fold]:
     """Return a fold for each of `drives(driven)`, with the parameters that fit all other drives.
 
-    `parts` are the blocks (a few seconds each) of the fit. A fold leaves out each block that
-    overlaps its drive in time. A drive gets no fold if no block overlaps it, or if all blocks do.
-    The parameters of a fold have one track for all turn rates (`with_constant_track`).
+    A drive has no fold if no block overlaps it, or if all blocks do.
     """
     run, begin, end = (
         np.array(column) for column in zip(*((p.run, p.begin, p.end) for p in parts), strict=True)
@@ -174,10 +131,7 @@ def folds(fit: Fit, parts: Sequence[Block], driven: Sequence[Run], rate: Rates) 
 
 
 def with_constant_track(parameters: Floats, rate: Rates) -> Floats:
-    """Return the parameters with one track for all turn rates, as in the daemon's odometry.
-
-    This track is the fitted track at the mean turn rate of the log.
-    """
+    """Return the parameters with the track at the log's mean turn rate, as the daemon uses it."""
     fixed = parameters.copy()
     fixed[Parameter.INVERSE_TRACK] *= 1.0 - fixed[Parameter.TRACK_GROWTH] * rate.mean
     fixed[Parameter.TRACK_GROWTH] = 0.0
@@ -188,19 +142,10 @@ def improvement(
     test_folds: Sequence[Fold], configured: Floats, base: Base, rows: Rows,
     places: Sequence[Sequence[Segment]], steps: Sequence[WheelSteps],
 ) -> Improvement:  # fmt: skip
-    """Return the errors of the odometry before and after the calibration.
+    """Return the errors of the odometry before and after, on drives that the fit did not use.
 
-    The errors after the calibration are measured on drives that the fit did not use.
-
-    Args:
-        test_folds: the folds. Each contains a drive, and parameters that were fitted without this
-            drive.
-        configured: the parameters with the configured multipliers.
-        base: the configured geometry.
-        rows: the motion in intervals of about a second. `rows.turned` is 0 if the log has no
-            heading sensor.
-        places: for each fold, the measured positions of its drive.
-        steps: the wheel steps of each run; empty if the log has no positions.
+    `configured` are the parameters with the configured multipliers. `places` has the positions of
+    each fold's drive. `steps` is empty if the log has no positions.
     """
     by_wheels = turned(rows, base, configured)
     before = rows.turned - by_wheels
@@ -231,11 +176,7 @@ def improvement(
 
 
 def rms(sums: Floats) -> BeforeAfter:
-    """Return the RMS errors before and after the calibration.
-
-    `sums` contains three numbers: the sum of the squared errors before the calibration, the sum
-    after it, and the number of samples. Without samples, the errors are None.
-    """
+    """Return RMS errors from the two sums of squared errors and the number of samples."""
     before, after, count = sums.tolist()
     if not count:
         return NOT_COMPARED
@@ -243,13 +184,7 @@ def rms(sums: Floats) -> BeforeAfter:
 
 
 def per_amount(sums: Floats, unit: float) -> BeforeAfter:
-    """Return the errors before and after the calibration, per driven angle or distance.
-
-    `sums` contains three numbers: the sum of the errors before the calibration, the sum after it,
-    and the driven angle or distance. A result is a sum of errors, divided by the driven angle or
-    distance, times `unit`. For example, if errors and angle are in rad, a `unit` of 360 gives the
-    error for a full turn in deg. If the driven angle or distance is 0, the errors are None.
-    """
+    """Return errors per driven angle or distance, in `unit`, from two sums and the amount."""
     before, after, amount = sums.tolist()
     if not amount:
         return NOT_COMPARED
@@ -257,12 +192,6 @@ def per_amount(sums: Floats, unit: float) -> BeforeAfter:
 
 
 def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
-    """Return the size of the improvement, and the standard deviation of this size.
-
-    The results are the fields `log_improvement` and `gain_std` of `Improvement`. `kinds` has one
-    array for each kind of error: heading or position. Each array has one row for each fold, in the
-    form that `rms()` takes.
-    """
     drives = np.any([squares[:, 2] > 0.0 for squares in kinds], axis=0)
     if not np.any(drives):
         return 0.0, np.inf
@@ -275,12 +204,9 @@ def _gain(kinds: Sequence[Floats]) -> tuple[float, float]:
 
 
 def with_gain_std(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, float]:
-    """Return a pair: the gain from all drives, and the standard deviation of this gain.
+    """Return the gain from all drives in the mask, and its standard deviation by a jackknife.
 
-    A gain is a measure of the improvement that new settings bring. `gain` computes it from the
-    drives in a mask, and `drives` is the mask of all drives. The deviation comes from a jackknife
-    over the drives. `student_factor()` increases it if there are few drives. It is infinite for a
-    single drive.
+    The deviation is infinite for a single drive.
     """
     count = int(drives.sum())
     if count == 1:
@@ -293,18 +219,11 @@ def with_gain_std(gain: Callable[[Mask], float], drives: Mask) -> tuple[float, f
 def _by_group(
     before: Floats, after: Floats, group: npt.NDArray[np.int64], among: Mask, amount: float
 ) -> Floats:
-    """Return the total errors before and after the calibration, and `amount`, for `per_amount()`.
-
-    `group` contains the group of each interval, and the mask `among` selects the intervals to use.
-    Within a group, the errors are added with their signs, so random errors cancel. The total is the
-    sum of the absolute values of all groups.
-    """
     sums = (np.abs(np.bincount(group[among], errors[among])).sum() for errors in (before, after))
     return np.array([*sums, amount])
 
 
 def _of_headings(test_folds: Sequence[Fold], before: Floats, after: Floats, rows: Rows) -> Floats:
-    """Return for each fold the row of squared heading errors, deg2, that `rms()` takes."""
     squares = np.zeros((len(test_folds), 3))
     for number, fold in enumerate(test_folds):
         out = fold.blocks[rows.block]
@@ -319,7 +238,6 @@ def _of_positions(
     test_folds: Sequence[Fold], configured: Floats, base: Base,
     places: Sequence[Sequence[Segment]], steps: Sequence[WheelSteps],
 ) -> Floats:  # fmt: skip
-    """Return for each fold the row of squared position errors, m2, that `rms()` takes."""
     squares = np.zeros((len(test_folds), 3))
     present = [path(run, base, configured) for run in steps]
     for number, (fold, out) in enumerate(zip(test_folds, places, strict=True)):
@@ -332,10 +250,7 @@ def _of_positions(
 
 
 def no_better(result: Improvement) -> str:
-    """Return the text of the error for new multipliers that are not clearly better.
-
-    `result` contains the errors of the odometry before and after the calibration.
-    """
+    """Return the text of the error for new multipliers that are not clearly better."""
     errors = ", ".join(
         f"{name} {error.before * factor:.2g} {unit} now and {error.after * factor:.2g} {unit} "
         "with the new values"

@@ -21,33 +21,23 @@ from acsard.core.values import NS_PER_S, AcsardError
 
 Floats = npt.NDArray[np.float64]
 
+# Columns of wheel speeds, rad/s: of each wheel, or the mean of each side.
 FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
-"""Columns of wheel speeds, rad/s.
 
-`FOUR` has a column for each wheel. `TWO` has a column for the mean speed of each side.
-"""
-
+# Columns with the twist that the daemon commands to the wheels, in m/s and rad/s.
 APPLIED = "applied_linear", "applied_angular"
-"""Columns with the twist that the daemon commands to the wheels, in m/s and rad/s."""
 
 BOUNDS = dict.fromkeys((*FOUR, *TWO), 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
+# Bound of the other columns. All bounds allow degrees and ns, so that later checks can name the
+# unit.
 DEFAULT_BOUND = 1e9
-"""Largest plausible absolute value in a column that `BOUNDS` does not list, in SI units.
 
-This limit and those in `BOUNDS` also allow values in degrees or nanoseconds, so that later checks
-can name the wrong unit.
-"""
-
+# Columns of wheel speeds and turn rates. Spikes are removed only from these columns.
 SPIKE_COLUMNS = frozenset((*FOUR, *TWO, "yaw_rate"))
-"""Columns of wheel speeds and turn rates. Spikes are removed only from these columns."""
 
+# A spike is `SPIKE` times its neighbors and the usual rate, which is the quantile 1 - `FEW_VALUES`
+# of the rates above `SLOW` rad/s.
 SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
-"""Definition of a spike, which is a rate that was recorded wrongly.
-
-A spike is more than `SPIKE` times as large as each of the two neighboring samples. It is also more
-than `SPIKE` times as large as the usual rate. The usual rate is the quantile 1 - `FEW_VALUES` of
-all rates above `SLOW` rad/s.
-"""
 
 
 def bounded(columns: dict[str, Floats]) -> Iterator[str]:
@@ -69,13 +59,10 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
 
 
 def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Return a mask of the spikes: values far above their neighbors, which were recorded wrongly.
+    """Return a mask of the values far above their neighbors, which were recorded wrongly.
 
-    `values` is in the order of the file. `order` contains the indices of the values sorted by time.
-    A spike is far above its neighbors in both orders. A correct value may be far above its
-    neighbors in only one of them, for example if the rows of the file are shuffled.
-
-    If fewer than 1 / `FEW_VALUES` values are above `SLOW`, no value counts as a spike.
+    A spike is far above its neighbors both in the order of the file and in `order`, the order of
+    time: rows may be shuffled. Logs with little motion have none.
     """
     sizes = np.abs(values)
     moving = sizes[sizes > SLOW]
@@ -88,10 +75,6 @@ def spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_
 
 
 def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
-    """Return a mask of the values that are far above `usual` and far above both neighbors.
-
-    Far above means more than `SPIKE` times as large. NaN values do not count as neighbors.
-    """
     indices = np.flatnonzero(np.isfinite(sizes))
     padded = np.concatenate([[0.0], sizes[indices], [0.0]])
     around = np.maximum(np.maximum(padded[:-2], padded[2:]), usual)
@@ -124,21 +107,17 @@ def attach_notes(error: Exception, notes: Iterable[str]) -> None:
 class Table(Struct, frozen=True):
     """The content of a log: columns of numbers, and the run of each row."""
 
-    columns: dict[str, Floats]
-    """Columns by name, in SI units, with NaN for an empty cell."""
-    runs: npt.NDArray[np.int64]
-    """For each row, the index of its run in `names`."""
+    columns: dict[str, Floats]  # columns by name, in SI units, with NaN for an empty cell
+    runs: npt.NDArray[np.int64]  # for each row, the index of its run in `names`
     names: tuple[str, ...]
-    notes: tuple[str, ...]
-    """Sentences about data that was left out."""
+    notes: tuple[str, ...]  # sentences about data that was left out
 
     @classmethod
     def joined(cls, sensors: Sequence[Mapping[str, Floats]]) -> Table:
         """Return a table of one run with all samples of several sensors, sorted by time.
 
-        Each element of `sensors` maps the column names of one sensor to values. Every sensor has
-        the column "t". Any other column belongs to only one sensor. Each sample has its own row,
-        in which the columns of the other sensors are NaN.
+        Every sensor has the column "t". Any other column belongs to only one sensor, and is NaN in
+        the rows of the others.
         """
         ends = np.cumsum([0, *(len(sensor["t"]) for sensor in sensors)])
         columns = {name: np.full(ends[-1], math.nan) for sensor in sensors for name in sensor}
@@ -205,15 +184,14 @@ def _used(header: Sequence[str]) -> list[str]:
 
 HEADER = f"t,{','.join(FOUR)},yaw_rate,x,y,yaw"
 
+# Zenoh keys whose messages `row()` converts to rows of a log.
 KEYS = ("wheel_states", "imu", "sim/pose")
-"""Zenoh keys whose messages `row()` converts to rows of a log."""
 
 
 def row(message: Message, arrived_ns: int) -> str:
     """Return the CSV row of a message on one of `KEYS`. Raises `ValueError` for other messages.
 
-    The time of the row is the stamp of the message. If the message has no stamp, the time is
-    `arrived_ns`, the wall-clock time of its arrival, ns since 1970.
+    The time is the stamp of the message, or `arrived_ns` (wall clock) if it has none.
     """
     if isinstance(message, JointState) and len(message.velocity) == len(FOUR):
         cells = [*(f"{speed:.6g}" for speed in message.velocity), "", "", "", ""]

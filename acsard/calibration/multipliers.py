@@ -16,31 +16,26 @@ from acsard.calibration.fit import Base, Parameter
 from acsard.calibration.heading import Rates
 from acsard.calibration.log_table import Floats, NoCalibrationError
 from acsard.core.config.settings import OdometryConfig
+from acsard.core.values import Metres
 
+# Indices into `Multipliers.values` and `Multipliers.covariance`.
 SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
-"""Indices into `Multipliers.values` and `Multipliers.covariance`."""
 
 
-TOLERANCE = 1e-4
-"""Difference between two multipliers that is too small to matter."""
+TOLERANCE = 1e-4  # difference between two multipliers that is too small to matter
 
 
 class Deviations(Struct, frozen=True):
     """Relative standard deviations of the robot's geometry: track and wheel radii."""
 
-    track: float
-    """Relative standard deviation of the ratio of effective track to mean radius."""
-    ratio: float
-    """Relative standard deviation of the ratio of the right to the left wheel radius."""
+    track: float  # relative standard deviation of the ratio of effective track to mean radius
+    ratio: float  # relative standard deviation of the ratio of the right to the left wheel radius
+    # Relative standard deviation of the mean radius, to which all distances are proportional.
     scale: float
-    """Relative standard deviation of the mean radius, to which all distances are proportional."""
 
     @classmethod
     def of(cls, odometry: OdometryConfig, base: Base) -> Deviations:
-        """Return the standard deviations that the settings of `[odometry]` state.
-
-        `base` is the configured geometry, to which the settings belong.
-        """
+        """Return the standard deviations that `[odometry]` states for the configured geometry."""
         sides = (
             odometry.left_wheel_radius_multiplier_std / base.left,
             odometry.right_wheel_radius_multiplier_std / base.right,
@@ -55,8 +50,7 @@ class Deviations(Struct, frozen=True):
 class Multipliers(Struct, frozen=True):
     """The multipliers of wheel separation, left radius and right radius, with their covariance."""
 
-    values: Floats
-    """The multipliers in the order of `SEPARATION`, `LEFT_RADIUS` and `RIGHT_RADIUS`."""
+    values: Floats  # the multipliers in the order of `SEPARATION`, `LEFT_RADIUS` and `RIGHT_RADIUS`
     covariance: Floats
 
     @property
@@ -64,19 +58,14 @@ class Multipliers(Struct, frozen=True):
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def apart(self, base: Base) -> float:
-        """Return how far these multipliers are from those of `base`, in standard deviations.
-
-        Chance alone hardly explains a large distance. A combination of multipliers that no sensor
-        measures, such as their common scale, stays as configured. It adds nothing to the distance.
-        """
+        """Return how far these multipliers are from those of `base`, in standard deviations."""
         off = self.values - (base.track, base.left, base.right)
         return math.sqrt(off @ np.linalg.solve(self.covariance + TOLERANCE**2 * np.eye(3), off))
 
     def relative_deviations(self) -> Deviations:
         """Return the relative standard deviations of track, ratio of the radii and mean radius.
 
-        The settings of `[odometry]` have the same form, because the odometry treats the errors of
-        these three quantities as independent.
+        The odometry treats the errors of these three as independent.
         """
         shares = self.covariance / np.outer(self.values, self.values)
         rows = np.array([[1.0, -0.5, -0.5], [0.0, -1.0, 1.0], [0.0, 0.5, 0.5]])
@@ -89,16 +78,10 @@ def configured(base: Base) -> Multipliers:
 
 
 def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipliers:
-    """Return the multipliers that fit best at the turn rates of the log.
+    """Return the multipliers that fit best at the mean turn rate of the log.
 
-    The multiplier of the wheel separation describes the track at the mean turn rate of the log,
-    because the daemon uses one track for all turn rates. The variance of this multiplier does not
-    cover skidding that differs from turn to turn, because that is noise of the odometry.
-
-    Args:
-        parameters: the fitted parameters, shape (PARAMETER_COUNT,).
-        covariance: the covariance of the parameters.
-        rate: the turn rates of the log.
+    The daemon uses one track for all turn rates. Skidding that differs from turn to turn is not in
+    the variance, because it is noise of the odometry.
     """
     inverse, growth = parameters[Parameter.INVERSE_TRACK], parameters[Parameter.TRACK_GROWTH]
     slower = 1.0 - growth * rate.mean
@@ -112,84 +95,55 @@ def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipli
     return Multipliers(values, jacobian @ covariance @ jacobian.T)
 
 
+# Includes the error of choosing the point on the robot to measure.
 RUN_LENGTH_STD_M = 0.01
-"""Standard deviation of a distance that a person measures by tape, m.
 
-It includes the error of choosing the point on the robot to measure.
-"""
-
+# Distances by tape and by positions contradict each other if they differ by this fraction and by
+# this number of standard deviations.
 CONTRADICTS, CONTRADICTS_STD = 0.02, 5.0
-"""Limits for the difference between a distance by tape and the same distance by positions.
 
-If the difference exceeds the fraction `CONTRADICTS` of the distance and also exceeds
-`CONTRADICTS_STD` standard deviations, one of the two distances is wrong.
-"""
-
+# Standard deviation of the logarithm of the wheels' size if no measurement has shown the size.
 UNKNOWN_SIZE_STD = 1.0
-"""Standard deviation of the logarithm of the wheels' size if no measurement has shown the size."""
 
+# Shortest distance between start and end of a run, that a person may measure by tape.
 MIN_TAPE_M = 0.5
-"""Shortest distance between start and end of a run, m, that a person may measure by tape."""
 
+# Smallest `Extent.straight` of a run whose distance a person may measure by tape.
 MIN_STRAIGHTNESS = 0.8
-"""Smallest `Extent.straight` of a run whose distance a person may measure by tape."""
 
 
 class Tape(Struct, frozen=True):
     """A straight-line distance from the start to the end of a run, measured by tape."""
 
     metres: float
-    run: str = ""
-    """Name of the run; "" means the straightest run of the log."""
+    run: str = ""  # name of the run; "" means the straightest run of the log
 
 
 class Extent(Struct, frozen=True):
-    """Length of a run's path, and straight-line distance from its start to its end.
+    """Length of a run's path, and distance from its start to its end, by the wheels."""
 
-    Both are computed from the wheels.
-    """
-
-    distance: float
-    """Straight-line distance from start to end, m."""
-    length: float
-    """Length along the path, m."""
+    distance: Metres  # straight-line distance from start to end
+    length: Metres  # length along the path
 
     @property
     def straight(self) -> float:
-        """Ratio of `distance` to `length`: 1 for a straight path, less for a curved path.
-
-        The value is 0 if `distance` is not greater than `MIN_TAPE_M`.
-        """
+        """Ratio of `distance` to `length`, or 0 if the distance is at most `MIN_TAPE_M`."""
         return self.distance / self.length if self.distance > MIN_TAPE_M else 0.0
 
 
+# Function that returns the `Extent` of a run for given multipliers.
 Follow = Callable[[Floats, int], Extent]
-"""Function that returns the `Extent` of a run for given multipliers.
-
-Its arguments are the multipliers, as in `Multipliers.values`, and the index of the run.
-"""
 
 
 def scaled(
     prior: Multipliers, tape: Tape, names: Sequence[str], follow: Follow, *, known: bool
 ) -> tuple[Multipliers, str]:
-    """Correct the multipliers with a distance that was measured by tape.
+    """Correct the multipliers with a distance by tape, and return them with the name of its run.
 
     The correction is the update step of a Kalman filter on the logarithms of the multipliers.
-
-    Args:
-        prior: the multipliers to correct.
-        tape: the distance that was measured.
-        names: the names of the runs.
-        follow: returns the `Extent` of a run for given multipliers.
-        known: whether positions have already shown the size of the wheels.
-
-    Returns:
-        A pair: the corrected multipliers, and the name of the run whose distance was measured.
-
-    Raises:
-        NoCalibrationError: the log has no such run, the run is too short or not straight enough,
-            or the distance contradicts the positions.
+    `known` says whether positions have already shown the size of the wheels. Raises
+    `NoCalibrationError` if the run is missing, too short or not straight, or contradicts the
+    positions.
     """
     if tape.run and tape.run not in names:
         raise NoCalibrationError(

@@ -1,13 +1,8 @@
 """Fits the noise settings of `[odometry]` to drives that the fit of the geometry did not use.
 
-Each drive is divided into windows of about half a minute. A residual is the difference between a
-measured heading or position and the heading or position that the wheels give for the same time.
-`Windows.search` finds the noise for which the residuals of all windows have the greatest
-likelihood. The comment above `Windows` has the equations.
-
-Some errors last for a whole turn of the robot, for example if the track changes with the turn rate.
-The residuals of a window are therefore several seconds apart, so that most turns fit between two
-residuals.
+A drive is divided into windows of half a minute. A residual is a measured heading or position minus
+that of the wheels. `Windows.search` maximizes the likelihood of all residuals. Those of a window
+are seconds apart, because some errors last for a whole turn.
 """
 
 from __future__ import annotations
@@ -29,138 +24,78 @@ from acsard.calibration.plausibility import RATIO, TRACK
 from acsard.calibration.positions import WheelPath, WheelSteps, path
 from acsard.calibration.runs import Complexes, Mask, Run, inside
 from acsard.core.config.settings import OdometryConfig
+from acsard.core.values import Metres
 
 
 class Source(IntEnum):
-    """Sources of random errors, as indices of an array with one number for each source.
+    """Sources of random errors; the last three are those of the sensors."""
 
-    The sources 0 to 5 belong to the robot, and the sources 6 to 8 belong to its sensors.
-    """
-
-    DISTANCE = 0
-    """Variance of the error of the distance, per metre driven, m2/m."""
+    DISTANCE = 0  # variance of the error of the distance, per metre driven, m2/m
+    # Variance of the error of the heading, per metre that the wheels roll (mean of both sides),
+    # rad2/m.
     YAW = 1
-    """Variance of the error of the heading, per metre that the wheels roll (mean of both sides),
-    rad2/m."""
-    SKID = 2
-    """Variance of the error of the heading, per radian that the robot turns, rad2/rad."""
+    SKID = 2  # variance of the error of the heading, per radian that the robot turns, rad2/rad
+    # Variance of the fraction of the distance that is lost to slip in a window.
     SLIP = 3
-    """Variance of the fraction of the distance that is lost because wheels slip.
-
-    The fraction is assumed to be constant in a window (half a minute) and to differ from window to
-    window.
-    """
+    # Relative variance of the ratio of right to left radius, from window to window.
     RATIO = 4
-    """Relative variance of the ratio of the right to the left wheel radius.
-
-    The ratio is assumed to be constant in a window (half a minute) and to differ from window to
-    window.
-    """
+    # Relative variance of the effective track, from window to window.
     TRACK = 5
-    """Relative variance of the effective track.
-
-    The track is assumed to be constant in a window (half a minute) and to differ from window to
-    window.
-    """
-    HEADING = 6
-    """Variance of a measured heading, rad2."""
-    DRIFT = 7
-    """Growth of the variance of the gyro's heading per second, rad2/s."""
-    PLACE = 8
-    """Variance of a measured coordinate, m2."""
+    HEADING = 6  # variance of a measured heading, rad2
+    DRIFT = 7  # growth of the variance of the gyro's heading per second, rad2/s
+    PLACE = 8  # variance of a measured coordinate, m2
 
 
 SOURCE_COUNT = len(Source)
 SENSOR_SOURCES = np.arange(SOURCE_COUNT) > Source.TRACK
 ROLLING_SOURCES = np.arange(SOURCE_COUNT) < Source.SLIP
+# Noise of each `Source` from which the search starts. The numbers only have to be positive.
 INITIAL_NOISE = np.array([1e-4, 1e-4, 1e-3, 1e-4, 1e-6, 1e-4, 1e-5, 1e-6, 1e-4])
-"""Noise of each `Source` from which the search starts. The numbers only have to be positive."""
 
+# Length of a window, or of a shorter drive, and time between the residuals in it.
 WINDOW_S, APART_S = 32.0, 4.0
-"""Length of the windows into which a drive is divided, and time between residuals in a window, s.
 
-A drive that is shorter than `WINDOW_S` has one window, which covers this drive.
-"""
-
+# Minimum number of intervals between the residuals of a window.
 MIN_INTERVALS = 4
-"""Minimum number of intervals between the residuals of a window.
 
-If the window is short, these intervals are shorter than `APART_S`.
-"""
-
+# Of more windows, only every n-th is used.
 MAX_WINDOWS = 80
-"""Maximum number of windows (half a minute of driving each) that are used.
 
-If a log has more windows, only every n-th window is used.
-"""
-
+# `SLIP`, `RATIO` and `TRACK` are the same in all steps of a window, other errors are independent.
 STEP_S = 0.5
-"""Duration of the steps into which a window is divided, s.
 
-The sources `SLIP`, `RATIO` and `TRACK` cause the same relative error in all steps of a window.
-Errors from other sources are independent from step to step.
-"""
-
+# Groups of drives that are left out in turn, which takes two searches each.
 MAX_FOLDS = 10
-"""Maximum number of groups into which the drives are divided for the cross-validation.
 
-Each group is left out once, which takes two searches for the noise.
-"""
-
+# Fewer suffice for a search that starts from the noise of the whole log.
 STEPS, FEWER_STEPS = 150, 60
-"""Number of iterations in a search for the noise.
 
-`FEWER_STEPS` suffices for a search that starts from the noise of the whole log.
-"""
-
+# If the mean square of a window's normalized residuals exceeds this limit, the window weighs less.
 OUTLIER_LIMIT = 9.0
-"""If the mean square of a window's normalized residuals exceeds this limit, the window weighs less.
-"""
 
+# Variance added to each residual, so that even a perfect sensor's covariance can be inverted.
 MIN_VARIANCE = 1e-12
-"""Variance added to each residual, so that even a perfect sensor's covariance can be inverted."""
 
+# The fit of a short log often finds 0, and the odometry would state that the pose is exact.
 MIN_NOISE_RATIO = 0.25
-"""Minimum for the noise of `DISTANCE`, `YAW` and `SKID`, in standard deviations of the estimate.
 
-In a short log, the fit often finds a noise of 0. Without the minimum, the odometry would then state
-that the pose is exact.
-"""
-
-# A window does not show whether an error lasts longer than the window. Without this minimum, the
-# pose covariance of one robot in eight was singular.
+# Of the noise of `SLIP`, `RATIO` and `TRACK`, because a window does not show what lasts longer.
+# Without it, the pose covariance of one robot in eight was singular.
 MIN_CHANGING_FRACTION = 0.1
-"""Minimum for the noise of `DISTANCE`, as a fraction of the noise of `SLIP`.
 
-In the same way, `RATIO` gives the minimum for `YAW`, and `TRACK` gives the minimum for `SKID`.
-`Windows.lasting` first converts the noise of one source to the unit of the other.
-"""
-
+# Mean loss of log likelihood per residual if each deviation is stated at twice its true value. A
+# larger gain is better even if its deviation is large.
 CERTAIN_GAIN = math.log(2.0) - 3 / 8
-"""Value of `LogNoise.log_likelihood_gain` above which the new noise always counts as better.
 
-The value is the mean loss of log likelihood per residual if each standard deviation is stated at
-twice its true value. Above this value, a large `LogNoise.gain_std` does not matter.
-"""
-
+# The largest value that the configuration accepts.
 MAX_SETTING = 1.0
-"""Largest value of a proposed setting. Larger values are reduced to this one.
 
-The configuration accepts this value.
-"""
-
-# A perfect simulated robot gave deviations of 1e-5 to 1e-25, and each deviation above 0 costs the
-# daemon a column of the covariance in each control period. A variance costs no column. The
-# multipliers are written with five decimals, so a smaller deviation is less than their rounding.
+# Each deviation above 0 costs the daemon a column of the covariance in each period. This is the
+# rounding of the multipliers; a perfect simulated robot gave 1e-5 to 1e-25.
 MIN_STD = 1e-5
-"""Smallest standard deviation that is proposed. Smaller ones are replaced by 0.0.
 
-The variances per metre and per radian have no such limit, because without them the odometry would
-state that the pose is exact.
-"""
-
+# Distance of driving, for which the report states the random errors of heading and distance.
 REPORT_DISTANCE_M = 10.0
-"""Distance of driving, m, for which the report states the random errors of heading and distance."""
 
 
 # The residuals of a window are modelled as normal with mean 0. Their covariance V is linear in the
@@ -179,28 +114,16 @@ REPORT_DISTANCE_M = 10.0
 class Windows(Struct, frozen=True):
     """The windows of a log (half a minute each), padded to the same number n of residuals."""
 
-    drive: npt.NDArray[np.int64]
-    """Index of the drive of each window."""
-    size: Floats
-    """Number of residuals of each window, without the padding."""
-    residual: Floats
-    """Residuals after the unknown start pose was projected out, shape (windows, n)."""
+    drive: npt.NDArray[np.int64]  # index of the drive of each window
+    size: Floats  # number of residuals of each window, without the padding
+    residual: Floats  # residuals after the unknown start pose was projected out, shape (windows, n)
+    # Covariance that a noise of 1 of each source causes, shape (windows, SOURCE_COUNT, n, n).
     effects: Floats
-    """Covariance of the residuals that each source alone causes if its noise is 1.
-
-    The shape is (windows, SOURCE_COUNT, n, n).
-    """
+    # Covariance due to the uncertain geometry and gyro bias, shape (windows, n, n).
     known: Floats
-    """Covariance of the residuals due to the uncertain geometry and the uncertain gyro bias.
-
-    The shape is (windows, n, n).
-    """
+    # Noise with the same effect in a window of average motion: `SLIP` to `DISTANCE` (m), `RATIO` to
+    # `YAW` (1/m) and `TRACK` to `SKID` (rad).
     lasting: Floats
-    """Factors that convert the noise of one source to an equivalent noise of another source.
-
-    The three factors convert `SLIP` to `DISTANCE` (m), `RATIO` to `YAW` (1/m) and `TRACK` to
-    `SKID` (rad). Noises are equivalent if they have the same effect in a window of average motion.
-    """
 
     def of(self, chosen: Mask | npt.NDArray[np.int64]) -> Windows:
         return Windows(
@@ -209,18 +132,11 @@ class Windows(Struct, frozen=True):
         )  # fmt: skip
 
     def covariance(self, noise: Floats) -> Floats:
-        """Return the covariance of the residuals, shape (windows, n, n).
-
-        `noise` contains a number for each `Source`.
-        """
+        """Return the covariance of the residuals, shape (windows, n, n)."""
         return np.asarray(np.tensordot(self.effects, noise, (1, 0)) + self.known)
 
     def search(self, start: Floats, free: Mask, steps: int = STEPS) -> Floats:
-        """Return the noise for which the residuals have the greatest likelihood.
-
-        The search starts from the noise `start` and takes `steps` steps. Sources outside the mask
-        `free` keep the noise that they have in `start`.
-        """
+        """Return the noise of the greatest likelihood; sources outside the mask `free` stay."""
         noise, flat = start.copy(), np.moveaxis(self.effects, 1, 0).reshape(SOURCE_COUNT, -1)
         for _ in range(steps):
             inverse = np.linalg.inv(self.covariance(noise))
@@ -234,12 +150,7 @@ class Windows(Struct, frozen=True):
         return noise
 
     def at_least(self, noise: Floats) -> Floats:
-        """Return `noise`, increased so that it is not too small for other drives.
-
-        Only the noise of `DISTANCE`, `YAW` and `SKID` is increased. It is first multiplied by
-        `student_factor()`, which is large if few residuals show this noise. It is then raised to
-        the minimum that `MIN_NOISE_RATIO` and `MIN_CHANGING_FRACTION` define.
-        """
+        """Return `noise`, increased where few residuals may make it too small."""
         # Windows overlap by half, so each residual counts as half a degree of freedom.
         shares = np.linalg.inv(self.covariance(noise))[:, None] @ self.effects
         free = noise * np.einsum("wkii->k", shares) / 2
@@ -256,10 +167,7 @@ class Windows(Struct, frozen=True):
         return np.asarray(np.maximum(noise, least))
 
     def likelihood(self, noise: Floats) -> Floats:
-        """Return the log likelihood of the residuals of each window, up to a constant.
-
-        `noise` contains a number for each `Source`.
-        """
+        """Return the log likelihood of the residuals of each window, up to a constant."""
         covariance = self.covariance(noise)
         solved = np.linalg.solve(covariance, self.residual[:, :, None])[:, :, 0]
         squares = np.einsum("wi,wi->w", solved, self.residual)
@@ -270,23 +178,16 @@ class Windows(Struct, frozen=True):
 class LogNoise(Struct, frozen=True):
     """The noise of the odometry in a log, compared with the configured noise."""
 
-    found: Floats
-    """The noise that the log shows, a number for each `Source`."""
-    present: Floats
-    """The configured noise of the robot, a number for each `Source`."""
+    found: Floats  # the noise that the log shows, a number for each `Source`
+    present: Floats  # the configured noise of the robot, a number for each `Source`
+    # Log likelihood per residual with the found noise, minus that with the configured noise.
     log_likelihood_gain: float
-    """Log likelihood per residual with the found noise, minus that with the configured noise.
-
-    The two likelihoods are computed on drives that the fit did not use.
-    """
+    # Standard deviation of `log_likelihood_gain`, from the differences between drives.
     gain_std: float
-    """Standard deviation of `log_likelihood_gain`, from the differences between drives."""
+    # Whether the log has positions. Only positions show the noise of the distance.
     places: bool
-    """Whether the log has positions. Only positions show the noise of the distance."""
-    turning: float
-    """Total turned angle per metre driven in this log, rad/m."""
-    track: float
-    """Effective track, m."""
+    turning: float  # total turned angle per metre driven in this log, rad/m
+    track: Metres  # effective track
 
     @property
     def better(self) -> bool:
@@ -294,17 +195,11 @@ class LogNoise(Struct, frozen=True):
         return self.log_likelihood_gain > min(SURE_DEVIATIONS * self.gain_std, CERTAIN_GAIN)
 
     def heading(self) -> tuple[float, float]:
-        """Return the standard deviation of the heading after `REPORT_DISTANCE_M` m, rad, as a pair.
-
-        The first number is due to the configured noise, the second number to the found noise.
-        """
+        """Return the deviation of the heading after `REPORT_DISTANCE_M`, rad: configured, found."""
         return self._after(Source.YAW, Source.RATIO, Source.SKID)
 
     def distance(self) -> tuple[float, float]:
-        """Return the standard deviation of the distance after `REPORT_DISTANCE_M` m, m, as a pair.
-
-        The first number is due to the configured noise, the second number to the found noise.
-        """
+        """Return the deviation of the distance after `REPORT_DISTANCE_M`, m: configured, found."""
         return self._after(Source.DISTANCE, Source.SLIP, None)
 
     def _after(self, rate: Source, lasting: Source, skid: Source | None) -> tuple[float, float]:
@@ -325,14 +220,8 @@ def settings(
 ) -> dict[str, float]:  # fmt: skip
     """Return the new values for settings of `[odometry]`, by the name of the setting.
 
-    Args:
-        known: the standard deviations of the new geometry.
-        track: the new multiplier of the wheel separation.
-        fixed: the names of the quantities that stay as configured. The possible names are
-            `plausibility.TRACK` and `plausibility.RATIO`.
-        odometry: the configured settings.
-        log_noise: the noise that the log shows, or None if the noise settings stay as configured.
-        scaled: whether the size of the wheels was measured.
+    `fixed` names the quantities that stay as configured: `plausibility.TRACK` and `RATIO`. `scaled`
+    says whether the size of the wheels was measured.
     """
     values, x = {}, np.zeros(SOURCE_COUNT) if log_noise is None else log_noise.found
     if TRACK not in fixed or log_noise is not None:
@@ -362,32 +251,18 @@ class Reference(Struct, frozen=True):
     """The sensors of a log, and the parameters that were fitted to the whole log."""
 
     runs: Sequence[Run]
-    headings: Headings | None
-    """The headings that a sensor measured, or None if the log has none."""
-    places: bool
-    """Whether the log has positions."""
+    headings: Headings | None  # the headings that a sensor measured, or None if the log has none
+    places: bool  # whether the log has positions
     steps: Sequence[WheelSteps]
     base: Base
+    # Fitted to the whole log; those from `Parameter.DELAY` on describe the sensors.
     parameters: Floats
-    """The fitted parameters.
-
-    Those with an index of at least `Parameter.DELAY` describe the sensors.
-    """
 
 
 def noise(
     folds: Sequence[Fold], sensors: Reference, known: Deviations, odometry: OdometryConfig
 ) -> LogNoise | None:
-    """Return the noise that a log shows, compared with the configured noise.
-
-    Return None if fewer than two drives have residuals.
-
-    Args:
-        folds: the drives, each with parameters that were fitted without this drive.
-        sensors: the sensors of the log.
-        known: the standard deviations of the fitted track and wheel radii.
-        odometry: the configured settings.
-    """
+    """Return the noise that a log shows, or None if fewer than two drives have residuals."""
     numbered = [
         (at, window) for at, fold in enumerate(folds) for window in _of_drive(fold, sensors)
     ]
@@ -424,14 +299,10 @@ def noise(
 
 
 class _Motion(Struct, frozen=True):
-    middle: Floats
-    """Times in the middle of the steps, s."""
-    distance: Floats
-    """Distance of each step, m."""
-    turn: Floats
-    """Turn of each step, rad."""
-    track: float
-    """Effective track, m."""
+    middle: Floats  # times in the middle of the steps, s
+    distance: Floats  # distance of each step, m
+    turn: Floats  # turn of each step, rad
+    track: Metres  # effective track
 
     @property
     def metres(self) -> float:
@@ -452,30 +323,24 @@ class _Motion(Struct, frozen=True):
 
 
 class _Window(Struct, frozen=True):
-    """The residuals of a window (half a minute of a drive), and the effects of errors on them."""
-
     residual: Floats
+    # Derivatives of the residuals with respect to the start pose, shape (residuals, unknowns).
     start: Floats
-    """Derivatives of the residuals with respect to the start pose, shape (residuals, unknowns)."""
     motion: _Motion
+    # Change of each residual per m of error in a step's distance, shape (residuals, steps).
     along: Floats
-    """Change of each residual per m of error in a step's distance, shape (residuals, steps)."""
+    # Change of each residual per rad of error in a step's turn, shape (residuals, steps).
     yaw: Floats
-    """Change of each residual per rad of error in a step's turn, shape (residuals, steps)."""
+    # Maps each source of sensor noise to the covariance of the residuals if this noise is 1.
     sensor: dict[Source, Floats]
-    """Maps each source of sensor noise to the covariance of the residuals if this noise is 1."""
+    # Covariance of the residuals due to the uncertain bias of the gyro; 0 without a gyro.
     bias: Floats | float = 0.0
-    """Covariance of the residuals due to the uncertain bias of the gyro; 0 without a gyro."""
 
     def projected(self, known: Deviations) -> tuple[Floats, Floats, Floats]:
-        """Return the residuals and their covariances, independent of the unknown start pose.
+        """Return the residuals and their covariances after projecting out the unknown start pose.
 
-        The effect of the start pose is projected out of these three results:
-
-        - the residuals
-        - for each `Source`, the covariance of the residuals if the noise of this source is 1
-        - the covariance of the residuals due to the uncertain geometry (`known`) and the uncertain
-          bias of the gyro
+        The covariances are those of each `Source` with a noise of 1, and that of the uncertain
+        geometry (`known`) and gyro bias.
         """
         distance, turn, track = self.motion.distance, self.motion.turn, self.motion.track
         sides = np.maximum(np.abs(distance), track / 2 * np.abs(turn))
@@ -499,10 +364,6 @@ class _Window(Struct, frozen=True):
 
 
 def _padded(numbered: Sequence[tuple[int, _Window]], known: Deviations) -> Windows:
-    """Return at most `MAX_WINDOWS` of the windows, padded to the same number of residuals.
-
-    `numbered` contains each window with the index of its drive.
-    """
     motions = [window.motion for _, window in numbered]
     metres, turned = np.mean([(motion.metres, motion.turned) for motion in motions], axis=0)
     lasting = np.array([metres, metres / motions[0].track ** 2, turned])
@@ -544,7 +405,6 @@ def _of_drive(fold: Fold, sensors: Reference) -> Iterator[_Window]:
 
 
 def _times(begin: float, end: float) -> Iterator[Floats]:
-    """Yield the times of the residuals of each window. Neighboring windows overlap by half."""
     whole = min(end - begin, WINDOW_S)
     if whole > 0.0:
         count = max(1, round(2 * (end - begin) / WINDOW_S) - 1)
@@ -555,10 +415,6 @@ def _times(begin: float, end: float) -> Iterator[Floats]:
 def _by_headings(
     t: Floats, at: Floats, heading: Heading, way: WheelPath, track: float, headings: Headings
 ) -> _Window:
-    """Return a window whose residuals are measured headings minus headings from the wheels.
-
-    `t` are times on the wheels' clock, and `at` the same moments on the sensor's clock.
-    """
     motion, since, parameters = _Motion.of(t, way, track), t - t[0], way.parameters
     turned = np.interp(at, heading.t, heading.angle) - parameters[Parameter.BIAS_ERROR] * since
     residual = turned / (1 + parameters[Parameter.SCALE_ERROR]) - np.interp(t, way.t, way.heading)
@@ -575,13 +431,6 @@ def _by_headings(
 def _by_places(
     t: Floats, at: Floats, place: Complexes, way: WheelPath, track: float
 ) -> Iterator[_Window]:
-    """Yield a window of position residuals: measured position minus the path of the robot.
-
-    The path is first shifted and rotated so that it fits the positions best. Each position belongs
-    to the nearest of the times `t`. The residual at a time is the median of the differences of its
-    positions. If a time has no position, nothing is yielded. `place` contains the positions (x +
-    iy, m), and `at` their times, s. `t` and `at` are times on the clock of the positions.
-    """
     group, delay_s = np.searchsorted((t[1:] + t[:-1]) / 2, at), way.parameters[Parameter.DELAY]
     numbers = range(len(t))
     if np.bincount(group, minlength=len(t)).min() == 0:

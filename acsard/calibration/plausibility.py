@@ -18,94 +18,65 @@ from acsard.calibration.log_table import Floats, NoCalibrationError
 from acsard.calibration.positions import StartingPoint
 from acsard.calibration.runs import Block
 
+# Minimum total turn of the robot in a log, rad. Left turns and right turns are added.
 MIN_TOTAL_TURN = 2 * np.pi
-"""Minimum total turn of the robot in a log, rad. Left turns and right turns are added."""
 
+# Least sum, rad, of the mean angles of both sides, and of half of their differences.
 MIN_ROLL = 3.0
-"""Minimum angle that the wheels must roll in a log, rad.
 
-The limit applies to two angles: the mean of the left and the right angle, and half of their
-difference. Each of the two is the sum of the absolute values in all intervals of the log.
-"""
-
+# With a larger squared correlation of mean and difference, all motion is the same curve.
 MAX_CORRELATION = 0.98
-"""Largest squared correlation between the mean and the difference of left and right motion.
 
-If it is larger, the robot drives the same curve all the time, and the log is refused.
-"""
-
+# Names of the two quantities that some logs do not determine accurately enough.
 TRACK, RATIO = "the effective track", "the ratio of the right to the left wheel radius"
-"""Names of the two quantities that some logs do not determine accurately enough."""
 
+# Largest accepted relative standard deviation of each quantity.
 MAX_LOG_STDS = {TRACK: 0.2, RATIO: 0.03}
-"""Largest accepted relative standard deviation of each quantity."""
 
+# Largest condition number of the normal equations at which radii and track can be separated.
 MAX_CONDITION = 1e4
-"""Largest condition number of the normal equations at which radii and track can be separated."""
 
 DRIVE_ADVICE = (
     "record a drive of 60 s: stand for 3 s, drive 2 m straight ahead and back, make three full "
     "turns to the left and three to the right, some slow and some fast, then drive curves both ways"
 )
 
+# Largest fraction of a sensor's motion (sum of squares) that the wheels may leave unexplained.
 MAX_CONTRADICTION = 0.5
-"""Largest fraction of a sensor's motion (sum of squares) that the wheels may leave unexplained."""
 
+# Largest credible ratio of a measured value to a configured one. Above it, a unit is wrong.
 WRONG_UNIT_RATIO = 8.0
-"""Largest credible ratio of a measured value to a configured one. Above it, a unit is wrong."""
 
+# Skidding does not explain a smaller ratio of measured to predicted turn: speeds in rpm do.
 MIN_TURN_RATIO = 0.2
-"""Smallest credible ratio of the measured turn to the turn that the configured wheels predict.
 
-Skidding does not explain a smaller ratio. The wheel speeds are then probably in rpm.
-"""
-
+# Of measured to configured radius: below, the unit of the positions is wrong; up to 1 /
+# `WRONG_UNIT_RATIO`, that of the wheel speeds.
 WRONG_POSITION_UNIT_RATIO = 2e-3
-"""Limit for the ratio of the measured wheel radius to the configured wheel radius.
 
-Below `WRONG_POSITION_UNIT_RATIO`, the positions have a wrong unit. From `WRONG_POSITION_UNIT_RATIO`
-to 1 / `WRONG_UNIT_RATIO`, the wheel speeds have a wrong unit.
-"""
-
+# Two turns in a second, rad/s. A larger value is probably in deg/s.
 MAX_TURN_RATE = 12.0
-"""Largest credible turn rate of a heading sensor, rad/s (two turns in a second).
 
-A larger value is probably in deg/s.
-"""
-
+# Smallest credible ratio of effective track to wheel separation. Skidding only makes it larger.
 MIN_TRACK_RATIO = 0.4
-"""Smallest credible ratio of effective track to wheel separation. Skidding only makes it larger."""
 
-LEAST_FACTOR, MOST_FACTOR = 0.1, 10.0
-"""Range of multipliers that the configuration accepts."""
+LEAST_FACTOR, MOST_FACTOR = 0.1, 10.0  # range of multipliers that the configuration accepts
 
 NOTABLE_S, FAR_S = 0.005, 0.5
-"""Limits for the delay of a sensor, s.
 
-From `NOTABLE_S` on, a remark states the delay. Above `FAR_S`, the remark also advises to
-synchronize the clocks.
-"""
+LARGE_BIAS = 0.05  # gyro bias, rad/s, above which the bias is reported
 
-LARGE_BIAS = 0.05
-"""Gyro bias, rad/s, above which the bias is reported."""
-
+# Below this fraction of turns to the rarer side, a remark says so.
 ONE_SIDED_RATIO = 0.1
-"""Limit for the turns to the rarer side, as a fraction of the turns to the more frequent side.
 
-Below this limit, a remark says that nearly all turns are to one side.
-"""
-
+# If measured and configured wheel radius differ by more than this factor, a remark says so.
 REPORTED_SIZE_RATIO = 1.25
-"""If measured and configured wheel radius differ by more than this factor, a remark says so."""
 
+# If left and right wheel radius differ by more than this factor, a remark says so.
 REPORTED_RADIUS_RATIO = 1.1
-"""If left and right wheel radius differ by more than this factor, a remark says so."""
 
+# Effective track / wheel separation. A remark states any other ratio.
 LEAST_TRACK, MOST_TRACK = 0.85, 3.0
-"""Usual range of the ratio of effective track to wheel separation.
-
-A remark states any other ratio.
-"""
 
 
 def drives_enough(parts: Sequence[Block]) -> None:
@@ -118,23 +89,18 @@ def drives_enough(parts: Sequence[Block]) -> None:
 
 
 def turns_in_place(rows: Rows) -> bool:
-    """Return whether the log has only turns in place.
+    """Return whether the wheels roll ahead or back by less than `MIN_ROLL` in total.
 
-    The wheels may roll ahead and back by less than `MIN_ROLL` in total. Such a log does not show
-    the ratio of the right to the left wheel radius.
+    Such a log does not show the ratio of the wheel radii.
     """
     return float(np.abs(rows.right + rows.left).sum()) / 2 < MIN_ROLL
 
 
 def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
-    """Raise `NoCalibrationError` if the log lacks a movement of the wheels that the fit needs.
+    """Raise `NoCalibrationError` if the log lacks driving ahead, turns, or a change between them.
 
-    The fit needs driving ahead or back, which is the mean of the left and the right wheel angle. It
-    also needs turns, which are half of the difference of these angles. Each of the two must add up
-    to `MIN_ROLL` over all intervals of `rows`. They must not be proportional to each other
-    (`MAX_CORRELATION`), because the robot then always drives the same curve.
-
-    If `spins` is true, a log with only turns in place is permitted too.
+    A robot that always drives the same curve does not separate them (`MAX_CORRELATION`). `spins`
+    permits a log with only turns in place.
     """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
     in_place = spins and turns_in_place(rows)
@@ -156,10 +122,7 @@ def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
 
 
 def turns_enough(turned: Floats) -> None:
-    """Raise `NoCalibrationError` if the robot hardly turns.
-
-    `turned` contains the robot's turn in each interval of the log, rad.
-    """
+    """Raise `NoCalibrationError` if the robot hardly turns."""
     if (angle := float(np.abs(turned).sum())) < MIN_TOTAL_TURN:
         raise NoCalibrationError(
             f"the robot turned by {np.degrees(angle):.0f} deg in total, which is too little to "
@@ -170,21 +133,14 @@ def turns_enough(turned: Floats) -> None:
 def too_inaccurate(
     deviations: Mapping[str, float], accepted: Mapping[str, float]
 ) -> dict[str, float]:
-    """Return the items of `deviations` that exceed the accepted values or are NaN.
-
-    Both arguments map `TRACK` and `RATIO` to relative standard deviations. That of the track is the
-    deviation of the mean track. The track of a single turn varies more.
-    """
+    """Return the items of `deviations` that exceed the accepted values or are NaN."""
     return {name: std for name, std in deviations.items() if not std <= accepted[name]}
 
 
 def inaccuracy(deviations: Mapping[str, float], accepted: Mapping[str, float]) -> str:
     """Return the text of the error for a log that determines `TRACK` or `RATIO` too inaccurately.
 
-    Args:
-        deviations: the relative standard deviations of the quantities that are too inaccurate, by
-            name. A deviation is inf or NaN if the log does not determine the quantity at all.
-        accepted: the largest accepted relative standard deviations of `TRACK` and of `RATIO`.
+    A deviation is inf or NaN if the log does not determine the quantity at all.
     """
     reasons = [
         f"the standard deviation of {name} is {deviation:.1%}, but at most "
@@ -202,10 +158,7 @@ def separates_track(fitted: Fit) -> bool:
 
 
 def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
-    """Raise `NoCalibrationError` if the wheels and the heading sensor show very different turns.
-
-    `source` is the name of the sensor. `sides` is the result of `heading.side_factors()`.
-    """
+    """Raise `NoCalibrationError` if the wheels and the heading sensor show very different turns."""
     spread = float(rows.turned @ rows.turned)
     off = rows.turned - heading.by_sides(rows, base, sides)
     if not spread or float(off @ off) > MAX_CONTRADICTION * spread:
@@ -218,10 +171,7 @@ def heading_follows(source: str, rows: Rows, base: Base, sides: Floats) -> None:
 
 
 def positions_follow(starting_point: StartingPoint) -> None:
-    """Raise `NoCalibrationError` if the positions do not follow the path computed from the wheels.
-
-    `starting_point` is the result of `positions.search()`.
-    """
+    """Raise `NoCalibrationError` if the positions do not follow the path of the wheels."""
     if starting_point.unexplained > MAX_CONTRADICTION:
         raise NoCalibrationError(
             "the positions do not match the motion of the wheels: check that x is ahead and y to "
@@ -233,14 +183,10 @@ def positions_follow(starting_point: StartingPoint) -> None:
 def turns_the_right_way(
     source: str, sides: Floats | None, starting_point: StartingPoint | None
 ) -> None:
-    """Raise `NoCalibrationError` if wheels and sensors show turns in opposite directions.
+    """Raise `NoCalibrationError`, which names the wrong sign, if turns have opposite directions.
 
-    The text of the error names the sign that is wrong.
-
-    Args:
-        source: the name of the heading sensor; "" without a heading sensor.
-        sides: the result of `heading.side_factors()`, or None without a heading sensor.
-        starting_point: the result of `positions.search()`, or None without positions.
+    `source` is "" and `sides` is None without a heading sensor; `starting_point` is None without
+    positions.
     """
     by_places = by_heading = ""
     if starting_point is not None:
@@ -289,10 +235,7 @@ def _wrong_sign(sides: Floats) -> str:
 
 
 def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
-    """Raise `NoCalibrationError` if the heading sensor shows far smaller turns than the wheels.
-
-    `source` is the name of the sensor. `MIN_TURN_RATIO` is the limit for the ratio of the turns.
-    """
+    """Raise `NoCalibrationError` if the heading sensor shows far smaller turns than the wheels."""
     angle = float(np.abs(rows.turned).sum())
     by_wheels = float(np.abs(heading.by_sides(rows, base, np.ones(2))).sum())
     if angle < MIN_TURN_RATIO * by_wheels:
@@ -308,8 +251,7 @@ def turns_like_the_wheels(source: str, rows: Rows, base: Base) -> None:
 def turn_rates(source: str, rows: Rows) -> None:
     """Raise `NoCalibrationError` if the heading sensor seems to report its turns in degrees.
 
-    The turns are then too fast for a robot. This check does not use the wheel speeds, because they
-    may be in degrees as well.
+    The wheel speeds are not used, because they may be in degrees as well.
     """
     rate = float(np.percentile(np.abs(rows.turned) / rows.seconds, 90))
     if rate > MAX_TURN_RATE:
@@ -323,12 +265,8 @@ def turn_rates(source: str, rows: Rows) -> None:
 def turn_units(source: str, turn: float, turn_without_multipliers: float, base: Base) -> None:
     """Raise `NoCalibrationError` if the turns of sensor and wheels show that a unit is wrong.
 
-    Args:
-        source: the name of the heading sensor, or "" if positions show the turns.
-        turn: the ratio of the measured turn to the turn that the configured multipliers predict.
-        turn_without_multipliers: the ratio of the measured turn to the turn that multipliers of 1
-            predict.
-        base: the configured geometry.
+    `turn` is measured / predicted turn with the configured multipliers, `turn_without_multipliers`
+    with multipliers of 1. `source` is "" if positions show the turns.
     """
     if MIN_TURN_RATIO < turn < WRONG_UNIT_RATIO and turn_without_multipliers < 1 / MIN_TRACK_RATIO:
         return
@@ -347,10 +285,7 @@ def turn_units(source: str, turn: float, turn_without_multipliers: float, base: 
 
 
 def distance_units(size: float, base: Base) -> None:
-    """Raise `NoCalibrationError` if the measured size of the wheels shows that a unit is wrong.
-
-    `size` is the ratio of the measured to the configured wheel radius.
-    """
+    """Raise `NoCalibrationError` if measured / configured wheel radius shows a wrong unit."""
     if 1 / WRONG_UNIT_RATIO < size < WRONG_UNIT_RATIO:
         return
     may = (
@@ -390,16 +325,7 @@ def remarks(
     *,
     sized: bool,
 ) -> Iterator[str]:
-    """Yield a sentence for each unusual fact that the calibration corrects or tolerates.
-
-    Args:
-        delays: the delay of each sensor's times relative to those of the wheels, s.
-        bias: the gyro bias, rad/s.
-        turned: the turn in each interval of the log, rad, positive to the left.
-        values: the multipliers, as in `Multipliers.values`.
-        base: the configured geometry.
-        sized: whether the size of the wheels was measured.
-    """
+    """Yield a sentence for each unusual fact that the calibration corrects or tolerates."""
     for source, seconds in delays.items():
         if abs(seconds) >= NOTABLE_S:
             word = "later" if seconds > 0 else "earlier"

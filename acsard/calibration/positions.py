@@ -1,11 +1,8 @@
 """Compares the robot's path, computed from the wheels, with measured positions from any source.
 
-The path of each block (a few seconds) is first shifted and rotated so that it fits the positions
-best. The comparison therefore needs neither the start pose nor the frame or the yaw of the
-positions. The remaining differences are the evidence for the fit. Places are complex numbers x + iy
-in m.
-
-The fit must start from a track that is nearly right. `search` finds such starting parameters.
+The path of each block is first shifted and rotated so that it fits the positions best. So neither
+the start pose nor the frame of the positions matters. The fit must start from a track that is
+nearly right, which `search` finds. Places are complex numbers x + iy in m.
 """
 
 from __future__ import annotations
@@ -22,31 +19,20 @@ from acsard.calibration.fit import PARAMETER_COUNT, RADII, Base, Evidence, Param
 from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Block, Complexes, Run, cumulative
 
+# Least number of positions in a segment.
 MIN_POINTS = 5
-"""Minimum number of positions in a segment.
 
-The path of the wheels is aligned with each segment. The alignment has three unknowns (x, y, angle).
-"""
-
+# Time step for integrating the path. Finer steps cost time and add no accuracy.
 STEP_S = 0.02
-"""Time step for integrating the path, s. Finer steps cost time and add no accuracy."""
 
 JUMP, JUMP_M = 6.0, 0.05
-"""Limits above which the distance between two successive positions is a jump.
 
-The distance may exceed the distance that the wheels rolled by `JUMP_M` m plus `JUMP` standard
-deviations of this excess. At a jump, the source of the positions was wrong, or it corrected itself.
-"""
-
+# Half of the interval from which the speed of the position sensor is computed.
 SPEED_HALF_INTERVAL_S = 0.05
-"""Half of the interval from which the speed of the position sensor is computed, s."""
 
 
 def extent(places: Complexes) -> float:
-    """Return how far apart some places are, m.
-
-    The result is the width plus the height of the bounding box of `places` (x + iy, m).
-    """
+    """Return the width plus the height of the bounding box of some places, m."""
     return float(np.ptp(places.real) + np.ptp(places.imag))
 
 
@@ -55,57 +41,37 @@ class Segment(Struct, frozen=True):
 
     block: int
     run: int
-    t: Floats
-    """Times of the positions, s."""
-    place: Complexes
-    """Positions x + iy, m."""
+    t: Floats  # times of the positions, s
+    place: Complexes  # positions x + iy, m
 
 
 class WheelSteps(Struct, frozen=True):
-    """The angles by which the wheels rolled in a run, step by step.
+    """The angles by which the wheels rolled in a run, step by step."""
 
-    The path of the robot is computed from these steps.
-    """
-
+    # Times at which the steps begin and end, s. There is one more time than there are steps.
     t: Floats
-    """Times at which the steps begin and end, s. There is one more time than there are steps."""
-    left: Floats
-    """Angle that the left wheels roll in each step, rad."""
-    right: Floats
-    """Angle that the right wheels roll in each step, rad."""
+    left: Floats  # angle that the left wheels roll in each step, rad
+    right: Floats  # angle that the right wheels roll in each step, rad
+    # Integral of |w| w over each step, rad2/s, with w the speed of right minus left wheels.
     signed_square_integral: Floats
-    """Integral of |w| w over each step, rad2/s.
-
-    w is the speed of the right wheels minus the speed of the left wheels, rad/s.
-    """
 
 
 class WheelPath(Struct, frozen=True):
-    """The path of the robot in a run, computed from the wheels.
+    """The path of the robot in a run, computed from the wheels, linear between the times `t`."""
 
-    It is interpolated linearly between the times `t`.
-    """
-
-    parameters: Floats
-    """Parameters with which the path was computed, shape (PARAMETER_COUNT,)."""
-    t: Floats
-    """Times of the points of the path, s."""
-    place: Complexes
-    """Place x + iy of the robot at the times `t`, m."""
-    heading: Floats
-    """Heading of the robot at the times `t`, rad."""
+    parameters: Floats  # parameters with which the path was computed, shape (PARAMETER_COUNT,)
+    t: Floats  # times of the points of the path, s
+    place: Complexes  # place x + iy of the robot at the times `t`, m
+    heading: Floats  # heading of the robot at the times `t`, rad
+    # Derivatives of `place` with respect to the radii, the inverse track and the track growth.
     derivatives: dict[Parameter, Complexes]
-    """Derivatives of `place` with respect to the radii, the inverse track and the track growth."""
+    # Derivatives of `heading` with respect to the radii, the inverse track and the track growth.
     heading_derivatives: dict[Parameter, Floats]
-    """Derivatives of `heading` with respect to the radii, the inverse track and the track growth.
-    """
 
     def at(self, t: Floats) -> tuple[Complexes, Complexes]:
-        """Return the places of the position sensor at the times `t`, m, and their derivatives.
+        """Return the places of the position sensor at recorded times `t`, and their derivatives.
 
-        `t` contains recorded times of positions, s. The delay `Parameter.DELAY` is subtracted from
-        them. The derivatives are with respect to the parameters, and have the shape (times,
-        PARAMETER_COUNT).
+        The derivatives are with respect to the parameters, shape (times, PARAMETER_COUNT).
         """
         t = t - self.parameters[Parameter.DELAY]
         derivatives = np.zeros((len(t), PARAMETER_COUNT), dtype=np.complex128)
@@ -126,7 +92,6 @@ class WheelPath(Struct, frozen=True):
         return complex(self.parameters[Parameter.SENSOR_X], self.parameters[Parameter.SENSOR_Y])
 
     def _sensor(self, t: Floats) -> tuple[Complexes, Complexes]:
-        """Return the places of the sensor, x + iy, m, and the headings as unit complex numbers."""
         ahead = np.exp(1j * np.interp(t, self.t, self.heading))
         return np.interp(t, self.t, self.place) + self._mounting * ahead, ahead
 
@@ -149,10 +114,7 @@ def segments(driven: Sequence[Run], parts: Sequence[Block]) -> list[Segment]:
 
 
 def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """Return the index of the first position after each jump of the positions.
-
-    `JUMP` and `JUMP_M` define a jump.
-    """
+    """Return the index of the first position after each jump of the positions."""
     steps = np.abs(np.diff(run.place))
     if len(steps) < MIN_POINTS:
         return np.zeros(0, dtype=np.int64)
@@ -166,10 +128,7 @@ def jumps(run: Run) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
 
 
 def wheel_steps(run: Run, fine_s: float = STEP_S) -> WheelSteps:
-    """Return the angles by which the wheels rolled in steps of about `fine_s` s.
-
-    If the samples of the wheels are further apart, a step is the interval between two samples.
-    """
+    """Return the angles by which the wheels rolled in steps of `fine_s` s, or longer."""
     usual = float(np.median(np.diff(run.t)))
     every = max(1, int(fine_s / usual))
     indices = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
@@ -179,10 +138,7 @@ def wheel_steps(run: Run, fine_s: float = STEP_S) -> WheelSteps:
 
 
 def path(steps: WheelSteps, base: Base, parameters: Floats) -> WheelPath:
-    """Return the path of the robot from the origin with heading 0, computed from the wheels.
-
-    Each step is an exact arc.
-    """
+    """Return the path of the robot from the origin with heading 0, in exact arcs."""
     left, right, turn, growth = parameters[: Parameter.DELAY]
     gain = base.radius_per_separation * turn
     mean = gain * (left + right) / 2
@@ -226,41 +182,28 @@ def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
 
 
 def _directions(turns: Floats) -> tuple[Floats, Complexes]:
-    """Return the headings before and after the steps, and the chord of each step.
-
-    A chord is a complex number x + iy, for a step whose arc has the length 1.
-    """
     heading = cumulative(turns)
     return heading, np.exp(1j * (heading[:-1] + turns / 2)) * np.sinc(turns / (2 * np.pi))
 
 
+# Path of the robot according to the wheels in each run, by the index of the run.
 Paths = Sequence[WheelPath] | Mapping[int, WheelPath]
-"""Path of the robot according to the wheels in each run, by the index of the run."""
 
 
 class Aligned(Struct, frozen=True):
-    """The positions of a segment, compared with the path that was computed from the wheels.
-
-    The path was shifted and rotated so that it fits the positions best.
-    """
+    """The positions of a segment, compared with the path that fits them best."""
 
     block: int
+    # Position minus aligned path, m, times the square root of the position's weight.
     residual: Complexes
-    """Position minus aligned path, m, times the square root of the position's weight."""
+    # Derivatives of the aligned path, times the same root, shape (positions, PARAMETER_COUNT).
     derivatives: Complexes
-    """Derivatives of the aligned path with respect to the parameters, shape (positions,
-    PARAMETER_COUNT).
-
-    They are multiplied by the square root of the position's weight. They include the effect of
-    the parameters on the shift and the rotation that align the path.
-    """
 
 
 def aligned(segments: Sequence[Segment], paths: Paths) -> Iterator[Aligned]:
-    """Yield the positions of each segment, compared with the path computed from the wheels.
+    """Yield the positions of each segment, compared with the path that fits them best.
 
-    The path is first shifted and rotated so that it fits the positions best. Outliers have smaller
-    weights.
+    The path is shifted and rotated. Outliers have smaller weights.
     """
     for segment in segments:
         place, derivatives = paths[segment.run].at(segment.t)
@@ -283,10 +226,7 @@ def aligned(segments: Sequence[Segment], paths: Paths) -> Iterator[Aligned]:
 
 
 def evidence(segments: Sequence[Segment], paths: Paths, blocks: int) -> Evidence:
-    """Return the evidence of the positions: their contribution to the normal equations of the fit.
-
-    `blocks` is the number of blocks (a few seconds of driving each).
-    """
+    """Return the evidence of the positions, which is their part of the normal equations."""
     normal, score = (
         np.zeros((blocks, PARAMETER_COUNT, PARAMETER_COUNT)),
         np.zeros((blocks, PARAMETER_COUNT)),
@@ -303,11 +243,7 @@ def evidence(segments: Sequence[Segment], paths: Paths, blocks: int) -> Evidence
 
 
 def spread(segments: Sequence[Segment], paths: Paths) -> float:
-    """Return the RMS distance between the measured positions and the paths of the wheels, m.
-
-    Each path is first shifted and rotated so that it fits the positions best. Outliers have smaller
-    weights.
-    """
+    """Return the RMS distance between the positions and the aligned paths, m."""
     squares, count = 0.0, 0
     for part in aligned(segments, paths):
         squares += float(np.sum(np.abs(part.residual) ** 2))
@@ -315,74 +251,47 @@ def spread(segments: Sequence[Segment], paths: Paths) -> float:
     return float(np.sqrt(squares / max(1, count)))
 
 
+# Configured / true track; closer together in the usual range.
 INVERSE_TRACK_RATIOS = np.unique(
     np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40)))
 )
-"""Ratios of configured to true track that `search` tries.
 
-In the usual range, the ratios are closer together.
-"""
+DELAYS_S = np.arange(-1.5, 1.55, 0.1)  # delays of the positions that `search` tries
 
-DELAYS_S = np.arange(-1.5, 1.55, 0.1)
-"""Delays of the positions that `search` tries, s."""
-
+# Segments of the largest extent that try and that refine starting points.
 MOST_SEGMENTS, REFINED_SEGMENTS = 60, 20
-"""Maximum numbers of segments that `search` uses.
 
-`MOST_SEGMENTS` applies while starting points are tried, and `REFINED_SEGMENTS` while they are
-refined. If there are more segments, those with the largest extent are used.
-"""
-
+# Largest number of positions of a segment that `search` uses. They are evenly spaced.
 MAX_POINTS = 80
-"""Largest number of positions of a segment that `search` uses. They are evenly spaced."""
 
+# No point is refined whose badness is `FAR_WORSE` times that of the best point. The badness is the
+# unexplained variance, increased for an unusual robot.
 MOST_REFINED, FAR_WORSE = 4, 20.0
-"""Limits for the starting points that `search` refines.
 
-`search` refines at most `MOST_REFINED` points, and no point whose badness is more than `FAR_WORSE`
-times that of the best point. The badness is the unexplained variance, increased if the point
-describes an unusual robot.
-"""
-
+# Turn / turn predicted without multipliers. A robot that skids much is at the lower end.
 USUAL_TURN_RANGE = 0.31, 1.25
-"""Usual range of the robot's turn, divided by the turn that the configured geometry predicts.
 
-The prediction uses wheel radius and wheel separation without multipliers. A robot that skids much
-is at the lower end. A robot that does not skid is near the upper end.
-"""
-
+# Usual range of the turn that positions show, divided by the turn that a heading sensor shows.
 HEADING_TURN_RANGE = 0.8, 1.25
-"""Usual range of the turn that positions show, divided by the turn that a heading sensor shows."""
 
+# Factor of the badness if a side seems to roll backwards, or if all turns seem reversed.
 REVERSAL_PENALTY = 4.0
-"""Penalty factor for a starting point with reversed wheels or turns.
 
-The factor applies if the wheels of one side seem to roll backwards, or if all turns seem reversed.
-"""
-
+# Added to `unexplained`, because smaller differences are only noise of the positions.
 UNEXPLAINED_OFFSET = 1e-3
-"""Number that is added to each `StartingPoint.unexplained` before two points are compared.
 
-Smaller differences between points are only noise of the positions. With this number added, they
-hardly matter.
-"""
-
+# A refinement that changes the turn by more is discarded.
 MAX_REFINEMENT = 1.3
-"""Largest factor by which `search` may change the robot's turn while it refines a starting point.
 
-After a larger change, `search` discards the refinement.
-"""
-
-SEARCH_STEP_S = 0.1
-"""Time step for integrating paths in `search`, s."""
+SEARCH_STEP_S = 0.1  # time step for integrating paths in `search`
 
 
 class StartingPoint(Struct, frozen=True):
     """Parameters from which a fit to positions can start."""
 
     parameters: Floats
+    # Fraction of the positions' variance that the path from the wheels does not explain.
     unexplained: float
-    """Fraction of the positions' variance that the path from the wheels does not explain."""
 
 
 # The search tries tracks from a tenth to thirty times the configured one. It also tries reversed
@@ -395,14 +304,7 @@ class StartingPoint(Struct, frozen=True):
 def search(
     segments: Sequence[Segment], driven: Sequence[Run], base: Base, sides: Floats | None = None
 ) -> StartingPoint:
-    """Return the best parameters from which a fit to the positions can start.
-
-    Args:
-        segments: the measured positions.
-        driven: the runs of the log.
-        base: the configured geometry.
-        sides: the result of `heading.side_factors()`, or None without a heading sensor.
-    """
+    """Return the best parameters from which a fit to the positions can start."""
     subset = _furthest(segments, MOST_SEGMENTS)
     needed = sorted({segment.run for segment in subset})
     steps = {run: wheel_steps(driven[run], SEARCH_STEP_S) for run in needed}
@@ -444,11 +346,6 @@ def _local_minima(tried: Sequence[StartingPoint]) -> list[StartingPoint]:
 
 
 def _penalty(point: StartingPoint, sides: Floats | None) -> float:
-    """Return a factor with which `search` prefers starting points that describe a usual robot.
-
-    The factor is 1 for a usual robot. It is larger if the robot turns unusually much or little, or
-    if turns or wheels are reversed. `sides` is the result of `heading.side_factors()`, or None.
-    """
     signed = point.parameters[RADII] * point.parameters[Parameter.INVERSE_TRACK]
     turn, (least, most) = float(np.abs(signed).mean()), USUAL_TURN_RANGE
     like = np.ones(2)
@@ -462,11 +359,6 @@ def _penalty(point: StartingPoint, sides: Floats | None) -> float:
 
 
 def _turn(parameters: Floats) -> float:
-    """Return the robot's turn if only the right wheels roll, relative to the configured geometry.
-
-    The value is 1 if the robot turns as the configured wheel radius and wheel separation predict
-    without multipliers.
-    """
     return float(parameters[Parameter.INVERSE_TRACK] * parameters[Parameter.RIGHT])
 
 
@@ -486,16 +378,6 @@ def _tried(
     turn: float,
     delay_s: float = 0.0,
 ) -> StartingPoint:
-    """Return the starting point for a shape of the path, with the wheel size that fits best.
-
-    Args:
-        subset: the measured positions.
-        steps: the wheel steps of each run.
-        base: the configured geometry.
-        left: 1, or -1 if the speeds of the left wheels have the wrong sign.
-        turn: the ratio of configured to true track, which is negative if all turns are reversed.
-        delay_s: the delay of the positions, s.
-    """
     parameters = base.start()
     parameters[: Parameter.TRACK_GROWTH] = left, 1.0, turn
     parameters[Parameter.DELAY] = delay_s

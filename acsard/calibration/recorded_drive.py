@@ -14,22 +14,14 @@ from acsard.recording.export import calibration_csv
 from acsard.recording.file import Recording
 from acsard.recording.mcap_records import MAGIC
 
+# Maximum size of a log, bytes. The file is read into memory.
 MAX_FILE_BYTES = 1 << 30
-"""Maximum size of a log, bytes. The file is read into memory."""
 
 
 def calibrated(log: Path, config: Config, tape: Tape | None) -> Calibration:
-    """Compute the calibration from a recording of the robot while it drove, and return it.
+    """Compute the calibration from a CSV file or a black-box recording of acsard.
 
-    Args:
-        log: path of a CSV file or of a black-box recording of acsard.
-        config: the configuration of the robot.
-        tape: a distance that a person measured by tape, or None.
-
-    Raises:
-        LogError: the content of the log is unreadable, incomplete or wrong.
-        MendableError: the file cannot be opened, or is too large.
-        NoCalibrationError: the log is valid, but it gives no useful calibration.
+    Raises `LogError` or `NoCalibrationError` for the content, and `MendableError` for the file.
     """
     if log.is_dir():
         raise LogError(f"this is a directory: {CSV_ADVICE}")

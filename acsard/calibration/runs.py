@@ -1,13 +1,9 @@
 """Splits the table of a log into runs, and runs into blocks.
 
-A run contains the samples of one drive. Its times begin at 0. A new run begins where the times of
-the log jump back by a second or more, or where the wheels have no sample for a minute. Rows that
-are out of order for another reason are sorted.
-
-A block is a few seconds of driving. Every estimate of the calibration is a sum over blocks, and the
-standard deviations come from the differences between blocks. The errors within a block are
-correlated, because a wheel skids throughout a turn. The errors of different blocks are nearly
-independent.
+A run contains the samples of one drive. A new run begins where the times jump back by a second or
+more, or where the wheels have no sample for a minute. A block is a few seconds of a run. Errors
+within a block are correlated, because a wheel skids throughout a turn; those of different blocks
+are nearly independent, so deviations come from the differences between blocks.
 """
 
 from __future__ import annotations
@@ -22,151 +18,101 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from acsard.calibration.log_table import APPLIED, FOUR, TWO, Floats, LogError, Table
+from acsard.core.values import Seconds
 
 Complexes = npt.NDArray[np.complex128]
 Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
 Number = TypeVar("Number", np.float64, np.complex128)
 
+# If the times in a log jump back by more than this time, the recording may have restarted.
 MIN_BACKWARD_STEP_S = 1.0
-"""If the times in a log jump back by more than this time, s, the recording may have restarted."""
 
+# With more jumps back, the log is one recording whose rows are not sorted by time.
 MAX_RESTARTS = 100
-"""Maximum number of restarts in a log.
 
-If the times jump back more often, the log counts as one recording whose rows are not sorted by
-time.
-"""
-
+# With a longer median period of the wheels, the times are probably not in seconds.
 MAX_PERIOD_S = 0.7
-"""Longest accepted median period of wheel samples, s.
 
-If the period is longer, the times are probably not in seconds.
-"""
+MIN_ROWS = 20  # minimum number of wheel samples in a run
 
-MIN_ROWS = 20
-"""Minimum number of wheel samples in a run."""
+NEW_RUN_AFTER_S = 60.0  # time without a wheel sample, after which a new run begins
 
-NEW_RUN_AFTER_S = 60.0
-"""Time without a wheel sample, s, after which a new run begins."""
-
+# Times are rounded if they are `ROUNDED_S` apart and `REPEATED` rows have the same time on average.
 ROUNDED_S, REPEATED = 0.2, 4.0
-"""Limits that show that the times in the column `t` were rounded.
 
-The times were rounded if the median interval between different times exceeds `ROUNDED_S` s, and if
-on average more than `REPEATED` rows have the same time.
-"""
-
+# The logger repeats values if, while the wheels roll at `ROLLING` rad/s (sum of both sides), this
+# fraction of the rows has the value of the row before. Such rows are removed.
 ROLLING, MAX_REPEATED_FRACTION = 0.2, 0.4
-"""Limits that show that the logger repeated old positions or yaws. Such rows are removed.
-
-The wheels roll if the absolute speeds of the left and the right side add up to more than `ROLLING`
-rad/s. The logger repeats values if, while the wheels roll, more than the fraction
-`MAX_REPEATED_FRACTION` of the rows have the same value as the row before.
-"""
 
 WHEEL_STREAM = "left right"
 COMMANDS = " ".join(APPLIED)
+# Names of the sensors, which are their columns. The commands count as a sensor.
 SENSOR_NAMES = (WHEEL_STREAM, "yaw_rate", "yaw", "x y", COMMANDS)
-"""Names of the sensors of a log. The commands count as a sensor.
 
-A name consists of the columns of the sensor, separated by spaces.
-"""
-
+# The times and the values of each sensor, by the name of the sensor in `SENSOR_NAMES`.
 Streams = dict[str, tuple[Floats, ...]]
-"""The times and the values of each sensor, by the name of the sensor in `SENSOR_NAMES`."""
 
+# Maximum number of different values in the column `run`. A log with more values is refused.
 MAX_RUNS = 1000
-"""Maximum number of different values in the column `run`. A log with more values is refused."""
 
-SUMMED_ROWS = 50
-"""Number of rows over which wheel speeds are summed before two wheels are compared."""
+SUMMED_ROWS = 50  # number of rows over which wheel speeds are summed before two wheels are compared
 
+# Difference between front and rear wheel as a fraction of the distance: the first is reported, a
+# log with the second is refused.
 REPORTED_DIFFERENCE, MAX_DIFFERENCE = 0.15, 0.8
-"""Limits for the difference between the front and the rear wheel of a side.
 
-The limits are fractions of the distance rolled. The report mentions a difference above
-`REPORTED_DIFFERENCE`. A log with a difference above `MAX_DIFFERENCE` is refused.
-"""
-
+# A gap is longer than `GAP_S` and than `GAP_PERIODS` median intervals.
 GAP_S, GAP_PERIODS = 0.3, 5.0
-"""Limits for the interval between two samples.
 
-An interval is a gap if it exceeds `GAP_S` s and also exceeds `GAP_PERIODS` times the median
-interval.
-"""
+STANDSTILL_SPEED = 0.02  # largest speed at which a wheel is considered to stand still, rad/s
 
-STANDSTILL_SPEED = 0.02
-"""Largest speed at which a wheel is considered to stand still, rad/s."""
-
+# Number of blocks into which a log is divided, unless the blocks would be too short or too long.
 BLOCK_COUNT = 16
-"""Number of blocks into which a log is divided, unless the blocks would be too short or too long.
-"""
 
+# Maximum length of a block, unless the caller of `blocks()` asks for longer blocks.
 MAX_BLOCK_S = 12.0
-"""Maximum length of a block, s, unless the caller of `blocks()` asks for longer blocks."""
 
+# Smooths the speeds of a coarse encoder, some of which are 0 and some far too large.
 SMOOTH_S = 0.3
-"""Time over which the difference of the wheel speeds is averaged before it is squared, s.
 
-Without this average, the speeds of a coarse encoder would be 0 in some samples and far too large
-in others.
-"""
-
+# Blocks in which neither side rolls this angle, rad, are left out.
 MIN_BLOCK_ROLL = 0.2
-"""Minimum angle that the wheels of one side must roll in a block, rad.
 
-A block in which neither side rolls this far is left out.
-"""
-
+# If the delay from stamp to arrival varies by more, the stamps are not used.
 MAX_JITTER_S = 5.0
-"""Largest accepted variation of the delay from stamp to arrival, s.
-
-If the delay varies by more, the stamps are not used.
-"""
 
 
 class Run(Struct, frozen=True, dict=True):
-    """The samples of one drive.
-
-    Times are in s since `start`. The times of each sensor strictly increase.
-    """
+    """The samples of one drive. The times of each sensor, s since `start`, strictly increase."""
 
     name: str
-    start: float
-    """Time of the first wheel sample of this drive, s, as the log gives it."""
-    t: Floats
-    """Times of the wheel speeds, s since `start`."""
-    left: Floats
-    """Mean speed of the left wheels, rad/s."""
+    start: Seconds  # time of the first wheel sample of this drive, as the log gives it
+    t: Floats  # times of the wheel speeds, s since `start`
+    left: Floats  # mean speed of the left wheels, rad/s
     right: Floats
     gyro_t: Floats
-    gyro: Floats
-    """Yaw rate, rad/s."""
+    gyro: Floats  # yaw rate, rad/s
     yaw_t: Floats
+    # Yaw as recorded, rad. It may be wrapped.
     yaw: Floats
-    """Yaw as recorded, rad. It may be wrapped."""
     place_t: Floats
-    place: Complexes
-    """Positions x + iy, m, relative to the first position."""
+    place: Complexes  # positions x + iy, m, relative to the first position
     commands_t: Floats
-    linear: Floats
-    """Commanded speed, m/s."""
-    angular: Floats
-    """Commanded turn rate, rad/s."""
+    linear: Floats  # commanded speed, m/s
+    angular: Floats  # commanded turn rate, rad/s
 
     @cached_property
     def gaps(self) -> Floats:
-        """Long intervals without a wheel sample, s: one row (begin, end) for each. See `gaps()`."""
+        """Return the gaps between the times of samples, s: one row (begin, end) for each.
+
+        A gap is much longer than the usual interval (`GAP_S`, `GAP_PERIODS`).
+        """
         return gaps(self.t)
 
     @cached_property
     def rolled(self) -> tuple[Floats, Floats]:
-        """Angles that the left and the right wheels have rolled since the start of the run, rad.
-
-        The value is a pair of arrays with a number for each of the times `t`. The angles stay
-        constant during a gap in the samples.
-        """
+        """Angles that left and right wheels have rolled at the times `t`, rad; constant in gaps."""
         steps = np.diff(self.t)
         steps[np.isin(self.t[:-1], self.gaps[:, 0])] = 0.0
         return integral(self.left, steps), integral(self.right, steps)
@@ -179,18 +125,12 @@ class Run(Struct, frozen=True, dict=True):
         )
 
     def angles(self, t: Floats) -> tuple[Floats, Floats]:
-        """Return the angles that the left and the right wheels have rolled at the times `t`, rad.
-
-        Times and angles count from the start of the run. `t` is in s.
-        """
+        """Return the angles that left and right wheels have rolled at the times `t`, rad."""
         left, right = self.rolled
         return np.interp(t, self.t, left), np.interp(t, self.t, right)
 
     def speed_difference(self, t: Floats) -> Floats:
-        """Return the speed of the right minus that of the left wheels at the times `t`, rad/s.
-
-        The difference is averaged over `SMOOTH_S`.
-        """
+        """Return the speed of right minus left wheels, rad/s, averaged over `SMOOTH_S`."""
         begin, end = (np.clip(t + s / 2, self.t[0], self.t[-1]) for s in (-SMOOTH_S, SMOOTH_S))
         (left, right), (far_left, far_right) = self.angles(begin), self.angles(end)
         turned = far_right - right - (far_left - left)
@@ -198,19 +138,13 @@ class Run(Struct, frozen=True, dict=True):
 
 
 class Notes:
-    """Sentences about a log. A sentence that applies to several runs is listed once.
-
-    A "{}" in a sentence is replaced by a count, which is the sum over all runs.
-    """
+    """Sentences about a log, each listed once for all its runs; "{}" is the sum of their counts."""
 
     def __init__(self, sentences: Iterable[str]) -> None:
         self._sentences = {sentence: [0, 0] for sentence in sentences}
 
     def add(self, sentence: str, count: int = 0) -> None:
-        """Add a sentence about one run. `count` is added to the sum that replaces "{}".
-
-        A sentence with "{}" and a count of 0 is ignored.
-        """
+        """Add a sentence about one run. A sentence with "{}" and a count of 0 is ignored."""
         if count or "{}" not in sentence:
             sums = self._sentences.setdefault(sentence, [0, 0])
             sums[0], sums[1] = sums[0] + count, sums[1] + 1
@@ -228,8 +162,8 @@ class Log(Struct, frozen=True):
 
     runs: tuple[Run, ...]
     notes: tuple[str, ...]
+    # True if the positions are the true ones of the built-in simulator, which have no error.
     true_positions: bool = False
-    """True if the positions are the true ones of the built-in simulator, which have no error."""
 
 
 def runs(table: Table) -> Log:
@@ -308,10 +242,6 @@ def _sides(columns: dict[str, Floats], notes: Notes) -> tuple[Floats, Floats]:
 
 
 def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
-    """Return how much the front and the rear wheel of a side differ, as a fraction of their speed.
-
-    Raises `LogError` if they differ by more than `MAX_DIFFERENCE`.
-    """
     finite = np.isfinite(columns[front]) & np.isfinite(columns[rear])
     starts = np.arange(0, int(finite.sum()), SUMMED_ROWS)
     if not len(starts):
@@ -332,7 +262,6 @@ def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
 
 
 def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
-    """Split `rows` into drives where the times of the wheel samples jump back."""
     # The times of rows without wheel speeds may jump back within a drive, because a file may list
     # all rows of one sensor after all rows of another.
     wheels = _wheel_rows(rows, columns)
@@ -352,7 +281,6 @@ def _wheel_rows(rows: Rows, columns: dict[str, Floats]) -> Rows:
 
 
 def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floats]) -> None:
-    """Raise `LogError` if the times of a run are not in seconds or are too coarse."""
     for rows in parts:
         times = np.sort(t[_wheel_rows(rows, columns)])
         if len(times) < MIN_ROWS:
@@ -425,11 +353,6 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
 
 
 def _repeats(streams: Streams, what: str) -> tuple[Mask, Mask]:
-    """Return two masks of the samples in the columns `what`.
-
-    The first mask selects samples that repeat the previous sample. The second mask selects samples
-    at times at which the wheels roll.
-    """
     t, *values = streams[what]
     if not len(t):
         return np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
@@ -464,23 +387,17 @@ def _ordered(stream: list[Floats], what: str, notes: Notes) -> Iterator[Floats]:
 
 
 class Block(Struct, frozen=True):
-    """A few seconds of a run.
-
-    To compute uncertainties, the fit leaves out one block at a time.
-    """
+    """A few seconds of a run. To compute uncertainties, the fit leaves out one block at a time."""
 
     run: int
-    begin: float
-    """Start of the block, s since the start of the run."""
-    end: float
-    """End of the block, s since the start of the run."""
+    begin: float  # start of the block, s since the start of the run
+    end: float  # end of the block, s since the start of the run
 
 
 def gaps(t: Floats) -> Floats:
-    """Return the gaps in the samples of a sensor, s: one row (begin, end) for each gap.
+    """Return the gaps between the times of samples, s: one row (begin, end) for each.
 
-    `t` contains the times of the samples, s. A gap is an interval between two samples that is much
-    longer than usual (`GAP_S`, `GAP_PERIODS`).
+    A gap is much longer than the usual interval (`GAP_S`, `GAP_PERIODS`).
     """
     steps = np.diff(t)
     if not len(steps):
@@ -490,11 +407,7 @@ def gaps(t: Floats) -> Floats:
 
 
 def inside(begin: Floats, end: Floats, holes: Floats) -> Mask:
-    """Return a mask of the intervals that do not overlap a gap.
-
-    `begin` and `end` contain the limits of the intervals. `holes` contains the gaps, as `gaps()`
-    returns them.
-    """
+    """Return a mask of the intervals that do not overlap one of the gaps `holes`."""
     after = np.searchsorted(holes[:, 1], begin, side="right")
     before = np.searchsorted(holes[:, 0], end, side="left")
     return np.asarray(after == before)
@@ -506,19 +419,12 @@ def cumulative(steps: npt.NDArray[Number]) -> npt.NDArray[Number]:
 
 
 def integral(values: Floats, steps: Floats) -> Floats:
-    """Return the integral of `values` from the first sample to each sample (trapezoidal rule).
-
-    `steps` contains the times from each sample to the next. The result is empty without samples.
-    """
+    """Return the integral of `values` from the first sample to each sample (trapezoidal rule)."""
     return cumulative((values[1:] + values[:-1]) / 2 * steps) if len(values) else values
 
 
 def rest_intervals(run: Run, least_s: float, edge_s: float) -> Floats:
-    """Return the intervals in which all wheels stand still, s: one row (begin, end) for each.
-
-    Each interval is shortened by `edge_s` s at each end. It is left out if it is then shorter than
-    `least_s` s.
-    """
+    """Return the intervals in which all wheels stand still, s, without `edge_s` at each end."""
     moving = np.concatenate(([True], run.moving, [True])).astype(np.int8)
     changes = np.flatnonzero(np.diff(moving))
     spans = [(run.t[a], run.t[b - 1]) for a, b in changes.reshape(-1, 2)]
@@ -527,11 +433,7 @@ def rest_intervals(run: Run, least_s: float, edge_s: float) -> Floats:
 
 
 def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
-    """Return the blocks of all runs, without the blocks in which the robot hardly moved.
-
-    The blocks are about `shortest_s` s long. If the log would then have more than `BLOCK_COUNT`
-    blocks, the blocks are longer, up to `MAX_BLOCK_S`.
-    """
+    """Return the blocks of all runs in which the robot moves, of `shortest_s` s or longer."""
     moved = sum(float(np.minimum(np.diff(r.t), GAP_S) @ r.moving[1:]) for r in driven)
     length = float(np.clip(moved / BLOCK_COUNT, shortest_s, max(MAX_BLOCK_S, shortest_s)))
     result = []
@@ -550,10 +452,6 @@ def blocks(driven: Sequence[Run], shortest_s: float) -> list[Block]:
 
 
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
-    """Return whether the wheels of one side rolled by `MIN_BLOCK_ROLL` or more, in any direction.
-
-    Motion to and fro does not cancel.
-    """
     if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= MIN_BLOCK_ROLL:
         return True
     a, b = np.searchsorted(run.t, (begin, end))
@@ -564,12 +462,8 @@ def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> 
 def on_arrival_clock(arrivals: Floats, stamps: Floats) -> Floats:
     """Return the times at which a sender made its samples, s, on the receiver's clock.
 
-    The times are the stamps plus the smallest delay from stamp to arrival. If the delays of the
-    samples vary by more than `MAX_JITTER_S`, the times are the times of arrival.
-
-    Args:
-        arrivals: the times of arrival on the receiver's clock, s.
-        stamps: the stamps of the sender's clock, s.
+    They are the stamps plus the smallest delay from stamp to arrival, or the arrivals if the delays
+    vary by more than `MAX_JITTER_S`.
     """
     delay = arrivals - stamps
     if float(np.ptp(delay)) > MAX_JITTER_S:

@@ -1,7 +1,4 @@
-"""Computes the calibration from a log.
-
-If the log gives no calibration, an error says why, and what the user must do.
-"""
+"""Computes the calibration from a log, or says why the log gives none."""
 
 from __future__ import annotations
 
@@ -42,31 +39,18 @@ from acsard.calibration.positions import Segment, WheelSteps, search
 from acsard.calibration.runs import Block, Log, Run, blocks
 from acsard.calibration.wheel_response import response
 from acsard.core.config.settings import DriveConfig, FeedbackConfig, OdometryConfig
-from acsard.core.values import AcsardError
+from acsard.core.values import AcsardError, RadPerS
 
+# Short blocks suit accurate positions, long ones coarse positions or wheels whose errors hide small
+# turns. The length that improves the odometry most is used.
 BLOCK_LENGTHS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
-"""Lengths of the blocks into which the tool divides a log for the fit, s.
 
-The tool tries several lengths, and uses the one that improves the odometry most.
-
-Short blocks suit accurate positions. Long blocks suit coarse positions, and wheels whose errors
-hide small turns. Without positions, the tool tries only the shortest length. With positions but no
-heading sensor, it does not try the shortest length.
-"""
-
-# With six blocks, the standard deviation of the ratio of the radii was up to three times too small.
+# With six blocks, the deviation of the ratio of the radii was up to three times too small.
 MIN_BLOCKS = 8
-"""Number of blocks that a log should have.
 
-A block length that gives fewer blocks is not tried if a shorter length has already given a fit.
-"""
-
-# For comparison: on a good floor, motion capture differs from the wheels by less than 1e-3.
+# As a fraction of the motion: with less, the sensor was computed from the wheels. Motion capture
+# differs by up to 1e-3.
 MIN_DIFFERENCE = 1e-4
-"""Smallest credible difference between a sensor and the wheels, as a fraction of the motion.
-
-If the difference is smaller, the sensor's data were probably computed from the wheels.
-"""
 
 
 class DriveTotals(Struct, frozen=True):
@@ -75,30 +59,16 @@ class DriveTotals(Struct, frozen=True):
     runs: int
     seconds: float
     metres: float
+    # Total turning of the robot to the left and to the right, as a number of turns of 360 deg.
     turns: float
-    """Total turning of the robot to the left and to the right, as a number of turns of 360 deg.
-
-    The turns are computed from the calibrated wheels.
-    """
-    fastest: float
-    """Turn rate below which the robot turned 95 % of its total turned angle, rad/s."""
+    fastest: RadPerS  # turn rate below which the robot turned 95 % of its total turned angle
 
     @classmethod
     def of(
         cls, runs: Sequence[Run], rows: Rows, by_wheels: Floats, base: Base, result: Multipliers,
         rate: Rates,
     ) -> DriveTotals:  # fmt: skip
-        """Return the totals of the runs.
-
-        Args:
-            runs: the runs of the log.
-            rows: the motion in intervals of about a second.
-            by_wheels: the robot's turn in each interval of `rows`, rad, computed from the
-                calibrated wheels.
-            base: the configured geometry.
-            result: the new multipliers.
-            rate: the turn rates of the log.
-        """
+        """Return the totals of the runs. `by_wheels` has the turn in each interval, rad."""
         size = base.radius * float(result.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())
         return cls(
             len(runs), sum(float(run.t[-1]) for run in runs),
@@ -108,57 +78,30 @@ class DriveTotals(Struct, frozen=True):
 
 
 class Calibration(Struct, frozen=True):
-    """The result of a calibration.
+    """The result of a calibration. Each standard deviation has the unit of its quantity."""
 
-    Each standard deviation has the unit of its quantity.
-    """
-
+    # What the wheels were compared with, such as "yaw_rate and positions" or "a tape".
     reference: str
-    """Names of the sensors, or of the measuring tool, with which the wheels were compared.
-
-    Examples are "yaw_rate and positions" and "a tape".
-    """
     drives: DriveTotals
     configured: Multipliers
-    multipliers: Multipliers
-    """New multipliers of the wheel separation and of the two wheel radii."""
+    multipliers: Multipliers  # new multipliers of the wheel separation and of the two wheel radii
+    # What shows the size of the wheels: "positions", "distance", "positions and distance" or "".
     scale: str
-    """Kind of the measurements that show the size of the wheels.
-
-    The value is "positions" (from a sensor), "distance" (by tape), "positions and distance", or
-    "". If it is "", no measurement shows the size of the wheels.
-    """
-    growth: float
-    """Fraction by which the effective track grows with each rad/s of turn rate."""
+    growth: float  # fraction by which the effective track grows with each rad/s of turn rate
     growth_std: float
     improvement: Improvement
+    # Delay of each sensor's recorded times relative to those of the wheels, s, by sensor name.
     delays: dict[str, float]
-    """Delay of each sensor's recorded times relative to those of the wheels, s, by sensor name.
-
-    A delay is positive if the sensor records the same event with a later time than the wheels.
-    """
-    gyro_bias: float
-    """Gyro bias, rad/s; 0 without a gyro."""
+    gyro_bias: RadPerS  # gyro bias; 0 without a gyro
     notes: tuple[str, ...]
+    # New values by the name of the setting; noise only if `LogNoise.better`.
     odometry: dict[str, float]
-    """New values for settings of `[odometry]`, by the name of the setting.
-
-    These settings state the uncertainty of the wheel radii and of the track. The noise settings
-    are included only if `LogNoise.better` is true.
-    """
+    # Of `plausibility.TRACK` and `plausibility.RATIO`.
     stays_configured: tuple[str, ...] = ()
-    """Names of the quantities that stay as configured.
-
-    The possible names are `plausibility.TRACK` and `plausibility.RATIO`.
-    """
+    # The same; empty if the settings cause no false wheel fault, or if no better ones were found.
     feedback: dict[str, float] = {}
-    """New values for settings of `[feedback]`, by the name of the setting.
-
-    The dictionary is empty if the configured settings cause no false wheel fault in this log, or
-    if no better settings were found.
-    """
+    # Noise of the odometry that this log shows; None if the log does not show it.
     noise: LogNoise | None = None
-    """Noise of the odometry that this log shows; None if the log does not show it."""
 
 
 def calibrate(
@@ -167,16 +110,7 @@ def calibrate(
 ) -> Calibration:  # fmt: skip
     """Return the calibration of the robot that recorded this log.
 
-    Args:
-        log: the runs of the log.
-        drive: the configured geometry, and the configured multipliers that scale it.
-        tape: a distance that a person measured by tape, or None.
-        odometry: the settings of `[odometry]`. None means the default settings.
-        feedback: the settings of `[feedback]`. None means the default settings.
-
-    Raises:
-        LogError: a sensor of the log cannot be used. The error includes the notes of the log.
-        NoCalibrationError: the log gives no calibration. The error includes the notes of the log.
+    Raises `LogError` or `NoCalibrationError`, with the notes of the log attached.
     """
     follows = response(log.runs, drive, feedback or FeedbackConfig())
     if follows is not None:
@@ -193,25 +127,17 @@ class Prepared(Struct, frozen=True):
     """A log that was divided into blocks of one length, and all other inputs of the fit."""
 
     runs: Sequence[Run]
+    # Headings that a sensor measured, or None if the log has no heading sensor.
     headings: Headings | None
-    """Headings that a sensor measured, or None if the log has no heading sensor."""
     base: Base
-    parts: list[Block]
-    """Blocks into which the runs were divided."""
+    parts: list[Block]  # blocks into which the runs were divided
+    # In intervals of about 1 s. A gyro is corrected for its bias, unless this is unknown.
     rows: Rows
-    """Motion in intervals of about 1 s.
-
-    The turns of a gyro are corrected for its bias, unless the bias is unknown
-    (`Headings.bias_unknown`).
-    """
-    segments: list[Segment]
-    """Measured positions; empty if the log has no positions."""
-    steps: list[WheelSteps]
-    """Rolling of the wheels in each run; empty if the log has no positions."""
+    segments: list[Segment]  # measured positions; empty if the log has no positions
+    steps: list[WheelSteps]  # rolling of the wheels in each run; empty if the log has no positions
+    # One function for each sensor, which returns the sensor's `Evidence` for given parameters.
     sources: list[Source]
-    """One function for each sensor, which returns the sensor's `Evidence` for given parameters."""
-    start: Floats
-    """Parameters from which the fit starts, shape (PARAMETER_COUNT,)."""
+    start: Floats  # parameters from which the fit starts, shape (PARAMETER_COUNT,)
 
 
 def prepared(
@@ -286,21 +212,15 @@ class Candidate(Struct, frozen=True):
 
     made: Prepared
     fitted: Fit
-    covariance: Floats
-    """Covariance of the parameters, shape (PARAMETER_COUNT, PARAMETER_COUNT)."""
+    covariance: Floats  # covariance of the parameters, shape (PARAMETER_COUNT, PARAMETER_COUNT)
+    # The motion in intervals of about a second, with the gyro corrected for its bias and scale.
     rows: Rows
-    """The motion in intervals of about a second, with the gyro corrected for its bias and scale."""
     rate: Rates
-    gyro_bias: float
-    """Gyro bias, rad/s; 0 without a gyro."""
+    gyro_bias: RadPerS  # gyro bias; 0 without a gyro
     result: Multipliers
     improvement: Improvement
+    # Relative deviation in this log of each quantity that stays as configured; inf if unknown.
     stays_configured: dict[str, float]
-    """Maps each quantity that stays as configured to its relative standard deviation in this log.
-
-    The possible names are `plausibility.TRACK` and `plausibility.RATIO`. A deviation is inf if it
-    is unknown.
-    """
 
 
 def _calibrated(
@@ -349,11 +269,6 @@ def _used_deviations(best: Candidate, odometry: OdometryConfig) -> Deviations:
 def _noise(
     best: Candidate, known: Deviations, odometry: OdometryConfig, *, present: bool
 ) -> LogNoise | None:
-    """Return the odometry noise that the log shows.
-
-    The odometry is computed with the configured geometry if `present` is true, and otherwise with
-    the fitted geometry.
-    """
     made, fitted = best.made, best.fitted
     test_folds = folds(fitted, made.parts, made.runs, best.rate)
     if present:
@@ -368,11 +283,6 @@ def _noise(
 
 
 def _candidates(made: Prepared) -> list[Candidate]:
-    """Return the fit of both track and radius ratio if the log determines both accurately enough.
-
-    Otherwise return one or two other fits: one that keeps the ratio as configured, and one that
-    keeps the track as configured. Raises `NoCalibrationError` if no fit is accurate enough.
-    """
     candidates: list[Candidate] = []
     deviations: dict[str, float] = {}
     refused: dict[str, float] = {}
@@ -520,10 +430,6 @@ def _cuts(driven: Sequence[Run]) -> Iterator[str]:
 
 
 def _too_good(made: Prepared, fitted: Fit, log: Log) -> Iterator[str]:
-    """Yield a sentence for each sensor whose values were probably computed from the wheels.
-
-    Such values cannot calibrate the wheels.
-    """
     rows, headings, base = made.rows, made.headings, made.base
     if headings is not None:
         off = rows.turned - heading.turned(rows, base, fitted.parameters)

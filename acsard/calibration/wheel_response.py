@@ -1,10 +1,9 @@
 """Estimates from a log how soon the wheels follow their commands, and how fast they can turn.
 
-The daemon reports a fault if a wheel contradicts the model of a healthy wheel for
-`feedback.fault_time`. The model depends on `feedback.response_time`. This module finds the
-response time that fits the wheels of the log best, and assumes that these wheels are healthy. It
-also runs the daemon's own fault detection (`core/motion/wheel_witness.py`) on the log, with the
-configured response time. The result shows whether the daemon would report a false fault.
+The daemon reports a wheel fault if a wheel contradicts the model of a healthy wheel for
+`feedback.fault_time`. This module finds the `feedback.response_time` that fits the healthy wheels
+of the log best, and runs the daemon's own detection (`core/motion/wheel_witness.py`) on the log
+with the configured one, which shows false faults.
 """
 
 from __future__ import annotations
@@ -23,90 +22,55 @@ from acsard.core.config.settings import DriveConfig, FeedbackConfig
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.wheel_faults import MIN_COMMANDED_SPEED
 from acsard.core.motion.wheel_witness import MIN_FAULT_SPEED, Expected, Witness
-from acsard.core.values import Twist
+from acsard.core.values import RadPerS, Seconds, Twist
 
+# Response times that are tried. They cover the range of `feedback.response_time`.
 RESPONSE_TIMES_S = np.geomspace(0.01, 5.0, 60)
-"""Response times that are tried, s. They cover the range of `feedback.response_time`."""
 
+# Minimum and maximum number of wheel samples.
 LEAST_ROWS, MOST_ROWS = 200, 30_000
-"""Minimum and maximum number of wheel samples.
 
-A log with fewer samples than `LEAST_ROWS` gives no response time. At most `MOST_ROWS` samples are
-used, which is 5 minutes at 100 Hz.
-"""
-
+# Largest fraction of the sum of squared wheel speeds that the model may leave unexplained.
 MAX_UNEXPLAINED = 0.5
-"""Largest fraction of the sum of squared wheel speeds that the model may leave unexplained."""
 
+# Longest time for which a healthy wheel may look faulty with the proposed response time.
 MAX_FAULTY_FRACTION = 0.5
-"""Longest time for which a healthy wheel may look faulty with the proposed response time.
 
-The time is a fraction of `feedback.fault_time`.
-"""
-
+# Limits that show that a wheel turns as fast as it can.
 STEADY_S, REACHED, CONSTANT = 1.0, 0.9, 0.03
-"""Limits that show that a wheel turns as fast as it can.
 
-The speed of such a wheel stays below `REACHED` times its command for at least 2 * `STEADY_S` s. In
-the last `STEADY_S` s, the speed changes by less than the fraction `CONSTANT`.
-"""
-
+# If the fitted and the configured response time differ by at most this factor, they agree.
 AGREEMENT_FACTOR = 1.5
-"""If the fitted and the configured response time differ by at most this factor, they agree."""
 
 
 class Commanded(NamedTuple):
     """The wheel speeds of a run, with the commands that applied to them."""
 
+    # Interval before each sample of the wheel speeds, s.
     steps: Floats
-    """Interval before each sample of the wheel speeds, s.
-
-    It is NaN if no command applies to this sample, or if the interval is a gap.
-    """
-    wanted: Floats
-    """Commanded speeds (left, right), rad/s, shape (samples, 2)."""
-    actual: Floats
-    """Measured speeds (left, right), rad/s, shape (samples, 2)."""
+    wanted: Floats  # commanded speeds (left, right), rad/s, shape (samples, 2)
+    actual: Floats  # measured speeds (left, right), rad/s, shape (samples, 2)
 
 
 class WheelResponse(Struct, frozen=True):
     """The response of the wheels to their commands in a log."""
 
-    seconds: float
-    """Response time that fits the log best, s."""
-    proposed: float | None
-    """Response time to configure, s; None if the tool proposes no change.
-
-    There is a proposal only if `false_fault` is true. The candidates are the times in
-    `RESPONSE_TIMES_S`, rounded to two digits. The proposal is the smallest candidate, not below
-    `seconds`, with which no wheel looks faulty for longer than `MAX_FAULTY_FRACTION` permits. If no
-    candidate meets this condition, the value is None.
-    """
-    present: float
-    """Configured response time, s."""
+    seconds: Seconds  # response time that fits the log best
+    # Response time to configure; None if the tool proposes no change.
+    proposed: Seconds | None
+    present: Seconds  # configured response time
+    # Whether the daemon would report a fault in this log with the configured response time.
     false_fault: bool
-    """Whether the daemon would report a fault in this log with the configured response time.
-
-    Such a fault would be false, because the wheels are assumed to be healthy.
-    """
-    fastest: float
-    """Highest speed that the wheels reach, rad/s; infinity if the log shows no such limit."""
+    fastest: RadPerS  # highest speed that the wheels reach; infinity if the log shows no such limit
 
     def settings(self) -> dict[str, float]:
-        """Return the new values for settings of `[feedback]`, by the name of the setting.
-
-        The dictionary is empty if no setting must change.
-        """
+        """Return the new values for settings of `[feedback]`; empty if none must change."""
         if not self.false_fault or self.proposed is None:
             return {}
         return {"response_time": self.proposed}
 
     def sentences(self) -> list[str]:
-        """Return one or two sentences for the report.
-
-        The first sentence is about the response time. If `fastest` is finite, a second sentence is
-        about `limits.wheel_speed`.
-        """
+        """Return one or two sentences for the report."""
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
         if self.false_fault:
             then = (
@@ -141,10 +105,7 @@ class WheelResponse(Struct, frozen=True):
 def response(
     driven: Sequence[Run], drive: DriveConfig, feedback: FeedbackConfig
 ) -> WheelResponse | None:
-    """Return the response of the wheels to the commands in the runs `driven`.
-
-    The result is None if the log has too few commands, or if the wheels do not follow them.
-    """
+    """Return the response of the wheels to their commands; None if the log does not show it."""
     parts: list[Commanded] = []
     room = MOST_ROWS
     for run in driven:
@@ -193,10 +154,6 @@ def _commanded(run: Run, drive: DriveConfig) -> Commanded:
 
 
 def _expected(part: Commanded) -> Floats:
-    """Return the wheel speeds, rad/s, that each of `RESPONSE_TIMES_S` predicts.
-
-    The shape is (samples, 2 sides, response times).
-    """
     # The speed y of a healthy wheel follows the command u with the response time T:
     #
     #     T dy/dt = u - y
@@ -213,10 +170,6 @@ def _expected(part: Commanded) -> Floats:
 
 
 def _evidence(parts: Sequence[Commanded], response_time: float, fault_time: float) -> float:
-    """Return the longest time for which a wheel contradicts the daemon's model of a wheel, s.
-
-    If this time exceeds `fault_time`, the daemon would report a fault.
-    """
     longest, most = 0.0, fault_time / MIN_EVIDENCE_LINES
     for steps, wanted, actual in parts:
         sides = [(Expected(), Witness()) for _ in range(2)]
@@ -236,10 +189,6 @@ def _evidence(parts: Sequence[Commanded], response_time: float, fault_time: floa
 
 
 def _fastest(parts: Sequence[Commanded]) -> float:
-    """Return the highest speed, rad/s, that a wheel keeps although its command is higher.
-
-    Return infinity if the log shows no such speed.
-    """
     speeds: list[float] = []
     for steps, wanted, actual in parts:
         for command, speed in zip(wanted.T, np.abs(actual.T), strict=True):

@@ -1,11 +1,9 @@
 """Sends speeds to the board that is checked, and stores its replies.
 
-A step of the check sends lines through a `Board` for some time, and then evaluates the stored
-`replies`. Speeds are given for the motors a to d and not for wheels, because the check must find
-out which wheel a motor turns. A step ends immediately if a motor runs away, if the board falls
-silent, or if the board restarts. After a restart the step can be repeated. After a runaway or a
-silence the check ends. The caller implements the interfaces `Wire` (the serial line) and `Operator`
-(the person at the robot).
+A step of the check sends lines through a `Board`, and evaluates the stored `replies`. Speeds are
+those of the motors a to d, because the check must find out which wheel a motor turns. A step ends
+at once if a motor runs away, if the board falls silent (both end the check), or if it restarts. The
+caller implements `Wire` (the serial line) and `Operator` (the person).
 """
 
 from __future__ import annotations
@@ -34,7 +32,7 @@ class Wire(Protocol):
     """Interface of the serial connection between this computer and the board."""
 
     def open(self, baud_rate: int) -> None:
-        """Open the connection at this baud rate. If it is open already, change its baud rate.
+        """Open the connection at this baud rate, or change the baud rate of an open one.
 
         Raises `MendableError` if the port cannot be opened, and `WireLostError` if it is lost.
         """
@@ -49,17 +47,15 @@ class Wire(Protocol):
         """Send bytes now. Raises `WireLostError` if the connection is lost."""
 
     def late_ns(self) -> int:
-        """Return for how long a simulated board waited for a processor since the last call, ns.
+        """Return how long a simulated board waited for a processor since the last call.
 
-        Such a board is a program on this computer, so a busy processor delays its replies. Return 0
-        for a real board.
+        It is a program on this computer. The result is 0 for a real board.
         """
 
     def listen(self, until_ns: int) -> Sequence[tuple[int, bytes]]:
-        """Receive data until the monotonic time `until_ns`, ns, and return it in pieces.
+        """Receive until the time `until_ns`; return pieces: time of arrival, ns, and bytes.
 
-        Each piece is a pair: the monotonic time of its arrival, ns, and its bytes. Raises
-        `WireLostError` if the connection is lost.
+        Raises `WireLostError` if the connection is lost.
         """
 
 
@@ -73,99 +69,83 @@ class Operator(Protocol):
         """Ask a question. Return one of `answers`, or None if no operator can answer."""
 
     def keys(self, wait_s: float) -> str:
-        """Return the keys that the operator has typed, or "" if no key was typed.
-
-        If no key has been typed yet, wait up to `wait_s` s for the first one.
-        """
+        """Return the keys that the operator has typed; wait up to `wait_s` s for the first one."""
 
 
 def _nothing() -> None:
     pass
 
 
-MIN_WAIT_S = 0.001
-"""Shortest remaining time in which `Board.drive` sends one more line, s."""
+MIN_WAIT_S = 0.001  # shortest remaining time in which `Board.drive` sends one more line
 
+# Longest wait of `Board.listen` without a break. After each such wait, `listen` measures how late
+# this computer runs the check.
 BEAT_NS = int(motion.LINE_PERIOD_S * NS_PER_S)
-"""Longest wait of `Board.listen` without a break, ns. After each such wait, `listen` measures how
-late this computer runs the check."""
 
-FINAL_ZEROS = 5
-"""Number of times that the check sends zero speeds at its end."""
+FINAL_ZEROS = 5  # number of times that the check sends zero speeds at its end
 
 
+# Results of earlier steps, which are restored before a step is repeated.
 RESULT_FIELDS = ("comma", "latched", "sealed", "sampled", "own_clock", "gap_s", "paced", "lost")
-"""Names of the attributes of `Board` that are restored before a step is repeated.
-
-These attributes contain results of earlier steps, which later steps use.
-"""
 
 
 class Board:
     """The board that is checked, with its replies and the results of the steps.
 
-    It is a context manager, which opens the serial line (`wire`) at the beginning and closes it at
-    the end. Before it closes the line, it sends zero speeds. If a motor runs away
-    (`runaway_seen`), it sends nothing, so that the board's watchdog can stop the motor.
+    The context manager opens the serial line, and sends zeros before it closes it. After a runaway
+    it sends nothing, so that the board's watchdog can stop the motor.
     """
 
     def __init__(
         self, wire: Wire, mcu: McuConfig, rate_hz: float, longest_reply: float = MAX_REPLY_PERIOD_S
     ) -> None:
         self.wire, self.mcu, self.rate_hz = wire, mcu, rate_hz
+        # Largest permitted value of the setting `mcu.reply_period`.
         self.longest_reply_s = longest_reply
-        """Largest permitted value of the setting `mcu.reply_period`, s."""
+        # Whether the check has seen all motors stand still. From then on, the check ends if a motor
+        # runs away or if the board falls silent.
         self.armed = False
-        """Whether the check has seen all motors stand still. From then on, the check ends if a
-        motor runs away or if the board falls silent."""
+        # Ends the check by an exception: called before each line that turns a motor, and in
+        # `listen` at least every `BEAT_NS`, but not while the last zeros are sent.
         self.abort_check: Callable[[], object] = _nothing
-        """Callback that can end the check by an exception. `send` calls it before each line that
-        turns a motor. `listen` calls it at its beginning and after each wait, which lasts `BEAT_NS`
-        at most. It is not called while the check sends its last zeros."""
         # Results of the steps
         self.baud_rate: int = mcu.baud_rate
-        self.comma = mcu.trailing_comma
-        """Whether the lines to the board end with a comma."""
+        self.comma = mcu.trailing_comma  # whether the lines to the board end with a comma
+        # Whether motor d stops only if the line of zeros has the right ending: a comma if `comma`
+        # is true, else no comma.
         self.latched = False
-        """Whether motor d stops only if the line of zeros has the right ending: a comma if `comma`
-        is true, else no comma."""
+        # `sealed`: whether each line has a checksum. `sampled`: whether each line to the board
+        # requests a sample, that is the board's clock and encoder counts.
         self.sealed = self.sampled = False
-        """`sealed`: whether each line has a checksum. `sampled`: whether each line to the board
-        requests a sample, that is the board's clock and encoder counts."""
         self.identity: dict[str, str] = {}
+        # Whether the board sends its replies by its own clock, and not as answers to lines.
         self.own_clock = False
-        """Whether the board sends its replies by its own clock, and not as answers to lines."""
-        self.gap_s = mcu.reply_period
-        """Mean time from one reply to the next while lines are sent, s."""
+        self.gap_s = mcu.reply_period  # mean time from one reply to the next while lines are sent
+        # Whether the reply rate has been measured, so that `own_clock` and `gap_s` are known.
         self.paced = False
-        """Whether the reply rate has been measured, so that `own_clock` and `gap_s` are known."""
+        # Fraction of lines that are lost or damaged, to the board and from the board together.
         self.lost = 0.0
-        """Fraction of lines that are lost or damaged, to the board and from the board together."""
         # Received lines
         self.replies: list[BoardReply] = []
+        # Received lines that are neither valid replies nor status lines.
         self.unrecognized_lines: list[bytes] = []
-        """Received lines that are neither valid replies nor status lines."""
+        # Maps the number of each input to whether the board last reported it as pressed.
         self.inputs: dict[int, bool] = {}
-        """Maps the number of each input to whether the board last reported it as pressed.
-
-        Input 0 is the emergency stop, and inputs 1, 2, ... are the bumpers. An input that the board
-        has never reported is missing.
-        """
+        # Statistics of all bytes and lines received since the last call of `open`.
         self.heard = Heard()
-        """Statistics of all bytes and lines received since the last call of `open`."""
         self.sent_lines = 0
         self.sent_s = 0.0
+        # The delays by which this computer ran the check too late. If the board is simulated on
+        # this computer, the delays of the simulator are included.
         self.lateness = HostDelays()
-        """The delays by which this computer ran the check too late. If the board is simulated on
-        this computer, the delays of the simulator are included."""
+        # Whether a motor runs away, or keeps turning although zeros are sent. The check sends
+        # nothing more in this case, so that the board's watchdog can stop the motor.
         self.runaway_seen = False
-        """Whether a motor runs away, or keeps turning although zeros are sent. The check sends
-        nothing more in this case, so that the board's watchdog can stop the motor."""
 
         self._commanded = ZERO
+        # Time for which `drive` has sent lines since the last reply. If this computer is late, only
+        # one line period of its delay counts, because a delay does not show a silent board.
         self._unanswered_s = 0.0
-        """Time for which `drive` has sent lines since the last reply, s. If this computer is late,
-        only one line period of its delay counts, because a delay does not show a silent board."""
         self._listened_s = 0.0
         self._sequence = 0
         self._lines = LineReader()
@@ -179,10 +159,7 @@ class Board:
         self.forget()
 
     def forget(self) -> None:
-        """Discard all received lines, and reset the detector of restarts.
-
-        The results of the steps remain unchanged.
-        """
+        """Discard all received lines and detected restarts, but not the results of the steps."""
         self.restarts, self._unanswered_s = Restarts(), 0.0
         for buffer in (self._lines, self.replies, self.unrecognized_lines):
             buffer.clear()
@@ -223,10 +200,7 @@ class Board:
 
     @property
     def saved_results(self) -> dict[str, object]:
-        """Mapping from each name in `RESULT_FIELDS` to the value of that attribute.
-
-        Assign an earlier mapping to restore the attributes before a step is repeated.
-        """
+        """The attributes in `RESULT_FIELDS`; assign an earlier mapping to restore them."""
         return {name: getattr(self, name) for name in RESULT_FIELDS}
 
     @saved_results.setter
@@ -248,11 +222,7 @@ class Board:
     # Sending
 
     def line(self, motors: Motors, comma: bool | None = None) -> bytes:
-        """Return the line that commands the speeds `motors`, rad/s.
-
-        The line ends with a comma if `comma` is true. None means the value of `self.comma`. The
-        line has a sequence number and a checksum if `self.sealed` is true.
-        """
+        """Return the line for the speeds `motors`; `comma` None means the value of `self.comma`."""
         line = self._codecs[self.comma if comma is None else comma].encode(WheelSpeeds(*motors))
         if not self.sealed:
             return line
@@ -260,10 +230,7 @@ class Board:
         return seal(line, self._sequence, SAMPLE_REQUEST if self.sampled else b"")
 
     def send(self, motors: Motors, comma: bool | None = None) -> None:
-        """Send one line that commands the speeds `motors`, rad/s.
-
-        The line ends with a comma if `comma` is true. None means the value of `self.comma`.
-        """
+        """Send one line for the speeds `motors`; `comma` None means the value of `self.comma`."""
         if any(motors):
             self.abort_check()
         turned, self._commanded = any(self._commanded), motors
@@ -275,11 +242,10 @@ class Board:
         self.restarts.record_speeds(motors, self.sent_s)
 
     def zeros(self) -> None:
-        """Send zero speeds in two lines: one ends with a comma, and the other does not.
+        """Send zeros in two lines, with and without a comma, and with a checksum if `sealed`.
 
-        Some firmware stops motor d only at lines with one of the two endings. A line end comes
-        first, so that a partial line does not spoil the two lines. If `sealed` is true, also send a
-        line with a checksum.
+        Some firmware stops motor d only at one of the endings. A line end comes first, so that a
+        partial line does not spoil the two.
         """
         self._commanded = ZERO
         plain = self._codecs[True].stop + self._codecs[False].stop
@@ -287,10 +253,7 @@ class Board:
         self.restarts.record_speeds(ZERO, self.now_s)
 
     def comes_back(self) -> bool:
-        """Send zero speeds until the board answers, and return whether it answers in time.
-
-        The time limit is `motion.BOOT_S`, in which a restarted board answers.
-        """
+        """Send zeros until the board answers; return whether it does so within `motion.BOOT_S`."""
         before, end_s = len(self.replies), self.now_s + motion.BOOT_S
         while len(self.replies) == before:
             if self.now_s >= end_s:
@@ -300,25 +263,16 @@ class Board:
         return True
 
     def send_zero(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
-        """Send one line of zero speeds, then listen for `wait_s` s, but at least for `period_s`.
-
-        The line ends with a comma if `comma` is true. None means the value of `self.comma`.
-        """
+        """Send one line of zeros, then listen for `wait_s`, but at least for `period_s`."""
         self.send(ZERO, comma)
         self.listen(max(wait_s, self.period_s))
 
     def answers(
         self, lines: int, wait_s: float, comma: bool | None = None
     ) -> list[tuple[float, BoardReply]]:
-        """Send lines of zero speeds, and return the first reply to each line with its delay.
+        """Send lines of zeros. Return the delay, s, and the first reply for each answered line.
 
-        Each entry of the result is a pair: the time from the line to its reply, s, and the reply. A
-        line without a reply has no entry.
-
-        Args:
-            lines: the number of lines to send.
-            wait_s: how long to listen after each line, s; at least 1.5 times `period_s`.
-            comma: whether the lines end with a comma. None means the value of `self.comma`.
+        `wait_s` is how long to listen after each line, at least 1.5 times `period_s`.
         """
         # Receive the replies to earlier lines now, so that they are not taken for replies to these.
         self.listen(max(motion.SHORT_MEASUREMENT_S / 4, wait_s))
@@ -330,12 +284,10 @@ class Board:
         return pairs
 
     def drive(self, motors: Motors, seconds: float, period_s: float = 0.0) -> list[BoardReply]:
-        """Send lines with the speeds `motors`, rad/s, for `seconds` s, and return the replies.
+        """Send lines with the speeds `motors` for `seconds` s, and return the replies.
 
-        `period_s` is the time from one line to the next, s; 0 means `self.period_s`. Raises
-        `StoppedError` if the board falls silent, because a motor could then run away unnoticed.
-        This applies only after the check has seen all motors stand still (`self.armed`). Also
-        raises the errors of `listen`.
+        Raises `StoppedError` if the armed board falls silent, because a motor could then run away
+        unnoticed, and the errors of `listen`.
         """
         period_s = period_s or self.period_s
         end_s = self.now_s + seconds
@@ -365,20 +317,17 @@ class Board:
         return StoppedError(finding)
 
     def stop_and_be_silent(self, silent_s: float) -> None:
-        """Send zero speeds once, then send nothing for `silent_s` s.
-
-        In this time the board's watchdog can stop the motors.
-        """
+        """Send zeros once, then nothing for `silent_s`, in which the watchdog can act."""
         self.zeros()
         self.listen(silent_s)
 
     # Receiving
 
     def listen(self, seconds: float) -> list[BoardReply]:
-        """Receive data for `seconds` s, and return the replies that arrived in this time.
+        """Receive for `seconds` s, and return the replies of this time.
 
-        Raises `RestartedError` if the board restarts. Raises `StoppedError` if a motor runs away
-        after the check has seen all motors stand still (`self.armed`).
+        Raises `RestartedError` if the board restarts, and `StoppedError` if a motor of the armed
+        board runs away.
         """
         end_ns = self.wire.now_ns() + ceil(seconds * NS_PER_S)
         if self.now_s - self._listened_s > BEAT_NS / NS_PER_S:
@@ -445,11 +394,9 @@ class Board:
 
     @property
     def silent_s(self) -> float:
-        """Time since the board's last reply, s.
+        """Time since the last reply, s; 0 before the first one and after a runaway.
 
-        It is 0 before the first reply. It is also 0 after a motor has run away (`runaway_seen`).
-        Otherwise the check would send lines until the board answers, but after a runaway the check
-        must send nothing.
+        After a runaway the check must send nothing, and so must not wait for an answer.
         """
         return self.now_s - self.replies[-1].at_s if self.replies and not self.runaway_seen else 0.0
 
@@ -481,13 +428,11 @@ class Board:
         return motion.moving(last, motion.STANDING_SPEED)
 
     def stop_motors(self) -> None:
-        """Send zero speeds until all motors stand still.
+        """Send zeros until all motors stand still.
 
-        Raises `StoppedError` if a motor keeps turning, or if the board falls silent.
-
-        Some firmware stops motor d only if the line has the right ending: a comma or none. So if a
-        motor does not stop in time, also send zeros with the other ending. If motor d alone had
-        kept its speed, and stops now, use the other ending for all later lines (`comma`).
+        If a motor does not stop in time, also send zeros with the other line ending. If motor d
+        alone had kept its speed, and stops now, use that ending from now on. Raises `StoppedError`
+        if a motor keeps turning, or if the board falls silent.
         """
         began_s = self.now_s
         if self.settles(self.comma):
@@ -510,15 +455,10 @@ class Board:
         raise StoppedError(outcomes.find("stop: turns", motors=motors, seconds=seconds))
 
     def _unheard_s(self, since_s: float) -> float:
-        """Return the time since the last reply or since `since_s`, whichever is later, s."""
         return self.now_s - max([since_s, *(reply.at_s for reply in self.replies[-1:])])
 
     def settles(self, comma: bool) -> bool:
-        """Send zero speeds until all motors stand still, and return whether they do so in time.
-
-        The time limit is `motion.MOTOR_TIMEOUT_S`, or `motion.SLOWING_TIMEOUT_S` while a motor
-        slows down. `comma` says whether the lines of zeros end with a comma.
-        """
+        """Send zeros until all motors stand still; return whether they do so in time."""
         # The motors stand still if the last two replies since the call report no motion, and if no
         # earlier reply shows that a motor with a coarse encoder may still turn (`motion.turning`).
         began_s = self.now_s

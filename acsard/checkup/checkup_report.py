@@ -16,15 +16,11 @@ from acsard.core.config.parsing import effective, from_builtins
 from acsard.core.config.settings import Config
 from acsard.core.config.toml_text import excerpt
 
+# Maps dotted keys of the configuration, such as "mcu.port", to new values.
 Changes = dict[str, object]
-"""Maps dotted keys of the configuration, such as "mcu.port", to new values."""
 
+# They make lines longer, so `changes` leaves them out, one after the other, on a slow wire.
 OPTIONAL_KEYS = ("mcu.encoder_counts", "mcu.link_check")
-"""Keys of settings that improve the link but make its lines longer.
-
-If the wire is too slow for the longer lines, `changes` leaves out the suggestion to switch on the
-first setting. If that is not enough, it also leaves out the one for the second setting.
-"""
 
 
 def answered(findings: Iterable[Finding]) -> bool:
@@ -35,14 +31,9 @@ def answered(findings: Iterable[Finding]) -> bool:
 def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Changes:
     """Return the suggested values that differ from the configuration `config`.
 
-    The findings contain the suggested values. If a board answered and `port` is not "", `port` is
-    the suggested value of `mcu.port`.
-
-    Suggested values can contradict each other. For example, lines with a checksum may be too long
-    for the control rate. Then the function tries two remedies, one after the other:
-
-    1. Leave out suggestions that switch on a setting in `OPTIONAL_KEYS`.
-    2. Set `control.rate` to "auto". If this does not help, leave `control.rate` unchanged.
+    `port` is the suggestion for `mcu.port` if a board answered. If the suggestions contradict each
+    other, for example because lines with a checksum are too long for the control rate, those for
+    `OPTIONAL_KEYS` are left out, or `control.rate` becomes "auto".
     """
     wanted: Changes = {"mcu.port": port} if port and answered(findings) else {}
     for finding in findings:
@@ -65,10 +56,7 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
 
 
 def withheld(simulated: bool, config: Config) -> str:
-    """Return the reason why the findings do not apply to the configured robot, or "".
-
-    They do not apply if the check tested the simulator (`simulated`), but `config` has a real port.
-    """
+    """Return the reason why the findings do not apply to the configured robot, or ""."""
     if not simulated or config.mcu.simulated:
         return ""
     return (
@@ -105,8 +93,8 @@ class CheckupReport(Struct, frozen=True):
     toml: str
     written: str | None = None
     error: str | None = None
+    # Reason why the findings do not apply to the robot of the configuration file, else None.
     withheld: str | None = None
-    """Reason why the findings do not apply to the robot of the configuration file, else None."""
 
 
 def report(
@@ -117,11 +105,7 @@ def report(
     error: str,
     withheld: str = "",
 ) -> CheckupReport:
-    """Return the report of a check.
-
-    The check has passed if the board answered, if every step was run and judged, and if no step
-    failed. If `written`, `error` or `withheld` is "", the report contains None for it.
-    """
+    """Return the report. The check has passed if every step was run and judged, and none failed."""
     judged = answered(findings) and not lateness.unjudged(findings)
     passed = judged and not any(
         finding.verdict == "FAIL" or finding.name == SKIPPED_STEPS for finding in findings
@@ -133,11 +117,7 @@ def report(
 
 
 def summary(result: CheckupReport, where: str) -> str:
-    """Return the text that the check prints last, for the report `result`.
-
-    It contains the number of findings with each verdict, and the suggested changes. `where` is the
-    path of the configuration file.
-    """
+    """Return the text that the check prints last: number of findings, suggested changes."""
     verdicts = [finding.verdict for finding in result.findings]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in get_args(Verdict) if v in verdicts)
     if late := lateness.unjudged(result.findings):

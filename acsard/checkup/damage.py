@@ -11,20 +11,12 @@ from acsard.checkup.motion import SHORT_MEASUREMENT_S, SPEED, ZERO, moving
 from acsard.core.link.checked_line import seal
 from acsard.core.link.codec import LETTERS
 
+# They do not change the speeds, so it is not dangerous if the board obeys these lines.
 HARMLESS_KINDS = {"over-long", "garbage before it"}
-"""Kinds of damage that do not change the speeds in a line.
-
-It is not dangerous if the board obeys lines with these kinds of damage.
-"""
 
 
 def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple[str, bytes]]:
-    """Return damaged lines, each as a pair: the name of the kind of damage, and the line.
-
-    The lines command `SPEED` for `motors` (numbers 0 to 3) and zero for the other motors. If
-    `comma` is true, the lines end with a comma. If `sealed` is true, the result also contains lines
-    with a damaged checksum.
-    """
+    """Return damaged lines that would turn `motors`, each with the name of its damage."""
     a, b, c, d = (
         f"{letter}p{SPEED if motor in motors else 0.0:05.2f}"
         for motor, letter in enumerate(LETTERS)
@@ -54,11 +46,9 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Send damaged lines, and return a finding that says whether such a line moved a motor.
+    """Send damaged lines, and return a finding that says whether one moved a motor.
 
-    The finding names the kinds of damage that the board did not reject. `motors` are the numbers of
-    the motors that are known to follow commands. The damaged lines command speeds for these motors,
-    which must stand still. If `motors` is empty, nothing is sent.
+    `motors` are known to follow commands, and must stand still. If there are none, nothing is sent.
     """
     if not motors:
         return outcomes.find("damaged lines: untested")

@@ -1,9 +1,7 @@
-"""Steps of the check that find out how the board communicates.
+"""Steps that find out how the board communicates; no motor turns.
 
-The steps find out the baud rate, the form of the lines, whether the board supports the checked
-link, and the rate and the delay of the replies. They send only zero speeds and requests for the
-board's identification, so no motor turns. They store their results in the `Board`, for the later
-steps.
+They find the baud rate, the form of the lines, the checked link, and the rate and delay of the
+replies. They store their results in the `Board`, for the later steps.
 """
 
 from __future__ import annotations
@@ -64,10 +62,9 @@ def _knock(board: Board, seconds: float) -> bool:
 
 
 def identity(board: Board) -> Finding:
-    """Ask the board for its identification, and store its `NAME=VALUE` fields in the `Board`.
+    """Ask for the board's identification, and store its `NAME=VALUE` fields in the `Board`.
 
-    The identification is optional for the board. Raises `StoppedError` if the port only returns the
-    request itself as an echo, because then no board answers.
+    A board need not have one. Raises `StoppedError` if the port only echoes the request.
     """
     board.unrecognized_lines.clear()
     # Ask up to three times, because the question or its answer may be lost.
@@ -89,10 +86,9 @@ def identity(board: Board) -> Finding:
 
 
 def form(board: Board) -> Finding | None:
-    """Find out whether a wrong value of `mcu.trailing_comma` keeps the board from answering.
+    """Find out whether a wrong `mcu.trailing_comma` keeps the board from answering.
 
-    If the board answers only lines with the other ending (a comma or none), use this ending from
-    now on, and return a finding with the verdict FAIL. Otherwise return None.
+    If so, use the other ending from now on, and return a finding; else return None.
     """
     if _answers(board, board.comma) or not _answers(board, not board.comma):
         return None
@@ -110,8 +106,8 @@ def _answers(board: Board, comma: bool) -> list[BoardReply]:
 def comma(board: Board, dead: bool) -> Finding:
     """Return the finding about `mcu.trailing_comma`, after the test of motor d.
 
-    Some firmware turns or stops motor d only if the line ends with a comma. `dead` is true if motor
-    d showed no movement, or if this computer was too late to measure its movement.
+    Some firmware turns or stops motor d only if the line ends with a comma. `dead` says that its
+    movement was not seen.
     """
     if board.comma != board.mcu.trailing_comma:
         return _comma_wrong(board, "latched" if board.latched and board.comma else "disobeyed")
@@ -133,10 +129,7 @@ def _comma_wrong(board: Board, how: str) -> Finding:
 
 
 def replies(board: Board) -> Finding:
-    """Compare the replies with the documented form, and return a finding with the differences.
-
-    Each difference is a warning only, because the daemon can read such replies too.
-    """
+    """Compare the replies with the documented form; the daemon can read other forms too."""
     lines = [reply.line.partition(b"#")[0] for reply in board.replies]
     forms = {"spaces": rb", ", "unpadded": rb"[pn]\d\.", "trailing comma": rb", *\Z"}
     names = [name for name, sign in forms.items() if any(re.search(sign, line) for line in lines)]
@@ -150,9 +143,7 @@ def replies(board: Board) -> Finding:
 def check(board: Board) -> Finding:
     """Find out whether the board supports the checked link, and whether it can send samples.
 
-    The checked link adds a sequence number and a checksum to each line. A sample in a reply
-    contains the board's clock and encoder counts. The results are stored in `board.sealed` and
-    `board.sampled`.
+    A sample has the board's clock and encoder counts.
     """
     wanted = board.mcu.link_check
     board.sealed = board.sampled = True
@@ -169,10 +160,7 @@ def check(board: Board) -> Finding:
 
 
 def rate(board: Board) -> Finding:
-    """Measure how often the board replies, and whether it reports by its own clock.
-
-    The results are stored in `board.gap_s` and `board.own_clock`.
-    """
+    """Measure how often the board replies, and whether it reports by its own clock."""
     board.paced = True
     board.listen(SHORT_MEASUREMENT_S / 4)
     unasked = board.listen(WATCHDOG_SILENCE_S)
@@ -210,12 +198,7 @@ def rate(board: Board) -> Finding:
 
 
 def trip(board: Board) -> Finding:
-    """Measure the time from the sending of a line to the arrival of the board's reply.
-
-    A free-running board does not reply to single lines, so for such a board the finding says that
-    the step was skipped. If an earlier step could not measure the rate of the replies, the finding
-    says that the step was not judged.
-    """
+    """Measure the time from a line to its reply; skipped for a free-running board."""
     if not board.paced:
         return lateness.finding("round trip", board.lateness.since(0.0))
     if board.own_clock:

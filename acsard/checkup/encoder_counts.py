@@ -12,44 +12,27 @@ from acsard.checkup.findings import Finding, motor_names
 from acsard.checkup.motion import SHORT_MEASUREMENT_S, BoardReply, steps
 from acsard.core.link.codec import LETTERS
 
+# Largest tolerated relative difference between the measured and the expected counts per turn.
 MAX_COUNT_DIFFERENCE = 0.02
-"""Largest tolerated relative difference between the measured and the expected counts per turn.
 
-The configuration or the firmware states the expected number.
-"""
-
+# Smallest to largest counts per turn; low, because coarse encoders are measured roughly.
 MIN_COUNT_RATIO = 0.75
-"""Smallest tolerated ratio of the smallest to the largest counts per turn of the encoders.
 
-The limit is low, because a coarse encoder allows only a rough measurement.
-"""
-
+# From this variation of the angle per reply on, rad, the daemon must know the counts per turn.
 COARSE_ANGLE = 0.015
-"""Limit from which on encoders count as coarse, rad.
 
-The limit applies to the mean variation of the angle by which a wheel turns from one reply to the
-next. The daemon must know the counts per turn of a coarse encoder.
-"""
-
+# If replies are rarer, the acceleration of a motor makes the speed jump as a coarse encoder does.
 MAX_REPLY_GAP_S = 0.05
-"""Longest time from one reply to the next in a search for coarse encoders, s.
 
-A coarse encoder makes the reported speed jump. If replies are rarer, the acceleration of a motor
-causes similar jumps.
-"""
+MIN_READINGS = 20  # smallest number of nonzero reported speeds that can show a coarse encoder
 
-MIN_READINGS = 20
-"""Smallest number of nonzero reported speeds that can show a coarse encoder."""
-
-MAX_COUNTS = 100_000
-"""Largest value that `mcu.encoder_counts` accepts."""
+MAX_COUNTS = 100_000  # largest value that `mcu.encoder_counts` accepts
 
 
 def per_turn(replies: Sequence[BoardReply], motors: Sequence[int]) -> float | None:
-    """Return the mean number of encoder counts per wheel turn of `motors` (numbers 0 to 3).
+    """Return the mean encoder counts per wheel turn of `motors` from the reported speeds.
 
-    The number of turns is computed from the reported speeds. Return None if the motors turned too
-    little. The result is negative if the counts fall while the reported speeds are positive.
+    It is None if the motors turned too little, and negative if the counts fall at positive speeds.
     """
     counts = angle = 0.0
     for step in steps(replies):
@@ -65,12 +48,10 @@ def per_turn(replies: Sequence[BoardReply], motors: Sequence[int]) -> float | No
 
 
 def coarse(replies: Sequence[BoardReply], motors: Sequence[int]) -> float | None:
-    """Estimate the counts per wheel turn of coarse encoders from the jumps of the reported speeds.
+    """Estimate the counts per turn of coarse encoders from the jumps of the reported speeds.
 
-    A coarse encoder has few counts per turn, so its reported speed jumps at each count. This
-    function is for replies that contain no counts. `motors` are numbers from 0 to 3. Return None if
-    the encoders are not coarse, if too few replies contain a speed other than 0, or if the replies
-    are too rare (`MAX_REPLY_GAP_S`).
+    For replies without counts. None if the encoders are not coarse, or if the replies are too few
+    or too rare.
     """
     course = [step for step in steps(replies) if 0.0 < step.seconds <= SHORT_MEASUREMENT_S]
     # Use the median, because the arrival time of a single reply is wrong if this computer is late.
@@ -91,11 +72,9 @@ def coarse(replies: Sequence[BoardReply], motors: Sequence[int]) -> float | None
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Return the finding about `mcu.encoder_counts`, the configured counts per wheel turn.
+    """Return the finding about `mcu.encoder_counts`, by the replies of `motors`.
 
-    The configured value is compared with the value that is measured from the replies. If the
-    board's identification also states a value, that value must agree with the measurement. `motors`
-    are the numbers of the motors that turned as commanded.
+    If the board's identification also states a value, it must agree with the measurement.
     """
     if not board.sampled:
         about = coarse(board.replies, motors)

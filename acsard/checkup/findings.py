@@ -13,16 +13,15 @@ from acsard.core.values import WHEELS, AcsardError
 
 Verdict = Literal["PASS", "WARN", "FAIL", "SKIPPED"]
 
+# Name of the finding that lists the steps without a result after an early end of the check.
 SKIPPED_STEPS = "the rest"
-"""Name of the finding that lists the steps without a result after an early end of the check."""
 
 
 class Finding(Struct, frozen=True):
     """The result of one step of the check, for example of the test of one motor.
 
-    `figure` is the measurement, and `text` explains it. `mend` is the remedy, or "" if no remedy is
-    needed. `keys` maps dotted keys of the configuration, such as "mcu.baud_rate", to suggested
-    values. A suggested value can be equal to the configured value. `outcomes.py` has the texts.
+    `figure` is the measurement, `text` explains it, and `mend` is the remedy. `keys` are suggested
+    values by dotted key, equal to the configured ones or not.
     """
 
     name: str
@@ -46,11 +45,7 @@ class WireLostError(AcsardError):
 
 
 def wheel_of(mcu: McuConfig, motor: int) -> tuple[str, int]:
-    """Return a pair: the wheel that a motor turns according to the configuration, and a sign.
-
-    `motor` is the number of the motor, 0 to 3. The sign is -1 if a positive speed of the motor
-    turns the wheel backward, else 1.
-    """
+    """Return the configured wheel of a motor, and -1 if positive speeds turn it backward."""
     for wheel in WHEELS:
         entry = getattr(mcu.wheels, wheel)
         if entry[1] == LETTERS[motor]:

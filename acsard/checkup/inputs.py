@@ -1,8 +1,7 @@
 """Asks the operator to press the emergency stop and each bumper, and checks the board's reports.
 
-The emergency stop and the bumpers are called the inputs of the board. The board reports them in
-status lines (`core/link/board_status.py`). This step is the last step of the check, because the
-emergency stop switches the motors off, and some motor drivers must be enabled again afterward.
+This step is the last one, because the emergency stop switches the motors off, and some motor
+drivers must be enabled again afterward.
 """
 
 from __future__ import annotations
@@ -12,19 +11,17 @@ from acsard.checkup.board import Board, Operator
 from acsard.checkup.findings import Finding
 from acsard.core.config.settings import SafetyConfig
 
+# Time within which the operator must press and release the emergency stop or a bumper.
 PRESS_TIMEOUT_S = 20.0
-"""Time within which the operator must press and release the emergency stop or a bumper, s."""
 
+# Time within which every board reports its emergency stop and each bumper at least once.
 REPORT_TIMEOUT_S = 0.5
-"""Time within which every board reports its emergency stop and each bumper at least once, s."""
 
 
 def finding(board: Board, operator: Operator, safety: SafetyConfig) -> Finding:
-    """Let the operator press each input, and check that the board reports each press and release.
+    """Let the operator press each input that is configured or that the board reports.
 
-    The inputs are the emergency stop and the bumpers that the configuration requires or that the
-    board reports. A bumper is named by its configured place on the robot, or by its number if the
-    configuration contains no places. The inputs are not tested if no operator is ready.
+    The inputs are the emergency stop and the bumpers. They are not tested if no operator is ready.
     """
     board.send_zero(REPORT_TIMEOUT_S)
     estop = safety.estop == "required" or (safety.estop == "auto" and 0 in board.inputs)

@@ -1,9 +1,8 @@
 """Counts lost and damaged lines, and finds out in which direction lines are lost.
 
-A reply that arrives damaged was damaged on its way from the board. If a line has no reply, the line
-or its reply was lost. To distinguish these two cases, the check sends pulses: single lines that
-turn the motors for a moment. The reply was lost if the motors obey a pulse that has no reply. The
-line was lost if the motors do not obey the pulse.
+A reply that arrives damaged was damaged on its way from the board. A line without a reply, or its
+reply, was lost. To tell which, the check sends pulses: single lines that turn the motors for a
+moment. If the motors obey, the reply was lost, and else the line.
 """
 
 from __future__ import annotations
@@ -22,29 +21,22 @@ from acsard.core.formatting import printable_bytes
 from acsard.core.link.link_diagnosis import MAX_SHOWN_BYTES
 from acsard.core.link.session import IDENTITY
 
+# Largest fraction of lost lines that the check accepts. A good link loses no line.
 MAX_LOSS = 0.02
-"""Largest fraction of lost lines that the check accepts. A good link loses no line."""
 
+# Smallest number of lost lines that shows a fault. A single lost line may be a coincidence.
 MIN_LOST_LINES = 2
-"""Smallest number of lost lines that shows a fault. A single lost line may be a coincidence."""
 
+# Without a loss, the counting takes `MIN_COUNT_S`, else up to `MAX_COUNTED_LINES` (enough to show 2
+# %) or `MAX_COUNT_S`.
 MAX_COUNTED_LINES, MIN_COUNT_S, MAX_COUNT_S = 300, 3.0, 10.0
-"""Limits of the step that counts lost lines: a number of lines, and two durations, s.
 
-The step takes `MIN_COUNT_S` if no line is lost. Otherwise it ends after `MAX_COUNTED_LINES` lines,
-which are enough to show a loss of 2 %, or after `MAX_COUNT_S`.
-"""
-
+# A gap between two replies is a silence only if it exceeds the mean gap times this number.
 SILENCE_FACTOR = 2.0
-"""A gap between two replies is a silence only if it exceeds the mean gap times this number."""
 
 
 class Count(Struct, frozen=True):
-    """Result of counting lines.
-
-    `lines` is the number of all lines, and `lost` the number of lost lines. `damaged` is the number
-    of lines that arrived damaged. A damaged line counts as lost too.
-    """
+    """Numbers of all, of lost, and of damaged lines. A damaged line counts as lost too."""
 
     lines: int
     lost: int
@@ -59,10 +51,8 @@ class Count(Struct, frozen=True):
 def finding(board: Board) -> Finding:
     """Send zeros at the control rate, count the lost lines, and set `board.lost`.
 
-    Raises `StoppedError` if more than `MAX_LOSS` of the lines are lost, some lines arrive damaged,
-    and the lines have no checksum. On such a link, a damaged line could command any speed. If an
-    earlier step could not measure the rate of the replies, the finding says that the loss was not
-    judged.
+    Raises `StoppedError` if too many lines without a checksum are lost and some arrive damaged,
+    because a damaged line could then command any speed.
     """
     if not board.paced:
         return lateness.finding("lost lines", board.lateness.since(0.0))
@@ -101,10 +91,6 @@ def finding(board: Board) -> Finding:
 
 
 def _period_s(board: Board) -> float:
-    """Return the time from one sent line to the next while lost lines are counted, s.
-
-    It is the daemon's control period, or longer if the wire or the board is too slow for this.
-    """
     longest = line_bytes(board.comma, board.sealed, board.sampled)
     period_s = 1 / min(board.rate_hz, highest_rate(board.baud_rate, longest, COMFORTABLE_USE))
     if not board.own_clock and board.gap_s > 1.5 * period_s:
@@ -122,7 +108,6 @@ def _counted(board: Board, began_s: float, lines: int, others: int) -> Count:
 
 
 def _left_out(replies: Sequence[BoardReply]) -> int:
-    """Return how many replies are missing, for a board that sends them at regular intervals."""
     # Compute the number from the time between the first and the last reply. A single long gap does
     # not show a lost reply, because a reply that is received late makes one gap longer and the next
     # gap shorter.
@@ -133,54 +118,30 @@ def _left_out(replies: Sequence[BoardReply]) -> int:
 
 
 def _silence_s(board: Board, replies: Sequence[BoardReply]) -> float:
-    """Return the longest gap between two replies, s, or 0 if the daemon tolerates such a gap."""
     longest = max(motion.gaps(replies), default=0.0)
     quiet_s = max(0.1, 4 / board.rate_hz, 3 * board.mcu.reply_period)
     return longest if longest > max(quiet_s, SILENCE_FACTOR * board.gap_s) else 0.0
 
 
+# From a pulse to its zeros: long enough for the encoders, too short for the watchdog.
 PULSE_S = 0.08
-"""Time from a pulse (a single line that turns the motors) to the zeros that follow, s.
 
-This time is long enough for the encoders to show the movement. It is too short for the board's
-watchdog to act.
-"""
-
+# Pulses are sent until this many had no reply, or for `MAX_PULSES_S`.
 MAX_UNANSWERED_PULSES, MAX_PULSES_S = 8, 20.0
-"""Limits of the search for the direction in which lines are lost.
 
-The check sends pulses (single lines that turn the motors) until `MAX_UNANSWERED_PULSES` pulses have
-had no reply, or until `MAX_PULSES_S` s have passed.
-"""
-
+# Pulse n is followed by (n * `STRIDE`) % `SPREAD` more periods, because a link that loses every
+# tenth line might never lose an evenly spaced pulse.
 SPREAD, STRIDE = 12, 5
-"""Numbers that make the pauses between pulses unequal (pulses are single lines with speeds).
 
-The pause after pulse n is the shortest pause plus (n * `STRIDE`) % `SPREAD` line periods. If all
-pauses were equal, a link that loses, for example, every tenth line might never lose a pulse.
-"""
-
+# Of the median angle of the pulses: a smaller angle means that a pulse was lost.
 OBEYED_FRACTION = 0.5
-"""Smallest angle that shows that the motors obeyed a pulse (a single line that turns them).
 
-It is a fraction of the median of the angles by which the pulses turned the motors.
-"""
-
+# The median angle, rad and in the smallest steps of the encoders, that shows which pulses arrived.
 MIN_PULSE_ANGLE, MIN_PULSE_STEPS = 0.02, 4
-"""Limits for the median angle by which pulses (single lines) turn the motors.
-
-The check can tell which pulses arrived if the median is at least `MIN_PULSE_ANGLE` rad, and at
-least `MIN_PULSE_STEPS` times the smallest angle that the encoders showed between two replies.
-"""
 
 
 class PulseCounts(Struct, frozen=True):
-    """Numbers of pulses. A pulse is a single line that turns the motors for a moment.
-
-    `sent` is the number of pulses whose movement was measured. `lost_out` is the number of pulses
-    that were lost on their way to the board. `lost_back` is the number of pulses that the motors
-    obeyed, although no reply arrived.
-    """
+    """Numbers of measured pulses, of pulses lost on their way, and of lost replies to pulses."""
 
     sent: int
     lost_out: int
@@ -188,11 +149,9 @@ class PulseCounts(Struct, frozen=True):
 
 
 def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Finding | None:
-    """Find out whether lines are lost on the way to the board, or replies on the way back.
+    """Find out whether lines or replies are lost, by `motors`, which turn briefly.
 
-    The motors turn briefly, several times. `motors` are the numbers of the motors that turn as
-    commanded: their encoders show which lines arrived. Do nothing and return None for a prompted
-    board that loses no more than the fraction `MAX_LOSS` of the lines.
+    Return None for a prompted board that loses no more than `MAX_LOSS`.
     """
     if not (board.own_clock or board.lost > MAX_LOSS):
         return None
@@ -211,10 +170,9 @@ def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Findin
 
 
 def pulsed(board: Board, motors: Sequence[int]) -> PulseCounts | None:
-    """Send pulses, and count the lost pulses and the lost replies.
+    """Send pulses from a standstill, and count the lost pulses and the lost replies.
 
-    A pulse is a single line that turns `motors` for a moment from a standstill. Return None if the
-    measured movement does not show which pulses arrived.
+    Return None if the movement does not show which pulses arrived.
     """
     on = motion.only(motors)
     # If the board reports by its own clock, no earlier step has found a loss of lines to the board,
@@ -250,13 +208,11 @@ def pulsed(board: Board, motors: Sequence[int]) -> PulseCounts | None:
 
 
 def _whole(board: Board, since_s: float) -> bool:
-    """Return whether all reports of a free-running board since the time `since_s` have arrived."""
     gaps = motion.gaps(motion.since(board.replies, since_s - board.gap_s))
     return all(gap_s < 1.5 * board.gap_s for gap_s in gaps)
 
 
 def _grain(board: Board, motors: Sequence[int]) -> float:
-    """Return the smallest nonzero angle by which an encoder turned between two replies, rad."""
     course = motion.steps(board.replies)
     angles = [abs(step.speeds[m]) * step.seconds for step in course for m in motors]
     return min((angle for angle in angles if angle), default=0.0)

@@ -1,7 +1,6 @@
-"""Evaluates the movement of the motors from the board's replies. The functions are pure.
+"""Evaluates the movement of the motors from the board's replies, without any I/O.
 
-The module also defines the speeds (rad/s) and times (s) that several steps of the check share. A
-speed or time that only one step uses is defined in the module of that step.
+It has the speeds (rad/s) and times (s) that several steps share.
 """
 
 from __future__ import annotations
@@ -52,23 +51,16 @@ MAX_REPLY_AGE_S = 1.0
 
 ZERO: Motors = (0.0, 0.0, 0.0, 0.0)
 
-TREND_S = 0.5
-"""Shortest duration of each of the two intervals whose mean speeds `trend` compares, s."""
+TREND_S = 0.5  # shortest duration of each of the two intervals whose mean speeds `trend` compares
 
+# Below this ratio of `trend`, a motor slows down; above its inverse, it speeds up.
 SLOWING_RATIO = 0.97
-"""Limit for the ratio of two successive mean speeds of a motor, which `trend` returns.
-
-The motor is slowing down if the ratio is below this limit. It is speeding up if the ratio is above
-the inverse of this limit.
-"""
 
 
 class BoardReply(Struct, frozen=True):
-    """A valid reply of the board.
+    """A valid reply: time of arrival, speeds of the motors a to d in rad/s, and its text.
 
-    `at_s` is the monotonic time at which the whole reply had arrived, s. `motors` are the reported
-    speeds of the motors a to d, rad/s. `line` is the text of the reply. `reading` contains the
-    board's clock and encoder counts, or is None if the reply does not contain them.
+    `reading` has the board's clock and encoder counts, if the reply has them.
     """
 
     at_s: float
@@ -78,12 +70,10 @@ class BoardReply(Struct, frozen=True):
 
 
 class ReplyInterval(Struct, frozen=True):
-    """The interval from one reply to the next.
+    """The interval from one reply to the next: its duration by both clocks, and later speeds.
 
-    `seconds` is its duration on this computer's clock, s. `mcu_s` is its duration on the board's
-    clock, s. `speeds` are the speeds in the later reply, rad/s. `counts` are the counts by which
-    each encoder moved, -32768 to 32767. If a reply lacks the board's clock and encoder counts,
-    `mcu_s` is 0 and `counts` is None.
+    `counts` are those by which each encoder moved, -32768 to 32767. Without the board's clock and
+    counts, `mcu_s` is 0 and `counts` is None.
     """
 
     seconds: float
@@ -111,10 +101,7 @@ def moving(speeds: Motors, least: float = MOVING_SPEED) -> list[int]:
 def since(
     replies: Sequence[BoardReply], since_s: float, until_s: float = math.inf
 ) -> Sequence[BoardReply]:
-    """Return the replies that arrived between two monotonic times, `since_s` and `until_s`, s.
-
-    `replies` must be in the order of their arrival.
-    """
+    """Return the replies that arrived between two monotonic times, s."""
     first = bisect_left(replies, since_s, key=lambda reply: reply.at_s)
     return replies[first : bisect_right(replies, until_s, key=lambda reply: reply.at_s)]
 
@@ -143,10 +130,10 @@ def steps(replies: Sequence[BoardReply]) -> Iterator[ReplyInterval]:
 
 
 def covered(replies: Sequence[BoardReply], since_s: float, per_turn: float = 0.0) -> Motors:
-    """Return the angle by which each encoder has turned since the monotonic time `since_s`, rad.
+    """Return the angle by which each encoder has turned since the time `since_s`, rad.
 
-    The angle is computed from the reported speeds. If `per_turn`, the number of encoder counts per
-    turn, is not 0, the angle is computed from the counts wherever the replies contain them.
+    It is that of the counts where replies have them and `per_turn` is known, else that of the
+    reported speeds.
     """
 
     def angle(step: ReplyInterval, motor: int) -> float:
@@ -159,10 +146,10 @@ def covered(replies: Sequence[BoardReply], since_s: float, per_turn: float = 0.0
 
 
 def turning(replies: Sequence[BoardReply], now_s: float) -> list[int]:
-    """Return the numbers of the motors that may still turn at the monotonic time `now_s`, s.
+    """Return the numbers of the motors that may still turn at the time `now_s`.
 
-    A coarse encoder reports a speed of 0 in most replies, even while its motor turns. After a reply
-    that reports a movement, the motor therefore counts as turning for some time.
+    A coarse encoder reports 0 in most replies, so a motor counts as turning for some time after a
+    movement.
     """
     # The motor counts as turning for the time that it would need to turn by the reported angle at
     # the speed `STANDING_SPEED`.
@@ -181,12 +168,9 @@ def turning(replies: Sequence[BoardReply], now_s: float) -> list[int]:
 
 
 def trend(replies: Sequence[BoardReply], now_s: float, gap_s: float) -> Motors:
-    """Return for each motor the ratio of its present mean speed to its mean speed shortly before.
+    """Return for each motor its present mean speed divided by that shortly before.
 
-    A ratio below 1 means that the motor slows down. The ratio is 1 for a motor that stands still.
-    The speeds are the means over two intervals of equal duration. The second interval ends at the
-    monotonic time `now_s`, s, and the first interval ends when the second begins. `gap_s` is the
-    mean time between two replies, s.
+    It is 1 for a motor that stands still. The means are over two successive intervals.
     """
     span_s = max(TREND_S, 4 * gap_s)
     before = mean(since(replies, now_s - 2 * span_s, now_s - span_s))
@@ -196,12 +180,10 @@ def trend(replies: Sequence[BoardReply], now_s: float, gap_s: float) -> Motors:
 
 
 def grain_s(steady: Sequence[BoardReply], motors: Sequence[int]) -> float:
-    """Return the resolution of the reported speeds, expressed as a time, s.
+    """Return the resolution of the reported speeds as a time, s; 0 for fewer than five replies.
 
-    The reported speeds jump even at a steady speed, because the firmware computes them from whole
-    encoder counts. A jump times the time between two replies is an angle. The result is the time in
-    which a motor at `SPEED` turns by this angle. `steady` are replies that arrived while `motors`
-    turned at `SPEED`. Return 0 for fewer than five replies.
+    Speeds jump because the firmware computes them from whole counts. It is the time in which a
+    motor at `SPEED` turns by a jump times the time between two replies.
     """
     if len(steady) < 5:
         return 0.0
@@ -212,10 +194,9 @@ def grain_s(steady: Sequence[BoardReply], motors: Sequence[int]) -> float:
 
 
 def runaway(replies: Sequence[BoardReply]) -> tuple[int, float] | None:
-    """Return a motor that several replies show to be faster than `RUNAWAY_SPEED`, or None.
+    """Return the number and speed of a motor that is faster than `RUNAWAY_SPEED`, or None.
 
-    The result is a pair: the number of the motor, and its mean speed in the last replies, rad/s. A
-    single reply proves nothing, because it may be damaged, or show one count of a coarse encoder.
+    It takes several replies, because one may be damaged, or show one count of a coarse encoder.
     """
     # Leave out the largest movement of each interval, which a single wrong reply can cause. A short
     # interval shows a runaway motor sooner, and a longer interval shows it even with a coarse

@@ -371,19 +371,17 @@ FAIL serial line: lost | lost
 class TimingFinding(Finding, frozen=True):
     """A finding that may be wrong if this computer ran the check too late.
 
-    `margin_s` is the time by which the measurement exceeds its limit, s. If this computer was late
-    by less than half of this time, its delay cannot have caused the finding.
+    A delay of less than half of `margin_s`, by which the measurement exceeds its limit, cannot have
+    caused it.
     """
 
     margin_s: float = 0.0
 
 
 class Outcome(Struct, frozen=True):
-    """One possible outcome of a step, with the texts of its finding.
+    """One possible outcome of a step, with the format strings of its finding.
 
-    `figure` (the measurement), `text` (its meaning) and `mend` (the remedy) are format strings,
-    into which `find` inserts the measured values. `unsure` says whether a computer that runs the
-    check too late can cause this outcome.
+    `unsure` says whether a computer that runs the check too late can cause this outcome.
     """
 
     verdict: Verdict
@@ -405,19 +403,15 @@ def _parse_manual(manual: str) -> dict[str, Outcome]:
     return outcomes
 
 
+# Maps the name of each outcome, such as "baud rate: right", to the outcome.
 OUTCOMES_BY_NAME = _parse_manual(OUTCOMES)
-"""Maps the name of each outcome, such as "baud rate: right", to the outcome."""
 
 
 def find(outcome: str, keys: dict[str, object] | None = None, **values: object) -> Finding:
-    """Return the finding for an outcome, with the measured values in its texts.
+    """Return the finding for an outcome, a key of `OUTCOMES_BY_NAME`, with the values in its texts.
 
-    Args:
-        outcome: a key of `OUTCOMES_BY_NAME`. The part before the colon is the name of the finding.
-        keys: the configuration values that the finding suggests, by dotted key.
-        values: the measured values by name. The value `name` replaces the name of the finding. The
-            value `margin_s` is stored in the finding if the outcome is unsure (see
-            `TimingFinding`).
+    The value `name` replaces the name of the finding, and `margin_s` is stored if the outcome is
+    unsure.
     """
     entry = OUTCOMES_BY_NAME[outcome]
     name = str(values.get("name", outcome.partition(":")[0]))

@@ -44,15 +44,15 @@ CONFIRMATION = (
     f'"{LIFTED}". No wheel has turned yet; q or Ctrl-C quits at any time:'
 )
 
+# After an early end, the finding `SKIPPED_STEPS` lists the steps without a result, or the motors
+# without one.
 STEPS = (
     "baud rate", "identification", "reply form", "reply rate", "round trip", "checked link",
     "lost lines", "motors", "trailing comma", "wheel map", "encoder counts", "watchdog",
     "damaged lines", "inputs",
 )  # fmt: skip
-"""Names of all steps. After an early end of the check, the finding `SKIPPED_STEPS` lists the steps
-without a result. If only some motors have a result, the finding names the other motors instead of
-the step "motors"."""
 
+# The first steps of the check, in order, each with a message for the operator.
 SILENT_STEPS: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("listening for 3 s at the configured baud rate, then at other baud rates", dialect.baud),
     ("asking the board for its name", dialect.identity),
@@ -64,34 +64,19 @@ SILENT_STEPS: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("asking whether the board supports the link check", dialect.check),
     ("counting lost lines for 3 s or more", line_loss.finding),
 )
-"""The first steps of the check, in order, each with a message for the operator.
-
-They send only zero speeds and questions.
-"""
 
 Step = Callable[[], Finding | None]
 
+# A step is repeated `LATE_AGAIN` times, all steps `LATE_MOST` times: else it could take four
+# minutes.
 LATE_AGAIN, LATE_MOST = 2, 8
-"""Limits for the repetition of steps that this computer ran too late.
 
-A step is repeated up to `LATE_AGAIN` times. All steps together are repeated up to `LATE_MOST`
-times, because a check could otherwise take four minutes.
-"""
-
+# A longer stall ends the check, because the operator may have left. The first applies until all
+# motors were seen to stand still.
 STALL_S, ZEROS_STALL_S = 0.5, 5.0
-"""Longest stalls of this program that do not end the check, s.
 
-A longer stall ends the check, because the operator may have left the robot meanwhile.
-`ZEROS_STALL_S` applies while the check sends only zeros, until it has seen all motors stand still.
-Later `STALL_S` applies. A shorter stall can only cause a repetition of the step.
-"""
-
+# The step with restart number `AGAIN` + 1, or restart number `MOST` in all, ends the check.
 AGAIN, MOST = 1, 5
-"""Limits for restarts of the board: `AGAIN` for one step, and `MOST` for all steps together.
-
-If the board restarts during a step, the step is repeated up to `AGAIN` times. One more restart in
-the same step ends the check. The check also ends with restart number `MOST` in all.
-"""
 
 
 def run(
@@ -103,29 +88,16 @@ def run(
 ) -> None:
     """Check one microcontroller, and call `tell` with each finding as soon as it is known.
 
-    Until the operator confirms that the wheels are lifted, the check sends only zeros. The last
-    lines are zeros, unless the serial port is lost. The check ends early if this program stalls for
-    longer than `STALL_S` or `ZEROS_STALL_S`. The wait for an answer of the operator is not a stall.
-    Raises `KeyboardInterrupt` if the operator types `QUITS`, even while a motor turns, and
-    `MendableError` if the port cannot be opened.
-
-    Args:
-        wire: the connection to the board, which is not open yet.
-        operator: the person near the robot, who confirms and answers.
-        config: the configuration of the robot, with which the check compares the board.
-        tell: function that receives each finding.
-        asleep_ns: function that returns for how long this computer has been suspended since its
-            start, ns. The clock of `wire` does not count this time.
+    Only zeros are sent until the operator confirms that the wheels are lifted, and at the end.
+    `asleep_ns` returns how long the computer has been suspended, which the clock of `wire` leaves
+    out. Raises `KeyboardInterrupt` if the operator types `QUITS`, and `MendableError` if the port
+    cannot be opened.
     """
     finding_names: set[str] = set()
     unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """Call `tell` with the first finding of each name, and ignore later findings of that name.
-
-        There is one exception. If the first finding says that its step was not judged, also call
-        `tell` with the next finding that judges the step.
-        """
+        """Call `tell` with the first finding of each name, and with a later one that judges."""
         if finding is None:
             return
         judged = lateness.judged(finding)
@@ -163,19 +135,13 @@ def run(
 
 
 class _Watched:
-    """Passes questions to the operator, and ends the check if the operator quits.
-
-    It also ends the check if this program stalls, because the operator may have left meanwhile.
-    """
-
     def __init__(self, operator: Operator, board: Board, asleep_ns: Callable[[], int]) -> None:
         self.doing, self.keys = operator.doing, operator.keys
         self._operator, self._board, self._asleep_ns = operator, board, asleep_ns
+        # Time of the last call of `check_operator` or of the operator's last answer.
         self._ran_s = self._now_s()
-        """Time of the last call of `check_operator` or of the operator's last answer, s."""
 
     def _now_s(self) -> float:
-        """Return a monotonic time, s, that advances even while the computer is suspended."""
         return self._board.now_s + self._asleep_ns() / NS_PER_S
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
@@ -198,8 +164,6 @@ class _Watched:
 
 
 class _Steps:
-    """Runs the steps. It repeats a step if the board restarts or if this computer is too late."""
-
     def __init__(
         self,
         board: Board,
@@ -208,8 +172,8 @@ class _Steps:
         seen: list[Restart],
     ) -> None:
         self._board, self._operator, self._tell = board, operator, tell
+        # All restarts of the board so far. The caller of `all` reads this list afterward.
         self._all_restarts = seen
-        """All restarts of the board so far. The caller of `all` reads this list afterward."""
         self._channels: list[Channel] = []
         self._late_left = LATE_MOST
 
@@ -237,10 +201,6 @@ class _Steps:
         self._board.armed = True
 
     def _turn(self, motor: int) -> Finding:
-        """Test one motor, then ask the operator which wheel turned.
-
-        The question is omitted if this computer ran the test too late.
-        """
         board, operator, channels = self._board, self._operator, self._channels
         operator.doing(f"{motor_name(board.mcu, motor)} turns: briefly, then forward and back")
 
@@ -259,11 +219,6 @@ class _Steps:
         self._take(doing, partial(self._in_time, step))
 
     def _in_time(self, step: Step) -> Finding | None:
-        """Run a step. Repeat it if this computer was too late for a reliable finding.
-
-        After the last permitted repetition, return a finding which says that the step was not
-        judged. Raises `StoppedError` if the step ends the check.
-        """
         board, saved, late_s = self._board, self._board.saved_results, 0.0
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:
@@ -317,11 +272,6 @@ class _Steps:
                 board.saved_results = saved
 
     def _tried(self, step: Step) -> Finding | None:
-        """Run a step. Raise `RestartedError` if the board restarted during the step.
-
-        A bad finding can come from a restart. So after a bad finding, if the board is silent, wait
-        until it sends a line, which can show the restart.
-        """
         try:
             finding = step()
         except StoppedError:

@@ -1,8 +1,7 @@
 """Detects restarts of the board during the check, from the lines that the board sends.
 
-During a restart, the present step of the check measures wrong values. The cable, a motor or the
-watchdog would then seem to be at fault. `procedure.py` therefore repeats the step. At the end of
-the check, a finding gives the probable cause of the restarts.
+After a restart, the cable, a motor or the watchdog would seem to be at fault, so `procedure.py`
+repeats the step. At the end a finding gives the probable cause.
 """
 
 from __future__ import annotations
@@ -19,43 +18,29 @@ from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, ZERO, BoardReply
 from acsard.core.config.settings import McuConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.session import IDENTITY
-from acsard.core.values import AcsardError
+from acsard.core.values import AcsardError, Seconds
 
+# A later identification was sent without a request, because the board booted.
 ANSWER_TIMEOUT_S = 1.0
-"""Longest time from a request for the board's identification to the answer, s.
 
-If an identification arrives later, the board sent it without a request, because it booted.
-"""
-
+# After fewer lines without a reply, a text may be a debug print of the firmware.
 RESTART_UNANSWERED_LINES = 5
-"""Number of successive lines without a reply that makes a text from the board a sign of a restart.
 
-After fewer lines without a reply, the text may be a debug print of the firmware.
-"""
-
+# By which the board's clock may advance more than this computer's between two replies. A clock
+# that restarts seems to advance by far more, modulo `CLOCK_RANGE_MS`.
 CLOCK_TOLERANCE_S = 2.0
-"""Tolerated difference between the board's clock and this computer's clock, s.
 
-Between two replies, the board's clock may advance by this time more than this computer's clock, for
-example because a reply was delayed. If it advances by more, the board has restarted, because a
-clock that jumps back to 0 seems to advance by a large time modulo `CLOCK_RANGE_MS`.
-"""
+CLOCK_RANGE_MS = 65536  # time after which the board's clock overflows and continues at 0
 
-CLOCK_RANGE_MS = 65536
-"""Time after which the board's clock overflows and continues at 0, ms."""
-
+# Shortest time without a line to the board that can make its watchdog restart the board.
 MIN_SILENCE_S = 0.25
-"""Shortest time without a line to the board that can make its watchdog restart the board, s."""
 
+# From the causes of the reference firmware to outcomes, without "restarts: ".
 CAUSES = {"power": "supply", "brown-out": "supply", "watchdog": "watchdog", "pin": "pin"}
-"""Maps causes of restarts, as the reference firmware reports them, to outcomes in `outcomes.py`.
 
-Each value is the part of the outcome's name after "restarts: ".
-"""
-
+# Pattern of three letters in a row, by which a text is recognized. A reply does not contain them,
+# even if it is damaged.
 _WORD = re.compile(rb"[a-z]{3}|[G-Z]{3}")
-"""Pattern of three letters in a row, by which a text is recognized. A reply does not contain them,
-even if it is damaged."""
 
 _CAUSE = re.compile(rb" reset=([a-z-]{1,20})")
 
@@ -63,14 +48,13 @@ _CAUSE = re.compile(rb" reset=([a-z-]{1,20})")
 class Restart(Struct, frozen=True):
     """One restart of the board."""
 
-    sign: str
-    """The observation that shows the restart, in words."""
+    sign: str  # the observation that shows the restart, in words
+    # Speeds that were commanded shortly before the restart, rad/s; zeros if no motor turned.
     turned: Motors = ZERO
-    """Speeds that were commanded shortly before the restart, rad/s; zeros if no motor turned."""
-    silent_s: float = 0.0
-    """Longest time without a line to the board, from the board's last reply to the restart, s."""
+    # Longest time without a line to the board, from the board's last reply to the restart.
+    silent_s: Seconds = 0.0
+    # Cause of the restart as the board reports it, or "" if the board does not report a cause.
     cause: str = ""
-    """Cause of the restart as the board reports it, or "" if the board does not report a cause."""
 
 
 class RestartedError(AcsardError):
@@ -85,24 +69,19 @@ class Restarts:
     """Detector of restarts of the board. All times are monotonic times, s."""
 
     def __init__(self) -> None:
+        # Whether `check_line` reports restarts. If false, `check_line` always returns None.
         self.watched = True
-        """Whether `check_line` reports restarts. If false, `check_line` always returns None."""
         self._asked_s = self._turned_s = float("-inf")
-        self._turned: Motors = ZERO
-        """The last commanded speeds, rad/s, that were not all zero."""
+        self._turned: Motors = ZERO  # the last commanded speeds, rad/s, that were not all zero
         self._sent_s: float | None = None
-        self._silent_s = 0.0
-        """Longest time between two sent lines since the board's last reply, s."""
+        self._silent_s = 0.0  # longest time between two sent lines since the board's last reply
         self._unanswered = 0
-        self._replied_s: float | None = None
-        """Time of the board's last reply, s, or None before the first reply.
-
-        Before the first reply, a text from the board does not show a restart. Many boards are reset
-        when the port is opened, and print texts while they boot.
-        """
+        # None before the first reply. Until then a text shows no restart: many boards boot when
+        # opened.
+        self._replied_s: Seconds | None = None
+        # Pair from the last reply that contained the board's clock: this clock, ms, and the time of
+        # that reply, s. None if no reply has contained the clock.
         self._clock: tuple[int, float] | None = None
-        """Pair from the last reply that contained the board's clock: this clock, ms, and the time
-        of that reply, s. None if no reply has contained the clock."""
 
     def record_request(self, at_s: float) -> None:
         """Record that the check requested the board's identification at the time `at_s`, s."""
@@ -116,10 +95,9 @@ class Restarts:
             self._turned, self._turned_s = motors, at_s
 
     def check_line(self, line: bytes, at_s: float, reply: BoardReply | None) -> Restart | None:
-        """Process a received line. Return a `Restart` if it shows that the board restarted.
+        """Process a line that arrived at `at_s`. Return a `Restart` if it shows one.
 
-        Otherwise return None. `at_s` is the time at which `line` arrived, s. `reply` is the decoded
-        line, or None if the line is not a valid reply.
+        `reply` is the decoded line, or None if it is not a valid reply.
         """
         sign = ""
         if reply is not None:
@@ -160,20 +138,13 @@ class Restarts:
 
 
 def cause(lines: Sequence[bytes]) -> str:
-    """Return the cause of the last restart that the board reports in `lines`, such as "power".
-
-    Return "" if `lines` do not report a cause.
-    """
+    """Return the cause of the last restart that the board reports in `lines`, or ""."""
     causes = [match[1].decode() for line in lines if (match := _CAUSE.search(line))]
     return causes[-1] if causes else ""
 
 
 def finding(mcu: McuConfig, restarts: Sequence[Restart], back: bool = True) -> Finding:
-    """Return the finding that reports `restarts` and their probable cause.
-
-    `restarts` contains at least one restart. `back` is false if the board did not answer after the
-    last restart.
-    """
+    """Return the finding about one or more `restarts`; `back` says whether the board answered."""
     each = Counter(_restart_texts(mcu, restart) for restart in restarts)
     return outcomes.find(
         f"restarts: {_outcome(restarts) if back else 'gone'}",

@@ -1,12 +1,9 @@
-"""Tests whether the board's watchdog stops the motors when this computer sends no more lines.
+"""Tests whether the board's watchdog stops the motors when no valid lines arrive.
 
-The watchdog must also act if the board receives only damaged lines, as with a half-broken cable.
-
-The check brings the motors to speed, sends nothing (or damaged lines) for some time, and then sends
-zeros. It compares the distance by which the motors run on with the distance in an ordinary stop.
-The difference gives the delay after which the watchdog acts. Some firmware does not show these
-distances, because it replies only to lines and reports momentary speeds. For such firmware, the
-check tries silences of different durations, and tests after each whether the motors still turn.
+The check brings the motors to speed, sends nothing or damaged lines for some time, and then zeros.
+The distance that the motors run on, beyond that of an ordinary stop, gives the delay of the
+watchdog. Firmware that replies only to lines, with momentary speeds, does not show it: then
+silences of different durations are tried.
 """
 
 from __future__ import annotations
@@ -24,65 +21,45 @@ from acsard.checkup.motion import BoardReply
 from acsard.checkup.wheels import run_up
 from acsard.core.config.wire_time import FIELD_VALUES
 from acsard.core.link.codec import LETTERS
+from acsard.core.values import Seconds
 
+# Kinds of damaged lines that must not feed the watchdog. The check sends lines of these kinds.
 DAMAGE_KINDS = ("a wrong letter", "neither p nor n", "cut short")
-"""Kinds of damaged lines that must not feed the watchdog. The check sends lines of these kinds."""
 
+# Of the commanded speed: from `TURNING` on a motor has not slowed down, below `STOPPED` it stands.
 TURNING, STOPPED = 0.9, 0.1
-"""Limits for the speed of a motor, as fractions of the commanded speed.
 
-A motor at `TURNING` or above has not slowed down. A motor below `STOPPED` stands still.
-"""
-
+# Upper bound of the watchdog's delay if the motors did not stop even in the longest silence.
 NOT_MEASURED = math.inf
-"""Upper bound of the watchdog's delay if the motors did not stop even in the longest silence."""
 
+# Pair: a lower and an upper bound of the time for which motors run on after the last line, s.
 Bounds = tuple[float, float]
-"""Pair: a lower and an upper bound of the time for which motors run on after the last line, s."""
 
 
 class Run(Struct, frozen=True):
-    """Behavior of the motors during and after a silence, in which no valid line is sent.
+    """Behavior of the motors during and after a silence, up to the zeros that end it."""
 
-    The silence begins after the last line that turned the motors, and ends with zeros.
-    """
-
-    silent_s: float
-    """Duration of the silence, s. It is about 0 for an ordinary stop, without a silence."""
-    ran_s: float
-    """How far the motors ran on before they stood still, as a time, s.
-
-    It is the time in which a motor would run equally far at its speed before the silence; the
-    largest of all motors.
-    """
-    slow_s: float
-    """Time from the last line that turned the motors until all motors are slower than `STOPPED`, s.
-
-    For an ordinary stop, the time begins with the line of zeros instead.
-    """
+    # Duration of the silence. It is about 0 for an ordinary stop, without a silence.
+    silent_s: Seconds
+    # How far the motors ran on before they stood still, as a time.
+    ran_s: Seconds
+    # From the last line that turned the motors (of an ordinary stop: from the zeros) to `STOPPED`.
+    slow_s: Seconds
+    # Speed in the first reply after the silence, of the commanded one: the momentary one, or the
+    # mean of the silence if the firmware computes it from the movement since the previous line.
     first: float
-    """Speed in the first reply after the silence, as a fraction of the commanded speed.
-
-    Some firmware computes the speed from the movement since the previous line, and so reports the
-    mean speed during the silence. Other firmware reports the momentary speed.
-    """
+    # Speed in the second reply after the silence, as a fraction of the commanded speed.
     second: float
-    """Speed in the second reply after the silence, as a fraction of the commanded speed.
-
-    By then, a motor that slows down quickly has obeyed the first line of zeros.
-    """
-    grain_s: float
-    """Resolution of the reported speeds, expressed as a time, s (`motion.grain_s`). In this time, a
-    motor at the commanded speed turns by one jump of the reported movement."""
+    # Resolution of the reported speeds, expressed as a time (`motion.grain_s`). In this time, a
+    # motor at the commanded speed turns by one jump of the reported movement.
+    grain_s: Seconds
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Measure the time after which the watchdog stops the motors, and return the finding.
+    """Measure the delay of the watchdog with `motors`, and return the finding.
 
-    If its verdict is not FAIL, also test whether damaged lines keep the watchdog from acting.
-    `motors` are the numbers of the motors that turned as commanded. At the end, all motors stand
-    still. Raises `StoppedError` if no motor reaches half of the commanded speed when all of
-    `motors` turn together.
+    Unless it is FAIL, also test damaged lines. At the end, all motors stand still. Raises
+    `StoppedError` if no motor reaches half of the commanded speed.
     """
     if not motors:
         return outcomes.find("watchdog: untested")
@@ -122,11 +99,10 @@ def _judged(least_s: float, most_s: float) -> Finding:
 
 
 def measured(board: Board, motors: Sequence[int], stop: Run) -> Bounds:
-    """Measure for how long motors run on when no lines are sent.
+    """Return a lower and an upper bound of the time for which motors run on without lines, s.
 
-    Return a lower and an upper bound of this time, s. If the motors do not stop even in the longest
-    silence, the upper bound is `NOT_MEASURED`. `motors` are numbers from 0 to 3. `stop` is the
-    behavior of these motors in an ordinary stop.
+    The upper bound is `NOT_MEASURED` if the longest silence does not stop them. `stop` is an
+    ordinary stop.
     """
     least_s = 0.0
     for length_s in (
@@ -150,11 +126,6 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Bounds:
 
 
 def _bisect_timeout(board: Board, motors: Sequence[int], stop: Run, bounds: Bounds) -> Bounds:
-    """Measure by bisection for how long motors run on after the last line.
-
-    Return a lower and an upper bound of this time, s. The search begins with `bounds`. `stop` is
-    the behavior of the motors in an ordinary stop.
-    """
     least_s, most_s = bounds
     # Each run halves the interval between the bounds, unless this computer is late.
     for _ in range(8):
@@ -174,11 +145,10 @@ def _bisect_timeout(board: Board, motors: Sequence[int], stop: Run, bounds: Boun
 
 
 def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[bytes] = ()) -> Run:
-    """Bring the motors to speed, send no valid line for `length_s` s, and stop them with zeros.
+    """Bring the motors to speed, send no valid line for `length_s` s, and stop them.
 
-    If `length_s` is 0, this is an ordinary stop. The lines in `instead`, which are damaged, are
-    sent during the time `length_s`. Raises `StoppedError` if no motor reaches half of the commanded
-    speed.
+    The damaged lines in `instead` are sent meanwhile. Raises `StoppedError` if no motor reaches
+    half of the commanded speed.
     """
     began_s = board.now_s
     full = run_up(board, motion.only(motors))
@@ -214,7 +184,6 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
 
 
 def _per_turn(board: Board, motors: Sequence[int]) -> float:
-    """Return the encoder counts per wheel turn; 0 if unknown or if a counter could overflow."""
     per_turn = encoder_counts.per_turn(board.replies, motors) or 0.0
     wraps = (
         per_turn * motion.RUNAWAY_SPEED / math.tau * motion.STANDSTILL_TIMEOUT_S >= FIELD_VALUES / 2

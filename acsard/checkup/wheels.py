@@ -1,8 +1,7 @@
 """Turns one motor at a time forward and backward, and asks the operator which wheel turned.
 
-A channel is a motor with its encoder and its wheel. The check finds out whether these three parts
-belong together, from the speeds that the encoders measure and from the operator's answers.
-`Channel`, `encoder_finding` and `wheel_map` compute this without any I/O.
+A channel is a motor with its encoder and its wheel. The speeds of the encoders and the answers of
+the operator show whether these three belong together.
 """
 
 from __future__ import annotations
@@ -21,57 +20,49 @@ from acsard.core.config.settings import McuConfig
 from acsard.core.link.codec import LETTERS, Motors
 from acsard.core.values import WHEELS
 
+# Largest relative difference between an encoder's speed and the commanded speed. If the difference
+# is larger, the check fails.
 FAIL_TOLERANCE = 0.25
-"""Largest relative difference between an encoder's speed and the commanded speed. If the difference
-is larger, the check fails."""
 
+# Largest usual relative difference between an encoder's speed and the commanded speed. If the
+# difference is larger, the check warns.
 WARN_TOLERANCE = 0.05
-"""Largest usual relative difference between an encoder's speed and the commanded speed. If the
-difference is larger, the check warns."""
 
-Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size", "off", "late"]
-"""Kind of the result for one motor.
-
-- right: only the motor's own encoder moved, in the commanded direction and at the commanded speed
-- reversed: only the motor's own encoder moved, but against the commanded direction
-- dead: no encoder moved
-- other: only the encoder of another motor moved
-- several: several encoders moved, or different encoders forward and backward
-- one way: encoders moved in only one of the two directions
-- size: the relative error of the speed is larger than `FAIL_TOLERANCE`
-- off: the relative error of the speed is larger than `WARN_TOLERANCE`
-- late: this computer was too late to judge the motor
-"""
-
+Kind = Literal[
+    "right",  # only the motor's own encoder moved, as commanded
+    "reversed",  # only its own encoder moved, but against the command
+    "dead",  # no encoder moved
+    "other",  # only the encoder of another motor moved
+    "several",  # several encoders moved, or different ones forward and backward
+    "one way",  # encoders moved in only one of the two directions
+    "size",  # the error of the speed is larger than `FAIL_TOLERANCE`
+    "off",  # the error of the speed is larger than `WARN_TOLERANCE`
+    "late",  # this computer was too late to judge the motor
+]
+# Only the motor's own encoder moves, in the right direction.
 FOLLOWING_KINDS: tuple[Kind, ...] = ("right", "off", "size")
-"""Values of `Channel.kind` for a motor that moves only its own encoder, in the right direction."""
 
 
 class Channel(Struct, frozen=True):
     """Behavior of one motor in its test, as the four encoders and the operator report it.
 
-    `motor` is the number of the motor, 0 to 3. `forth` contains the speeds of the four encoders,
-    rad/s, while the motor was commanded to turn forward (letter p). `back` contains their speeds
-    while the motor was commanded to turn backward (letter n).
+    `forth` has the speeds of the four encoders, rad/s, for the command forward (letter p), and
+    `back` those for backward (letter n).
     """
 
     motor: int
     forth: Motors
     back: Motors
+    # Wheel that the operator saw turn; "" if no wheel turned, None if nobody was asked.
     wheel: str | None = None
-    """Wheel that the operator saw turn; "" if no wheel turned, None if nobody was asked."""
+    # Whether the operator saw the wheel turn forward first. False means backward first.
     forward: bool = True
-    """Whether the operator saw the wheel turn forward first. False means backward first."""
+    # The motor was only probed, because its encoder did not follow: `forth` has the probe's speeds.
     probed: bool = False
-    """Whether the motor was only probed (turned slowly and briefly).
-
-    This is the case if its own encoder did not follow. Then `forth` contains the speeds in the
-    probe, and `back` contains zeros.
-    """
+    # Possible relative error of the measured speeds, because the encoder is coarse.
     unsure: float = 0.0
-    """Possible relative error of the measured speeds, because the encoder is coarse."""
+    # False if this computer was too late, so that the other fields are doubtful.
     judged: bool = True
-    """False if this computer was too late, so that the other fields are doubtful."""
 
     @property
     def moved(self) -> list[int]:
@@ -102,9 +93,8 @@ class Channel(Struct, frozen=True):
 
     @property
     def error(self) -> float:
-        """Relative difference between the speed of the motor's own encoder and the commanded speed.
-
-        The value is the larger of the differences forward and backward.
+        """Larger relative difference of the own encoder's speed from the command, of both
+        directions.
         """
         own = self.motor
         return max(abs(self.forth[own] / SPEED - 1), abs(self.back[own] / SPEED + 1))
@@ -142,11 +132,6 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
 
 
 def _fault_suffix(mcu: McuConfig, channel: Channel) -> str:
-    """Return the end of the outcome's name that says which part is at fault, such as ", motor".
-
-    Only the wheel and the direction that the operator saw can distinguish a wrong motor from a
-    wrong encoder. Return "" for a kind of result that needs no such distinction.
-    """
     wheel, sign = wheel_of(mcu, channel.motor)
     answer = channel.wheel
     match channel.kind:
@@ -167,9 +152,7 @@ def _fault_suffix(mcu: McuConfig, channel: Channel) -> str:
 def wheel_map(mcu: McuConfig, channels: Sequence[Channel]) -> Finding:
     """Return the finding that compares `[mcu.wheels]` with the wheels that the operator saw turn.
 
-    The finding suggests an entry (sign and motor, such as "-d") for each wheel. If a motor does not
-    work correctly, or if the operator did not see its wheel turn, the finding suggests the
-    configured entry. If no operator answered, the finding does not suggest any entries.
+    It suggests the configured entry if a motor does not work, or if its wheel was not seen.
     """
     if any(channel.wheel is None for channel in channels):
         return outcomes.find("wheel map: not seen")
@@ -190,18 +173,15 @@ def wheel_map(mcu: McuConfig, channels: Sequence[Channel]) -> Finding:
     )
 
 
+# Of `WARN_TOLERANCE`: with a larger error, a longer measurement follows, because a heavy wheel may
+# not have reached its speed.
 REPEAT_FRACTION = 0.8
-"""Limit for the relative error of a measured speed, as a fraction of `WARN_TOLERANCE`.
 
-If the error is larger, a second, longer measurement follows, because a heavy wheel may not have
-reached its speed in the first one.
-"""
-
+# Time over which the second, longer measurement of a speed averages the speed.
 LONG_MEASUREMENT_S = 0.75 * motion.MOTOR_TIMEOUT_S
-"""Time over which the second, longer measurement of a speed averages the speed, s."""
 
+# Largest number of short measurements that `run_up` averages to get the present speed.
 MAX_MEASUREMENTS = 8
-"""Largest number of short measurements that `run_up` averages to get the present speed."""
 
 WHEEL_ANSWERS = {
     "fr": "front_right", "fl": "front_left", "rl": "rear_left", "rr": "rear_right", "none": "",
@@ -209,10 +189,9 @@ WHEEL_ANSWERS = {
 
 
 def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
-    """Bring a motor to `speed`, rad/s, and measure the speeds of all encoders.
+    """Bring a motor to `speed`, and return the speeds of all encoders, rad/s.
 
-    Return a pair: the measured speeds, rad/s, and the possible relative error of this motor's
-    measured speed. This error exists because an encoder counts only whole steps.
+    The second result is the possible relative error, because an encoder counts whole steps.
     """
     means = run_up(board, motion.only([motor], speed))
     unsure = _unsure(board, motor, 2 * _look_s(board))
@@ -236,11 +215,9 @@ def _look_s(board: Board) -> float:
 
 
 def run_up(board: Board, motors: Motors) -> Motors:
-    """Ramp up to the speeds `motors`, rad/s, and return each encoder's mean speed, rad/s.
+    """Ramp up to the speeds `motors`, and return each encoder's mean speed, rad/s.
 
-    The function returns when the speeds are steady, but at the latest after
-    `motion.MOTOR_TIMEOUT_S`, or after `motion.SLOWING_TIMEOUT_S` if a motor still speeds up. It
-    returns earlier if no encoder moves.
+    It returns when the speeds are steady, when time is over, or earlier if no encoder moves.
     """
     steps = max(1, int(motion.SHORT_MEASUREMENT_S / board.period_s))
     for step in range(1, steps + 1):
@@ -274,8 +251,7 @@ def _patience_s(board: Board, driven: list[int]) -> float:
 def channel(board: Board, motor: int) -> Channel:
     """Turn a motor forward and backward, and return how the encoders moved.
 
-    If motor d (number 3) does not move, repeat the test with the other line ending: a comma or
-    none. If motor d moves then, use that ending for all later lines too.
+    If motor d does not move, try the other line ending, and keep it if motor d moves then.
     """
     result = _both_ways(board, motor)
     if motor == 3 and result.kind == "dead" and not board.latched:
@@ -284,10 +260,6 @@ def channel(board: Board, motor: int) -> Channel:
 
 
 def _both_ways(board: Board, motor: int) -> Channel:
-    """Turn a motor forward and back.
-
-    First probe the motor. If its own encoder does not move with it, do not turn the motor further.
-    """
     speeds = probe(board, motor)
     if speeds is not None:
         return Channel(motor, speeds, ZERO, probed=True)
@@ -305,8 +277,8 @@ def _both_ways(board: Board, motor: int) -> Channel:
 def probe(board: Board, motor: int) -> Motors | None:
     """Turn a motor slowly and briefly, to find out whether its own encoder moves with it.
 
-    If it moves, return None; the motor may still turn then. Otherwise stop the motor, and return
-    the speeds of the four encoders in the probe, rad/s.
+    If it moves, return None; the motor may still turn then. Else stop it, and return the speeds of
+    the four encoders.
     """
     # The firmware may drive a motor without a working encoder to full speed, but the probe is too
     # short for that. If the encoder does not follow, repeat the probe, because a coarse encoder may
@@ -331,10 +303,6 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     began_s = board.now_s
 
     def mean_speeds() -> Motors:
-        """Return each encoder's mean speed in the probe, rad/s.
-
-        The movement of a motor that still coasted when the probe began is subtracted.
-        """
         seconds = board.now_s - began_s
         ran = motion.covered(board.replies, began_s)
         sure = [max(0.0, abs(ran[m]) - abs(coasting[m]) * seconds) for m in range(4)]
@@ -359,7 +327,6 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
 
 
 def _with_other_comma(board: Board, dead: Channel) -> Channel:
-    """Test motor d again with the other line ending. If the motor moves now, keep that ending."""
     configured, board.comma = board.comma, not board.comma
     channel = _both_ways(board, dead.motor)
     if channel.probed or dead.motor not in moving(channel.forth):
@@ -372,10 +339,9 @@ def _with_other_comma(board: Board, dead: Channel) -> Channel:
 
 
 def ask_which_wheel(board: Board, operator: Operator, channel: Channel) -> Channel:
-    """Ask the operator which wheel turned and in which direction. Add the answers to `channel`.
+    """Ask the operator which wheel turned and in which direction; return `channel` with that.
 
-    The wheels stand still during a question. If the operator wants to see the movement again, the
-    motor turns once more. If no operator answers, return `channel` without a change.
+    The wheels stand still during a question, and turn again on request.
     """
     question = (
         f"which wheel did motor {LETTERS[channel.motor]} turn: front right (fr), front left (fl), "

@@ -1,15 +1,9 @@
 """The types of a guided drive: `Method`, `Leg`, `Move` and measurements, and the robot's `Setup`.
 
-`acsard calibrate` and the web page import this module for the names of the methods. It does not
-import numpy, so that both programs start quickly.
-
-A guided drive stays within the robot's limits and on a floor of 3 m x 3 m. Before the calibration,
-the turn that a command causes is unknown, because the robot may skid. The plan must therefore work
-for an effective track of 1 to 2.5 times the wheel separation. Each drive has one of these forms:
-
-- It goes out and comes back on the same path.
-- It is straight, and a person placed the robot in the right direction.
-- It comes after a turn that a person measured, which shows the effective track.
+It does not import numpy, so that `acsard calibrate` starts quickly. A drive stays on a floor of 3 m
+x 3 m for each effective track of 1 to 2.5 times the wheel separation, which is unknown before: it
+goes out and back on the same path, is straight from a known pose, or follows a turn that a person
+measured.
 """
 
 from __future__ import annotations
@@ -23,15 +17,15 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, DriveConfig, FeedbackConfig, OdometryConfig
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.values import AcsardError, Twist
+from acsard.core.values import AcsardError, Metres, Rad, RadPerS, Twist
 from acsard.terminal.prompt import NumberQuestion
 
+# Equipment that the person needs, by the name in `--method`.
 NEEDS: dict[str, str] = {
     "gyro": "a gyro on the Zenoh key imu, and a tape measure",
     "positions": "positions of the robot on a Zenoh key",
     "tape": "a tape measure and a straight line on the floor",
 }
-"""Equipment that the person needs for each method, by the name of the method in `--method`."""
 
 
 class GuideError(AcsardError):
@@ -42,77 +36,48 @@ class DisturbedError(GuideError):
     """A part of the guided drive was cut short for a temporary reason, and can be repeated."""
 
     def __init__(self, why: str, text: str) -> None:
-        """Store the reason `why`, and the message `text` to show if this part is not repeated."""
         super().__init__(text)
         self.why = why
 
 
 class Move(Struct, frozen=True):
-    """A twist, and the time for which the tool commands it.
-
-    A move with a zero twist is a pause.
-    """
+    """A twist, and the time for which the tool commands it; a pause if the twist is zero."""
 
     seconds: float
-    linear: float = 0.0
-    """Linear speed, m/s."""
-    angular: float = 0.0
-    """Commanded turn rate, rad/s, positive to the left."""
+    linear: float = 0.0  # linear speed, m/s
+    angular: RadPerS = 0.0  # commanded turn rate, positive to the left
 
 
-UNITS = {"m": 1.0, "mm": 1e-3}
-"""Factors that convert the units of the person's answers to m."""
+UNITS = {"m": 1.0, "mm": 1e-3}  # factors that convert the units of the person's answers to m
 
 
+# Motion since the pose was last known: the turn, rad, left is +, with whole turns (`turned`) or
+# without (`angle`), or the straight-line `distance`, m.
 Quantity = Literal["turned", "angle", "distance"]
-"""Kind of a measurement of the robot's motion since its pose was last known.
-
-- `turned`: the turn in rad, positive to the left, including whole turns.
-- `angle`: the turn in rad, positive to the left, with an unknown number of whole turns.
-- `distance`: the straight-line distance in m.
-"""
 
 
 class Distance(Struct, frozen=True):
     """A straight-line distance of the leg just driven, which a person measures by tape."""
 
-    answer: str
-    """Name of the answer."""
-    deviation: float
-    """Standard deviation of the answer, m."""
+    answer: str  # name of the answer
+    deviation: Metres  # standard deviation of the answer
 
 
 class Slant(Struct, frozen=True):
-    """A measurement of the robot's turn by the distances of two points of the robot to a line.
-
-    The person measures the distances. The line is on the floor.
-    """
+    """The robot's turn, from the distances of two points of the robot to a line on the floor."""
 
     quantity: Literal["turned", "angle"]
+    # Answer: distance of the point that a turn to the left moves towards the line.
     near: str
-    """Name of the answer with the distance of one point of the robot from the line.
-
-    A turn to the left moves this point towards the line.
-    """
+    # Answer: distance of the point that a turn to the left moves away from the line.
     far: str
-    """Name of the answer with the distance of the other point of the robot from the line.
-
-    A turn to the left moves this point away from the line.
-    """
+    # Answer before the first leg: distance between the two points.
     apart: str
-    """Name of the answer with the distance between the two points of the robot.
-
-    The tool asks for this distance once, before the first leg.
-    """
+    # Earlier leg after which the start angle was measured; "" if the robot started parallel.
     since: str = ""
-    """Name of the earlier leg after which the person measured the robot's start angle to the line.
-
-    "" means that the robot started parallel to the line.
-    """
-    plus: float = 0.0
-    """Whole turns to add, rad, because the distances to the line do not show them."""
+    plus: Rad = 0.0  # whole turns to add, because the distances to the line do not show them
+    # Legs whose total motion was measured; () means the leg just driven.
     over: tuple[str, ...] = ()
-    """Names of the legs whose total motion the person measured; () means the leg just driven."""
 
 
 Measure = Distance | Slant
@@ -122,90 +87,63 @@ class Leg(Struct, frozen=True):
     """A series of moves that a person starts with Enter and can stop at any time with any key."""
 
     name: str
-    words: str
-    """Text that tells the person, before the leg, what to do and how the robot will move."""
+    words: str  # text that tells the person, before the leg, what to do and how the robot will move
     moves: tuple[Move, ...]
-    asks: tuple[NumberQuestion, ...] = ()
-    """Questions that the person answers after the moves."""
+    asks: tuple[NumberQuestion, ...] = ()  # questions that the person answers after the moves
     measures: tuple[Measure, ...] = ()
+    # The person ends the last move with a key; its duration is a timeout.
     by_key: bool = False
-    """Whether the person ends the last move with a key.
-
-    The duration of this move is then a timeout.
-    """
 
     @property
     def seconds(self) -> float:
         return sum(move.seconds for move in self.moves)
 
 
-FLOOR_M = 3.0
-"""Side length of the square floor that must be free, m."""
+FLOOR_M = 3.0  # side length of the square floor that must be free
 
+# Speed straight ahead in a guided drive, m/s, unless the robot's limits are lower.
 USUAL_SPEED = 0.3
-"""Speed straight ahead in a guided drive, m/s, unless the robot's limits are lower."""
 
+# Largest rolling speed of the wheels while the robot turns in a guided drive, m/s.
 MAX_ROLLING_SPEED = 0.5
-"""Largest rolling speed of the wheels while the robot turns in a guided drive, m/s."""
 
+# Assumed distance from the robot's middle to its outermost point, as a multiple of the wheel
+# separation.
 REACH_RATIO = 0.75
-"""Assumed distance from the robot's middle to its outermost point, as a multiple of the wheel
-separation."""
 
-EDGE_MARGIN_M = 0.1
-"""Distance to keep between the robot and the edge of the floor, m."""
+EDGE_MARGIN_M = 0.1  # distance to keep between the robot and the edge of the floor
 
-LONGEST, SHORTEST = 2.0, 0.8
-"""Largest and smallest length of the straight drive, m."""
+LONGEST, SHORTEST = 2.0, 0.8  # largest and smallest length of the straight drive, m
 
+# Limits, m/s and rad/s, below which a guided drive is not possible.
 LEAST_SPEED, LEAST_TURN = 0.05, 0.2
-"""Smallest limits with which a guided drive is possible.
 
-`LEAST_SPEED` applies to the speed straight ahead, m/s, and `LEAST_TURN` to `limits.angular_speed`,
-rad/s.
-"""
+STOP_DISTANCE_M = 0.1  # distance that the robot may still roll after a leg has ended
 
-STOP_DISTANCE_M = 0.1
-"""Distance that the robot may still roll after a leg has ended, m."""
-
+# Ratio of effective track to wheel separation; the smallest is 1.
 MAX_TRACK_RATIO = 2.5
-"""Largest ratio of effective track to wheel separation for which the plan works.
-
-The smallest ratio is 1.
-"""
 
 
 class Setup(Struct, frozen=True):
     """The robot, and the speeds and lengths of its guided drive."""
 
     drive: DriveConfig
-    speed: float
-    """Speed straight ahead, m/s."""
-    length: float
-    """Length of the straight drive, m."""
-    reach: float
-    """Distance from the robot's middle to its outermost point, m."""
-    max_command_rate: float
-    """Largest turn rate that the robot's limits permit in a command, rad/s."""
-    max_rolling_speed: float
-    """Largest rolling speed of the wheels while the robot turns, m/s."""
+    speed: float  # speed straight ahead, m/s
+    length: Metres  # length of the straight drive
+    reach: Metres  # distance from the robot's middle to its outermost point
+    max_command_rate: RadPerS  # largest turn rate that the robot's limits permit in a command
+    max_rolling_speed: float  # largest rolling speed of the wheels while the robot turns, m/s
     odometry: OdometryConfig = OdometryConfig()
     feedback: FeedbackConfig = FeedbackConfig()
 
     @property
     def from_edge(self) -> float:
-        """Distance from the robot's middle to the edge of the free floor behind the robot, m.
-
-        A person places the robot at this distance from the edge before the straight drive begins.
-        """
+        """Distance from the free floor's edge at which a person places the robot's middle, m."""
         return self.reach + EDGE_MARGIN_M
 
     @property
     def to_middle(self) -> float:
-        """Distance from the end of the straight drive to the middle of the free floor, m.
-
-        The robot drives back by this distance, so that it can turn in the middle of the floor.
-        """
+        """Distance from the end of the straight drive back to the middle of the free floor, m."""
         return self.from_edge + self.length - FLOOR_M / 2
 
     def ahead(self, metres: float) -> Move:
@@ -213,40 +151,25 @@ class Setup(Struct, frozen=True):
         return Move(abs(metres) / self.speed, math.copysign(self.speed, metres))
 
     def spin(self, rate: float, seconds: float) -> Move:
-        """Return a turn in place that lasts `seconds` s.
-
-        `rate` is the turn rate of a robot that does not skid, rad/s, positive to the left. A robot
-        that skids turns more slowly.
-        """
+        """Return a turn in place; `rate` is that of a robot that does not skid, left is +."""
         return Move(seconds, 0.0, self.command(rate))
 
     def arc(self, rate: float, metres: float) -> Move:
-        """Return a curve of the length `metres`, m. A negative length is a curve backwards.
-
-        `rate` is the turn rate, rad/s, of a robot that does not skid, positive to the left.
-        """
+        """Return a curve; `rate` is that without skidding. A negative length is backwards."""
         straight = self.ahead(metres)
         return Move(straight.seconds, straight.linear, self.command(rate))
 
     def turn(self, angle: float, rate: float, track: float) -> Move:
-        """Return a turn in place by `angle`, with a command that compensates for skidding.
+        """Return a turn in place by `angle`, left is +, whose command compensates for skidding.
 
-        Args:
-            angle: the angle of the turn, rad, positive to the left.
-            rate: the true turn rate, rad/s. If the limits do not permit it, the robot turns more
-                slowly.
-            track: the ratio of effective track to wheel separation.
+        `rate` is the true turn rate, and `track` the ratio of effective track to wheel separation.
         """
         command = abs(self.command(rate * track))
         seconds = abs(angle) * track / (command * self.rate_per_command)
         return Move(seconds, 0.0, math.copysign(command, angle))
 
     def command(self, rate: float) -> float:
-        """Return the turn rate to command, rad/s, for a true turn rate of `rate`, rad/s.
-
-        The robot turns at `rate` if it does not skid. If the command would exceed the robot's
-        limits, the result is the largest command within these limits.
-        """
+        """Return the command for a turn at `rate` without skidding, within the robot's limits."""
         per_command = self.rate_per_command
         most = min(
             2 * self.max_rolling_speed / self.drive.wheel_separation,
@@ -256,10 +179,7 @@ class Setup(Struct, frozen=True):
 
     @property
     def rate_per_command(self) -> float:
-        """Turn rate of a robot that does not skid, rad/s, if the command is 1 rad/s.
-
-        The rate differs from 1 because the configured multipliers compensate for skidding.
-        """
+        """Turn rate without skidding, rad/s, of a command of 1 rad/s: multipliers change it."""
         bare = replace(
             self.drive, wheel_separation_multiplier=1.0, left_wheel_radius_multiplier=1.0,
             right_wheel_radius_multiplier=1.0,
@@ -268,35 +188,24 @@ class Setup(Struct, frozen=True):
         return Kinematics(bare).twist(commanded).angular
 
 
+# Returns the legs for the ratio of effective track to separation. The legs up to the first `turned`
+# measurement, which shows this ratio, must not depend on it.
 Legs = Callable[[Setup, float], tuple[Leg, ...]]
-"""Function that returns the legs of a method.
 
-Its arguments are the robot's setup, and the ratio of effective track to wheel separation. The
-first `turned` measurement shows this ratio. The legs up to that measurement must not depend on the
-ratio.
-"""
-
-# The largest ratio does not always need the longest time, because with a smaller ratio a leg may
-# have one more full turn.
+# Not only the largest ratio, because with a smaller one a leg may have one more full turn.
 TRACK_RATIOS = [1.0 + 0.05 * step for step in range(round((MAX_TRACK_RATIO - 1.0) / 0.05) + 1)]
-"""Ratios of effective track to wheel separation for which the driving time is computed."""
 
 
 class Method(Struct, frozen=True):
     """A method of calibration by a guided drive."""
 
     legs: Legs
-    asks: tuple[NumberQuestion, ...] = ()
-    """Questions that the person answers before the first leg."""
+    asks: tuple[NumberQuestion, ...] = ()  # questions that the person answers before the first leg
+    # Whether a person measures the motion by tape; otherwise a sensor measures it.
     by_tape: bool = False
-    """Whether a person measures the motion by tape; otherwise a sensor measures it."""
 
     def longest_s(self, setup: Setup) -> float:
-        """Return the total driving time of all legs, s, for the least favorable effective track.
-
-        The time depends on the ratio of effective track to wheel separation. The result is the
-        longest of the times for the ratios in `TRACK_RATIOS`.
-        """
+        """Return the driving time of all legs for the least favorable of `TRACK_RATIOS`, s."""
         return max(sum(leg.seconds for leg in self.legs(setup, track)) for track in TRACK_RATIOS)
 
 

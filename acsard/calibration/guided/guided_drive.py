@@ -20,23 +20,21 @@ from acsard.core.messages.schema import Info
 from acsard.host.errors import NoAnswerError, UsageError
 from acsard.terminal.prompt import Prompt
 
+# Key of the true pose, without the robot's id. Only the built-in simulator publishes it.
 TRUE_POSE = "sim/pose"
-"""Key of the true pose, without the robot's id. Only the built-in simulator publishes it."""
 
 
 class DriveOptions(Struct, frozen=True):
     """The options of a guided drive. None means that the user chose nothing."""
 
-    method: str | None = None
-    """Name of the method, as in `METHODS`."""
+    method: str | None = None  # name of the method, as in `METHODS`
+    # Zenoh key of the robot's positions, with or without the robot's id.
     positions: str | None = None
-    """Zenoh key of the robot's positions, with or without the robot's id."""
+    # Endpoint at which the positions are published; None means the daemon's endpoint.
     positions_at: str | None = None
-    """Endpoint at which the positions are published; None means the daemon's endpoint."""
-    imu: str | None = None
-    """Zenoh key of the gyro, with or without the robot's id."""
+    imu: str | None = None  # zenoh key of the gyro, with or without the robot's id
+    # Start every leg without a person. Only the built-in simulator permits this.
     without_person: bool = False
-    """Start every leg without a person. Only the built-in simulator permits this."""
 
 
 def guided_drive(
@@ -50,18 +48,9 @@ def guided_drive(
 ) -> tuple[Calibration, Config]:
     """Guide a person through a drive. Return its calibration and the daemon's configuration.
 
-    Args:
-        client: the connection to the robot.
-        options: the method and the sensors.
-        file: the path of the configuration file into which the result may be written.
-        file_config: the configuration in that file.
-        prompt: the context manager that opens the prompt. It is entered when the drive can begin.
-        must_write: whether to refuse the drive if the file does not belong to the daemon.
-
-    Raises:
-        UsageError: the options do not suit this robot.
-        GuideError: the drive cannot begin or continue, or the operator has ended it.
-        LogError, NobodyError, NoCalibrationError: for the reasons that `guide` lists.
+    The result may be written into `file`, which has `file_config`; `must_write` refuses a file that
+    does not belong to the daemon. Raises `UsageError` for unsuitable options, `GuideError` if the
+    drive ends early, and the errors of `guide`.
     """
     info, robot_id = client.get("info"), client.where.robot_id
     if options.without_person and not info.simulated:
@@ -115,8 +104,7 @@ def guided_drive(
 def require_same_robot(client: Client, info: Info, settings: object) -> None:
     """Raise `GuideError` if another robot or other settings answer than before the first leg.
 
-    `info` and `settings` are the first answers on the keys `info` and `config`. A daemon that was
-    restarted meanwhile may drive a real robot instead of the simulator.
+    A restarted daemon may drive a real robot instead of the simulator.
     """
     now = client.get("info")
     # The simulator's port is a pty, whose name changes at each start.
@@ -133,9 +121,8 @@ def require_same_robot(client: Client, info: Info, settings: object) -> None:
 
 
 def choose_method(options: DriveOptions, config: Config) -> str:
-    """Return the name of the method that the options name or need.
+    """Return the method that the options need, else "gyro" if the daemon reads one, else "tape".
 
-    Without such an option, the method is "gyro" if the daemon reads a gyro, and "tape" otherwise.
     Raises `UsageError` if the options need a gyro that the daemon does not read.
     """
     if options.positions:
@@ -150,13 +137,7 @@ def choose_method(options: DriveOptions, config: Config) -> str:
 
 
 def other_robot(config: Config, file_config: Config, file: str) -> str:
-    """Return an error message if the file is for a robot with another geometry, else "".
-
-    Args:
-        config: the daemon's configuration.
-        file_config: the configuration in the file.
-        file: the path of the file, for the message.
-    """
+    """Return an error message if the file is for a robot with another geometry, else ""."""
     ours, theirs = config.drive, file_config.drive
     if (ours.wheel_radius, ours.wheel_separation) == (theirs.wheel_radius, theirs.wheel_separation):
         return ""

@@ -25,46 +25,32 @@ STALL_REASON = (
     "on it"
 )
 
+# Time that the robot may take to follow a changed command, including the ramp. The path of the
+# wheels may lag behind the commanded path by this time.
 RESPONSE_TIMEOUT_S = 1.5
-"""Time that the robot may take to follow a changed command, including the ramp, s. The path of the
-wheels may lag behind the commanded path by this time."""
 
+# Time for which the daemon may not follow the commands, or may report no wheel speeds, before the
+# leg is halted.
 DEVIATION_TIMEOUT_S = 1.0
-"""Time for which the daemon may not follow the commands, or may report no wheel speeds, s, before
-the leg is halted."""
 
 PATH_OFF_M, PATH_OFF_RAD = 0.1, 0.15
+# The rolled path may differ from the commanded one by these, plus `SAME_SHARE` of the same motion
+# and `OTHER_SHARE` of the other one. With more, the robot could leave the free floor.
 SAME_SHARE, OTHER_SHARE = 0.05, 0.03
-"""Limits for the difference between the path that the wheels rolled and the commanded path.
 
-The wheels may be slower or faster than commanded by the fraction `SAME_SHARE`, and those of one
-side may differ from those of the other side by about twice the fraction `OTHER_SHARE`. So the
-rolled distance may differ by `PATH_OFF_M` m plus `SAME_SHARE` of the commanded distance plus
-`OTHER_SHARE` of the distance that the wheels roll in the commanded turns. The turn may differ by
-`PATH_OFF_RAD` rad plus the same two parts, with turn and distance exchanged. With a larger
-difference, the robot could leave the free floor.
-"""
-
+# Longest time between two samples of the wheel speeds, over which the path is continued.
 MAX_SAMPLE_GAP_S = 2.0
-"""Longest time between two samples of the wheel speeds, s, over which the path is continued."""
 
+# A leg is done when the wheels stand still for `STANDING_S`, and halted after `STANDS_S`.
 STANDING_S, STANDS_S = 0.5, 6.0
-"""Times for the end of a leg, s.
-
-The leg is done when the wheels have stood still for `STANDING_S`. If the leg is not done
-`STANDS_S` after the last move, it is halted.
-"""
 
 
 class Phase(StrEnum):
     """The phases of a leg, in their order. `HALTED` can follow any phase except `DONE`."""
 
-    OPENING = "opening"
-    """The tool commands zero until the daemon accepts the commands of this leg."""
-    MOVING = "moving"
-    """The tool commands the moves of the leg."""
-    SETTLING = "settling"
-    """The tool commands zero until the wheels stand still."""
+    OPENING = "opening"  # the tool commands zero until the daemon accepts the commands of this leg
+    MOVING = "moving"  # the tool commands the moves of the leg
+    SETTLING = "settling"  # the tool commands zero until the wheels stand still
     DONE = "done"
     HALTED = "halted"
 
@@ -72,11 +58,10 @@ class Phase(StrEnum):
 class CommandedPath:
     """Compares the path that the wheels rolled in a leg with the commanded path.
 
-    The commanded path contains the ramps of the configured `[limits]`, but not a `speed_limit` or a
-    limit that was changed later. The robot follows with a delay. Therefore the rolled distance must
-    be equal to one of the commanded distances of the last `RESPONSE_TIMEOUT_S`, within the limits
-    of this module. The same is required of the turn. The turn of the wheels is compared, and not
-    that of a gyro, because a robot that skids turns less than commanded.
+    The commanded path has the ramps of `[limits]`, but no `speed_limit`. The robot follows late, so
+    the rolled distance must be near one of the commanded distances of the last
+    `RESPONSE_TIMEOUT_S`. The same holds for the turn of the wheels; a gyro shows less if the robot
+    skids.
     """
 
     def __init__(self, drive: DriveConfig, limits: LimitsConfig, now: float) -> None:
@@ -84,20 +69,17 @@ class CommandedPath:
         self._ramps = Limiter(limits, self._kinematics)
         self._lever = drive.wheel_separation * drive.wheel_separation_multiplier / 2.0
         self._stepped = now
+        # Stamp of the last sample, s, and its twist.
         self._sampled: tuple[float, Twist] | None = None
-        """Stamp of the last sample, s, and its twist."""
+        # Commanded metres and radians, without their signs.
         self._lengths = [0.0, 0.0]
-        """Length of the commanded path, m, and sum of the sizes of the commanded turns, rad."""
+        # Commanded and rolled distance, m (forward is +), and turn, rad (left is +).
         self._commanded, self._rolled = (0.0, 0.0), (0.0, 0.0)
-        """Commanded and rolled distance, m (forward is +), and turn, rad (left is +)."""
+        # The values of `_commanded` in the last `RESPONSE_TIMEOUT_S`, each with its time, s.
         self._recent: deque[tuple[float, tuple[float, float]]] = deque([(now, self._commanded)])
-        """The values of `_commanded` in the last `RESPONSE_TIMEOUT_S`, each with its time, s."""
 
     def command(self, twist: Twist, now: float) -> None:
-        """Add the path of the command `twist`, which was in force since the last call.
-
-        `now` is the present time on a monotonic clock, s.
-        """
+        """Add the path of the command `twist`, which was in force since the last call."""
         passed, self._stepped = now - self._stepped, now
         allowed = self._ramps.follow(twist, passed) if passed > 0.0 else self._ramps.twist
         x, turn = allowed.linear * passed, allowed.angular * passed
@@ -143,37 +125,28 @@ class CommandedPath:
 
 
 class LegDriver:
-    """Decides the commands of one leg, which is one drive of a guided calibration.
+    """Decides the commands of one leg.
 
-    Every argument `now` is the present time, s. All these times come from one monotonic clock,
-    which also advances while the computer is suspended.
+    Every `now` is a time, s, on a monotonic clock that also advances while the computer is
+    suspended.
     """
 
     def __init__(self, leg: Leg, source: str, config: Config, now: float, sender: str) -> None:
-        """Start a leg.
-
-        The daemon recognizes the commands of this leg by their `source` and `sender`.
-        """
         self._leg, self._source, self._sender = leg, source, sender
         self._path = CommandedPath(config.drive, config.limits, now)
         self.phase = Phase.OPENING
-        self.halted = ""
-        """The reason why the leg ended early; "" if it did not end early."""
+        self.halted = ""  # the reason why the leg ended early; "" if it did not end early
+        # The reason in `halted` is temporary, so the leg can be repeated.
         self.disturbed = False
-        """True if the reason in `halted` is temporary, so that the leg can be repeated."""
+        # No messages arrived from the daemon. If they do again, the leg can be repeated.
         self.silent = False
-        """True if the leg was halted because no messages from the daemon arrived.
-
-        If messages arrive again, the leg can be repeated.
-        """
         self._begun = self._received = self._stepped = now
         self._number, self._ends = -1, now
         self._command = REST
+        # The reason why the daemon does not accept the commands yet; "" if it accepts them.
         self._waits = "no message with the daemon's state has arrived"
-        """The reason why the daemon does not accept the commands yet; "" if it accepts them."""
+        # Reason to halt the leg if this computer is so busy that the daemon receives no commands.
         self._starved = f"the daemon has received no command of source {source} for {OPENING_S:g} s"
-        """Reason to halt the leg if this computer is so busy that the daemon receives no commands.
-        """
         self._still_since: float | None = None
         self._deviates_since: float | None = None
 
@@ -191,11 +164,10 @@ class LegDriver:
         return min(0.99, max(0.0, (planned_s - self._ends + now) / self._leg.seconds))
 
     def key(self, pressed: str, now: float) -> None:
-        """Process a key press. A key halts the leg, with two exceptions.
+        """Process a key press, which halts the leg.
 
-        In the last move of a leg with `Leg.by_key`, a key ends this move as planned, and further
-        keys are ignored. In the phase OPENING, Enter is ignored, because the person may still hold
-        the Enter key that started the leg.
+        In the last move of a leg with `by_key` it ends this move instead. Enter is ignored in the
+        phase OPENING, because the person may still hold the key that started the leg.
         """
         if self.phase is Phase.OPENING and pressed in "\r\n":
             return
@@ -233,11 +205,7 @@ class LegDriver:
             self._tolerate_briefly(why, now, disturbed=disturbed)
 
     def wheels(self, speeds: WheelSpeeds, stamp: float, now: float) -> None:
-        """Process wheel speeds from the daemon, rad/s. `stamp` is their time, s.
-
-        They show whether the robot follows the commanded path, and whether it stands still at the
-        end of the leg.
-        """
+        """Process wheel speeds from the daemon, rad/s, of the time `stamp`, s."""
         self._received = now
         self._path.wheels(speeds, stamp)
         if max(map(abs, speeds.as_tuple())) > STANDSTILL_SPEED:
@@ -308,12 +276,6 @@ class LegDriver:
             )
 
     def _tolerate_briefly(self, why: str, now: float, *, disturbed: bool) -> None:
-        """Halt the leg if the robot does not follow its commands for `DEVIATION_TIMEOUT_S`.
-
-        Call this method for each `state` while the robot moves. `why` says why the robot does not
-        follow its commands. It is "" if the robot follows them. `disturbed` is true if the leg can
-        be repeated.
-        """
         # A short deviation is harmless. If this computer is busy for a moment, it sends commands
         # late, and the robot only slows down.
         if not why:

@@ -17,29 +17,20 @@ from acsard.calibration.guided.drive_plan import (
 from acsard.calibration.multipliers import MIN_TAPE_M
 from acsard.terminal.prompt import NumberQuestion
 
+# Covers the errors at both ends of the tape.
 STRAIGHT_LEG_STD_M = 0.005
-"""Standard deviation of the length of a straight drive that a person measures by tape, m.
 
-It covers the errors at both ends of the tape.
-"""
+FIRST_TURN_RATE = 1.2  # turn rate of the first turn in place, rad/s, if the robot does not skid
 
-FIRST_TURN_RATE = 1.2
-"""Turn rate of the first turn in place, rad/s, if the robot does not skid."""
-
+# Multiple of the time that the robot with the largest effective track needs.
 FIRST_TURN_TIMEOUT_FACTOR = 1.1
-"""Timeout of the first turn, as a multiple of the longest time for a full turn.
 
-The robot with the largest effective track (`MAX_TRACK_RATIO`) needs the longest time.
-"""
+MAX_SPIN_S = 24.0  # longest total time of the full turns in place in one leg
 
-MAX_SPIN_S = 24.0
-"""Longest total time of the full turns in place in one leg, s."""
+SETTLE = Move(1.0)  # pause between moves, in which the robot comes to rest and stops shaking
 
-SETTLE = Move(1.0)
-"""Pause between moves, in which the robot comes to rest and stops shaking."""
-
+# Name of the leg in which the robot turns once in place, until the person presses a key.
 ROUND_LEG = "once round"
-"""Name of the leg in which the robot turns once in place, until the person presses a key."""
 
 FROM_MARK = NumberQuestion(
     "How far is the marked wheel from its mark now, in a straight line?",
@@ -73,11 +64,7 @@ def once_round(setup: Setup) -> Leg:
 
 
 def turns(setup: Setup, rate: float, track: float) -> int:
-    """Return how many full turns in place fit into `MAX_SPIN_S`, from 1 to 3.
-
-    `rate` is the true turn rate, rad/s. `track` is the ratio of effective track to wheel
-    separation.
-    """
+    """Return how many full turns in place fit into `MAX_SPIN_S`, from 1 to 3."""
     turn_s = setup.turn(2 * math.pi, rate, track).seconds
     return max(1, min(3, int(MAX_SPIN_S / turn_s)))
 
@@ -100,11 +87,8 @@ TO_LINE = (
         name="rear",
     ),
 )
+# For `Slant.near`, `far` and `apart`, of a line on the left of the robot.
 LINE_ANSWERS = "front", "rear", "wheelbase"
-"""Names of the answers for `Slant.near`, `Slant.far` and `Slant.apart`.
-
-The answers describe a line on the left of the robot.
-"""
 
 
 def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
@@ -145,32 +129,21 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
 # The methods "gyro" and "positions". Each drive goes there and back, so the robot stays on the
 # floor although its effective track is unknown.
 
+# Turn rates of fast turns, slow turns and curves, rad/s, if the robot does not skid.
 FAST, SLOW, CURVE = 1.5, 0.75, 0.8
-"""Turn rates of fast turns, slow turns and curves, rad/s, if the robot does not skid."""
 
+# Duration of a turn in place in "gyro", longest length of a curve, and angle of a turn in place in
+# "positions" without skidding.
 SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
-"""Sizes of moves in the methods "gyro" and "positions".
 
-- `SPIN_S`: the duration of a turn in place in "gyro", s.
-- `CURVE_M`: the longest length of a curve, m.
-- `TURN_RAD`: the angle of a turn in place in "positions", rad, if the robot does not skid.
-"""
-
+# Turn rates of a turn in place, and of a curve there and back; 0 is straight.
 POSITION_MOVES = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
-"""Moves of the method "positions": each pair is a turn in place, and a curve there and back.
 
-The two numbers are the turn rates of the turn and of the curve, rad/s, if the robot does not skid.
-A curve with the rate 0 is straight.
-"""
-
+# The first two are long enough to measure the bias of a gyro.
 STANDING, PAUSE, SHORT = Move(2.5), Move(1.4), Move(0.7)
-"""Pauses: before the first drive, between drives, and where the robot only has to stop.
 
-`STANDING` and `PAUSE` are long enough to measure the bias of a gyro.
-"""
-
+# Name of the leg straight ahead. In the method "gyro", a person may measure its length by tape.
 STRAIGHT_LEG = "straight"
-"""Name of the leg straight ahead. In the method "gyro", a person may measure its length by tape."""
 
 
 def _straight(setup: Setup, asks: tuple[NumberQuestion, ...] = ()) -> Leg:
@@ -224,10 +197,6 @@ def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
 
 
 def _there_and_back(setup: Setup, rate: float) -> tuple[Move, ...]:
-    """Return the moves of a curve forwards, and back on the same path.
-
-    The curve is short enough that the robot stays on the floor, whatever its heading is.
-    """
     metres = min(CURVE_M, FLOOR_M / 2 - setup.from_edge)
     return setup.arc(rate, metres), SHORT, setup.arc(-rate, -metres), SHORT
 

@@ -1,8 +1,7 @@
 """Connects a guided drive to the robot: sends the commands of a leg, and records the messages.
 
-The senders stamp their messages with different clocks, or not at all. The stamps of one sensor
-therefore show only the intervals between its messages. The recorder assumes that the message with
-the smallest delay from stamp to arrival has no delay. The fit then finds the delay that remains.
+The senders stamp with different clocks, or not at all, so stamps show only intervals. The message
+with the smallest delay from stamp to arrival counts as undelayed; the fit finds the rest.
 """
 
 from __future__ import annotations
@@ -29,41 +28,29 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import by_key
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, Time, TwistStamped
-from acsard.core.values import NS_PER_S, WheelSpeeds
+from acsard.core.values import NS_PER_S, Seconds, WheelSpeeds
 from acsard.host import clock
 from acsard.terminal.prompt import Prompt
 
 SOURCE = "app"
 
+# A key takes effect within this time.
 POLL_PERIOD_S = 0.005
-"""Period at which the keyboard and the message queues are polled, s.
 
-A key takes effect within this time.
-"""
+DISPLAY_PERIOD_S = 0.2  # interval between updates of the progress display of a leg
 
-DISPLAY_PERIOD_S = 0.2
-"""Interval between updates of the progress display of a leg, s."""
-
+# If a silent daemon sends its state again within this time, the leg is repeated.
 RECONNECT_TIMEOUT_S = 3.0
-"""If a silent daemon sends its state again within this time, s, the leg is repeated."""
 
+# CDR does not name its type. A pose is too short to be decoded as `Odometry`.
 POSITION_TYPES = (Odometry, PoseStamped)
-"""Message types with positions, in the order in which `Sensor` tries to decode the first message.
 
-A CDR payload does not name its type. `Odometry` comes first because a pose is too short to be
-decoded as `Odometry`.
-"""
-
+# Function that processes a message. Its second argument is the time of arrival, s.
 Take = Callable[[Any, float], object]
-"""Function that processes a message. Its second argument is the time of arrival, s."""
 
 
 class Sensor:
-    """A subscription to one Zenoh key.
-
-    The first message decides which one of `types` the messages have. All later messages must have
-    the same type.
-    """
+    """A subscription to one Zenoh key. The first message decides which of `types` all must have."""
 
     def __init__(self, session: zenoh.Session, key: str, types: tuple[type, ...]) -> None:
         self.key = key
@@ -73,8 +60,7 @@ class Sensor:
     def receive(self, take: Take, now: float) -> int:
         """Pass each message that has arrived to `take`, and return the number of messages.
 
-        `now` is the present time, s, which `take` receives as the time of arrival. Raises
-        `GuideError` if a message cannot be decoded.
+        Raises `GuideError` if a message cannot be decoded.
         """
         count = 0
         while (sample := self._samples.try_recv()) is not None:
@@ -87,11 +73,7 @@ class Sensor:
         return self.receive(lambda message, now: None, 0.0)
 
     def await_first(self, what: str) -> None:
-        """Wait until a message arrives on the key, and discard it.
-
-        Raises `GuideError` if no message arrives within `FIRST_STATE_TIMEOUT_S`. `what` is the name
-        of the message in the text of this error.
-        """
+        """Wait for a message and discard it. Raises `GuideError` if none arrives."""
         end = clock.steady_s() + FIRST_STATE_TIMEOUT_S
         while not self.discard():
             if clock.steady_s() > end:
@@ -117,29 +99,23 @@ class Sensor:
         )
 
 
+# Columns of a log that each kind of recorded message fills.
 COLUMNS_BY_STREAM = {
     "wheels": FOUR, "gyro": ("yaw_rate",), "places": ("x", "y"), "commands": APPLIED,
 }  # fmt: skip
-"""Columns of a log that the values of each kind of recorded message fill."""
 
 
 class Sample(Struct, frozen=True):
     """The values of one message, with its time of arrival and its stamp."""
 
-    arrival: float
-    """Time of arrival on this computer's clock, s."""
-    stamp: float | None
-    """Stamp of the sender's clock, s; None if the message has no stamp."""
+    arrival: Seconds  # time of arrival on this computer's clock
+    stamp: Seconds | None  # stamp of the sender's clock; None if the message has no stamp
+    # Values of the columns that `COLUMNS_BY_STREAM` lists for this kind of message.
     values: tuple[float, ...]
-    """Values of the columns that `COLUMNS_BY_STREAM` lists for this kind of message."""
 
 
 class LegRecorder:
-    """Collects the samples of one leg, which is one drive of a guided calibration.
-
-    Every argument `arrival` is the time of arrival of the message, s. `joints` contains the names
-    of the wheel joints: front right, front left, rear left, rear right.
-    """
+    """Collects the samples of one leg. Every `arrival` is the time of arrival of a message, s."""
 
     def __init__(self, joints: Sequence[str]) -> None:
         self._joints = joints
@@ -182,10 +158,8 @@ class LegRecorder:
     def log(self) -> Log:
         """Return the samples of the leg as a log.
 
-        Raises:
-            DisturbedError: the wheel samples have a gap, which divides the leg into several runs.
-            LogError: there are too few wheel samples, or two wheels of a side contradict each
-                other.
+        Raises `DisturbedError` if the wheel samples have a gap, and `LogError` if they cannot be
+        used.
         """
         sensors: list[dict[str, Floats]] = []
         for stream, names in COLUMNS_BY_STREAM.items():
@@ -200,11 +174,7 @@ class LegRecorder:
 
 
 def times(samples: Sequence[Sample]) -> Floats:
-    """Return the times at which the samples were made, s, on this computer's clock.
-
-    The times are computed from the stamps (`on_arrival_clock`). If any sample has no stamp, the
-    times are the times of arrival.
-    """
+    """Return the times at which the samples were made, s, on this computer's clock."""
     arrivals = np.array([sample.arrival for sample in samples])
     stamps = np.array([math.nan if s.stamp is None else s.stamp for s in samples])
     return (
@@ -234,8 +204,7 @@ class RobotOnBus:
     def positions(self, key: str, session: zenoh.Session | None) -> None:
         """Record the positions on `key` in each later leg. Raises `GuideError` if none arrive.
 
-        `session` is the Zenoh session that receives the positions. If it is None, the session that
-        commands the robot also receives the positions.
+        A `session` of None means the session that commands the robot.
         """
         sensor = Sensor(session or self._client.session, self._full(key), POSITION_TYPES)
         sensor.await_first("a position (PoseStamped or Odometry)")
@@ -244,12 +213,8 @@ class RobotOnBus:
     def ride(self, leg: Leg) -> Run:
         """Drive a leg and return its recording.
 
-        Raises:
-            DisturbedError: the leg was halted for a temporary reason, or the wheel samples have a
-                gap of `NEW_RUN_AFTER_S`. The leg can be repeated.
-            GuideError: the leg was halted for another reason.
-            LogError: there are too few wheel samples, or two wheels of a side contradict each
-                other.
+        Raises `DisturbedError` if the leg can be repeated, `GuideError` if not, and `LogError` if
+        the wheel samples cannot be used.
         """
         recorder = LegRecorder(self._joints)
         self._drain()
@@ -321,5 +286,4 @@ class RobotOnBus:
         self._watch.poll(clock.steady_s())
 
     def _full(self, key: str) -> str:
-        """Return `key`, with this robot's id in front if acsard itself defines the key ("imu")."""
         return self._client.key(key) if by_key(key) is not None else key

@@ -28,34 +28,24 @@ from acsard.calibration.solve import Calibration, calibrate
 from acsard.calibration.wheel_response import response
 from acsard.terminal.prompt import NumberQuestion, Prompt
 
-MAX_REPEATS = 2
-"""Maximum number of times that a disturbed leg is repeated on a real robot."""
+MAX_REPEATS = 2  # maximum number of times that a disturbed leg is repeated on a real robot
 
+# No person has to put the simulated robot back.
 MAX_SIMULATED_REPEATS = 20
-"""Maximum number of times that a disturbed leg is repeated on the simulator.
-
-The number is large because no person has to put the simulated robot back.
-"""
 
 
 def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
-    """Return the index of the leg with which the drive continues after a disturbed leg.
+    """Return the index of the leg with which the drive continues after the disturbed leg `number`.
 
-    If a sensor measures the motion (`sensor`), only the disturbed leg `number` is repeated.
-    Otherwise a person measures by tape, relative to the place where the person put the robot before
-    the first leg. The drive then returns to the first leg.
-
-    Some legs need only the robot's angle at their start (`angle_before`). Such a leg is repeated
-    alone, after the person has measured this angle again.
+    If a sensor measures, only this leg is repeated. Measurements by tape are relative to the place
+    where the person put the robot, so the drive returns to the first leg, unless the leg needs only
+    an angle that the person measures again.
     """
     return number if sensor or angle_before(legs[number]) else 0
 
 
 def angle_before(leg: Leg) -> str:
-    """Return the name of the earlier leg after which the person measured the start angle of `leg`.
-
-    Return "" if `leg` needs no start angle, or if its measurements cover several legs.
-    """
+    """Return the earlier leg after which the person measured the start angle of `leg`, or ""."""
     slants = [measure for measure in leg.measures if isinstance(measure, Slant)]
     return next((slant.since for slant in slants if slant.since and not slant.over), "")
 
@@ -64,22 +54,11 @@ def guide(
     name: str, setup: Setup, prompt: Prompt, ride: Callable[[Leg], Run], *,
     simulated: bool = False, true_positions: bool = False,
 ) -> Calibration:  # fmt: skip
-    """Lead a person through the legs of a method of calibration, and return the calibration.
+    """Lead a person through the legs of the method `name`, and return the calibration.
 
-    Args:
-        name: the name of the method, as in `METHODS`.
-        setup: the robot, and the speeds and lengths of its drive.
-        prompt: shows texts to the person, and asks the questions.
-        ride: the function that drives one leg and returns the recording of this leg.
-        simulated: whether the robot is the built-in simulator, which allows more repeats.
-        true_positions: whether the recorded positions are the simulator's true ones.
-
-    Raises:
-        GuideError: the drive cannot continue.
-        LogError: a recording has too few samples.
-        NobodyError: no person answers the questions.
-        NoCalibrationError: the measurements are impossible or contradict each other, or the drive
-            gives no useful calibration.
+    `ride` drives a leg and returns its recording. `true_positions` are the simulator's. Raises
+    `GuideError` if the drive cannot continue, `NobodyError` if no person answers, and `LogError` or
+    `NoCalibrationError` if recordings or measurements give no calibration.
     """
     method = METHODS[name]
     longest = method.longest_s(setup)

@@ -1,10 +1,8 @@
-"""Computes a `Calibration` from tape readings: wheel radii, effective track and improvement.
+"""Computes a `Calibration` from tape readings: distances and turns since a known pose.
 
-A reading is one measurement of the robot's motion since its pose was last known: a distance or a
-turn. A Gauss-Newton fit compares all readings with the path that is computed
-from the wheel speeds. A reading differs from this path because the person measures inaccurately,
-and because the robot skids. If there are enough readings, their scatter shows how much the robot
-skidded.
+A Gauss-Newton fit compares the readings with the path that is computed from the wheels. They differ
+because the person measures inaccurately, and because the robot skids. The scatter of enough
+readings shows how much it skidded.
 """
 
 from __future__ import annotations
@@ -50,62 +48,42 @@ from acsard.calibration.runs import Run, blocks
 from acsard.calibration.solve import Calibration, DriveTotals
 from acsard.core.config.settings import DriveConfig, OdometryConfig
 
+# After 1 m, rad; it grows with the square root of the rolled distance.
 SKID_HEADING_STD = 0.015
-"""Standard deviation of the heading due to skidding, rad, after the wheels have rolled 1 m.
 
-The deviation grows with the square root of the rolled distance.
-"""
-
+# Standard deviation of a distance due to skidding, as a fraction of the distance.
 SKID_LENGTH_STD = 0.002
-"""Standard deviation of a distance due to skidding, as a fraction of the distance."""
 
+# Prior standard deviation of the mean wheel radius, as a fraction of the wheel radius.
 PRIOR_RADIUS_STD = 1.0
-"""Prior standard deviation of the mean wheel radius, as a fraction of the wheel radius."""
 
+# Weight of the assumed noise against the noise that the scatter of the readings shows.
 PRIOR_DEGREES_OF_FREEDOM = 4.0
-"""Weight of the assumed noise of the readings, in degrees of freedom.
-
-The fit averages two estimates of the noise: the assumed noise, and the noise that the scatter of
-the readings shows. The weight of the second estimate is the number of readings that the fit would
-not need.
-"""
 
 MAX_STEPS = 50
-CONVERGED = 1e-9
-"""Largest change of a parameter in the last step of a fit that has converged."""
+CONVERGED = 1e-9  # largest change of a parameter in the last step of a fit that has converged
 
+# Largest condition number of normal equations from which the parameters can be computed.
 MAX_CONDITION = 1e8
-"""Largest condition number of normal equations from which the parameters can be computed."""
 
+# For the `turned` reading from which the first estimate of the track is computed.
 MAX_STARTING_STD = 0.2
-"""Largest relative standard deviation of a `turned` reading with which the fit may start.
-
-The first estimate of the effective track is computed from this reading.
-"""
 
 
 class Reading(Struct, frozen=True, dict=True):
-    """A measurement of the robot's motion over one or more recorded legs, in rad or m.
+    """A measurement by tape of the robot's motion over one or more recorded legs, rad or m."""
 
-    A person made it by tape.
-    """
-
-    rides: tuple[Run, ...]
-    """The recorded legs that the measurement covers, in order."""
+    rides: tuple[Run, ...]  # the recorded legs that the measurement covers, in order
     quantity: Quantity
     value: float
-    deviation: float
-    """Standard deviation of the measurement by tape, rad or m."""
+    deviation: float  # standard deviation of the measurement by tape, rad or m
 
     @cached_property
     def steps(self) -> WheelSteps:
         return joined(self.rides)
 
     def residual(self, prediction: float) -> float:
-        """Return the measured value minus `prediction`, rad or m.
-
-        For an `angle`, the result is reduced by whole turns to a value from -pi to pi.
-        """
+        """Return measured minus predicted value; for an `angle`, reduced to -pi to pi."""
         off = self.value - prediction
         return math.remainder(off, 2 * math.pi) if self.quantity == "angle" else off
 
@@ -114,10 +92,9 @@ class Predicted(Struct, frozen=True):
     """A prediction of a reading, computed from the angles by which the wheels rolled."""
 
     value: float
+    # Derivatives of `value` with respect to the parameters, shape (PARAMETER_COUNT,).
     derivatives: Floats
-    """Derivatives of `value` with respect to the parameters, shape (PARAMETER_COUNT,)."""
-    variance: float
-    """Variance of `value` due to skidding, rad2 or m2."""
+    variance: float  # variance of `value` due to skidding, rad2 or m2
 
 
 class TapeFit(Struct, frozen=True):
@@ -125,13 +102,9 @@ class TapeFit(Struct, frozen=True):
 
     parameters: Floats
     covariance: Floats
-    residuals: Floats
-    """Measured value minus predicted value of each reading, rad or m."""
+    residuals: Floats  # measured value minus predicted value of each reading, rad or m
+    # With parameters that were fitted to all other readings; NaN if that fit fails.
     held_out: Floats
-    """Residual of each reading with parameters that were fitted to all other readings.
-
-    The residual is NaN if the fit to the other readings fails.
-    """
 
 
 def joined(rides: Sequence[Run]) -> WheelSteps:
@@ -147,14 +120,7 @@ def joined(rides: Sequence[Run]) -> WheelSteps:
 
 
 def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Floats) -> Predicted:
-    """Return a prediction of a reading, computed from the angles by which the wheels rolled.
-
-    Args:
-        steps: the angles by which the wheels rolled in the legs of the reading.
-        quantity: the quantity that the reading measures.
-        base: the configured geometry.
-        parameters: the parameters of the fit, shape (PARAMETER_COUNT,).
-    """
+    """Return a prediction of a reading from the angles by which the wheels rolled."""
     driven = path(steps, base, parameters)
     rolled = base.radius * float(np.abs(steps.left).sum() + np.abs(steps.right).sum()) / 2
     derivatives = np.zeros(PARAMETER_COUNT)
@@ -196,11 +162,6 @@ def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
 
 
 def _starting_parameters(readings: Sequence[Reading], base: Base) -> Floats:
-    """Return parameters from which the fit can start.
-
-    An `angle` reading does not include whole turns. These parameters are accurate enough to predict
-    how many whole turns the robot made.
-    """
     start = base.start()
     for reading in readings:
         if reading.quantity == "turned" and reading.deviation < MAX_STARTING_STD * abs(
@@ -228,12 +189,6 @@ def _compared(
 
 
 def _solved(readings: Sequence[Reading], base: Base, start: Floats) -> tuple[Floats, Floats]:
-    """Return the parameters that fit the readings, and the matrix of the normal equations.
-
-    The matrix is that of the last step: J^T W J plus the prior information. Raises
-    `NoCalibrationError` if the readings do not determine the parameters, or if they contradict each
-    other.
-    """
     parameters, configured = start.copy(), base.start()
     for _ in range(MAX_STEPS):
         normal, score = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT)), np.zeros(PARAMETER_COUNT)
@@ -275,33 +230,19 @@ def _held_out_residual(
     return residual
 
 
+# Includes the error of choosing the point on the robot to measure.
 LINE_DISTANCE_STD_M = 0.002
-"""Standard deviation of a distance that a person measures by tape, m.
 
-It is also the standard deviation of the position of a robot that a person places at a line.
-"""
+TRACK_RATIO_RANGE = 0.85, 3.0  # range of credible ratios of effective track to wheel separation
 
-TRACK_RATIO_RANGE = 0.85, 3.0
-"""Range of credible ratios of effective track to wheel separation."""
-
+# By the names of leg and question, m or rad; the leg is "" before the first leg.
 Answers = dict[tuple[str, str], float]
-"""The person's answers, in m or rad, by the names of leg and question.
-
-The name of the leg is "" for questions before the first leg.
-"""
 
 
 def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answers) -> Reading:
-    """Return the reading that `measure` defines, computed from the person's answers.
+    """Return the reading that `measure` defines after the leg `leg`, from the person's answers.
 
-    Args:
-        measure: the definition of the reading.
-        leg: the name of the leg after which the person measured.
-        rides: the recording of each leg, by the name of the leg.
-        answers: the answers so far.
-
-    Raises:
-        NoCalibrationError: the answers are impossible.
+    Raises `NoCalibrationError` if the answers are impossible.
     """
     if isinstance(measure, Distance):
         return Reading((rides[leg],), "distance", answers[leg, measure.answer], measure.deviation)
@@ -318,11 +259,9 @@ def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answe
 
 
 def track_ratio(reading: Reading, drive: DriveConfig) -> float:
-    """Return the approximate ratio of effective track to wheel separation.
+    """Return effective track / wheel separation, limited to 1 to `MAX_TRACK_RATIO`.
 
-    `reading` is the measurement of one full turn of the robot. The ratio is limited to the range
-    from 1 to `MAX_TRACK_RATIO`, because the next legs are planned with it. Raises `GuideError` if
-    the ratio is not credible (`TRACK_RATIO_RANGE`).
+    `reading` is one full turn. Raises `GuideError` if the ratio is not credible.
     """
     # Use the measured radius and separation without the configured multipliers.
     base = Base(drive.wheel_radius, drive.wheel_separation, 1.0, 1.0, 1.0)
@@ -342,13 +281,8 @@ def track_ratio(reading: Reading, drive: DriveConfig) -> float:
 def slant(near: float, far: float, apart: float) -> float:
     """Return the angle between the robot and a line, rad, positive after a turn to the left.
 
-    The angle is computed from the distances of two points of the robot to the line. Raises
-    `NoCalibrationError` if the distances are impossible.
-
-    Args:
-        near: distance of the point that a turn to the left moves towards the line, m.
-        far: distance of the other point, m.
-        apart: distance between the two points, m.
+    A turn to the left moves the point at the distance `near` towards the line. All distances are in
+    m. Raises `NoCalibrationError` if they are impossible.
     """
     sine = (far - near) / apart
     if abs(sine) > 0.98:
@@ -360,15 +294,11 @@ def slant(near: float, far: float, apart: float) -> float:
     return math.asin(sine)
 
 
+# Largest accepted relative standard deviation of each quantity.
 MAX_TAPE_STDS = {TRACK: 0.1, RATIO: 0.02}
-"""Largest accepted relative standard deviation of each quantity."""
 
+# Above `TURNED` rad, a reading shows an error of turns; below `STRAIGHT`, of straight driving.
 TURNED, STRAIGHT = np.pi, 0.5
-"""Limits for the angle that the robot turns in the legs of a reading, rad.
-
-Above `TURNED`, the reading shows an error of turns. Below `STRAIGHT`, it shows an error of
-straight driving.
-"""
 
 
 def calibrated(
@@ -412,11 +342,6 @@ def calibrated(
 
 
 def _improvement(readings: Sequence[Reading], base: Base, fit: TapeFit, rate: Rates) -> Improvement:
-    """Return the errors of the configured and of the new parameters.
-
-    For each reading, the error of the new parameters is computed with a fit to all other readings.
-    If this fit fails, the fit to all readings is used.
-    """
     sums = {name: np.zeros(3) for name in ("turn", "straight")}
     present = base.configured(fit.parameters)
     constant = with_constant_track(fit.parameters, rate)
