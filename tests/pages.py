@@ -539,6 +539,10 @@ COMMANDS: dict[str, How] = {
     f"acsard call stop {_ROUTER} laptop-anna": LAPTOP,
     f"acsard fleet {_ROUTERS} laptop-anna": MANY,
     f"acsard call stop {_ROUTERS} laptop-anna": MANY,
+    "sudo acsard set limits.linear_speed 0.8 --keep --config /etc/acsard/acsard.toml": Elsewhere(
+        "tests/system/test_keep.py",
+        "test_a_kept_setting_survives_a_restart_and_its_comments_stay",
+    ),
     f"acsard set limits.linear_speed 0.8 {_ROUTERS} fleet/clients/maintainer": Elsewhere(
         "tests/system/test_many.py",
         "test_set_changes_named_robots_and_prints_a_line_for_each",

@@ -13,13 +13,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from acsard.bus.zenoh_sessions import reachable
-from acsard.cli.common import add_config, load, options_text, overrides, with_record_directory
+from acsard.cli.common import add_config, load, options_text, with_record_directory
 from acsard.core.config.contradictions import warnings
-from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
 from acsard.core.values import ROOT_KEY, Event
 from acsard.daemon import daemon
-from acsard.daemon.settings_file import SettingsFile
 from acsard.host.logs import Log, Writer
 from acsard.host.version import version
 
@@ -134,24 +132,12 @@ def main(args: argparse.Namespace) -> int:
                 announce,
                 None if args.no_gateway else gateway,
                 served,
-                settings_file(where, config, options(args)),
             )
         )
     finally:
         log.close()
         screen.close(0.2)
     return 0
-
-
-def settings_file(where: str, config: Config, cli_values: dict[str, object]) -> SettingsFile:
-    """Return the `SettingsFile` with which the daemon changes its own configuration file.
-
-    The `SettingsFile` parses the file as the daemon would after a restart. `where` is the path of
-    the file, or another text if there is no file. `cli_values` is the result of `options`.
-    """
-    values = overrides(cli_values)
-    file = Path(where).absolute() if Path(where).is_file() else None
-    return SettingsFile(file, lambda text: with_record_directory(parse(text, values)), config)
 
 
 def page(config: Config, where: str) -> list[str] | None:

@@ -1,10 +1,9 @@
 """Change settings of the running robot: limits, timeouts, covariances, publishing rates, the log
 level. Either all given settings change or none. The daemon checks them like the configuration file,
-logs them and publishes them on the key `config`. They last until the daemon's next start.
-With --keep the robot also writes the settings into its own configuration file,
-and the answer names that file. With --write this tool writes them into the configuration file of
-this machine. --keep and --write cannot write a source's timeout: edit [[commands.sources]] in the
-file. A robot that drives faster than a new limit slows down to it.
+logs them and publishes them on the key `config`. They last until the daemon's next start. With
+--keep, typed on the robot, this tool also writes them into the robot's configuration file. --keep
+cannot write a source's timeout: edit [[commands.sources]] in the file. A robot that drives faster
+than a new limit slows down to it.
 Without a setting, list the settings that can be changed. If --id names several robots, all of them
 get the settings at the same time, and each line has the answer of one robot. The exit code is 1 if
 a robot refuses, and 69 if a robot does not answer.
@@ -29,11 +28,10 @@ from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.ros.parameters import described
 from acsard.core.values import Plain
-from acsard.host.config_file import change, require_changeable, writable
+from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install
-
-UNTIL = "a set lasts until the daemon's next start"
+from acsard.host.processes import is_daemon_here
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -44,19 +42,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="a key of acsard.toml with the name of its table, for example limits.linear_speed, "
         "and the new value; write a list as [1, 2]",
     )
-    files = parser.add_mutually_exclusive_group()
-    files.add_argument(
+    parser.add_argument(
         "--keep",
         action="store_true",
-        help="the robot also writes the settings into its own configuration file, whose comments "
-        "stay. Nothing is set if the daemon may not change that file, if git tracks the file, or "
-        "if the robot lacks the library tomlkit",
-    )
-    files.add_argument(
-        "--write",
-        action="store_true",
-        help="also write the settings into the configuration file of this machine, whose comments "
-        f"stay (needs the library tomlkit: {install('write')})",
+        help="also write the settings into the robot's configuration file, whose comments stay. "
+        "Type this on the robot (with sudo for the file of the service), and name the file with "
+        f"--config if it is not found by itself. Needs the library tomlkit: {install('write')}",
     )
     parser.add_argument("--json", action="store_true", help="print the answer or the list as JSON")
     add_bus(parser, SEVERAL_IDS + " (to change settings)")
@@ -68,17 +59,15 @@ def main(args: argparse.Namespace) -> int:
         raise UsageError("--keep needs a setting: acsard set limits.linear_speed 0.8 --keep")
     if several_ids(args):
         _require_for_many(args, settings)
-    file = _file(args.config, settings) if args.write else None
-    if file is not None:
-        require_changeable(file, settings)
     with connected_to_many(args) as (robot, many):
         if not settings:
             _print_settings(robot.get("config"), args.json)
             return Exit.OK
         if many:
-            return _set_all(robot, many, settings, keep=args.keep, as_json=args.json)
-        reply = robot.set(settings, keep=args.keep)
-    text = reply.message if args.keep or not reply.success else f"{reply.message}; {UNTIL}"
+            return _set_all(robot, many, settings, as_json=args.json)
+        file = _file(robot, args.config, settings) if args.keep else None
+        reply = robot.set(settings)
+    text = _with_duration(reply).message
     if reply.success and file is not None:
         try:
             change(file, settings)
@@ -118,35 +107,43 @@ def _value(word: str) -> Plain:
 def _require_for_many(args: argparse.Namespace, settings: dict[str, Plain]) -> None:
     if not settings:
         raise UsageError("name one robot in --id to list its settings")
-    if args.write:
+    if args.keep:
         raise UsageError(
-            f"--write changes only the configuration file of this machine, but --id '{args.id}' "
-            "names several robots: use --keep instead, and each robot writes its own file"
+            f"--keep changes only the file of the robot on which it is typed, but --id '{args.id}' "
+            "names several robots: type the command on each robot"
         )
 
 
+def _with_duration(reply: ServiceReply) -> ServiceReply:
+    if not reply.success:
+        return reply
+    return ServiceReply(True, f"{reply.message}; a set lasts until the daemon's next start")
+
+
 def _set_all(
-    robot: Client, ids: tuple[str, ...], settings: dict[str, Plain], *, keep: bool, as_json: bool
+    robot: Client, ids: tuple[str, ...], settings: dict[str, Plain], *, as_json: bool
 ) -> int:
     def change_one(client: Client) -> ServiceReply:
-        reply = client.set(settings, keep=keep)
-        if as_json or keep or not reply.success:
-            return reply
-        return ServiceReply(True, f"{reply.message}; {UNTIL}")
+        reply = client.set(settings)
+        return reply if as_json else _with_duration(reply)
 
     replies = of_each(robot, ids, change_one)
     return print_each(replies, robot, ids, "NO ANSWER: {error}", as_json=as_json)
 
 
-def _file(path: str | None, settings: dict[str, Plain]) -> Path:
-    if not settings:
-        raise UsageError("--write needs a setting: acsard set limits.linear_speed 0.8 --write")
+def _file(robot: Client, path: str | None, settings: dict[str, Plain]) -> Path:
+    """Return the robot's configuration file. Raise an error if it cannot be changed here."""
     if any(key.startswith("commands.sources.") for key in settings):
         raise UsageError(
-            "--write cannot change [[commands.sources]]: set the timeout without --write, and "
+            "--keep cannot change [[commands.sources]]: set the timeout without --keep, and "
             "write it into the file yourself. If the file has no [[commands.sources]] yet, copy "
             "all of these tables from the output of `acsard check` first, because the file's "
             "tables replace all built-in ones"
+        )
+    if not is_daemon_here(robot.get("info").pid):
+        raise MendableError(
+            "no setting was changed: --keep writes the file on the robot, but the daemon runs on "
+            "another machine or in a container: type the command there, or leave out --keep"
         )
     return writable(path)
 

@@ -117,11 +117,9 @@ class AsyncClient:
         """Call a service and return its reply, as `Client.call` does."""
         return await _in_thread(lambda: self._client.call(service, **fields))
 
-    async def set(
-        self, settings: Mapping[str, Plain], *, keep: bool = False
-    ) -> schema.ServiceReply:
+    async def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
         """Change settings of the daemon and return the reply, as `Client.set` does."""
-        return await _in_thread(lambda: self._client.set(settings, keep=keep))
+        return await _in_thread(lambda: self._client.set(settings))
 
     async def get(self, name: str) -> Any:
         """Return the last message on a key, decoded to its type, as `Client.get` does."""

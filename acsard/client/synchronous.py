@@ -352,16 +352,13 @@ class Client:
             fields["latch"] = self.get("state").latch
         return self.request(service, fields)
 
-    def set(self, settings: Mapping[str, Plain], *, keep: bool = False) -> schema.ServiceReply:
+    def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
         """Change settings of the daemon, for example `{"rates.state": 5.0}`, and return the reply.
 
         The daemon changes all of the settings or none. The change lasts until the next start of the
-        daemon. If `keep` is true, the daemon also writes the settings into
-        its configuration file. The reply names the file, or says why the settings are refused or
-        not written.
+        daemon.
         """
-        fields: dict[str, object] = {"settings": settings}
-        return self.request("set", fields | {"keep": True} if keep else fields)
+        return self.request("set", {"settings": settings})
 
     def request(self, service: str, fields: Mapping[str, object]) -> schema.ServiceReply:
         """Call the service `service` with `fields` as its payload, and return its reply.

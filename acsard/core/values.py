@@ -692,8 +692,8 @@ class Snapshot(Struct, frozen=True):
     """Why the latches would be lost if the daemon restarted now, in words. It is "" if they would
     be kept, and None if this daemon has no latch file."""
     settings_differ: str = ""
-    """The settings in force that differ from the configuration file, in words. The text is "" if
-    all agree with the file, and in an export of a recording."""
+    """The settings that `set` changed since the daemon's start, in words. The text is "" if there
+    are none, and in an export of a recording."""
     speed_limit: str = ""
     """The speed limit that lowers a setting, in words. The text is "" if no speed limit does, and
     in an export of a recording."""

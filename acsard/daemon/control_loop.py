@@ -12,8 +12,10 @@ from collections.abc import Callable, Mapping
 
 from msgspec.structs import replace
 
+from acsard.core.config.live import differences
 from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_ns
+from acsard.core.formatting import listed
 from acsard.core.guard import Guard
 from acsard.core.incoming.bus_interface import GATEWAY_KEY as GATEWAY
 from acsard.core.incoming.bus_interface import (
@@ -53,7 +55,6 @@ from acsard.core.values import (
 from acsard.daemon.latch_rules import MAX_ANSWER_DELAY_NS, Handover, LatchKeeper
 from acsard.daemon.latencies import Stopwatch
 from acsard.daemon.pacing import NO_PERIOD, Pace, Period
-from acsard.daemon.settings_file import SettingsFile, keeps
 from acsard.recording.recorded_steps import StepRecorder, count_superseded
 
 FEEDBACK_TOPICS = ("odom", "tf", "wheel_states")
@@ -68,6 +69,9 @@ MIN_WRITE_DELAY_NS = 1_000_000
 """Smallest write delay that the control loop reports to the robot, ns. The write delay is the time
 from the start of a step to the write of its line. A smaller delay is reported as 0, because the
 error of the estimated sample times is larger."""
+
+MAX_NAMED = 3
+"""Largest number of settings that `settings_differ` of the message `state` names."""
 
 NOT_STORED = (
     "the new state is not on the disk yet; if the daemon restarts before the disk has this state, "
@@ -102,7 +106,6 @@ class ControlLoop:
         recorder: StepRecorder | None = None,
         latches: Latches = Latches(),  # noqa: B008
         keeper: LatchKeeper | None = None,
-        settings_file: SettingsFile | None = None,
     ) -> None:
         """Create the robot and the parts that convert its inputs and outputs.
 
@@ -126,8 +129,6 @@ class ControlLoop:
             latches: the latches (stop, fault, "inactive") with which the robot starts.
             keeper: stores the latches, so that they survive a restart of the daemon. With None, the
                 latches are not stored.
-            settings_file: writes settings to the configuration file. With None, a `set` request
-                with the field `keep` is refused.
         """
         self.robot = Robot(config, latches)
         self.report = Report(config, start, certificate_ends)
@@ -137,9 +138,9 @@ class ControlLoop:
         self._start_ns = start.mono_ns
         self._others = [] if others is None else others
         self._beside = beside
-        self._config, self._adopted, self._settings_file = config, adopted, settings_file
+        self._config, self._adopted = config, adopted
+        self._started, self._changed_settings = config, ""
         self._recorder, self._handover = recorder, Handover(latches, keeper)
-        self._configured_speed = config.limits.linear_speed
         self._speed_cap: SpeedCap | None = None
         self._answers: deque[tuple[int, Answer]] = deque()
         """Answers that wait until the latch file contains the newest latches. Each answer is paired
@@ -217,8 +218,6 @@ class ControlLoop:
             self._stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns, missed)
             self._others += self._handover.take_events()
         commands, refusals, requests = self._from_bus(now)
-        if self._settings_file is not None and self._settings_file.pending:
-            requests += self._keepable(self._settings_file, now)
         port, pace = self._port, self.pace
         # Call `take` before reading `is_open`. After a suspend of the computer, `take` closes the
         # port.
@@ -296,8 +295,9 @@ class ControlLoop:
         self._guard.use(config)
         self.report.use(config)
         self._queries.use(config)
-        if self._settings_file is not None:
-            self._settings_file.use(config)
+        changes = differences(config, self._started)
+        texts = [change.describe(key) for key, change in changes.items()]
+        self._changed_settings = listed(texts, MAX_NAMED)
 
     def _from_bus(
         self, now: Instant
@@ -324,7 +324,7 @@ class ControlLoop:
                 continue
             if arrival.key == SPEED_LIMIT:
                 try:
-                    self._speed_cap = decode_limit(arrival, self._configured_speed)
+                    self._speed_cap = decode_limit(arrival, self._started.limits.linear_speed)
                 except DecodeError as error:
                     refusals.append(Refusal(error.reason, f"{SPEED_LIMIT}: {error}"))
                 continue
@@ -374,8 +374,7 @@ class ControlLoop:
     def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
         """Answer a query, or return it as a request if the robot must process it.
 
-        Return None if this method has answered the query. Also return None for a `set` request with
-        the field `keep`. This request first waits until the settings file has been checked.
+        Return None if this method has answered the query.
         """
         try:
             served = self._queries.serve(query, self._current, self.outputs)
@@ -384,42 +383,11 @@ class ControlLoop:
             reply = refused(query, str(error), now.wall_ns)
             served = [] if reply is None else [reply]
         if isinstance(served, Request):
-            wants = query.via == "native" and served.verb == "set"
-            if wants and keeps(query.encoding, query.payload):
-                self._keep(served, now)
-                return None
             return served
         for reply in served:
             self._bus.reply(reply)
         self._bus.retire(query.ticket)
         return None
-
-    def _keep(self, request: Request, now: Instant) -> None:
-        if self._settings_file is None:
-            text = (
-                "no setting was changed: this daemon has no configuration file in which to keep "
-                "settings; leave `keep` out of the request"
-            )
-            refusal: Answer | None = Answer(request.id, False, text)
-        else:
-            refusal = self._settings_file.keep(request, now.mono_ns)
-        if refusal is not None:
-            self._answers.append((now.mono_ns, refusal))
-
-    def _keepable(self, file: SettingsFile, now: Instant) -> tuple[Request, ...]:
-        """Return the `set` requests with the field `keep` that the robot must process now.
-
-        For these requests, the thread of the settings file has checked that it can write the
-        settings to the file. This method also queues the answers to `set` requests that failed or
-        are complete.
-        """
-        requests: list[Request] = []
-        for result in file.results(now.mono_ns, self._others):
-            if isinstance(result, Answer):
-                self._answers.append((now.mono_ns, result))
-            else:
-                requests.append(result)
-        return tuple(requests)
 
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
         """Write the line of a step to the port. Return the line, or None if it was not written.
@@ -456,8 +424,7 @@ class ControlLoop:
         for estimate in outputs.estimates:
             self._stopwatch.feedback(estimate, queued_ns)
         for answer in answers:
-            if self._settings_file is None or not self._settings_file.defers_answer(answer):
-                self._answers.append((outputs.now.mono_ns, answer))
+            self._answers.append((outputs.now.mono_ns, answer))
         if self._answers:
             self._answer(outputs.now)
         for event in outputs.events:
@@ -494,7 +461,7 @@ class ControlLoop:
             routers=self._routers.status,
             latch_file=self._handover.trouble,
             recording=Recording() if self._recorder is None else self._recorder.status,
-            settings_differ="" if self._settings_file is None else self._settings_file.differ,
+            settings_differ=self._changed_settings,
         )
 
 

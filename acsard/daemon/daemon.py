@@ -30,7 +30,6 @@ from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_file import LatchFile
 from acsard.daemon.serial.port import SerialPort
 from acsard.daemon.serial.simulator_pty import Simulated
-from acsard.daemon.settings_file import SettingsFile
 from acsard.daemon.supervisor import GATEWAY, PAGE, keep_running
 from acsard.daemon.wakeup import Next, Ticker, Wakeup
 from acsard.host import clock, real_time
@@ -123,7 +122,6 @@ async def run(
     announce: Announce,
     gateway: Sequence[str] | None = None,
     page: Sequence[str] | None = None,
-    settings_file: SettingsFile | None = None,
 ) -> None:
     """Run the daemon until a signal ends it.
 
@@ -137,9 +135,6 @@ async def run(
             `bus.outside` names endpoints. None if the gateway runs as a separate service.
         page: command-line arguments with which the daemon starts `acsard web`. None for no web
             page.
-        settings_file: the configuration file. The daemon compares the file with the settings in
-            force, and writes settings to it if a client requests that. With None, the daemon does
-            neither.
     """
     wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())
@@ -189,11 +184,7 @@ async def run(
             # then ends before it touches the latch file.
             Latches() if keeper is None else await keeper.start(clock.now()),
             keeper,
-            settings_file,
         )
-        if settings_file is not None:
-            settings_file.start()
-            stack.callback(settings_file.close)
         between.callback(lambda: control.finish(clock.now()))
         after.callback(lambda: control.keep_last_stops(clock.now()))
         stack.callback(lambda: totals.update(control.totals(clock.mono_ns())))

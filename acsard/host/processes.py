@@ -79,6 +79,11 @@ def name_of(pid: int) -> str:
     return _name(PROC / str(pid))
 
 
+def is_daemon_here(pid: int) -> bool:
+    """Return whether the daemon with the process id `pid` runs on this machine."""
+    return name_of(pid) == "acsard"
+
+
 def waited_ns(pid: int) -> Ns:
     """Return how long the first thread of a process has waited for a processor; 0 if unknown."""
     try:

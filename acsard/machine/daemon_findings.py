@@ -45,7 +45,7 @@ from acsard.core.motion.gyro import STATUS_TEXTS
 from acsard.core.values import NS_PER_S, AcsardError, BatteryLevel, BatteryStatus, GyroDoes
 from acsard.host import clock
 from acsard.host.errors import MendableError, NoAnswerError
-from acsard.host.processes import name_of
+from acsard.host.processes import is_daemon_here
 from acsard.machine.finding import LEVELS, Finding, Level
 
 MIN_JUDGED_LINES = 40
@@ -132,7 +132,7 @@ def query(config: Config, address: Address) -> Running:
         info, before = robot.get("info"), robot.get("state")
         time.sleep(1.0)  # the daemon counts about a hundred lines in this time
         rows = tuple(robot.get("diagnostics").status)
-        runs, is_local = _configuration(robot, info, config), name_of(info.pid) == "acsard"
+        runs, is_local = _configuration(robot, info, config), is_daemon_here(info.pid)
         sent = clock.now()
         state, answered = robot.get("state"), clock.now()
         round_trip_ns = answered.mono_ns - sent.mono_ns
@@ -497,12 +497,9 @@ def daemon(running: Running) -> Iterator[Finding]:
     if state.settings_differ and not running.is_local:
         mend = (
             "when the daemon restarts, it uses the values of the file; `acsard set KEY VALUE "
-            "--keep` writes a value into the file"
+            "--keep` on the robot writes a value into the file"
         )
-        text = (
-            "the daemon's settings differ from the configuration file on the robot: "
-            f"{state.settings_differ}"
-        )
+        text = f"settings were changed since the daemon's start: {state.settings_differ}"
         yield Finding("configuration", "warning", text, mend)
     yield from late(running)
 

@@ -54,16 +54,13 @@ def slopes(lines: list[tuple[float, float]]) -> list[float]:
     return [(v - before) / (t - at) for (at, before), (t, v) in pairwise(lines)]
 
 
-def test_a_daemon_without_a_file_keeps_nothing_and_sets_nothing(world: World) -> None:
-    wishes = {"settings": {"limits.linear_speed": 0.4}, "keep": True}
-    reply = world.call("set", msgspec.json.encode(wishes))
-    message = (
-        "no setting was changed: this daemon has no configuration file in which to keep settings; "
-        "leave `keep` out of the request"
-    )
-    assert (reply.success, reply.message) == (False, message)
-    assert config(world).limits.linear_speed == Config().limits.linear_speed
-    assert world.call("set", msgspec.json.encode(wishes | {"keep": False})).success
+def test_state_names_the_settings_that_were_changed_since_the_start(world: World) -> None:
+    assert world.state.settings_differ == ""
+    for speed, text in ((0.4, "limits.linear_speed = 0.4, not 1.0"), (1.0, "")):
+        wish = {"settings": {"limits.linear_speed": speed}}
+        assert world.call("set", msgspec.json.encode(wish)).success
+        world.run(0.2)
+        assert world.state.settings_differ == text
 
 
 def test_a_lowered_limit_is_reached_by_the_deceleration_and_never_by_a_jump(world: World) -> None:

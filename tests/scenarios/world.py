@@ -30,7 +30,6 @@ from acsard.core.values import NS_PER_S, Event, Instant, Latches, Outputs, Pose,
 from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_rules import LatchKeeper
 from acsard.daemon.pacing import NO_PERIOD, Period
-from acsard.daemon.settings_file import SettingsFile
 from acsard.recording.recorded_steps import StepRecorder
 
 START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
@@ -153,7 +152,6 @@ class World:
         recorder: StepRecorder | None = None,
         latches: Latches = Latches(),  # noqa: B008
         keeper: LatchKeeper | None = None,
-        settings_file: SettingsFile | None = None,
         wanted: Collection[str] = (),
     ) -> None:
         """Start the daemon. It encodes messages only for the keys in `wanted`.
@@ -196,7 +194,6 @@ class World:
             recorder=recorder,
             latches=latches,
             keeper=keeper,
-            settings_file=settings_file,
         )
         self._queries = 0
         self._moved_ns: dict[str, int] = {}

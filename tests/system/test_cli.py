@@ -494,7 +494,7 @@ def test_call_with_wrong_values_ends_with_2_and_prints_the_usage(
 # set
 
 
-def test_set_changes_the_robot_that_runs_and_with_write_the_file(
+def test_set_changes_the_robot_that_runs_and_with_keep_the_file(
     shared: Daemon, bus: Bus, tmp_path: Path
 ) -> None:
     file = tmp_path / "mine.toml"
@@ -506,11 +506,11 @@ def test_set_changes_the_robot_that_runs_and_with_write_the_file(
         assert (ended.code, ended.out) == (
             0,
             'rates.state = 5.0 (was 10.0), log.level = "debug" (was "info"); '
-            "in force until the daemon's next start",
+            "a set lasts until the daemon's next start",
         )
         assert bus.get("config")["rates"]["state"] == 5.0
         assert "state = 10.0  # often" in file.read_text(encoding="utf-8")
-        ended = typed("set", "rates.state", "4", "--write", "--config", str(file))
+        ended = typed("set", "rates.state", "4", "--keep", "--config", str(file))
         assert (ended.code, ended.out) == (
             0, f"rates.state = 4.0 (was 5.0); written to {file}",
         )  # fmt: skip
@@ -537,8 +537,8 @@ def test_set_without_arguments_lists_the_settings_and_when_they_can_change(
         (("limits.linear_speed", "20"), 1, "expected a number from 0 to 10 m/s"),
         (("mcu.port", "/dev/x"), 1, "read only when the daemon starts"),
         (("limits.linear_speed",), 2, "pairs of KEY VALUE"),
-        (("commands.sources.nav.timeout", "0.5", "--write"), 2, "output of `acsard check`"),
-        (("--write",), 2, "--write needs a setting"),
+        (("commands.sources.nav.timeout", "0.5", "--keep"), 2, "output of `acsard check`"),
+        (("--keep",), 2, "--keep needs a setting"),
     ],
 )
 def test_a_setting_that_cannot_be_set_is_refused_with_the_reason_and_changes_nothing(

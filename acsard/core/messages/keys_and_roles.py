@@ -108,8 +108,7 @@ SERVICES: dict[Verb, Service] = {
     ),
     "set": Service(
         "maintainer",
-        "change settings; the payload is {settings: {key: value}}; {keep: true} also writes them "
-        "to the configuration file",
+        "change settings until the next start; the payload is {settings: {key: value}}",
         "Settings",
         '{"settings": {"limits.linear_speed": 0.8}}',
     ),

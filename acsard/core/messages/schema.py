@@ -413,10 +413,7 @@ class RobotState(Message, frozen=True):
     battery: BatterySummary | None = None
     """The battery; null if the board has never reported its voltage or its charge."""
     settings_differ: str = ""
-    """Settings in force that differ from the configuration file, in words; else empty.
-
-    If the daemon could not start with the present file, the text gives the reason.
-    """
+    """Settings that `set` changed since the daemon's start, in words; else empty."""
     speed_limit: str = ""
     """The speed limit in force below `limits.linear_speed`, with its sender, in words.
 
@@ -540,8 +537,6 @@ class Settings(Message, frozen=True):
     """New values for settings, by the dotted keys of the settings in `acsard.toml`."""
 
     settings: Annotated[dict[str, Plain], MAX_64_ITEMS]
-    keep: bool = False
-    """True if the daemon must also write the new values into its configuration file."""
 
 
 class Info(Message, frozen=True):

@@ -322,7 +322,7 @@ def test_a_file_that_this_user_may_not_write_is_refused_before_the_work(
     places.here.write_text("")
     # Root may write everywhere.
     monkeypatch.setattr(os, "access", lambda *_: False)
-    with pytest.raises(MendableError, match="was not changed: no permission"):
+    with pytest.raises(MendableError, match="was not changed: it is read-only"):
         writable(None)
 
 

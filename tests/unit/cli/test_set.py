@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
 
-from acsard.cli import main, parser
+from acsard.cli import main
 from acsard.cli.set import pairs
-from acsard.core.messages.schema import ServiceReply
+from acsard.core.messages.schema import Info, ServiceReply
 from acsard.host.errors import Exit, UsageError
 from tests.each import each
 
@@ -59,23 +60,11 @@ def test_a_number_that_is_not_finite_is_refused_with_its_key(word: str) -> None:
         pairs(["rates.state", "5", "limits.linear_speed", word])
 
 
-def test_the_help_and_the_ros_page_say_what_write_does_not_write(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """Both pages say that `--write` refuses a source's timeout, which `set` alone accepts."""
-    with pytest.raises(SystemExit):
-        parser().parse_args(["set", "--help"])
-    page = (Path(__file__).parents[3] / "deploy" / "ros2" / "README.md").read_text()
-    exception = r"--write`? cannot write a source's timeout: edit `?\[\[commands\.sources\]\]"
-    for text in (capsys.readouterr().out, page):
-        assert re.search(exception, " ".join(text.split()))
-
-
 @pytest.mark.parametrize(
     ("words", "why"),
     [
         ([], "name one robot in --id to list its settings"),
-        (["rates.state", "5", "--write"], "--write changes only the configuration file"),
+        (["rates.state", "5", "--keep"], "--keep changes only the file of the robot"),
     ],
 )
 def test_several_robots_are_refused_for_a_list_and_for_the_local_file(
@@ -85,29 +74,63 @@ def test_several_robots_are_refused_for_a_list_and_for_the_local_file(
     assert why in capsys.readouterr().err
 
 
+class Robot:
+    """A robot that sets everything."""
+
+    def __init__(self) -> None:
+        self.settings: dict[str, object] = {}
+
+    def __enter__(self) -> Robot:
+        return self
+
+    def __exit__(self, *words: object) -> None: ...
+
+    def get(self, key: str) -> Info:
+        assert key == "info"
+        return Info("acsar", "0", 1, "sim", True, 100.0, [], [])
+
+    def set(self, settings: dict[str, object]) -> ServiceReply:
+        self.settings = settings
+        return ServiceReply(True, "rates.state = 5.0 (was 10.0)")
+
+
 def test_the_answer_says_how_long_the_setting_lasts(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    answer = "rates.state = 5.0 (was 10.0)"
-
-    class Robot:
-        def __enter__(self) -> Robot:
-            return self
-
-        def __exit__(self, *words: object) -> None: ...
-
-        def set(self, settings: dict[str, object], *, keep: bool) -> ServiceReply:
-            return ServiceReply(True, f"{answer}; written to robot.toml" if keep else answer)
-
     monkeypatch.setattr("acsard.cli.connection.connect", lambda *words, **more: Robot())
-    outputs: tuple[tuple[list[str], str], ...] = (
-        ([], f"{answer}; a set lasts until the daemon's next start"),
-        (["--keep"], f"{answer}; written to robot.toml"),
-    )
-    for words, output in outputs:
-        args = parser().parse_args(["set", "rates.state", "0.5", *words])
-        assert args.main(args) == 0
-        assert capsys.readouterr().out == f"{output}\n"
+    assert main(["set", "rates.state", "5"]) == 0
+    text = "rates.state = 5.0 (was 10.0); a set lasts until the daemon's next start\n"
+    assert capsys.readouterr().out == text
+
+
+def test_keep_writes_the_file_of_the_robot_on_which_it_is_typed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_text("# mine\n")
+    monkeypatch.setattr("acsard.cli.connection.connect", lambda *words, **more: Robot())
+    monkeypatch.setattr("acsard.cli.set.is_daemon_here", lambda pid: True)
+    assert main(["set", "rates.state", "5", "--keep", "--config", str(file)]) == 0
+    assert capsys.readouterr().out == f"rates.state = 5.0 (was 10.0); written to {file}\n"
+    assert "# mine\n" in file.read_text()
+    assert tomllib.loads(file.read_text()) == {"rates": {"state": 5}}
+
+
+@each("why", ["another machine", "it is read-only", "no configuration file"])
+def test_keep_sets_nothing_if_it_cannot_write_the_file(
+    why: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    file, robot = tmp_path / "acsard.toml", Robot()
+    file.unlink(missing_ok=True)
+    if why != "no configuration file":
+        file.touch(0o444 if why == "it is read-only" else 0o644)
+    monkeypatch.setattr("acsard.host.config_file.SEARCH_PATHS", (file,))
+    monkeypatch.setattr("acsard.cli.connection.connect", lambda *words, **more: robot)
+    monkeypatch.setattr("acsard.cli.set.is_daemon_here", lambda pid: why != "another machine")
+    assert main(["set", "rates.state", "5", "--keep"]) == 1
+    assert why in capsys.readouterr().err
+    assert not robot.settings
 
 
 def test_keep_needs_a_setting(capsys: pytest.CaptureFixture[str]) -> None:

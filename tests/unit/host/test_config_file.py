@@ -12,7 +12,7 @@ from tomlkit.exceptions import NonExistentKey
 
 from acsard.bus.address import address_by_environment
 from acsard.core.config.parsing import ConfigError, parse
-from acsard.host.config_file import change, find, prepare_edit, require_changeable
+from acsard.host.config_file import change, find, require_changeable
 from acsard.host.errors import MendableError, UsageError
 
 REFERENCE = Path(__file__).parents[3] / "acsard.toml"
@@ -116,20 +116,15 @@ def connect_with(file: Path) -> None:
         address_by_environment(None, None, None)
 
 
-def edit(file: Path) -> None:
-    prepare_edit(file, KEYS)
-
-
 def edit_by_command(file: Path) -> None:
     change(file, KEYS)
 
 
-@pytest.mark.parametrize("use", [start_with, connect_with, edit, edit_by_command])
+@pytest.mark.parametrize("use", [start_with, connect_with, edit_by_command])
 def test_a_huge_file_is_refused_without_being_read_to_its_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, use: Callable[[Path], None]
+    tmp_path: Path, use: Callable[[Path], None]
 ) -> None:
     """`truncate -s 1G acsard.toml` must not take the memory or the time of a running daemon."""
-    monkeypatch.setattr("acsard.host.config_edit_process.EDIT_TIMEOUT_S", 30.0)
     file = tmp_path / "acsard.toml"
     # The limit lies within a character, which must not hide the cause.
     file.write_text("é" * 40_000)
@@ -153,7 +148,7 @@ def require(file: Path) -> None:
     require_changeable(file, KEYS)
 
 
-@pytest.mark.parametrize("use", [edit, edit_by_command, make_new, require])
+@pytest.mark.parametrize("use", [edit_by_command, make_new, require])
 def test_a_loop_of_symbolic_links_is_refused_and_kept(
     tmp_path: Path, use: Callable[[Path], None]
 ) -> None:
