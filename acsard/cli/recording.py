@@ -25,7 +25,6 @@ from acsard.core.config.settings import Config
 from acsard.core.formatting import json_line, listed, many, printable
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import Exit, ExitError, MendableError, RecordingError, UsageError
-from acsard.host.extras import missing
 from acsard.recording.atomic_output import replacing
 from acsard.recording.directory import is_being_recorded
 from acsard.recording.directory import listed as recordings_in
@@ -76,9 +75,8 @@ cannot be read because of damage is left out. Exit codes: 0 complete, 65 a part 
 """
 
 REPORT_DESCRIPTION = """\
-Draw a recording as one HTML file that needs no network. Needs the library plotly; if it is missing,
-a message gives the command that installs it. A part that cannot be read because of damage is
-left out and named; the exit code stays 0.
+Draw a recording as one HTML file that needs no network. A part that cannot be read because of
+damage is left out and named; the exit code stays 0.
 """
 
 
@@ -424,15 +422,10 @@ def main_export(args: argparse.Namespace) -> int:
 
 def main_report(args: argparse.Namespace) -> int:
     _require_suffix(args.new, "html")
-    try:
-        from plotly.offline import get_plotlyjs
-    except ImportError:
-        raise missing("plotly", "report") from None
-    plotly: str = get_plotlyjs()
     for recording, part in _files_to_write(args):
         new = Path(args.new or f"{recording.path.name.partition('.')[0]}.html")
         with _written(new), replacing(new, args.force) as file, _progress(recording) as tell:
-            text, notes = make_report(recording, plotly, part, tell)
+            text, notes = make_report(recording, part, tell)
             file.write_text(text, encoding="utf-8")
         print(f"{new}: {len(text) / 1e6:.1f} MB; open it in any browser")
         for note in notes:

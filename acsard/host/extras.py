@@ -18,7 +18,7 @@ from urllib.parse import unquote, urlsplit
 
 from acsard.host.errors import MendableError
 
-Extra = Literal["foxglove", "report", "tls", "web", "write"]
+Extra = Literal["foxglove", "tls", "web", "write"]
 
 
 def install(extra: Extra) -> str:

@@ -14,6 +14,7 @@ import html
 import time
 from collections import deque
 from collections.abc import Sequence
+from pathlib import Path
 
 import msgspec
 
@@ -28,6 +29,9 @@ from acsard.report.figures import TimeFigures
 from acsard.report.plot_elements import Figure
 from acsard.report.report_data import Mark, ReportData
 from acsard.report.report_text import Clock, Origin, differences, notes, reasons, rows, summary
+
+# The file of the npm package plotly.js-basic-dist-min 4.1.1, which draws curves and bars.
+PLOTLY = Path(__file__).with_name("plotly-basic.min.js")
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c2127; --soft: #59636e; --paper: #fff; --card: #f5f7f9;
@@ -184,7 +188,7 @@ def page(
 
 
 def make_report(
-    recording: Recording, library: str, span: Span = WHOLE_SPAN, progress: Progress = no_progress
+    recording: Recording, span: Span = WHOLE_SPAN, progress: Progress = no_progress
 ) -> tuple[str, list[str]]:
     """Replay a recording, and make the report of a part of it.
 
@@ -192,7 +196,6 @@ def make_report(
 
     Args:
         recording: the recording to replay.
-        library: the JavaScript code of plotly.
         span: the part of the recording that the report shows.
         progress: shows the progress. It is called every `PROGRESS_STEPS` steps.
 
@@ -227,6 +230,7 @@ def make_report(
     names = ", ".join(path.name for path in recording.paths)
     origin = Origin(names, about.robot, about.version, about.python, tuple(remarks))
     offset_s = time.localtime(data.began).tm_gmtoff
+    library = PLOTLY.read_text(encoding="utf-8")
     return page(data, origin, library, clock, offset_s), notes(data, origin)
 
 

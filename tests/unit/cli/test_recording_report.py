@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import sys
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -143,13 +142,3 @@ def test_a_range_without_steps_makes_no_report(tmp_path: Path) -> None:
     assert code == 1
     assert "no step in that span of time" in err
     assert not new.exists()
-
-
-def test_without_the_library_the_message_says_how_to_install_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setitem(sys.modules, "plotly.offline", None)
-    code, _, err = report(QUIET)
-    assert code == 1
-    assert "needs the library plotly; to install it, run: " in err
-    assert "[report]" in err

@@ -203,7 +203,7 @@ def test_a_report_of_a_robot_with_a_wrong_counter_is_refused_with_a_message(
     spoilt = replace_state(taped, freeze(robot, memory))
     spoilt.write(path := tmp_path / "spoilt.mcap", Config(), 100)
     with pytest.raises(RecordingError, match="cannot read the robot state"):
-        page.make_report(Recording(path), "")
+        page.make_report(Recording(path))
 
 
 def test_a_defect_of_the_report_is_not_reported_as_a_wrong_robot_state(
@@ -215,7 +215,7 @@ def test_a_defect_of_the_report_is_not_reported_as_a_wrong_robot_state(
     taped.write(path := tmp_path / "whole.mcap", Config(), 100)
     monkeypatch.setattr(Curve, "add", fail)
     with pytest.raises(ZeroDivisionError):
-        page.make_report(Recording(path), "")
+        page.make_report(Recording(path))
 
 
 def replace_state(tape: Tape, state: bytes) -> Tape:
