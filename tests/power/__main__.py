@@ -2,9 +2,7 @@
 
     python -m tests.power compare [--minutes M] [--jobs 2]
     python -m tests.power baseline [--anew] [--minutes M] [--jobs 2]
-    python -m tests.power mutants [--sample 240] [--seed 1] [--jobs 2]
-    python -m tests.power mutants --safety
-    python -m tests.power mutants --only PATH [PATH ...] [--sample N]
+    python -m tests.power mutants [--safety] [--only PATH [PATH ...]] [--sample N] [--seed 1]
 
 `compare` lists each item of `baseline.json` that tests noticed and do not notice any more. Its exit
 status is 1 if there is one. There are three scales: a fixed sample of mutants of the whole product,
@@ -13,11 +11,10 @@ item whose code was deleted or rewritten is gone, not lost. `baseline` measures 
 result, and `--anew` all items of this tree. `--scales` and `--only` choose some of them. A run that
 is ended loses at most the items under way, and the next run goes on.
 
-A mutant is the source with one small fault. The first form of `mutants` tries a random sample of
-all mutants of the core. Tests must notice 95 % of them. `--safety` tries every mutant of the
-modules in `SAFETY`, and tests must notice 98 %. `--only` does the same for the modules whose path
-contains a PATH. The output lists each mutant that no test noticed, with the reason if
-`equivalent.py` says that no test can notice it. The exit status is 1 if the tests noticed too few.
+A mutant is the source with one small fault. `mutants` tries all mutants, or a sample, of the
+modules whose path contains a PATH, and with `--safety` of the modules in `SAFETY`. It lists each
+mutant that no test noticed, with the reason if `equivalent.py` says that no test can notice it. The
+exit status is 1 if the tests noticed less than 98 %.
 
 All tests that run in this process take part (`TESTS` in `trials.py`). Run it as a user or in a
 container that can destroy nothing: a fault may be in code that deletes files or ends processes.
@@ -40,7 +37,6 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from tests.power.equivalent import EQUIVALENT
-from tests.power.mutants import mutants
 from tests.power.scales import (
     Results,
     drawn,
@@ -49,27 +45,14 @@ from tests.power.scales import (
     present,
     report,
     save,
-    trial,
     was_noticed,
 )  # fmt: skip
-from tests.power.trials import UNDECIDED, Trial, Trials, digest
+from tests.power.trials import NOBODY, UNDECIDED, UNREACHED, Trial, Trials, digest
 
 ROOT = Path(__file__).parents[2]
 BASELINE = Path(__file__).with_name("baseline.json")
 CACHE = ROOT / ".pytest_cache" / "power"
 SCALES = ("planted", "mutants", "hunks")
-CORE = (
-    "acsard/core/motion/",
-    "acsard/core/guard.py",
-    "acsard/core/link/board_status.py",
-    "acsard/core/link/checked_line.py",
-    "acsard/core/link/encoders.py",
-    "acsard/core/link/codec.py",
-    "acsard/core/link/negotiation.py",
-    "acsard/core/link/minimum_delay.py",
-    "acsard/core/robot.py",
-    "acsard/daemon/latch_rules.py",
-)
 SAFETY = (
     "acsard/core/guard.py",
     "acsard/core/motion/neutral.py",
@@ -80,8 +63,8 @@ SAFETY = (
     "acsard/core/motion/wheel_witness.py",
     "acsard/daemon/latch_rules.py",
 )
-ENOUGH, ENOUGH_OF_ALL = 0.95, 0.98
-"""Share of the mutants that tests must notice: of a sample, and of every mutant of some modules."""
+ENOUGH = 0.98
+"""Share of the mutants of `SAFETY` that tests must notice."""
 
 
 class Run:
@@ -129,41 +112,29 @@ class Run:
             Trials(Path(folder), work).run()
 
     def mutants(self) -> int:
-        """Draw the mutants, try each, and print the result."""
-        asked = self.asked
-        only = [*asked.only, *(SAFETY if asked.safety else ())]
-        paths = sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("acsard/**/*.py"))
-        paths = [path for path in paths if any(part in path for part in only or CORE)]
-        pool = drawn([mutant for path in paths for mutant in mutants(ROOT, path)], asked.seed)
-        chosen = pool[: asked.sample or (len(pool) if only else 240)]
-        where = dict(chosen)
-        enough = ENOUGH_OF_ALL if only else ENOUGH
-        print(f"{len(chosen)} of {len(pool)} mutants, seed {asked.seed}", flush=True)
-        tried, equivalent, holes = 0, 0, 0
+        """Draw mutants of some modules, try each, and print those that no test notices."""
+        only = [*self.asked.only, *(SAFETY if self.asked.safety else ())]
+        pool = drawn(ROOT, only, self.asked.seed)[: self.asked.sample]
+        results: Results = {"mutants": {}}
 
         def keep(item: Trial, verdict: str) -> None:
-            nonlocal tried, equivalent, holes
-            if verdict == UNDECIDED:
-                return
-            tried += 1
-            mutant = where[item.name]
-            why = EQUIVALENT.get(mutant.key, "")
-            if was_noticed(verdict):
-                if why:
-                    print(f"not equivalent, {verdict} notices it: {mutant.key}", flush=True)
-                return
-            equivalent += bool(why)
-            holes += not why
-            print(f"line {mutant.line} of {mutant.key}\n    {why or verdict.upper()}", flush=True)
+            why = EQUIVALENT.get(item.name, "")
+            if why and was_noticed(verdict):
+                print(f"not equivalent, {verdict} notices it: {item.name}", flush=True)
+            elif verdict in (NOBODY, UNREACHED):
+                line = min(item.lines, default="outside of functions")
+                print(f"{item.name}, line {line}\n    {why or verdict.upper()}", flush=True)
 
-        self.tried([trial(*pair) for pair in chosen], {"mutants": {}}, keep)
-        killed = tried - equivalent - holes
-        score = killed / max(1, killed + holes)
+        self.tried(pool, results, keep)
+        verdicts = results["mutants"]
+        holes = [n for n, v in verdicts.items() if v in (NOBODY, UNREACHED) and n not in EQUIVALENT]
+        noticed = sum(map(was_noticed, verdicts.values()))
+        score = noticed / max(1, noticed + len(holes))
         print(
-            f"noticed {killed} of {tried}, {score:.1%} without the {equivalent} equivalent, "
-            f"{holes} not noticed, {enough:.0%} is enough; {self.minutes():.1f} min"
+            f"{noticed} of {len(pool)} noticed, {len(holes)} not: "
+            f"{score:.1%} without equivalent ones, {ENOUGH:.0%} is enough"
         )
-        return 0 if score >= enough else 1
+        return int(score < ENOUGH)
 
     def baseline(self) -> int:
         """Measure the items of the baseline that have no result yet."""
@@ -208,7 +179,7 @@ def main() -> int:
     parser.add_argument("--anew", action="store_true", help="a new baseline of this tree")
     parser.add_argument("--only", nargs="+", default=[], metavar="PATH", help="parts of paths")
     parser.add_argument("--safety", action="store_true", help="the modules that stop the robot")
-    parser.add_argument("--sample", type=int, help="how many mutants (240; all of named modules)")
+    parser.add_argument("--sample", type=int, help="how many mutants")
     parser.add_argument("--seed", type=int, default=1, help="which mutants")
     asked = parser.parse_args()
     os.nice(19)

@@ -16,36 +16,34 @@ import sys
 from collections import Counter
 from collections.abc import Collection, Iterator
 from functools import partial
-from itertools import islice
 from pathlib import Path
 
 from tests.power.equivalent import EQUIVALENT
 from tests.power.history import hunks
-from tests.power.mutants import Mutant, mutants
+from tests.power.mutants import mutants
 from tests.power.trials import NOBODY, UNDECIDED, UNREACHED, Trial
 
 SAMPLE = 1000
 Results = dict[str, dict[str, str | None]]
 
 
-def drawn(pool: list[Mutant], seed: int) -> list[tuple[str, Mutant]]:
-    """Return all mutants with their names, in a random order that depends on the seed.
+def drawn(root: Path, only: Collection[str], seed: int) -> list[Trial]:
+    """Return all mutants in a random order that depends on the seed.
 
     The order follows from each mutant's key. So an edit of the source moves only its own mutants.
+    With `only`, the modules are those whose path contains one of these.
     """
     met: Counter[str] = Counter()
-    lots: list[tuple[bytes, str, Mutant]] = []
-    for mutant in pool:
-        met[mutant.key] += 1
-        lot = f"{seed} {met[mutant.key]} {mutant.key}".encode()
-        name = mutant.key + (f" #{met[mutant.key]}" if met[mutant.key] > 1 else "")
-        lots.append((hashlib.sha256(lot).digest(), name, mutant))
-    return [(name, mutant) for _, name, mutant in sorted(lots)]
-
-
-def trial(name: str, mutant: Mutant) -> Trial:
-    lines = frozenset({mutant.statement} - {0})
-    return Trial("mutants", name, mutant.path, lines, mutant.text)
+    lots: list[tuple[bytes, Trial]] = []
+    paths = sorted(path.relative_to(root).as_posix() for path in root.glob("acsard/**/*.py"))
+    for path in (path for path in paths if not only or any(part in path for part in only)):
+        for _, _, statement, key, text in mutants(root, path):
+            met[key] += 1
+            lot = hashlib.sha256(f"{seed} {met[key]} {key}".encode()).digest()
+            name = f"{key} #{met[key]}" if met[key] > 1 else key
+            lines = frozenset({statement} - {0})
+            lots.append((lot, Trial("mutants", name, path, lines, text)))
+    return [trial for _, trial in sorted(lots, key=lambda pair: pair[0])]
 
 
 def planted(root: Path) -> Iterator[Trial]:
@@ -72,28 +70,21 @@ def again(root: Path, name: str, seed: str) -> str:
     return NOBODY if f"\n{name}: seed " in f"\n{done.stdout}" else f"seed {seed}"
 
 
-def sample(root: Path, known: Collection[str], only: Collection[str]) -> Iterator[Trial]:
-    """Yield the mutants with these names, or a sample if there are none.
+def sample(pool: list[Trial], known: Collection[str]) -> list[Trial]:
+    """Return the mutants with these names, or the first ones if there are none.
 
-    Args:
-        root: The tree.
-        known: The names. A mutant whose function is in another module now keeps its name.
-        only: Parts of the modules' paths; all modules without any.
+    A mutant whose function is in another module now keeps its name.
     """
-    paths = sorted(path.relative_to(root).as_posix() for path in root.glob("acsard/**/*.py"))
-    paths = [path for path in paths if not only or any(part in path for part in only)]
-    pool = drawn([mutant for path in paths for mutant in mutants(root, path)], seed=1)
     if not known:
-        new = (pair for pair in pool if pair[1].key not in EQUIVALENT)
-        yield from (trial(*pair) for pair in islice(new, SAMPLE))
-        return
-    gone = set(known) - {name for name, _ in pool}
+        return [trial for trial in pool if trial.name not in EQUIVALENT][:SAMPLE]
+    gone = set(known) - {trial.name for trial in pool}
     moved = {name.partition(" ")[2]: name for name in gone}
-    for name, mutant in pool:
-        if name in known:
-            yield trial(name, mutant)
-        elif old := moved.pop(name.partition(" ")[2], ""):
-            yield trial(old, mutant)
+    here = [trial for trial in pool if trial.name in known]
+    return here + [
+        trial._replace(name=moved.pop(tail))
+        for trial in pool
+        if (tail := trial.name.partition(" ")[2]) in moved
+    ]
 
 
 def present(
@@ -102,7 +93,7 @@ def present(
     """Return the items of this tree in the order in which to try them: the scales take turns."""
     found: list[list[Trial]] = []
     if "mutants" in scales:
-        found.append(list(sample(root, known.get("mutants", ()), only)))
+        found.append(sample(drawn(root, only, seed=1), known.get("mutants", ())))
     if "hunks" in scales:
         found.append(list(hunks(root)))
     if "planted" in scales:

@@ -27,7 +27,7 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from functools import partial
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from importlib.util import spec_from_file_location
@@ -273,7 +273,7 @@ class Trials:
                 part, file = left.pop(0)
                 some = set(tests[part * size : (part + 1) * size]) - self.failed
                 running[self._fork(partial(self._measure, some, file))] = part, file
-            pid, status = os.wait()
+            pid, status = self._ended(running)
             if status:
                 test = self._said(pid)
                 if test not in self.items:
@@ -296,13 +296,18 @@ class Trials:
                 running[self._fork(partial(self._judge, trial))] = trial
             if not running:
                 return
-            pid, status = os.wait()
-            trial = running.pop(pid)
-            said = self._said(pid)
+            pid, status = self._ended(running)
+            trial, said = running.pop(pid), self._said(pid)
             if status:
                 print(f"not tried: {trial.name}\n{said}", file=sys.stderr)
             else:
                 yield trial, said
+
+    def _ended(self, running: Container[int]) -> tuple[int, int]:
+        """Wait for one of these processes. The first process of a container gets others too."""
+        while (ended := os.wait())[0] not in running:
+            pass
+        return ended
 
     def _file(self, pid: int) -> Path:
         return self._root / f"trial-{pid}" / "said"
