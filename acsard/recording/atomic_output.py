@@ -1,9 +1,7 @@
 """Writes a file or a directory atomically, and protects recordings from being overwritten.
 
-The data is written to a temporary path. When the data is complete, this path gets the final name.
-So another program never finds partial data under the final name. An existing file or ROS bag is
-replaced only if the caller permits it with `force`. A recording is replaced only if the function
-`may_replace` permits it too.
+Data is complete before its temporary path gets the final name. A file or ROS bag is replaced only
+with `force`, and a recording only if `may_replace` permits it too.
 """
 
 from __future__ import annotations
@@ -19,19 +17,15 @@ from acsard.host.errors import RecordingError
 from acsard.recording.file import Recording
 from acsard.recording.mcap_records import MAGIC
 
-PROFILE, HEADER_BYTES = b"acsard", 64
-"""`PROFILE` is the MCAP profile of every recording: a name in the header of the file. This name is
-in the first `HEADER_BYTES` bytes of the file."""
+PROFILE, HEADER_BYTES = b"acsard", 64  # MCAP profile of every recording, within its first bytes
 
-METADATA = "metadata.yaml"
-"""Name of the file that describes a ROS bag."""
+METADATA = "metadata.yaml"  # describes a ROS bag
 
-BAG_SUFFIXES = (".mcap", ".db3")
-"""Suffixes of the data files of a ROS bag."""
+BAG_SUFFIXES = (".mcap", ".db3")  # data files of a ROS bag
 
 
 def never(recording: Recording) -> bool:
-    """Return False, so that no recording may be replaced. This is the default of `may_replace`."""
+    """Return False: the default of `may_replace`."""
     return False
 
 
@@ -39,20 +33,10 @@ def never(recording: Recording) -> bool:
 def replacing(
     new: Path, force: bool, may_replace: Callable[[Recording], bool] = never
 ) -> Iterator[Path]:
-    """Yield a temporary path for the new data, and rename it to `new` after the `with` block.
+    """Yield a temporary path for a file or directory, and rename it to `new` after the block.
 
-    The caller creates a file or a directory at the temporary path. If the block fails, `new` is
-    unchanged, and the temporary file or directory is removed.
-
-    Args:
-        new: final path of the file or directory.
-        force: true if an existing file or ROS bag at `new` may be replaced.
-        may_replace: function that takes the recording at `new`, and returns whether this recording
-            may be replaced. It is called only if `new` is a recording. The recording is replaced
-            only if `force` is true as well.
-
-    Raises:
-        FileExistsError: `new` exists, and must not be replaced.
+    If the block fails, `new` is unchanged and the temporary path removed. `may_replace` is asked
+    only about a recording at `new`. Raises `FileExistsError` if `new` must not be replaced.
     """
     _require_free(new, force, may_replace)
     part = _hidden_sibling(new, "part")
@@ -66,7 +50,7 @@ def replacing(
 
 
 def synced(stream: BinaryIO) -> None:
-    """Flush the stream and sync its file to the disk."""
+    """Flush a stream and sync its file to the disk."""
     stream.flush()
     os.fsync(stream.fileno())
 
@@ -142,7 +126,7 @@ def _recording(path: Path) -> Recording | None:
 
 
 def _remove(path: Path) -> None:
-    """Remove a file or a ROS bag. A bag has no subdirectory, so a subdirectory raises `OSError`."""
+    # A bag has no subdirectory, so a subdirectory raises `OSError`.
     if path.is_dir() and not path.is_symlink():
         for file in path.iterdir():
             file.unlink()

@@ -1,15 +1,11 @@
 """Manages the directory of recordings: begins, finishes and deletes files.
 
-The name of a file shows its state:
-
     000012-20261121T070027Z.mcap.part   being written, or cut off
     000012-20261121T070027Z.mcap        finished
-    000012-20261121T070027Z.near.mcap   finished, less than a minute before or after an incident
-    000012-20261121T070027Z.kept.mcap   finished, and an incident happened in the file
+    000012-20261121T070027Z.near.mcap   finished, within a minute of an incident
+    000012-20261121T070027Z.kept.mcap   finished, with an incident (or a crash) in it
 
-An incident is a crash of the daemon, or one of the `INCIDENTS` in step_writer.py, such as a fault.
-The number gives the order of the files, even if the wall clock was adjusted between two files.
-`retention.py` decides which files are deleted.
+The number gives the order, even if the wall clock was adjusted. `retention.py` decides deletions.
 """
 
 from __future__ import annotations
@@ -29,7 +25,7 @@ from msgspec import Struct, field
 from acsard.core.config.settings import RECORD_VARIABLE, RecordConfig
 from acsard.core.formatting import listed as listed_names
 from acsard.core.formatting import many
-from acsard.core.values import NS_PER_S, Event, Instant
+from acsard.core.values import NS_PER_S, Event, Instant, Ns, WallNs
 from acsard.host.atomic_file import sync
 from acsard.recording.end_record import CUT_TEXTS
 from acsard.recording.file import FILE_MODE, About, RecordingWriter
@@ -52,49 +48,38 @@ DIRECTORY_MODE = 0o750
 # service of the robot's web page reads the files through a read-only mount. Group permissions
 # cannot give this service access: a dynamic group has no name, and systemd 257 makes the user
 # `nobody` the owner of state directories.
+# Modes for a service with a dynamic user: every user who can enter the parent directory may read.
 OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
-"""File modes of the directory (0o755) and of its files (0o644) if the daemon is a systemd service
-with a dynamic user. Every user who can enter the parent directory may then read the files."""
 
+# State of services with a dynamic user; only root can enter it.
 PRIVATE_STATE = Path("/var/lib/private")
-"""Parent of the state directories of services with a dynamic user. Only root can enter it."""
 
 KEPT_SUFFIX = ".kept.mcap"
 NEAR_SUFFIX = ".near.mcap"
 MCAP_SUFFIX = ".mcap"
 PART_SUFFIX = ".mcap.part"
 
-MARKER_SUFFIX = ".left"
-"""Suffix of a marker file, which shows that the disk, and not a crash, cut off a `.part` file."""
+MARKER_SUFFIX = ".left"  # of a marker that the disk, and not a crash, cut off a `.part` file
 
 # The last suffix is the end of every name.
+# End of a finished file's name, by retention class.
 SUFFIX_OF_KIND: dict[Kind, str] = {"kept": KEPT_SUFFIX, "near": NEAR_SUFFIX, "plain": MCAP_SUFFIX}
-"""Maps each retention class to the end of the name of a finished file."""
 
 # `RecordingDirectory.maintain` is called once a second, so there is a search every ten minutes.
 # More searches are not needed, because a single file may cover an hour.
-TRIM_ROUNDS = 600
-"""Number of calls of `RecordingDirectory.maintain` between two searches for files that are too
-old."""
+TRIM_ROUNDS = 600  # calls of `maintain` between two searches for files that are too old
 
 S_PER_DAY = 86400
 
-MAX_NAMES = 5
-"""Largest number of deleted files that an event names."""
+MAX_NAMES = 5  # of deleted files in an event
 
-BEING_RECORDED_S = 10.0
-"""If no daemon has written to a `.part` file for this time, s, the file no longer counts as being
-recorded. A daemon writes once a second."""
+BEING_RECORDED_S = 10.0  # a daemon writes once a second
 
-NAME_TIME_FORMAT = "%Y%m%dT%H%M%SZ"
-"""Format of the time in a file's name: the time at which the file began, in UTC."""
+NAME_TIME_FORMAT = "%Y%m%dT%H%M%SZ"  # UTC, of the beginning
 
 
 def listed(directory: Path) -> list[Path]:
-    """Return the paths of the recordings in a directory, the oldest first.
-
-    The result includes the file that is being written, and files that were cut off.
-    """
+    """Return the recordings in a directory, the oldest first, unfinished ones too."""
     paths = [
         path
         for path in directory.iterdir()
@@ -105,16 +90,12 @@ def listed(directory: Path) -> list[Path]:
 
 
 def is_being_recorded(path: Path, now_s: float) -> bool:
-    """Return whether a daemon is still writing to a recording file.
-
-    `now_s` is the present time, s since 1970. Raises `OSError` if the file does not exist or cannot
-    be examined.
-    """
+    """Return whether a daemon is still writing to a file, `now_s` after 1970. Raises `OSError`."""
     return path.name.endswith(PART_SUFFIX) and abs(now_s - path.stat().st_mtime) < BEING_RECORDED_S
 
 
 def _number(path: Path) -> int:
-    """Return the number at the beginning of a recording's name, or -1 for any other name."""
+    # -1: not a recording's name
     head, _, rest = path.name.partition("-")
     return int(head) if head.isdecimal() and rest.endswith((MCAP_SUFFIX, PART_SUFFIX)) else -1
 
@@ -124,20 +105,15 @@ def _kind(path: Path) -> Kind:
 
 
 def stem(path: Path) -> str:
-    """Return the part of a file's name that stays the same when the state of the file changes."""
+    """Return the part of a file's name that stays when its state changes."""
     return path.name.partition(".")[0]
 
 
 def mark_cut(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
-    """Create a marker file, which says why the end of a `.part` file could not be written.
+    """Create the marker of a `.part` file that the disk cut off ("late": too slow; "disk": full).
 
-    Without the marker, the next start of the daemon would assume that a crash cut off the file.
-    Raises `OSError` if the disk does not accept the marker.
-
-    Args:
-        part: the `.part` file.
-        kind: the retention class that the file gets when it is finished.
-        cut: "late" if the disk was too slow, or "disk" if the disk accepted no more data.
+    Otherwise the next start would assume a crash. `kind` is its class when it is finished. Raises
+    `OSError`.
     """
     # The marker is empty and has `kind` and `cut` in its name, because even a full disk usually
     # accepts a new name.
@@ -169,65 +145,43 @@ def _deletion(names: list[str], disk: Disk, refused: bool) -> Event:
 
 
 def disk_has_room(directory: Path) -> bool:
-    """Return whether the disk of a directory reports enough free space for a small file."""
+    """Return whether the disk reports enough free space for a small file."""
     size = os.statvfs(directory)
     # Some file systems do not report their size.
     return not size.f_blocks or size.f_bavail * size.f_frsize >= MIN_FILE_BYTES
 
 
 class Run(Struct):
-    """State that all `RecordingDirectory` objects of one run of the daemon share.
+    """State of one run of the daemon, which outlives a `RecordingDirectory` after a disk error."""
 
-    After a disk error, the daemon makes a new `RecordingDirectory` with the same `Run`.
-    """
-
-    numbers: set[int] = field(default_factory=set)
-    """Numbers of the files that ended in this run. The number of a file is in its name."""
+    numbers: set[int] = field(default_factory=set)  # of files that ended in this run
+    # Class of each file that a disk error cut off in this run, by name. Others without a marker
+    # were cut off by a crash before it.
     cut: dict[str, Kind] = field(default_factory=dict)
-    """Retention class of each file that a disk error cut off in this run, by file name. Any other
-    `.part` file without a marker file was cut off by a crash before this run."""
-    freed: int = 0
-    """Total size of the recordings that were deleted because the disk was full, bytes. It counts
-    the deletions since the last successful write."""
+    freed: int = 0  # bytes deleted for a full disk since the last successful write
     clock: ClockWatch = field(default_factory=ClockWatch)
+    # About deleted recordings; `StepWriter` takes them.
     events: list[Event] = field(default_factory=list)
-    """Events that report the deleted recordings. `StepWriter` takes them from this list."""
 
 
 class RecordingDirectory:
-    """The directory of recordings: begins and ends files, and deletes old files to make room.
+    """The directory of recordings, locked until `close`: begins and ends files, makes room.
 
-    A `RecordingDirectory` locks the directory until `close`, so that only one daemon records to it.
     Every method may raise `OSError`.
     """
 
     def __init__(
         self, settings: RecordConfig, run: Run | None = None, refused: bool = False
     ) -> None:
-        """Lock the directory, make room in it, and finish the files that were cut off.
-
-        If the directory does not exist, create it. Raises `OSError` if another daemon records to
-        the directory, or if the disk refuses to write.
-
-        Args:
-            settings: the configuration of the recordings.
-            run: the `Run` of the `RecordingDirectory` before the last disk error; None for the
-                first `RecordingDirectory` in a run of the daemon.
-            refused: true if the disk refused the last write although it reported free space.
-        """
+        # Makes room, and finishes files that were cut off. `refused`: the disk refused the last
+        # write although it reported free space.
         self._directory = Path(settings.directory)
         self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
         self._run = run or Run()
-        self._rounds = self.file_bytes = 0
-        """`_rounds` is the number of calls of `maintain`. `file_bytes` is the size above which the
-        file that is being written should end, bytes."""
-        self.messages: list[str] = []
-        """Messages for the log about damaged files, and files that could not be finished."""
-        self.cut_ns: int | None = None
-        """Wall-clock time at which a crash cut off a file of an earlier run, ns since 1970.
-
-        None if there was no crash. If several files were cut off, the newest file counts.
-        """
+        self._rounds = self.file_bytes = 0  # calls of `maintain`; size at which a file should end
+        self.messages: list[str] = []  # for the log, about damaged or unfinished files
+        # Wall-clock time of a crash that cut off an earlier run's newest file.
+        self.cut_ns: WallNs | None = None
         here = self._directory.resolve()
         as_service = os.environ.get(RECORD_VARIABLE) == settings.directory
         self._open_to_all = as_service and here.is_relative_to(PRIVATE_STATE)
@@ -286,12 +240,8 @@ class RecordingDirectory:
                 self.cut_ns = status.st_mtime_ns
                 self._retain_before(part, status.st_mtime_ns)
 
-    def _retain_before(self, part: Path, cut_ns: int) -> None:
-        """Give the retention class `near` to files that ended within a minute of a crash.
-
-        Only `plain` files that are older than `part` get this class. The crash cut off the file
-        `part` at the wall-clock time `cut_ns`, ns since 1970.
-        """
+    def _retain_before(self, part: Path, cut_ns: WallNs) -> None:
+        # `plain` files within a minute before the crash at `cut_ns` become `near`.
         for path in listed(self._directory):
             # Another process may have just removed the file.
             with suppress(FileNotFoundError):
@@ -303,7 +253,7 @@ class RecordingDirectory:
                     self.retain(path)
 
     def _open_files(self) -> None:
-        """Let every user read the directory and its files, including files of older versions."""
+        # Files of older versions, too.
         for path in (self._directory, *listed(self._directory)):
             mode = OPEN_DIRECTORY_MODE if path == self._directory else OPEN_MODE
             # The file may belong to another user. Recording goes on in any case.
@@ -312,14 +262,10 @@ class RecordingDirectory:
                     path.chmod(mode)
 
     def close(self) -> None:
-        """Release the lock of the directory."""
         os.close(self._lock)
 
     def begin(self, about: About) -> RecordingWriter:
-        """Create a new file with the metadata `about`, and return the open file.
-
-        The number in the name of the file is one above the largest number in the directory.
-        """
+        """Create and return a new file, numbered after the largest number in the directory."""
         files = listed(self._directory)
         number = 1 + max([_number(path) for path in files], default=0)
         stamp = time.strftime(NAME_TIME_FORMAT, time.gmtime(about.wall_ns // 1_000_000_000))
@@ -330,13 +276,9 @@ class RecordingDirectory:
         return writing
 
     def end(self, writing: RecordingWriter, kind: Kind, cut: str = "", why: str = "") -> Path:
-        """Finish a file, rename it, and return its new path.
+        """Finish a file, rename it by its class, and return its new path.
 
-        Args:
-            writing: the file that is being written.
-            kind: the retention class of the file, which becomes a part of the new name.
-            cut: the cause that cut off the recording, a key of `CUT_TEXTS`; "" for an ordinary end.
-            why: an explanation of this cause in words, or "".
+        `cut` is a key of `CUT_TEXTS`, "" for an ordinary end, and `why` its explanation.
         """
         writing.finish(cut, why)
         path = writing.path.with_name(stem(writing.path) + SUFFIX_OF_KIND[kind])
@@ -346,22 +288,14 @@ class RecordingDirectory:
         return path
 
     def just_ended(self, now: Instant) -> Iterator[tuple[Path, Kind, int]]:
-        """Yield the triple (path, retention class, time) of each file that ended recently.
-
-        These are the finished files that ended less than a minute before `now`. The time in the
-        triple is the monotonic time at which the file ended, ns.
-        """
+        """Yield path, class and end of each file that ended within a minute before `now`."""
         for file in self._ended():
             ago_ns = now.wall_ns - int(file.at_s * NS_PER_S)
             if 0 <= ago_ns < INCIDENT_MARGIN_NS:
                 yield self._directory / file.name, file.kind, now.mono_ns - ago_ns
 
     def retain(self, path: Path) -> None:
-        """Rename a finished `plain` file so that it has the retention class `near`.
-
-        Call this method for a file that ended less than a minute before an incident. A file of
-        another class keeps its name.
-        """
+        """Rename a `plain` file to `near`: it ended less than a minute before an incident."""
         if path.name.endswith(MCAP_SUFFIX) and _kind(path) == "plain":
             # Another process may have removed the file.
             with suppress(FileNotFoundError):
@@ -369,10 +303,9 @@ class RecordingDirectory:
             sync(self._directory)
 
     def maintain(self, now: Instant) -> None:
-        """Call `trim` if it is due: every ten minutes, and whenever the disk is nearly full.
+        """Call `trim` every ten minutes and when the disk is nearly full; call this once a second.
 
-        After a jump of the wall clock, also correct the modification times of the files that ended
-        in this run of the daemon. The caller must call this method about once a second.
+        After a jump of the wall clock, also correct the modification times of this run's files.
         """
         jumped_ns = self._run.clock.jump_ns(now)
         if jumped_ns:
@@ -381,7 +314,7 @@ class RecordingDirectory:
         if self._rounds % TRIM_ROUNDS == 0 or self._disk().low:
             self.trim(now)
 
-    def _shift_times(self, jumped_ns: int) -> None:
+    def _shift_times(self, jumped_ns: Ns) -> None:
         for path in listed(self._directory):
             if _number(path) in self._run.numbers:
                 # Another process may have just removed the file.
@@ -391,14 +324,9 @@ class RecordingDirectory:
                     os.utime(path, ns=(status.st_atime_ns, at_ns))
 
     def trim(self, now: Instant | None, refused: bool = False) -> None:
-        """Delete recordings to comply with the limits on total size, age and free disk space.
+        """Delete finished recordings beyond the limits on size, age and free space.
 
-        `.part` files are never deleted. This method also updates `file_bytes`, the size limit of
-        a single file.
-
-        Args:
-            now: the present time; None if the time is not known, so that no file counts as too old.
-            refused: true if the disk refused the last write although it reported free space.
+        Updates `file_bytes`. Without `now`, no file is too old. `refused` is as in the constructor.
         """
         ended, disk = self._ended(), self._disk()
         oldest_s = -math.inf

@@ -1,7 +1,6 @@
-"""Reads the end record: the metadata record at the end of a finished recording.
+"""Reads the end record at the end of a finished recording: times, summary, cause of a cut.
 
-The end record holds the times, a summary, and the cause if the recording was cut off. A program
-that lists many recordings reads only this record of each file.
+A program that lists many recordings reads only this record of each file.
 """
 
 from __future__ import annotations
@@ -21,26 +20,20 @@ from msgspec import Meta, Struct
 from acsard.core.formatting import printable
 from acsard.recording.mcap_records import DAMAGE_ERRORS, MAGIC, RECORD_HEAD
 
-END_RECORD_NAME = "acsard end"
-"""Name of the MCAP metadata record that holds the `EndRecord`."""
+END_RECORD_NAME = "acsard end"  # of the metadata record
 
+# Searched at the end of a file; the end record typically begins 1960 bytes before it.
 TAIL_BYTES = 1 << 16
-"""Number of bytes at the end of a file in which `read_end` searches for the end record. The end
-record typically begins 1960 bytes before the end of the file."""
 
 _NAMED = struct.pack("<I", len(END_RECORD_NAME)) + END_RECORD_NAME.encode()
-"""Bytes that follow the MCAP header of the end record: the length of the record's name, and the
-name."""
 
 _FOOTER = RECORD_HEAD.pack(Opcode.FOOTER, 20)
-"""Header of the MCAP footer record, whose content has 20 bytes."""
 
 _DATA_END = RECORD_HEAD.pack(Opcode.DATA_END, 4)
-"""Header of the MCAP record `DataEnd`, which directly follows the end record."""
 
-Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
-"""Time in ns that fits in a signed 64-bit integer."""
+Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]  # fits in 64 bits
 
+# Texts by cause. After `bug` the failing daemon still finishes its file; otherwise recovery does.
 CUT_TEXTS = {
     "bug": "cut: an internal error ended the daemon",
     "crash": "cut: the daemon or the computer stopped suddenly",
@@ -48,44 +41,27 @@ CUT_TEXTS = {
     "late": "cut: the daemon was asked to end, and the disk was too slow to write the last steps",
     "open": "cut off, or still being recorded, when `acsard recording recover` read it",
 }
-"""Description of each cause that cuts off a recording, by cause. After the cause `bug`, the failing
-daemon still finishes its file. After any other cause, the file has no end record until it is
-recovered."""
 
 
 class EndRecord(Struct, frozen=True):
-    """Content of the end record of a recording: times, summary, and the cause if it was cut off."""
+    """The end record of a recording."""
 
-    wall_ns: Ns
-    """Wall-clock time at which the recording began, ns since 1970."""
-    last_ns: Ns
-    """Latest wall-clock time of any message, ns since 1970. The time of a message with several
-    steps is the time of the first of these steps."""
-    said: str
-    """Summary of the events in a few words, from `timeline.summary`."""
-    cut: str = ""
-    """Cause that cut off the recording, a key of `CUT_TEXTS`; "" if the daemon ended normally."""
-    why: str = ""
-    """Text about the internal error that ended the daemon: the exception, and the number of the
-    control step if a step failed. It is "" if `cut` is not "bug"."""
+    wall_ns: Ns  # wall-clock time at which it began
+    last_ns: Ns  # latest of any message, by its first step
+    said: str  # `timeline.summary`
+    cut: str = ""  # key of `CUT_TEXTS`; "" if the daemon ended normally
+    why: str = ""  # of `bug`: the exception, and the number of a failed step
+    # Earliest of any message: before `wall_ns` if the clock was set back.
     earliest_ns: Ns | None = None
-    """Earliest wall-clock time of any message, ns since 1970; None if the file does not contain
-    this time. It is earlier than `wall_ns` if the clock was set back during the recording."""
 
 
-CRASH_CUTS = frozenset({"bug", "crash"})
-"""The keys of `CUT_TEXTS` that stand for a failure of the daemon or of its computer."""
+CRASH_CUTS = frozenset({"bug", "crash"})  # a failure of the daemon or of its computer
 
 
 def ending_text(cut: str, why: str = "") -> str:
-    """Return a text that says how a recording was cut off; "" if the daemon ended normally.
+    """Return how a recording was cut off, or "" for an ordinary end.
 
-    If another version of acsard recorded a cause that is not in `CUT_TEXTS`, the text contains only
-    the word "cut" and `why`.
-
-    Args:
-        cut: the field `EndRecord.cut`; "" if the daemon ended normally.
-        why: the field `EndRecord.why`.
+    A cause of another version is only "cut" and `why`.
     """
     if not cut:
         return ""
@@ -94,17 +70,13 @@ def ending_text(cut: str, why: str = "") -> str:
 
 
 def as_metadata(last: EndRecord) -> dict[str, str]:
-    """Return the end record `last` as MCAP metadata, which maps strings to strings."""
+    """Return the end record as MCAP metadata."""
     fields = msgspec.to_builtins(last).items()
     return {key: str(value) for key, value in fields if value is not None}
 
 
 def read_end(path: Path) -> EndRecord | None:
-    """Read the end record of a recording file.
-
-    Return None if the file cannot be read, or if no undamaged end record is found. The function is
-    quick: it reads only the first bytes and the last `TAIL_BYTES` of the file.
-    """
+    """Return the end record of a file, or None; this reads only its first and last bytes."""
     # Do not follow the MCAP index or unpack chunks, because a forged file may claim lengths of
     # gigabytes.
     try:
@@ -120,10 +92,7 @@ def read_end(path: Path) -> EndRecord | None:
 
 
 def end_in(data: bytes) -> EndRecord | None:
-    """Return the end record that is in `data`, the last bytes of a file.
-
-    Return None if these bytes contain no valid end record.
-    """
+    """Return the end record in the last bytes of a file, or None."""
     try:
         metadata = _metadata_in(data[-TAIL_BYTES:])
         return msgspec.convert(metadata, EndRecord, strict=False) if metadata else None
@@ -133,10 +102,7 @@ def end_in(data: bytes) -> EndRecord | None:
 
 
 def _metadata_in(tail: bytes) -> dict[str, str] | None:
-    """Return the metadata of the end record, or None if the file is not finished.
-
-    `tail` contains the last bytes of the file.
-    """
+    # None: the file is not finished.
     footer_at = len(tail) - len(MAGIC) - 20 - RECORD_HEAD.size
     if footer_at < 0 or not (tail.startswith(_FOOTER, footer_at) and tail.endswith(MAGIC)):
         return None

@@ -1,9 +1,8 @@
 """Exports a recording for other programs: as ROS messages in MCAP or a ROS bag, or as CSV.
 
-In the CSV table, each feedback line of the board and each gyro sample has its own row. The first
-columns are those that `acsard calibrate` reads. A calibration must not use the columns `odom_...`
-as measured positions, because odometry is computed with the dimensions that the calibration has to
-find.
+In the CSV, each feedback line and each gyro sample has a row, which begins with the columns that
+`acsard calibrate` reads. It must not use `odom_...` as measured positions: odometry is computed
+with the dimensions that the calibration has to find.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from acsard import __version__
 from acsard.core.config.settings import Config
 from acsard.core.ros.channels import ENCODING, SCHEMA_ENCODING, Channel
 from acsard.core.ros.names import TYPE_HASHES, Qos
-from acsard.core.values import NS_PER_S, Estimate, GyroSample, Instant, Outputs
+from acsard.core.values import NS_PER_S, Estimate, GyroSample, Instant, Ns, Outputs, WallNs
 from acsard.host.errors import RecordingError
 from acsard.recording.atomic_output import METADATA, replacing, synced
 from acsard.recording.file import About, Recording
@@ -45,14 +44,12 @@ _ENDLESS = "{sec: 9223372036, nsec: 854775807}"
 class BagTopic(Struct, frozen=True):
     name: str
     type: str
-    """ROS type of the messages, such as `nav_msgs/msg/Odometry`."""
     qos: Qos
     count: int
-    """Number of messages on the topic."""
 
 
 def offered_qos(qos: Qos) -> str:
-    """Return a QoS profile in the form that rosbag2 expects: a YAML list with one entry."""
+    """Return a QoS profile as rosbag2 expects it: a YAML list with one entry."""
     return "\n".join(
         [
             "- history: 1",
@@ -69,17 +66,10 @@ def offered_qos(qos: Qos) -> str:
     )
 
 
-def bag_metadata(file: str, topics: Sequence[BagTopic], first_ns: int, last_ns: int) -> str:
-    """Return the text of the file `metadata.yaml` for a ROS bag with one MCAP file.
+def bag_metadata(file: str, topics: Sequence[BagTopic], first_ns: Ns, last_ns: Ns) -> str:
+    """Return the `metadata.yaml` of a ROS bag with one MCAP file.
 
-    The text has format version 5 with numeric QoS policies, which every ROS 2 release since Humble
-    reads.
-
-    Args:
-        file: name of the MCAP file.
-        topics: the topics in the MCAP file.
-        first_ns: earliest wall-clock time of any message, ns since 1970.
-        last_ns: latest wall-clock time of any message, ns since 1970.
+    Format version 5 with numeric QoS policies is read by every ROS 2 release since Humble.
     """
     count = sum(topic.count for topic in topics)
     begins = f"nanoseconds_since_epoch: {first_ns}"
@@ -120,6 +110,7 @@ def _quoted(text: str) -> str:
     return msgspec.json.encode(text).decode()
 
 
+# For a calibration: s since 1970, rad/s of the wheels, and rad/s of the gyro.
 MEASURED_COLUMNS = (
     "t",
     "fr",
@@ -128,14 +119,12 @@ MEASURED_COLUMNS = (
     "rr",
     "yaw_rate",
 )
-"""Columns that a calibration reads: the wall-clock time (s since 1970), the speeds of the front
-right, front left, rear left and rear right wheel (rad/s), and the yaw rate from a gyro (rad/s)."""
 
+# SI units; empty for a gyro sample.
 OUTPUT_COLUMNS = (
     "odom_x", "odom_y", "odom_yaw", "linear", "angular",
     "applied_linear", "applied_angular", "mode", "link", "source",
 )  # fmt: skip
-"""Columns with outputs of the robot, in SI units. The row of a gyro sample has no values here."""
 
 CSV_HEADER = ",".join([*MEASURED_COLUMNS, *OUTPUT_COLUMNS])
 MEASURED_CSV_HEADER = ",".join([*MEASURED_COLUMNS, "applied_linear", "applied_angular"])
@@ -145,10 +134,7 @@ _NO_OUTPUTS = "," * len(OUTPUT_COLUMNS)
 
 
 def csv_rows(step: RecordedStep, outputs: Outputs) -> Iterator[str]:
-    """Yield the rows of a step for the CSV table of an export, without line breaks.
-
-    `outputs` are the replayed outputs of the step.
-    """
+    """Yield the rows of a step for the CSV of an export, by its replayed outputs."""
     now = step.inputs.now
     for sample in step.inputs.gyro:
         yield gyro_columns(sample, now) + _NO_OUTPUTS
@@ -162,11 +148,7 @@ def csv_rows(step: RecordedStep, outputs: Outputs) -> Iterator[str]:
 
 
 def measured_csv_rows(step: RecordedStep, outputs: Outputs) -> Iterator[str]:
-    """Yield the rows of a step for the CSV table that `acsard calibrate` reads.
-
-    `MEASURED_CSV_HEADER` names the columns. The rows have no line breaks. `outputs` are the
-    replayed outputs of the step.
-    """
+    """Yield the rows of a step for `acsard calibrate` (`MEASURED_CSV_HEADER`)."""
     for sample in step.inputs.gyro:
         yield gyro_columns(sample, step.inputs.now) + ",,"
     for estimate in outputs.estimates:
@@ -175,65 +157,44 @@ def measured_csv_rows(step: RecordedStep, outputs: Outputs) -> Iterator[str]:
 
 
 def wheel_columns(estimate: Estimate) -> str:
-    """Return the CSV fields of a feedback line of the board for the columns `MEASURED_COLUMNS`.
-
-    The field for the yaw rate is empty.
-    """
+    """Return the `MEASURED_COLUMNS` of a feedback line."""
     wheels = ",".join(f"{speed:.6g}" for speed in estimate.speeds.as_tuple())
     return f"{_csv_seconds(estimate.at.wall_ns)},{wheels},"
 
 
 def gyro_columns(sample: GyroSample, now: Instant) -> str:
-    """Return the CSV fields of a gyro sample for the columns `MEASURED_COLUMNS`.
-
-    The fields for the wheel speeds are empty. The time is the stamp of the sample. A sample without
-    a stamp gets the wall-clock time at which it arrived. `now` is the time of the step.
-    """
+    """Return the `MEASURED_COLUMNS` of a gyro sample, at its stamp or else its arrival."""
     arrived_ns = sample.at_ns + now.wall_ns - now.mono_ns
     at_ns = arrived_ns if sample.stamp_ns is None else sample.stamp_ns
     return f"{_csv_seconds(at_ns)},{_NO_WHEELS}{sample.rate:.6g}"
 
 
-def _csv_seconds(wall_ns: int) -> str:
+def _csv_seconds(wall_ns: WallNs) -> str:
     return f"{wall_ns // NS_PER_S}.{wall_ns % NS_PER_S // 1000:06d}"
 
 
 Kind = Literal["mcap", "csv", "rosbag2"]
 
+# End of the default name.
 SUFFIX: dict[Kind, str] = {"mcap": ".ros2.mcap", "csv": ".csv", "rosbag2": ".rosbag2"}
-"""Maps each kind of export to the suffix of the default name of its file or directory."""
 
 
 class ExportResult(Struct, frozen=True):
-    count: int
-    """Number of exported messages, or number of exported rows of a CSV table."""
-    gaps: list[Gap]
-    """Parts of the recording that cannot be replayed and that overlap the exported part. The export
-    does not contain the outputs of their steps."""
+    count: int  # messages, or rows of a CSV
+    gaps: list[Gap]  # exported parts that cannot be replayed, whose outputs are missing
 
 
 class _Writer:
-    """Base class of the writers, one for each file format."""
-
     count = 0
-    """Number of messages or rows that were written so far."""
 
     def step(self, step: RecordedStep, outputs: Outputs) -> None:
         raise NotImplementedError
 
     def skip(self, step: RecordedStep, inside: bool) -> None:
-        """Process a step whose outputs are not exported.
-
-        `inside` is true if the step is in the exported part of the recording, but cannot be
-        replayed. The log lines of the step are then still written. `inside` is false if the step is
-        before the exported part.
-        """
+        """Process a step without outputs: one that cannot be replayed, or is not inside."""
 
     def end(self, ending: str = "") -> None:
-        """Write the log lines that follow the last exported step.
-
-        `ending` says how the recording was cut off, if the exported part reaches that place.
-        """
+        """Write the log after the last step; `ending` says how the recording was cut off there."""
 
     def finish(self) -> None:
         pass
@@ -252,8 +213,7 @@ class _MessageWriter(_Writer):
         self._channels: dict[tuple[str, str], int] = {}
         self._topics: dict[int, tuple[str, Channel]] = {}
         self._counts: dict[int, int] = {}
-        self.times: tuple[int, int] = (0, 0)
-        """Earliest and latest wall-clock time of a written message, ns since 1970."""
+        self.times: tuple[int, int] = (0, 0)  # earliest and latest message
 
     def step(self, step: RecordedStep, outputs: Outputs) -> None:
         self._publisher.robot = self._run.robot
@@ -335,22 +295,9 @@ def export(
 ) -> ExportResult:
     """Replay a recording, and write its messages or its CSV table to `new`.
 
-    If an error occurs, no partial data is left at `new`.
-
-    Args:
-        recording: the recording to replay.
-        new: path of the file to write, or of the directory if `kind` is "rosbag2".
-        kind: the format of the exported data.
-        other: the configuration of the replay; None for the recorded configuration.
-        span: the part of the recording that is exported.
-        progress: shows the progress. It is called every `PROGRESS_STEPS` steps.
-        force: true if an existing file or ROS bag at `new` may be overwritten. A recording is never
-            overwritten.
-
-    Raises:
-        RecordingError: nothing was recorded in `span`, or the recording cannot be replayed.
-        FileExistsError: `new` exists, and must not be overwritten.
-        OSError: the disk refuses to write.
+    `other` replaces the recorded configuration. `force` never replaces a recording. An error leaves
+    nothing at `new`: `RecordingError` (nothing in `span`, or no replay), `FileExistsError`,
+    `OSError`.
     """
     run = RecordedRun(recording, other)
     with replacing(new, force) as part:
@@ -386,7 +333,7 @@ def _write_steps(
     began_ns, over = recording.about.mono_ns, False
 
     def is_inside(step: RecordedStep) -> bool:
-        """Return whether a step is in `span`. At the first step after `span`, end the output."""
+        # Ends the output at the first step after `span`.
         nonlocal over
         seconds = (step.inputs.now.mono_ns - began_ns) / NS_PER_S
         if seconds > span.end and not over:
@@ -420,11 +367,10 @@ def _gaps(run: RecordedRun, span: Span, about: About) -> list[Gap]:
 
 
 def calibration_csv(recording: Recording) -> bytes:
-    """Return the measured data of a recording as the CSV table that `acsard calibrate` reads.
+    """Return a recording as the CSV that `acsard calibrate` reads.
 
-    The table begins with the first step that can be replayed, and ends before the next step that is
-    missing or cannot be replayed. Raises `RecordingError` if the table has no gyro samples, or if
-    the recording cannot be replayed.
+    It has the steps from the first that can be replayed to the next that cannot. Raises
+    `RecordingError`, also without gyro samples.
     """
     run = RecordedRun(recording)
     lines, has_gyro = [MEASURED_CSV_HEADER], False

@@ -1,22 +1,11 @@
-"""Writes and reads one recording as an MCAP file.
+"""Writes and reads one recording as an MCAP file, to which the writer adds every second.
 
-The writer adds data every second. If a file is cut off or damaged, the undamaged data stays
-readable.
-
-A file has four channels:
-- `steps`: batches of steps, as `rows.py` encodes them.
-- `events`: one event per message, in JSON.
-- `state`: the complete `Robot` object between two steps, as `state.py` encodes it. Each state has
-  its own chunk, so that damage to a chunk of steps does not destroy a state. A file that begins
-  after the daemon's first step has a `state` message first.
-- `unfinished`: the inputs of the step in which the daemon failed.
-
-A metadata record names the robot and the version of acsard, and an attachment contains the
-`acsard.toml`. No step can be replayed without them, so a finished file has a copy of both at its
-beginning and another copy before its end.
-
-A file that was cut off has no end record, but all data that was synced to the disk can still be
-read. `rewrite` copies the messages of such a file to a new, finished file.
+It has the channels `steps` (batches of `rows.py`), `events` (JSON), `state` (a `Robot` of
+`state.py` in its own chunk, first if the file begins after the daemon's first step), and
+`unfinished` (inputs of a step in which the daemon failed). A metadata record names robot and
+version, and an attachment is the `acsard.toml`: both stand at the beginning and, in a finished
+file, again before the end. A file that was cut off has all that was synced, and `rewrite` finishes
+a copy.
 """
 
 from __future__ import annotations
@@ -48,7 +37,7 @@ from mcap.records import (
 from msgspec import Struct
 
 from acsard.core.formatting import many
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, WallNs
 from acsard.host.errors import MSGSPEC_ERRORS, RecordingError
 from acsard.recording.end_record import (
     END_RECORD_NAME,
@@ -64,24 +53,21 @@ from acsard.recording.rows import FORMAT, Batch, Row, first_of
 from acsard.recording.state import Checkpoint
 from acsard.recording.timeline import INCIDENT_WORDS, TimelineEntry, summary
 
+# Longest time in an MCAP chunk: longer ones save little, and damage to one would destroy more.
 CHUNK_NS = 10 * NS_PER_S
-"""Longest time between the first and the last message of an MCAP chunk, ns. Longer chunks would
-save little space, and damage to a single chunk would destroy more data."""
 
-CHUNK_BYTES = 1 << 20
-"""Uncompressed size at which a chunk ends, bytes. Ten seconds of driving take 160 000 bytes."""
+CHUNK_BYTES = 1 << 20  # uncompressed; ten seconds of driving take 160 000
 
-FILE_MODE = 0o640
-"""File mode of a recording: 0o640. The group of the daemon's service may read the file."""
+FILE_MODE = 0o640  # the group of the daemon's service may read
 
 Topic = Literal["steps", "events", "state", "unfinished"]
 
+# In the order of their MCAP numbers from 1, because the records that say so may be damaged.
 CHANNELS: tuple[Topic, ...] = ("steps", "state", "events", "unfinished")
-"""Channels in the order of their MCAP channel numbers, which begin with 1. The reader relies on
-this order, because the records that define the channels may be damaged."""
 
 CHANNEL_NUMBERS = {topic: number for number, topic in enumerate(CHANNELS, 1)}
 
+# Metadata for people with another MCAP program.
 HOW_TO_READ = Metadata(
     "how to read this file",
     {
@@ -93,7 +79,6 @@ HOW_TO_READ = Metadata(
         "acsard.toml": "the configuration of the robot, as an attachment",
     },
 )
-"""Metadata record for people who open a recording with another MCAP program."""
 
 CHANNEL_DESCRIPTIONS: dict[Topic, str] = {
     "steps": "the inputs and outputs of the control steps of about a second, in MessagePack: an "
@@ -106,33 +91,24 @@ CHANNEL_DESCRIPTIONS: dict[Topic, str] = {
     "unfinished": "the inputs of the step in which the daemon failed, in MessagePack: a map of "
     f"{', '.join(Unfinished.__struct_fields__)}",
 }
-"""Text in the file that describes the messages of a channel, by channel."""
 
+# `Recording.ending` without an end record.
 UNFINISHED = "the file has no end: it was cut off, or is still being recorded"
-"""Text of `Recording.ending` for a file without an end record."""
 
-EVENTS_SCHEMA = 1
-"""MCAP schema number of the channel `events`. The other channels have no schema."""
+EVENTS_SCHEMA = 1  # MCAP schema of `events`
 
 
 class About(Struct, frozen=True):
-    """Metadata of a recording: which robot, program and configuration made it."""
+    """Which robot, program and configuration made a recording."""
 
     robot: str
-    version: str
-    """Version of acsard."""
+    version: str  # of acsard
     python: str
     mono_ns: Ns
-    """Monotonic time at which the recording began, ns."""
     wall_ns: Ns
-    """Wall-clock time at which the recording began, ns since 1970."""
-    config: str = ""
-    """Configuration at the beginning of the recording, as an `acsard.toml` with every key."""
-    format: str = FORMAT
-    """Version of the encoding of the messages, as in `rows.FORMAT`."""
-    started_ns: Ns = 0
-    """Wall-clock time at which the daemon started, ns since 1970; 0 if this time is not known. The
-    daemon may have started hours before this recording began."""
+    config: str = ""  # every key, as an `acsard.toml`
+    format: str = FORMAT  # `rows.FORMAT`
+    started_ns: Ns = 0  # start of the daemon, maybe hours before; 0 if unknown
 
 
 class EndRecordBuilder:
@@ -141,14 +117,10 @@ class EndRecordBuilder:
     def __init__(self, about: About) -> None:
         self._wall_ns = self._last_ns = self._earliest_ns = about.wall_ns
         self._incidents: list[TimelineEntry] = []
-        self._starts = False
-        """True if the messages so far include the daemon's first step."""
+        self._starts = False  # with the daemon's first step
 
-    def message(self, topic: Topic, wall_ns: int, data: bytes) -> None:
-        """Add a message of any channel. `wall_ns` is the message's wall-clock time, ns since 1970.
-
-        The caller must also decode each message of the channel `events`, and pass it to `event`.
-        """
+    def message(self, topic: Topic, wall_ns: WallNs, data: bytes) -> None:
+        """Add a message of any channel; an event must also go to `event`."""
         self._last_ns = max(self._last_ns, wall_ns)
         self._earliest_ns = min(self._earliest_ns, wall_ns)
         if topic == "steps":
@@ -158,23 +130,18 @@ class EndRecordBuilder:
                 self._starts = self._starts or unfinished(data).number == 0
 
     def event(self, event: TimelineEntry) -> None:
-        """Add an event to the summary. Events whose name is not in `INCIDENT_WORDS` are ignored."""
+        """Add an event to the summary, if its name is in `INCIDENT_WORDS`."""
         if event.name in INCIDENT_WORDS:
             self._incidents.append(event)
 
     def end_record(self, cut: str = "", why: str = "") -> EndRecord:
-        """Return the end record of a recording with the messages that were added so far.
-
-        Args:
-            cut: the cause that cut off the recording, a key of `CUT_TEXTS`; "" for an ordinary end.
-            why: an explanation of this cause in words, or "".
-        """
+        """Return the end record so far; `cut` is a key of `CUT_TEXTS` or ""."""
         text = summary(self._incidents, self._starts)
         return EndRecord(self._wall_ns, self._last_ns, text, cut, why, self._earliest_ns)
 
 
 class Index:
-    """Collects the statistics and the index for the summary section at the end of an MCAP file."""
+    """The statistics and the index at the end of an MCAP file."""
 
     def __init__(self) -> None:
         self._places: list[McapRecord] = []
@@ -190,11 +157,8 @@ class Index:
             schema_count=1,
         )
 
-    def message(self, channel: int, wall_ns: int) -> None:
-        """Count a message of the MCAP channel with the number `channel`.
-
-        `wall_ns` is the message's wall-clock time in ns since 1970, at least 0.
-        """
+    def message(self, channel: int, wall_ns: WallNs) -> None:
+        """Count a message of the MCAP channel, at a time of at least 0."""
         totals = self._totals
         first_ns = totals.message_start_time if totals.message_count else wall_ns
         totals.message_start_time = min(first_ns, wall_ns)
@@ -207,11 +171,7 @@ class Index:
         self._totals.chunk_count += 1
 
     def record(self, record: McapRecord, at: int, length: int) -> None:
-        """Add a metadata record or an attachment to the index. Ignore a record of another kind.
-
-        `at` is the offset in the file at which the record begins, bytes. `length` is the length of
-        the record, bytes.
-        """
+        """Add a metadata record or an attachment at this offset; ignore other records."""
         if isinstance(record, Metadata):
             self._totals.metadata_count += 1
             self._places.append(MetadataIndex(at, length, record.name))
@@ -222,31 +182,21 @@ class Index:
             self._places.append(AttachmentIndex(at, length, *times, size, record.name, kind))
 
     def records(self) -> list[McapRecord]:
-        """Return the MCAP records of the summary section: the statistics and the index."""
+        """Return the MCAP records of the summary section."""
         return [self._totals, *self._places]
 
 
 class RecordingWriter:
-    """A recording file that is being written.
-
-    If the disk refuses to write, a method raises `OSError`. After that, call only `close`.
-    """
+    """A recording file that is being written. After an `OSError`, call only `close`."""
 
     def __init__(self, path: Path, about: About, mode: int = FILE_MODE) -> None:
-        """Create a file at `path`, and write the metadata `about` to it.
-
-        `mode` is the file mode. Raises `OSError` if a file already exists at `path`; that file
-        stays unchanged. Also raises `OSError` if the disk refuses to write; the new file is then
-        deleted.
-        """
+        # Raises `OSError`: a file at `path` stays, and a new one that the disk refuses is deleted.
         self.path, self._mode = path, mode
         self._end_builder = EndRecordBuilder(about)
         self._about = _about_records(about)
         self._index = Index()
         self._chunk: GrowingChunk | None = None
-        self._chunk_at: int | None = None
-        """Offset in the file of the header of the chunk that is being written, bytes. None if this
-        header is not written yet."""
+        self._chunk_at: int | None = None  # offset of the header of the growing chunk
         self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb")
         try:
             self._open(about)
@@ -271,19 +221,11 @@ class RecordingWriter:
 
     @property
     def size(self) -> int:
-        """Number of bytes that were written to the file so far.
-
-        Messages that the next `flush` will write do not count.
-        """
+        """Number of bytes in the file, before the next `flush`."""
         return self._file.tell()
 
-    def add(self, topic: Topic, wall_ns: int, data: bytes) -> None:
-        """Add a message to the channel `topic`. `wall_ns` is its wall-clock time, ns since 1970.
-
-        The message is written to the file at the next `flush`, or when its chunk ends. For the
-        channel `events`, call the method `event` instead: it also counts the event for the end
-        record.
-        """
+    def add(self, topic: Topic, wall_ns: WallNs, data: bytes) -> None:
+        """Add a message, which is written at the next `flush`; use `event` for events."""
         self._end_builder.message(topic, wall_ns, data)
         wall_ns = max(0, wall_ns)
         chunk = self._chunk
@@ -300,16 +242,13 @@ class RecordingWriter:
             self.end_chunk()
 
     def event(self, event: TimelineEntry) -> None:
-        """Add an event to the channel `events`, and to the summary in the end record."""
+        """Add an event to its channel and to the summary of the end record."""
         wall_ns = int(event.seconds * NS_PER_S)
         self.add("events", wall_ns, msgspec.json.encode(event))
         self._end_builder.event(event)
 
     def flush(self) -> None:
-        """Write all added messages to the file, and sync the file to the disk.
-
-        Raises `FileNotFoundError` if the file was deleted.
-        """
+        """Write all messages and sync the file. Raises `FileNotFoundError` if it was deleted."""
         if self._chunk is not None and self._chunk.has_unwritten:
             self._append(self._chunk.take())
         self._sync()
@@ -328,7 +267,7 @@ class RecordingWriter:
         os.fsync(self._file.fileno())
 
     def end_chunk(self) -> None:
-        """End the chunk that is being written. The next message begins a new chunk."""
+        """End the chunk, so that the next message begins a new one."""
         if self._chunk is None:
             return
         last, head = self._chunk.end()
@@ -342,12 +281,7 @@ class RecordingWriter:
         self._index.chunk()
 
     def finish(self, cut: str = "", why: str = "") -> None:
-        """Write the end record and the MCAP summary section, and close the file.
-
-        Args:
-            cut: the cause that cut off the recording, a key of `CUT_TEXTS`; "" for an ordinary end.
-            why: an explanation of this cause in words, or "".
-        """
+        """Write the end and close the file; `cut` is a key of `CUT_TEXTS` or ""."""
         self.end_chunk()
         for record in self._about:
             self._write(record)
@@ -357,7 +291,7 @@ class RecordingWriter:
         self._file.close()
 
     def close(self) -> None:
-        """Close the file without an end record. This method does not raise `OSError`."""
+        """Close the file without an end record; this raises no `OSError`."""
         try:
             self._file.close()
         except OSError:
@@ -368,13 +302,9 @@ class RecordingWriter:
 def file_end(
     last: EndRecord, index: Index, at: int, definitions: Iterable[McapRecord] = ()
 ) -> bytes:
-    """Return the last bytes of an MCAP file: end record, summary section and footer.
+    """Return the last bytes of an MCAP file, at this offset: end record, summary and footer.
 
-    Args:
-        last: the end record.
-        index: the statistics and the index of the file. The end record is added to it.
-        at: the offset in the file at which the caller writes the bytes.
-        definitions: the schema and the channels, for the summary section.
+    The end record is added to `index`. `definitions` are the schema and the channels.
     """
     record = Metadata(END_RECORD_NAME, as_metadata(last))
     data = encoded(record)
@@ -395,7 +325,7 @@ def _about_records(about: About) -> list[McapRecord]:
 
 
 def _checksum(metadata: Mapping[str, str]) -> int:
-    """Return the CRC-32 of a metadata record, for which MCAP defines no checksum."""
+    # CRC-32, which MCAP does not define for metadata.
     return zlib.crc32(msgspec.json.encode(metadata, order="sorted"))
 
 
@@ -414,13 +344,16 @@ def _definitions() -> Iterator[McapRecord]:
 
 
 class Recording:
-    """A recording read from a file. Damaged parts of the file are skipped."""
+    """A recording read from a file, without its damaged parts.
+
+    Only after the last message of `messages()` do `ended`, `damaged`, `cut`, `why`, `unfinished`
+    and the properties below have their final values.
+    """
 
     def __init__(self, path: Path) -> None:
-        """Read the file. Raises `RecordingError` if it is not a readable recording of acsard."""
+        # Raises `RecordingError`.
         self.path = path
-        self.paths = [path]
-        """Paths of the files of the recording, in order. Only a `Series` has more than one file."""
+        self.paths = [path]  # several only in a `Series`
         try:
             if not stat.S_ISREG(path.stat().st_mode):
                 raise OSError(errno.EINVAL, "it is not a file")
@@ -434,56 +367,35 @@ class Recording:
             raise RecordingError(
                 f"cannot read {path}: {error.strerror}; `acsard recording` lists the recordings"
             ) from None
-        self.ended = False
-        """True if the file is finished, so that it has an end record. A finished file may still be
-        damaged. Use this attribute only after `messages()` has yielded the last message."""
+        self.ended = False  # it has an end record
+        # Damaged places, mostly chunks; not the incomplete end of a file that was cut off.
         self.damaged = 0
-        """Number of damaged places that were skipped, mostly MCAP chunks. The incomplete end of a
-        file that was cut off does not count."""
-        self.cut = ""
-        """Cause that cut off the recording, a key of `CUT_TEXTS`; "" if the daemon ended normally
-        or if the file is not finished."""
-        self.why = ""
-        """Text about the internal error that ended the daemon: the exception, and the number of the
-        control step if a step failed. It is "" if `cut` is not "bug"."""
+        self.cut = ""  # key of `CUT_TEXTS`; "" for an ordinary end, and without one
+        self.why = ""  # of `bug`: the exception, and the number of a failed step
+        # Inputs of the step in which the daemon failed, encoded.
         self.unfinished: bytes | None = None
-        """Encoded inputs of the step in which the daemon failed; None if no step failed."""
         self.about = self._about()
 
     @property
     def is_intact(self) -> bool:
-        """True if the file is finished and undamaged.
-
-        Use this property only after `messages()` has yielded the last message.
-        """
         return self.ended and not self.damaged
 
     @property
     def ending(self) -> str:
-        """Text that says how the recording was cut off; "" if the daemon ended normally.
-
-        Use this property only after `messages()` has yielded the last message.
-        """
+        """How the recording was cut off; "" if the daemon ended normally."""
         if not self.ended:
             return UNFINISHED
         return ending_text(self.cut, self.why)
 
     @property
     def missing_text(self) -> str:
-        """Text that tells the user about missing data: the number of damaged places, and `ending`.
-
-        The text is "" if the file is undamaged and the daemon ended normally. Use this property
-        only after `messages()` has yielded the last message.
-        """
+        """The number of damaged places and `ending`, for the user; "" if nothing is missing."""
         places = many(self.damaged, "damaged place is", "damaged places are")
         damaged = f"{places} left out" if self.damaged else ""
         return "; ".join(filter(None, [damaged, self.ending]))
 
     def compute_end_record(self) -> EndRecord:
-        """Read all messages of the recording, and return an end record that is built from them.
-
-        The field `cut` of the end record is "", because the messages do not show the cause.
-        """
+        """Return an end record that is built from the messages, which do not show `cut`."""
         builder = EndRecordBuilder(self.about)
         for topic, wall_ns, data in self.messages():
             builder.message(topic, wall_ns, data)
@@ -492,12 +404,8 @@ class Recording:
                     builder.event(event_of(self, data))
         return builder.end_record()
 
-    def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
-        """Yield the triple (topic, wall-clock time in ns since 1970, data) of each message.
-
-        Messages in damaged parts of the file are skipped. After the last message, the attributes
-        `ended`, `damaged`, `cut`, `why` and `unfinished` have their final values.
-        """
+    def messages(self) -> Iterator[tuple[Topic, WallNs, bytes]]:
+        """Yield topic, wall-clock time and data of each readable message."""
         self.ended, self.damaged, self.cut, self.why = False, 0, "", ""
         self.unfinished = None
         topics = {number: topic for topic, number in CHANNEL_NUMBERS.items()}
@@ -554,15 +462,10 @@ class Recording:
 
 
 def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
-    """Copy all readable messages to a new, finished file at `path`, and return their number.
+    """Copy the readable messages to a new, finished file, and return their number.
 
-    If the recording is not finished, the end record of the new file names the cause `cut`, a key of
-    `CUT_TEXTS`. Otherwise the new end record has the cause of the recording's own end record. If an
-    error occurs, the new file is deleted.
-
-    Raises:
-        OSError: a file already exists at `path`, or the disk refuses to write.
-        RecordingError: an event cannot be decoded.
+    Only an unfinished recording gets the cause `cut`. An error deletes the new file: `OSError`, or
+    `RecordingError` for an event that cannot be decoded.
     """
     writing = RecordingWriter(path, recording.about)
     try:
@@ -582,17 +485,14 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
 
 
 def is_part(part: Recording, recording: Recording) -> bool:
-    """Return whether `recording` has the metadata and all the messages of `part`.
-
-    If it has, the file of `recording` can replace the file of `part` without loss of data.
-    """
+    """Return whether `recording` has all of `part`, and can replace it."""
     if part.about != recording.about:
         return False
     return Counter(part.messages()) <= Counter(recording.messages())
 
 
 def event_of(recording: Recording, data: bytes) -> TimelineEntry:
-    """Decode a message of the channel `events`. Raises `RecordingError` if it is damaged."""
+    """Decode a message of the channel `events`. Raises `RecordingError`."""
     try:
         return msgspec.json.decode(data, type=TimelineEntry)
     except MSGSPEC_ERRORS as error:

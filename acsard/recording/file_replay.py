@@ -1,9 +1,7 @@
 """Replays a recording, and checks the copies of the events in the recording.
 
-A file contains each event twice: in a control step, and as a message of the channel `events`.
-
-After a damaged place, the replay resumes at the next robot state in the file. The steps between the
-damage and this state cannot be replayed.
+A file has each event in its step and in the channel `events`. After a damaged place, the replay
+resumes at the next robot state, and the steps before it cannot be replayed.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from acsard.core.config.toml_text import document
 from acsard.core.formatting import printable
 from acsard.core.guard import Memory
 from acsard.core.robot import Robot
-from acsard.core.values import Outputs
+from acsard.core.values import Ns, Outputs, WallNs
 from acsard.host.errors import RecordingError
 from acsard.recording.end_record import read_end
 from acsard.recording.file import Recording, event_of
@@ -34,72 +32,47 @@ from acsard.recording.state import Checkpoint, State, StateError, adopt, checkpo
 from acsard.recording.timeline import TimelineEntry, entry_of
 from acsard.recording.unpickling import MAX_BYTES
 
-Progress = Callable[[int], None]
-"""Function that shows the progress of a replay. Its argument is the wall-clock time of the present
-step, ns since 1970."""
+Progress = Callable[[int], None]  # shows the progress, by the present wall-clock time, ns
 
-PROGRESS_STEPS = 1024
-"""Number of replayed steps between two calls of the function that shows the progress."""
+PROGRESS_STEPS = 1024  # between two calls of it
 
 
-def no_progress(wall_ns: int) -> None:
-    """Do nothing. This is the default `Progress` function, which shows no progress."""
+def no_progress(wall_ns: WallNs) -> None:
+    """Do nothing: the default `Progress`."""
 
 
+# Raised by a `Robot` from an incomplete recorded state.
 INCOMPLETE_STATE_ERRORS = (
     AttributeError, TypeError, ValueError, LookupError, ArithmeticError, RecursionError
 )  # fmt: skip
-"""Exceptions that a `Robot` may raise if it was rebuilt from an incomplete recorded state."""
 
 
 class Gap(Struct):
-    """Part of a recording that is not replayed.
+    """Part of a recording that is not replayed: from unreadable steps to the next robot state."""
 
-    A gap begins with unreadable steps and ends at the next recorded state of the robot.
-    """
-
-    begin_ns: int
-    """Monotonic time of the last replayed step before the gap, ns. If no step was replayed before
-    the gap, it is the time at which the recording began."""
-    end_ns: int
-    """Monotonic time of the first replayed step after the gap, or of the recording's end, ns."""
-    unreadable: int = 0
-    """Number of steps that cannot be read. The replay computes it from the step numbers before and
-    after the unreadable steps."""
-    skipped: int = 0
-    """Number of steps that can be read, but not replayed. They are between the unreadable steps and
-    the next recorded state of the robot."""
-    lines: int = 0
-    """Number of `skipped` steps with a line that the robot decided to send to the board."""
-    end_lost: bool = False
-    """True if the last steps of the recording cannot be read."""
+    begin_ns: Ns  # last replayed step before it, or the beginning
+    end_ns: Ns  # first replayed step after it, or the end
+    unreadable: int = 0  # by the step numbers
+    skipped: int = 0  # readable steps before the next robot state
+    lines: int = 0  # of `skipped`, with a line to the board
+    end_lost: bool = False  # the last steps of the recording are unreadable
 
 
 class ReplayResult(NamedTuple):
     comparison: Comparison
-    gaps: list[Gap]
-    """The parts of the recording that were not replayed. Their outputs were not compared."""
+    gaps: list[Gap]  # not compared
+    # Whether the step in which the daemon failed fails here, too; "": it did not fail.
     failed_step: str = ""
-    """Text about the step in which the recorded daemon failed: whether this step also fails in this
-    version of acsard. "" if the daemon did not fail."""
-    event_copies: str = ""
-    """Text about the first event that differs from its copy in the channel `events`. "" if all
-    events equal their copies."""
+    event_copies: str = ""  # about the first event that differs from its copy, or ""
 
     @property
     def same(self) -> bool:
-        """True if the replay found no difference.
-
-        All replayed outputs then equal the recorded outputs, and all events equal their copies.
-        """
+        """Whether all outputs equal the recorded ones, and all events their copies."""
         return self.comparison.same and not self.event_copies
 
 
 def config_of(recording: Recording) -> Config:
-    """Return the configuration at the beginning of a recording.
-
-    Raises `RecordingError` if this version of acsard cannot use the configuration.
-    """
+    """Return the configuration at the beginning of a recording. Raises `RecordingError`."""
     try:
         return parse(recording.about.config.encode())
     except ConfigError as error:
@@ -119,7 +92,7 @@ def steps(recording: Recording) -> Iterator[RecordedStep]:
 def _steps_and_states(
     recording: Recording, copies: EventCopies | None = None
 ) -> Iterator[tuple[RecordedStep, Checkpoint | None]]:
-    """Yield every readable step in order, with the last recorded robot state before it."""
+    # With the last robot state before each.
     saved: Checkpoint | None = None
     for topic, _, data in recording.messages():
         if topic == "events" and copies is not None:
@@ -138,23 +111,16 @@ def _steps_and_states(
 
 # A genuine file stays below this limit. Without the limit, the replay of a forged file of 5 kB took
 # 4 s.
-STATE_BYTES_PER_FILE_BYTE = 8
-"""Limit on the total size of the robot states that a replay decodes after gaps, in bytes for each
-byte of the file. A replay may decode `MAX_BYTES` in addition."""
+STATE_BYTES_PER_FILE_BYTE = 8  # decoded after gaps, plus `MAX_BYTES`
 
 
 class _Source:
-    """Base class of `RecordedRun` and `DisplayReplay`. It decodes recorded states of the robot."""
-
+    # Decodes recorded states of the robot.
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self._state: State | None = None
-        """The recorded robot state from which the replay last started; None while the replay uses a
-        new robot."""
-        self._place = "at the start of"
-        """Words for the position of `_state` in the recording, for error messages."""
-        self._state_bytes_left = MAX_BYTES
-        """Total size of the robot states that may still be decoded after gaps, bytes."""
+        self._state: State | None = None  # from which the replay last started; None: a new robot
+        self._place = "at the start of"  # position of `_state`, for messages
+        self._state_bytes_left = MAX_BYTES  # to be decoded after gaps
         for path in recording.paths:
             # The reader of the steps reports a missing file later.
             with suppress(OSError):
@@ -162,10 +128,9 @@ class _Source:
 
     @contextmanager
     def state_errors(self) -> Iterator[None]:
-        """Convert errors that an incomplete robot state causes in a `with` block.
+        """Raise `RecordingError` for what an incomplete robot state causes in a `with` block.
 
-        The block then raises `RecordingError`. A forged recording may contain a robot state without
-        some of its parts. Therefore every use of the robot must be in such a `with` block.
+        A forged recording may lack parts, so every use of the robot is in such a block.
         """
         try:
             yield
@@ -187,12 +152,8 @@ class _Source:
         number: int,
         tried: Callable[[Config], Config] | None = None,
     ) -> State | None:
-        """Return the robot's state before step `number`, decoded from `saved`.
-
-        Return None if `saved` is None, if it is the state before another step, or if it cannot be
-        used. `tried` takes the configuration in `saved`, and returns the configuration of the
-        replay. If `tried` is None, the replay uses the configuration in `saved`.
-        """
+        # None if it is not usable or of another step. `tried` maps its configuration to the
+        # replay's.
         if saved is None or saved.number != number:
             return None
         self._state_bytes_left -= len(saved.data)
@@ -212,9 +173,8 @@ class _Source:
 class RecordedRun(_Source):
     """The steps of a recording that can be replayed, and a robot that can replay them.
 
-    The caller must replay each step from `steps()` with `robot` before it requests the next step.
-    After missing steps, the replay resumes with another robot, from the next robot state in the
-    file.
+    Replay each step of `steps()` with `robot` before the next. After missing steps, it is another
+    one.
     """
 
     def __init__(
@@ -223,42 +183,25 @@ class RecordedRun(_Source):
         other: Config | None = None,
         copies: EventCopies | None = None,
     ) -> None:
-        """Read the configuration and the first robot state of a recording.
-
-        Args:
-            recording: the recording to replay.
-            other: the configuration of the replay; None for the recorded configuration.
-            copies: if not None, `steps()` passes both copies of each event to this object. The
-                caller must call `copies.end()` after the last step.
-
-        Raises:
-            RecordingError: this version of acsard cannot use the recorded configuration or state.
-        """
+        # `other` replaces the recorded configuration. `copies` gets both copies of each event; call
+        # its `end()` after the last step. Raises `RecordingError`.
         super().__init__(recording)
         self._other, self._recorded, self._copies = other, config_of(recording), copies
         config = other or self._recorded
-        self.gaps: list[Gap] = []
-        """The gaps that `steps()` has found so far."""
-        self.number: int | None = None
-        """Number of the last step that `steps()` yielded; None before the first step."""
+        self.gaps: list[Gap] = []  # found so far
+        self.number: int | None = None  # of the last step
+        # Gets each step that can be read, but not replayed.
         self.on_skipped: Callable[[RecordedStep], None] = lambda step: None
-        """Function that `steps()` calls with each step that can be read, but not replayed."""
+        # Next step, and the state of the robot, or None.
         self._next, self._state = _first_state(recording)
-        """`_next` is the number of the step that `robot` can replay next. `_state` is the recorded
-        state from which `robot` was rebuilt, or None for a new robot."""
+        # With the memory of its guard.
         self.robot, self.memory = self._state or (Robot(config), Memory())
-        """`robot` is the robot that replays the steps. `memory` is the memory of the robot's guard,
-        which checks each line to the board. After a gap, `steps()` replaces both with the next
-        robot and memory in the file."""
         if self._state is not None:
             with self.state_errors():
                 adopt(self.robot, Robot(self._recorded), Robot(config))
 
     def steps(self) -> Iterator[RecordedStep]:
-        """Yield the steps that can be replayed, in order. Collect the gaps in `gaps`.
-
-        Raises `RecordingError` if no step can be replayed.
-        """
+        """Yield the steps that can be replayed. Raises `RecordingError` if there are none."""
         recording = self._recording
         replayed_ns = recording.about.mono_ns
         read, damaged = self._next, 0
@@ -300,7 +243,7 @@ class RecordedRun(_Source):
                 gap = gap or self._open_gap(replayed_ns)
                 gap.end_ns, gap.end_lost = max(gap.end_ns, now.mono_ns) + lost_ns, True
 
-    def _open_gap(self, begin_ns: int) -> Gap:
+    def _open_gap(self, begin_ns: Ns) -> Gap:
         gap = Gap(begin_ns, begin_ns)
         self.gaps.append(gap)
         return gap
@@ -317,11 +260,7 @@ class RecordedRun(_Source):
 
 
 def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
-    """Return `other` with the settings that clients changed during the recording.
-
-    `recorded` is the configuration before these changes, and `present` is the configuration after
-    them. If one of the changes is not permitted in `other`, return `other` unchanged.
-    """
+    # `other` with what clients changed from `recorded` to `present`, if all of it is permitted.
     # A robot with the configuration `other` would have refused changes that are not permitted.
     before = dict(flat(effective(recorded)))
     changes = {k: v for k, v in flat(effective(present)) if before.get(k) != v}
@@ -334,15 +273,9 @@ def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
 def replay_file(
     recording: Recording, other: Config | None = None, progress: Progress = no_progress
 ) -> ReplayResult:
-    """Replay a recording, and compare the replayed outputs with the recorded outputs.
+    """Replay a recording and compare its outputs, maybe with an `other` configuration.
 
-    Args:
-        recording: the recording to replay.
-        other: the configuration of the replay; None for the recorded configuration.
-        progress: shows the progress. It is called every `PROGRESS_STEPS` steps.
-
-    Raises:
-        RecordingError: the recording cannot be replayed.
+    Raises `RecordingError` if it cannot be replayed.
     """
     copies = EventCopies(recording)
     run = RecordedRun(recording, other, copies)
@@ -360,11 +293,7 @@ def replay_file(
 
 
 def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
-    """Replay the step in which the recorded daemon failed; return `ReplayResult.failed_step`.
-
-    `last` is the number of the step that `robot` has replayed last, or None. Call this function
-    after `recording.messages()` has yielded the last message.
-    """
+    # After the last message; `last` is the last step that `robot` has replayed.
     if recording.unfinished is None:
         return ""
     try:
@@ -385,26 +314,17 @@ def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
 
 
 class DisplayReplay(_Source):
-    """Replays every readable step of a recording, to display the recorded drive.
+    """Replays every readable step, to display the recorded drive.
 
-    In contrast to `RecordedRun`, the replay does not skip steps after a gap. After missing steps,
-    the state of the replayed robot may be wrong until the next robot state in the file.
+    It does not skip steps after a gap, so the robot may be wrong until the next recorded state.
     """
 
     def __init__(self, recording: Recording) -> None:
-        """Read the configuration and the first robot state of the recording.
-
-        If the state cannot be used, the replay begins with a new robot, and `notes` says so. Raises
-        `RecordingError` if this version of acsard cannot use the configuration.
-        """
+        # A state that cannot be used gives a note. Raises `RecordingError` for the configuration.
         super().__init__(recording)
-        self.notes: list[str] = []
-        """Notes for the user about possible differences between this replay and the recorded
-        drive."""
-        self.config = config_of(recording)
-        """Configuration at the beginning of the recording."""
-        self._in_gap = False
-        """True after missing steps, until the replay goes on with a robot state from the file."""
+        self.notes: list[str] = []  # possible differences to the recorded drive
+        self.config = config_of(recording)  # at the beginning
+        self._in_gap = False  # missing steps, until the next recorded state
         try:
             _, self._state = _first_state(recording)
             with self.state_errors():
@@ -419,11 +339,7 @@ class DisplayReplay(_Source):
             )
 
     def steps(self) -> Iterator[tuple[RecordedStep, Outputs, Robot]]:
-        """Yield a triple for each readable step: the step, its replayed outputs, and the robot.
-
-        The robot has just replayed the step. Raises `RecordingError` if the robot fails because its
-        recorded state lacks a part.
-        """
+        """Yield each readable step, its outputs, and the robot. Raises `RecordingError`."""
         number: int | None = None
         for step, saved in _steps_and_states(self._recording):
             if number is None and self._state is None and step.number > 0 and not self.notes:
@@ -443,11 +359,7 @@ class DisplayReplay(_Source):
 
 
 def _first_state(recording: Recording) -> tuple[int, State | None]:
-    """Return the robot state at the beginning of a recording, as (number of the next step, state).
-
-    Return (0, None) if the recording does not begin with a state. Raises `RecordingError` if this
-    version of acsard cannot use the state.
-    """
+    # The number of the next step and the state; (0, None) without one. Raises `RecordingError`.
     for topic, _, data in recording.messages():
         if topic == "state":
             try:
@@ -468,33 +380,21 @@ def _foreign(recording: Recording, reason: str) -> RecordingError:
 
 
 class EventCopies:
-    """Finds the first event in a recording that differs from its copy.
+    """Finds the first event in one file, not a `Series`, that differs from its copy.
 
-    The recording must be a single file, not a `Series`. A file contains each event twice: in the
-    step of the event, and as a message of the channel `events`. In the order of the file, call
-    `batch()` for each batch of steps, and `copy()` for each message of the channel `events`. Call
-    `end()` after the last message.
+    Call `batch()` and `copy()` in the order of the file, and then `end()`.
     """
 
     def __init__(self, recording: Recording) -> None:
-        self.difference = ""
-        """Text about the first event that differs from its copy; "" if all events equal their
-        copies."""
+        self.difference = ""  # about that event, or ""
         self._recording = recording
-        self._events: list[TimelineEntry] = []
-        """The events in the steps of the most recent batch."""
-        self._copies: list[TimelineEntry] = []
-        """The messages of the channel `events` since the most recent batch."""
-        self._number: int | None = None
-        """Number of the step that follows the most recent batch; None before the first batch."""
-        self._damaged = 0
-        """Value of `Recording.damaged` when the most recent batch was read."""
+        self._events: list[TimelineEntry] = []  # of the last batch
+        self._copies: list[TimelineEntry] = []  # since the last batch
+        self._number: int | None = None  # of the step after the last batch
+        self._damaged = 0  # `Recording.damaged` at the last batch
 
     def batch(self, steps: list[RecordedStep]) -> None:
-        """Process the next batch of steps.
-
-        The events of the previous batch are compared with their copies.
-        """
+        """Process the next batch of steps, and compare the previous one with its copies."""
         self._compare(last=False, follows=self._number in (None, steps[0].number))
         self._number, self._damaged = steps[-1].number + 1, self._recording.damaged
         self._events = [
@@ -505,21 +405,14 @@ class EventCopies:
         self._copies = []
 
     def copy(self, data: bytes) -> None:
-        """Process a message of the channel `events`: the copy of an event in the previous batch.
-
-        `data` is the content of the message.
-        """
+        """Process a message of the channel `events`, a copy in the previous batch."""
         try:
             self._copies.append(event_of(self._recording, data))
         except RecordingError as error:
             self._differs(str(error))
 
     def end(self) -> None:
-        """Compare the events of the last batch with their copies, and check the end record.
-
-        The summary in the end record must agree with the events. This is checked only if the file
-        is finished and undamaged.
-        """
+        """Compare the last batch, and the end record of a finished and undamaged file."""
         recording = self._recording
         self._compare(last=True)
         if self.difference or not recording.is_intact:
@@ -533,12 +426,8 @@ class EventCopies:
             )
 
     def _compare(self, last: bool, follows: bool = True) -> None:
-        """Compare the events of the most recent batch with their copies, and store a difference.
-
-        `last` is true for the last batch of the file: if the file was cut off, copies may be
-        missing. `follows` is false if steps are missing after the batch: the batch is then not
-        compared.
-        """
+        # Copies may be missing after the `last` batch of a cut file; `follows` is false before
+        # missing steps, where nothing is compared.
         recording = self._recording
         if recording.damaged > self._damaged or not follows:
             return

@@ -1,16 +1,10 @@
 """Writes MCAP chunks in small pieces, and reads the MCAP records of files that may be damaged.
 
-The header of an MCAP chunk contains the chunk's length and checksum. Most programs therefore write
-a chunk only when it is complete, so that a power cut destroys the whole chunk. The recorder instead
-writes each chunk while the chunk grows:
-
-1. First the recorder writes a header whose length field is larger than any file.
-2. Once a second it appends a zstd block with the new messages.
-3. When the chunk is complete, the recorder replaces the header with the true header.
-
-The reader does not need the length and the checksum in the header. Each zstd block contains its own
-length, and each message contains a checksum in the field for its sequence number. After a damaged
-chunk or a record whose length is wrong, the reader searches for the next complete chunk.
+A power cut destroys a chunk that is written when it is complete, as its header has its length. So
+the recorder first writes a header with a length that no file has, once a second appends a zstd
+block of messages, and at the end replaces the header. The reader needs neither length nor checksum:
+a zstd block has its own length, and a message a checksum as its sequence number. After damage it
+searches for the next complete chunk.
 """
 
 from __future__ import annotations
@@ -29,85 +23,56 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, DataEnd, Footer, Header, McapRecord, Metadata
 from zstandard import COMPRESSOBJ_FLUSH_BLOCK, ZstdCompressionParameters
 
+from acsard.core.values import Ns, WallNs
+
 # At this level, ten seconds of steps are compressed in 2 to 8 ms. The result is 13 to 16 % smaller
 # than at level 3.
+# For chunks of 256 KiB: the compressor needs 3 MB.
 ZSTD_PARAMETERS = ZstdCompressionParameters.from_level(
     9, source_size=1 << 18, write_content_size=False
 )
-"""Parameters of the zstd compressor for chunks of 256 KiB. The compressor then needs 3 MB of
-memory."""
 
-LAST_BLOCK = b"\x01\0\0"
-"""Empty zstd block with the mark of a last block. It completes a chunk that was cut off."""
+LAST_BLOCK = b"\x01\0\0"  # empty last zstd block, which completes a chunk that was cut off
 
-MAX_CHUNK_BYTES = 1 << 23
-"""Largest uncompressed size of a chunk that is read, bytes. Recorders write at most 1 MiB plus one
-message."""
+MAX_CHUNK_BYTES = 1 << 23  # uncompressed, read at most; recorders write 1 MiB plus one message
 
-MAX_MESSAGE_BYTES = 1 << 22
-"""Largest size of a message that is read, bytes. A message with one second of steps and 20 commands
-has 16 000 bytes."""
+MAX_MESSAGE_BYTES = 1 << 22  # read at most; one second of steps and 20 commands has 16 000
 
+# Chunk header: opcode, length, first and last time, uncompressed size and CRC-32, length and name
+# of the compression, compressed size.
 _HEAD = struct.Struct("<BQQQQII4sQ")
-"""Layout of the header of an MCAP chunk record.
 
-The fields are: opcode, length of the record, earliest time of a message, latest time of a message,
-size of the uncompressed data, CRC-32 of the uncompressed data, length of the compression's name,
-name of the compression, and size of the compressed data.
-"""
+_AFTER_LENGTH = _HEAD.size - 9  # counted in the record's length
 
-_AFTER_LENGTH = _HEAD.size - 9
-"""Number of bytes in a chunk's header after the field "length of the record". The value of that
-field includes these bytes."""
+_NAME_AT = 37  # offset of `ZSTD_NAME_FIELD` in a chunk's header
 
-_NAME_AT = 37
-"""Offset of the bytes `ZSTD_NAME_FIELD` from the beginning of a chunk's header, bytes."""
+ZSTD_NAME_FIELD = struct.pack("<I4s", 4, b"zstd")  # length and name of the compression
 
-ZSTD_NAME_FIELD = struct.pack("<I4s", 4, b"zstd")
-"""Bytes that every chunk's header contains: the length of the compression's name, and the name."""
+_ENDLESS = (1 << 63) - 1  # lengths in the header of a growing chunk
 
-_ENDLESS = (1 << 63) - 1
-"""Value of the length fields in the header of a growing chunk. No file is that long."""
-
+# Message header: opcode, length, channel, sequence number (here a checksum), log time, publish
+# time.
 _MESSAGE = struct.Struct("<BQHIQQ")
-"""Layout of the header of an MCAP message record.
-
-The fields are: opcode, length of the record, channel, sequence number, log time and publish time.
-In a recording, the sequence number is a checksum, and the two times are equal.
-"""
 
 MAX_DATA_BYTES = MAX_MESSAGE_BYTES - _MESSAGE.size
-"""Largest size of the data of a message that is read, bytes."""
 
-_CHECKED = struct.Struct("<HQ")
-"""Layout of a message's channel and time, which the checksum covers together with the data."""
+_CHECKED = struct.Struct("<HQ")  # channel and time, which the checksum covers too
 
-_BESIDE_DATA = _MESSAGE.size - 9
-"""Number of bytes in a message's header after the field "length of the record". The value of that
-field includes these bytes."""
+_BESIDE_DATA = _MESSAGE.size - 9  # counted in the record's length
 
-_LONGEST_FRAME_HEAD = 18
-"""Largest size of the header of a zstd frame, bytes."""
+_LONGEST_FRAME_HEAD = 18  # of a zstd frame
 
-_BLOCK_BYTES = 1 << 17
-"""Largest size of a zstd block, compressed or uncompressed, bytes."""
+_BLOCK_BYTES = 1 << 17  # of a zstd block
 
+# Bytes of work for each zstd block: even an empty one takes as long as 1 KiB.
 _BLOCK_EFFORT = 1 << 10
-"""Work that the reader counts for each zstd block in addition to the data of the block, in unpacked
-bytes. Even an empty block takes about as long to read as 1 KiB of data."""
 
-_REPEATED = 1
-"""Type number of a zstd block that repeats one byte. Such a block stores the byte only once, and
-its size field contains the number of repetitions."""
+_REPEATED = 1  # type of a zstd block that repeats one byte
 
 
 class Message(NamedTuple):
-    """A message of a recording, as an MCAP chunk contains it."""
-
-    channel: int
-    """Number of the MCAP channel."""
-    wall_ns: int
-    """Wall-clock time of the message, ns since 1970, at least 0."""
+    channel: int  # number of the MCAP channel
+    wall_ns: WallNs  # at least 0
     data: bytes
 
 
@@ -115,7 +80,7 @@ def _crc(message: Message) -> int:
     return zlib.crc32(message.data, zlib.crc32(_CHECKED.pack(message.channel, message.wall_ns)))
 
 
-def _head(first_ns: int, last_ns: int, size: int, crc: int, length: int) -> bytes:
+def _head(first_ns: Ns, last_ns: Ns, size: int, crc: int, length: int) -> bytes:
     whole = length if length == _ENDLESS else length + _AFTER_LENGTH
     return _HEAD.pack(Opcode.CHUNK, whole, first_ns, last_ns, size, crc, 4, b"zstd", length)
 
@@ -124,22 +89,20 @@ GROWING_HEAD = _head(0, 0, 0, 0, _ENDLESS)
 
 
 class GrowingChunk:
-    """A chunk that is being written. It compresses messages to bytes that the caller writes."""
+    """A chunk that is being written: it compresses messages to bytes that the caller writes."""
 
     def __init__(self) -> None:
         self._compressor = zstandard.ZstdCompressor(
             compression_params=ZSTD_PARAMETERS
         ).compressobj()
-        self.size = 0
-        """Uncompressed size of the messages so far, in bytes."""
+        self.size = 0  # uncompressed
         self._crc = self._length = 0
-        self.first_ns, self._last_ns = _ENDLESS, 0
-        """Earliest and latest wall-clock time of the messages so far, ns since 1970."""
+        self.first_ns, self._last_ns = _ENDLESS, 0  # of the messages so far
         self._out: list[bytes] = []
 
     @property
     def has_unwritten(self) -> bool:
-        """True if a message was added since the last call of `take`."""
+        """Whether a message was added since the last `take`."""
         return bool(self._out)
 
     def add(self, message: Message) -> None:
@@ -153,16 +116,12 @@ class GrowingChunk:
         self._out += [self._compressor.compress(head), self._compressor.compress(data)]
 
     def take(self) -> bytes:
-        """Return the compressed bytes of the messages that were added since the last call."""
+        """Return the compressed messages since the last call."""
         self._out.append(self._compressor.flush(COMPRESSOBJ_FLUSH_BLOCK))
         return self._take_output()
 
     def end(self) -> tuple[bytes, bytes]:
-        """End the chunk, and return a pair: the last bytes of the chunk, and its true header.
-
-        The caller appends the last bytes to the file, and replaces the header at the beginning of
-        the chunk with the true header.
-        """
+        """End the chunk; return its last bytes, and the header that replaces the first one."""
         self._out.append(self._compressor.flush())
         last = self._take_output()
         return last, _head(self.first_ns, self._last_ns, self.size, self._crc, self._length)
@@ -175,25 +134,14 @@ class GrowingChunk:
 
 
 class ReadChunk(NamedTuple):
-    """The readable part of a chunk."""
-
-    begin: int
-    """Offset in the file at which the chunk's header begins, bytes."""
-    end: int
-    """Offset in the file at which the readable part ends, bytes. The last zstd block of the
-    readable part ends with a complete message."""
+    begin: int  # offset of its header
+    end: int  # offset of the end of its last block that ends with a complete message
     messages: list[Message]
-    complete: bool
-    """True if the readable part includes the last zstd block of the chunk."""
-    effort: int = 0
-    """Work of reading the chunk: number of unpacked bytes, plus `_BLOCK_EFFORT` for each block."""
+    complete: bool  # with the last zstd block
+    effort: int = 0  # unpacked bytes, plus `_BLOCK_EFFORT` for each block
 
     def head(self, data: bytes) -> bytes:
-        """Return a new chunk header that describes only the readable part of the chunk.
-
-        `data` is the content of the whole file. If `complete` is false, the caller must also write
-        `LAST_BLOCK` at the offset `self.end`. The sizes in the header then include this block.
-        """
+        """Return a header for the readable part; `LAST_BLOCK` completes one that is cut."""
         times = [message.wall_ns for message in self.messages]
         blocks = _blocks(data[: self.end], self.begin + _HEAD.size)
         out = b"".join([out for _, out, _ in blocks])
@@ -204,10 +152,7 @@ class ReadChunk(NamedTuple):
 
 
 def chunk_places(data: bytes, begin: int) -> Iterator[int]:
-    """Yield each offset in a file at which a chunk's header may begin, in increasing order.
-
-    `data` is the content of the whole file. The offsets are at least `begin`.
-    """
+    """Yield the offsets in a file, from `begin` on, at which a chunk's header may begin."""
     at = data.find(ZSTD_NAME_FIELD, begin + _NAME_AT)
     while at >= 0:
         yield at - _NAME_AT
@@ -215,10 +160,7 @@ def chunk_places(data: bytes, begin: int) -> Iterator[int]:
 
 
 def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
-    """Read the chunk whose header begins at the offset `begin`, as far as it is readable.
-
-    Return None if no chunk begins at this offset. `data` is the content of the whole file.
-    """
+    """Read the chunk at this offset of a file as far as possible, or return None."""
     at = begin + _HEAD.size
     named = data.startswith(ZSTD_NAME_FIELD, begin + _NAME_AT)
     if at > len(data) or not (named or data[begin] == Opcode.CHUNK):
@@ -253,10 +195,7 @@ def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
 
 
 def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield (end offset in the file, data, is last) for each block of the zstd frame at `at`.
-
-    Raises `ZstdError` for a damaged block.
-    """
+    # End offset, data, and whether it is the last. Raises `ZstdError`.
     begin = at + zstandard.frame_header_size(data[at : at + _LONGEST_FRAME_HEAD])
     unpacker = zstandard.ZstdDecompressor(max_window_size=1 << ZSTD_PARAMETERS.window_log)
     stream = unpacker.decompressobj()
@@ -275,13 +214,8 @@ def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
 
 
 def _messages(data: bytearray) -> tuple[list[Message], int, int]:
-    """Decode the complete messages at the beginning of `data`.
-
-    Returns:
-        A triple: the messages, their total size in bytes, and the size of the next message in
-        bytes. If the header of the next message is incomplete, the third value is the size of a
-        header. If the next message is damaged, the third value exceeds `MAX_MESSAGE_BYTES`.
-    """
+    # The messages, their size, and that of the next one: of its header if that is incomplete, and
+    # above `MAX_MESSAGE_BYTES` if it is damaged.
     messages: list[Message] = []
     at = 0
     while at + _MESSAGE.size <= len(data):
@@ -299,23 +233,22 @@ def _messages(data: bytearray) -> tuple[list[Message], int, int]:
     return messages, at, _MESSAGE.size
 
 
+# Raised by the decoders for damaged bytes.
 DAMAGE_ERRORS = (
     McapError, msgspec.MsgspecError, zstandard.ZstdError, struct.error,
     ValueError, OverflowError, EOFError, MemoryError,
 )  # fmt: skip
-"""Exceptions that the decoders raise if the bytes of a file are damaged."""
 
 MAGIC = b"\x89MCAP0\r\n"
 
 # In the test recordings, each byte of a chunk unpacks to 5 to 13 bytes. The limit is larger,
 # because a damaged chunk is read up to three times, and a damaged block counts as 128 KiB.
+# Unpacked bytes of damaged chunks for each byte of the file, plus `MAX_CHUNK_BYTES`.
 MAX_EFFORT = 256
-"""Limit on the work for damaged chunks, in unpacked bytes for each byte of the file. The reader may
-unpack `MAX_CHUNK_BYTES` in addition."""
 
-RECORD_HEAD = struct.Struct("<BQ")
-"""Layout of the header of an MCAP record: opcode, and number of bytes that follow the header."""
+RECORD_HEAD = struct.Struct("<BQ")  # opcode, and bytes that follow
 
+# Decoders by opcode; `read_chunk` decodes chunks.
 READ_RECORDS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.ATTACHMENT: Attachment.read,
     Opcode.DATA_END: DataEnd.read,
@@ -323,11 +256,8 @@ READ_RECORDS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.HEADER: Header.read,
     Opcode.METADATA: Metadata.read,
 }
-"""Decoder of each kind of MCAP record that the reader decodes, by opcode. Chunks are an exception:
-the function `read_chunk` decodes them."""
 
 SKIPPED_RECORDS = frozenset(Opcode) - READ_RECORDS.keys() - {Opcode.CHUNK}
-"""Opcodes of the MCAP records that the reader skips."""
 
 
 def encoded(*records: McapRecord) -> bytes:
@@ -341,15 +271,9 @@ class FileItem(NamedTuple):
     """A record, a chunk or a damaged place of a file."""
 
     record: McapRecord | None
-    """The decoded record; None for a chunk and for a damaged place."""
     chunk: ReadChunk | None
-    """The readable part of a complete or damaged chunk; None if this is not a chunk."""
-    end: int
-    """Offset in the file at which the record, chunk or damaged place ends, bytes. The next item
-    begins at this offset."""
-    damaged: bool = False
-    """True for a damaged place. The incomplete end of a file that was cut off does not count as
-    damaged."""
+    end: int  # offset of the next item
+    damaged: bool = False  # not the incomplete end of a file that was cut off
 
     @property
     def messages(self) -> list[Message]:
@@ -357,10 +281,9 @@ class FileItem(NamedTuple):
 
 
 def walk(data: bytes) -> Iterator[FileItem]:
-    """Yield the records, chunks and damaged places of a file in order, up to the MCAP footer.
+    """Yield the items of a file in order, up to the MCAP footer or its end.
 
-    A file without a footer is read to its end. If the work for damaged chunks exceeds `MAX_EFFORT`,
-    the rest of the file counts as one damaged place. `data` is the content of the file.
+    Beyond `MAX_EFFORT` for damaged chunks, the rest is one damaged place.
     """
     at, stream, chunks = len(MAGIC), io.BytesIO(data), _Chunks(data)
     # If the first bytes of a finished file are damaged, its last bytes still identify it.
@@ -395,11 +318,7 @@ def walk(data: bytes) -> Iterator[FileItem]:
 def _decode_record(
     stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int
 ) -> FileItem | None:
-    """Decode the record at the offset `at`, or return None if it is damaged or cut off.
-
-    `claimed` is the offset at which the record ends according to its length field. `size` is the
-    size of the file, bytes.
-    """
+    # `claimed` is its end by its length field.
     read = READ_RECORDS.get(opcode)
     if read is None:
         return None
@@ -415,11 +334,7 @@ def _decode_record(
 
 
 def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
-    """Return whether the checksum of an attachment is correct.
-
-    An attachment with the checksum 0 has no checksum, so the result is True. `at` and `end` are the
-    offsets at which the attachment begins and ends.
-    """
+    # A checksum of 0 is none.
     stream.seek(at)
     record = stream.read(end - at)
     crc = int.from_bytes(record[-4:], "little")
@@ -427,23 +342,16 @@ def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
 
 
 class _Chunks:
-    """Reads chunks, and finds the next complete chunk.
-
-    The work for incomplete chunks is limited, because a forged file may contain thousands of them.
-    """
-
+    # The work for incomplete chunks is limited, because a forged file may have thousands.
     # In a hostile file thousands of incomplete chunks may share the same blocks, and each chunk
     # unpacks to megabytes. So the limit on the work is proportional to the file's size, and no part
     # of the file is searched twice.
 
     def __init__(self, data: bytes) -> None:
         self._data = data
-        self._effort = MAX_CHUNK_BYTES + MAX_EFFORT * len(data)
-        """Work that may still be spent on incomplete chunks, in unpacked bytes."""
-        self._searched = 0
-        """Offset up to which the file was searched for complete chunks, bytes."""
-        self._last_complete: int | None = None
-        """Offset of the complete chunk that the last search found, bytes, or None."""
+        self._effort = MAX_CHUNK_BYTES + MAX_EFFORT * len(data)  # left for incomplete chunks
+        self._searched = 0  # up to this offset
+        self._last_complete: int | None = None  # found by the last search
 
     @property
     def spent(self) -> bool:
@@ -456,7 +364,7 @@ class _Chunks:
         return chunk
 
     def later(self, begin: int) -> int | None:
-        """Return the offset of the next complete chunk. `begin` must not decrease between calls."""
+        """Return the offset of the next complete chunk; `begin` must not decrease."""
         if self._last_complete is not None and self._last_complete >= begin:
             return self._last_complete
         self._last_complete = None

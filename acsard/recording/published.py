@@ -1,9 +1,8 @@
 """Rebuilds the messages that a robot published, while its recording is replayed.
 
-The daemon's class `Report` builds the messages as if a client had subscribed to every topic for the
-whole time. A recording does not contain the daemon's measurements of itself, so these values are
-omitted from `state` and `diagnostics`. The messages on `log` are the entries of `timeline.py`. The
-robot did not publish some of these entries, such as `drive` and `reason`.
+`Report` builds them as if a client had subscribed to everything. `state` and `diagnostics` lack the
+daemon's measurements of itself, which are not recorded. Messages on `log` are the entries of
+`timeline.py`, some of which the robot did not publish.
 """
 
 from __future__ import annotations
@@ -19,64 +18,46 @@ from acsard.core.robot import Robot
 from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG_CHANNEL, Channel, published_channels
 from acsard.core.ros.shapes import LEVELS, Log, command_message
 from acsard.core.ros.transports import left_out
-from acsard.core.values import NS_PER_S, Command, Instant, Outputs
+from acsard.core.values import NS_PER_S, Command, Instant, Outputs, WallNs
 from acsard.recording.recorded_steps import RecordedStep
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
 
+# Rows of `diagnostics` that are not recorded.
 MEASURED_ROWS = frozenset({"acsard: control loop", "acsard: certificate"})
-"""Names of the rows that are omitted from `diagnostics`, because a recording does not contain their
-values."""
 
 
-MAX_ROUNDING_NS = 1000
-"""Upper bound of the rounding error of `TimelineEntry.seconds`, ns. The time between two steps is
-always longer."""
+MAX_ROUNDING_NS = 1000  # of `TimelineEntry.seconds`; two steps are always further apart
 
 
 class Published(NamedTuple):
-    """A message that a robot published, or a command that it received, with the time."""
+    """A message that a robot published, or a command that it received."""
 
     channel: Channel
-    source: str
-    """Command source of a received command; "" for a published message."""
-    wall_ns: int
-    """Wall-clock time at which the message was published or the command arrived, ns since 1970."""
+    source: str  # of a received command
+    wall_ns: WallNs
     message: Any
 
 
 class Publisher:
-    """Rebuilds the messages of a replayed robot, step by step."""
-
-    def __init__(self, robot: Robot, started_ns: int) -> None:
-        """Prepare for the first step.
-
-        Args:
-            robot: the robot that replays the steps, before its first step.
-            started_ns: wall-clock time of the daemon's start, ns since 1970. This time becomes the
-                stamp of the messages that never change.
-        """
-        self.robot = robot
-        """The robot that replays the steps. If the replay goes on with another robot, the caller
-        must assign the new robot to this attribute."""
+    def __init__(self, robot: Robot, started_ns: WallNs) -> None:
+        # `started_ns`, the daemon's start, is the stamp of messages that never change.
+        self.robot = robot  # replays the steps; assign another one if the replay goes on with it
         self._config = robot.config
         self._report = Report(robot.config, Instant(0, started_ns))
         self._wanted = self._wanted_keys()
         self._timeline = TimelineWriter(robot.config)
         self._now = Instant(0, started_ns)
         self._static: TFMessage | None = None
-        self._static_due = True
-        """True if the message `tf_static` must be built: at the first step, and after a change of a
-        setting."""
+        self._static_due = True  # at the first step, and after a change of a setting
 
     def _wanted_keys(self) -> frozenset[str]:
         names = {channel.native for channel in published_channels(left_out(self._config))}
         return frozenset(names & BY_KEY.keys())
 
     def step(self, step: RecordedStep, outputs: Outputs) -> Iterator[Published]:
-        """Yield the messages of a step that was just replayed.
+        """Yield the messages of a step that was just replayed: commands first, the log last.
 
-        The received commands come first, and the log lines come last. `outputs` are the replayed
-        outputs. Call this method or `skip` for each step, in order.
+        Call this method or `skip` for each step, in order.
         """
         # A step that changes a setting gives the robot a new configuration.
         if self.robot.config is not self._config:
@@ -99,15 +80,12 @@ class Publisher:
         yield from self.skip(step)
 
     def skip(self, step: RecordedStep) -> Iterator[Published]:
-        """Yield only the log lines of a step. The step need not have been replayed."""
+        """Yield only the log of a step, which need not have been replayed."""
         self._now = step.inputs.now
         yield from map(self._line, self._timeline.step(step))
 
     def end(self, ending: str = "") -> Iterator[Published]:
-        """Yield the log lines after the last step.
-
-        `ending` says how the recording was cut off, or is "" if the daemon ended normally.
-        """
+        """Yield the log after the last step; `ending` says how the recording was cut off."""
         yield from map(self._line, self._timeline.end(ending))
 
     def _line(self, entry: TimelineEntry) -> Published:

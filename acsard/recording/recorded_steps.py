@@ -1,7 +1,7 @@
 """One control step as a recording stores it: all inputs, and the outputs that are worth comparing.
 
-Poses from odometry are rounded to um and urad. A checksum of the exact values lets a replay detect
-differences that are smaller than this rounding. `rows.py` encodes batches of steps.
+Poses are rounded to um and urad, and a checksum of the exact values shows smaller differences.
+`rows.py` encodes batches of steps.
 """
 
 from __future__ import annotations
@@ -30,48 +30,31 @@ from acsard.host.errors import MSGSPEC_ERRORS
 
 US_PER_S = 1e6
 
-Status = tuple[str, str, str, str]
-"""Tuple: the robot's mode, the reason of this mode in words, the state of the link to the board,
-and the name of the source that commands the robot ("" without a source)."""
+Status = tuple[str, str, str, str]  # mode, its reason, link, and source that commands
 
-Micropose = tuple[int, int, int]
-"""Pose as integers: x and y in um, yaw in urad."""
+Micropose = tuple[int, int, int]  # x and y in um, yaw in urad
 
 _DOUBLES = struct.Struct("<9d")
 
 
 class FinishedStep(NamedTuple):
-    """A finished step, as the control loop passes it to the recorder."""
-
     inputs: Inputs
     outputs: Outputs
-    sent: bytes | None
-    """Line that the daemon wrote to the serial port, or None if it wrote no line."""
+    sent: bytes | None  # line on the serial port
 
 
 class StateBeforeStep(NamedTuple):
-    """The robot's state before the step `number`, as the control loop passes it to the recorder.
-
-    The recorder begins a new file with this state, or adds the state to the present file as a
-    checkpoint.
-    """
+    """The state before the step `number`, for a new file or a checkpoint."""
 
     number: int
-    state: bytes
-    """The state of the robot and of its guard, encoded by `state.freeze`; empty for a new robot."""
-    config: Config
-    """Configuration before the step `number`, with all changes since the daemon's start."""
+    state: bytes  # `state.freeze`; empty for a new robot
+    config: Config  # with all changes since the daemon's start
 
 
 def split_at_states(
     items: list[FinishedStep | StateBeforeStep],
 ) -> Iterator[tuple[StateBeforeStep | None, list[FinishedStep]]]:
-    """Split the items of the recorder's queue at each `StateBeforeStep`.
-
-    Yields pairs of a `StateBeforeStep` and the list of the steps that follow it. The first pair
-    contains None, and the steps before the first `StateBeforeStep`. These steps continue the steps
-    that were taken from the queue earlier.
-    """
+    """Split the recorder's queue into each state (first None) and the steps that follow it."""
     start: StateBeforeStep | None = None
     steps: list[FinishedStep] = []
     for item in items:
@@ -87,22 +70,15 @@ class StepRecorder(Protocol):
     """Interface through which the control loop uses the recorder. No method waits for the disk."""
 
     def begins(self, robot: Robot, guard: Guard) -> None:
-        """Record the state of the robot and of its guard before the first step."""
+        """Record the state before the first step."""
 
     def step(
         self, inputs: Inputs, outputs: Outputs, sent: bytes | None, robot: Robot, guard: Guard
     ) -> None:
-        """Record a finished step.
-
-        `sent` is the line that was written to the serial port, or None. `robot` and `guard` are in
-        their state after the step.
-        """
+        """Record a finished step, with the line on the serial port and the state after it."""
 
     def died(self, inputs: Inputs) -> None:
-        """Record the inputs of the step in which the daemon failed.
-
-        Call this method once, after the failure and before the daemon ends.
-        """
+        """Record, once, the inputs of the step in which the daemon failed."""
 
     @property
     def status(self) -> Recording:
@@ -110,63 +86,42 @@ class StepRecorder(Protocol):
 
 
 class RecordedOutputs(Struct, frozen=True):
-    """The part of a step's outputs that a recording stores."""
-
-    line: bytes | None
-    """Line to the board that the robot decided to send, or None."""
-    sent: bytes | None
-    """Line that the daemon wrote to the serial port, or None."""
+    line: bytes | None  # that the robot decided to send
+    sent: bytes | None  # on the serial port
     status: Status
-    poses: tuple[Micropose, ...]
-    """One pose for each feedback line of the board that odometry accepted in this step."""
+    poses: tuple[Micropose, ...]  # for each line that odometry accepted
     events: tuple[Event, ...] = ()
+    # Of all steps of a batch, in its last step (`checksum`, `input_names`)
     checksum: int | None = None
-    """CRC-32 of the exact poses, twists and wheel angles of all steps in a batch (see the function
-    `checksum`). Only the last step of a batch has this value. It is None in all other steps."""
+    # Of all steps of a batch, in its last step (`checksum`, `input_names`)
     names: int | None = None
-    """CRC-32 of the names in the inputs of all steps in a batch (see the function `input_names`).
-    Only the last step of a batch has this value. It is None in all other steps, and in files of
-    older versions."""
 
 
 class RecordedStep(Struct, frozen=True):
-    """A step that was read from a recording."""
-
-    number: int
-    """Number of the step. It counts the steps since the daemon's start, from 0."""
+    number: int  # from 0 at the daemon's start
     inputs: Inputs
     recorded: RecordedOutputs
-    begins: bool = False
-    """True for the first step of a batch. The checksums of the exact values and of the names
-    restart from 0 at this step."""
+    begins: bool = False  # first of a batch: the checksums restart at 0
 
     @property
     def places(self) -> bool:
-        """Whether a request sets the pose. It takes effect after the poses of this step."""
+        """Whether a request sets the pose, after the poses of this step."""
         verbs = [request.verb for request in self.inputs.requests]
         return "set_pose" in verbs or "reset_odometry" in verbs
 
 
 class UnfinishedError(AcsardError):
-    """The recorded inputs of the step in which the daemon failed cannot be decoded.
-
-    A recording stores these inputs in a message of its own, on the channel `unfinished`, because
-    the daemon did not finish this control step.
-    """
+    """The inputs of the step in which the daemon failed cannot be decoded."""
 
 
 class Unfinished(Struct, frozen=True):
-    """Inputs of the control step in which the daemon failed.
+    """Inputs of the step in which the daemon failed, for the channel `unfinished`."""
 
-    The outputs are missing, because the daemon did not finish this step.
-    """
-
-    number: int
-    """Number of the step. It counts the steps since the daemon's start, from 0."""
+    number: int  # from 0 at the daemon's start
     inputs: Inputs
 
     def encode(self) -> bytes:
-        """Return the content of a message on the channel `unfinished`, in MessagePack."""
+        """Return the message, in MessagePack."""
         # The encoding contains the field names, because a later version may add fields.
         return msgspec.msgpack.encode(self)
 
@@ -175,10 +130,7 @@ _unfinished = msgspec.msgpack.Decoder(Unfinished)
 
 
 def unfinished(data: bytes) -> Unfinished:
-    """Decode a message of the channel `unfinished`: the step in which the daemon failed.
-
-    Raises `UnfinishedError` if the bytes are damaged.
-    """
+    """Decode a message of the channel `unfinished`. Raises `UnfinishedError`."""
     try:
         return _unfinished.decode(data)
     except MSGSPEC_ERRORS as error:
@@ -188,14 +140,7 @@ def unfinished(data: bytes) -> Unfinished:
 
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:
-    """Return the CRC-32 of the estimates in a batch of steps, up to and including this step.
-
-    It covers all bits of the poses, of the twists and of the angles by which the wheels turned.
-
-    Args:
-        estimates: the estimates of this step.
-        before: the CRC-32 of the earlier steps of the batch; 0 for the first step.
-    """
+    """Return the CRC-32 of all bits of a batch's poses, twists and angles, up to this step."""
     for e in estimates:
         pose, twist = e.pose, e.twist
         data = _DOUBLES.pack(pose.x, pose.y, pose.yaw, twist.linear, twist.angular, *e.positions)
@@ -204,14 +149,7 @@ def checksum(estimates: Sequence[Estimate], before: int) -> int:
 
 
 def input_names(inputs: Inputs, before: int) -> int:
-    """Return the CRC-32 of the names in a batch of steps, up to and including this step.
-
-    It covers the names of sources, senders and clients in the inputs.
-
-    Args:
-        inputs: the inputs of this step.
-        before: the CRC-32 of the earlier steps of the batch; 0 for the first step.
-    """
+    """Return the CRC-32 of the names of sources, senders and clients up to this step."""
     names = [
         *[name for command in inputs.commands for name in (command.source, command.sender)],
         *[request.by for request in inputs.requests],
@@ -224,10 +162,7 @@ def input_names(inputs: Inputs, before: int) -> int:
 
 
 def count_superseded(commands: Sequence[Command]) -> int:
-    """Return the number of commands that are followed by a newer command of the same sender.
-
-    `commands` are the commands of one step, in order.
-    """
+    """Return the number of commands of a step before a newer one of the same sender."""
     return len(commands) - len({(command.source, command.sender) for command in commands})
 
 

@@ -1,9 +1,7 @@
 """The black box of a running daemon: records each step without delaying the control loop.
 
-The control loop puts each step into a bounded queue. Once a second a thread writes the queued steps
-to a file, and syncs the file to the disk. If the queue is full, further steps are lost and counted.
-The recording then goes on in a new file that begins with the robot's state, so that the new file
-can be replayed.
+Once a second a thread writes the queued steps to a file and syncs it. If the queue is full, steps
+are lost and counted, and the recording goes on in a new file with the robot's state.
 """
 
 from __future__ import annotations
@@ -17,79 +15,50 @@ from acsard.core.config.settings import Config
 from acsard.core.formatting import many
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
-from acsard.core.values import NS_PER_S, Event, Inputs, Outputs, Recording
+from acsard.core.values import NS_PER_S, Event, Inputs, Ns, Outputs, Recording, WallNs
 from acsard.recording.recorded_steps import FinishedStep, StateBeforeStep, StepRecorder, Unfinished
 from acsard.recording.state import MAX_ERROR_LENGTH, freeze
 from acsard.recording.step_writer import Bug, StepWriter
 
-MAX_QUEUED_STEPS = 4096
-"""Largest number of queued steps. At 400 steps a second, the queue is full after 10 s."""
+MAX_QUEUED_STEPS = 4096  # 10 s at 400 steps a second
 
-SLOW_SYNC_NS = 3 * NS_PER_S
-"""If a sync of the file to the disk takes longer than this time, ns, the log reports that the disk
-hangs."""
+SLOW_SYNC_NS = 3 * NS_PER_S  # of a sync, after which the log reports that the disk hangs
 
 SLOW_DISK = "the disk has accepted no data for 3 s"
 
-SYNC_PAUSE_S = 0.98
-"""Pause between two syncs of the file to the disk, s. The pause and one sync together take about a
-second."""
+SYNC_PAUSE_S = 0.98  # between two syncs: with one, about a second
 
+# Text for the log and `state`.
 ENDED = (
     "the recorder has ended because of an internal error, which is in the log: restart the daemon "
     "to record again"
 )
-"""Text for the log and for `state` after an internal error has ended the recorder's thread."""
 
+# In `close()`: for the last steps and the end of the file, then for a marker.
 CLOSE_S, MARK_S = 0.5, 0.1
-"""Time limits in `Recorder.close()`, s. `CLOSE_S` applies to writing the last steps and the end of
-the file. If the disk is too slow for that, `MARK_S` applies to writing a marker file."""
 
 
 class Recorder(StepRecorder):
-    """The black box of a running daemon.
-
-    The control loop calls `step`, which never waits for the disk. A thread writes the steps to the
-    disk.
-    """
+    """The black box of a running daemon."""
 
     def __init__(
-        self, config: Config, report: Callable[[Event], None], started_ns: int = 0
+        self, config: Config, report: Callable[[Event], None], started_ns: WallNs = 0
     ) -> None:
-        """Start the thread that writes to the disk.
-
-        Args:
-            config: the configuration at the daemon's start.
-            report: receives events about the recorder itself. Only `step()` calls this function, so
-                the function runs in the thread of the control loop.
-            started_ns: wall-clock time of the daemon's start, ns since 1970. An export uses this
-                time as the stamp of the messages that never change.
-        """
+        # `report` runs in the thread of the control loop. An export stamps messages that never
+        # change with `started_ns`, the daemon's start.
         self._queue: deque[FinishedStep | StateBeforeStep] = deque()
         self._report = report
-        self._events: deque[Event] = deque()
-        """Events from the recorder's thread. Each call of `step` passes one event to `report`."""
-        self._number = 0
-        """Number of the next step. It counts the steps since the daemon's start."""
-        self._lost = 0
-        """Number of steps that were lost because the queue was full."""
-        self._full = False
-        """True after the queue was full, until half of the queue is free again."""
-        self._sync_ns = 0
-        """Duration of the running sync of the file, as of the last call of `step`, ns. It is 0 if
-        no sync runs."""
-        self._slow = False
-        """True from the event that reports a slow disk to the event that reports a fast disk."""
-        self._lost_before = 0
-        """Value of `_lost` when `_slow` became true."""
-        self._failed_inputs: Inputs | None = None
-        """Inputs of the step in which the daemon failed, or None."""
+        self._events: deque[Event] = deque()  # of the thread; each `step` reports one
+        self._number = 0  # of the next step
+        self._lost = 0  # for a full queue
+        self._full = False  # until half of the queue is free again
+        self._sync_ns = 0  # running sync at the last `step`, or 0
+        self._slow = False  # a slow disk was reported
+        self._lost_before = 0  # `_lost` at that time
+        self._failed_inputs: Inputs | None = None  # of the step in which the daemon failed
+        # For a new file or a checkpoint. The thread sets it, and `step` after a full queue; `step`
+        # clears it.
         self._wants_state = False
-        """True if the control loop must queue the robot's state for a new file or a checkpoint.
-
-        The recorder's thread sets this flag, and also `step` after the queue was full. When `step`
-        queues the state, it clears the flag.
-        """
         self._writer = StepWriter(config, self._events.append, self._request_state, started_ns)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._work, name="record", daemon=True)
@@ -98,11 +67,7 @@ class Recorder(StepRecorder):
     # These methods run in the control loop's thread.
 
     def begins(self, robot: Robot, guard: Guard) -> None:
-        """Record the state of the robot and of its guard before the first step.
-
-        This call may be omitted. A replay of the first file then begins with a new robot and a new
-        guard.
-        """
+        # Without this call, a replay begins with a new robot and guard.
         self._queue.append(StateBeforeStep(0, freeze(robot, guard.memory), robot.config))
 
     def step(
@@ -135,8 +100,7 @@ class Recorder(StepRecorder):
             self._wants_state = False
             queue.append(StateBeforeStep(self._number, freeze(robot, guard.memory), robot.config))
 
-    def _watch_disk(self, now_ns: int) -> None:
-        """Report when the disk begins to hang, and when it is fast enough again."""
+    def _watch_disk(self, now_ns: Ns) -> None:
         timer = self._writer.sync_timer
         ended, last_ns = timer.ended, self._sync_ns
         self._sync_ns = timer.wait_ns(now_ns)
@@ -158,7 +122,7 @@ class Recorder(StepRecorder):
             self._slow, self._lost_before = True, self._lost
 
     def died(self, inputs: Inputs) -> None:
-        """Store the inputs of the step in which the daemon failed, so that `close` records them."""
+        # Recorded by `close`.
         self._failed_inputs = inputs
 
     @property
@@ -171,15 +135,10 @@ class Recorder(StepRecorder):
         return Recording(self._writer.where, trouble, self._lost + self._writer.lost)
 
     def close(self, error: BaseException | None = None) -> None:
-        """Write the last steps and the end of the file, and wait at most `CLOSE_S` for that.
+        """Write the last steps and the end of the file within `CLOSE_S`.
 
-        If the disk is slower, and the daemon has not failed, also try for at most `MARK_S` to
-        create a marker file. The file tells the next start of the daemon that the disk was slow.
-
-        Args:
-            error: the exception that ends the daemon. An `Exception` is a failure of the daemon.
-                None, or any other exception such as `KeyboardInterrupt`, is an ordinary end. In an
-                exception group, the first exception counts.
+        If the disk is slower and the daemon has not failed, create a marker within `MARK_S`. Only
+        an `Exception` (the first of a group) is a failure.
         """
         while isinstance(error, BaseExceptionGroup):
             error = error.exceptions[0]

@@ -1,9 +1,8 @@
 """Finishes a recording that was cut off, so that the file has an end record.
 
-The readable data is copied to a new file. If the disk has no room for a copy, the end record is
-written to the old file instead. Recovery deletes no readable data. If this version cannot read a
-file, or if the disk has no room even for the end record, the file is only renamed, and its content
-stays unchanged.
+The readable data goes to a new file, or, on a full disk, the end record into the old one. No
+readable data is deleted. A file that this version cannot read, or without room for the end record,
+is only renamed.
 """
 
 from __future__ import annotations
@@ -24,36 +23,14 @@ from acsard.recording.mcap_records import LAST_BLOCK, MAGIC, chunk_places, encod
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
-MAX_DELETED_BYTES = 64 << 10
-"""Recovery deletes a file without readable data only if the file has at most this size, bytes.
-
-A larger file contains more than a header and one second of steps.
-"""
+MAX_DELETED_BYTES = 64 << 10  # a larger file has more than a header and one second of steps
 
 
 def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
-    """Finish a recording that was cut off, and give it its final name.
+    """Finish `part` as `whole`, and return a message for the log, or "".
 
-    Usually this function writes a finished copy at `whole` and deletes `part`. If the disk has no
-    room for a copy, it finishes `part` in place and renames it to `whole`. There are three
-    exceptions:
-
-    - A small file without any data is deleted.
-    - Any other file that this version cannot read is renamed to `whole`, with unchanged content.
-    - If the disk has no room even for the end record, `part` is renamed to `whole`, with unchanged
-      content.
-
-    Args:
-        part: path of the file that was cut off.
-        whole: path of the finished file.
-        cut: the cause that cut off the file, a key of `CUT_TEXTS`.
-        room: true if the disk has room for a copy.
-
-    Returns:
-        A message for the log, or "" if there is nothing to report.
-
-    Raises:
-        OSError: the disk refuses to read or write.
+    `cut` is a key of `CUT_TEXTS`, and `room` says that a copy fits. A small file without data is
+    deleted. Raises `OSError`.
     """
     before, message = part.stat(), ""
     try:
@@ -97,18 +74,12 @@ def _has_configuration(part: Path) -> bool:
 
 
 def _has_chunks(part: Path) -> bool:
-    """Return whether the file has the header of a chunk, even if the chunk is unreadable.
-
-    Such a file is not deleted, because another version may be able to read its data.
-    """
+    # Another version may be able to read its data.
     return any(True for _ in chunk_places(part.read_bytes(), 0))
 
 
 def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
-    """Copy the readable data to `whole`, delete `part`, and return True.
-
-    If the disk is full, keep `part` and return False.
-    """
+    # False: the disk is full, and `part` stays.
     written = part.with_name(f".{part.name}.new")
     written.unlink(missing_ok=True)
     try:
@@ -123,12 +94,8 @@ def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
 
 
 def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
-    """Finish the file `part` without a copy, and return True.
-
-    The end record and the MCAP footer overwrite the incomplete data at the end of the file. Chunks
-    that were being written get their true headers. If the disk has no room for the end record,
-    leave the file unchanged, and return False.
-    """
+    # End record and footer overwrite the incomplete end, and growing chunks get true headers.
+    # False: no room for the end record, and nothing changes.
     # Readable data is not removed to make room, because on some disks this does not help.
     builder = EndRecordBuilder(recording.about)
     for topic, wall_ns, data in recording.messages():
@@ -157,12 +124,8 @@ def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
 
 
 def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
-    """Return the data to write to a file in order to finish it, and the size of the finished file.
-
-    The data is a list of pairs (offset in the file, bytes). `before` is the present content of the
-    file, and `last` is its future end record. If an earlier recovery has already written the end
-    record and the footer, the list contains only chunk headers.
-    """
+    # Pairs of offset and bytes, and the finished size. An earlier recovery may have left only chunk
+    # headers to write.
     # The first write is the end of the file, because the disk may have no room for the end.
     heads: list[tuple[int, bytes]] = []
     chunk, index = None, Index()
@@ -197,7 +160,7 @@ def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], in
 
 
 def _write_at(stream: FileIO, at: int, data: bytes) -> None:
-    """Write `data` at the offset `at`, and sync the file. An `OSError` may leave a part written."""
+    # An `OSError` may leave a part written.
     stream.seek(at)
     while data:
         data = data[stream.write(data) :]

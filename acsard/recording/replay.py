@@ -1,8 +1,7 @@
 """Replays steps: runs `Robot.step` with the recorded inputs, and compares the outputs.
 
-A robot's behavior depends only on its inputs and its configuration. So the same code with the same
-configuration reproduces every line to the board, every mode and every pose. If the code or the
-configuration has changed, the differences show how the changed robot would have behaved.
+Behavior depends only on inputs and configuration, so the same ones give every line, mode and pose
+again. With changed code or configuration, the differences show what would have been.
 """
 
 from __future__ import annotations
@@ -31,6 +30,8 @@ from acsard.recording.recorded_steps import (
     status_of,
 )
 
+# "sent line" is after the guard, "event" all but text and client. "input names" are compared at the
+# end of a batch.
 Output = Literal[
     "line",
     "sent line",
@@ -44,94 +45,55 @@ Output = Literal[
     "event text",
     "input names",
 ]
-"""Name of an output whose recorded and replayed values are compared.
 
-- line: The line to the board that the robot decided to send.
-- sent line: The line that was sent after the guard had checked it.
-- event: All properties of an event except its text and its client.
-- client: The name of the client that caused an event.
-- input names: The names in the inputs of a step. One checksum covers all steps of a batch, so a
-  difference is reported at the last step of the batch.
-"""
-
+# Texts for people, which another version may word differently.
 TEXT_OUTPUTS: frozenset[Output] = frozenset({"reason", "event text"})
-"""Outputs that are text for people. Another version of acsard may word such a text differently."""
 
 
 class Difference(Struct, frozen=True):
-    """A step whose replayed outputs differ from the recorded outputs."""
-
-    number: int
-    """Number of the step. It counts the steps since the daemon's start."""
+    number: int  # from 0 at the daemon's start
     at: Instant
     what: tuple[Output, ...]
-    """Names of the outputs that differ."""
     recorded: RecordedOutputs
     replayed: RecordedOutputs
-    trip: str
-    """Why the guard, which checks each line to the board, replaced the replayed line with zeros; ""
-    if the guard did not replace it."""
+    trip: str  # why the guard replaced the line with zeros
 
 
 class Comparison(Struct):
-    """Result of a replay so far.
-
-    It contains the number of outputs that were compared, the number of outputs that are equal, and
-    the first differences.
-    """
+    """The result of a replay so far."""
 
     steps: int = 0
-    lines: int = 0
-    """Number of steps in which the recorded robot, the replayed robot or both decided to send a
-    line."""
+    lines: int = 0  # steps in which the recorded robot, the replayed one, or both sent a line
     lines_same: int = 0
     poses: int = 0
-    """Number of recorded poses."""
     poses_same: int = 0
     modes_same: int = 0
     reasons_same: int = 0
     links_same: int = 0
     sources_same: int = 0
-    events: int = 0
-    """Number of compared events. If a step has different numbers of recorded and replayed events,
-    the larger number counts."""
+    events: int = 0  # the larger number of each step
     events_same: int = 0
-    exact: bool = True
-    """True if all poses, twists and wheel angles so far are equal to the last bit. They are
-    compared by checksums."""
-    first: Difference | None = None
-    """First step in which any output differs, or None."""
+    exact: bool = True  # all poses, twists and wheel angles are equal to the last bit
+    first: Difference | None = None  # with any difference
     first_by_output: dict[Output, Difference] = {}
-    """First step in which an output differs, by the name of the output."""
-    fault: Difference | None = None
-    """First step in which the replayed robot is in the mode `fault` and the recorded robot is not,
-    or None."""
-    max_distance_m: float = 0.0
-    """Largest distance so far between the recorded and the replayed position, m."""
-    max_wheel_speeds: tuple[int, int] = (0, 0)
-    """Pair: the highest wheel speed in the recorded lines, and the highest wheel speed in the
-    replayed lines, both in 0.01 rad/s."""
-    end: tuple[Micropose, Micropose] | None = None
-    """Pair: the last recorded pose, and the pose of the replayed robot after the step with this
-    recorded pose. None before the first recorded pose."""
+    fault: Difference | None = None  # only the replayed robot is in the mode `fault`
+    max_distance_m: float = 0.0  # between positions
+    max_wheel_speeds: tuple[int, int] = (0, 0)  # recorded and replayed, 0.01 rad/s
+    end: tuple[Micropose, Micropose] | None = None  # last recorded pose, and the replayed one
 
     @property
     def same(self) -> bool:
-        """True if every compared output is equal. Poses are first rounded to um and urad."""
+        """Whether every output is equal, poses in um and urad."""
         return self.first is None
 
     @property
     def only_words(self) -> bool:
-        """True if outputs differ, but all differences are in the texts of reasons and events."""
+        """Whether only texts of reasons and events differ."""
         return not self.same and self.first_by_output.keys() <= TEXT_OUTPUTS
 
 
 def replay_step(robot: Robot, step: RecordedStep) -> Outputs:
-    """Run `robot.step` with the inputs of a recorded step, and return the new outputs.
-
-    Also update the robot's counters `lines_sent`, `lines_superseded` and `commands_superseded`,
-    which the daemon's control loop updates while it records.
-    """
+    """Run `robot.step` with recorded inputs; update counters that the control loop updates."""
     recorded, inputs = step.recorded, step.inputs
     if superseded := count_superseded(inputs.commands):
         robot.counters["commands_superseded"] += superseded
@@ -144,33 +106,21 @@ def replay_step(robot: Robot, step: RecordedStep) -> Outputs:
 
 
 class Replay:
-    """A robot that replays a recording step by step."""
-
     def __init__(self, robot: Robot, memory: Memory | None = None) -> None:
-        """Prepare for the first step. `resume` describes the arguments."""
-        self.outputs: Outputs | None = None
-        """Outputs of the last replayed step; None before the first step."""
+        self.outputs: Outputs | None = None  # of the last step
         self.comparison = Comparison()
         self.resume(robot, memory)
         self._checksum = self._names = 0
         self._pose: Micropose = (0, 0, 0)
 
     def resume(self, robot: Robot, memory: Memory | None) -> None:
-        """Replay the next steps with `robot`, for example after missing steps.
-
-        `memory` is the memory of this robot's guard, which checks each line to the board. It is
-        None for a new guard.
-        """
+        """Go on with another robot, for example after missing steps, and its guard's memory."""
         self.robot = robot
         self._config = robot.config
         self._guard = Guard(robot.session.codec.stop, robot.config, memory)
 
     def step(self, step: RecordedStep) -> Difference | None:
-        """Replay a step, and update `outputs` and `comparison`.
-
-        Returns the difference between the recorded and the replayed outputs, or None if these
-        outputs are equal. The steps must come in order.
-        """
+        """Replay the next step; return how it differs, or None."""
         if step.begins:
             self._checksum = self._names = 0
         outputs = self.outputs = replay_step(self.robot, step)
@@ -272,10 +222,7 @@ def _different_parts(
 
 @lru_cache(64)
 def max_wheel_speed(line: bytes | None) -> int:
-    """Return the highest absolute wheel speed in a line to the board, in 0.01 rad/s.
-
-    Returns 0 without a line.
-    """
+    """Return the highest wheel speed in a line, in 0.01 rad/s; 0 without a line."""
     if line is None:
         return 0
     tokens = [line[start + 2 : start + 7].replace(b".", b"") for start in (0, 8, 16, 24)]

@@ -9,20 +9,19 @@ from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import show
 from acsard.core.formatting import listed, many, printable
-from acsard.core.values import NS_PER_S, Event
+from acsard.core.values import NS_PER_S, Event, Ns
 from acsard.recording.file_replay import Gap
 from acsard.recording.recorded_steps import US_PER_S, RecordedOutputs
 from acsard.recording.replay import Comparison, Difference, max_wheel_speed
 
+# Settings that affect the speeds in the lines to the board.
 LINE_SETTINGS = ("limits.", "drive.", "mcu.wheels.")
-"""Prefixes of the names of the settings that affect the speeds in the lines to the board."""
 
-MAX_KEYS = 8
-"""Largest number of changed settings that are named in one line of text."""
+MAX_KEYS = 8  # changed settings in a line of text
 
 
 def verdict(comparison: Comparison) -> str:
-    """Return one line of text: how many replayed outputs of each kind equal the recorded ones."""
+    """Return a line of text: how many outputs of each kind are equal."""
     c = comparison
     shares = (
         ("poses", c.poses_same, c.poses),
@@ -43,10 +42,7 @@ def _share(same: int, total: int) -> str:
 
 
 def explain_verdict(other: bool) -> str:
-    """Return a paragraph that explains the numbers in the text of `verdict()`.
-
-    `other` is true if the replay used another configuration than the recorded configuration.
-    """
+    """Return a paragraph on the numbers of `verdict()`, maybe with an `other` configuration."""
     computed = "with the other configuration" if other else "with this version of acsard"
     return (
         "(The replay computes new outputs "
@@ -58,10 +54,7 @@ def explain_verdict(other: bool) -> str:
 
 
 def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
-    """Return a text with the duration of the gaps and the number of steps in them.
-
-    The text begins with `how`, for example "not compared". It is "" if `gaps` is empty.
-    """
+    """Return a text with the duration of the gaps and their steps, which begins with `how`."""
     if not gaps:
         return ""
     seconds = sum(gap.end_ns - gap.begin_ns for gap in gaps) / NS_PER_S
@@ -81,13 +74,8 @@ def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
     return f"{how}: {seconds:.1f} s in {many(len(gaps), 'damaged place')}{because}"
 
 
-def describe_difference(difference: Difference, began_ns: int) -> list[str]:
-    """Return lines of text with the recorded and the replayed outputs of a step.
-
-    Args:
-        difference: the first step whose recorded and replayed outputs differ.
-        began_ns: the monotonic time at which the recording began, ns.
-    """
+def describe_difference(difference: Difference, began_ns: Ns) -> list[str]:
+    """Return lines with the recorded and the replayed outputs of a step."""
     what = ", ".join(difference.what)
     return [
         f"the first difference is in step {difference.number}, "
@@ -99,7 +87,7 @@ def describe_difference(difference: Difference, began_ns: int) -> list[str]:
     ]
 
 
-def _seconds(difference: Difference, began_ns: int) -> float:
+def _seconds(difference: Difference, began_ns: Ns) -> float:
     return (difference.at.mono_ns - began_ns) / NS_PER_S
 
 
@@ -125,18 +113,12 @@ def _event(event: Event) -> str:
 
 
 def explain_settings(
-    recorded: Config, other: Config, comparison: Comparison, began_ns: int
+    recorded: Config, other: Config, comparison: Comparison, began_ns: Ns
 ) -> list[str]:
-    """Return lines of text about the effects of changed settings in a replay.
+    """Return lines about the effects of changed settings.
 
-    The text names the changed settings, the first line to the board that differs from the recorded
-    line, and the first fault that only the replayed robot has.
-
-    Args:
-        recorded: the recorded configuration.
-        other: the configuration that the replay used instead.
-        comparison: the result of the replay.
-        began_ns: the monotonic time at which the recording began, ns.
+    They name the settings, the first line to the board that differs, and the first fault that only
+    the replayed robot has.
     """
     before, after = (dict(flat(effective(config))) for config in (recorded, other))
     keys = [key for key in before | after if before.get(key) != after.get(key)]
@@ -172,16 +154,12 @@ def _value(key: str, settings: Mapping[str, object]) -> str:
 
 
 def _speeds(recorded: int, replayed: int) -> str:
-    """Return a text with two wheel speeds in rad/s. The arguments are in 0.01 rad/s."""
+    # In rad/s, of 0.01 rad/s.
     return f"{recorded / 100:.2f} rad/s recorded, {replayed / 100:.2f} rad/s replayed"
 
 
 def describe_outcome(comparison: Comparison) -> list[str]:
-    """Return lines of text that compare the motion of the recorded and the replayed robot.
-
-    The text says how many lines to the board differ. It also contains the highest wheel speeds and
-    the last poses of both robots, and the largest distance between their paths.
-    """
+    """Return lines that compare the motion: lines to the board, wheel speeds, poses, distance."""
     rows = [
         f"{comparison.lines - comparison.lines_same} of {comparison.lines} lines to the board "
         f"differ from the recorded ones, and {comparison.steps - comparison.modes_same} of "

@@ -1,10 +1,8 @@
 """Encodes steps as rows, in batches of about one second, and decodes them.
 
-A row is one step. Its times and poses are stored as differences from earlier times and poses.
-Similar steps therefore give equal bytes, which compress well. Each batch can be decoded without the
-other batches. A file may be forged, so `decode` refuses a batch with values that no daemon records.
-
-If you change a struct of this module, change `FORMAT` as well.
+Times and poses are differences from earlier ones, so similar steps give equal bytes, which compress
+well. Each batch is decoded alone. A forged one with values that no daemon records is refused. If
+you change a struct of this module, change `FORMAT` as well.
 """
 
 from __future__ import annotations
@@ -24,6 +22,7 @@ from acsard.core.values import (
     GyroSample,
     Inputs,
     Instant,
+    Ns,
     Received,
     Refusal,
     Request,
@@ -41,26 +40,15 @@ from acsard.recording.recorded_steps import (
     status_of,
 )
 
-FORMAT = "3"
-"""Version of the encoding of the messages in a recording."""
+FORMAT = "3"  # of the messages in a recording
 
-MAX_ROWS = 4096
-"""Largest number of rows in a batch that `decode` accepts. The recorder's queue contains at most
-this number of steps."""
+MAX_ROWS = 4096  # like the recorder's queue
 
+# 73 years: the age of a read, and `late_ns`; a monotonic time has twice as much.
 MAX_TIME_NS = 1 << 61
-"""Limit on two durations in a recorded step, ns: the age of a serial read, and
-`OccasionalFields.late_ns`.
 
-It is 73 years. The limit on a monotonic time is twice as large.
-"""
-
+# Wall clock minus monotonic clock, reached in 2116; its sum with a time fits in 64 bits.
 MAX_OFFSET_NS = 1 << 62
-"""Limit on the offset of the wall clock from the monotonic clock, ns.
-
-The limit ensures that the sum of this offset and a monotonic time fits in 64 bits. A correct wall
-clock reaches the limit in the year 2116.
-"""
 
 
 class BatchError(AcsardError):
@@ -68,14 +56,11 @@ class BatchError(AcsardError):
 
 
 class OccasionalFields(Struct, frozen=True, omit_defaults=True):
-    """The part of a row with the inputs and outputs that are absent or unchanged in most steps."""
+    """Inputs and outputs that are absent or unchanged in most steps."""
 
-    opened: int | None = None
-    """`Inputs.opened`; None if it is the same as in the previous row of the batch."""
-    trouble: str | None = None
-    """`Inputs.port_trouble`; None if it is the same as in the previous row of the batch."""
-    status: Status | None = None
-    """Status of the robot; None if it is the same as in the previous row of the batch."""
+    opened: int | None = None  # None: as in the previous row
+    trouble: str | None = None  # None: as in the previous row
+    status: Status | None = None  # None: as in the previous row
     missed: int = 0
     late_ns: Annotated[int, Meta(ge=0, le=MAX_TIME_NS)] = 0
     guard_trip: str = ""
@@ -92,61 +77,40 @@ NO_OCCASIONAL_FIELDS = OccasionalFields()
 
 
 class Read(NamedTuple):
-    """The bytes of one read from the serial port, and the time of this read."""
+    """The bytes of one read from the serial port; times in `Batch.unit`."""
 
-    age: int
-    """Time from the read to the step that processes the bytes, in units of `Batch.unit`."""
-    offset: int
-    """Change of the wall clock against the monotonic clock, from the first step of the batch to the
-    read, in units of `Batch.unit`."""
+    age: int  # from the read to its step
+    offset: int  # of wall clock minus monotonic clock, since the first step of the batch
     data: bytes
 
 
 class Row(Struct, frozen=True, array_like=True):
-    """One step as a recording stores it."""
+    """One step as a recording stores it; times in `Batch.unit`."""
 
     tick: bool
     port_open: bool
     at_once: bool
     shutting_down: bool
     superseded: bool
-    now: int
-    """Monotonic time of the step, as the time since the last earlier row with a true `tick`. If the
-    batch has no such row, it is the time since `Batch.mono_ns`. The unit is `Batch.unit`."""
-    offset: int
-    """Change of the wall clock against the monotonic clock, from the first step of the batch to
-    this step, in units of `Batch.unit`."""
+    now: int  # since the last earlier row with a true `tick`, or `Batch.mono_ns`
+    offset: int  # of wall clock minus monotonic clock, since the first step of the batch
     reads: tuple[Read, ...]
-    line: bytes | None
-    """Line to the board that the robot decided to send, or None."""
-    sent: bytes | bool
-    """True if the daemon sent `line`, and False if it sent no line. If the daemon sent another line
-    than `line`, these are the bytes that it sent."""
+    line: bytes | None  # that the robot decided to send
+    sent: bytes | bool  # True: `line`; False: none; otherwise another line
+    # Um and urad, each after the first as the difference from the one before.
     poses: tuple[Micropose, ...]
-    """Poses in um and urad. Each pose is stored as its difference from the previous pose of the
-    batch. The first pose of the batch is stored unchanged."""
-    rare: OccasionalFields | None
-    """Further inputs and outputs; None if all of them are absent or unchanged."""
+    rare: OccasionalFields | None  # None: all absent or unchanged
 
 
 class Batch(Struct, frozen=True, array_like=True):
-    """A batch of successive steps, as a recording stores it."""
-
-    first: int
-    """Number of the first step of the batch. It counts the steps since the daemon's start."""
-    mono_ns: int
-    """Monotonic time of the first step, ns."""
-    offset_ns: int
-    """Wall-clock time minus monotonic time at the first step, ns."""
+    first: int  # number, from 0 at the daemon's start
+    mono_ns: Ns
+    offset_ns: Ns  # wall clock minus monotonic clock
+    # ns: greatest common divisor of the times, 1000 or more if the clocks count in us.
     unit: Annotated[int, Meta(ge=1)]
-    """Unit of the times in `rows`, ns: the greatest common divisor of these times. It is at least
-    1000 if the clocks count in us."""
     rows: Annotated[tuple[Row, ...], Meta(min_length=1, max_length=MAX_ROWS)]
-    checksum: int
-    """CRC-32 of the exact poses, twists and wheel angles of all steps in the batch."""
-    names: int | None = None
-    """CRC-32 of the names in the inputs of all steps in the batch; None in a file of an older
-    version."""
+    checksum: int  # of exact poses, twists and wheel angles
+    names: int | None = None  # CRC-32 of the names in the inputs; None in older files
 
 
 class _First(Struct, frozen=True, array_like=True):
@@ -161,12 +125,7 @@ _decoder_of_first = msgspec.msgpack.Decoder(_First)
 
 
 def encode(first: int, steps: Sequence[FinishedStep]) -> bytes:
-    """Encode successive steps as a batch.
-
-    Args:
-        first: the number of the first step. It counts the steps since the daemon's start.
-        steps: 1 to `MAX_ROWS` steps.
-    """
+    """Encode 1 to `MAX_ROWS` successive steps as a batch."""
     start = steps[0].inputs.now
     offset_ns = start.wall_ns - start.mono_ns
     times = list(_times(steps, start.mono_ns, offset_ns))
@@ -203,12 +162,8 @@ def encode(first: int, steps: Sequence[FinishedStep]) -> bytes:
     return msgspec.msgpack.encode(batch)
 
 
-def _times(steps: Sequence[FinishedStep], mono_ns: int, offset_ns: int) -> Iterator[list[int]]:
-    """Yield one list of times for each step, ns.
-
-    The list begins with the values of `Row.now` and `Row.offset`. For each read of the step, the
-    list then contains two values: the time from the read to the step, and the offset of the read.
-    """
+def _times(steps: Sequence[FinishedStep], mono_ns: Ns, offset_ns: Ns) -> Iterator[list[int]]:
+    # For each step, ns: `Row.now`, `Row.offset`, and for each read its age and offset.
     tick_ns = mono_ns
     for inputs, _, _ in steps:
         now = inputs.now
@@ -249,10 +204,7 @@ def _rares(steps: Sequence[FinishedStep]) -> Iterator[OccasionalFields]:
 
 
 def decode(data: bytes) -> list[RecordedStep]:
-    """Return the steps of an encoded batch.
-
-    Raises `BatchError` if the bytes are damaged, or if they contain values that no daemon records.
-    """
+    """Return the steps of a batch. Raises `BatchError`."""
     try:
         return list(_steps(_decoder.decode(data)))
     except (msgspec.DecodeError, ValueError) as error:
@@ -260,7 +212,7 @@ def decode(data: bytes) -> list[RecordedStep]:
 
 
 def first_of(data: bytes) -> int | None:
-    """Return the number of the first step of an encoded batch, or None if the bytes are damaged."""
+    """Return the number of the first step of a batch, or None if it is damaged."""
     try:
         return _decoder_of_first.decode(data).number
     except msgspec.MsgspecError:
@@ -331,12 +283,8 @@ def _sent_line(row: Row) -> bytes | None:
     return None if row.sent is False else row.sent
 
 
-def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
-    """Return the monotonic time `mono_ns` together with the wall-clock time of the same moment.
-
-    `offset` is the `Row.offset` or `Read.offset` that gives the difference between the two times.
-    Raises `ValueError` if a time is out of range.
-    """
+def _instant(batch: Batch, mono_ns: Ns, offset: int) -> Instant:
+    # Raises `ValueError` if a time is out of range.
     ahead_ns = batch.offset_ns + offset * batch.unit
     if abs(mono_ns) >= 2 * MAX_TIME_NS or abs(ahead_ns) >= MAX_OFFSET_NS:
         raise ValueError("a time is out of range")
@@ -344,10 +292,7 @@ def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
 
 
 def _require_finite(rare: OccasionalFields) -> None:
-    """Raise `ValueError` if a pose in a request, a speed limit or a gyro sample is not finite.
-
-    The robot itself checks the numbers in commands.
-    """
+    # Raises `ValueError`. The robot itself checks the numbers in commands.
     for request in rare.requests:
         pose = request.pose
         if pose is not None and not all(map(math.isfinite, (pose.x, pose.y, pose.yaw))):

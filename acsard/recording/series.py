@@ -1,8 +1,7 @@
 """Finds the recordings of a range of time, and reads successive files as one recording.
 
-The daemon splits the recording of one run into several files. The last step of a file and the first
-step of the next file have consecutive numbers. Such files are read as one `Series`, so that a drive
-or a replay can continue from one file to the next.
+The daemon splits the recording of one run into files. If their step numbers follow each other, they
+are one `Series`, so that a drive or a replay goes on from file to file.
 """
 
 from __future__ import annotations
@@ -21,42 +20,22 @@ from acsard.recording.end_record import read_end
 from acsard.recording.file import Recording, Topic
 from acsard.recording.time_span import Contents, Span, clock, part_between, read_contents
 
+# Tolerance of a search by the times of end records: the last message may have many seconds of steps
+# if the disk is slow. Also the longest time between two files of a series.
 TIME_TOLERANCE_S = 60.0
-"""Tolerance of a search, s.
 
-- A file is read if the times in its end record are at most this far from the searched range. The
-  tolerance is needed because the end record has the time of the first step in the last message. If
-  the disk is slow, this message may contain many seconds of steps.
-- In a series, the first step of a file comes less than this time after the last step of the
-  previous file.
-"""
-
-MIN_GAP_S = 2.0
-"""A time without a recording counts as a gap if it is longer than this, s."""
+MIN_GAP_S = 2.0  # without a recording
 
 
 class Series(Recording):
-    """Successive files of one run of the daemon, read as one recording.
-
-    No step is missing between the files.
-    """
+    """Successive files of one run of the daemon without a missing step, read as one recording."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        """Read the first file. The other files are read by `messages()`.
-
-        `paths` are the paths of the files in order. Raises `RecordingError` if the first file is
-        not a readable recording.
-        """
+        # Reads only the first file. Raises `RecordingError`.
         super().__init__(_present(paths[0]))
         self.paths = list(paths)
 
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
-        """Yield the triple (topic, wall-clock time in ns since 1970, data) of each message.
-
-        The files are read one after the other, in their order. After the last message, `damaged`
-        is the number of damaged places in all files. `ended`, `cut`, `why` and `unfinished`
-        describe the last file. Raises `RecordingError` if a file is not a readable recording.
-        """
         self.damaged, self.ended, self.cut, self.why = 0, False, "", ""
         self.unfinished = None
         for path in self.paths:
@@ -71,58 +50,34 @@ class Series(Recording):
 
 
 class FoundRecording(NamedTuple):
-    """A recording with steps in the searched range of time."""
-
     recording: Recording
-    part: Span
-    """Part of the recording that is in the searched range."""
+    part: Span  # in the searched range
 
 
 class Search(Struct):
-    """Result of a search: the recordings in a range of time, and the gaps between them."""
+    """The result of a search."""
 
-    found: list[FoundRecording] = field(default_factory=list)
-    """The recordings that have steps in the range, the oldest first."""
-    unreadable: list[str] = field(default_factory=list)
-    """A sentence for each file that cannot be read."""
+    found: list[FoundRecording] = field(default_factory=list)  # the oldest first
+    unreadable: list[str] = field(default_factory=list)  # a sentence for each such file
+    # Parts of the range over `MIN_GAP_S` without a recording, s since 1970.
     gaps: list[tuple[float, float]] = field(default_factory=list)
-    """Pairs: the beginning and the end of each part of the range without a recording, s since 1970.
-
-    Parts of at most `MIN_GAP_S` are left out.
-    """
 
 
 class NothingRecordedError(AcsardError):
-    """No recording has a step in the searched range of time.
-
-    The text of this error names the nearest recordings before and after the range.
-    """
+    """No recording has a step in the range; the text names the nearest ones."""
 
 
 class _CoveredRange(NamedTuple):
-    """A range of time for which a file contains steps."""
-
-    begin: float
-    """Wall-clock time, s since 1970."""
-    end: float
-    """Wall-clock time, s since 1970."""
+    begin: float  # s since 1970
+    end: float  # s since 1970
     path: Path
 
 
 def search(files: Sequence[Path], first: float, last: float, tell: Callable[[int], None]) -> Search:
-    """Find the recordings that have steps in a range of time.
+    """Find the recordings that have steps in a range of time, s since 1970.
 
-    Successive files without a missing step between them are joined into a `Series`. If a file
-    begins during a drive, its series also includes the files with the earlier part of this drive.
-
-    Args:
-        files: paths of the files to search, the oldest first.
-        first: beginning of the range, s since 1970; -inf for no limit.
-        last: end of the range, s since 1970; inf for no limit.
-        tell: receives the number of files that have been searched, before each file.
-
-    Raises:
-        NothingRecordedError: no recording has a step in the range.
+    Files are joined into a `Series`, with the earlier part of a drive that a file begins in. `tell`
+    gets the number of searched files. Raises `NothingRecordedError`.
     """
     result, pieces = Search(), list[_CoveredRange]()
     chosen: dict[int, Contents] = {}
@@ -168,10 +123,7 @@ def _gaps(pieces: Sequence[_CoveredRange], first: float, last: float) -> list[tu
 
 
 def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int]]:
-    """Return a list of indices in `files` for each recording of one or more successive files.
-
-    `chosen` maps the index of each file with steps in the searched range to its contents.
-    """
+    # Indices in `files` for each recording; `chosen` has files in the range.
     groups: list[list[int]] = []
     for number, contents in sorted(chosen.items()):
         if groups and number - 1 in chosen and _continues(chosen[number - 1], contents):
@@ -182,11 +134,7 @@ def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int
 
 
 def _earlier(files: Sequence[Path], number: int, contents: Contents) -> list[int]:
-    """Return the indices of the earlier files of a drive, the oldest file first.
-
-    The file with the index `number` and the contents `contents` begins during this drive. If that
-    file does not begin during a drive, the result is empty.
-    """
+    # The earlier files of a drive in which this file begins.
     indices: list[int] = []
     while number > 0 and contents.first.recorded.status[0] == "driving":
         number -= 1
@@ -214,7 +162,7 @@ def _covered(path: Path) -> _CoveredRange:
 
 
 def _present(path: Path) -> Path:
-    """Return the present path of a recording, which the daemon may have renamed."""
+    # The daemon may have renamed it.
     if path.exists() or not path.parent.is_dir():
         return path
     return next((p for p in listed(path.parent) if stem(p) == stem(path)), path)
@@ -238,10 +186,7 @@ def _described(piece: _CoveredRange) -> str:
 
 
 def in_words(first: float, last: float) -> str:
-    """Return a text for a range of time, for example "from 2026-11-21 14:05:00".
-
-    `first` and `last` are times in s since 1970. An infinite limit does not appear in the text.
-    """
+    """Return a range, s since 1970, as "from 2026-11-21 14:05:00"; inf is left out."""
     parts = [
         f"{word} {clock(at, day=True)}"
         for word, at in (("from", first), ("to", last))

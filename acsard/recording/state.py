@@ -1,11 +1,8 @@
-"""Encodes a `Robot` between two steps as bytes, and decodes such bytes.
+"""Encodes a `Robot` between two steps as bytes, decodes it, and applies another configuration.
 
-The module also applies another configuration to a decoded robot. A recording file begins with an
-encoded robot; only the first file of a run of the daemon may begin without one. About every 20 s a
-file contains another encoded robot, so that a replay can go on after a damaged place.
-
-`freeze` uses pickle, which takes a fraction of a millisecond. `thaw` uses `unpickling.py` instead,
-because a forged file could run code through pickle.
+A recording begins with a robot (a run's first file may not), and has one about every 20 s, so that
+a replay goes on after damage. `freeze` uses pickle, which takes a fraction of a millisecond, and
+`thaw` `unpickling.py`, because a forged file could run code through pickle.
 """
 
 from __future__ import annotations
@@ -27,61 +24,49 @@ from acsard.core.robot import Robot
 from acsard.core.values import AcsardError
 from acsard.recording.unpickling import unpickle
 
+# A package ends with a dot. The classes need constructors without side effects.
 PART_MODULES = (
     "acsard.core.values", "acsard.core.robot", "acsard.core.guard", "acsard.core.config.settings",
     "acsard.core.motion.", "acsard.core.link.",
 )  # fmt: skip
-"""Names of the modules and packages whose classes may be parts of a robot. The name of a package
-ends with a dot. A class in these modules must have a constructor without side effects."""
 
+# Classes by module and name.
 OTHER_PARTS: dict[tuple[str, str], type] = {
     ("collections", "Counter"): Counter,
     ("collections", "deque"): deque,
 }
-"""Maps the pair (module name, class name) to each further class that may be a part of a robot."""
 
-PICKLE_PROTOCOL = 5
-"""Version of the pickle format that `unpickling.py` reads."""
+PICKLE_PROTOCOL = 5  # read by `unpickling.py`
 
-MAX_ERROR_LENGTH = 200
-"""Number of characters to which the text of an error is cut."""
+MAX_ERROR_LENGTH = 200  # characters of an error's text
 
 # Without this table, Python 3.11 before 3.11.4, as in Debian 12, would encode a mode as a call of
 # `getattr`, which `unpickling.py` refuses.
+# A mode becomes a call of `Mode`.
 DISPATCH_TABLE = copyreg.dispatch_table | {
     Mode: lambda mode: (Mode, (mode.value,)),
 }
-"""Dispatch table for pickle. It encodes a mode as a call of `Mode` with the mode's value."""
 
 
 class StateError(AcsardError):
-    """The recorded state of a robot is damaged, or this version of acsard cannot use this state."""
+    """The recorded state of a robot is damaged, or this version of acsard cannot use it."""
 
 
 class State(NamedTuple):
-    """The complete state of a robot between two control steps.
-
-    The state and the inputs of the following steps determine all outputs of these steps.
-    """
+    """The state of a robot between two steps, which with the inputs gives all later outputs."""
 
     robot: Robot
-    memory: Memory
-    """Memory of the guard, which checks the robot's lines to the board."""
+    memory: Memory  # of the guard
 
 
 class Checkpoint(Struct, frozen=True, array_like=True):
-    """The saved state of a robot between two control steps, and the number of the next step.
-
-    A recording contains checkpoints as messages on the channel `state`.
-    """
+    """A saved state, and the number of the step that follows it, for the channel `state`."""
 
     number: Annotated[int, Meta(ge=0)]
-    """Number of the step that follows the saved state."""
-    data: bytes
-    """The robot and the memory of its guard, encoded by `freeze`."""
+    data: bytes  # `freeze`
 
     def encode(self) -> bytes:
-        """Return the content of a message on the channel `state`, in MessagePack."""
+        """Return the message, in MessagePack."""
         return msgspec.msgpack.encode(self)
 
 
@@ -89,11 +74,7 @@ _checkpoint = msgspec.msgpack.Decoder(Checkpoint)
 
 
 def checkpoint(data: bytes) -> Checkpoint:
-    """Decode a message of the channel `state` of a recording.
-
-    The robot in the checkpoint stays encoded; `thaw` decodes it. Raises `StateError` if the message
-    is damaged.
-    """
+    """Decode a message of the channel `state`, without its robot. Raises `StateError`."""
     try:
         return _checkpoint.decode(data)
     except msgspec.MsgspecError as error:
@@ -101,10 +82,7 @@ def checkpoint(data: bytes) -> Checkpoint:
 
 
 def freeze(robot: Robot, memory: Memory) -> bytes:
-    """Encode the state of a robot, and the memory of the guard that checks its lines to the board.
-
-    `thaw` decodes the result.
-    """
+    """Encode the state of a robot and of its guard, for `thaw`."""
     written = io.BytesIO()
     pickler = pickle.Pickler(written, PICKLE_PROTOCOL)
     pickler.dispatch_table = DISPATCH_TABLE
@@ -113,10 +91,9 @@ def freeze(robot: Robot, memory: Memory) -> bytes:
 
 
 def thaw(data: bytes) -> State:
-    """Decode a robot and its guard's memory, which `freeze` has encoded. The bytes may be forged.
+    """Decode a robot and its guard's memory, from bytes that may be forged.
 
-    Raises `StateError` if the bytes are damaged or forged, or if another version of acsard encoded
-    them and this version cannot use them.
+    Raises `StateError`, also for another version that this one cannot use.
     """
     try:
         made = unpickle(data, part_class)
@@ -136,20 +113,15 @@ def _unreadable(error: Exception) -> StateError:
 
 
 def short(error: Exception) -> str:
-    """Return the text of an error without control characters.
-
-    The text has at most `MAX_ERROR_LENGTH` characters.
-    """
+    """Return the text of an error without control characters, cut to `MAX_ERROR_LENGTH`."""
     # The text may quote a forged file.
     return printable(str(error))[:MAX_ERROR_LENGTH]
 
 
 def part_class(module: str, name: str) -> type:
-    """Return the class with the name `name` in the module `module`, for `unpickle`.
+    """Return a class that may be a part of a robot, for `unpickle`; this imports nothing.
 
-    Raises `ValueError` if objects of this class cannot be parts of a robot, or if `module` does not
-    define this class. Also raises `ValueError` if `module` is not loaded, because this function
-    imports nothing.
+    Raises `ValueError`.
     """
     if (module, name) in OTHER_PARTS:
         return OTHER_PARTS[module, name]
@@ -168,34 +140,19 @@ PLAIN_TYPES = (bool, int, float, str, bytes, type(None))
 def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
     """Change the configuration of a recorded robot, in place.
 
-    The recorded run has changed an attribute if its values in `robot` and `begun` differ. Such an
-    attribute keeps its value. Every other attribute gets its value from `other`.
-
-    Args:
-        robot: the recorded robot, which is changed.
-        begun: a new robot with the recorded configuration, as `robot` was before the run.
-        other: a new robot with the new configuration. Do not use it later, because `robot` may
-            share objects with it.
+    An attribute that differs from `begun`, a new robot with the recorded configuration, keeps its
+    value. Others get that of `other`, a new robot with the new one, which must not be used later.
     """
     _Walk().into(robot, begun, other)
 
 
 class _Walk:
-    """Does the work of `adopt()`: walks through its three robots at the same time.
-
-    It visits each part of the recorded robot once, and changes it.
-    """
-
+    # Walks through the three robots of `adopt()` and changes each part of the first once.
     def __init__(self) -> None:
+        # By `id()`; the reference keeps it from being used again.
         self._visited: dict[int, Any] = {}
-        """Maps the `id()` of each visited object to the object. A reference keeps the object alive,
-        so that no other object gets the same `id()`."""
 
     def into(self, now: Any, begun: Any, other: Any) -> None:
-        """Change the attributes of the object `now` as `adopt()` describes.
-
-        `now`, `begun` and `other` are the same part of the three robots of `adopt()`.
-        """
         if id(now) in self._visited:
             return
         self._visited[id(now)] = now
@@ -211,10 +168,7 @@ class _Walk:
                 setattr(now, name, merged)
 
     def merged(self, now: Any, begun: Any, other: Any) -> Any:
-        """Return the new value of an attribute. Parts of `now` may be changed in place.
-
-        `now`, `begun` and `other` are the values of the attribute in the three robots of `adopt()`.
-        """
+        """Return the new value of an attribute; parts of `now` may change in place."""
         if type(now) is not type(other):
             return other if _same(now, begun) else now
         match now:

@@ -1,8 +1,8 @@
 """Writes recorded steps to the current file, and reacts to errors of the disk.
 
-The recorder's thread calls `StepWriter.write` about once a second. If the disk refuses to write,
-the steps of that call are lost and counted. The writer then pauses for `RETRY_ROUNDS` calls. After
-the pause, the writer begins a new file with the robot's state.
+The recorder's thread calls `write` about once a second. If the disk refuses, the steps of that call
+are lost and counted, the next `RETRY_ROUNDS` calls write nothing, and then a new file begins with
+the robot's state.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.config.toml_text import document
 from acsard.core.formatting import many
-from acsard.core.values import NS_PER_S, Event, Instant
+from acsard.core.values import NS_PER_S, Event, Instant, Ns, WallNs
 from acsard.host.version import version
 from acsard.host.wait_timer import WaitTimer
 from acsard.recording.directory import RecordingDirectory, Run, disk_has_room, mark_cut
@@ -30,116 +30,71 @@ from acsard.recording.rows import encode
 from acsard.recording.state import Checkpoint
 from acsard.recording.timeline import entry_of
 
-RETRY_ROUNDS = 5
-"""Number of calls of `StepWriter.write()` that write nothing after an error of the disk. There is
-about one call each second."""
+RETRY_ROUNDS = 5  # about 1 s each, after an error of the disk
 
-MAX_BATCH_STEPS = 256
-"""Largest number of steps in one message of the channel `steps`. If few commands arrive, all steps
-of a second fit in one message."""
+MAX_BATCH_STEPS = 256  # in a message: a second, if few commands arrive
 
 # After damage to a chunk, a replay lacks at most 20 s. The control loop needs 0.6 ms for a
 # checkpoint, after it has written its line. A checkpoint has 6 kB while the robot stands still, and
 # 13 kB while it drives.
-CHECKPOINT_NS = 18 * NS_PER_S + NS_PER_S // 2
-"""Time from one checkpoint to the request for the next checkpoint, ns. A checkpoint is a state of
-the robot in a file. A replay can begin there."""
+CHECKPOINT_NS = 18 * NS_PER_S + NS_PER_S // 2  # between checkpoints, from which a replay can begin
 
-MAX_FILE_NS = 3600 * NS_PER_S
-"""When a file covers this time, ns, the recording goes on in a new file."""
+MAX_FILE_NS = 3600 * NS_PER_S  # covered by one file
 
+# Events that retain their file, and those within a minute.
 INCIDENTS = frozenset({
     "fault", "stop", "emergency_stop", "bumper_pressed", "battery_stop", "link_down", "link_stale",
     "port_lost",
 })  # fmt: skip
-"""Names of the events that count as incidents. The file with an incident, and every file that ended
-or began within a minute of the incident, is retained longer than other files."""
 
 
 class Bug(NamedTuple):
     """An internal error that ends the daemon."""
 
-    why: str
-    """Type and text of the exception. If a control step raised the exception, the number of that
-    step comes first."""
-    at: Instant | None
-    """Time of the control step that failed; None if the daemon failed outside a step."""
-    unfinished: bytes
-    """Inputs of the control step that failed, as an encoded `Unfinished`. Empty if the daemon
-    failed outside a step, or if the inputs cannot be encoded."""
+    why: str  # the number of a failed step, and the exception
+    at: Instant | None  # of the failed step
+    unfinished: bytes  # its inputs, encoded
 
 
 class StepWriter:
-    """Writes steps to the directory of recordings, and begins a new file after a disk error."""
-
     def __init__(
         self,
         config: Config,
         report: Callable[[Event], None],
         request_state: Callable[[], None],
-        started_ns: int,
+        started_ns: WallNs,
     ) -> None:
-        """Prepare to write. The first call of `write` opens the directory and a file.
-
-        Args:
-            config: the configuration at the daemon's start.
-            report: receives each event for the log.
-            request_state: asks the control loop to queue the robot's state (`StateBeforeStep`).
-            started_ns: wall-clock time of the daemon's start, ns since 1970.
-        """
+        # `request_state` asks the control loop for a `StateBeforeStep`. The first `write` opens a
+        # file.
         self._started_ns = started_ns
         self.where = config.record.directory
-        """Directory of the recordings."""
-        self.trouble = ""
-        """The present error of the disk, in words for the user; "" if the disk accepts data."""
-        self.lost = 0
-        """Number of steps that were not written because of errors of the disk."""
-        self.sync_timer = WaitTimer()
-        """Measures the syncs of the file to the disk, for the control loop."""
-        self._lost_before = 0
-        """Value of `lost` when the present error of the disk began."""
-        self._safe_ns: int | None = None
-        """Monotonic time of the last step that is synced to the disk, ns; None before the first
-        sync."""
+        self.trouble = ""  # the present error of the disk, in words
+        self.lost = 0  # steps, for errors of the disk
+        self.sync_timer = WaitTimer()  # of the file, for the control loop
+        self._lost_before = 0  # `lost` when the present error began
+        self._safe_ns: Ns | None = None  # last step that is synced
         self._config, self._report, self._request_state = config, report, request_state
         self._directory: RecordingDirectory | None = None
         self._writing: RecordingWriter | None = None
+        # State for the next file; None: a file is open, or it must be requested.
         self._start: StateBeforeStep | None = StateBeforeStep(0, b"", config)
-        """The robot's state with which the next file begins. None if a file is open, or if the
-        state must be requested from the control loop."""
         self._incidents = IncidentWindow[Path]()
         self._number = self._began_ns = self._state_ns = 0
         self._last = Instant(0, 0)
-        self._reported = False
-        """True once this object has reported that the daemon records."""
-        self._refused = False
-        """True if the disk refused the last write although it reported free space."""
-        self._looked_back = False
-        """True once the files of the previous run are registered in `_incidents`."""
+        self._reported = False  # that the daemon records
+        self._refused = False  # although it reported free space
+        self._looked_back = False  # the previous run's files are in `_incidents`
         self._run = Run()
-        self._cut_ns: int | None = None
-        """Wall-clock time at which a crash cut off the file of the previous run, ns since 1970.
-
-        The value is None without such a crash, and after this run has begun a file.
-        """
-        self.bug: Bug | None = None
-        """The internal error that ends the daemon, or None. The last call of `write` records it."""
-        self._pause = 0
-        """Number of further calls of `write` that write nothing because of an error of the disk."""
+        # Wall-clock time of a crash of the previous run, until a file begins.
+        self._cut_ns: Ns | None = None
+        self.bug: Bug | None = None  # recorded by the last `write`
+        self._pause = 0  # calls that still write nothing
+        # Steps of this `write` that were written or lost, and that are synced or in `lost`. The
+        # others are lost if the disk refuses.
         self._handed = self._safe = 0
-        """Numbers of steps in the present call of `write`.
-
-        `_handed` counts the steps that were written to the file or lost so far. `_safe` counts only
-        the steps that are synced to the disk or already counted in `lost`. If the disk refuses to
-        write, all other steps of the call are lost.
-        """
 
     def write(self, items: list[FinishedStep | StateBeforeStep], over: bool) -> None:
-        """Write the items of the recorder's queue, and sync the file to the disk.
-
-        If the disk refuses to write, and during the pause after such an error, the steps are lost
-        and counted. `over` is true for the last call, which also finishes the file.
-        """
+        """Write the items of the recorder's queue and sync; the last call finishes the file."""
         self._handed = self._safe = 0
         try:
             if self._pause == 0 or over:
@@ -162,11 +117,9 @@ class StepWriter:
             self._request_state()
 
     def mark_cut(self, cut: Literal["late", "disk"]) -> None:
-        """Create a marker file with the reason why the current file is not finished.
+        """Create a marker of why the file is not finished ("late": too slow; "disk": full).
 
-        Without this marker, the next start of the daemon would assume a crash. `cut` is "late" if
-        the disk was too slow, or "disk" if the disk accepted no more data. Another thread may call
-        this method while `write` waits for the disk.
+        Otherwise the next start would assume a crash. Another thread may call this during `write`.
         """
         writing = self._writing
         if writing is not None:
@@ -182,16 +135,11 @@ class StepWriter:
 
     @property
     def _opened(self) -> RecordingDirectory:
-        """The directory, which `write` opens before it calls the methods that use it."""
         assert self._directory is not None
         return self._directory
 
     def _write_group(self, start: StateBeforeStep | None, steps: list[FinishedStep]) -> None:
-        """Write `steps` to the current file.
-
-        `start` is the robot's state before these steps, or None. The state begins a new file, or
-        becomes a checkpoint in the current file.
-        """
+        # The state begins a new file, or is a checkpoint.
         if start is not None and self._writing is not None and self._goes_on(start):
             self._add_checkpoint(self._writing, start, self._last)
         elif start is not None:
@@ -264,11 +212,8 @@ class StepWriter:
         self._add_checkpoint(self._writing, start, now)
 
     def _look_back(self, now: Instant) -> None:
-        """Register recent files of the previous run of the daemon in `_incidents`.
-
-        An incident at the beginning of this run then protects the recent files. An incident in one
-        of the recent files protects the first file of this run.
-        """
+        # An incident at the beginning of this run protects them, and one in them this run's first
+        # file.
         for path, kind, ended_ns in self._opened.just_ended(now):
             self._incidents.earlier(path, kind, ended_ns)
         self._looked_back = True

@@ -1,8 +1,7 @@
 """Parses times that a person types, and finds the part of a recording between two such times.
 
-A recording may cross midnight, and the wall clock may be adjusted during the recording. Therefore
-this module divides a recording where the clock was adjusted, and searches a time in each part. Such
-a part is called a `Stretch`.
+A recording may cross midnight, and the wall clock may be adjusted in it, so a time is searched in
+each `Stretch` between adjustments.
 """
 
 from __future__ import annotations
@@ -21,27 +20,23 @@ from acsard.recording.timeline import MIN_CLOCK_CHANGE_NS, clock_change_ns
 
 
 class Span(NamedTuple):
-    """A part of a recording, limited by two times in s after the recording began.
-
-    Both times are measured with the monotonic clock.
-    """
+    """A part of a recording, between two monotonic times in s after its beginning."""
 
     begin: float = -math.inf
     end: float = math.inf
 
 
 WHOLE_SPAN = Span()
-"""The part that contains the whole recording."""
 
 
 class Offset(NamedTuple):
-    """A time that a person typed as a number of seconds after the beginning of a recording."""
+    """A typed number of seconds after the beginning of a recording."""
 
     seconds: float
 
 
 class TimeOfDay(NamedTuple):
-    """A time that a person typed as a time of day without a date. It is a local time."""
+    """A typed local time of day without a date."""
 
     hours: int
     minutes: int
@@ -52,25 +47,18 @@ MIDNIGHT = TimeOfDay(0, 0, 0.0)
 
 
 class Moment(NamedTuple):
-    """A time that a person typed with a date, as "2 h ago", or as a whole day such as "today".
+    """A time with a date, as "2 h ago", or as a whole day, whose `begin` and `end` differ."""
 
-    A whole day has two different times `begin` and `end`. In the other cases both are equal.
-    """
-
-    begin: float
-    """Wall-clock time, s since 1970."""
-    end: float
-    """Wall-clock time, s since 1970."""
+    begin: float  # s since 1970
+    end: float  # s since 1970
 
 
-When = Offset | TimeOfDay | Moment
-"""A time that a person typed, after parsing."""
+When = Offset | TimeOfDay | Moment  # as typed
 
+# For messages, without the form of `Offset`.
 TIME_EXAMPLES = (
     '14:05, 14:05:30, today, "yesterday 14:05", "2026-11-21 14:05", 2026-11-21 or "2 h ago"'
 )
-"""Examples of the times that a user may type, without the form "seconds after the beginning of a
-recording". Messages to the user contain this text."""
 
 ALL_EXAMPLES = f"{TIME_EXAMPLES}; for one recording also a number of seconds after its beginning"
 
@@ -85,11 +73,7 @@ class TimeError(AcsardError):
 
 
 def parse_when(text: str, now_s: float) -> When:
-    """Parse a time that a person typed. `ALL_EXAMPLES` shows the permitted forms.
-
-    `now_s` is the present time, s since 1970. Raises `TimeError` with advice if `text` is not a
-    time.
-    """
+    """Parse a typed time (`ALL_EXAMPLES`). Raises `TimeError` with advice."""
     words = re.sub(r"(?<=\d)t(?=\d)", " ", " ".join(text.lower().split()))
     if re.fullmatch(r"\d+(\.\d+)?", words):
         return Offset(float(words))
@@ -121,11 +105,7 @@ def _time_of_day(words: str, text: str) -> TimeOfDay:
 
 
 def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
-    """Parse a typed date, such as "today" or "2026-11-21". Return (year, month, day).
-
-    If today is the first day of a month, "yesterday" gives the day 0. `_moment` treats this day as
-    the last day of the previous month.
-    """
+    # Year, month, day; "yesterday" on the first of a month is the day 0.
     if words in _DAYS_AGO:
         today = time.localtime(now_s)
         return today.tm_year, today.tm_mon, today.tm_mday - _DAYS_AGO[words]
@@ -141,7 +121,7 @@ def _date(words: str, text: str, now_s: float) -> tuple[int, int, int]:
 
 
 def _moment(date: tuple[int, int, int], when: TimeOfDay = MIDNIGHT, days: int = 0) -> float:
-    """Return a local time as s since 1970. The day 0 is the last day of the previous month."""
+    # s since 1970; the day 0 is the last one of the month before
     year, month, day = date
     whole = (year, month, day + days, when.hours, when.minutes, 0, 0, 0, -1)
     return time.mktime(whole) + when.seconds
@@ -152,22 +132,11 @@ def _unknown(text: str) -> TimeError:
 
 
 def resolve(begin: When | None, end: When | None, now_s: float) -> tuple[float, float]:
-    """Return the range of time that a person typed, as the pair (first, last), s since 1970.
+    """Return a typed range as (first, last), s since 1970, without a limit for None and `Offset`.
 
-    None and an `Offset` set no limit, so `first` is -inf or `last` is inf. A `Moment` already has a
-    date. A `TimeOfDay`, for example 14:05, gets a date as follows:
-
-    - `begin` is the most recent 14:05 before the present, and before `end` if `end` is a `Moment`.
-    - `end` is the first 14:05 after `begin`. If `begin` sets no limit, `end` is the most recent
-      14:05 before the present.
-
-    Args:
-        begin: the beginning of the range.
-        end: the end of the range.
-        now_s: the present time, s since 1970.
-
-    Raises:
-        TimeError: the range ends before it begins.
+    A `TimeOfDay` as the end is the first one after `begin`, and otherwise the most recent one
+    before the present, and before `end` if that has a date. Raises `TimeError` if the range ends
+    before it begins.
     """
     first, last = -math.inf, math.inf
     if isinstance(begin, TimeOfDay):
@@ -197,11 +166,7 @@ def _last_occurrence(when: TimeOfDay, before_s: float) -> float:
 
 
 def clock(seconds: float, day: bool = False) -> str:
-    """Return a time as text in local time. `seconds` is the time in s since 1970.
-
-    If `day` is true, the text contains the date and whole seconds, such as "2026-11-21 14:05:30".
-    Otherwise it contains milliseconds and no date, such as "14:05:30.250".
-    """
+    """Return s since 1970 as local time: "14:05:30.250", or "2026-11-21 14:05:30" with the day."""
     local = time.localtime(seconds)
     if day:
         return time.strftime("%Y-%m-%d %H:%M:%S", local)
@@ -209,26 +174,20 @@ def clock(seconds: float, day: bool = False) -> str:
 
 
 def date(seconds: float) -> str:
-    """Return the local date of a time in s since 1970 as text, such as "2026-11-21"."""
+    """Return the local date of s since 1970, such as "2026-11-21"."""
     return time.strftime("%Y-%m-%d", time.localtime(seconds))
 
 
 class Stretch(NamedTuple):
     """A part of a recording without an adjustment of the wall clock."""
 
-    at: float
-    """Start of the stretch, s after the beginning of the recording."""
-    begin: float
-    """Wall-clock time at the start of the stretch, s since 1970."""
-    end: float
-    """Wall-clock time at the end of the stretch, s since 1970."""
+    at: float  # s after the beginning of the recording
+    begin: float  # s since 1970
+    end: float  # s since 1970
 
 
 def span(recording: Recording, begin: When | None, end: When | None) -> Span:
-    """Return the part of a recording between two times that a person typed.
-
-    If `begin` or `end` is None, the part is not limited on that side.
-    """
+    """Return the part of a recording between two typed times; None is no limit."""
     by_clock = any(isinstance(when, TimeOfDay | Moment) for when in (begin, end))
     contents = read_contents(recording) if by_clock else None
     stretch_list = contents.stretches if contents else []
@@ -257,16 +216,7 @@ def _seconds(when: When, stretch_list: list[Stretch], end: bool) -> float:
 
 
 def part_between(stretch_list: list[Stretch], first: float, last: float) -> Span | None:
-    """Return the part of a recording between two wall-clock times.
-
-    If the range overlaps several stretches, the part includes all of them. Return None if the range
-    overlaps no stretch.
-
-    Args:
-        stretch_list: the stretches of the recording, in order.
-        first: beginning of the range, s since 1970.
-        last: end of the range, s since 1970.
-    """
+    """Return the part between two times, s since 1970, with all stretches that overlap, or None."""
     inside = [stretch for stretch in stretch_list if stretch.begin <= last and first <= stretch.end]
     if not inside:
         return None
@@ -287,16 +237,12 @@ class Contents(NamedTuple):
     """The stretches of a recording, and its first and last readable step."""
 
     stretches: list[Stretch]
-    """Parts of the recording without an adjustment of the wall clock, in order."""
     first: RecordedStep
     last: RecordedStep
 
 
 def read_contents(recording: Recording) -> Contents | None:
-    """Return the stretches of a recording, and its first and last readable step.
-
-    A stretch is a part without an adjustment of the wall clock. Return None if no step is readable.
-    """
+    """Return the contents of a recording, or None if no step is readable."""
     stretch_list: list[Stretch] = []
     first: RecordedStep | None = None
     last_ns, before = 0, b""

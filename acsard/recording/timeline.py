@@ -1,8 +1,8 @@
 """Describes a recording as a timeline of short texts.
 
-The timeline has an entry for each event in the daemon's log, and further entries. For example, each
-drive (a period in the mode `driving`) has an entry. `acsard recording show` and `acsard recording
-report` show the same entries, and an export writes them to the channel `log`.
+It has an entry for each event of the log and more, such as each drive (a period in the mode
+`driving`). `acsard recording show`, the report and the channel `log` of an export have the same
+ones.
 """
 
 from __future__ import annotations
@@ -22,101 +22,62 @@ from acsard.core.link.link_diagnosis import blames_host
 from acsard.core.link.session import IDENTITY
 from acsard.core.motion.arbiter_text import MAX_SENDER_LENGTH
 from acsard.core.ros.shapes import how_often
-from acsard.core.values import NS_PER_S, Command, Event, Instant
+from acsard.core.values import NS_PER_S, Command, Event, Instant, Ns, WallNs
 from acsard.recording.recorded_steps import US_PER_S, RecordedStep
 
-MAX_TIME_S = 2**63 / 1e9
-"""Largest time between 1970 and an entry of the timeline, s. It is 292 years, because a time in ns
-must fit in 64 bits."""
+MAX_TIME_S = 2**63 / 1e9  # 292 years, because a time in ns must fit in 64 bits
 
 
+# Least time between entries `reason`, `waits` or `board`: two sources that alternate would fill the
+# timeline.
 MIN_REASON_NS = NS_PER_S
-"""Shortest time between two timeline entries with the same name, ns.
 
-The limit applies to entries with the names `reason`, `waits` and `board`. Without this limit, two
-sources that alternate in every step would fill the timeline.
-"""
+MAX_POSE_WAIT_NS = NS_PER_S  # of `continues` for its first pose, which without a link does not come
 
-MAX_POSE_WAIT_NS = NS_PER_S
-"""Longest time for which the timeline entry `continues` waits for the first pose, ns. The entry
-contains this pose. Without a link to the board, poses do not arrive."""
+MIN_CLOCK_CHANGE_NS = 5 * NS_PER_S  # of the wall clock, for an entry `clock`
 
-MIN_CLOCK_CHANGE_NS = 5 * NS_PER_S
-"""Smallest change of the wall clock that gives a timeline entry `clock`, ns. The change is measured
-against the monotonic clock."""
-
+# Least time for an entry `waits`: two senders may send while an operator changes between them.
 MIN_WAIT_NS = NS_PER_S
-"""If a sender sends speeds without effect for this time, ns, it gets a timeline entry `waits`.
 
-While an operator changes from one sender to another, both senders may send, but for less than this
-time.
-"""
+MIN_SILENCE_NS = NS_PER_S  # of a waiting sender, after which its time restarts
 
-MIN_SILENCE_NS = NS_PER_S
-"""Silence of a waiting sender, ns, after which the sender's waiting time restarts at 0."""
+MAX_IDENTITY_BYTES = 256  # of the line that names a board; the reference firmware's has 150
 
-MAX_IDENTITY_BYTES = 256
-"""Largest length, bytes, of the line with which a microcontroller names itself. The line of the
-reference firmware has 150 bytes."""
+MAX_WAITING = 16  # tracked: a hostile client may use many names
 
-MAX_WAITING = 16
-"""Largest number of waiting senders that are tracked at a time. A waiting sender sends speeds while
-the robot follows another sender. The number is limited, because a hostile client may use many
-names."""
-
+# Not a digit in a name; reasons that differ only in numbers are equal.
 NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
-"""Pattern for a number in a reason, but not for a digit in a name. Reasons that differ only in
-numbers count as equal."""
 
 
-def clock_change_ns(before: Instant, after: Instant) -> int:
-    """Return by how much the wall clock was set forward between two times, ns.
-
-    The result is negative if the clock was set back.
-    """
+def clock_change_ns(before: Instant, after: Instant) -> Ns:
+    """Return by how much the wall clock was set forward between two times."""
     return after.wall_ns - after.mono_ns - before.wall_ns + before.mono_ns
 
 
 class TimelineEntry(Struct, frozen=True, omit_defaults=True):
-    """An event of the daemon's log, or another entry of a recording's timeline."""
+    """An event of the log, or another entry of a recording's timeline."""
 
-    seconds: Annotated[float, Meta(ge=-MAX_TIME_S, le=MAX_TIME_S)]
-    """Wall-clock time, s since 1970."""
+    seconds: Annotated[float, Meta(ge=-MAX_TIME_S, le=MAX_TIME_S)]  # since 1970
+    # Name of an event, or: start, continues (an earlier recording), drive (over, or under way at
+    # the end), link_late (`link_stale` by a delay of this computer), link_heard (a repetition),
+    # reason (of the same mode), waits (a sender while another one drives), board (named itself and
+    # its last reset), clock (adjusted), gap (missing steps), end (requested), cut (no ordinary
+    # end).
     name: str
-    """Name of the event, or one of the names that only the timeline uses:
-
-    - `start`: the daemon starts.
-    - `continues`: the recording continues an earlier one.
-    - `drive`: a drive has ended, or is under way as the recording ends.
-    - `link_late`: an event `link_stale` that a delay of the daemon's computer caused.
-    - `link_heard`: an event that repeats an earlier event about the same loss of the link.
-    - `reason`: the reason of the robot's mode has changed, but the mode has not.
-    - `waits`: a sender must wait while another one drives.
-    - `board`: a microcontroller has named itself and its last reset.
-    - `clock`: the wall clock was adjusted.
-    - `gap`: steps are missing.
-    - `end`: the daemon received the request to end.
-    - `cut`: the recording has no ordinary end.
-    """
     text: str
     level: str = "info"
-    by: str = ""
-    """The client that caused the event, or the sources that commanded the drive; "" if unknown."""
-    count: int = 1
-    """Number of equal events that the log combined into this entry."""
+    by: str = ""  # client of the event, or sources of the drive
+    count: int = 1  # equal events in this entry
 
     @property
     def sentence(self) -> str:
-        """The text, the client and the number of events, combined as in a line of the log."""
+        """The text, the client and the number of events, as in a line of the log."""
         by = f" (by {self.by})" if self.by else ""
         return f"{self.text}{by}{how_often(self.text, self.count)}"
 
 
-def entry_of(event: Event, wall_ns: int) -> TimelineEntry:
-    """Return the timeline entry for an event of the log.
-
-    `wall_ns` is the wall-clock time of the event, ns since 1970.
-    """
+def entry_of(event: Event, wall_ns: WallNs) -> TimelineEntry:
+    """Return the entry for an event of the log."""
     late = event.name == "link_stale" and blames_host(event.text)
     name = "link_late" if late else event.name
     return TimelineEntry(wall_ns / 1e9, name, event.text, event.level, event.by, event.count)
@@ -126,14 +87,10 @@ class LinkLosses:
     """Detects repeated events about the same loss of the link to the board."""
 
     def __init__(self) -> None:
-        self._names: set[str] = set()
-        """Names of the events that have reported a lost link since the link was last up."""
+        self._names: set[str] = set()  # events of a lost link since it was up
 
     def repeated(self, name: str) -> bool:
-        """Register the name of the next event.
-
-        Return whether an earlier event with this name has reported the same loss of the link.
-        """
+        """Register an event; return whether one of this name has reported the same loss."""
         if name == "link_up":
             self._names.clear()
         if name not in ("link_down", "link_booting", "link_stale", "link_late"):
@@ -147,21 +104,14 @@ class ReasonChanges:
     """Makes an entry `reason` when the reason of the robot's mode changes, but not the mode."""
 
     def __init__(self) -> None:
-        self._mode = self._reason = ""
-        """The last mode and reason that the timeline shows. A `#` replaces each number in the
-        reason."""
-        self._reported_ns = -MIN_REASON_NS
-        """Monotonic time of the last entry `reason`, or of the last event that reports the mode
-        `waiting` if this event is later, ns."""
-        self._sender = ("", "")
-        """Pair: the source that the robot followed last, and the sender of that source's last
-        command."""
+        self._mode = self._reason = ""  # last ones shown, with `#` for numbers
+        self._reported_ns = -MIN_REASON_NS  # last entry `reason` or event of the mode `waiting`
+        self._sender = ("", "")  # last followed source, and the sender of its last command
 
     def step(self, step: RecordedStep) -> Iterator[TimelineEntry]:
-        """Yield an entry if the reason of the mode has changed in a step, but the mode has not.
+        """Yield an entry if only the reason has changed, at most one each second.
 
-        There is no entry if an event reports the reason, or while the robot drives. There is at
-        most one entry each second.
+        There is none if an event reports it, or while the robot drives.
         """
         mode, text, _, source = step.recorded.status
         now, reason = step.inputs.now, NUMBER.sub("#", text)
@@ -189,20 +139,16 @@ _IDENTITY = re.compile(re.escape(IDENTITY) + rb"([^\r\n]*)[\r\n]")
 class BoardIdentity:
     """Makes an entry `board` when the board sends a line with its name.
 
-    The board sends such a line after its start, and when the daemon asks for its name. The robot
-    reports the line as an event only if the link was up. If the link was lost before the line
-    arrived, only this entry shows that the board was restarted.
+    It does so after its start and on request. The robot reports it only if the link was up, so
+    without this entry a restart may be unknown.
     """
 
     def __init__(self) -> None:
-        self._data = b""
-        """The last received bytes, if they may be the beginning of the line with the board's name;
-        otherwise empty."""
-        self._reported_ns = -MIN_REASON_NS
-        """Monotonic time of the last entry `board`, ns."""
+        self._data = b""  # maybe the beginning of that line
+        self._reported_ns = -MIN_REASON_NS  # last entry
 
     def step(self, step: RecordedStep) -> Iterator[TimelineEntry]:
-        """Yield an entry if the board has named itself in a step, but at most one each second."""
+        """Yield an entry if the board has named itself, at most one each second."""
         now = step.inputs.now
         for read in step.inputs.received:
             data = self._data + read.data
@@ -229,32 +175,24 @@ class BoardIdentity:
 
 
 class _Waiting(Struct):
-    """A sender that sends speeds while the robot follows another sender."""
-
-    since_ns: int
-    """Monotonic time of the sender's first speed that the robot did not follow, ns."""
-    last_ns: int
-    """Monotonic time of the sender's last speed that the robot did not follow, ns."""
-    reported: bool = False
-    """True if the sender already has an entry in the timeline."""
+    # Sends speeds while the robot follows another sender.
+    since_ns: Ns  # first speed that the robot did not follow
+    last_ns: Ns  # last one
+    reported: bool = False  # in the timeline
 
 
 class WaitingSenders:
     """Makes an entry `waits` when a sender sends speeds, but the robot follows another sender."""
 
     def __init__(self, priorities: Mapping[str, int]) -> None:
-        """Prepare for the first step. `priorities` maps each source's name to its priority."""
+        # of the sources
         self._priorities = priorities
-        self._commander = ""
-        """The sender that the robot follows, as the text "source (sender)" of the last event
-        `commander`."""
-        self._waiting: dict[tuple[str, str], _Waiting] = {}
-        """Maps the pair (source, sender) to each waiting sender."""
-        self._reported_ns = -MIN_REASON_NS
-        """Monotonic time of the last entry `waits`, ns."""
+        self._commander = ""  # "source (sender)" of the last event
+        self._waiting: dict[tuple[str, str], _Waiting] = {}  # by source and sender
+        self._reported_ns = -MIN_REASON_NS  # last entry
 
     def step(self, step: RecordedStep) -> Iterator[TimelineEntry]:
-        """Yield an entry for each sender that has waited for `MIN_WAIT_NS` and has no entry yet."""
+        """Yield an entry for each sender that has waited for `MIN_WAIT_NS` and has none."""
         for event in step.recorded.events:
             if event.name == "commander":
                 # If the log combined several changes of the sender, `by` contains several names.
@@ -298,19 +236,12 @@ class WaitingSenders:
         return len(self._waiting) < MAX_WAITING
 
     def _sender_is_known(self, source: str) -> bool:
-        """Return whether it is known which sender of the source `source` the robot follows.
-
-        It is known if `_commander` contains a single sender, and this sender uses `source`.
-        """
+        # A single sender in `_commander`, with this source.
         return self._commander.startswith(f"{source} (") and ", " not in self._commander
 
     def _why(self, waiting: str, followed: str) -> str:
-        """Return a text that says why the robot follows `followed` and not `waiting`.
-
-        An example is "which came first". The arguments are names of sources. The text is "" if a
-        priority is unknown, or if `waiting` has the higher priority. In the second case the source
-        does not wait, because the robot refuses its commands for another reason.
-        """
+        # Such as "which came first". A source of the higher priority does not wait: its commands
+        # are refused for another reason.
         priority, other = self._priorities.get(waiting), self._priorities.get(followed)
         if priority is None or other is None or priority > other:
             return ""
@@ -325,34 +256,25 @@ class TimelineWriter:
     """Makes the timeline of a recording from its steps."""
 
     def __init__(self, config: Config | None = None) -> None:
-        """Prepare for the first step.
-
-        `config` is the configuration of the recorded robot. If it is None, the timeline does not
-        contain `waits` entries.
-        """
+        # Without `config`, there are no entries `waits`.
         sources = config.commands.sources if config is not None else ()
         self._number: int | None = None
         self._pose: tuple[int, int, int] | None = None
-        self._began_ns: int | None = None
-        """Monotonic time at which the present drive began, ns; None between drives."""
+        self._began_ns: Ns | None = None  # begin of the present drive
         self._distance_m = 0.0
-        self._sources: list[str] = []
-        """The sources that commanded the present drive, in the order in which they began."""
-        self._since = ""
-        """Note at the end of the entry `drive` if the drive began before this recording; otherwise
-        ""."""
+        self._sources: list[str] = []  # of the present drive, in their order
+        self._since = ""  # note of a drive that began before this recording
         self._now: Instant | None = None
         self._shutting_down = False
+        # First step of a recording that continues another, until the entry.
         self._continued: RecordedStep | None = None
-        """First step of a recording that continues an earlier recording. None in other recordings,
-        and after the entry `continues` was made."""
         self._losses = LinkLosses()
         self._board = BoardIdentity()
         self._reasons = ReasonChanges()
         self._waiting = WaitingSenders({source.name: source.priority for source in sources})
 
     def step(self, step: RecordedStep) -> Iterator[TimelineEntry]:
-        """Yield the timeline entries of a step. The steps must come in order."""
+        """Yield the entries of a step. The steps must come in order."""
         if self._number is None and step.number > 0:
             self._continued = step
         entries, first = list(self._entries(step)), self._continued
@@ -444,12 +366,7 @@ class TimelineWriter:
             self._began_ns = None
 
     def end(self, ending: str = "") -> Iterator[TimelineEntry]:
-        """Yield the timeline entries that follow the last step.
-
-        There is an entry `drive` if the robot still drives, and an entry `cut` if the recording was
-        cut off. `ending` says how the recording was cut off, as in `Recording.ending`. It is "" if
-        the daemon ended normally.
-        """
+        """Yield the entries after the last step: an unfinished `drive`, and `cut`."""
         yield from self._continues()
         if self._now is None:
             return
@@ -460,11 +377,12 @@ class TimelineWriter:
         if ending:
             yield TimelineEntry(wall_s, "cut", ending.removeprefix("cut: "), "warning")
 
-    def _driven(self, now_ns: int) -> str:
+    def _driven(self, now_ns: Ns) -> str:
         seconds = (now_ns - (self._began_ns or now_ns)) / 1e9
         return f"{self._distance_m:.2f} m in {seconds:.1f} s"
 
 
+# Singular; `link_up` only shows where a loss ends.
 INCIDENT_WORDS = {
     "fault": "fault",
     "stop": "stop",
@@ -480,34 +398,22 @@ INCIDENT_WORDS = {
     "wheel_fault": "wheel fault",
     "link_up": "",
 }
-"""Word for an event in a summary, singular, by the name of the event. The event `link_up` has no
-word: a summary does not count it, but it shows where a loss of the link ends."""
 
 
+# Not a wheel fault.
 SERIOUS_SUMMARY = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|battery stop|stop|fault)s?\b")
-"""Pattern for the number of stops, bumper hits or faults in a summary. A stop may also be an
-emergency stop or a battery stop. A wheel fault does not count as a fault."""
 
 
 def is_serious(text: str) -> bool:
-    """Return whether the text of a summary mentions a stop, a bumper hit or a fault.
-
-    `text` is the result of `summary`. Emergency stops and battery stops are stops too. A wheel
-    fault (`wheel_fault`) does not count.
-    """
+    """Return whether a `summary` has a stop, a bumper hit or a fault (not of a wheel)."""
     # Ignore the names of the clients, because a name may look like a fault.
     return SERIOUS_SUMMARY.search(text.partition(" (stopped by ")[0]) is not None
 
 
 def summary(events: Iterable[TimelineEntry], starts: bool = False) -> str:
-    """Return a text that counts the incidents of a recording, such as "start, 2 stops".
+    """Return the incidents of a recording, such as "start, 2 stops", with who stopped it.
 
-    The text also names the clients that stopped the robot.
-
-    Args:
-        events: the events of the recording in order. Events that are not in `INCIDENT_WORDS` are
-            ignored.
-        starts: true if the recording includes the daemon's start.
+    `starts` says that it includes the daemon's start.
     """
     counts: Counter[str] = Counter()
     stopped: list[str] = []

@@ -1,23 +1,11 @@
 """Rebuilds a pickled `Robot` safely, even if an attacker forged the bytes.
 
-Python's own unpickler executes all instructions in the bytes. It calls functions, imports modules,
-changes classes, and nests objects without limit. This module executes only the opcodes that occur
-in a pickled robot. It calls only constructors of plain data, and checks each part of the robot when
-it makes the part:
-
-    a number, text, bytes    a number has at most 128 bits
-    a list, a tuple ...      depth and size are limited; a part that occurs twice counts twice
-    a Struct                 each field has the type that the Struct declares
-    any other object         made without its constructor, then given attributes; no attribute
-                             hides an attribute of the class
-
-A list of allowed classes in `Unpickler.find_class` is not enough. When only the classes of
-`state.py` were allowed, forged bytes still did harm. They took more than 3 s of processor time
-(nested tuples as keys, keys with equal hashes, copies of one dict), allocated more than 2 GB, or
-changed the class of the robot for the whole process.
-
-Once the bytes refer to an earlier part, that part cannot grow any more. Therefore no part contains
-itself, and the computed depth and size of every part are exact.
+Python's unpickler calls functions, imports modules, changes classes and nests without limit. A list
+of allowed classes in `find_class` is not enough: forged bytes then took 3 s (nested tuples, equal
+hashes, copies of a dict) or 2 GB, or changed the robot's class. This executes only opcodes that
+occur, constructs only plain data and Structs of the declared types, gives other objects attributes
+that hide none of the class, and limits depth and size. A part that is referred to no longer grows,
+so none contains itself.
 """
 
 from __future__ import annotations
@@ -31,62 +19,37 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-MAX_BYTES = 1 << 20
-"""Largest size of a pickled robot, bytes. A robot usually has 12 000 to 40 000 bytes, but more if
-many senders have sent commands."""
+MAX_BYTES = 1 << 20  # usually 12 000 to 40 000, more with many senders
 
 MAX_OPCODES = 1 << 17
-"""Largest number of opcodes in a pickled robot."""
 
-MAX_PARTS = 1 << 19
-"""Largest number of values in a robot. A value that occurs several times counts each time."""
+MAX_PARTS = 1 << 19  # values, each time that they occur
 
+# In total, or a few bytes could copy a large value again and again.
 MAX_COPIED_PARTS = 4 * MAX_PARTS
-"""Largest total number of values that are copied when objects are made and attributes are set.
-Without this limit, a few bytes could copy a large value again and again."""
 
+# Bound of an integer as a key: smaller ones but -1 are their own hash, so no keys have forged equal
+# ones.
 MAX_KEY = 2**61 - 1
-"""Bound on the absolute value of an integer that is a dict key or a set element.
-
-Every smaller integer except -1 is its own hash, so that an attacker cannot forge many keys with
-equal hashes.
-"""
 
 MAX_DEPTH = 50
-"""Largest depth to which values may be nested."""
 
-MAX_INT_BITS = 128
-"""Largest number of bits of an integer. Sums of times in ns have more than 64 bits."""
+MAX_INT_BITS = 128  # sums of times in ns have more than 64
 
-MAX_KEY_PARTS = 4
-"""Largest number of elements in a tuple that is a dict key or a set element."""
+MAX_KEY_PARTS = 4  # elements of a tuple as a key
 
+# Python hashes tuples of integers without a secret. Below this there are 2^32 of four, and almost
+# none with equal hashes. A real robot has pairs below 10 (`second_order.py`).
 MAX_TUPLE_KEY = 256
-"""Bound on each integer in a tuple that is a dict key or a set element.
 
-Python hashes the integers of a tuple without a secret key, so an attacker can compute tuples of
-large integers with equal hashes. There are only 2^32 tuples of up to four integers below this
-bound, and almost no two of them have the same hash of 64 bits. A real robot uses pairs of column
-numbers of the odometry's error model, which are below 10 (`core/motion/second_order.py`).
-"""
+FindClass = Callable[[str, str], type]  # by module and name; raises `ValueError`
 
-FindClass = Callable[[str, str], type]
-"""Function that takes the name of a module and the name of a class, and returns the class.
-
-It raises `ValueError` if objects of this class cannot be parts of a robot.
-"""
-
+# Types of dict keys and set elements, beside members of an Enum and short tuples.
 KEY_TYPES = (str, int, float, bool, bytes, type(None))
-"""Allowed types of dict keys and set elements. Members of an Enum are allowed too, and also short
-tuples of strings and small integers."""
 
 
 def unpickle(data: bytes, find: FindClass) -> object:
-    """Return the object that a pickle describes. The bytes may be forged.
-
-    `find` takes the names of a module and a class, and returns the class. Raises `ValueError` if
-    the bytes are damaged, or if they contain anything that a pickled robot never contains.
-    """
+    """Return the object that a pickle describes; its bytes may be forged. Raises `ValueError`."""
     if len(data) > MAX_BYTES:
         raise _forged(f"the robot state has {len(data)} bytes, more than any real robot needs")
     machine = _Machine(find)
@@ -111,23 +74,17 @@ def _forged(what: str) -> ValueError:
 
 
 class _Entry:
-    """A value on the stack, with its nesting depth and its size (the number of values in it)."""
-
+    # A value on the stack, with its depth and its number of values.
     __slots__ = ("closed", "depth", "size", "value")
 
     def __init__(self, value: Any) -> None:
         self.value = value
         self.depth = 0
         self.size = 1
-        self.closed = False
-        """True once an opcode has fetched the value from the memo, the pickle's list of earlier
-        values. From then on, the value must not grow."""
+        self.closed = False  # fetched from the memo, so it must not grow
 
     def holds(self, parts: Sequence[_Entry]) -> None:
-        """Update the depth and the size before the caller adds `parts` to this value.
-
-        Raises `ValueError` if the value must not grow, or if it exceeds a limit.
-        """
+        """Update depth and size for `parts` to be added. Raises `ValueError`."""
         if self.closed:
             raise _forged("a part of the robot state contains itself, or grows after it was used")
         for part in parts:
@@ -145,16 +102,12 @@ class _Entry:
 
 
 class _Machine:
-    """Stack machine that executes the opcodes of a pickle."""
-
     def __init__(self, find: FindClass) -> None:
         self._find = find
         self._stack: list[_Entry] = []
-        self._marks: list[int] = []
-        """Height of the stack at each `MARK` opcode whose values were not popped yet."""
+        self._marks: list[int] = []  # height of the stack at each open `MARK`
         self._memo: list[_Entry] = []
-        self._copied = 0
-        """Number of values that were copied so far."""
+        self._copied = 0  # values so far
 
     def result(self) -> object:
         if len(self._stack) != 1 or self._marks:
@@ -162,7 +115,7 @@ class _Machine:
         return self._stack[0].value
 
     def do(self, name: str, argument: Any) -> None:
-        """Execute an opcode. Damaged operands may raise any exception that `unpickle` converts."""
+        """Execute an opcode; damaged operands may raise what `unpickle` converts."""
         match name:  # the most frequent opcodes come first
             case "MEMOIZE":
                 self._memo.append(self._stack[-1])
@@ -309,7 +262,7 @@ class _Machine:
         self._push(object.__new__(kind.value))
 
     def _set_attributes(self) -> None:
-        """Pop a dict, and set its items as attributes of an object that `_make_bare` has made."""
+        # The object is one that `_make_bare` has made.
         (state,) = self._top(1)
         whole, named = self._stack[-1], state.value
         if not _is_part(type(whole.value)) or not isinstance(named, dict):
@@ -329,11 +282,8 @@ class _Machine:
 
 
 def _keys(entries: Sequence[_Entry]) -> None:
-    """Raise `ValueError` for a dict key or set element that is not allowed.
-
-    A value that is not hashable or is slow to hash is not allowed. A value is also not allowed if
-    an attacker can compute many such values with equal hashes.
-    """
+    # Raises `ValueError` for keys that are not hashable, slow to hash, or of forgeable equal
+    # hashes.
     for entry in entries:
         value = entry.value
         if type(value) is tuple:
@@ -360,20 +310,13 @@ def _is_tuple_key_part(part: object) -> bool:
 
 
 def _is_part(kind: Any) -> bool:
-    """Return whether objects of the class `kind` can be rebuilt from their attributes alone.
-
-    The constructor and other methods of the class need not run for this.
-    """
+    # From attributes alone, without any method.
     plain = kind.__new__ is object.__new__ and kind.__reduce_ex__ is object.__reduce_ex__
     return plain and kind.__module__ != "builtins" and not hasattr(kind, "__setstate__")
 
 
 def _construct(kind: type, arguments: tuple[Any, ...]) -> object:
-    """Return an object of the class `kind`, constructed with the arguments `arguments`.
-
-    Raises `ValueError` if the class is not allowed. Raises `TypeError` or a msgspec error if the
-    class does not accept the arguments.
-    """
+    # Raises `ValueError`, or what the class raises.
     match arguments:
         case (dict(),) if kind is Counter:
             return Counter(*arguments)
