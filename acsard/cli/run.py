@@ -148,7 +148,7 @@ def page(config: Config, where: str) -> list[str] | None:
     configuration file.
     """
     looked_at = sys.stdout is not None and sys.stdout.isatty() and "INVOCATION_ID" not in os.environ
-    there = find_spec("aiohttp") and find_spec("segno")
+    there = all(map(find_spec, ("aiohttp", "prometheus_client", "segno")))
     if not (config.web.page and looked_at and there):
         return None
 

@@ -95,10 +95,11 @@ def main(args: argparse.Namespace) -> int:
             )
     try:
         import aiohttp  # noqa: F401
+        import prometheus_client  # noqa: F401
         import segno  # noqa: F401
     except ImportError:
         raise MendableError(
-            f"needs the libraries aiohttp and segno; run: {install('web')}"
+            f"needs the libraries aiohttp, prometheus-client and segno; run: {install('web')}"
         ) from None
     options = {"record.directory": args.record or None, "bus.tls": args.tls or None}
     where, loaded = load(args.config, options)

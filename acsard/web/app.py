@@ -242,7 +242,7 @@ class Page:
             robots.id, robots.about.version, robots.state, not robots.gone, len(self._viewers),
             counts.all(), counts.refused(),
         )  # fmt: skip
-        return web.Response(body=body.encode(), headers={"Content-Type": metrics.CONTENT_TYPE})
+        return web.Response(body=body, headers={"Content-Type": metrics.CONTENT_TYPE})
 
     async def whoami(self, request: web.Request) -> web.StreamResponse:
         identity = request[IDENTITY_KEY]

@@ -1,14 +1,15 @@
-"""Counts the actions and refusals of the page's server, and writes the metrics for Prometheus.
-
-The text of `/metrics` has Prometheus's text format 0.0.4.
-"""
+"""Counts the actions and refusals of the page's server, and writes the metrics for Prometheus."""
 
 from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Literal, get_args
+from collections.abc import Iterator, Mapping
+from typing import get_args
+
+from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.registry import Collector
 
 from acsard.core.link.link_state import State
 from acsard.core.messages.schema import RobotState
@@ -17,11 +18,43 @@ from acsard.core.motion.modes import Mode
 from acsard.core.values import WHEELS, Event
 from acsard.web.callers import Reason
 
-CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+CONTENT_TYPE = CONTENT_TYPE_LATEST
 
-Kind = Literal["gauge", "counter"]
+Family = GaugeMetricFamily | CounterMetricFamily
 
-Sample = tuple[Mapping[str, str], float]
+Samples = Mapping[str, float] | Mapping[tuple[str, ...], float]  # by the values of the labels
+
+
+class Metrics(Collector):
+    """The metrics of one robot, all with the label `robot`."""
+
+    def __init__(self, robot: str) -> None:
+        self._robot = robot
+        self._families: list[Family] = []
+
+    def collect(self) -> Iterator[Family]:
+        yield from self._families
+
+    def gauge(self, name: str, what: str, value: float | None) -> None:
+        if value is not None:
+            family = GaugeMetricFamily(f"acsard_{name}", what, labels=("robot",))
+            family.add_metric((self._robot,), value)
+            self._families.append(family)
+
+    def gauges(self, name: str, what: str, labels: tuple[str, ...], samples: Samples) -> None:
+        family = GaugeMetricFamily(f"acsard_{name}", what, labels=("robot", *labels))
+        self._add(family, samples)
+
+    def counters(self, name: str, what: str, label: str, counts: Mapping[str, int]) -> None:
+        family = CounterMetricFamily(f"acsard_{name}", what, labels=("robot", label))
+        self._add(family, {word: float(count) for word, count in sorted(counts.items())})
+
+    def _add(self, family: Family, samples: Samples) -> None:
+        for words, value in samples.items():
+            labels = (words,) if isinstance(words, str) else words
+            family.add_metric((self._robot, *labels), value)
+        if samples:
+            self._families.append(family)
 
 
 def text(
@@ -32,114 +65,65 @@ def text(
     viewers: int,
     counts: Mapping[str, int],
     refused: Mapping[str, int],
-) -> str:
+) -> bytes:
     """Return all metrics in the text format of Prometheus.
 
-    `is_reachable` says whether messages from the daemon arrive. If not, the robot's metrics are
-    left out. `viewers` is the number of open WebSockets. `counts` are the numbers of the server's
+    `is_reachable` says whether the daemon's messages arrive. If not, the robot's metrics are left
+    out. `viewers` is the number of open WebSockets. `counts` are the numbers of the server's
     actions by name, and `refused` the numbers of its refusals by reason.
     """
-    lines: list[str] = []
-
-    def add(name: str, kind: Kind, what: str, samples: Iterable[Sample]) -> None:
-        lines.extend(_family(f"acsard_{name}", kind, what, robot, samples))
-
-    add("up", "gauge", "1 while the daemon's messages arrive, else 0", [({}, float(is_reachable))])
+    metrics = Metrics(robot)
+    metrics.gauge("up", "1 while the daemon's messages arrive, else 0", float(is_reachable))
     if state is not None and is_reachable:
-        add(
-            "info",
-            "gauge",
-            "always 1; the label `version` is the version of the daemon",
-            [({"version": version}, 1.0)],
-        )
-        for name, kind, what, samples in _of_robot(state):
-            add(name, kind, what, samples)
-    add("page_viewers", "gauge", "pages and programs connected", [({}, viewers)])
-    add("page_total", "counter", "actions of the page's server, by kind", _by("what", counts))
-    add(
-        "page_refused_total",
-        "counter",
-        "requests that the page's server refused, by reason",
-        _by("reason", refused),
-    )
-    return "\n".join(lines) + "\n"
+        what = "always 1; the label `version` is the version of the daemon"
+        metrics.gauges("info", what, ("version",), {version: 1.0})
+        _add_state(metrics, state)
+    metrics.gauge("page_viewers", "pages and programs connected", viewers)
+    metrics.counters("page", "actions of the page's server, by kind", "what", counts)
+    what = "requests that the page's server refused, by reason"
+    metrics.counters("page_refused", what, "reason", refused)
+    return generate_latest(metrics)
 
 
-def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Sample]]]:
-    modes = [({"mode": mode.value}, float(mode.value == state.mode)) for mode in Mode]
-    yield "mode", "gauge", "1 for the robot's present mode, else 0", modes
-    links = [({"state": link}, float(link == state.link)) for link in get_args(State)]
-    yield (
-        "link",
-        "gauge",
-        "1 for the present state of the link to the microcontroller, else 0",
-        links,
-    )
+def _add_state(metrics: Metrics, state: RobotState) -> None:
+    modes = {mode.value: float(mode.value == state.mode) for mode in Mode}
+    metrics.gauges("mode", "1 for the robot's present mode, else 0", ("mode",), modes)
+    what = "1 for the present state of the link to the microcontroller, else 0"
+    links = {link: float(link == state.link) for link in get_args(State)}
+    metrics.gauges("link", what, ("state",), links)
     warned = {item.what for item in warnings(state)}
-    subjects = [({"what": what}, float(what in warned)) for what in WARNING_KINDS]
-    yield "warning", "gauge", "1 while the robot gives this warning, else 0", subjects
+    subjects: dict[str, float] = {kind: float(kind in warned) for kind in WARNING_KINDS}
+    metrics.gauges("warning", "1 while the robot gives this warning, else 0", ("what",), subjects)
     if state.certificate_days is not None:
-        left: list[Sample] = [({}, state.certificate_days * 86400.0)]
-        yield (
-            "certificate_seconds",
-            "gauge",
-            "seconds until the next expiry of a TLS certificate",
-            left,
-        )
+        what = "seconds until the next expiry of a TLS certificate"
+        metrics.gauge("certificate_seconds", what, state.certificate_days * 86400.0)
     if state.emergency_stop:
-        pressed = float(state.emergency_stop != "released")
-        yield (
-            "emergency_stop",
-            "gauge",
-            "1 while the emergency stop counts as pressed, else 0",
-            [({}, pressed)],
-        )
-    bumpers = [({"bumper": str(n)}, float(item)) for n, item in enumerate(state.bumpers or (), 1)]
-    if bumpers:
-        yield "bumper", "gauge", "1 while the bumper counts as pressed, else 0", bumpers
-    battery = state.battery
-    if battery is not None:
-        for name, what, value, scale in (
-            ("volts", "voltage", battery.volts, 1.0),
-            ("amperes", "current; negative while the battery discharges", battery.amps, 1.0),
-            ("charge_ratio", "state of charge, 0 to 1", battery.percent, 0.01),
-        ):
-            if value is not None:
-                yield f"battery_{name}", "gauge", what, [({}, value * scale)]
+        what = "1 while the emergency stop counts as pressed, else 0"
+        metrics.gauge("emergency_stop", what, float(state.emergency_stop != "released"))
+    bumpers = {str(number): float(one) for number, one in enumerate(state.bumpers or (), 1)}
+    what = "1 while the bumper counts as pressed, else 0"
+    metrics.gauges("bumper", what, ("bumper",), bumpers)
+    if (battery := state.battery) is not None:
+        metrics.gauge("battery_volts", "voltage", battery.volts)
+        what = "current; negative while the battery discharges"
+        metrics.gauge("battery_amperes", what, battery.amps)
+        share = None if battery.percent is None else 0.01 * battery.percent
+        metrics.gauge("battery_charge_ratio", "state of charge, 0 to 1", share)
     if state.linear is not None and state.angular is not None:
-        yield "linear_speed_mps", "gauge", "measured, forward", [({}, state.linear)]
-        yield "angular_speed_radps", "gauge", "measured; left is positive", [({}, state.angular)]
-    pose = [({"axis": a}, v) for a, v in (("x", state.x), ("y", state.y), ("yaw", state.yaw))]
-    yield "pose", "gauge", "pose in the frame odom, in m and rad", pose
-    wheels = [({"wheel": w}, v) for w, v in zip(WHEELS, state.wheels, strict=False)]
-    if wheels:
-        yield "wheel_speed_radps", "gauge", "measured", wheels
-    yield "robot_total", "counter", "the daemon's counters", _by("what", state.counters)
-    figures: list[Sample] = []
-    for name, figure in state.latencies.items():
-        spread = figure.last_minute
-        for at, value in (("p50", spread.p50), ("p99", spread.p99), ("max", spread.max)):
-            figures.append(({"latency": name, "at": at}, value * 1e-6))
-    yield "latency_seconds", "gauge", "latencies of the daemon, over the last minute", figures
-
-
-def _by(label: str, counts: Mapping[str, int]) -> list[Sample]:
-    return [({label: name}, float(count)) for name, count in sorted(counts.items())]
-
-
-def _family(
-    name: str, kind: Kind, what: str, robot: str, samples: Iterable[Sample]
-) -> Iterator[str]:
-    yield f"# HELP {name} {what}"
-    yield f"# TYPE {name} {kind}"
-    for labels, value in samples:
-        all_labels = {"robot": robot, **labels}
-        inner = ",".join(f'{key}="{_escaped(word)}"' for key, word in all_labels.items())
-        yield f"{name}{{{inner}}} {value!r}"
-
-
-def _escaped(word: str) -> str:
-    return word.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+        metrics.gauge("linear_speed_mps", "measured, forward", state.linear)
+        metrics.gauge("angular_speed_radps", "measured; left is positive", state.angular)
+    pose = {"x": state.x, "y": state.y, "yaw": state.yaw}
+    metrics.gauges("pose", "pose in the frame odom, in m and rad", ("axis",), pose)
+    wheels = dict(zip(WHEELS, state.wheels, strict=False))
+    metrics.gauges("wheel_speed_radps", "measured", ("wheel",), wheels)
+    metrics.counters("robot", "the daemon's counters", "what", state.counters)
+    latencies: dict[tuple[str, ...], float] = {
+        (name, at): getattr(latency.last_minute, at) * 1e-6
+        for name, latency in state.latencies.items()
+        for at in ("p50", "p99", "max")
+    }
+    what = "latencies of the daemon, over the last minute"
+    metrics.gauges("latency_seconds", what, ("latency", "at"), latencies)
 
 
 MAX_NAMED = 5
