@@ -353,7 +353,7 @@ class Client:
         return self.request(service, fields)
 
     def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
-        """Change settings of the daemon, for example `{"rates.state": 5.0}`, and return the reply.
+        """Change settings of the daemon, for example `{"rates.odom": 5.0}`, and return the reply.
 
         The daemon changes all of the settings or none. The change lasts until the next start of the
         daemon.

@@ -15,6 +15,7 @@ from acsard.bus.address import Address
 from acsard.bus.tls import shown_at
 from acsard.client import Client
 from acsard.client.follower import Watch, restarted
+from acsard.core.config.settings import RatesConfig
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import Info, PoseStamped, RobotState, Twist, TwistStamped
 from acsard.core.thinning import Place, Track
@@ -260,7 +261,7 @@ class Robots:
                 info.simulated,
                 float(config["limits"]["linear_speed"]),
                 float(config["limits"]["angular_speed"]),
-                float(config["rates"]["state"]),
+                RatesConfig(telemetry=float(config["rates"]["telemetry"])).state_hz,
                 str(config["record"]["directory"]),
                 {
                     str(source["name"]): float(source["timeout"])

@@ -96,15 +96,15 @@ def test_a_speed_limit_of_zero_brings_the_robot_to_rest(world: World) -> None:
 def test_a_setting_is_in_config_and_in_the_log_with_its_client_and_old_value(
     world: World,
 ) -> None:
-    payload = b'{"settings": {"limits.linear_speed": 0.8, "rates.state": 5}}'
+    payload = b'{"settings": {"limits.linear_speed": 0.8, "rates.telemetry": 5}}'
     name = msgspec.json.encode({"sender": "joe@laptop/s3cret"})
     key = "srv/set"
     world.bus.queries.append(Query(77, key, key, "", payload, "", world.now_ns, "native", name))
     world.run(0.03)
     (event,) = [event for event in world.events if event.name == "set"]
-    assert event.text == "limits.linear_speed = 0.8 (was 1.0), rates.state = 5.0 (was 10.0)"
+    assert event.text == "limits.linear_speed = 0.8 (was 1.0), rates.telemetry = 5.0 (was 0.0)"
     assert event.by == f"{public_name('joe@laptop/s3cret')} (native)"
-    assert (config(world).limits.linear_speed, config(world).rates.state) == (0.8, 5.0)
+    assert (config(world).limits.linear_speed, config(world).rates.telemetry) == (0.8, 5.0)
 
 
 def test_each_of_several_settings_is_reported(world: World) -> None:
@@ -243,7 +243,7 @@ def test_rates_and_covariances_are_in_force_from_the_next_message_on(world: Worl
 def test_a_rate_whose_period_is_no_number_is_refused(world: World) -> None:
     reply = sets(world, rates__odom=1e-300)
     assert not reply.success
-    assert "at least 0.001 Hz" in reply.message
+    assert "at least 0.1 Hz" in reply.message
     world.run(0.5)
     assert world.state.mode == "ready"
 

@@ -51,7 +51,7 @@ VALUES = (*PLAIN, *(f"json/{key}" for key in PLAIN))
 TWIST_JSON = json.dumps(ZERO).encode()
 WHEELS_JSON = json.dumps({"name": ros.WHEELS, "velocity": [0.0] * 4}).encode()
 POSE_JSON = json.dumps({"x": 0.0, "y": 0.0, "yaw": 0.0}).encode()
-SET_JSON = json.dumps({"settings": {"rates.state": 10.0}}).encode()
+SET_JSON = json.dumps({"settings": {"rates.telemetry": 0.0}}).encode()
 FORGED = b"forged"
 NO_NAMES = b"\x00\x01\x00\x00" + bytes(4)
 NO_PREFIXES = b"\x00\x01\x00\x00" + bytes(16)
@@ -227,8 +227,7 @@ class Robot:
         self.certificates = Certificates(where)
         self.plain, self.tls = free_endpoint(), free_tls_endpoint()
         bus = {"listen": [self.plain, self.tls], "tls": str(self.certificates.robot)}
-        rates = {"state": 100.0, "diagnostics": 100.0}
-        tables: dict[str, dict[str, object]] = {"bus": dict(bus), "rates": dict(rates)}
+        tables: dict[str, dict[str, object]] = {"bus": dict(bus)}
         tables["sim"] = {"faults": ["battery=80:600"]}
         self.daemon = Daemon(where, config=tables, endpoint=self.plain)
         self._fooled = threading.Event()

@@ -499,24 +499,24 @@ def test_set_changes_the_robot_that_runs_and_with_keep_the_file(
 ) -> None:
     file = tmp_path / "mine.toml"
     text = shared.config.read_text(encoding="utf-8")
-    file.write_text(f"{text}\n[rates]\nstate = 10.0  # often\n", encoding="utf-8")
-    words = ("set", "rates.state", "5", "log.level", "debug", "--config", str(file))
+    file.write_text(f"{text}\n[rates]\ntelemetry = 10.0  # often\n", encoding="utf-8")
+    words = ("set", "rates.telemetry", "5", "log.level", "debug", "--config", str(file))
     try:
         ended = typed(*words)
         assert (ended.code, ended.out) == (
             0,
-            'rates.state = 5.0 (was 10.0), log.level = "debug" (was "info"); '
+            'rates.telemetry = 5.0 (was 0.0), log.level = "debug" (was "info"); '
             "a set lasts until the daemon's next start",
         )
-        assert bus.get("config")["rates"]["state"] == 5.0
-        assert "state = 10.0  # often" in file.read_text(encoding="utf-8")
-        ended = typed("set", "rates.state", "4", "--keep", "--config", str(file))
+        assert bus.get("config")["rates"]["telemetry"] == 5.0
+        assert "telemetry = 10.0  # often" in file.read_text(encoding="utf-8")
+        ended = typed("set", "rates.telemetry", "4", "--keep", "--config", str(file))
         assert (ended.code, ended.out) == (
-            0, f"rates.state = 4.0 (was 5.0); written to {file}",
+            0, f"rates.telemetry = 4.0 (was 5.0); written to {file}",
         )  # fmt: skip
-        assert "state = 4 # often" in file.read_text(encoding="utf-8").replace("  #", " #")
+        assert "telemetry = 4 # often" in file.read_text(encoding="utf-8").replace("  #", " #")
     finally:
-        assert tool(shared, "set", "rates.state", "10", "log.level", "info").code == 0
+        assert tool(shared, "set", "rates.telemetry", "0", "log.level", "info").code == 0
 
 
 def test_set_without_arguments_lists_the_settings_and_when_they_can_change(

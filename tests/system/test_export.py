@@ -16,12 +16,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from tests.scenarios.taped import ADDED, plain
 from tests.system.harness import ROOT, Bus, Daemon, acsard, finish, until
 
-OFTEN = {"rates": {"state": 100.0, "diagnostics": 100.0}}
-"""Messages with a rate go out when the mode changes, and from then on at that rate.
-
-All clients that listen by then get the same ones, whenever they began.
-"""
-
 ROS = ("odom", "tf", "joint_states", "cmd_vel_out", "diagnostics")
 
 MEASURED = {"acsard: control loop", "acsard: recording"}
@@ -142,7 +136,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Any:
     where = tmp_path_factory.mktemp("export")
     words = ["--record", str(where / "record")]
     with (
-        Daemon(where, config=OFTEN, words=words) as daemon,
+        Daemon(where, words=words) as daemon,
         Bus(daemon.endpoint) as bus,
         collect_messages(bus) as live,
     ):

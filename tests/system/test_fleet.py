@@ -78,7 +78,7 @@ ONE, TWO = "acsard/robot1", "acsard/robot2"
 TWIST = json.dumps(ZERO).encode()
 WHEELS = json.dumps({"name": astuple(Config().joints), "velocity": [0.0] * 4}).encode()
 POSE = json.dumps({"x": 0.0, "y": 0.0, "yaw": 0.0}).encode()
-SET = json.dumps({"settings": {"rates.state": 10.0}}).encode()
+SET = json.dumps({"settings": {"rates.telemetry": 0.0}}).encode()
 TURNING = json.dumps({"angular_velocity": {"z": 0.1}}).encode()
 FORGED = b"forged"
 SOURCES = tuple(source.name for source in Config().commands.sources)
@@ -264,7 +264,6 @@ class Fleet:
             tables["bus"]["mode"] = "peer"
         tables["robot"]["id"] = robot_id
         tables["bus"] |= {"connect": [self.endpoint], "tls": str(self.where / robot_id)}
-        tables["rates"] = {"state": 100.0, "diagnostics": 100.0}
         tables["sim"] = {"faults": ["battery=80:600"]}
         tables["limits"] = {"linear_acceleration": 5.0, "linear_stop_deceleration": 5.0}
         return Daemon(self.where, config=tables, name=name or robot_id, ready=ready)

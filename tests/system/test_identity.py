@@ -36,7 +36,7 @@ class Robot:
             "listen": [self.plain, self.tls],
             "tls": str(self.certificates.robot),
         }
-        tables: dict[str, dict[str, object]] = {"bus": bus, "rates": {"state": 100.0}}
+        tables: dict[str, dict[str, object]] = {"bus": bus}
         self.daemon = Daemon(where, config=tables, endpoint=self.plain)
 
     @contextmanager

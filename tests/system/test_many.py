@@ -289,15 +289,15 @@ def test_fleet_warns_of_the_robot_whose_settings_differ_from_its_file(robots: Ro
         out = robots.tool("fleet", "--once", who=f"{ONE},{TWO}").out.splitlines()
         return {line.split()[0]: line for line in out}
 
-    differ = "rates.odom = 50.0, not 0.0, rates.state = 7.5, not 10.0"
-    assert robots.tool("set", "rates.state", "7.5", "rates.odom", "50", who=ONE).code == 0
+    differ = "rates.odom = 50.0, not 0.0, rates.telemetry = 7.5, not 0.0"
+    assert robots.tool("set", "rates.telemetry", "7.5", "rates.odom", "50", who=ONE).code == 0
     until(lambda: "WARNING: settings differ" in table()[ONE], 10.0, "the warning")
     assert differ in table()[ONE]
     assert "WARNING" not in table()[TWO]
     ended = robots.tool("fleet", "--json", who=f"{ONE},{TWO}")
     warnings = {row["robot_id"]: row["state"]["settings_differ"] for row in json.loads(ended.out)}
     assert (ended.code, warnings) == (0, {ONE: differ, TWO: ""})
-    assert robots.tool("set", "rates.state", "10.0", "rates.odom", "0", who=ONE).code == 0
+    assert robots.tool("set", "rates.telemetry", "0.0", "rates.odom", "0", who=ONE).code == 0
     until(lambda: "WARNING" not in table()[ONE], 10.0, "no warning")
 
 
@@ -334,16 +334,18 @@ def test_stop_of_several_names_the_robot_that_did_not_answer_and_ends_with_69(
 
 
 def test_set_changes_named_robots_and_prints_a_line_for_each(robots: Robots) -> None:
-    for value in ("7.5", "10.0"):
-        ended = robots.tool("set", "rates.state", value, who=f"{TWO},{ONE}")
+    for value in ("7.5", "0.0"):
+        ended = robots.tool("set", "rates.telemetry", value, who=f"{TWO},{ONE}")
         assert (ended.code, ended.err) == (0, "")
         replies = dict(line.split(": ", 1) for line in ended.out.splitlines())
         assert list(replies) == [TWO, ONE]
-        assert all(reply.startswith(f"rates.state = {value} (was ") for reply in replies.values())
+        assert all(
+            reply.startswith(f"rates.telemetry = {value} (was ") for reply in replies.values()
+        )
         assert all(
             reply.endswith("; in force until the daemon's next start") for reply in replies.values()
         )
-    ended = robots.tool("set", "rates.state", "10.0", "--json")
+    ended = robots.tool("set", "rates.telemetry", "0.0", "--json")
     assert [json.loads(line)["robot"] for line in ended.out.splitlines()] == [ONE, TWO]
 
 
@@ -352,11 +354,11 @@ def test_set_ends_with_1_if_one_robot_refuses_and_with_69_if_one_does_not_answer
 ) -> None:
     refusal = json.dumps({"success": False, "message": "not now"})
     with fake(robots, refusal.encode()):
-        ended = robots.tool("set", "rates.state", "10.0", who=f"{ONE},fake")
+        ended = robots.tool("set", "rates.telemetry", "0.0", who=f"{ONE},fake")
     assert ended.code == 1
     assert re.search(rf"^{ONE}: nothing changed", ended.out, re.M)
     assert re.search(r"^fake: not now$", ended.out, re.M)
-    ended = robots.tool("set", "rates.state", "10.0", who=f"{ONE},robot9")
+    ended = robots.tool("set", "rates.telemetry", "0.0", who=f"{ONE},robot9")
     assert ended.code == 69
     assert re.search(rf"^{ONE}: nothing changed", ended.out, re.M)
     assert re.search(r"^robot9: NO ANSWER: ", ended.out, re.M)

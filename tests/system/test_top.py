@@ -94,7 +94,7 @@ def test_top_shows_the_robot_in_a_pipe_and_at_a_terminal_and_outlives_its_daemon
 
 @pytest.mark.slow
 def test_top_once_shows_the_current_state_even_if_it_is_published_rarely(tmp_path: Path) -> None:
-    with Daemon(tmp_path, config={"rates": {"state": 0.1}}) as daemon:
+    with Daemon(tmp_path, config={"rates": {"telemetry": 0.1}}) as daemon:
         done = finish(acsard("top", "--once", "--config", str(daemon.config)), tmp_path)
     assert (done.code, done.err) == (0, "")
     assert re.search(r"^ [A-Z]+  ", done.out, re.M)

@@ -94,10 +94,7 @@ LIVE: dict[str, Live] = {
         "always", "added variance of the heading per radian turned, rad2 per rad"
     ),
     "rates.odom": Live("always", "how often the messages odom and tf are published"),
-    "rates.wheel_states": Live("always", "how often the message wheel_states is published"),
-    "rates.cmd_vel_out": Live("always", "how often the message cmd_vel_out is published"),
-    "rates.state": Live("always", "how often the message state is published"),
-    "rates.diagnostics": Live("always", "how often the message diagnostics is published"),
+    "rates.telemetry": Live("always", "how often the other messages are published at most"),
     "log.level": Live("always", "lowest level of the events that are logged"),
 }
 """The settings that may change while the daemon runs, by their dotted keys in `acsard.toml`. In the

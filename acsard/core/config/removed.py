@@ -6,12 +6,17 @@ To be dropped after 0.3.
 from __future__ import annotations
 
 _LIDAR = "describe the lidar in the URDF and set lidar.publish_tf = false"
+_RATE = "remove the key; rates.telemetry is the highest rate of all messages but odom and tf"
 
 REMOVED = {
     "footprint": "remove this table, and give the URDF a fixed joint base_link -> base_footprint",
     "lidar.lidar_z_offset": _LIDAR,
     "lidar.lidar_roll": _LIDAR,
     "lidar.lidar_pitch": _LIDAR,
+    "rates.wheel_states": _RATE,
+    "rates.cmd_vel_out": _RATE,
+    "rates.state": _RATE,
+    "rates.diagnostics": _RATE,
     "ros.announce": "remove the key: the topics of the bridge are always announced",
     "ros.node": 'remove the key: the node is "acsard", and ros.namespace tells robots apart',
     "ros.urdf": "remove the key: robot_state_publisher publishes robot_description",

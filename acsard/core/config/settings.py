@@ -120,7 +120,6 @@ Variance = Annotated[float, Meta(ge=0.0, le=1e9, extra={"unit": "(m2 or rad2)"})
 ErrorRate = Annotated[float, Meta(ge=0.0, le=10.0)]
 Deviation = Annotated[float, Meta(ge=0.0, le=1.0)]
 PublishRate = Annotated[float, Meta(ge=0.0, le=1000.0, extra={"unit": "Hz (0 = every sample)"})]
-SlowRate = Annotated[float, Meta(ge=0.1, le=100.0, extra={"unit": "Hz"})]
 Diagonal = tuple[Variance, Variance, Variance, Variance, Variance, Variance]
 Motor = Literal["+a", "-a", "+b", "-b", "+c", "-c", "+d", "-d"]
 EncoderCounts = Annotated[
@@ -317,12 +316,22 @@ class LidarConfig(Struct, frozen=True):
     lidar_yaw: Angle = 0.0
 
 
+STATE_HZ = 10.0
+DIAGNOSTICS_HZ = 1.0
+
+
 class RatesConfig(Struct, frozen=True):
     odom: PublishRate = 0.0
-    wheel_states: PublishRate = 0.0
-    cmd_vel_out: PublishRate = 0.0
-    state: SlowRate = 10.0
-    diagnostics: SlowRate = 1.0
+    telemetry: PublishRate = 0.0
+
+    @property
+    def state_hz(self) -> float:
+        """Rate of `state`, Hz."""
+        return self.at_most(STATE_HZ)
+
+    def at_most(self, hz: float) -> float:
+        """Return the rate of a message that is built `hz` times a second unless it is limited."""
+        return min(hz, self.telemetry or hz)
 
 
 TLS_PREFIX = "tls/"

@@ -9,9 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 
-from msgspec.structs import asdict
-
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import DIAGNOSTICS_HZ, Config
 from acsard.core.messages.certificate_expiry import DAY_NS, expiry, first_expiry
 from acsard.core.messages.covariances import UNKNOWN_COVARIANCE, Covariances
 from acsard.core.messages.diagnostics import diagnostics
@@ -58,6 +56,9 @@ GetSnapshot = Callable[[], Snapshot]
 
 UNKNOWN_STATUS, CHARGING, DISCHARGING, NOT_CHARGING = range(4)
 """Values of `Battery.power_supply_status`."""
+
+
+BATTERY_HZ = 1.0
 
 
 class _Rate:
@@ -109,8 +110,15 @@ class Report:
     def use(self, config: Config) -> None:
         """Use the rates, frames and covariances of `config` from the next message on."""
         self._config = config
-        rates = asdict(config.rates) | {"battery": 1.0}
-        self._rates = {key: _Rate(hz) for key, hz in rates.items()}
+        rates = config.rates
+        self._rates = {
+            "odom": _Rate(rates.odom),
+            "wheel_states": _Rate(rates.telemetry),
+            "cmd_vel_out": _Rate(rates.telemetry),
+            "state": _Rate(rates.state_hz),
+            "diagnostics": _Rate(rates.at_most(DIAGNOSTICS_HZ)),
+            "battery": _Rate(rates.at_most(BATTERY_HZ)),
+        }
         self._covariances = Covariances(config.odometry)
 
     def due(

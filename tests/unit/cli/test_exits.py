@@ -84,7 +84,10 @@ def test_an_unknown_option_names_the_help_that_lists_the_known_ones(
         ("call set_pose --json 1 -2 3", "call set_pose 1 -2 3 --json"),
         ("call set_pose 1 --id r1 -2 --json 3", "call set_pose 1 -2 3 --id r1 --json"),
         ("set limits.linear_speed --json 0.8", "set limits.linear_speed 0.8 --json"),
-        ("set rates.state 5 --id r1 log.level info", "set rates.state 5 log.level info --id r1"),
+        (
+            "set rates.telemetry 5 --id r1 log.level info",
+            "set rates.telemetry 5 log.level info --id r1",
+        ),
         ("echo imu -n 1 wheel_states --csv", "echo imu wheel_states --csv -n 1"),
     ],
 )

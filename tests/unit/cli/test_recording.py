@@ -396,11 +396,11 @@ def test_a_replay_names_changed_limits_their_effect_and_a_fault_they_might_avoid
 
 def test_settings_that_change_no_line_are_reported_too(where: Path, tmp_path: Path) -> None:
     same = tmp_path / "same.toml"
-    same.write_text("[rates]\nstate = 5.0\n")
+    same.write_text("[rates]\ntelemetry = 5.0\n")
     code, out, _ = log(where, "replay", "1", "--config", str(same))
     assert (code, "differs" in out) == (0, False)
     assert "computes new outputs with the other configuration from the recorded inputs" in out
-    assert out.splitlines()[-1].startswith("changed settings: rates.state was 10.0, is 5.0")
+    assert out.splitlines()[-1].startswith("changed settings: rates.telemetry was 0.0, is 5.0")
 
 
 def test_recover_writes_a_truncated_recording_as_a_finished_file(

@@ -41,8 +41,8 @@ def test_a_value_is_written_as_in_the_file_and_a_bare_word_is_a_text(
 
 
 def test_several_settings_are_a_list_of_key_value_pairs() -> None:
-    assert pairs(["rates.state", "5", "log.level", "info"]) == {
-        "rates.state": 5,
+    assert pairs(["rates.telemetry", "5", "log.level", "info"]) == {
+        "rates.telemetry": 5,
         "log.level": "info",
     }
     assert pairs([]) == {}
@@ -57,14 +57,14 @@ def test_a_key_without_a_value_is_refused_with_the_syntax() -> None:
 def test_a_number_that_is_not_finite_is_refused_with_its_key(word: str) -> None:
     words = rf"^limits\.linear_speed = {re.escape(word)}: a number must be finite"
     with pytest.raises(UsageError, match=words):
-        pairs(["rates.state", "5", "limits.linear_speed", word])
+        pairs(["rates.telemetry", "5", "limits.linear_speed", word])
 
 
 @pytest.mark.parametrize(
     ("words", "why"),
     [
         ([], "name one robot in --id to list its settings"),
-        (["rates.state", "5", "--keep"], "--keep changes only the file of the robot"),
+        (["rates.telemetry", "5", "--keep"], "--keep changes only the file of the robot"),
     ],
 )
 def test_several_robots_are_refused_for_a_list_and_for_the_local_file(
@@ -91,15 +91,15 @@ class Robot:
 
     def set(self, settings: dict[str, object]) -> ServiceReply:
         self.settings = settings
-        return ServiceReply(True, "rates.state = 5.0 (was 10.0)")
+        return ServiceReply(True, "rates.telemetry = 5.0 (was 10.0)")
 
 
 def test_the_answer_says_how_long_the_setting_lasts(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("acsard.cli.connection.connect", lambda *words, **more: Robot())
-    assert main(["set", "rates.state", "5"]) == 0
-    text = "rates.state = 5.0 (was 10.0); a set lasts until the daemon's next start\n"
+    assert main(["set", "rates.telemetry", "5"]) == 0
+    text = "rates.telemetry = 5.0 (was 10.0); a set lasts until the daemon's next start\n"
     assert capsys.readouterr().out == text
 
 
@@ -110,10 +110,10 @@ def test_keep_writes_the_file_of_the_robot_on_which_it_is_typed(
     file.write_text("# mine\n")
     monkeypatch.setattr("acsard.cli.connection.connect", lambda *words, **more: Robot())
     monkeypatch.setattr("acsard.cli.set.is_daemon_here", lambda pid: True)
-    assert main(["set", "rates.state", "5", "--keep", "--config", str(file)]) == 0
-    assert capsys.readouterr().out == f"rates.state = 5.0 (was 10.0); written to {file}\n"
+    assert main(["set", "rates.telemetry", "5", "--keep", "--config", str(file)]) == 0
+    assert capsys.readouterr().out == f"rates.telemetry = 5.0 (was 10.0); written to {file}\n"
     assert "# mine\n" in file.read_text()
-    assert tomllib.loads(file.read_text()) == {"rates": {"state": 5}}
+    assert tomllib.loads(file.read_text()) == {"rates": {"telemetry": 5}}
 
 
 @each("why", ["another machine", "it is read-only", "no configuration file"])
@@ -128,7 +128,7 @@ def test_keep_sets_nothing_if_it_cannot_write_the_file(
     monkeypatch.setattr("acsard.host.config_file.SEARCH_PATHS", (file,))
     monkeypatch.setattr("acsard.cli.connection.connect", lambda *words, **more: robot)
     monkeypatch.setattr("acsard.cli.set.is_daemon_here", lambda pid: why != "another machine")
-    assert main(["set", "rates.state", "5", "--keep"]) == 1
+    assert main(["set", "rates.telemetry", "5", "--keep"]) == 1
     assert why in capsys.readouterr().err
     assert not robot.settings
 

@@ -260,9 +260,9 @@ def test_an_expiring_certificate_in_use_is_a_warning_with_a_remedy(here: bool, m
 @pytest.mark.parametrize("here", [True, False])
 def test_changed_settings_of_a_daemon_on_another_machine_are_a_warning(here: bool) -> None:
     running = running_daemon(0.0, here=here)
-    running = replace(running, state=replace(running.state, settings_differ="rates.state = 7.5"))
+    running = replace(running, state=replace(running.state, settings_differ="rates.odom = 7.5"))
     texts = [finding.text for finding in daemon(running) if finding.subject == "configuration"]
-    words = "settings were changed since the daemon's start: rates.state = 7.5"
+    words = "settings were changed since the daemon's start: rates.telemetry = 7.5"
     # On the daemon's own machine the doctor compares with the file itself.
     assert texts == ([] if here else [words])
 

@@ -91,9 +91,11 @@ def test_the_timeout_of_a_source_is_set_by_the_name_of_the_source() -> None:
 
 def test_whole_numbers_are_accepted_as_floats_also_in_lists() -> None:
     made, _ = changed(
-        CONFIG, {"rates.state": 5, "odometry.twist_covariance_diagonal": [1, 2, 3, 4, 5, 6]}, True
+        CONFIG,
+        {"rates.telemetry": 5, "odometry.twist_covariance_diagonal": [1, 2, 3, 4, 5, 6]},
+        True,
     )
-    assert made.rates.state == 5.0
+    assert made.rates.telemetry == 5.0
     assert made.odometry.twist_covariance_diagonal == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 
 
@@ -119,7 +121,7 @@ VALUES: dict[str, list[object]] = {
     "commands.sources.nav.timeout": [0.01, 0.02, 0.03, 10.0],
     "odometry.pose_covariance_diagonal": [[1.0] * 6, [1.0] * 5, [1.0] * 5 + [-1.0], 1.0],
     "odometry.covariance": ["constant", "none", 1],
-    "rates.state": [0.0, 0.1, 100.0, 101.0],
+    "rates.telemetry": [0.0, 0.01, 0.1, 1000.0, 1001.0],
     "log.level": ["error", "loud", ""],
 }
 

@@ -179,7 +179,6 @@ PLANTED = [
     ("[limits]\nlinear_jerk = -1", "limits.linear_jerk", "-1", "(0 = no limit)"),
     ('[joints]\nrear_left = "/x"', "joints.rear_left", '"/x"', "no leading slash"),
     ("[lidar]\nlidar_yaw = 180", "lidar.lidar_yaw", "180", "from -6.2832 to 6.2832 rad"),
-    ("[rates]\nstate = 0", "rates.state", "0", "from 0.1 to 100 Hz"),
     ("[rates]\nodom = 2000", "rates.odom", "2000", "(0 = every sample)"),
     ('[log]\nlevel = "loud"', "log.level", '"loud"', '"debug"'),
     ("[sim]\nencoder_counts = 3200.5", "sim.encoder_counts", "3200.5", "a whole number from 16"),
