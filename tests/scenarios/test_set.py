@@ -11,7 +11,7 @@ from acsard.core.config.settings import Config, LimitsConfig
 from acsard.core.incoming.commands import Via
 from acsard.core.incoming.queries import Query
 from acsard.core.messages.cdr import Cdr
-from acsard.core.messages.schema import Odometry, ServiceReply
+from acsard.core.messages.schema import ServiceReply
 from acsard.core.messages.signature import public_name
 from acsard.core.ros import parameters as rcl
 from acsard.core.values import NS_PER_S, Outputs, Plain
@@ -223,21 +223,12 @@ def test_a_new_neutral_pause_is_in_force_for_known_senders(world: World) -> None
         assert world.state.mode == mode, world.state.reason
 
 
-def test_rates_and_covariances_are_in_force_from_the_next_message_on(world: World) -> None:
-    diagonal: list[float | str] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
-    assert sets(
-        world,
-        rates__odom=10.0,
-        odometry__covariance="constant",
-        odometry__pose_covariance_diagonal=diagonal,
-    ).success
+def test_a_rate_is_in_force_from_the_next_message_on(world: World) -> None:
+    assert sets(world, rates__odom=10.0).success
     world.bus.wanted_keys.add("odom")
     world.run(2.0)
     messages = world.bus.published["odom"]
     assert 19 <= len(messages) <= 21
-    last = messages[-1]
-    assert isinstance(last, Odometry)
-    assert last.pose.covariance[::7] == diagonal
 
 
 def test_a_rate_whose_period_is_no_number_is_refused(world: World) -> None:

@@ -51,7 +51,7 @@ def _numbers(kind: Any) -> Iterator[Bounded]:
             yield kind
         case inspect.Metadata(type=inner) | inspect.VarTupleType(item_type=inner):
             yield from _numbers(inner)
-        case inspect.UnionType(types=types) | inspect.TupleType(item_types=types):
+        case inspect.UnionType(types=types):
             for member in types:
                 yield from _numbers(member)
 

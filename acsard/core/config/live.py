@@ -74,16 +74,6 @@ LIVE: dict[str, Live] = {
     "commands.sources.*.timeout": Live(
         "rest", "time without a command after which the robot stops following the source"
     ),
-    "odometry.covariance": Live(
-        "always", '"model" computes the covariances, "constant" publishes the configured diagonals'
-    ),
-    "odometry.pose_covariance_diagonal": Live(
-        "always",
-        "variances (x y z roll pitch yaw) of the start pose, and of axes that no sensor measures",
-    ),
-    "odometry.twist_covariance_diagonal": Live(
-        "always", "variances (x y z roll pitch yaw) of the axes that no sensor measures"
-    ),
     "odometry.distance_variance_per_metre": Live(
         "always", "added variance of the distance per metre driven, m2 per m"
     ),

@@ -6,6 +6,7 @@ To be dropped after 0.3.
 from __future__ import annotations
 
 _LIDAR = "describe the lidar in the URDF and set lidar.publish_tf = false"
+_AXES = "remove the key: axes that wheels do not measure always have the variance 1e6"
 _RATE = "remove the key; rates.telemetry is the highest rate of all messages but odom and tf"
 
 REMOVED = {
@@ -13,6 +14,9 @@ REMOVED = {
     "lidar.lidar_z_offset": _LIDAR,
     "lidar.lidar_roll": _LIDAR,
     "lidar.lidar_pitch": _LIDAR,
+    "odometry.covariance": "remove the key: the daemon always computes the covariances",
+    "odometry.pose_covariance_diagonal": _AXES,
+    "odometry.twist_covariance_diagonal": _AXES,
     "rates.wheel_states": _RATE,
     "rates.cmd_vel_out": _RATE,
     "rates.state": _RATE,

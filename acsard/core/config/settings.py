@@ -116,11 +116,9 @@ AngularRate = Annotated[float, Meta(ge=0.01, le=500.0, extra={"unit": "rad/s2"})
 LinearJerk = Annotated[float, Meta(ge=0.0, le=1000.0, extra={"unit": "m/s3 (0 = no limit)"})]
 AngularJerk = Annotated[float, Meta(ge=0.0, le=5000.0, extra={"unit": "rad/s3 (0 = no limit)"})]
 WheelSpeed = Annotated[float, Meta(ge=0.1, le=99.99, extra={"unit": "rad/s"})]
-Variance = Annotated[float, Meta(ge=0.0, le=1e9, extra={"unit": "(m2 or rad2)"})]
 ErrorRate = Annotated[float, Meta(ge=0.0, le=10.0)]
 Deviation = Annotated[float, Meta(ge=0.0, le=1.0)]
 PublishRate = Annotated[float, Meta(ge=0.0, le=1000.0, extra={"unit": "Hz (0 = every sample)"})]
-Diagonal = tuple[Variance, Variance, Variance, Variance, Variance, Variance]
 Motor = Literal["+a", "-a", "+b", "-b", "+c", "-c", "+d", "-d"]
 EncoderCounts = Annotated[
     int, Meta(ge=0, le=100_000, extra={"unit": "per wheel turn (0 = unknown)"})
@@ -294,8 +292,6 @@ class OdometryConfig(Struct, frozen=True):
     gyro: bool = False
     gyro_scale_std: Deviation = 0.004
     learned_track: bool = False
-    pose_covariance_diagonal: Diagonal = (1e-6, 1e-6, 1e6, 1e6, 1e6, 1e-6)
-    twist_covariance_diagonal: Diagonal = (1e-3, 1e-3, 1e6, 1e6, 1e6, 1e-2)
     distance_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_radian: ErrorRate = 1e-2
@@ -305,7 +301,6 @@ class OdometryConfig(Struct, frozen=True):
     wheel_radius_ratio_std: Deviation = 0.0
     wheel_slip_std: Deviation = 0.0
     distance_scale_std: Deviation = 0.0
-    covariance: Literal["model", "constant"] = "model"
 
 
 class LidarConfig(Struct, frozen=True):

@@ -107,12 +107,7 @@ def _value(
 
 
 def finite(raw: object) -> bool:
-    """Return False if a TOML value, or an item of a TOML list, is infinite or NaN, else True.
-
-    This check is necessary because TOML allows inf and nan, and msgspec accepts them.
-    """
-    if isinstance(raw, list):
-        return all(finite(item) for item in raw)
+    """Return False for inf and nan, which TOML allows and msgspec accepts."""
     return not isinstance(raw, float) or math.isfinite(raw)
 
 
@@ -142,8 +137,6 @@ def expected(kind: inspect.Type) -> str:
             return "one of " + ", ".join(show(value) for value in values)
         case inspect.UnionType(types=types):
             return " or ".join(expected(type_) for type_ in types)
-        case inspect.TupleType(item_types=items):
-            return f"a list of {len(items)} values, each {expected(items[0])}"
         case inspect.VarTupleType(item_type=item, min_length=least, max_length=most):
             return f"a list{_entries(least, most)}, each {expected(item)}"
         case _:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 
 from acsard.core.config.settings import DIAGNOSTICS_HZ, Config
 from acsard.core.messages.certificate_expiry import DAY_NS, expiry, first_expiry
-from acsard.core.messages.covariances import UNKNOWN_COVARIANCE, Covariances
+from acsard.core.messages.covariances import UNKNOWN_COVARIANCE, pose_covariance, twist_covariance
 from acsard.core.messages.diagnostics import diagnostics
 from acsard.core.messages.recent_events import RecentEvents
 from acsard.core.messages.schema import (
@@ -108,7 +108,7 @@ class Report:
         self.use(config)
 
     def use(self, config: Config) -> None:
-        """Use the rates, frames and covariances of `config` from the next message on."""
+        """Use the rates and frames of `config` from the next message on."""
         self._config = config
         rates = config.rates
         self._rates = {
@@ -119,7 +119,6 @@ class Report:
             "diagnostics": _Rate(rates.at_most(DIAGNOSTICS_HZ)),
             "battery": _Rate(rates.at_most(BATTERY_HZ)),
         }
-        self._covariances = Covariances(config.odometry)
 
     def due(
         self, outputs: Outputs, wanted: Collection[str], get_snapshot: GetSnapshot
@@ -221,10 +220,8 @@ class Report:
         covariance `UNKNOWN_COVARIANCE`.
         """
         frames, pose = self._config.odometry, estimate.pose
-        of_pose = self._covariances.of_pose(estimate.covariance)
-        of_twist = (
-            self._covariances.of_twist(estimate.twist_variances) if live else UNKNOWN_COVARIANCE
-        )
+        of_pose = pose_covariance(estimate.covariance)
+        of_twist = twist_covariance(estimate.twist_variances) if live else UNKNOWN_COVARIANCE
         return Odometry(
             Header(Time.from_ns(estimate.at.wall_ns), frames.odom_frame),
             frames.base_frame,

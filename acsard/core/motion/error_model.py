@@ -42,6 +42,9 @@ SPEED_RESOLUTION = 0.01
 MAX_TWIST_VARIANCE = 1e9
 """Largest variance of a twist, m2/s2 and rad2/s2. It means "unknown"."""
 
+LATERAL_VARIANCE = 1e-3
+"""Variance of the sideways speed of a robot that moves, m2/s2. Wheels do not measure this speed."""
+
 MIN_TWIST_VARIANCE = 1e-8
 """Smallest variance of a twist, m2/s2 and rad2/s2. Filters that use the published twist treat a
 smaller variance as an error."""
@@ -230,11 +233,10 @@ class TwistUncertainty:
             yaw += (to_yaw * linear + of_turn * angular) ** 2
         along += self._to_linear * quantum
         yaw += self._to_angular * quantum
-        lateral = model.settings.twist_covariance_diagonal[1]
         # Do not call `max` here: three calls take half as long as all lines above.
         return TwistVariances(
             along if along > MIN_TWIST_VARIANCE else MIN_TWIST_VARIANCE,
-            lateral if lateral > MIN_TWIST_VARIANCE else MIN_TWIST_VARIANCE,
+            LATERAL_VARIANCE,
             yaw if yaw > MIN_TWIST_VARIANCE else MIN_TWIST_VARIANCE,
         )
 

@@ -30,6 +30,8 @@ MAX_VARIANCE = 1e9  # m2 or rad2: "unknown"
 
 ASSUMED_COUNTS = 400  # per revolution; few encoders have fewer
 
+START_VARIANCE = 1e-6  # of x, y (m2) and yaw (rad2) at the start and after the pose was set
+
 UNKNOWN_POSE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
 # Cause of a motion that the pose may have missed: a gap, or doubtful wheels of a side.
@@ -77,8 +79,7 @@ class PoseUncertainty:
 
     def set(self, yaw: Rad) -> None:
         """Reset the covariance to that of an initial pose with this heading."""
-        xx, yy, _, _, _, yawyaw = self._model.settings.pose_covariance_diagonal
-        self._p = PoseCovariance(xx, 0.0, 0.0, yy, 0.0, yawyaw)
+        self._p = PoseCovariance(START_VARIANCE, 0.0, 0.0, START_VARIANCE, 0.0, START_VARIANCE)
         self._cos, self._sin = math.cos(yaw), math.sin(yaw)
         if self._counted:
             self._p = added(self._p, *self._phase, self._cos, self._sin)

@@ -128,7 +128,7 @@ MAX_REQUEST_BYTES = 16384
 """Largest size of a request, bytes. A request with the names of all parameters is smaller."""
 
 NOT_SET, BOOL, INTEGER, DOUBLE, STRING = range(5)
-INTEGER_ARRAY, DOUBLE_ARRAY, STRING_ARRAY = 7, 8, 9
+STRING_ARRAY = 9
 
 SEPARATOR = "."
 
@@ -346,8 +346,6 @@ def _plain(parameter: Parameter) -> Plain:
         INTEGER: value.integer_value,
         DOUBLE: value.double_value,
         STRING: value.string_value,
-        INTEGER_ARRAY: [float(item) for item in value.integer_array_value],
-        DOUBLE_ARRAY: [*value.double_array_value],
         STRING_ARRAY: [*value.string_array_value],
     }
     if value.type not in fields:
@@ -380,11 +378,6 @@ def _value(value: object) -> ParameterValue:
             return ParameterValue(DOUBLE, double_value=value)
         case str():
             return ParameterValue(STRING, string_value=value)
-        case [float() | int(), *_]:
-            return ParameterValue(
-                DOUBLE_ARRAY,
-                double_array_value=[float(v) for v in value if isinstance(v, float | int)],
-            )
         case list() | tuple():
             return ParameterValue(STRING_ARRAY, string_array_value=[*map(str, value)])
     return ParameterValue()

@@ -103,7 +103,7 @@ def test_every_value_of_a_file_is_in_the_configuration() -> None:
         priority = 1
         timeout = 0.5
         [odometry]
-        pose_covariance_diagonal = [1, 2, 3, 4, 5, 6]
+        yaw_variance_per_metre = 1
         """
     )
     assert config.mcu.port == "/dev/ttyUSB0"
@@ -111,7 +111,7 @@ def test_every_value_of_a_file_is_in_the_configuration() -> None:
     assert config.mcu.wheels.front_left == "-b"
     assert config.rate_hz == 50.0
     assert config.commands.sources == (Source("only", 1, 0.5),)
-    assert config.odometry.pose_covariance_diagonal == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+    assert config.odometry.yaw_variance_per_metre == 1.0
     assert config.drive == Config().drive
 
 
@@ -182,18 +182,6 @@ PLANTED = [
     ("[rates]\nodom = 2000", "rates.odom", "2000", "(0 = every sample)"),
     ('[log]\nlevel = "loud"', "log.level", '"loud"', '"debug"'),
     ("[sim]\nencoder_counts = 3200.5", "sim.encoder_counts", "3200.5", "a whole number from 16"),
-    (
-        "[odometry]\ntwist_covariance_diagonal = [1.0, 2.0]",
-        "odometry.twist_covariance_diagonal",
-        "[1.0, 2.0]",
-        "a list of 6",
-    ),
-    (
-        "[odometry]\npose_covariance_diagonal = [1, 1, 1, 1, 1, -1]",
-        "odometry.pose_covariance_diagonal",
-        "[1, 1, 1, 1, 1, -1]",
-        "each a number from 0",
-    ),
     # sources
     (
         '[[commands.sources]]\nname = "x"',

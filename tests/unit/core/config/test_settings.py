@@ -27,9 +27,8 @@ FLOATS = [key for key in NUMBERS if isinstance(key.numbers()[0], inspect.FloatTy
 
 
 def accepts(key: Key, value: float) -> bool:
-    """Return whether the key's own range accepts `value`, in every element if the key is a list."""
-    raw: Any = [value] * len(key.field.default) if "diagonal" in key.path else value
-    table = {key.field.name: raw}
+    """Return whether the key's own range accepts `value`."""
+    table: dict[str, Any] = {key.field.name: value}
     if key.table is Source:
         table = {"name": "x", "priority": 1} | table
     return build(key.table, table, "t", []) is not None

@@ -21,7 +21,6 @@ CONFIGS = [
     b'[[commands.sources]]\nname = "x"\npriority = 0\ntimeout = 10.0',
     b'[bus]\nlisten = ["tcp/127.0.0.1:1", "tcp/[::1]:2"]\nconnect = ["tcp/localhost:3"]',
     b'[mcu]\nport = "/dev/serial/by-id/usb-\\"odd\\" \\\\ \\u00e9\\t"',
-    b"[odometry]\npose_covariance_diagonal = [1e-6, 0, 1e9, 0.1, 3, 1e-300]",
 ]
 
 

@@ -11,6 +11,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import DriveConfig, OdometryConfig
 from acsard.core.motion.error_model import (
+    LATERAL_VARIANCE,
     MIN_TWIST_VARIANCE,
     ErrorModel,
     Noise,
@@ -228,10 +229,9 @@ def test_coarse_encoders_see_rest_only_after_a_while() -> None:
     assert early.angular > late.angular
 
 
-def test_the_lateral_variance_is_the_configured_one_except_at_rest() -> None:
-    config = OdometryConfig(twist_covariance_diagonal=(1.0, 0.25, 1.0, 1.0, 1.0, 1.0))
-    assert uncertainty(config).of(REST, 0.01).lateral == 0.25
-    assert uncertainty(config).at_rest(1.0).lateral == MIN_TWIST_VARIANCE
+def test_the_lateral_variance_is_small_at_rest_only() -> None:
+    assert uncertainty().of(REST, 0.01).lateral == LATERAL_VARIANCE
+    assert uncertainty().at_rest(1.0).lateral == MIN_TWIST_VARIANCE
 
 
 def test_the_ratio_s_error_makes_one_side_larger_and_the_other_smaller() -> None:

@@ -19,7 +19,7 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.learned_track import Track
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.path import arc
-from acsard.core.motion.uncertainty import MAX_VARIANCE, UNKNOWN_POSE
+from acsard.core.motion.uncertainty import MAX_VARIANCE, START_VARIANCE, UNKNOWN_POSE
 from acsard.core.values import REST, Estimate, Instant, Pose, PoseCovariance, Twist, WheelSpeeds
 from tests.each import each
 from tests.unit.core.motion.liars import fold
@@ -255,9 +255,9 @@ def approx(p: PoseCovariance) -> object:
     return pytest.approx(matrix(p), rel=1e-4, abs=1e-15)
 
 
-def test_at_the_start_the_pose_is_as_certain_as_configured() -> None:
-    robot = odometry(OdometryConfig(pose_covariance_diagonal=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0)))
-    assert robot.fold(feedback(0.0, 0.0, 0.01)).covariance == PoseCovariance(1, 0, 0, 2, 0, 6)
+def test_at_the_start_the_pose_is_nearly_certain() -> None:
+    start = odometry().fold(feedback(0.0, 0.0, 0.01)).covariance
+    assert start == PoseCovariance(1e-6, 0, 0, 1e-6, 0, 1e-6)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -552,13 +552,6 @@ def test_a_gap_at_an_unknown_place_makes_the_whole_pose_unknown() -> None:
     assert robot.fold(feedback(40.0, 40.0, 0.0, gap=5.0)).covariance == UNKNOWN_POSE
 
 
-def test_a_robot_of_unknown_heading_knows_its_place_until_it_moves() -> None:
-    start = (1e-6, 1e-6, 1e6, 1e6, 1e6, 1e9)
-    robot = odometry(OdometryConfig(pose_covariance_diagonal=start))
-    assert robot.fold(feedback(0.0, 0.0, 0.01)).covariance.xx == pytest.approx(1e-6)
-    assert robot.fold(feedback(4.0, 4.0, 0.01)).covariance == UNKNOWN_POSE
-
-
 def test_a_gap_of_years_leaves_a_variance_of_1e9_and_no_more() -> None:
     robot = odometry()
     robot.fold(feedback(4.5, 7.5, 0.0))
@@ -710,7 +703,7 @@ def test_the_wheels_give_only_the_distance_when_a_gyro_gives_the_turn(
     assert by_gyro.twist == Twist(by_wheels.twist.linear, 4.0)
     assert by_gyro.positions == by_wheels.positions
     assert gyro.travelled == pytest.approx(wheels.travelled)
-    more = by_gyro.covariance.yawyaw - OdometryConfig().pose_covariance_diagonal[5]
+    more = by_gyro.covariance.yawyaw - START_VARIANCE
     assert more == pytest.approx(1e-4, rel=1e-3)  # the gyro's scale adds 0.2 mrad
 
 

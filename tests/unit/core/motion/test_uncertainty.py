@@ -204,7 +204,10 @@ def uncertainty(model: Model = DEFAULT, **changes: float) -> PoseUncertainty:
     return PoseUncertainty(ErrorModel(config, Kinematics(DriveConfig())), 0)
 
 
-def test_the_deviation_of_a_wheel_radius_makes_the_pose_less_certain() -> None:
+def test_the_deviation_of_a_wheel_radius_makes_the_pose_less_certain(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("acsard.core.motion.uncertainty.START_VARIANCE", 0.0)
     # After 10 m straight with the right wheels' radius off by 0.2 %, 0.01 m of length and 20 mm /
     # 0.3 m of yaw are wrong.
     odometry = OdometryConfig(
@@ -212,7 +215,6 @@ def test_the_deviation_of_a_wheel_radius_makes_the_pose_less_certain() -> None:
         yaw_variance_per_metre=0.0,
         yaw_variance_per_radian=0.0,
         right_wheel_radius_multiplier_std=0.002,
-        pose_covariance_diagonal=(0.0,) * 6,
     )
     model = PoseUncertainty(ErrorModel(odometry, Kinematics(DriveConfig())), 0)
     for _ in range(1000):
@@ -281,9 +283,12 @@ def test_the_unknown_wheel_angle_within_a_count_adds_to_the_yaw_variance(
     assert known.yawyaw - unknown.yawyaw == pytest.approx(places), "at the start, and now"
 
 
-def test_the_error_of_a_track_counts_for_the_turns_that_it_made() -> None:
+def test_the_error_of_a_track_counts_for_the_turns_that_it_made(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("acsard.core.motion.uncertainty.START_VARIANCE", 0.0)
     none = replace(Model(0.0, 0.0, 0.0, track_std=0.05).config(), learned_track=True)
-    robot = Odometry(replace(none, pose_covariance_diagonal=(0.0,) * 6), Kinematics(DriveConfig()))
+    robot = Odometry(none, Kinematics(DriveConfig()))
 
     def turned(rad: float) -> tuple[float, float]:
         before = robot.pose.yaw
