@@ -53,7 +53,7 @@ def test_a_key_without_a_value_is_refused_with_the_syntax() -> None:
         pairs(["limits.linear_speed"])
 
 
-@each("word", ["nan", "-inf", "1e400", "[1, inf]"])
+@each("word", ["nan", "-inf", "1e400"])
 def test_a_number_that_is_not_finite_is_refused_with_its_key(word: str) -> None:
     words = rf"^limits\.linear_speed = {re.escape(word)}: a number must be finite"
     with pytest.raises(UsageError, match=words):
