@@ -262,7 +262,7 @@ def test_changed_settings_of_a_daemon_on_another_machine_are_a_warning(here: boo
     running = running_daemon(0.0, here=here)
     running = replace(running, state=replace(running.state, settings_differ="rates.odom = 7.5"))
     texts = [finding.text for finding in daemon(running) if finding.subject == "configuration"]
-    words = "settings were changed since the daemon's start: rates.telemetry = 7.5"
+    words = "settings were changed since the daemon's start: rates.odom = 7.5"
     # On the daemon's own machine the doctor compares with the file itself.
     assert texts == ([] if here else [words])
 
