@@ -523,7 +523,7 @@ COMMANDS: dict[str, How] = {
     "sudo install -m 0644 router.json5 /etc/zenohd/": PLACES,
     "acsard router /etc/zenohd/router.json5": Elsewhere(
         ROUTER,
-        "test_a_signal_ends_the_router_and_its_child_process",
+        "test_a_signal_ends_the_router",
         "with the file's addresses and certificates changed",
     ),
     "zenohd -c /etc/zenohd/router.json5": Elsewhere(

@@ -30,7 +30,7 @@ from acsard.core.messages.permissions import (
 )
 from acsard.core.ros.transports import ros_names
 from acsard.core.values import ROLES, Role, Verb
-from acsard.daemon.gateway.fleet_router import EXAMPLE_ROBOT
+from acsard.machine.router_file import EXAMPLE_ROBOT
 
 ROOT = Path(__file__).parent.parent
 

@@ -11,7 +11,7 @@ import sys
 
 from acsard.bus.zenoh_sessions import log_from_environment
 from acsard.cli.common import add_config, load
-from acsard.daemon.gateway.listener_process import ListenerProcess
+from acsard.daemon.gateway.gateway_process import GatewayProcess
 from acsard.daemon.gateway.tls_gateway import Gateway
 from acsard.host.errors import UsageError
 from acsard.host.logs import Log
@@ -40,7 +40,7 @@ def main(args: argparse.Namespace) -> int:
     log, manager = Log(config.log), Systemd(os.environ, os.getpid())
     try:
         holder = sys.stdin.fileno() if args.supervised else None
-        return ListenerProcess(Gateway(config), log, manager, holder).run()
+        return GatewayProcess(Gateway(config), log, manager, holder).run()
     finally:
         manager.close()
         log.close()

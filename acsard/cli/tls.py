@@ -19,11 +19,11 @@ from acsard.cli.common import add_config, load, whole
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import write
 from acsard.core.values import ROLES
-from acsard.daemon.gateway.fleet_router import router_file
 from acsard.host.config_file import change, require_changeable, require_tomlkit
 from acsard.host.errors import UsageError
 from acsard.machine import certificates
 from acsard.machine import service_installation as service
+from acsard.machine.router_file import router_file
 from acsard.machine.service_installation import TLS_DIRECTORY, source
 
 NAME = re.compile(r"(?!@)[A-Za-z0-9_ .:@+-]{1,64}")

@@ -226,7 +226,7 @@ EventName = Literal[
     "missed_periods", "recording", "latch_file",
     "gateway_open", "gateway_full", "gateway_stuck", "gateway_lost_daemon", "gateway_ended",
     "page_ended", "page_refused",
-    "router_open", "router_full", "router_stuck", "router_ended",
+    "router_open",
     Verb,
     "speed_limit",
     "mode", "commander", "commands_without_effect", "new_sender", "command_refused", "fault",

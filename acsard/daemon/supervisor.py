@@ -1,4 +1,4 @@
-"""Runs the process of the TLS gateway, of a fleet's router or of the web page, and restarts it.
+"""Runs the process of the TLS gateway or of the web page, and restarts it.
 
 A process that sends no signs of life is killed and started again. If the gateway runs as a service,
 systemd supervises it instead (`acsard-gateway.service`), because only systemd can set the limits of
@@ -45,15 +45,6 @@ class Kind(Struct, frozen=True):
 GATEWAY = Kind("the TLS gateway", "gateway_ended")
 """The TLS gateway. It is always restarted, because a person may correct its files while the robot
 drives."""
-
-ROUTER = Kind(
-    "the router",
-    "router_ended",
-    final_at_first=frozenset({Exit.USAGE, Exit.BAD_CONFIG}),
-    remedy="correct its configuration or its certificates, and run `acsard router` again",
-)
-"""The router of a fleet. If its files are unusable at the first start, the router is not started
-again. At a later restart a person may be changing the files, so the router is started again."""
 
 PAGE = Kind(
     "the robot's page",

@@ -1,19 +1,14 @@
-"""Run the router of deploy/zenoh/router.json5, in three ways.
-
-They are the Zenoh library of Python, `acsard router`, and the real zenohd.
-"""
+"""Run the router of deploy/zenoh/router.json5 by the Zenoh library of Python, or by acsard."""
 
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
-import pytest
 import zenoh
 
-from acsard.daemon.gateway.fleet_router import router_file
 from acsard.machine.authority import Authority
+from acsard.machine.router_file import router_file
 from tests.system.harness import ROOT, Program, acsard
 from tests.system.strangers import command_line
 
@@ -111,14 +106,6 @@ def router(where: Path, endpoint: str) -> Program:
     return Program(command_line(_ROUTER, file, json.dumps(_changes(file, where, endpoint))), where)
 
 
-def watched_router(where: Path, endpoint: str) -> Program:
+def acsard_router(where: Path, endpoint: str) -> Program:
     """Run `acsard router` with that file. Its log says when it listens."""
     return Program(acsard("router", str(write_local_copy(for_two(where), where, endpoint))), where)
-
-
-def zenohd(where: Path, endpoint: str) -> Program:
-    """Run the real zenohd, if it is on the PATH, without its plugins."""
-    program = shutil.which("zenohd")
-    if program is None:
-        pytest.skip("needs zenohd")
-    return Program([program, "-c", str(write_local_copy(for_two(where), where, endpoint))], where)

@@ -21,7 +21,7 @@ from acsard.bus.certificate_watch import FILES_CHECK_PERIOD_NS
 from acsard.bus.tls import KEY, peer_ends_ns
 from acsard.core.config.settings import BusConfig, Config
 from acsard.core.values import NS_PER_S
-from acsard.daemon.gateway.listener_process import MAX_UNANSWERED
+from acsard.daemon.gateway.session_health import MAX_UNANSWERED
 from acsard.daemon.gateway.tls_gateway import Gateway
 from acsard.host.errors import CertificateError, InUseError
 from acsard.machine.authority import Authority

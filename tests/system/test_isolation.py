@@ -20,10 +20,9 @@ import zenoh
 from tests.system.bystander import lost
 from tests.system.fleet_router import (
     ITS_NAME,
+    acsard_router,
     certified,
     tls_settings,
-    watched_router,
-    zenohd,
 )
 from tests.system.harness import (
     Bus,
@@ -287,17 +286,14 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Gateway:
     return Gateway(Certificates(tmp_path_factory.mktemp("certificates")))
 
 
-Router = Callable[[Path, str], Program]
-
-
 @contextmanager
-def fleet(where: Path, router: Router) -> Iterator[Network]:
+def fleet(where: Path) -> Iterator[Network]:
     """Run a router with the rules of deploy/zenoh. Yield how a client reaches a robot behind it."""
     tls = free_tls_endpoint()
     certified(where, "robot1", ITS_NAME, "viewer", "operator", "unlisted")
     bus: dict[str, object] = {"listen": [], "connect": [tls], "tls": str(where / "robot1")}
     tables: Tables = {"bus": bus, "access": {"maintainers": [ITS_NAME]}}
-    with router(where, tls) as program:
+    with acsard_router(where, tls) as program:
         until(lambda: _answers(tls), 10.0, f"the router listens\n{program}")
         yield Network(tls, lambda identity: tls_settings(where / identity), tables, "robot1")
 
@@ -370,28 +366,8 @@ def test_an_admitted_attacker_disturbs_neither_the_loop_nor_a_stop_nor_other_cli
     undisturbed(figures, long=seconds >= LONG_S)
 
 
-@pytest.mark.parametrize(
-    ("form", "identity", "seconds"),
-    attacks(
-        {"viewer": (*FORMS, *LARGE), "unlisted": ("publish", "sessions", "come_and_go", "flood")},
-        {
-            "viewer": ("subscribe", "publish", "querier", "as_peer"),
-            "unlisted": ("sessions",),
-        },
-    ),
-)
-@pytest.mark.nightly
-def test_an_attack_on_the_fleets_router_does_not_disturb_the_robot_behind_it(
-    tmp_path: Path, form: str, identity: Identity, seconds: float
-) -> None:
-    with fleet(tmp_path, watched_router) as network:
-        figures = Robot(tmp_path, network).attacked(form, identity, seconds)
-    print(f"\n{form} by {identity}: {figures}")
-    undisturbed(figures, long=seconds >= LONG_S)
-
-
 HOLD_UP = ("publish", "querier", "as_peer")
-"""Attacks that zenohd's rules do not cover: they block the router, and a person must restart it."""
+"""Attacks that the rules do not cover: they block the router, and a person must restart it."""
 
 
 @pytest.mark.parametrize(
@@ -401,10 +377,10 @@ HOLD_UP = ("publish", "querier", "as_peer")
         for n, form in enumerate(form for form in FORMS if form not in HOLD_UP)
     ],
 )
-def test_an_attack_on_zenohd_does_not_disturb_the_robot_behind_it(
+def test_an_attack_on_the_fleets_router_does_not_disturb_the_robot_behind_it(
     tmp_path: Path, form: str
 ) -> None:
-    with fleet(tmp_path, zenohd) as network:
+    with fleet(tmp_path) as network:
         figures = Robot(tmp_path, network).attacked(form, "viewer", 1.5)
     print(f"\n{form} by viewer: {figures}")
     undisturbed(figures)

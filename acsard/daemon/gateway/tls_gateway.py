@@ -2,7 +2,7 @@
 
 The gateway is a Zenoh router in a separate process. It forwards only the messages that the access
 rules allow. The worst effect that a client can have is a restart of the gateway
-(`listener_process.py`), after which all clients reconnect.
+(`gateway_process.py`), after which all clients reconnect.
 """
 
 from __future__ import annotations
@@ -21,12 +21,7 @@ from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.keys_and_roles import full_key
 from acsard.core.messages.schema import GatewayState
 from acsard.core.values import NS_PER_S
-from acsard.daemon.gateway.listener_process import (
-    GATEWAY_EVENTS,
-    Listener,
-    Observation,
-    SessionHealth,
-)
+from acsard.daemon.gateway.session_health import Observation, SessionHealth
 from acsard.host import clock
 
 PROBE_TIMEOUT_NS = NS_PER_S
@@ -38,8 +33,8 @@ QUERY_TIMEOUT_S = 60.0
 `PROBE_TIMEOUT_NS`, after which the query counts as unanswered."""
 
 
-class Gateway(Listener):
-    """The TLS gateway, as a `Listener`.
+class Gateway:
+    """The session of the TLS gateway.
 
     The gateway admits clients only after the daemon has started. It tells the daemon how many
     clients are connected.
@@ -47,7 +42,6 @@ class Gateway(Listener):
 
     most = MAX_SESSIONS - 1
     """Largest number of connections from the network. One more connection is for the daemon."""
-    events = GATEWAY_EVENTS
 
     def __init__(self, config: Config) -> None:
         """Check the certificate files.

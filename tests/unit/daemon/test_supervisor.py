@@ -13,7 +13,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.core.values import Event
-from acsard.daemon.supervisor import GATEWAY, PAGE, ROUTER, Kind, keep_running
+from acsard.daemon.supervisor import GATEWAY, PAGE, Kind, keep_running
 
 
 async def first_event(kind: Kind = GATEWAY) -> Event:
@@ -62,9 +62,7 @@ def test_a_program_that_falls_silent_is_killed(
         os.kill(int(pid.read_text()), signal.SIGCONT)
 
 
-@pytest.mark.parametrize(
-    ("kind", "code"), [(ROUTER, 2), (ROUTER, 78), (PAGE, 2), (PAGE, 75), (PAGE, 77), (PAGE, 78)]
-)
+@pytest.mark.parametrize(("kind", "code"), [(PAGE, 2), (PAGE, 75), (PAGE, 77), (PAGE, 78)])
 def test_a_program_that_cannot_start_at_first_is_given_up_and_the_log_says_the_remedy(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Kind, code: int
 ) -> None:
@@ -77,9 +75,7 @@ def test_a_program_that_cannot_start_at_first_is_given_up_and_the_log_says_the_r
     assert kind.remedy in event.text
 
 
-@pytest.mark.parametrize(
-    ("kind", "code"), [(ROUTER, 2), (ROUTER, 78), (PAGE, 2), (PAGE, 77), (PAGE, 78)]
-)
+@pytest.mark.parametrize(("kind", "code"), [(PAGE, 2), (PAGE, 77), (PAGE, 78)])
 def test_a_program_that_once_ran_is_started_again_when_its_files_are_wrong(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Kind, code: int
 ) -> None:
@@ -119,10 +115,10 @@ def test_a_page_that_a_person_ends_after_it_ran_stays_ended_and_the_log_says_the
     assert "`acsard web`" in events[1].text
 
 
-def test_the_first_router_that_could_be_started_counts_as_the_first(
+def test_the_first_page_that_could_be_started_counts_as_the_first(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """If the system refuses to start the process, this says nothing about the router's files."""
+    """If the system refuses to start the process, this says nothing about the page's files."""
     monkeypatch.setattr("acsard.daemon.supervisor.LONG_RESTART_PAUSE_S", 0.01)
     program(monkeypatch, tmp_path, "raise SystemExit(78)")
     executable = sys.executable
@@ -133,13 +129,13 @@ def test_the_first_router_that_could_be_started_counts_as_the_first(
         events.append(event)
         monkeypatch.setattr(sys, "executable", executable)
 
-    assert asyncio.run(keep_running(["router"], log, ROUTER)) == 78
+    assert asyncio.run(keep_running(["web"], log, PAGE)) == 78
     refused, given_up = (event.text for event in events)
     assert "could not be started" in refused
     assert "it is not restarted" in given_up
 
 
-@pytest.mark.parametrize(("kind", "code"), [(GATEWAY, 78), (ROUTER, 75), (ROUTER, 1)])
+@pytest.mark.parametrize(("kind", "code"), [(GATEWAY, 78), (PAGE, 1)])
 def test_a_program_that_may_start_later_is_restarted(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Kind, code: int
 ) -> None:

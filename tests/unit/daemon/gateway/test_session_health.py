@@ -5,7 +5,7 @@ It logs them, and it restarts if necessary.
 
 from __future__ import annotations
 
-from acsard.daemon.gateway.listener_process import (
+from acsard.daemon.gateway.session_health import (
     FIRST_CONNECTION_NS,
     LOST_DAEMON_NS,
     MAX_UNANSWERED,

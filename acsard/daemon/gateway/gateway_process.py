@@ -1,0 +1,159 @@
+"""Runs the TLS gateway's Zenoh session in a separate process that can be restarted.
+
+A malicious client can make Zenoh compare key expressions for ever, use all connections, or use much
+memory. This process then suffers, but the daemon does not. During such an attack a call to Zenoh
+may never return. So a separate thread observes the session, and the main thread checks that new
+observations keep coming.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import select
+import signal
+import threading
+
+import zenoh
+
+from acsard.core.values import Event
+from acsard.daemon.gateway.session_health import Observation, SessionHealth
+from acsard.daemon.gateway.tls_gateway import Gateway
+from acsard.host import clock
+from acsard.host.child import Parent, end_signals, end_with_parent
+from acsard.host.errors import Exit
+from acsard.host.logs import Log
+from acsard.host.systemd import Systemd
+
+CHECK_PERIOD_S = 0.25
+"""Interval at which a thread observes the Zenoh session, s. At the same interval, the main thread
+checks that this thread still makes observations."""
+
+MAX_MEMORY_BYTES = 192 << 20
+"""Limit of the data memory of this process, bytes. The process needs 35 MB, or 72 MB if all
+connections are in use. An attack can use another 600 MB in each second, too fast for a periodic
+check. So the kernel enforces the limit: it refuses more memory, which ends the process."""
+
+
+class GatewayProcess:
+    """The main loop of the process that opens and observes the session of the gateway.
+
+    The loop ends when the process must end or be restarted.
+    """
+
+    def __init__(self, gateway: Gateway, log: Log, manager: Systemd, parent: int | None) -> None:
+        """Prepare the process; `run` runs it.
+
+        Args:
+            gateway: the session of this process.
+            log: the log of this process.
+            manager: the connection to systemd.
+            parent: file descriptor whose other end belongs to the parent process, or None. This
+                process ends when the parent closes that end. If the descriptor is a socket, this
+                process writes a sign of life to it in every period.
+        """
+        self._gateway, self._log, self._manager = gateway, log, manager
+        self._parent = None if parent is None else Parent(parent)
+        self._session: zenoh.Session | None = None
+        """The open session. It is never closed, because closing it could take for ever."""
+        self._observed = Observation(0)
+        self._error: BaseException | None = None
+        self._leaving = False
+
+    def run(self) -> Exit:
+        """Run until the process must end, and return its exit code.
+
+        The code is OK after a signal or the end of the parent, and FAILURE if a restart is needed.
+        If the observing thread fails, raise its exception.
+        """
+        for number in end_signals():
+            signal.signal(number, self._leave)
+        if self._parent is not None:
+            end_with_parent(signal.SIGKILL)
+        _confine()
+        self._manager.ready()
+        while not self._gateway.ready():
+            self._manager.status("waits for the daemon")
+            if self._wait():
+                return Exit.OK
+        health = self._open()
+        before_ns = clock.mono_ns()
+        while not self._wait():
+            if self._error is not None:
+                raise self._error
+            now_ns = clock.mono_ns()
+            event = health.restart_event(self._observed, now_ns - before_ns)
+            if event is not None:
+                self._log.event(event)
+                return Exit.FAILURE
+            if self._renewed():
+                text = (
+                    "this process restarts with its new certificate, which disconnects all clients"
+                )
+                self._log.info("gateway_open", text=text)
+                return Exit.FAILURE
+            before_ns = now_ns
+        return Exit.OK
+
+    def _renewed(self) -> bool:
+        """Return whether the process must restart to use a new certificate."""
+        files = self._gateway.files
+        if not files.renewed():
+            return False
+        why = files.refused()
+        if why:
+            text = (
+                "this process goes on with its old certificate, because it cannot use the new one: "
+                f"{why}"
+            )
+            self._log.event(Event("gateway_open", text, "warning"))
+        return not why
+
+    def _leave(self, *_: object) -> None:
+        self._leaving = True
+
+    def _wait(self) -> bool:
+        """Wait for `CHECK_PERIOD_S`, and return whether the process must end."""
+        self._manager.alive()
+        parent = self._parent
+        if parent is None:
+            select.select([], [], [], CHECK_PERIOD_S)
+            return self._leaving
+        parent.beat()
+        readable, _, _ = select.select([parent.fd], [], [], CHECK_PERIOD_S)
+        return self._leaving or (bool(readable) and parent.is_gone())
+
+    def _open(self) -> SessionHealth:
+        gateway = self._gateway
+        session = self._session = gateway.open()
+        opened_ns = clock.mono_ns()
+        self._observed = Observation(opened_ns)
+        health = SessionHealth(gateway.most, opened_ns)
+        threading.Thread(target=self._observe, args=(session, health), daemon=True).start()
+        self._log.info("gateway_open", text=f"listens at {gateway.where}")
+        self._manager.status(f"open at {gateway.where}")
+        return health
+
+    def _observe(self, session: zenoh.Session, health: SessionHealth) -> None:
+        try:
+            pause = threading.Event()
+            while True:
+                observed = self._observed = self._gateway.observe(session)
+                event = health.full_event(observed)
+                if event is not None:
+                    self._log.event(event)
+                self._gateway.report(session, observed, health)
+                pause.wait(CHECK_PERIOD_S)
+        except BaseException as error:  # noqa: BLE001 - raised by `run`, which ends the process
+            self._error = error
+
+
+def _confine() -> None:
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_DATA, (MAX_MEMORY_BYTES, MAX_MEMORY_BYTES))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    with contextlib.suppress(OSError):
+        os.nice(5)  # the daemon and ordinary programs have priority over this process
+    # If a lack of memory ends the process, a backtrace would only fill the log.
+    os.environ["RUST_BACKTRACE"] = "0"
