@@ -1,10 +1,9 @@
 """Runs the daemon from its start to its end.
 
-The daemon opens the built-in simulator (if it is configured), the bus and the serial port, in this
-order. Then it runs the control loop. At the first signal, the robot ramps to zero speed, and a
-second signal cuts the ramp short. Then the port sends STOP (a line of zero speeds) and closes, and
-the bus closes last. If an exception ends a task of the daemon, the robot does not ramp, but the
-port still sends STOP.
+It opens the simulator (if configured), the bus and the port, in this order, and runs the control
+loop. At the first signal the robot ramps to zero, and a second one cuts that short. Then the port
+sends STOP (zeros) and closes, and the bus last. If an exception ends a task, there is no ramp, but
+STOP.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from acsard.bus.zenoh_sessions import log_from_environment
 from acsard.core.config.settings import Config
 from acsard.core.link.codec import Codec
 from acsard.core.messages.schema import Info
-from acsard.core.values import NS_PER_S, Event, Latches
+from acsard.core.values import NS_PER_S, Event, Latches, Ns, WallNs
 from acsard.daemon.bus.bus import ZenohBus
 from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_file import LatchFile
@@ -39,41 +38,30 @@ from acsard.host.systemd import START_EXTENSION_S, Systemd
 from acsard.host.version import version
 from acsard.recording.recorder import Recorder
 
-MAX_EXIT_RAMP_S = 0.6
-"""Longest time for the ramp to zero speed at the shutdown, s. After this time the daemon sends
-STOP, the line of zero speeds, even if the robot still moves."""
+MAX_EXIT_RAMP_S = 0.6  # then STOP is sent even if the robot still moves
 
 
 class Departure:
-    """State of the daemon's shutdown, and a context manager that handles the signals.
-
-    The first signal begins a ramp to zero speed, and a second signal cuts the ramp short. If the
-    daemon's start is not complete, a signal cancels the start.
-    """
+    """The daemon's shutdown by signals, of which one during the start cancels the start."""
 
     def __init__(self, log: Log, wake: Callable[[], None], manager: Systemd) -> None:
         self._log, self._wake, self._manager = log, wake, manager
         self._starting = asyncio.current_task()
-        self.begun_ns: int | None = None
+        self.begun_ns: Ns | None = None
         self.hurried = False
 
     def __enter__(self) -> Self:
-        """Begin to handle the signals that end the daemon."""
         loop = asyncio.get_running_loop()
         for number in end_signals():
             loop.add_signal_handler(number, self._signal, number)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> bool:
-        """Suppress a `CancelledError` if a signal has begun the shutdown.
-
-        A signal that arrives during the start of the daemon cancels the start. The resulting
-        `CancelledError` is a normal end of the daemon and not an error.
-        """
+        # A signal cancels the start, which is no error.
         return kind is asyncio.CancelledError and self.begun_ns is not None
 
     def started(self) -> None:
-        """Record that the daemon's start is complete, so that a signal no longer cancels it."""
+        """Record that the start is complete, so that a signal no longer cancels it."""
         self._starting = None
 
     def _signal(self, number: signal.Signals) -> None:
@@ -88,32 +76,21 @@ class Departure:
             self._starting = None
         self._wake()
 
-    def over(self, now_ns: int, at_rest: bool) -> bool:
-        """Return whether the daemon may end now.
-
-        Before the first signal, return False. Afterwards return True if the last step commanded
-        zero speed, if a second signal has arrived, or if the ramp has lasted for `MAX_EXIT_RAMP_S`.
-
-        Args:
-            now_ns: the present monotonic time, ns.
-            at_rest: whether the last step commanded zero speed.
-        """
+    def over(self, now_ns: Ns, at_rest: bool) -> bool:
+        """Return whether the daemon may end: after a signal, at rest or after the ramp."""
         if self.begun_ns is None:
             return False
         return at_rest or self.hurried or now_ns - self.begun_ns > MAX_EXIT_RAMP_S * NS_PER_S
 
 
+# Longest hold of the interpreter lock by another thread; the default, 5 ms, is half a period.
 SWITCH_INTERVAL_S = 0.0005
-"""Longest time that another Python thread may hold the interpreter lock, s. Python's default of
-5 ms is half a control period."""
 
+# `tf_static` is repeated, as some subscribers cannot query the last sample of a latched topic.
 LATCHED_PERIOD_S = 5.0
-"""Interval at which the daemon publishes the latched topic `tf_static` again, s. It does so because
-some subscribers cannot query the last sample of a latched topic."""
 
+# Gets the serial device, and why it is not open, once the start is complete.
 Announce = Callable[[str, str], None]
-"""Function that the daemon calls once, when its start is complete. The first argument is the path
-of the serial device. The second is the reason why this device is not open, or "" if it is open."""
 
 
 async def run(
@@ -123,18 +100,10 @@ async def run(
     gateway: Sequence[str] | None = None,
     page: Sequence[str] | None = None,
 ) -> None:
-    """Run the daemon until a signal ends it.
+    """Run the daemon until a signal ends it. Raises a `MendableError` if it cannot start.
 
-    Raises a `MendableError` if the daemon cannot start.
-
-    Args:
-        config: the configuration at the start of the daemon.
-        log: the daemon's log.
-        announce: function that is called once, when the start is complete.
-        gateway: command-line arguments with which the daemon starts `acsard gateway` if
-            `bus.outside` names endpoints. None if the gateway runs as a separate service.
-        page: command-line arguments with which the daemon starts `acsard web`. None for no web
-            page.
+    `gateway` (with `bus.outside`) and `page` are the arguments of child processes, if this daemon
+    has to start them.
     """
     wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())
@@ -202,7 +171,7 @@ async def run(
 
 
 def _recorder(
-    config: Config, log: Callable[[Event], None], wall_ns: int, stack: AsyncExitStack
+    config: Config, log: Callable[[Event], None], wall_ns: WallNs, stack: AsyncExitStack
 ) -> Recorder | None:
     if not config.record.directory:
         return None
@@ -237,12 +206,8 @@ async def _beside(helpers: Iterable[Coroutine[Any, Any, object]]) -> AsyncIterat
 
 
 def _certificates(config: Config, ours: bool) -> dict[str, int]:
-    """Return the expiry time of each TLS certificate of this robot, ns since 1970.
-
-    The keys of the returned dict are those of `tls.expiry_times`. Return {} if neither the daemon
-    nor its gateway uses TLS. Raises `MendableError` if a certificate file cannot be used. `ours` is
-    true if this daemon itself starts the TLS gateway.
-    """
+    # By the keys of `tls.expiry_times`; {} without TLS. Raises `MendableError`. `ours`: this daemon
+    # starts the TLS gateway.
     bus = config.bus
     if not (bus.tls_routers or (ours and bus.outside)):
         return {}
@@ -291,7 +256,7 @@ async def _control(
 
 @asynccontextmanager
 async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator[None]:
-    """Log that the daemon waits for its router, and tell systemd so. Do nothing in peer mode."""
+    # Nothing in peer mode.
     if config.bus.mode == "peer":
         yield
         return

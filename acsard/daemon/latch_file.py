@@ -1,12 +1,9 @@
-"""The file that stores the latches for the next start of the daemon.
+"""The file that stores the latches for the next start of the daemon (`latch_rules.py`).
 
-A latch is a stop, a fault or "inactive", which lasts until a person releases it. `latch_rules.py`
-decides with which latches the robot starts.
-
-The control loop hands the newest latches to a thread that writes the file, and never waits for the
-disk. Once this thread has renamed the new file, a kill of the process loses nothing. A second
-thread syncs the file; after that a power cut loses nothing. There are two threads, because a stop
-must not wait for the sync of earlier latches. On an SD card, a sync takes up to seconds.
+The control loop hands them to a thread that writes the file, and never waits for the disk. After
+the rename, a kill loses nothing, and after the sync of a second thread, a power cut. There are two,
+because a stop must not wait for the sync of earlier latches, which takes up to seconds on an SD
+card.
 """
 
 from __future__ import annotations
@@ -44,34 +41,21 @@ from acsard.host.mailbox import Mailbox
 from acsard.host.threads import NoThreadError, in_thread
 from acsard.host.wait_timer import WaitTimer
 
-HANG_TIMEOUT_S = 2.0
-"""Time limit for the disk, s. If a write or a sync of the latch file takes longer, the daemon
-reports that the disk hangs. At the start of the daemon, the first read and the first write together
-must not take longer."""
+HANG_TIMEOUT_S = 2.0  # of a write or a sync; at the start, of the first read and write together
 
-MIN_WRITE_PAUSE_S = 0.05
-"""Pause after each successful write, s. Each stop is a new latch, so without this pause a flood of
-stops would wear out an SD card."""
+MIN_WRITE_PAUSE_S = 0.05  # each stop is a new latch: a flood of stops would wear out an SD card
 
-RETRY_PAUSE_S = 1.0
-"""Pause between two attempts to write a file that could not be written, s."""
+RETRY_PAUSE_S = 1.0  # between two attempts to write
 
-CLOSE_TIMEOUT_S = 0.3
-"""Longest time that the daemon waits at its end for the last write and its sync, s."""
+CLOSE_TIMEOUT_S = 0.3  # at the end of the daemon
 
 DISK_HANGS = f"the disk did not answer within {HANG_TIMEOUT_S:g} s"
 
-MAX_EVENTS = 64
-"""Largest number of events that wait for the next control step. A newer event displaces the
-oldest."""
+MAX_EVENTS = 64  # for the next control step; the oldest goes
 
 
 def place(config: Config, environ: Mapping[str, str]) -> Path:
-    """Return the path of this robot's latch file.
-
-    `environ` contains the environment variables, which may name the directory. Raises `OSError` if
-    no directory can be found, for example because the user has no home directory.
-    """
+    """Return the path of this robot's latch file, by its environment. Raises `OSError`."""
     name = f"{config.robot.id}.latches.json"
     try:
         if config.control.state_directory:
@@ -95,65 +79,42 @@ def place(config: Config, environ: Mapping[str, str]) -> Path:
 
 
 class LatchFile(LatchKeeper):
-    """The file that stores a robot's latches: a stop, a fault or "inactive".
-
-    The latches then survive a restart of the daemon. Call `start()` once, and then `keep()` after
-    every change of the latches.
-    """
+    """The file that stores a robot's latches over a restart: `start()` once, then `keep()`."""
 
     def __init__(self, config: Config, environ: Mapping[str, str]) -> None:
-        self.where = "no directory"
-        """Path of the file as messages show it, or "no directory" if no directory is found."""
-        self._path: Path | None = None
-        """Path of the file. If the path is a link to a file, `_read` replaces the path by that of
-        the link's target."""
+        self.where = "no directory"  # for messages
+        self._path: Path | None = None  # of the target, if it is a link
         self._robot = config.robot.id
-        self._barred = ""
-        """Reason why the daemon must never write the file; "" if the daemon may write it."""
+        self._barred = ""  # why the file must never be written
         try:
             self._path = place(config, environ)
             self.where = str(self._path)
         except OSError as error:
             self._barred = _reason(error)
-        self._lock = -1
-        """Descriptor of the lock that keeps other daemons away from the latch file; -1 without a
-        lock."""
+        self._lock = -1  # descriptor that keeps other daemons away, or -1
+        # Held while reading or writing, not for a sync, and never by the control loop.
         self._disk = threading.Lock()
-        """Lock of the thread that reads or writes the latch file. A sync needs no lock. The control
-        loop never takes this lock."""
-        self._abandoned = False
-        """True if `start` has timed out while another thread was reading and writing the file."""
-        self._start_latches: Latches | None = None
-        """The latches that the file contained when the daemon started; None before it is read."""
-        self._blind = False
-        """True if `start()` could not read the file in time. The writing thread must then read it
-        before its first write."""
-        self._missed = Latches()
-        """Latches in the file that the robot did not get, because `start()` could not read the file
-        in time. Each write adds these latches to the file again."""
-        self._box = Mailbox[Latches](1)
-        """Passes the latches of the last call of `keep` to the writing thread."""
+        self._abandoned = False  # `start` timed out while another thread used the file
+        self._start_latches: Latches | None = None  # in the file at the start
+        self._blind = False  # not read in time: the writing thread reads it before its first write
+        self._missed = Latches()  # latches in such a file, which each write adds again
+        self._box = Mailbox[Latches](1)  # to the writing thread
         self._news = Mailbox[Event](MAX_EVENTS)
-        self._written_latches: Latches | None = None
-        """The latches that this process wrote last. None before the first write."""
+        self._written_latches: Latches | None = None  # by this process
         self._failed = ""
-        self._newest_latches: Latches | None = None
-        """The latches of the last call of `keep`."""
+        self._newest_latches: Latches | None = None  # of the last `keep`
         self._write_timer, self._sync_timer = WaitTimer(), WaitTimer()
-        self._hangs = False
-        """True if the last call of `take_events` found that the disk hangs."""
-        self._renamed = Mailbox[Latches](1)
-        """Passes the newest latches in the file to the syncing thread."""
-        self._threads: tuple[threading.Thread, ...] = ()
-        """The thread that writes the file and the thread that syncs it. Empty until both run."""
+        self._hangs = False  # at the last `take_events`
+        self._renamed = Mailbox[Latches](1)  # in the file, to the syncing thread
+        self._threads: tuple[threading.Thread, ...] = ()  # for writing and syncing, once both run
 
     # The start of the daemon calls the methods below.
 
     async def start(self, now: Instant) -> Latches:
         """Read the file, try to write it, and return the latches with which the robot starts.
 
-        If the file cannot be read or written, the returned latches contain a stop. `now` is the
-        time of that stop. Raises `InUseError` if another daemon uses this file.
+        They have a stop at `now` if that fails. Raises `InUseError` if another daemon uses the
+        file.
         """
         try:
             latches = await in_thread(lambda: self._load(now), HANG_TIMEOUT_S)
@@ -203,10 +164,7 @@ class LatchFile(LatchKeeper):
         return after_failed_write(latches, at_start(unwritable(self.where, why)), now)
 
     def _read(self, now: Instant) -> Latches:
-        """Lock the file, and return its latches. If the file cannot be read, return a stop.
-
-        Raises `InUseError` if another daemon has locked the file.
-        """
+        # Locks the file; a stop if it is unreadable. Raises `InUseError`.
         path = self._path
         if path is None:
             return Latches()
@@ -306,10 +264,7 @@ class LatchFile(LatchKeeper):
         )
 
     def close(self) -> None:
-        """Wait until the newest latches are written and synced, and end both threads.
-
-        The wait takes at most `CLOSE_TIMEOUT_S`.
-        """
+        """Wait at most `CLOSE_TIMEOUT_S` until the latches are synced, and end both threads."""
         end_ns = clock.mono_ns() + CLOSE_TIMEOUT_S * NS_PER_S
         for box, thread in zip((self._box, self._renamed), self._threads, strict=False):
             box.close()
@@ -332,10 +287,7 @@ class LatchFile(LatchKeeper):
             self._box.wait(None if latches is None else RETRY_PAUSE_S)
 
     def _try(self, latches: Latches, now: Instant) -> str:
-        """Write these latches. Return the reason if that fails, else "".
-
-        `now` is the time at which the daemon started.
-        """
+        # Why that fails; `now` is the daemon's start.
         self._write_timer.begin()
         with self._disk:
             if self._blind:
@@ -347,10 +299,7 @@ class LatchFile(LatchKeeper):
         return trouble
 
     def _read_late(self, now: Instant) -> None:
-        """Read the latches in the file, if `start()` could not read the file in time.
-
-        Without this call, the next write of the file would overwrite these latches.
-        """
+        # The next write would overwrite what `start()` could not read in time.
         self._blind = False
         if self._start_latches is None:
             try:
@@ -412,13 +361,8 @@ class LatchFile(LatchKeeper):
         return ""
 
     def _with_missed(self, latches: Latches) -> Latches:
-        """Return `latches` with the latches in `_missed` added.
-
-        `_missed` contains latches of the file that `start()` could not read in time. If `latches`
-        has a fault, the fault in `_missed` is dropped permanently. The same holds for "inactive".
-        `_missed` never contains a stop, because `start()` has set a stop when it could not read the
-        file.
-        """
+        # A fault of `latches` replaces the missed one for good; so does "inactive". `_missed` has
+        # no stop, because `start()` has set one.
         missed = self._missed
         if latches.fault is not None:
             missed = replace_fields(missed, fault=None)

@@ -1,79 +1,61 @@
 """Decides when a line may be written to the board: in every control period, and early if needed.
 
-An early line is written between two periods: for a new command or mode, or after a press of the
-emergency stop or a bumper. It replaces the line of the next period, so a flood of commands does not
-cause more lines. The time from the previous line to an early line must be at least the wire time of
-a line plus `REPLY_TIME_NS`. In each period, the control loop may try only once to write an early
-line.
+An early line is for a new command or mode, or after a press of the emergency stop or a bumper. It
+replaces the next period's, so a flood of commands causes no more lines. It comes after the wire
+time of a line plus `REPLY_TIME_NS`, and only one is tried in a period.
 """
 
 from __future__ import annotations
 
 from msgspec import Struct
 
+from acsard.core.values import Ns
+
 
 class Period(Struct, frozen=True):
-    """The control periods that have ended since the last step.
-
-    `expired` is the number of these periods. `due_ns` is the monotonic time at which the first of
-    these periods ended, ns.
-    """
+    """The control periods that have ended since the last step, and when the first of them did."""
 
     expired: int
-    due_ns: int
+    due_ns: Ns
 
 
 NO_PERIOD = Period(0, 0)
 
 
-REPLY_TIME_NS = 1_000_000
-"""Shortest time from the end of a line on the wire to an early line after it, ns. An early line is
-a line between two control periods. The board can reply in this time."""
+REPLY_TIME_NS = 1_000_000  # after a line, in which the board can reply before an early one
 
+# Steps in a period whose input brings no new command or mode. Further input waits for the next
+# period, so a flood takes little processor time.
 MAX_IDLE_WAKES = 3
-"""Limit for the idle steps in one control period. A step is idle if it had input from the bus that
-brought no new command or mode. After more idle steps, further input waits for the next period, so
-that a flood of messages takes little processor time."""
 
 
 class Pace:
-    """Decides when a line to the board may be written.
-
-    In all methods, `sent_ns` is the monotonic time at which the last line was written, ns.
+    """Decides when a line may be written; `sent_ns` is always the last line's time.
 
     Args:
-        line_ns: time that the longest line takes on the wire, ns.
-        period_ns: length of a control period, ns.
+        line_ns: wire time of the longest line.
+        period_ns: control period.
     """
 
-    def __init__(self, line_ns: int, period_ns: int) -> None:
+    def __init__(self, line_ns: Ns, period_ns: Ns) -> None:
         self._gap_ns = line_ns + REPLY_TIME_NS
-        self._possible = self._gap_ns < period_ns
-        """Whether a period is long enough for an early line (a line between two periods)."""
-        self._ahead = False
-        """Whether an early line was written in place of the next period's line."""
-        self._tried = False
-        """Whether the control loop has tried to write an early line in this period."""
-        self._waiting = False
-        """Whether a new command has not been sent yet, because it came too soon after the last
-        line."""
+        self._possible = self._gap_ns < period_ns  # a period is long enough for an early line
+        self._ahead = False  # an early line has replaced the next period's
+        self._tried = False  # an early line, in this period
+        self._waiting = False  # for a command that came too soon after the last line
         self._idle = 0
 
     def period_ended(self, missed: int) -> bool:
-        """Record the end of a period, and return whether a line must be written for this period.
+        """Record the end of a period, and return whether its line must be written.
 
-        No line is needed if an early line has replaced the line of this period and no period was
-        missed. `missed` is the number of periods just before this one that got no step.
+        It need not if an early line has replaced it and no period was missed.
         """
         ahead, self._ahead, self._tried = self._ahead, False, False
         self._idle = 0
         return missed > 0 or not ahead
 
-    def at_once(self, now_ns: int, sent_ns: int) -> bool:
-        """Return whether a line between two control periods may be written now.
-
-        `now_ns` is the present monotonic time, ns.
-        """
+    def at_once(self, now_ns: Ns, sent_ns: Ns) -> bool:
+        """Return whether a line between two control periods may be written now."""
         return self._possible and not self._tried and now_ns - sent_ns >= self._gap_ns
 
     def record_step(
@@ -81,14 +63,9 @@ class Pace:
     ) -> None:
         """Record the result of a step.
 
-        Args:
-            tick: whether the step had to write the line of a period. The line of any other step is
-                an early line.
-            due: whether the step had a line to write.
-            written: whether the line was written.
-            changed: whether the command or the mode has changed since the last line that was due,
-                or the emergency stop or a bumper was pressed.
-            had_input: whether the bus had input for this step.
+        `tick` says that it had to write a period's line, `due` that it had a line, `changed` that
+        the command or the mode was new or an input was pressed, and `had_input` that the bus had
+        any.
         """
         self._waiting = changed and not due
         self._idle += had_input and not changed
@@ -97,17 +74,10 @@ class Pace:
 
     @property
     def accepts_early_command(self) -> bool:
-        """Whether the next command gets an extra step immediately.
-
-        If False, the command waits for a step that another event runs, such as the end of the
-        period.
-        """
+        """Whether the next command gets an extra step, and does not wait for another one."""
         return self._possible and not (self._tried or self._waiting or self._idle > MAX_IDLE_WAKES)
 
-    def retry_ns(self, sent_ns: int) -> int | None:
-        """Return the monotonic time at which the waiting command may be sent, ns.
-
-        Return None if no command waits.
-        """
+    def retry_ns(self, sent_ns: Ns) -> Ns | None:
+        """Return when the waiting command may be sent, or None without one."""
         waits = self._waiting and self._possible and not self._tried
         return sent_ns + self._gap_ns if waits else None

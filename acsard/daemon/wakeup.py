@@ -1,15 +1,8 @@
-"""Runs a control step for each of these events, directly in the event loop's callback.
+"""Runs a control step in the event loop's callback, as waking a task would cost another round.
 
-- period: a control period has ended. Missed periods are counted, but get no separate steps.
-- bytes: the serial port has received data or was lost.
-- retry: the line with a waiting command may be written now (`pacing.py`).
-- command: the bus has a sample that may be a command, and `pacing.py` permits an early line.
-  Otherwise the sample waits for the next step.
-- stop: the bus has a stop, which gets a step even if `pacing.py` permits no early line. In a flood
-  of stops, not every stop gets a separate step.
-- signal: the shutdown begins.
-
-The step does not run in a task, because waking a task would cost another round of the event loop.
+The causes: a period has ended (missed ones only count); bytes have come or the port was lost; a
+line with a waiting command may be written (`pacing.py`); a command may be there, and an early line
+too; a stop, even without an early line, but not each stop of a flood; a signal.
 """
 
 from __future__ import annotations
@@ -20,6 +13,7 @@ from typing import Self
 
 from msgspec import Struct
 
+from acsard.core.values import Ns
 from acsard.daemon.pacing import NO_PERIOD, Period
 from acsard.host.timerfd import TimerFd
 
@@ -44,22 +38,19 @@ class _Timer:
             self._wake()
 
     def _expired(self) -> None:
-        """Process the expiration before `wake` is called."""
+        # Before `wake`.
         raise NotImplementedError
 
 
 class Alarm(_Timer):
-    """A timer that calls `wake` once, at a time that can be changed."""
+    """A timer that calls `wake` once."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
         super().__init__(wake)
-        self._at_ns: int | None = None
+        self._at_ns: Ns | None = None
 
-    def set(self, at_ns: int | None) -> None:
-        """Call `wake` once, at the monotonic time `at_ns`, ns.
-
-        A new time replaces the earlier one. None leaves an earlier time in force.
-        """
+    def set(self, at_ns: Ns | None) -> None:
+        """Call `wake` at this time instead of an earlier one; None changes nothing."""
         if at_ns is not None and at_ns != self._at_ns:
             self._timer.set(at_ns)
         self._at_ns = at_ns
@@ -70,29 +61,21 @@ class Alarm(_Timer):
 
 
 class Ticker(_Timer):
-    """A timer that calls `wake` at the end of every period.
+    """A timer that calls `wake` at the end of every period; then call `take`."""
 
-    After each call of `wake`, `take` must be called. It returns how many periods have ended, and
-    sets the timer for the next period.
-    """
-
-    def __init__(self, period_ns: int, wake: Callable[[], None]) -> None:
+    def __init__(self, period_ns: Ns, wake: Callable[[], None]) -> None:
         super().__init__(wake)
         self._period_ns = period_ns
         self._rang = False
         self._due_ns = 0
 
-    def start(self, now_ns: int) -> None:
-        """Start the timer. The first period begins at the monotonic time `now_ns`, ns."""
+    def start(self, now_ns: Ns) -> None:
+        """Start the first period now."""
         self._due_ns = now_ns + self._period_ns
         self._timer.set(self._due_ns)
 
-    def take(self, now_ns: int) -> Period:
-        """Return how many periods have ended since the last call, and when the first of them ended.
-
-        Also set the timer for the next period. `now_ns` is the present monotonic time, ns. If no
-        period has ended, `expired` is 0 in the result.
-        """
+    def take(self, now_ns: Ns) -> Period:
+        """Return the periods that have ended since the last call, and set the next one."""
         if not self._rang and now_ns < self._due_ns:
             return NO_PERIOD
         late_ns = now_ns - self._due_ns
@@ -113,23 +96,17 @@ class Ticker(_Timer):
 
 
 class Next(Struct, frozen=True):
-    """Result of a step: the events that may run another step before the present period ends."""
+    """The events that may run another step before the present period ends."""
 
-    accepts_early_command: bool
-    """Whether the next command gets an extra step immediately. If False, the command waits for a
-    step that another event runs, such as the end of the period."""
-    retry_ns: int | None
-    """Monotonic time at which a step can send the waiting command, ns; None if no command waits."""
-    period_ended: bool = True
-    """Whether the step ran at the end of a period. If so, the next stop gets an extra step
-    immediately."""
+    accepts_early_command: bool  # the next command does
+    retry_ns: Ns | None  # a step can send the waiting command
+    period_ended: bool = True  # the next stop does, because this step was a period's
 
 
 class Wakeup:
     """Runs a control step whenever the serial port, a timer, the bus or a signal requires one.
 
-    Calling this object runs a step immediately, in the thread of the event loop. If a step is
-    running already, another step runs after it.
+    Calling this runs a step in the thread of the event loop, or one more after a running one.
     """
 
     def __init__(self) -> None:
@@ -163,10 +140,9 @@ class Wakeup:
             self._loop.call_soon(self)
 
     def command(self) -> None:
-        """Report that the bus has a sample that may be a command. Any thread may call this method.
+        """Report a sample that may be a command, from any thread.
 
-        If `accepts_early_command` was True in the result of the last step, the first such sample
-        runs a step. Every other sample waits for the next step.
+        The first runs a step if the last one said `accepts_early_command`.
         """
         self._command_arrived = True
         if self._accepts_early_command:
@@ -174,11 +150,9 @@ class Wakeup:
             self._from_thread()
 
     def stop(self) -> None:
-        """Report that the bus has a stop. Any thread may call this method.
+        """Report a stop, from any thread.
 
-        The first stop runs a step. Further stops wait for the next step, so that a flood of stops
-        does not run a flood of steps. A stop runs a step again as soon as a period has ended, or a
-        step has returned `accepts_early_command` = True.
+        The first runs a step; further ones do after a period or `accepts_early_command`.
         """
         if not self._stop_pending:
             self._stop_pending = True
@@ -191,10 +165,7 @@ class Wakeup:
             pass  # the event loop has closed, so nothing is left to wake
 
     async def run(self, step: Callable[[], Next | None]) -> None:
-        """Run `step` for every event, until `step` returns None.
-
-        If `step` raises an exception, this method raises the same exception.
-        """
+        """Run `step` for every event until it returns None. Raises its exception."""
         self._over = self._loop.create_future()
         with self._alarm:
             self._step = step

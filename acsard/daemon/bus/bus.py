@@ -34,36 +34,25 @@ from acsard.host.threads import NoThreadError, in_thread
 OPEN_TIMEOUT_S = 10.0
 CLOSE_TIMEOUT_S = 0.3
 
-TWIN_TIMEOUT_S = 0.5
-"""Time for which a starting daemon looks for another daemon with its robot id or its ROS names,
-s."""
+TWIN_TIMEOUT_S = 0.5  # for another daemon with this robot id or these ROS names
 
 
 class ZenohBus(Bus):
-    """The robot's keys on the bus, as an asynchronous context manager.
-
-    The keys are declared when the context is entered, and removed when it is left.
-    """
+    """The robot's keys on the bus, for the duration of an `async with` block."""
 
     def __init__(self, config: Config, waker: Waker) -> None:
-        """Prepare the buffers for samples and queries.
-
-        `waker` wakes the control loop when a command or a stop arrives.
-        """
+        # `waker` wakes the control loop for a command or a stop.
         self._config, self._id = config, config.robot.id
         self._alive = full_key(self._id, "alive")
         prefix = full_key(self._id, "")
-        self._thread_errors: list[BaseException] = []
-        """The exceptions that have ended threads of the bus."""
+        self._thread_errors: list[BaseException] = []  # ended threads of the bus
         self._replies = Replies(prefix, self._thread_errors)
         sources = tuple(source.name for source in config.commands.sources)
         self._inbox = Inbox(prefix, self._replies, sources, waker, config.rate_hz)
         self._outlets = Outlets(self._thread_errors)
         self._links = RouterLinks(config.bus, self._thread_errors)
         self._session: zenoh.Session
-        self._entities: list[object] = []
-        """References to the declared Zenoh entities. Zenoh undeclares an entity when nothing refers
-        to it."""
+        self._entities: list[object] = []  # Zenoh undeclares an entity when nothing refers to it
 
     # The control loop calls the methods below, which `Bus` describes.
 
@@ -135,11 +124,7 @@ class ZenohBus(Bus):
         return session
 
     def _conflict(self, tokens: set[str]) -> str:
-        """Return an error message if another daemon uses this robot's id or ROS names, or "".
-
-        `tokens` is the result of `_others`: liveliness tokens that another session has declared,
-        although they belong to this robot.
-        """
+        # `tokens` of this robot are another session's.
         if self._alive in tokens:
             return (
                 f"another daemon on this bus already has the id {self._id}; give this robot its "
@@ -177,7 +162,7 @@ class ZenohBus(Bus):
             self._declare_json(session, topic)
 
     def _declare_json(self, session: zenoh.Session, topic: Topic) -> None:
-        """Declare the JSON key of a topic, for clients without msgpack."""
+        # For clients without msgpack.
         below = json_key(topic.key)
         key = full_key(self._id, below)
         # The publisher is not latched: a latched publisher encodes every message even without
@@ -221,12 +206,7 @@ class ZenohBus(Bus):
 
 
 def _others(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[str]:
-    """Return the liveliness tokens of this robot that another session has already declared.
-
-    Such a token shows that another daemon uses this robot's id or ROS names. `alive` is the token
-    of the robot's id, and `claims` are the tokens of its ROS names. Blocks for up to
-    `TWIN_TIMEOUT_S`.
-    """
+    # Blocks for up to `TWIN_TIMEOUT_S`.
     liveliness = session.liveliness()
     subscribers = {
         token: liveliness.declare_subscriber(token, history=True) for token in (alive, *claims)

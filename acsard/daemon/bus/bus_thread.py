@@ -1,7 +1,6 @@
 """A thread of the bus that leaves its exception for the control loop, so that the daemon ends too.
 
-If the daemon went on without the thread, it would drive the robot, but would no longer publish or
-answer.
+Without the thread, the daemon would drive the robot, but no longer publish or answer.
 """
 
 from __future__ import annotations
@@ -11,9 +10,9 @@ from threading import Thread
 
 
 class BusThread(Thread):
-    """A thread of the bus. An exception that ends the thread is appended to the list `errors`.
+    """A thread of the bus, which appends an exception that ends it to `errors`.
 
-    All threads of the bus share one list, so that each control step checks only this list.
+    All of them share the list, so a control step checks only one.
     """
 
     def __init__(self, name: str, work: Callable[[], None], errors: list[BaseException]) -> None:

@@ -1,11 +1,9 @@
 """Buffers the samples and queries from the bus for the next control step, and sends the replies.
 
-Zenoh's threads fill the buffers, and every buffer is bounded. A callback in this module only copies
-its input. It never calls back into Zenoh: even a refusal is queued for `Replies`.
-
-`Replies` sends the replies in a separate thread, because a client that hangs would block the
-control loop. Each query gets a number, called its ticket, when it arrives. A reply names the ticket
-of its query. When a ticket is retired, Zenoh's query is dropped, and the client stops waiting.
+Zenoh's threads fill the buffers, which are bounded. A callback only copies its input and never
+calls Zenoh: even a refusal is queued for `Replies`, whose thread sends all replies, because a
+client that hangs would block the control loop. A query has a number, its ticket, which a reply
+names. When it is retired, Zenoh's query is dropped and the client stops waiting.
 """
 
 from __future__ import annotations
@@ -34,33 +32,24 @@ from acsard.daemon.bus.bus_thread import BusThread
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
-MAX_OPEN_QUERIES = 1024
-"""Largest number of queries that are not ended yet. A further query is dropped without an
-answer."""
+MAX_OPEN_QUERIES = 1024  # a further query is dropped without an answer
 
 
 class Replies:
     """The queries that are not ended yet, and the thread that sends the replies to them."""
 
     def __init__(self, prefix: str, errors: list[BaseException]) -> None:
-        """Start without queries.
-
-        `prefix` is the beginning of the robot's keys. `errors` gets an exception that ends the
-        thread of this object.
-        """
+        # `errors` gets an exception that ends the thread.
         self._prefix, self._errors = prefix, errors
         self._queries: dict[int, tuple[zenoh.Query, str]] = {}
         self._tickets = count(1)
+        # A ticket ends its query, and None the thread.
         self._queue: queue.SimpleQueue[Reply | int | None] = queue.SimpleQueue()
-        """Items for the thread, in the order of their arrival. A `Reply` is sent, a ticket (number)
-        ends its query, and None ends the thread."""
 
     def issue(self, query: zenoh.Query, key: str) -> int | None:
-        """Store a query, and return its ticket, which is a number.
+        """Return the ticket of a query, or None beyond `MAX_OPEN_QUERIES`.
 
-        Return None if `MAX_OPEN_QUERIES` queries are stored already. The replies are sent on the
-        full key `key`. If `key` is "", each reply is sent on the key in `Reply.key`, below the
-        robot's id.
+        Replies go to the full key `key`, or if it is "", to `Reply.key` below the robot's id.
         """
         if len(self._queries) >= MAX_OPEN_QUERIES:
             return None
@@ -76,11 +65,11 @@ class Replies:
         self._queue.put(ticket)
 
     def start(self, session: zenoh.Session) -> None:
-        """Start the thread that sends the replies. Replies may be queued already."""
+        """Start the thread that sends the replies, which may be queued already."""
         BusThread("replies", partial(self._run, session), self._errors).start()
 
     def stop(self) -> None:
-        """Let the sending thread end after it has sent the queued replies. Do not wait for it."""
+        """Let the thread end after the queued replies, without waiting."""
         self._queue.put(None)
 
     def _run(self, session: zenoh.Session) -> None:
@@ -114,35 +103,25 @@ class Replies:
         )
 
 
+# Samples of a command key at 100 steps a second, more at a lower rate; the oldest goes. A sender at
+# the limit of 1000 Hz puts 10 between two steps.
 COMMAND_BUFFER = 16
-"""Size of the buffer of each command key at 100 control steps a second, in samples. At a lower
-control rate the buffer is larger. A newer sample displaces the oldest one. A sender at the limit of
-1000 Hz puts 10 samples between two steps."""
 
-GYRO_BUFFER = 64
-"""Size of the buffer for gyro samples. A gyro at 400 Hz fills it if the control loop takes no
-samples for 160 ms."""
+GYRO_BUFFER = 64  # samples: 400 Hz fill it if the control loop takes none for 160 ms
 
+# All unconfigured sources share a buffer, so that they cannot displace a configured command.
 OTHER_SOURCES = ""
-"""Name of the buffer that all unconfigured sources share. They have a separate buffer, so that a
-flood of their commands cannot displace the command of a configured source."""
 
-ANY_CERTIFICATE = "*"
-"""Placeholder in a command key for the name of any certificate."""
+ANY_CERTIFICATE = "*"  # for the name of any certificate in a command key
 
-STOP_BUFFER = 16
-"""Size of the buffer for stops. Stops have a separate buffer, so that no flood of commands
-displaces a stop."""
+STOP_BUFFER = 16  # no flood of commands displaces a stop
 
+# Size of the queues of service calls, of slow queries (`set`, ROS parameters) and of others; more
+# are refused with `BUSY`. One slow query per step: the last of 256 waits 2.6 s at 100 Hz.
 QUERY_QUEUE = 256
-"""Size of each of the three queues: service calls, slow queries (`set` and ROS parameters), and
-other queries. If a queue is full, further queries are refused with `BUSY`. One slow query is
-answered per step, so the last of 256 waits 2.6 s at 100 Hz."""
 
+# rmw_zenoh's has 33, acsard's up to 140. A longer one is cut off and names no sender.
 MAX_ATTACHMENT_BYTES = 256
-"""Largest size of an attachment, bytes. An attachment of rmw_zenoh has 33 bytes, and an attachment
-of acsard has up to 140. A longer attachment is cut off, so that it cannot be decoded and names no
-sender."""
 
 STOP, SET = service_key("stop"), service_key("set")
 STOP_ALL = full_key("*", "stop")
@@ -159,18 +138,10 @@ class Inbox:
         waker: Waker,
         rate_hz: float = 100.0,
     ) -> None:
-        """Start with empty buffers.
-
-        Args:
-            prefix: the beginning of the robot's keys.
-            replies: stores each query until the query is ended, and sends its replies.
-            sources: the names of the robot's command sources.
-            waker: wakes the control loop when a command or a stop arrives.
-            rate_hz: number of control steps a second.
-        """
+        # `waker` wakes the control loop for a command or a stop.
+        # The daemon's session stamps samples without a timestamp, so one with this id is not the
+        # sender's.
         self.own_id: zenoh.TimestampId | None = None
-        """The id in the timestamps that the daemon's session makes. The session stamps each sample
-        that comes without a timestamp, so a timestamp with this id is not from the sender."""
         self._prefix, self._replies = prefix, replies
         self._arrivals: dict[str, Mailbox[Arrival]] = {
             key: Mailbox(
@@ -189,24 +160,15 @@ class Inbox:
         # These queues are not mailboxes. In a full mailbox, a new query would displace the oldest
         # one. Here the new query must be refused.
         self._services: deque[Query] = deque()
-        self._others: deque[Query] = deque()
-        """Native queries that are neither services nor slow."""
+        self._others: deque[Query] = deque()  # native ones that are neither services nor slow
+        # ROS parameters and `set`: one takes as long as all others of a step.
         self._slow: deque[Query] = deque()
-        """Slow queries: ROS parameters and `set`. The answer to one slow query takes about as much
-        time as the answers to all other queries of a step."""
-        self._lost = dict.fromkeys(self._arrivals, 0)
-        """For each buffer, the total number of displaced samples that `take` has already
-        reported."""
-        self._any = False
-        """True if a sample or query waits. It becomes True after the item is in its buffer, so that
-        `take` never overlooks an item."""
+        self._lost = dict.fromkeys(self._arrivals, 0)  # displaced samples that `take` has reported
+        self._any = False  # set after the item is in its buffer, so `take` overlooks none
         self._waker = waker
 
     def take(self, queries: int) -> BusInput:
-        """Return the samples since the last call, and the queries that `Bus.take` must return.
-
-        The stops come first, and then the other samples in the order of their arrival.
-        """
+        """Return the samples since the last call, stops first, and up to `queries` queries."""
         if not self._any:
             return NO_INPUT
         self._any = False
@@ -237,11 +199,7 @@ class Inbox:
         self._arrived(sample, key, str(sample.encoding), "native")
 
     def on_ros_sample(self, endpoint: Endpoint, sample: zenoh.Sample) -> None:
-        """Queue a sample that arrived on a ROS key.
-
-        The sample is queued as if it had arrived on `endpoint.native`, the key of acsard with the
-        same meaning. A sample from ROS does not name its encoding, so `endpoint.encoding` is used.
-        """
+        """Queue a ROS sample like one on `endpoint.native`, with the endpoint's encoding."""
         key = str(sample.key_expr)
         native = endpoint.native if key == endpoint.key else key
         self._arrived(sample, native, endpoint.encoding, endpoint.transport)
@@ -293,11 +251,10 @@ class Inbox:
         self._waker.stop()
 
     def on_query(self, topic: str, query: zenoh.Query) -> None:
-        """Queue a query that a queryable has received on the key `topic`, without the robot's id.
+        """Queue a query on the key `topic`, without the robot's id.
 
-        A query with a wildcard is dropped if `topic` is a service, because a wildcard must not call
-        a service. It is also dropped if `topic` is a JSON key (`json/...`), because a wildcard such
-        as `**` also matches the key without `json/`, which answers.
+        A wildcard must not call a service, and `**` matches a JSON key (`json/...`) too, whose
+        other key answers.
         """
         asked = str(query.key_expr).removeprefix(self._prefix)
         if asked != topic and (topic in VERBS or topic.startswith(JSON_TREE)):
@@ -306,10 +263,7 @@ class Inbox:
         self._queried(query, topic, asked, "", "native")
 
     def on_ros_query(self, endpoint: Endpoint, query: zenoh.Query) -> None:
-        """Queue a query on a ROS key, such as a call of a ROS service.
-
-        A query with a wildcard is dropped, because it must not call a service.
-        """
+        """Queue a query on a ROS key; a wildcard must not call a service."""
         if str(query.key_expr) == endpoint.key:
             native = endpoint.native
             self._queried(query, native, native, endpoint.key, endpoint.transport)
@@ -354,10 +308,7 @@ class Inbox:
 
 
 def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:
-    """Return the first `most` + 1 bytes of a payload, or b"" if `payload` is None.
-
-    If the result is longer than `most` bytes, the payload is too long.
-    """
+    # `most` + 1 bytes show that the payload is too long.
     return b"" if payload is None else payload.to_bytes()[: most + 1]
 
 

@@ -1,12 +1,9 @@
 """Publishes the messages of each topic on every key of the topic that has a subscriber.
 
-A topic has native keys (one for msgpack, one for JSON) and perhaps ROS keys. Each key has an
-outlet, which is the publisher on that key. A message is encoded once per encoding, and only if an
-outlet with that encoding is latched or has a subscriber.
-
-The control loop only puts a message into the slot of its topic, which is a bounded queue. A thread
-encodes and sends the messages. So if the bus blocks, messages are lost, but the control loop misses
-no period.
+A topic has native keys (msgpack, JSON) and perhaps ROS keys, each with a publisher, its outlet. A
+message is encoded once per encoding that is latched or has a subscriber. The control loop only puts
+it into the topic's bounded slot, and a thread sends it: a bus that blocks costs messages, but no
+control period.
 """
 
 from __future__ import annotations
@@ -21,7 +18,7 @@ from acsard.bus.subscription import direct
 from acsard.core.messages.encodings import Format, encode, encoding_name
 from acsard.core.messages.schema import Message
 from acsard.core.ros.attachments import Attachment
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Ns
 from acsard.daemon.bus.bus_thread import BusThread
 from acsard.host import clock
 from acsard.host.mailbox import Bell, Mailbox
@@ -32,24 +29,21 @@ PUBLISHER_OPTIONS: dict[str, Any] = {
     "priority": zenoh.Priority.REAL_TIME,
 }
 
+# The oldest goes. At 100 Hz a slot covers 0.16 s; a busy machine or a new client usually blocks the
+# thread for less.
 SLOT_MESSAGES = 16
-"""Largest number of messages in the slot of a topic, which is the queue to the sending thread. A
-newer message displaces the oldest one. With odometry at 100 Hz, a slot covers 0.16 s. A busy
-machine, or a client that connects, usually blocks the thread for a shorter time."""
 
+# The bus is blocked if messages wait so long; usually the thread needs 0.1 ms.
 BLOCKED_AFTER_NS = NS_PER_S // 4
-"""If the sending thread has not sent all waiting messages after this time, ns, the bus counts as
-blocked. Usually the thread needs 0.1 ms."""
 
+# Heartbeat of latched ROS topics, as in rmw_zenoh.
 HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
-"""Heartbeat of the publishers of latched ROS topics. The settings are those of rmw_zenoh."""
 
 
 class _Outlet:
     def __init__(self, publisher: Any, form: Format, gid: bytes, signed: bytes) -> None:
         self.publisher, self.form = publisher, form
-        self.wanted = False
-        """True if the key has a subscriber, or if the publisher is latched."""
+        self.wanted = False  # it has a subscriber or is latched
         self._gid, self._sequence = gid, 0
         self._signed = {"attachment": signed} if signed else {}
 
@@ -66,24 +60,17 @@ class Outlets:
     """The publishers of the daemon's session, and the thread that sends their messages."""
 
     def __init__(self, errors: list[BaseException]) -> None:
-        """Start without publishers. `errors` gets an exception that ends the sending thread."""
-        self._outlets: dict[str, list[_Outlet]] = {}
-        """Maps the native key of each topic to its outlets."""
-        self._listeners: list[object] = []
-        """References to Zenoh's listeners. Zenoh ends a listener when nothing refers to it."""
+        # `errors` gets an exception that ends the thread.
+        self._outlets: dict[str, list[_Outlet]] = {}  # by the topic's native key
+        self._listeners: list[object] = []  # Zenoh ends a listener when nothing refers to it
         self._counting = Lock()
+        # Native keys with a subscriber or a latched publisher.
         self.wanted: frozenset[str] = frozenset()
-        """The native keys of the topics that have a subscriber or a latched publisher."""
         self._slots: dict[str, Mailbox[Message]] = {}
-        self._bell = Bell()
-        """Signal that wakes the sending thread. All slots share one signal, because a control step
-        fills several slots."""
+        self._bell = Bell()  # one for all slots, because a step fills several
         self._waiting = self._leaving = self._stuck = False
-        self._dropped = 0
-        """Number of messages that newer messages have displaced since the last call of `losses`."""
-        self._began_ns: int | None = None
-        """Monotonic time at which the sending thread began to send the waiting messages, ns. None
-        while this thread waits for messages."""
+        self._dropped = 0  # displaced since the last `losses`
+        self._began_ns: Ns | None = None  # the thread began to send the waiting messages
         self._thread = BusThread("outlets", self._run, errors)
 
     def _count(self, outlet: _Outlet, wanted: bool) -> None:
@@ -100,10 +87,7 @@ class Outlets:
     # The control loop calls the methods below. None of them waits or calls Zenoh.
 
     def publish(self, topic: str, message: Message) -> None:
-        """Put a message into the slot of its topic. `flush` wakes the thread that sends it.
-
-        `topic` is the native key of the topic.
-        """
+        """Put a message into the slot of its native key; `flush` wakes the thread."""
         if not self._slots[topic].store(message):
             self._dropped += 1
         self._waiting = True
@@ -116,29 +100,22 @@ class Outlets:
 
     @property
     def behind(self) -> bool:
-        """True if messages were dropped, or if the bus may be blocked.
-
-        The caller must then call `losses`.
-        """
+        """Whether the caller must call `losses`: messages were dropped, or may be blocked."""
         return self._began_ns is not None or self._stuck or self._dropped > 0
 
-    def losses(self, now_ns: int) -> tuple[int, bool]:
-        """Return the number of dropped messages, and whether the bus has begun to block.
-
-        Both values cover the time since the last call. The beginning of a block is therefore
-        returned only once. `now_ns` is the present monotonic time, ns.
-        """
+    def losses(self, now_ns: Ns) -> tuple[int, bool]:
+        """Return the newly dropped messages, and whether the bus has begun to block."""
         dropped, self._dropped = self._dropped, 0
         began_ns, was_stuck = self._began_ns, self._stuck
         self._stuck = began_ns is not None and now_ns - began_ns > BLOCKED_AFTER_NS
         return dropped, self._stuck and not was_stuck
 
     def start(self) -> None:
-        """Start the thread that sends the messages. Messages may already wait in the slots."""
+        """Start the thread that sends the messages, which may wait already."""
         self._thread.start()
 
     def stop(self, timeout: float) -> None:
-        """Let the thread end after it has sent the waiting messages. Wait at most `timeout` s."""
+        """Let the thread end after the waiting messages; wait at most `timeout` s."""
         self._leaving = True
         self._bell.ring()
         self._thread.join(timeout)
@@ -176,18 +153,10 @@ class Outlets:
         gid: bytes = b"",
         signed: bytes = b"",
     ) -> None:
-        """Declare one publisher of a topic.
+        """Declare one publisher of the topic with this native key, on the full key `key`.
 
-        Args:
-            session: the Zenoh session of the daemon.
-            topic: native key of the topic.
-            key: full key on which the publisher puts the topic's messages.
-            form: encoding of the messages.
-            type_name: type of the messages for Zenoh's Encoding, or "" to leave it out.
-            latched: whether the publisher keeps its last sample for late subscribers.
-            gid: identity of a ROS publisher, or b"" for a native publisher. Each sample of a ROS
-                publisher gets an attachment in the form of rmw_zenoh.
-            signed: attachment of each sample of a native publisher, or b"" for no attachment.
+        `type_name` is for Zenoh's Encoding. `gid` identifies a ROS publisher, whose samples have
+        rmw_zenoh's attachment; `signed` is the attachment of a native one.
         """
         encoding = encoding_name(form, type_name)
         if latched:

@@ -13,26 +13,22 @@ from acsard.core.values import RoutersStatus
 from acsard.daemon.bus.bus_thread import BusThread
 from acsard.host.mailbox import Mailbox
 
-POLL_S = 0.5
-"""Time between two polls of Zenoh, s. One poll takes Zenoh 0.1 ms."""
+POLL_S = 0.5  # one poll takes Zenoh 0.1 ms
 
-STOP_TIMEOUT_S = 0.05
-"""Longest time for which `stop` waits until the polling thread ends, s."""
+STOP_TIMEOUT_S = 0.05  # for the polling thread
 
 
 class RouterLinks:
-    """Observer of the daemon's connections to the endpoints of `bus.connect`.
+    """Observes the daemon's connections to the endpoints of `bus.connect`.
 
-    Zenoh reconnects by itself, but does not report that a connection is lost or restored. A
-    separate thread polls Zenoh, because the call may block.
+    Zenoh reconnects by itself without a report, and a call may block, so a thread polls.
     """
 
     def __init__(self, bus: BusConfig, errors: list[BaseException]) -> None:
-        """Prepare the polling thread. `errors` gets an exception that ends this thread."""
+        # `errors` gets an exception that ends the thread.
         self._bus = bus
         self._status: RoutersStatus | None = None
-        self.changes = Mailbox[RoutersStatus](1, lambda: None)
-        """The newest state of the connections, if it has changed since the last `pop`."""
+        self.changes = Mailbox[RoutersStatus](1, lambda: None)  # newest state, if it has changed
         self._over = Event()
         self._thread = BusThread("links", self._run, errors)
         self._session: zenoh.Session
@@ -44,11 +40,7 @@ class RouterLinks:
             self._thread.start()
 
     def stop(self) -> None:
-        """Stop polling.
-
-        Wait at most `STOP_TIMEOUT_S` for the end of the polling thread, because a name lookup may
-        block it.
-        """
+        """Stop polling, in at most `STOP_TIMEOUT_S`: a name lookup may block the thread."""
         self._over.set()
         if self._thread.is_alive():
             self._thread.join(STOP_TIMEOUT_S)
@@ -78,15 +70,11 @@ class RouterLinks:
 
 
 def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[str, ...]:
-    """Return those of `endpoints` to which the daemon has no link. May block in a name lookup.
+    """Return the endpoints without a link; this may block in a name lookup.
 
-    Args:
-        mode: Zenoh's mode. In mode "client" there is only one link. If this link exists, no
-            endpoint counts as unreached.
-        endpoints: the endpoints of `bus.connect`.
-        ends: the address at the far end of each link, such as "tcp/192.168.0.2:7447". The link of a
-            program that connects to the daemon, such as the TLS gateway, does not count: its
-            address has a random port, which matches no endpoint.
+    In mode "client" the only link is to one of them. `ends` are far ends such as
+    "tcp/192.168.0.2:7447"; a program that connects to the daemon has a random port, which matches
+    none.
     """
     if mode == "client":
         return () if ends else endpoints
@@ -94,10 +82,7 @@ def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[st
 
 
 def _leads_there(endpoint: str, ends: set[str]) -> bool:
-    """Return whether a link leads to the endpoint. May block in a name lookup.
-
-    `ends` contains far ends of links, such as "tcp/192.168.0.2:7447".
-    """
+    # May block in a name lookup.
     if endpoint in ends:
         return True
     protocol, (host, port) = endpoint.partition("/")[0], host_and_port(endpoint)

@@ -11,31 +11,23 @@ import serial
 
 from acsard.checkup.board import Wire
 from acsard.checkup.findings import WireLostError
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Ns
 from acsard.daemon.serial.device import close, draining, open_raw, refusal
 from acsard.host import clock
 from acsard.host.processes import Holder, master_of, waited_ns
 
-SEND_TIMEOUT_S = 0.5
-"""Longest time for which `send` waits until the driver has accepted all bytes, s. After this time,
-the connection counts as lost. A line needs only 50 ms, even at the lowest baud rate."""
+SEND_TIMEOUT_S = 0.5  # for all bytes; a line needs 50 ms at the lowest baud rate
 
-DRAIN_TIMEOUT_S = 0.5
-"""Longest time for which `close` waits until the driver has sent the last stop lines, s."""
+DRAIN_TIMEOUT_S = 0.5  # for the last stop lines
 
-CLOSE_TIMEOUT_S = 1.0
-"""Longest time for which `close` waits until the device is closed, s. Some drivers take 30 s,
-because they first try to send the bytes in their buffer."""
+CLOSE_TIMEOUT_S = 1.0  # some drivers take 30 s to close, because they send their buffer first
 
 
 class BlockingPort(Wire):
-    """Blocking access to one serial device. `Wire` describes its methods."""
-
     def __init__(self, path: str) -> None:
         self._path = path
         self._device: serial.Serial | None = None
-        self._program: Holder | None = None
-        """The program at the other end of a pty, or None for a real device."""
+        self._program: Holder | None = None  # at the other end of a pty
         self._waited_ns = 0
 
     def open(self, baud_rate: int) -> None:
@@ -65,10 +57,10 @@ class BlockingPort(Wire):
         close(device, wait_s=CLOSE_TIMEOUT_S)
         device.close()
 
-    def now_ns(self) -> int:
+    def now_ns(self) -> Ns:
         return clock.mono_ns()
 
-    def late_ns(self) -> int:
+    def late_ns(self) -> Ns:
         if self._program is None:
             return 0
         before_ns, self._waited_ns = self._waited_ns, waited_ns(self._program.pid)
@@ -88,7 +80,7 @@ class BlockingPort(Wire):
             except OSError as error:
                 raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
 
-    def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+    def listen(self, until_ns: Ns) -> list[tuple[int, bytes]]:
         fd = self._fileno()
         pieces: list[tuple[int, bytes]] = []
         while True:

@@ -1,7 +1,4 @@
-"""System calls that open the serial device raw and locked, drain it and close it.
-
-This module also explains the errors of these calls to users.
-"""
+"""System calls that open the serial device raw and locked, drain it and close it, with advice."""
 
 from __future__ import annotations
 
@@ -16,17 +13,16 @@ from contextlib import suppress
 
 import serial
 
+from acsard.core.values import Ns
 from acsard.host import clock
 from acsard.host.errors import InUseError, MendableError, NoPortError, NotPermittedError
 from acsard.host.processes import holder_of
 
-_left_open: list[int] = []
-"""File descriptors that `close` could not close, because it could not start a thread."""
+_left_open: list[int] = []  # descriptors that `close` had no thread for
 
 
 class _Device(serial.Serial):  # type: ignore[misc]
-    """A port whose `read` makes one system call and never waits."""
-
+    # A port whose `read` makes one system call and never waits.
     def read(self, size: int = 1) -> bytes:
         if self.fd is None:
             raise serial.PortNotOpenError
@@ -42,10 +38,7 @@ class _Device(serial.Serial):  # type: ignore[misc]
 
 
 def open_raw(path: str, baud_rate: int) -> serial.Serial:
-    """Open the port in raw mode, lock it and empty its buffers.
-
-    Raises `OSError` if one of these steps fails.
-    """
+    """Open the port in raw mode, lock it and empty its buffers. Raises `OSError`."""
     # Close the devices that `close` could not close. Two threads may empty the list at the same
     # time.
     with suppress(IndexError):
@@ -91,10 +84,7 @@ def _set_up(device: serial.Serial) -> None:
 
 
 def unsent(fd: int) -> int:
-    """Return the number of bytes that the driver has not sent yet.
-
-    Return 0 if the driver does not report this number.
-    """
+    """Return the number of bytes that the driver has not sent; 0 if it does not say."""
     waiting = array.array("i", [0])
     try:
         fcntl.ioctl(fd, termios.TIOCOUTQ, waiting)
@@ -103,21 +93,14 @@ def unsent(fd: int) -> int:
     return waiting[0]
 
 
-def draining(fd: int, deadline_ns: int) -> Iterator[float]:
-    """Yield the length of each pause, in seconds, until the driver has sent all bytes.
-
-    The caller must sleep for this time after each yield. The iteration ends at the monotonic time
-    `deadline_ns`, ns, even if the driver still has bytes to send.
-    """
+def draining(fd: int, deadline_ns: Ns) -> Iterator[float]:
+    """Yield pauses in s until the driver has sent all bytes, or until `deadline_ns`."""
     while unsent(fd) and clock.mono_ns() < deadline_ns:
         yield 0.001  # shorter than the time that a line takes, even at the highest baud rate
 
 
 def unlock(fd: int) -> None:
-    """Unlock the device.
-
-    Without this call, a pty would stay locked even after this process has ended.
-    """
+    """Unlock the device: a pty would stay locked even after this process has ended."""
     try:
         fcntl.ioctl(fd, termios.TIOCNXCL)
     except OSError:
@@ -125,20 +108,11 @@ def unlock(fd: int) -> None:
 
 
 def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> None:
-    """Discard unsent bytes, then unlock and close the device in a thread.
+    """Discard unsent bytes, unlock, and close the device in a thread, which may take 30 s.
 
-    A thread closes the device, because a driver may take 30 s to close it. If no thread can be
-    started, the next `open_raw` closes the device.
-
-    The caller must then close the object `device`. This takes no time, because the descriptor of
-    `device` now refers to /dev/null. There is one exception: if this process has no free
-    descriptor, `device` still refers to the device, and closing it may take 30 s.
-
-    Args:
-        device: the open device.
-        lost: whether the device has failed. In this case, its output buffer is discarded even if
-            the driver reports no unsent bytes.
-        wait_s: longest time for which this call waits until the thread has closed the device, s.
+    The descriptor of `device` then is /dev/null, so the caller closes it at once (but not if this
+    process has no free descriptor). Without a thread, the next `open_raw` closes the device. `lost`
+    discards the output even if the driver reports none. Waits at most `wait_s`.
     """
     fd = device.fileno()
     if lost or unsent(fd):
@@ -174,10 +148,7 @@ def _end(fd: int) -> None:
 
 
 def refusal(path: str, error: OSError) -> MendableError:
-    """Return the error that tells the user why the port at `path` cannot be opened, and what to do.
-
-    `error` is the error of the operating system.
-    """
+    """Return the error that says why the port cannot be opened, and what to do."""
     match error.errno:
         case errno.ENOENT | errno.ENODEV | errno.ENXIO | errno.ENOTDIR:
             return NoPortError(

@@ -1,9 +1,8 @@
 """The daemon's serial port: opens, reads and reopens the device, and sends STOP before closing it.
 
-The daemon uses pyserial-asyncio only to read. A transport of that library would queue the bytes
-that the kernel does not accept, and send an old line later. No line may be delayed, so the daemon
-writes to the descriptor directly. Opening runs in a thread with a time limit, because drivers may
-block.
+pyserial-asyncio only reads: its transport would queue bytes that the kernel does not accept and
+send an old line later. So the daemon writes to the descriptor. Opening runs in a thread with a time
+limit, because drivers may block.
 """
 
 from __future__ import annotations
@@ -19,37 +18,30 @@ import serial
 import serial_asyncio
 
 from acsard.core.link.serial_output import Offered, Port, SerialOutput
-from acsard.core.values import Event, Instant, Received
+from acsard.core.values import Event, Instant, Ns, Received
 from acsard.daemon.serial.device import close, draining, open_raw, refusal, unsent
 from acsard.host import clock
 from acsard.host.clock import SuspendDetector
 from acsard.host.errors import InUseError, MendableError, NotPermittedError
 from acsard.host.threads import NoThreadError, in_thread
 
+# A call of this duration counts as hung, and no other one is tried until it has returned.
 OPEN_TIMEOUT_S = 5.0
-"""Time limit of a call that opens a device, s. After this time the call counts as hung. The daemon
-does not try to open the same device again until that call has returned."""
 
+# The last is repeated; the first are short, because udev soon sets a new device's group.
 REOPEN_PAUSES_S = (0.05, 0.1, 0.2)
-"""Pauses between the attempts to reopen the port, s. The last pause is repeated. The first pauses
-are short, because udev soon sets the group of a new device."""
 
-PERMISSION_TIMEOUT_S = 2.0
-"""Time for which the starting daemon waits until udev grants access to the device, s. If the daemon
-still has no access after this time, its start fails."""
+PERMISSION_TIMEOUT_S = 2.0  # for udev to grant access at the start
 
 DRIVER_HUNG = "the driver of the serial port did not answer"
 
-FINAL_STOP_TIMEOUT_S = 0.15
-"""Longest time for sending the last STOP, the line of zero speeds, s. It is twice the time of
-a line at the lowest baud rate, plus a margin."""
+FINAL_STOP_TIMEOUT_S = 0.15  # twice a line at the lowest baud rate, plus a margin
 
 
 class SerialPort(Port):
-    """The serial port to the board, as an asynchronous context manager.
+    """The serial port to the board, for the duration of an `async with` block.
 
-    The port is opened when the context is entered. When the context is left, the port sends STOP
-    and closes. While `keep_open` runs, it opens a port that was lost, or that was absent at first.
+    `keep_open` reopens it. At the end, the port sends STOP.
     """
 
     def __init__(
@@ -57,22 +49,12 @@ class SerialPort(Port):
         path: str,
         baud_rate: int,
         stop: bytes,
-        period_ns: int,
+        period_ns: Ns,
         wake: Callable[[], None],
         log: Callable[[Event], None],
         asleep: SuspendDetector | None = None,
     ) -> None:
-        """Prepare the port.
-
-        Args:
-            path: path of the serial device.
-            baud_rate: baud rate of the port.
-            stop: the line that commands speed zero for all wheels.
-            period_ns: control period, ns.
-            wake: function that is called after data has arrived or the port was lost.
-            log: function that writes an event to the log.
-            asleep: detector of a suspend of this computer.
-        """
+        # `stop` is zeros for all wheels. `wake` is called for data and for a lost port.
         self.is_open = False
         self._asleep = asleep or SuspendDetector()
         self.opened = 0
@@ -84,14 +66,14 @@ class SerialPort(Port):
         self._transport: serial_asyncio.SerialTransport | None = None
         self._lost = asyncio.Event()
         self._fd = -1
+        # Devices that threads are opening: `st_dev`, `st_ino`.
         self._opening = set[tuple[int, int]]()
-        """The devices that threads are opening now, each as a pair (`st_dev`, `st_ino`)."""
         self.trouble = ""
 
     # The control loop calls the methods below, which `Port` describes.
 
     @property
-    def sent_ns(self) -> int:
+    def sent_ns(self) -> Ns:
         return self._output.sent_ns
 
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
@@ -207,7 +189,7 @@ class SerialPort(Port):
     # The reader calls the methods below.
 
     def _leave(self, error: BaseException | None) -> None:
-        """Close the port and discard unsent bytes. `error` is None at the end of the daemon."""
+        # None: the daemon ends.
         if not self.is_open:
             return
         self.is_open = False
@@ -229,10 +211,7 @@ class SerialPort(Port):
     # Closing.
 
     async def __aexit__(self, *_: object) -> None:
-        """Send STOP (zero speeds) as the last line, and close the port, even after an exception.
-
-        Sending takes at most `FINAL_STOP_TIMEOUT_S`.
-        """
+        # STOP is the last line, within `FINAL_STOP_TIMEOUT_S`, even after an exception.
         deadline_ns = clock.now().mono_ns + int(FINAL_STOP_TIMEOUT_S * 1e9)
         while self.is_open and self.offer(self._stop, clock.now()) == "superseded":
             if clock.now().mono_ns > deadline_ns:

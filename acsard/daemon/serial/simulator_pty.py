@@ -1,8 +1,6 @@
-"""The simulated board at the end of a pty, in real time.
+"""The simulated board at the end of a pty, in real time, for the daemon's real serial code.
 
-The daemon uses its real serial code to communicate with this board. A pty carries data at any baud
-rate. If the daemon's baud rate differs from the board's, this module garbles the data in both
-directions, as a real wire would.
+A pty carries data at any baud rate, so this garbles them if the daemon's is not the board's.
 """
 
 from __future__ import annotations
@@ -43,7 +41,7 @@ class PtyEnd:
         return self._master
 
     def read(self) -> bytes:
-        """Return the bytes that the host has written, or b"" if no bytes wait."""
+        """Return the bytes that the host has written."""
         try:
             data = os.read(self._master, 4096)
         except OSError as error:
@@ -56,7 +54,7 @@ class PtyEnd:
         return data
 
     def write(self, data: bytes) -> bool:
-        """Send data to the host. If the pty's buffer is full, drop the rest and return False."""
+        """Send data to the host; if the buffer is full, drop the rest and return False."""
         try:
             return os.write(self._master, data) == len(data)
         except BlockingIOError:
@@ -71,10 +69,7 @@ _RATES: dict[int, int] = {getattr(termios, f"B{rate}"): rate for rate in get_arg
 
 
 class SimPty:
-    """The simulated board at one end of a pty, as a context manager.
-
-    The pty is created when the context is entered. `path` is then the serial device for the daemon.
-    """
+    """The simulated board at one end of a pty; `path` is the daemon's device in a `with` block."""
 
     def __init__(self, mcu: FakeMcu) -> None:
         self.mcu = mcu
@@ -106,16 +101,13 @@ class SimPty:
             self._arm()
 
     def _set_speed(self) -> None:
-        """Set the pty to the board's baud rate, in case the host sets no baud rate."""
+        # In case the host sets none.
         attributes = termios.tcgetattr(self._end.slave)
         attributes[4] = attributes[5] = getattr(termios, f"B{self.mcu.baud_rate}")
         termios.tcsetattr(self._end.slave, termios.TCSANOW, attributes)
 
     def _speed(self) -> int:
-        """Return the baud rate that the host has set on the pty.
-
-        If acsard does not support this rate, return the baud rate of the board.
-        """
+        # The board's, for a rate that acsard does not support.
         return _RATES.get(termios.tcgetattr(self._end.slave)[5], self.mcu.baud_rate)
 
     def _advance(self) -> None:
@@ -135,7 +127,7 @@ TRUE_POSE_KEY = "sim/pose"
 
 
 class Simulated(SimPty):
-    """The simulated board of a daemon. It also publishes the true pose and the gyro's samples."""
+    """The simulated board of a daemon, with the true pose and the gyro."""
 
     def __init__(self, config: Config) -> None:
         super().__init__(WatchedMcu(config, clock.mono_ns(), self._see))
@@ -146,11 +138,11 @@ class Simulated(SimPty):
         self._last: tuple[Observation, int] | None = None
 
     def publish_on(self, bus: Bus) -> None:
-        """Publish the robot's true pose and the gyro's samples on `bus` from now on."""
+        """Publish the true pose and the gyro's samples from now on."""
         self._bus = bus
 
     def current(self, key: str) -> Message | None:
-        """Return the newest true pose, or None if no pose is known or `key` is not `sim/pose`."""
+        """Return the newest true pose for the key `sim/pose`."""
         return true_pose(*self._last) if key == TRUE_POSE_KEY and self._last is not None else None
 
     def _see(self, sight: Observation) -> None:
