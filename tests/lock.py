@@ -1,6 +1,6 @@
 """`python -m tests.lock`: rewrite `deploy/systemd/requirements.lock` with today's versions.
 
-It asks pip which distributions an install of acsard with the extras `tls` and `web` takes from the
+It asks pip which distributions an install of acsard with the extra `tools` takes from the
 package index, including those needed to build it. It asks for each supported Python on x86_64 and
 aarch64, and pins the hashes of those wheels. All platforms get the same versions. `--check` prints
 the changes and writes nothing.
@@ -21,8 +21,6 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 
 LOCK = ROOT / "deploy" / "systemd" / "requirements.lock"
-
-EXTRAS = ("tls", "web")
 
 PYTHONS = ("3.11", "3.12", "3.13")
 
@@ -49,7 +47,7 @@ def declared_requirements() -> list[str]:
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
     project = pyproject["project"]
     asked = {*pyproject["build-system"]["requires"], *project["dependencies"]}
-    return sorted(asked.union(*(project["optional-dependencies"][name] for name in EXTRAS)))
+    return sorted(asked.union(project["optional-dependencies"]["tools"]))
 
 
 def resolved(python: str, machine: str, versions: dict[str, str]) -> dict[str, tuple[str, str]]:

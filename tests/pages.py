@@ -197,7 +197,7 @@ _RMW_ROUTER = """ZENOH_CONFIG_OVERRIDE='listen/endpoints=["tcp/127.0.0.1:7447"]'
 
 COMMANDS: dict[str, How] = {
     # README.md
-    "python3 -m venv .venv && .venv/bin/pip install '.[web]' && .venv/bin/acsard run": FIRST,
+    "python3 -m venv .venv && .venv/bin/pip install '.[tools]' && .venv/bin/acsard run": FIRST,
     "python3 -m venv .venv && .venv/bin/pip install -e '.[test]' && .venv/bin/pytest": InCi(
         "-e '.[test]'"
     ),
@@ -455,7 +455,7 @@ COMMANDS: dict[str, How] = {
     "sudo /opt/acsard/venv/bin/pip install -r deploy/systemd/requirements.lock": VENV,
     "sudo /opt/acsard/venv/bin/pip install --no-deps --no-build-isolation .": VENV,
     "sudo /opt/acsard/venv/bin/acsard service install": INSTALLED,
-    "git pull && .venv/bin/pip install '.[web]'": UntestedCommand("needs a newer commit"),
+    "git pull && .venv/bin/pip install '.[tools]'": UntestedCommand("needs a newer commit"),
     "python3 -m pip download -r deploy/systemd/requirements.lock -d wheels": DOWNLOADED,
     "sudo /opt/acsard/venv/bin/pip install --no-index --find-links wheels -r "
     "deploy/systemd/requirements.lock": DOWNLOADED,
@@ -511,7 +511,7 @@ COMMANDS: dict[str, How] = {
     f"acsard fleet {_PLAIN}": IN_ONE_VIEW,
     f"acsard drive --id robot2 {_PLAIN}": DRIVE._replace(but="without the router"),
     f"acsard call stop --id '*' {_PLAIN}": IN_ONE_VIEW,
-    "python3 -m venv .venv && .venv/bin/pip install '.[tls]'": AUTHORITY,
+    "python3 -m venv .venv && .venv/bin/pip install '.[tools]'": AUTHORITY,
     "acsard tls init --directory fleet": Run("^Wrote "),
     "acsard tls add router.local --address 192.168.1.10 --directory fleet": Run("router.local"),
     "for n in {1..10}; do acsard tls add robot$n --directory fleet; done": TEN,

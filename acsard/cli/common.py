@@ -39,7 +39,7 @@ def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
         "--write",
         action="store_true",
         help=f"also write {result} into the configuration file and keep its comments (needs the "
-        "library tomlkit; if it is missing, a message gives the command that installs it)",
+        "extra `tools`)",
     )
 
 

@@ -30,7 +30,6 @@ from acsard.core.ros.parameters import described
 from acsard.core.values import Plain
 from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, UsageError
-from acsard.host.extras import install
 from acsard.host.processes import is_daemon_here
 
 
@@ -47,7 +46,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="also write the settings into the robot's configuration file, whose comments stay. "
         "Type this on the robot (with sudo for the file of the service), and name the file with "
-        f"--config if it is not found by itself. Needs the library tomlkit: {install('write')}",
+        "--config if it is not found by itself. Needs the extra `tools`",
     )
     parser.add_argument("--json", action="store_true", help="print the answer or the list as JSON")
     add_bus(parser, SEVERAL_IDS + " (to change settings)")

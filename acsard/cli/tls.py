@@ -1,6 +1,5 @@
 """Make certificates for a bus that other machines can reach, and the configuration of a fleet's
-router. Needs the library cryptography; if it is missing, a message gives the command that installs
-it.
+router. Needs the extra `tools`.
 """
 
 from __future__ import annotations

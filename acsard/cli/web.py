@@ -20,8 +20,8 @@ from acsard.cli.connection import add_bus
 from acsard.core.config.settings import Config
 from acsard.core.formatting import lasting
 from acsard.core.values import ROLES
-from acsard.host.errors import Exit, MendableError, UsageError
-from acsard.host.extras import install
+from acsard.host.errors import Exit, UsageError
+from acsard.host.extras import missing
 from acsard.host.logs import Log, output_in_threads
 from acsard.web.callers import LOCAL_NAME
 
@@ -37,7 +37,6 @@ NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}\Z")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = f"Needs extra libraries: `{install('web')}` installs them."
     add_bus(parser)
     parser.add_argument(
         "--address",
@@ -98,9 +97,7 @@ def main(args: argparse.Namespace) -> int:
         import prometheus_client  # noqa: F401
         import segno  # noqa: F401
     except ImportError:
-        raise MendableError(
-            f"needs the libraries aiohttp, prometheus-client and segno; run: {install('web')}"
-        ) from None
+        raise missing("aiohttp, prometheus-client or segno") from None
     options = {"record.directory": args.record or None, "bus.tls": args.tls or None}
     where, loaded = load(args.config, options)
     config = with_record_directory(loaded)

@@ -134,8 +134,7 @@ def require_tomlkit() -> None:
         import tomlkit  # noqa: F401
     except ImportError:
         raise MendableError(
-            f"changing the file needs the library tomlkit; run: {install('write')}, or edit the "
-            "file by hand",
+            f"changing the file needs the library tomlkit: {install()}, or edit the file by hand"
         ) from None
 
 

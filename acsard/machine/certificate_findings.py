@@ -74,7 +74,7 @@ def certificates(tls: str) -> Iterator[Finding]:
     mend = (
         renewal(tls, first_expiry(expiries)[0])
         if expiries
-        else f"run `{install('tls')}`, which installs the library that reads certificates"
+        else f"to install the library that reads certificates, {install()}"
     )
     yield Finding("certificates", LEVELS[level], f"{tls}: {words}", mend if level else "")
 

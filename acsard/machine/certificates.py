@@ -197,7 +197,7 @@ def _maker() -> type[Authority]:
     try:
         from acsard.machine.authority import Authority
     except ImportError:
-        raise missing("cryptography", "tls") from None
+        raise missing("cryptography") from None
     return Authority
 
 

@@ -258,7 +258,7 @@ def test_the_first_command_of_the_readme_installs_it_and_the_robot_is_up(clone: 
     endpoint = free_endpoint()  # port 7448 may be in use here
     config = write_config(clone.parent / "other.toml", {"bus": {"listen": [endpoint]}})
     env = of_a_stranger(ACSARD_CONFIG=str(config))
-    words = ["bash", "-c", find("README.md", "'.[web]'")]
+    words = ["bash", "-c", find("README.md", "'.[tools]'")]
     with Program(words, clone, env, start_new_session=True) as program:
         try:
             program.says(endpoint, INSTALL_S)

@@ -1,6 +1,6 @@
 """Changes values in the text of an `acsard.toml`, and keeps its comments, order and line ends.
 
-Needs the library tomlkit (extras `tls` and `write`).
+Needs the library tomlkit (extra `tools`).
 """
 
 from __future__ import annotations
