@@ -467,7 +467,7 @@ def row_names() -> list[str]:
         latch_file="",
         board={"emergency_stop": "released"},
     )
-    rows = diagnostics(config, OUTPUTS, snapshot, (0, "valid for a year")).status
+    rows = diagnostics(config, OUTPUTS, snapshot, ("valid", "valid for a year")).status
     return [row.name for row in rows]
 
 

@@ -11,13 +11,18 @@ from __future__ import annotations
 
 import re
 from functools import lru_cache
+from typing import Literal
 
 from msgspec import Struct
 
+from acsard.core.codes import GuardCode
 from acsard.core.config.settings import Config
 from acsard.core.values import NS_PER_S, Ns, Outputs
 
 Wheels = tuple[int, int, int, int]  # speeds of the motors a to d, in hundredths of rad/s
+
+Trip = GuardCode | Literal[""]
+"""Why the guard replaced a line with the stop line; "" if it did not."""
 
 _ZERO: Wheels = (0, 0, 0, 0)
 _COLUMNS = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
@@ -78,7 +83,7 @@ class Guard:
         if self._wheels == _ZERO:
             self._longest = self._ramps
 
-    def check(self, outputs: Outputs) -> tuple[bytes | None, str]:
+    def check(self, outputs: Outputs) -> tuple[bytes | None, Trip]:
         """Return the line to send (None if `outputs` has none), and why it is not the robot's."""
         if outputs.mode == "driving":
             if self._commanded(outputs):
@@ -94,28 +99,25 @@ class Guard:
         trip = self._objection(line, outputs, self._wheels or _ZERO)
         return (self._stop, trip) if trip else (line, "")
 
-    def _objection(self, line: bytes, outputs: Outputs, before: Wheels) -> str:
+    def _objection(self, line: bytes, outputs: Outputs, before: Wheels) -> Trip:
         wheels = _wheels(line[:31])
         if wheels is None or not (line[31:] == self._stop[31:] or self._sealed(line)):
-            return "the line is not complete, or does not have four wheel speeds"
+            return "guard_line_damaged"
         if wheels == _ZERO:
             return ""
         if max(wheels) > self._most or min(wheels) < -self._most:
-            return "the line moves a wheel faster than limits.wheel_speed"
+            return "guard_too_fast"
         if not outputs.linked:
-            return "the line moves a wheel while the serial link is not up"
+            return "guard_no_link"
         if self._require_check and b"#" not in line:
-            return "the line moves a wheel without the checksum that mcu.link_check requires"
+            return "guard_no_checksum"
         grows = wheels != before and any(
             abs(new) > abs(old) or new * old < 0 for new, old in zip(wheels, before, strict=True)
         )
         if grows and not self._commanded(outputs):
-            return (
-                "the line speeds up a wheel although no command is fresh, or although the mode is "
-                "not driving"
-            )
+            return "guard_no_command"
         if self._late(outputs.now.mono_ns):
-            return "the line still moves a wheel although the longest ramp to zero has ended"
+            return "guard_too_long"
         return ""
 
     def _late(self, now_ns: Ns) -> bool:

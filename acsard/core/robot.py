@@ -16,7 +16,8 @@ from typing import assert_never
 
 from msgspec.structs import replace
 
-from acsard.core.config.live import changed
+from acsard.core.codes import Code, Reason, joined, reason, sentence
+from acsard.core.config.live import Changes, changed, describe_changes
 from acsard.core.config.motion_rules import longest_reply
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config
@@ -26,15 +27,12 @@ from acsard.core.link.link_diagnosis import UnansweredLines
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
-from acsard.core.motion.arbiter_text import REFUSED, CommandEvents, chosen, missed, refused
-from acsard.core.motion.battery import EMPTY_REASON, Battery
-from acsard.core.motion.bumpers import Bumpers, missing_text
+from acsard.core.motion.arbiter_text import OBJECTIONS, CommandEvents, chosen, missed, refused
+from acsard.core.motion.battery import Battery
+from acsard.core.motion.bumpers import Bumpers, missing_reason
 from acsard.core.motion.emergency_stop import (
-    DRIVER_FAULT_ADVICE,
     DRIVER_FAULT_REASON,
     MISSING_REASON,
-    PRESSED_REASON,
-    SILENT_REASON,
     EmergencyStop,
 )
 from acsard.core.motion.event_throttle import EventThrottle
@@ -82,16 +80,21 @@ INPUT_NAMES = {
 """Maps each input of the board to its words in the text "wait until the board has reported
 ..."."""
 
+INPUT_OF: dict[Code, str] = {
+    "emergency_stop": "estop",
+    "emergency_stop_silent": "estop",
+    "bumper": "bumpers",
+    "bumpers_silent": "bumpers",
+    "driver_fault": "driver",
+}
+"""Maps the cause of a latch to the input of the board that caused it, as in `INPUT_NAMES`."""
+
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 """Modes in which the robot brakes at the stop deceleration."""
 
 NS_PER_MS = 1_000_000
 
-CANNOT_MOVE = (
-    ", but the robot cannot move: limits.linear_speed and limits.angular_speed are 0; set a "
-    "higher limit"
-)
-"""Text that the reason in `state` contains while a source drives and both speed limits are 0."""
+NOTHING_CHANGED = "nothing changed: all settings already have these values"
 
 MAX_REFUSAL_LENGTH = 200
 """Largest number of characters of the text in `state` about a refused message. The text may quote
@@ -127,8 +130,8 @@ class Robot:
         self._life = Lifecycle(config.control.auto_activate, latches)
         self._first_event: Event | None = None
         if latches.in_force:
-            kind = f"start -> {self._life.mode}"
-            self._first_event = Event("mode", self._life.why, "warning", kind=kind)
+            kind, why = f"start -> {self._life.mode}", self._life.why
+            self._first_event = Event("mode", why.text, "warning", kind=kind, code=why.code)
         self._choice = Choice()
         self._speeds = STILL
         self._computed = self._written = STILL
@@ -148,7 +151,7 @@ class Robot:
         line was not written, `_settle` sets `_made` back to `_said`. After a press of the emergency
         stop or a bumper, and while the link is not up, both contain the state of a robot at
         rest."""
-        self._status = ("", "", "", "")
+        self._status: tuple[str, Code, str, str, str] = ("", "booting", "", "", "")
         self._battery_level = ""
         """Level of the battery in the previous step; "" before the board's first report."""
         self.counters: Counter[str] = Counter()
@@ -160,14 +163,17 @@ class Robot:
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
         latched = [latch for latch in (latches.fault, latches.stop) if latch is not None]
-        causes = [cause.why for latch in latched for cause in latch.causes if not cause.by]
-        self._estop = EmergencyStop(config.safety.estop, PRESSED_REASON in causes)
+        causes = [cause for latch in latched for cause in latch.causes]
+        codes = {cause.code for cause in causes}
+        self._estop = EmergencyStop(config.safety.estop, "emergency_stop" in codes)
         self._bumpers = Bumpers(config.safety)
-        self._battery = Battery(config.battery, any(why.startswith(EMPTY_REASON) for why in causes))
-        self._unreported = {name: why for why in causes if (name := _input(why))}
+        self._battery = Battery(config.battery, "battery_empty" in codes)
+        self._unreported = {
+            INPUT_OF[cause.code]: cause for cause in causes if cause.code in INPUT_OF
+        }
         """The inputs of the board that caused a latch in an earlier run of the daemon, if the board
         has not reported them in this run. The keys are those of `INPUT_NAMES`, and the values are
-        the causes in words. While the map is not empty, a `clear` is refused."""
+        the causes. While the map is not empty, a `clear` is refused."""
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
@@ -260,19 +266,19 @@ class Robot:
         applied = self._limiter.twist
         self._odometry.command(applied)
         link = self.session.link
-        # Use `_value_`, because the property `value` of an enum runs Python code.
-        reason = self._reason()
+        why = self._reason()
         if limiting:
-            reason = self._with_bumper(reason)
-        status = (self._life.mode._value_, reason, link, self._choice.source)
+            why = self._with_bumper(why)
+        # Use `_value_`, because the property `value` of an enum runs Python code.
+        status = (self._life.mode._value_, why.code, why.text, link, self._choice.source)
         battery = self._battery.status
         level = battery.level if battery else ""
         another = status != self._status or level != self._battery_level
         self._status, self._battery_level = status, level
         # If `another` and `news` are false, the mode and the sender that drives are unchanged.
         if another or news:
-            events += self._told.changes(self._life.mode, self._choice, status[1])
-        # Pass the arguments by position: seventeen keyword arguments take three times as long.
+            events += self._told.changes(self._life.mode, self._choice, why)
+        # Pass the arguments by position: eighteen keyword arguments take three times as long.
         return Outputs(
             inputs.now,
             due,
@@ -375,17 +381,17 @@ class Robot:
         """
         estop, bumpers, statuses = self._estop, self._bumpers, self.session.statuses
         events += estop.process_reports(statuses, now.mono_ns)
-        if estop.pressed_now:
+        if estop.pressed_now is not None:
             self.counters["emergency_stops"] += 1
             self._life.press(estop.pressed_now, now)
         events += bumpers.process_reports(statuses, now.mono_ns)
-        if bumpers.pressed_now:
+        if bumpers.pressed_now is not None:
             self.counters["bumper_presses"] += 1
             if bumpers.latching:
                 self._life.press(bumpers.pressed_now, now)
             else:
                 self._arbiter.require_neutral(now.mono_ns)
-        if estop.pressed_now or bumpers.pressed_now:
+        if estop.pressed_now is not None or bumpers.pressed_now is not None:
             # Do not ramp: the hardware has cut the motors, or the robot touches an obstacle.
             self._limiter.cut()
             self._speeds, self._made_of, self._pressed_ns = STILL, None, now.mono_ns
@@ -401,22 +407,22 @@ class Robot:
             for part in (estop, bumpers, battery):
                 part.forget()
             self._unreported = {}
-        refusal = self._awaited_report() if self._unreported else ("", "")
-        if estop.why:
-            refusal = estop.why, estop.mend
-        elif bumpers.clear_refusal:
-            refusal = bumpers.clear_refusal, bumpers.mend
+        refusal = self._awaited_report() if self._unreported else None
+        if estop.why is not None:
+            refusal = estop.why
+        elif bumpers.clear_refusal is not None:
+            refusal = bumpers.clear_refusal
         elif self.session.status.driver_fault:
-            refusal = DRIVER_FAULT_REASON, DRIVER_FAULT_ADVICE
+            refusal = DRIVER_FAULT_REASON
         elif battery.refuses_clear:
-            refusal = battery.why, battery.mend
-        self._life.refuse_clear(*refusal, now.mono_ns)
+            refusal = battery.refusal
+        self._life.refuse_clear(refusal, now.mono_ns)
 
-    def _awaited_report(self) -> tuple[str, str]:
+    def _awaited_report(self) -> Reason | None:
         """Return the cause of a latch from an earlier run of the daemon, and advice about it.
 
         An input of the board caused this latch. Until the board reports this input again, `clear`
-        is refused. If there is no such latch, both texts are "".
+        is refused. If there is no such latch, the result is None.
         """
         reported = {
             "estop": self._estop.use == "off" or bool(self._estop.state),
@@ -425,9 +431,10 @@ class Robot:
         }
         for name in [name for name in self._unreported if reported[name]]:
             del self._unreported[name]
-        for name, why in self._unreported.items():
-            return why, f"wait until the board has reported {INPUT_NAMES[name]}"
-        return "", ""
+        for name, cause in self._unreported.items():
+            advice = f"wait until the board has reported {INPUT_NAMES[name]}"
+            return Reason(cause.code, cause.why, advice, cause.part)
+        return None
 
     def _limit_by_bumpers(self, now_ns: int) -> None:
         """Reduce the command to motion that leads away from the pressed bumpers.
@@ -465,7 +472,7 @@ class Robot:
             self._reject(why, 1, events)
             self._odometry.skip(line)
             if self._sanity.doubtful:
-                self._fault(f"the board reports impossible speeds ({why})", now, events)
+                self._fault(reason("impossible_speeds", cause=why), now, events)
             return []
         lines, dropped = self._odometry.confirmed(line)
         if dropped:
@@ -484,15 +491,15 @@ class Robot:
         wheels = checks.wheels
         # While the emergency stop counts as pressed, the motors may have no power, so wheels that
         # do not follow the commanded speeds are not a sign of a fault.
-        pressed = self._estop.why or self._estop.pressed_now
+        pressed = self._estop.why is not None or self._estop.pressed_now is not None
         if self.session.lateness.step_s > WRITE_PAUSE_S and not pressed:
             # This computer was late, and the board may have stopped the motors meanwhile. So the
             # feedback lines that waited to be read say nothing about faults of the wheels.
-            fault = ""
+            fault = None
             wheels.skip(line.speeds)
         else:
             fault = wheels.watch(None if pressed else self._written, line.speeds, line.since)
-        if fault:
+        if fault is not None:
             self._fault(fault, now, events)
         if wheels.pushed:
             self.counters["uncommanded_motion"] += 1
@@ -507,10 +514,7 @@ class Robot:
 
     def _serve(self, inputs: Inputs, events: list[Event]) -> tuple[Answer, ...]:
         if inputs.guard_trip:
-            trip = (
-                f"the daemon's guard replaced a line for the board with zeros: {inputs.guard_trip}"
-            )
-            self._fault(trip, inputs.now, events)
+            self._fault(reason(inputs.guard_trip), inputs.now, events)
             self._life.caused_again(inputs.now.mono_ns)
         if inputs.shutting_down and self._life.mode is not Mode.SHUTDOWN:
             self._life.leave()
@@ -520,19 +524,21 @@ class Robot:
         return answers
 
     def _answer(self, request: Request, now: Instant, events: list[Event]) -> Answer:
-        before = self._life.mode
+        mode, latches = self._life.mode, self._life.latches
+        changes: Changes = {}
         try:
-            message = self._execute(request, now)
+            message = self._execute(request, now, changes)
         except RefusedError as refusal:
             return Answer(request.id, False, str(refusal))
         asked = (request.verb, request.by, request.asked_ns)
         if asked != self._asked or request.asked_ns is None:
-            news = self._life.mode is not before or request.verb == "set"
+            news = self._life.mode is not mode or request.verb == "set"
             events.append(Event(request.verb, message, by=request.by, news=news))
         self._asked = asked
-        return Answer(request.id, True, message)
+        latch = _changed_latch(latches, self._life.latches)
+        return Answer(request.id, True, message, latch, changes)
 
-    def _execute(self, request: Request, now: Instant) -> str:
+    def _execute(self, request: Request, now: Instant, changes: Changes) -> str:
         life = self._life
         asked_ns = now.mono_ns if request.asked_ns is None else request.asked_ns
         match request.verb:
@@ -556,7 +562,8 @@ class Robot:
             case "set_pose" | "reset_odometry":
                 return self._place(request.pose or Pose())
             case "set":
-                return self._set(request.settings, now.mono_ns)
+                changes |= self._set(request.settings, now.mono_ns)
+                return describe_changes(changes) or NOTHING_CHANGED
             case _:
                 assert_never(request.verb)
 
@@ -565,13 +572,13 @@ class Robot:
         pose = self._odometry.pose
         return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 
-    def _set(self, settings: dict[str, Plain], now_ns: int) -> str:
+    def _set(self, settings: dict[str, Plain], now_ns: int) -> Changes:
         # The robot is at rest only if two lines are zero: the last one that was written to the
         # port, which the wheels follow, and the last one that was computed.
         sent_twist, made = self._said[0].twist, self._limiter.twist
         before, at_rest = self.config, self._speeds == STILL and sent_twist == made == REST
         try:
-            self.config, news = changed(before, settings, at_rest)
+            self.config, changes = changed(before, settings, at_rest)
         except ConfigError as error:
             raise RefusedError(str(error)) from None
         self._limiter.use(self.config.limits)
@@ -579,12 +586,13 @@ class Robot:
         if self.config.commands != before.commands:
             self._arbiter.use(self.config.commands)
             self._arbiter.require_neutral(now_ns)
-        return news or "nothing changed: all settings already have these values"
+        return changes
 
-    def _fault(self, why: str, now: Instant, events: list[Event]) -> None:
+    def _fault(self, why: Reason, now: Instant, events: list[Event]) -> None:
         if self._life.fault(why, now):
             self._arbiter.require_neutral(self._made_ns)
-            events.append(Event("fault", f"{why}; srv/clear releases it", "error"))
+            text = f"{why.text}; srv/clear releases it"
+            events.append(Event("fault", text, "error", code=why.code))
 
     # Commands.
 
@@ -606,10 +614,10 @@ class Robot:
                 continue
             if message.stamp_replaced:
                 self.counters["stamps_replaced"] += 1
-            reason = self._arbiter.accept(message)
-            if reason:
-                text = f"source {message.source}: {REFUSED[reason]}"
-                self._refuse(Refusal(reason, text, message.source, message.sender), now_ns, events)
+            code = self._arbiter.accept(message)
+            if code:
+                text = f"source {message.source}: {OBJECTIONS[code]}"
+                self._refuse(Refusal(code, text, message.source, message.sender), now_ns, events)
             else:
                 self.counters["commands"] += 1
 
@@ -660,29 +668,30 @@ class Robot:
 
     # Report.
 
-    def _with_bumper(self, reason: str) -> str:
+    def _with_bumper(self, why: Reason) -> Reason:
         match self._life.mode:
             case Mode.DRIVING:
-                return f"{reason}; {self._bumpers.note()}"
+                limit = joined(self._bumpers.limit())
+                return Reason(limit.code, f"{why.text}; {limit.text}")
             case Mode.READY:
-                return f"{self._bumpers.note()}; {reason}"
+                limit = joined(self._bumpers.limit())
+                return Reason(limit.code, f"{limit.text}; {why.text}")
             case _:
-                return reason
+                return why
 
-    def _reason(self) -> str:
+    def _reason(self) -> Reason:
         match self._life.mode:
-            case Mode.DRIVING:
-                limits = self.config.limits
-                moves = limits.linear_speed or limits.angular_speed
-                suffix = "" if moves else CANNOT_MOVE
-                return f"driving: {chosen(self._choice)}{suffix}{self.session.note}"
-            case Mode.READY:
-                return f"{chosen(self._choice)}{self.session.note}"
+            case Mode.DRIVING | Mode.READY:
+                why, limits = chosen(self._choice), self.config.limits
+                if why.code == "commanded" and not (limits.linear_speed or limits.angular_speed):
+                    why = sentence("limits_zero", source=self._choice.source)
+                note = self.session.note
+                return Reason(why.code, why.text + note) if note else why
             case Mode.WAITING:
                 if self.session.link == "up":
-                    return (
-                        MISSING_REASON if self._estop.missing else missing_text(self.config.safety)
-                    )
+                    if self._estop.missing:
+                        return MISSING_REASON
+                    return missing_reason(self.config.safety)
                 return self.session.describe_link(self._port_trouble)
             case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
                 return self._life.why
@@ -692,14 +701,15 @@ class Robot:
                 assert_never(self._life.mode)
 
 
-def _input(why: str) -> str:
-    """Return the input of the board that caused a latch, as a key of `INPUT_NAMES`.
-
-    `why` is the cause of the latch, as text. The result is "" if no input of the board caused the
-    latch.
-    """
-    if why in (PRESSED_REASON, SILENT_REASON):
-        return "estop"
-    if why == DRIVER_FAULT_REASON:
-        return "driver"
-    return "bumpers" if "bumper" in why else ""
+def _changed_latch(before: Latches, after: Latches) -> int:
+    """Return the number of the latch that was set or released; 0 if none was."""
+    pairs = (
+        (before.fault, after.fault),
+        (before.stop, after.stop),
+        (before.inactive, after.inactive),
+    )
+    for old, new in pairs:
+        latch = new or old
+        if new is not old and latch is not None:
+            return latch.number
+    return 0

@@ -12,6 +12,8 @@ from typing import Annotated, Literal, get_args
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
+from acsard.core.codes import Code, GuardCode, Reason, RefusalCode, WaitCode
+
 WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
 """Names of the wheels, in the order of every value with one item per wheel."""
 
@@ -194,17 +196,21 @@ class Answer(Struct, frozen=True):
     id: int
     success: bool
     message: str
+    latch: int = 0
+    """Number of the latch that the request has set or released; 0 if it did neither."""
+    changes: dict[str, tuple[Plain, Plain]] = {}
+    """The settings that the request has changed: old and new value by dotted key."""
 
 
 class Refusal(Struct, frozen=True):
     """A message from a client that the daemon refused.
 
-    `reason` is a short code, and `text` explains the refusal. The robot adds 1 to the counter
+    `reason` is the code, and `text` explains the refusal. The robot adds 1 to the counter
     `command_<reason>`, or to `commands_of_new_senders` if the reason is `unproven`. `source` and
     `sender` are "" if they are unknown.
     """
 
-    reason: str
+    reason: RefusalCode
     text: str
     source: str = ""
     sender: str = ""
@@ -255,6 +261,9 @@ class Event(Struct, frozen=True):
     """Number of occurrences that this object stands for."""
     news: bool = True
     """False if the event only repeats an earlier event. Its log line may then be delayed."""
+    code: Code | Literal[""] = ""
+    """Code of the cause; "" if `name` says everything. If the event stands for several events, it
+    is the code of the last one."""
 
 
 class Estimate(Struct, frozen=True, gc=False):
@@ -279,28 +288,13 @@ class Estimate(Struct, frozen=True, gc=False):
     """Monotonic time at which the daemon had received the complete feedback line, ns."""
 
 
-WaitKind = Literal[
-    "nothing",
-    "command",
-    "proof",
-    "late",
-    "stalled",
-    "neutral",
-    "zeros",
-    "higher",
-    "equal",
-    "senders",
-]
-"""Kind of the condition that a command source waits for. `Wait.what` explains the kinds."""
-
-
 class Wait(Struct, frozen=True):
     """The condition that must be met before a command source drives the robot.
 
     `arbiter_text.py` turns it into a sentence.
     """
 
-    what: WaitKind
+    what: WaitCode
     """Kind of the condition. `source` explains most kinds. The other kinds are:
 
     - nothing: The source need not wait.
@@ -482,6 +476,9 @@ class Latch(Struct, frozen=True):
     fault."""
     why: str
     """Reason in words, such as "stopped by NAME" or the cause of a fault."""
+    code: Code
+    part: str = ""
+    """The part of the robot that the cause is about, such as a wheel; "" if the code says it."""
     kept: bool = False
     """True if the latch was set before the present run of the daemon."""
     earlier: tuple[Latch, ...] = ()
@@ -493,6 +490,11 @@ class Latch(Struct, frozen=True):
     def causes(self) -> tuple[Latch, ...]:
         """All causes of the same stop or fault, each as a latch: this latch, then `earlier`."""
         return (self, *self.earlier)
+
+    @property
+    def cause(self) -> tuple[str, str, str]:
+        """The identity of the cause. Two latches with the same identity have the same cause."""
+        return self.code, self.part, self.by
 
     def each(self, change: Callable[[Latch], Latch]) -> Latch:
         """Return a copy with `change` applied to this latch and to each latch in `earlier`."""
@@ -555,9 +557,9 @@ class Inputs(Struct, frozen=True):
     gyro: tuple[GyroSample, ...] = ()
     refusals: tuple[Refusal, ...] = ()
     """The messages from the bus that were refused before they became a `Command`."""
-    guard_trip: str = ""
-    """Why the guard replaced the previous line with zeros, in words; "" if it did not. If the
-    guard replaced a line, the robot latches a fault."""
+    guard_trip: GuardCode | Literal[""] = ""
+    """Why the guard replaced the previous line with zeros; "" if it did not. If the guard replaced
+    a line, the robot latches a fault."""
     superseded: bool = False
     """True if the line of the previous step was not written to the port."""
     missed: int = 0
@@ -595,8 +597,10 @@ class Outputs(Struct, frozen=True):
     wheel by the stop line."""
     estimates: tuple[Estimate, ...]
     mode: str
+    code: Code
+    """Why the robot moves or does not move."""
     reason: str
-    """Why the robot moves or does not move, in words."""
+    """The same in words."""
     link: str
     source: str
     """Source that the arbiter has selected; "" if no source is selected. A selected source does
@@ -605,8 +609,8 @@ class Outputs(Struct, frozen=True):
     command_ns: int | None
     """Monotonic time at which the selected command arrived, ns; None if no command is selected."""
     status_changed: bool
-    """True if `mode`, `reason`, `link`, `source` or the level of the battery changed in this
-    step."""
+    """True if `mode`, `code`, `reason`, `link`, `source` or the level of the battery has changed in
+    this step."""
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False
@@ -670,8 +674,8 @@ class Snapshot(Struct, frozen=True):
     bumpers: tuple[bool, ...] | None = None
     """Whether each bumper counts as pressed, in the order of the board's reports. None if the
     board has never reported its bumpers."""
-    bumper: str = ""
-    """Why a bumper counts as pressed, in words; "" while no bumper counts as pressed."""
+    bumper: Reason | None = None
+    """Why a bumper counts as pressed; None while no bumper counts as pressed."""
     battery: BatteryStatus | None = None
     """State of the battery; None if the board has never reported the battery."""
     board: dict[str, str] = {}

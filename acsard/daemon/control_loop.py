@@ -16,7 +16,7 @@ from acsard.core.config.live import differences
 from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.formatting import listed
-from acsard.core.guard import Guard
+from acsard.core.guard import Guard, Trip
 from acsard.core.incoming.bus_interface import GATEWAY_KEY as GATEWAY
 from acsard.core.incoming.bus_interface import (
     NO_INPUT,
@@ -159,7 +159,8 @@ class ControlLoop:
         self._turn_rates: list[GyroSample] = []
         """Gyro samples that have arrived since the last step."""
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
-        self._superseded, self._trip, self._late_ns = False, "", 0
+        self._superseded, self._late_ns = False, 0
+        self._trip: Trip = ""
         """Three facts about the last line to the board. `_superseded` is true if the port did not
         send the line, so that a newer line must replace it. `_trip` is the reason why the guard
         replaced the line with zeros, or "". `_late_ns` is the time from the start of the step to

@@ -13,11 +13,17 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.core.motion.lifecycle import number_after_restart, with_causes
+from acsard.core.codes import Reason, reason
+from acsard.core.motion.lifecycle import (
+    NAMELESS,
+    latch_of,
+    number_after_restart,
+    with_causes,
+)
 from acsard.core.values import NS_PER_S, AcsardError, Event, Instant, Latch, Latches
 from acsard.host.errors import MSGSPEC_ERRORS
 
-FORMAT = 1  # another version is unreadable
+FORMAT = 2  # another version is unreadable
 
 MAX_BYTES = 65_536  # a larger file is unreadable; three latches take about 1 kB
 
@@ -93,14 +99,14 @@ def decode(robot: str, data: bytes) -> Latches:
     return latches.after_restart()
 
 
-def at_start(why: str) -> str:
+def at_start(why: str) -> Reason:
     """Return the reason of a stop that the daemon itself sets at its start."""
-    return f"stopped when the daemon started, because {why}"
+    return reason("stopped_at_start", cause=why)
 
 
-def unreadable(where: str, reason: str) -> str:
+def unreadable(where: str, problem: str) -> Reason:
     """Return the reason of the stop for an unreadable file."""
-    return at_start(f"{where} cannot be read: {reason}; a stop may have been lost")
+    return at_start(f"{where} cannot be read: {problem}; a stop may have been lost")
 
 
 def unwritable(where: str, reason: str) -> str:
@@ -111,7 +117,7 @@ def unwritable(where: str, reason: str) -> str:
 
 
 def stopped(
-    latches: Latches, why: str, now: Instant, by: str = DAEMON_NAME, before: int = -1
+    latches: Latches, why: Reason, now: Instant, by: str = DAEMON_NAME, before: int = -1
 ) -> Latches:
     """Return `latches` with a stop, unless they have one.
 
@@ -121,10 +127,10 @@ def stopped(
         return latches
     numbers = [latch.number for latch in (latches.fault, latches.inactive) if latch is not None]
     number = number_after_restart(max([*numbers, before]), now)
-    return replace(latches, stop=Latch(number, now.wall_ns, by, why))
+    return replace(latches, stop=latch_of(number, now.wall_ns, by, why))
 
 
-def after_failed_write(latches: Latches, why: str, now: Instant) -> Latches:
+def after_failed_write(latches: Latches, why: Reason, now: Instant) -> Latches:
     """Return the latches with which the robot starts if the file cannot be written: stopped.
 
     The previous process may have set others. All get new numbers, so that a `clear` or `activate`
@@ -185,9 +191,9 @@ class Handover:
         stop from releasing it.
         """
         for name in reversed(by):
-            last, text = latches.stop, f"stopped by {name or 'request'}"
+            last, why = latches.stop, reason("stopped", by=name or NAMELESS)
             before = -1 if last is None else last.number
-            latches = stopped(replace(latches, stop=None), text, now, name, before)
+            latches = stopped(replace(latches, stop=None), why, now, name, before)
             assert latches.stop is not None
             latches = replace(latches, stop=with_causes(latches.stop, last))
         self.take(latches)

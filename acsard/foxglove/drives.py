@@ -63,7 +63,7 @@ def encoding_of(encoding: str, schema_name: str) -> str:
             f"a channel of the type {schema_name or '(none)'} cannot drive the robot: use "
             f"{TWISTS[0]}"
         )
-        raise DecodeError("wrong_type", text)
+        raise DecodeError("wrong_shape", text)
     if encoding == "cdr":
         return f"{encoding_name('cdr')};{full}"
     if encoding == "json":

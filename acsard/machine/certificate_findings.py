@@ -24,7 +24,7 @@ from acsard.bus.tls import (
 )
 from acsard.bus.zenoh_sessions import certificate_trouble
 from acsard.core.config.settings import Config
-from acsard.core.messages.certificate_expiry import expiry, first_expiry
+from acsard.core.messages.certificate_expiry import CERTIFICATE_LEVELS, expiry, first_expiry
 from acsard.host.clock import now
 from acsard.host.errors import MendableError
 from acsard.host.extras import install
@@ -70,7 +70,8 @@ def certificates(tls: str) -> Iterator[Finding]:
         yield Finding("certificates", "warning", text, renewal(tls, ""))
         return
     expiries = expiry_times(tls)
-    level, words = expiry(expiries, now().wall_ns)
+    code, words = expiry(expiries, now().wall_ns)
+    level = CERTIFICATE_LEVELS[code]
     mend = (
         renewal(tls, first_expiry(expiries)[0])
         if expiries
@@ -148,5 +149,6 @@ def router_certificates(config: Config) -> Iterator[Finding]:
     """
     tls = config.bus.tls
     for whose, ends_ns in router_expiry_times(config.bus.tls_routers, tls).items():
-        level, words = expiry({whose: ends_ns}, now().wall_ns)
+        code, words = expiry({whose: ends_ns}, now().wall_ns)
+        level = CERTIFICATE_LEVELS[code]
         yield Finding("router", LEVELS[level], words, renewal(tls, whose) if level else "")

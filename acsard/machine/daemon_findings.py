@@ -17,12 +17,13 @@ from msgspec.structs import replace
 from acsard.bus.address import Address
 from acsard.bus.zenoh_sessions import answers, reachable
 from acsard.client import Client, connect
+from acsard.core.codes import GUARD_CODES, HOST_CODES
 from acsard.core.config.live import Difference, differences, find_live_setting
 from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import SIMULATOR, BatteryConfig, Config, is_tls
 from acsard.core.config.validation import write
 from acsard.core.formatting import listed, many
-from acsard.core.link.link_diagnosis import BUSY_ADVICE, MAX_UNANSWERED_FRACTION, blames_host
+from acsard.core.link.link_diagnosis import BUSY_ADVICE, MAX_UNANSWERED_FRACTION
 from acsard.core.messages.diagnostics import NO_ROUTER
 from acsard.core.messages.schema import (
     BatterySummary,
@@ -35,10 +36,8 @@ from acsard.core.motion.battery import MISSING_REASON as NO_BATTERY
 from acsard.core.motion.battery import Battery
 from acsard.core.motion.battery import status_text as battery_words
 from acsard.core.motion.emergency_stop import (
-    CHECK,
     MISSING_REASON,
     PRESSED_REASON,
-    RELEASE,
     SILENT_REASON,
 )
 from acsard.core.motion.gyro import STATUS_TEXTS
@@ -208,7 +207,7 @@ def link(running: Running) -> Iterator[Finding]:
                 if running.is_local
                 else "run `acsard doctor` on the daemon's machine, where it checks the serial port"
             )
-        if config.mcu.simulated or blames_host(state.reason):
+        if config.mcu.simulated or state.code in HOST_CODES:
             mend = BUSY_ADVICE
         text = f"{state.link}: {state.reason}" if state.mode == "waiting" else state.link
         yield Finding("link", "failure", text, mend)
@@ -258,23 +257,29 @@ def link(running: Running) -> Iterator[Finding]:
 def _emergency_stop(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
     if state.emergency_stop == "pressed":
         yield Finding(
-            "emergency stop", "warning", PRESSED_REASON, f"{RELEASE}, then `acsard call clear`"
+            "emergency stop",
+            "warning",
+            PRESSED_REASON.text,
+            f"{PRESSED_REASON.advice}, then `acsard call clear`",
         )
     elif state.emergency_stop == "silent":
-        yield Finding("emergency stop", "failure", SILENT_REASON, CHECK)
+        yield Finding("emergency stop", "failure", SILENT_REASON.text, SILENT_REASON.advice)
     elif state.emergency_stop:
         yield Finding(
             "emergency stop", "ok", "the board reports that the emergency stop is released"
         )
     elif config.safety.estop == "required":
-        yield Finding("emergency stop", "failure", MISSING_REASON, mend)
+        yield Finding("emergency stop", "failure", MISSING_REASON.text, mend)
 
 
 def _bumpers(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
     safety, pressed = config.safety, state.bumpers
     if pressed is not None and any(pressed):
         # If the board has fallen silent, all bumpers count as pressed.
-        todo = f"{RELEASE}; if none is pressed, {CHECK}; then `acsard call clear`"
+        todo = (
+            f"{PRESSED_REASON.advice}; if none is pressed, {SILENT_REASON.advice}; then `acsard "
+            "call clear`"
+        )
         if safety.bumper == "away":
             todo = (
                 "drive the robot in a straight line away from the obstacle; if the robot is "
@@ -285,7 +290,7 @@ def _bumpers(config: Config, state: RobotState, mend: str) -> Iterator[Finding]:
         text = f"the board reports {many(len(pressed), 'bumper')}, and none is pressed"
         yield Finding("bumpers", "ok", text)
     elif safety.needs_bumpers:
-        yield Finding("bumpers", "failure", bumpers.missing_text(safety), mend)
+        yield Finding("bumpers", "failure", bumpers.missing_reason(safety).text, mend)
 
 
 def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -> Iterator[Finding]:
@@ -301,7 +306,7 @@ def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -
     elif level == "unknown":
         yield Finding("battery", "warning", text, mend)
     elif level == "stop":
-        mend = f"{Battery(config).mend}, then `acsard call clear`"
+        mend = f"{Battery(config).why.advice}, then `acsard call clear`"
         yield Finding("battery", "failure", text, mend)
     else:
         yield Finding("battery", "warning", text, "charge it")
@@ -469,7 +474,7 @@ def daemon(running: Running) -> Iterator[Finding]:
         "correct the cause that this reason names, then release the fault with `acsard call "
         f"clear`; {check(running)}"
     )
-    if "the daemon's guard" in state.reason:
+    if state.code in GUARD_CODES:
         mend = (
             "this is a defect of acsard: report it with the newest recording (`acsard recording` "
             "lists the recordings), then release the fault with `acsard call clear`"

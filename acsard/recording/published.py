@@ -107,7 +107,9 @@ class Publisher:
 def _without_measurements(message: Any) -> Any:
     match message:
         case RobotState():
-            return replace(message, certificate_expiry="", certificate_days=None, latencies={})
+            return replace(
+                message, certificate="", certificate_expiry="", certificate_days=None, latencies={}
+            )
         case DiagnosticArray():
             rows = [row for row in message.status if row.name not in MEASURED_ROWS]
             return DiagnosticArray(message.header, rows)

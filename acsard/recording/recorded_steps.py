@@ -30,7 +30,7 @@ from acsard.host.errors import MSGSPEC_ERRORS
 
 US_PER_S = 1e6
 
-Status = tuple[str, str, str, str]  # mode, its reason, link, and source that commands
+Status = tuple[str, str, str, str, str]  # mode, its reason, link, source that commands, code
 
 Micropose = tuple[int, int, int]  # x and y in um, yaw in urad
 
@@ -167,7 +167,7 @@ def count_superseded(commands: Sequence[Command]) -> int:
 
 
 def status_of(outputs: Outputs) -> Status:
-    return outputs.mode, outputs.reason, outputs.link, outputs.source
+    return outputs.mode, outputs.reason, outputs.link, outputs.source, outputs.code
 
 
 def micropose(estimate: Estimate) -> Micropose:

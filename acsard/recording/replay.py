@@ -15,7 +15,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.core.guard import Guard, Memory
+from acsard.core.guard import Guard, Memory, Trip
 from acsard.core.robot import Robot
 from acsard.core.values import Event, Instant, Outputs
 from acsard.recording.recorded_steps import (
@@ -38,6 +38,7 @@ Output = Literal[
     "mode",
     "link",
     "source",
+    "code",
     "pose",
     "event",
     "client",
@@ -56,7 +57,7 @@ class Difference(Struct, frozen=True):
     what: tuple[Output, ...]
     recorded: RecordedOutputs
     replayed: RecordedOutputs
-    trip: str  # why the guard replaced the line with zeros
+    trip: Trip  # why the guard replaced the line with zeros
 
 
 class Comparison(Struct):
@@ -152,19 +153,22 @@ class Replay:
             comparison.fault = comparison.fault or difference
 
     def _compare(
-        self, step: RecordedStep, replayed: RecordedOutputs, trip: str
+        self, step: RecordedStep, replayed: RecordedOutputs, trip: Trip
     ) -> Difference | None:
         recorded = step.recorded
         exact = recorded.checksum is None or recorded.checksum == self._checksum
         self.comparison.exact = self.comparison.exact and exact
-        mode, reason, link, source = replayed.status
-        recorded_mode, recorded_reason, recorded_link, recorded_source = recorded.status
+        mode, reason, link, source, code = replayed.status
+        recorded_mode, recorded_reason, recorded_link, recorded_source, recorded_code = (
+            recorded.status
+        )
         pairs: tuple[tuple[Output, object, object], ...] = (
             ("line", replayed.line, recorded.line),
             ("sent line", replayed.sent, recorded.sent),
             ("mode", mode, recorded_mode),
             ("link", link, recorded_link),
             ("source", source, recorded_source),
+            ("code", code, recorded_code),
             ("pose", replayed.poses, recorded.poses),
             ("reason", reason, recorded_reason),
         )
@@ -183,7 +187,7 @@ class Replay:
         if recorded.line is not None or replayed.line is not None:
             comparison.lines += 1
             comparison.lines_same += recorded.line == replayed.line
-        mode, reason, link, source = map(operator.eq, replayed.status, recorded.status)
+        mode, reason, link, source, _ = map(operator.eq, replayed.status, recorded.status)
         comparison.modes_same += mode
         comparison.reasons_same += reason
         comparison.links_same += link

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from acsard.core.codes import reason
 from acsard.core.config.live import flat
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
@@ -83,7 +84,7 @@ def describe_difference(difference: Difference, began_ns: Ns) -> list[str]:
         f"beginning of the recording: {what}",
         *_side("recorded", difference.recorded),
         *_side("replayed", difference.replayed),
-        *([f"            the guard: {difference.trip}"] if difference.trip else []),
+        *([f"            {reason(difference.trip).text}"] if difference.trip else []),
     ]
 
 
@@ -92,7 +93,7 @@ def _seconds(difference: Difference, began_ns: Ns) -> float:
 
 
 def _side(name: str, outputs: RecordedOutputs) -> list[str]:
-    mode, reason, link, source = map(printable, outputs.status)
+    mode, why, link, source, code = map(printable, outputs.status)
     line = (
         "no line"
         if outputs.line is None
@@ -101,7 +102,7 @@ def _side(name: str, outputs: RecordedOutputs) -> list[str]:
     poses = [[f"{value / US_PER_S:.6f}" for value in pose] for pose in outputs.poses]
     return [
         f"  {name:8}  {line}",
-        f"            mode {mode} ({reason}), link {link}, source {source or 'none'}",
+        f"            mode {mode} ({code}: {why}), link {link}, source {source or 'none'}",
         *[f"            pose x {x} y {y} yaw {yaw}" for x, y, yaw in poses],
         *[f"            event {_event(event)}" for event in outputs.events],
     ]

@@ -15,6 +15,7 @@ from typing import Annotated, NamedTuple
 import msgspec
 from msgspec import Meta, Struct
 
+from acsard.core.guard import Trip
 from acsard.core.values import (
     AcsardError,
     Command,
@@ -40,7 +41,7 @@ from acsard.recording.recorded_steps import (
     status_of,
 )
 
-FORMAT = "3"  # of the messages in a recording
+FORMAT = "4"  # of the messages in a recording
 
 MAX_ROWS = 4096  # like the recorder's queue
 
@@ -63,7 +64,7 @@ class OccasionalFields(Struct, frozen=True, omit_defaults=True):
     status: Status | None = None  # None: as in the previous row
     missed: int = 0
     late_ns: Annotated[int, Meta(ge=0, le=MAX_TIME_NS)] = 0
-    guard_trip: str = ""
+    guard_trip: Trip = ""
     commands: tuple[Command, ...] = ()
     requests: tuple[Request, ...] = ()
     refusals: tuple[Refusal, ...] = ()

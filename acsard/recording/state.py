@@ -26,7 +26,8 @@ from acsard.recording.unpickling import unpickle
 
 # A package ends with a dot. The classes need constructors without side effects.
 PART_MODULES = (
-    "acsard.core.values", "acsard.core.robot", "acsard.core.guard", "acsard.core.config.settings",
+    "acsard.core.values", "acsard.core.codes", "acsard.core.robot", "acsard.core.guard",
+    "acsard.core.config.settings",
     "acsard.core.motion.", "acsard.core.link.",
 )  # fmt: skip
 

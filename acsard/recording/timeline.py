@@ -16,9 +16,9 @@ from typing import Annotated
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
+from acsard.core.codes import HOST_CODES
 from acsard.core.config.settings import Config
 from acsard.core.formatting import lasting, many, printable_bytes
-from acsard.core.link.link_diagnosis import blames_host
 from acsard.core.link.session import IDENTITY
 from acsard.core.motion.arbiter_text import MAX_SENDER_LENGTH
 from acsard.core.ros.shapes import how_often
@@ -78,7 +78,7 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
 
 def entry_of(event: Event, wall_ns: WallNs) -> TimelineEntry:
     """Return the entry for an event of the log."""
-    late = event.name == "link_stale" and blames_host(event.text)
+    late = event.name == "link_stale" and event.code in HOST_CODES
     name = "link_late" if late else event.name
     return TimelineEntry(wall_ns / 1e9, name, event.text, event.level, event.by, event.count)
 
@@ -113,7 +113,7 @@ class ReasonChanges:
 
         There is none if an event reports it, or while the robot drives.
         """
-        mode, text, _, source = step.recorded.status
+        mode, text, _, source, _ = step.recorded.status
         now, reason = step.inputs.now, NUMBER.sub("#", text)
         for command in step.inputs.commands:
             if command.source == source:
@@ -197,7 +197,7 @@ class WaitingSenders:
             if event.name == "commander":
                 # If the log combined several changes of the sender, `by` contains several names.
                 self._commander = event.by
-        mode, _, _, source = step.recorded.status
+        mode, _, _, source, _ = step.recorded.status
         if mode != "driving":
             self._waiting.clear()
             return
@@ -288,7 +288,7 @@ class TimelineWriter:
         first, self._continued = self._continued, None
         if first is None:
             return
-        mode, reason, link, source = first.recorded.status
+        mode, reason, link, source, _ = first.recorded.status
         does = mode if mode == "driving" else f"{mode} ({reason})"
         at = "the pose of the robot is not known"
         if self._pose is not None:
@@ -349,7 +349,7 @@ class TimelineWriter:
         if step.places:
             # The pose jumps before the next step, and a jump is no distance.
             self._pose = None
-        mode, _, _, source = step.recorded.status
+        mode, _, _, source, _ = step.recorded.status
         now_ns = step.inputs.now.mono_ns
         if mode == "driving":
             if self._began_ns is None:

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from acsard.core.config.settings import Source
-from acsard.core.motion.arbiter_text import REFUSED, waiting
+from acsard.core.motion.arbiter_text import OBJECTIONS, waiting
 from acsard.core.robot import Robot
 from acsard.core.thinning import Band
 from acsard.core.values import NS_PER_S, Command, Outputs, Twist
@@ -109,7 +109,7 @@ class CommandSources:
         # The counters of a robot from a recorded state include refusals before this step.
         if not (new and same):
             return
-        words = "; ".join(REFUSED[reason] for reason in new)
+        words = "; ".join(OBJECTIONS[code] for code in new)
         now_ns = step.inputs.now.mono_ns
         ages = {source.name: source.age_s for source in self._reader.sources(robot, now_ns)}
         for command in step.inputs.commands:
@@ -143,11 +143,11 @@ class CommandSources:
 
     def _states(self, step: RecordedStep, t: float, robot: Robot) -> Iterator[tuple[str, str, str]]:
         """Yield the name, state and reason of each source. A silent source has the state ""."""
-        mode, reason, _, driver = step.recorded.status
+        mode, reason, _, driver, _ = step.recorded.status
         for source in self._reader.sources(robot, step.inputs.now.mono_ns):
             refusal, wait = self._refusal(source.name, t), source.waits_for
             if mode == "driving" and source.name == driver:
-                yield source.name, "drives", waiting(wait)
+                yield source.name, "drives", waiting(wait).text
             elif refusal:
                 yield source.name, "refused", refusal
             elif wait.what == "command":
@@ -155,7 +155,7 @@ class CommandSources:
             elif mode not in FOLLOWING_MODES or wait.what in ("nothing", "senders"):
                 yield source.name, "sends", f"{mode}: {reason}"[:MAX_TEXT_LENGTH]
             else:
-                yield source.name, "waits", waiting(wait)
+                yield source.name, "waits", waiting(wait).text
         refusal = self._refusal(OTHER_SOURCES, t)
         yield OTHER_SOURCES, "refused" if refusal else "", refusal
 

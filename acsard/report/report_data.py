@@ -433,7 +433,7 @@ class ReportData:
 
     def _drive(self, step: RecordedStep, t: float, inside: bool) -> None:
         """Process the poses of a step. `inside` is true if the report covers this step."""
-        mode, _, _, source = step.recorded.status
+        mode, _, _, source, _ = step.recorded.status
         driven = self._driven(source) if mode == "driving" and inside else None
         if driven is not None and t > self.seconds:
             driven.seconds += t - self.seconds
@@ -494,7 +494,7 @@ class ReportData:
             self.lateness.at_once()
 
     def _sample(self, step: RecordedStep, t: float, robot: Robot, refused: bool) -> None:
-        mode, reason, link, _ = status = step.recorded.status
+        mode, reason, link, _, _ = status = step.recorded.status
         if status == self._status and t - self._sampled < SAMPLE_PERIOD_S and not refused:
             return
         self._status, self._sampled = status, t

@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager, nullcontext
 
 import msgspec
 
-from acsard.core.motion.arbiter_text import REFUSED
+from acsard.core.motion.arbiter_text import OBJECTIONS
 from acsard.core.robot import Robot
 from acsard.core.values import Outputs, SourceStatus
 
@@ -60,10 +60,10 @@ class RobotReader:
             )
 
     def refused(self, robot: Robot) -> Mapping[str, int]:
-        """Return how many commands the robot has refused for each reason in `REFUSED`."""
+        """Return how many commands the robot has refused for each reason in `OBJECTIONS`."""
         with self._errors():
             return msgspec.convert(
-                {name: robot.counters[f"command_{name}"] for name in REFUSED}, dict[str, int]
+                {name: robot.counters[f"command_{name}"] for name in OBJECTIONS}, dict[str, int]
             )
 
     def sources(self, robot: Robot, now_ns: int) -> tuple[SourceStatus, ...]:

@@ -193,7 +193,7 @@ def title(data: ScreenData, state: RobotState) -> Text:
 
 
 def certificate(state: RobotState) -> Text:
-    style = "" if state.certificate_expiry.startswith("valid") else "bold red"
+    style = "" if state.certificate == "valid" else "bold red"
     return Text(f"certificate {clean(state.certificate_expiry)}", style)
 
 

@@ -244,7 +244,7 @@ def test_failed_hardware_holds_the_robot_and_the_reason_is_reported(world: World
     # a person may hold the robot by these zeros, so no other client drives past them
     assert world.state.linear == 0.0
     assert world.state.reason == (
-        "driving: ros2_control commands zero speed: it has sent only zeros for over 10 s; the "
+        "ros2_control commands zero speed: it has sent only zeros for over 10 s; the "
         "speeds of nav have no effect"
     )
     (text,) = [event.text for event in world.events if event.name == "commands_without_effect"]
@@ -252,7 +252,7 @@ def test_failed_hardware_holds_the_robot_and_the_reason_is_reported(world: World
     assert "the speeds of nav have no effect" in text
     world.run(0.3)
     world.drive(0.3, seconds=0.5, source="nav")
-    assert world.state.reason == "driving: commanded by nav"
+    assert world.state.reason == "commanded by nav"
     assert world.state.linear > 0.0
 
 

@@ -7,6 +7,7 @@ import random
 
 import pytest
 
+from acsard.core.codes import reason
 from acsard.core.config.settings import (
     Config,
     ControlConfig,
@@ -71,7 +72,7 @@ def into(world: World, mode: str) -> None:
         world.drive(0.8, 0.5, seconds=0.4)
         world.call("deactivate")
     elif mode == "fault":
-        world.loop.robot._fault("a fault of the test", world.instant, [])
+        world.loop.robot._fault(reason("driver_fault"), world.instant, [])
         world.run(0.02)
     assert world.state.mode == mode
 

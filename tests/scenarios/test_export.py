@@ -200,7 +200,7 @@ def test_every_line_reason_of_the_log_is_a_reason_that_the_state_has(both: Any) 
     steps = {step.inputs.now.wall_ns: step.recorded.status for step in tape.steps()}
     assert lines
     for line in lines:
-        mode, reason, _, _ = steps[line.stamp.to_ns()]
+        mode, reason, _, _, _ = steps[line.stamp.to_ns()]
         assert line.msg.partition(" (by ")[0] == f"{mode}: {reason}"
 
 

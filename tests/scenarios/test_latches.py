@@ -16,6 +16,7 @@ from acsard.core.messages.cdr import Cdr
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.messages.signature import public_name
 from acsard.core.ros.attachments import Attachment
+from acsard.core.ros.shapes import Trigger
 from acsard.core.values import NS_PER_S
 from tests.scenarios.speakers import Speaker, moved
 from tests.scenarios.world import World
@@ -50,7 +51,8 @@ def call(
     (reply,) = world.bus.replies[ticket]
     if via == "native":
         return msgspec.json.decode(reply.payload, type=ServiceReply)
-    return Cdr(ServiceReply).decode(reply.payload)
+    trigger = Cdr(Trigger).decode(reply.payload)
+    return ServiceReply(trigger.success, trigger.message)
 
 
 def runaway(world: World) -> None:

@@ -224,7 +224,9 @@ def test_a_fault_over_a_stop_takes_two_calls_after_a_restart_as_before() -> None
 @each("away_s", [-(10**9), -60, 0, 1, 10**9])
 def test_a_plain_clear_waits_two_seconds_after_a_reboot_wherever_its_clock_is(away_s: int) -> None:
     at_ns = START.wall_ns - away_s * NS_PER_S
-    world = World(latches=Latches(stop=Latch(7, at_ns, "joe", "stopped by joe", kept=True)))
+    world = World(
+        latches=Latches(stop=Latch(7, at_ns, "joe", "stopped by joe", "stopped", kept=True))
+    )
     world.run(0.5)
     world.ask("srv/clear")
     assert world.state.mode == "stopped"

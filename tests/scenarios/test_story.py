@@ -378,7 +378,7 @@ def third_run(host: Host) -> None:
     """Start a robot that is still stopped, because the client anna stopped it earlier."""
     wall_ns = host.world.instant.wall_ns
     client = f"{ANNA}/0123456789abcdef (native)"
-    stop = Latch(1, wall_ns, client, f"stopped by {client}", kept=True)
+    stop = Latch(1, wall_ns, client, f"stopped by {client}", "stopped", kept=True)
     host.start(wall_ns + 60 * NS_PER_S, Latches(stop=stop))
     host.note(
         "restart of a stopped robot",

@@ -1129,7 +1129,7 @@ def test_a_robot_does_not_learn_the_delay_of_a_command_that_the_inbox_dropped(
 def test_a_daemon_that_has_ended_writes_nothing_when_the_disk_has_room_again() -> None:
     disk = Disk()
     disk.fill(True)
-    disk.keep(Latches(stop=Latch(1, 0, "ann", "stopped by ann")))
+    disk.keep(Latches(stop=Latch(1, 0, "ann", "stopped by ann", "stopped")))
     assert disk.behind
     disk.end()
     disk.fill(False)

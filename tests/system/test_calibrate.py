@@ -28,9 +28,9 @@ from acsard.calibration.guided.robot_on_bus import (
     Sensor,
 )
 from acsard.client import Client
+from acsard.core.codes import CODES
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, JointsConfig
-from acsard.core.link.link_diagnosis import blames_host
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
 from acsard.terminal.prompt import Prompt
@@ -55,6 +55,9 @@ SKIDDING: dict[str, dict[str, object]] = {
         "gyro_bias": 0.01, "gyro_noise": 0.01,
     },
 }  # fmt: skip
+
+
+HOST_LATE = CODES["host_late"].text.partition("{")[0]
 
 
 @pytest.fixture
@@ -152,7 +155,7 @@ def tried(bus: Bus, drive: Callable[[], T]) -> T:
         except AssertionError as error:
             why = " ".join(str(error).split())
             if not left or not (
-                blames_host(why) or STALL_REASON in why or lost(time.monotonic() - 5.0) > 0.2
+                HOST_LATE in why or STALL_REASON in why or lost(time.monotonic() - 5.0) > 0.2
             ):
                 raise
             bus.at_rest()

@@ -13,8 +13,8 @@ from acsard.calibration.guided.drive_plan import Leg
 from acsard.calibration.runs import STANDSTILL_SPEED
 from acsard.client.commander import NEVER_DRIVING_MODES, OPEN_TIMEOUT_S, OPENING_S, objection
 from acsard.client.follower import MAX_STATE_AGE_S
+from acsard.core.codes import HOST_CODES
 from acsard.core.config.settings import Config, DriveConfig, LimitsConfig
-from acsard.core.link.link_diagnosis import blames_host
 from acsard.core.messages.schema import RobotState
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.limits import Limiter
@@ -186,7 +186,7 @@ class LegDriver:
         self._received = now
         why = self._objection(state)
         if state.mode in (*NEVER_DRIVING_MODES, "waiting"):
-            late = state.mode == "waiting" and blames_host(state.reason)
+            late = state.code in HOST_CODES
             self._halt(f"the robot is {state.mode}: {state.reason}", disturbed=late)
         elif state.source not in ("", self._source):
             self._halt(

@@ -18,6 +18,7 @@ from acsard.core.config.parsing import ConfigError, effective
 from acsard.core.config.removed import why_removed
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import build, show
+from acsard.core.values import Plain
 
 When = Literal["always", "raised", "rest"]
 
@@ -154,11 +155,22 @@ def differences(runs: Config, file: Config) -> dict[str, Difference]:
     }
 
 
-def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tuple[Config, str]:
-    """Return a pair: `config` with new values of settings, and a text that lists the changes.
+Changes = dict[str, tuple[Plain, Plain]]
+"""Old and new value of each changed setting, by dotted key."""
+
+
+def describe_changes(changes: Changes) -> str:
+    """Return a text that lists the changes, such as "log.level = debug (was info)"."""
+    return ", ".join(
+        f"{key} = {show(new)} (was {show(old)})" for key, (old, new) in changes.items()
+    )
+
+
+def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tuple[Config, Changes]:
+    """Return a pair: `config` with new values of settings, and the changes.
 
     The change is applied completely or not at all. A value that is already in force is ignored. It
-    causes no error, even if its setting cannot be changed. The text is "" if nothing changes.
+    causes no error, even if its setting cannot be changed.
 
     Args:
         config: the configuration in force.
@@ -193,7 +205,12 @@ def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tupl
         problems += [line for key in new if (line := _must_stand(key, before[key], after[key]))]
     if problems:
         raise ConfigError(problems)
-    return made, ", ".join(f"{key} = {show(after[key])} (was {show(before[key])})" for key in new)
+    return made, {key: (_plain(before[key]), _plain(after[key])) for key in new}
+
+
+def _plain(value: Any) -> Plain:
+    plain: Plain = list(value) if isinstance(value, tuple) else value
+    return plain
 
 
 def _same(before: object, value: object) -> bool:

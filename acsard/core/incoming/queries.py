@@ -36,10 +36,12 @@ from acsard.core.messages.keys_and_roles import (
 )
 from acsard.core.messages.schema import (
     MESSAGES,
+    Change,
     HardwareInterface,
     Info,
     Interfaces,
     Message,
+    ReplyData,
     ServiceReply,
     TopicInfo,
     Topics,
@@ -54,6 +56,7 @@ from acsard.core.ros.parameters import (
     outcome,
     requested_values,
 )
+from acsard.core.ros.shapes import Trigger
 from acsard.core.ros.transports import PARAMETERS_PREFIX, in_ros_words, left_out
 from acsard.core.values import ROLES, Answer, Outputs, Request, Verb
 
@@ -175,7 +178,7 @@ class Queries:
             service, name = key.removeprefix(PARAMETERS_PREFIX), ""
             payload = outcome(service, waiting.wish, answer.success, message)
         else:
-            payload = encode(ServiceReply(answer.success, message), form)
+            payload = _encoded(ServiceReply(answer.success, message, _data(answer)), form)
         attachment = _echo(waiting.asked, wall_ns)
         return Reply(answer.id, key, payload, encoding_name(form, name), attachment=attachment)
 
@@ -216,7 +219,7 @@ class Queries:
             )
         except DecodeError as error:
             message = invalid_call(VERBS[query.topic], error)
-            payload, name = encode(message, form), encoding_name(form, "ServiceReply")
+            payload, name = _encoded(message, form), encoding_name(form, "ServiceReply")
             return [Reply(query.ticket, query.topic, payload, name)]
         self._waiting[query.ticket] = _Waiting(query.topic, form, None)
         return replace(request, by=caller_name(query.via, query.attachment))
@@ -304,7 +307,7 @@ def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
     except DecodeError:
         return None
     if query.topic in VERBS:
-        payload, name = encode(ServiceReply(False, why), "cdr"), "ServiceReply"
+        payload, name = _encoded(ServiceReply(False, why), "cdr"), "ServiceReply"
     else:
         payload, name = failure(query.topic.removeprefix(PARAMETERS_PREFIX), why, query.payload), ""
     encoding = encoding_name("cdr", name)
@@ -314,6 +317,16 @@ def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
 def invalid_call(verb: Verb, error: DecodeError) -> ServiceReply:
     """Return the reply to a call of the service `verb` whose payload is not valid."""
     return ServiceReply(False, f"{error}; send {SERVICES[verb].example}")
+
+
+def _encoded(reply: ServiceReply, form: Format) -> bytes:
+    return encode(Trigger(reply.success, reply.message) if form == "cdr" else reply, form)
+
+
+def _data(answer: Answer) -> ReplyData:
+    return ReplyData(
+        answer.latch, {key: Change(old, new) for key, (old, new) in answer.changes.items()}
+    )
 
 
 def most_bytes(topic: str) -> int:

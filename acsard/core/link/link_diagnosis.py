@@ -11,11 +11,12 @@ from typing import Literal
 
 from msgspec import Struct
 
+from acsard.core.codes import CODES, LinkCode, Reason, sentence
 from acsard.core.formatting import many, printable_bytes
 from acsard.core.link.codec import TOKENS
-from acsard.core.link.link_state import STATE_TEXTS, Link
+from acsard.core.link.link_state import Link
 from acsard.core.link.link_state import State as LinkState
-from acsard.core.link.negotiation import ADVICE, Negotiation
+from acsard.core.link.negotiation import TROUBLES, Negotiation
 from acsard.core.values import NS_PER_S, Event
 
 LATE_STEP_FRACTION = 0.5
@@ -24,16 +25,15 @@ LATE_STEP_FRACTION = 0.5
 silence ends with a late step, this computer has caused the silence, because it did not run the
 daemon."""
 
-BUSY_ADVICE = (
-    "the Linux command `top` shows which other program uses the processor; acsard has priority if "
-    "it runs as the systemd service"
-)
+BUSY_ADVICE = CODES["host_late"].advice
 
-HOST_STALL = "this computer did not run the daemon for"
-SIMULATOR_FAULT = (
-    "the built-in simulator is silent because of a fault in sim.faults, or because the daemon, "
-    "which runs the simulator, is late"
-)
+STATE_REASONS: dict[LinkState, Reason] = {
+    "down": sentence("port_closed"),
+    "booting": sentence("booting"),
+    "up": sentence("link_up"),
+    "stale": sentence("link_silent"),
+}
+SIMULATOR_FAULT = sentence("simulator_fault")
 
 FIRST_DIAGNOSIS_NS = 3 * NS_PER_S
 """Time without a link until the first diagnosis, ns. A board that is only booting answers within
@@ -54,26 +54,21 @@ ReceivedClass = Literal["nothing", "statuses", "cut", "foreign", "garbage", "few
 - sparse: only good lines, but too few of them
 """
 
-RECEIVED_ADVICE: dict[ReceivedClass, str] = {
-    "nothing": "does the board have power, is mcu.port its port, is mcu.baud_rate right, are TX "
-    "and RX swapped?",
-    "statuses": "is TX of this computer connected to RX of the board?",
-    "cut": "does the board cut its lines short, or omit the line ends?",
-    "foreign": "is there noise on the cable, or does another program send on the cable too?",
-    "garbage": "is mcu.baud_rate the baud rate of the board?",
-    "few": "check the cable, the ground and the baud rate;",
-    "sparse": "if the board reports by its own clock, set mcu.reply_period to the seconds between "
-    "its lines;",
+RECEIVED_CODES: dict[ReceivedClass, LinkCode] = {
+    "nothing": "received_nothing",
+    "statuses": "received_statuses",
+    "cut": "received_cut",
+    "foreign": "received_foreign",
+    "garbage": "received_garbage",
+    "few": "received_few",
+    "sparse": "received_sparse",
 }
 
 _RIGHT = re.compile(TOKENS)
 _PIECE = re.compile(rb"[abcdpn0-9A-F., #@*\r\n]+")
 """Pattern of bytes that may be a piece of a reply: only characters that a reply can contain."""
 
-PORT_BLOCKED = (
-    "the serial port sends nothing, because its driver accepts no bytes: unplug the "
-    "adapter and plug it in again"
-)
+PORT_BLOCKED = sentence("port_blocked")
 
 WINDOW_LINES = 1000
 """Number of sent lines after which `UnansweredLines` counts the answers to these lines. At 100 Hz,
@@ -81,14 +76,6 @@ this takes 10 s."""
 
 MAX_UNANSWERED_FRACTION = 0.02
 """Share of unanswered lines above which `UnansweredLines` warns. A good link loses no answer."""
-
-
-def blames_host(words: str) -> bool:
-    """Return whether the text `words` blames this computer or the built-in simulator for a silence.
-
-    `words` is the text of an event of the link, or the `reason` in `state`.
-    """
-    return HOST_STALL in words or SIMULATOR_FAULT in words
 
 
 class Lateness:
@@ -130,20 +117,18 @@ class Lateness:
         self.late_s = 0.0 if good else late_s
         return good and (late_s > 0.0 or self._simulated)
 
-    def describe(self, link: LinkState) -> str:
+    def describe(self, link: LinkState) -> Reason:
         """Return a sentence that describes the state `link` for the operator.
 
         If the link is stale because a control step was late, the sentence blames this computer. If
         the link to the built-in simulator is stale, the sentence blames the simulator.
         """
         if link == "stale" and self.late_s:
-            return (
-                f"{HOST_STALL} {self.late_s:.2f} s, so the daemon received nothing from the "
-                f"microcontroller: {BUSY_ADVICE}"
-            )
+            received = "nothing from the microcontroller"
+            return sentence("host_late", seconds=self.late_s, received=received)
         if link == "stale" and self._simulated:
-            return f"{SIMULATOR_FAULT}: {BUSY_ADVICE}"
-        return STATE_TEXTS[link]
+            return SIMULATOR_FAULT
+        return STATE_REASONS[link]
 
 
 class Heard(Struct):
@@ -210,15 +195,12 @@ class Heard(Struct):
         return f"{many(self.lines, 'line')} received, {good}{last}"
 
     @property
-    def diagnosis(self) -> str:
+    def diagnosis(self) -> Reason:
         """The complete diagnosis as a sentence for the message `state`."""
         if self.looks == "sparse" and self.late_s:
-            return (
-                f"{HOST_STALL} {self.late_s:.2f} s, so the daemon received too few lines for a "
-                f"link: {BUSY_ADVICE}"
-            )
-        mend = f"{RECEIVED_ADVICE[self.looks]} `acsard mcu check` finds out more"
-        return f"no link to the microcontroller: {self.counted}; {mend}"
+            received = "too few lines for a link"
+            return sentence("host_late", seconds=self.late_s, received=received)
+        return sentence(RECEIVED_CODES[self.looks], received=self.counted)
 
 
 class SilenceDiagnosis:
@@ -319,7 +301,7 @@ def describe_link(
     silence: SilenceDiagnosis,
     lateness: Lateness,
     longest_reply: float,
-) -> str:
+) -> Reason:
     """Return a sentence for the operator about the state of the link while the port is open.
 
     `check` is the negotiation of the checksum, `silence` is the diagnosis of a silence, and
@@ -329,14 +311,11 @@ def describe_link(
     if link.state in ("booting", "stale"):
         traffic = silence.heard
         if check.trouble:
-            return ADVICE[check.trouble]
+            return TROUBLES[check.trouble]
         if traffic is not None and not traffic.good:
             return traffic.diagnosis
         if damaged(link, check):
-            return (
-                "the microcontroller's replies arrive damaged, so the daemon asks it for the "
-                "checksum again; check cable and ground"
-            )
+            return sentence("replies_damaged")
         if link.sparse_s:
             return _sparse(link.sparse_s, longest_reply)
         if traffic is not None:
@@ -344,18 +323,11 @@ def describe_link(
     return lateness.describe(link.state)
 
 
-def _sparse(sparse_s: float, longest_reply: float) -> str:
+def _sparse(sparse_s: float, longest_reply: float) -> Reason:
     apart = f"{sparse_s:.2f}"
     if float(apart) > longest_reply:
-        return (
-            f"the microcontroller sends a line only every {apart} s, and no value of "
-            "mcu.reply_period allows that; firmware that reports by its own clock must send a line "
-            f"at least every {longest_reply:g} s"
-        )
-    return (
-        f"the microcontroller's lines come {apart} s apart; if it reports by its own clock, set "
-        f"mcu.reply_period = {apart}"
-    )
+        return sentence("lines_too_rare", apart=apart, longest=longest_reply)
+    return sentence("reply_period", apart=apart)
 
 
 def check_event(check: Negotiation, wants_samples: bool) -> Event:

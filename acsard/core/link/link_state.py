@@ -34,13 +34,6 @@ TRANSITIONS: dict[tuple[State, Input], State] = {
     ("stale", "trusted"): "up",
 }
 
-STATE_TEXTS: dict[State, str] = {
-    "down": "the serial port is closed; it is being reopened",
-    "booting": "the port is open; waiting for the microcontroller's first good lines",
-    "up": "the link to the microcontroller is up",
-    "stale": "the microcontroller has fallen silent",
-}
-
 WATCHDOG_S = 0.3  # without a valid line, the board stops the motors
 
 WATCHDOG_NS = int(WATCHDOG_S * NS_PER_S)

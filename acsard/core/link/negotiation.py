@@ -29,6 +29,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Literal
 
+from acsard.core.codes import Reason, sentence
 from acsard.core.config.settings import McuConfig
 from acsard.core.config.wire_time import line_bytes, wire_ns
 from acsard.core.link.checked_line import (
@@ -91,17 +92,10 @@ Trouble = Literal["", "echo", "forgotten", "unknown"]
 - unknown: the board does not support checksums, and the configuration requires them
 """
 
-ADVICE: dict[Trouble, str] = {
-    "": "",
-    "echo": "the daemon's own lines come back: TX and RX are connected to each other, or a "
-    "terminal or the RS-485 adapter echoes, or the board reports the commanded speeds "
-    "instead of the measured ones; remove the cause, then unplug the board and plug it in again",
-    "forgotten": "the microcontroller answered with a checksum before and now answers without "
-    "one: either its replies are damaged (check cable and baud rate), or it runs other "
-    "firmware (then unplug it and plug it in again)",
-    "unknown": 'the microcontroller answers without a checksum, but mcu.link_check = "require" '
-    "lets the robot drive only with one: install firmware that supports the checksum, or "
-    'write mcu.link_check = "auto"',
+TROUBLES: dict[Trouble, Reason] = {
+    "echo": sentence("echo"),
+    "forgotten": sentence("checksum_lost"),
+    "unknown": sentence("no_checksum"),
 }
 
 MAX_UNANSWERED_QUESTIONS = 3

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 
+from acsard.core.codes import Reason, sentence
 from acsard.core.config.settings import MAX_REPLY_PERIOD_S, FeedbackConfig, McuConfig
 from acsard.core.link import link_diagnosis
 from acsard.core.link.board_status import STATUS, BoardStatus, decode_status, merged
@@ -21,9 +22,19 @@ from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import Lateness, SilenceDiagnosis
 from acsard.core.link.link_state import WATCHDOG_NS, WATCHDOG_S, Link
 from acsard.core.link.link_state import State as LinkState
-from acsard.core.link.negotiation import ADVICE, SILENT_BOARD_PERIOD_NS, Negotiation, Throttle
+from acsard.core.link.negotiation import SILENT_BOARD_PERIOD_NS, TROUBLES, Negotiation, Throttle
 from acsard.core.link.quantization import CountRecovery
-from acsard.core.values import NS_PER_S, STILL, Event, EventName, Instant, Ns, Received, WheelSpeeds
+from acsard.core.values import (
+    NS_PER_S,
+    STILL,
+    Event,
+    EventName,
+    Instant,
+    Level,
+    Ns,
+    Received,
+    WheelSpeeds,
+)
 
 NAMES: dict[LinkState, EventName] = {
     "down": "link_down",
@@ -181,10 +192,10 @@ class McuSession:
         """Return the time since the last good line of any session; None before the first one."""
         return None if self._heard_ns is None else (now_ns - self._heard_ns) / NS_PER_S
 
-    def describe_link(self, port_trouble: str = "") -> str:
+    def describe_link(self, port_trouble: str = "") -> Reason:
         """Return a sentence about the link; `port_trouble` says why the port is closed."""
         if self.link == "down" and port_trouble:
-            return port_trouble
+            return sentence("port_trouble", trouble=port_trouble)
         if self.blocked:
             return link_diagnosis.PORT_BLOCKED
         return link_diagnosis.describe_link(
@@ -271,7 +282,8 @@ class McuSession:
         if up or self.blocked:
             self._hearing.forget()
         elif self._hearing.judge(now_ns, self.lateness.step_s):
-            self.events.append(Event(NAMES[self.link], self.describe_link(), "warning"))
+            why = self.describe_link()
+            self.events.append(Event(NAMES[self.link], why.text, "warning", code=why.code))
 
     def _reject(self, reason: str, line: bytes = b"", more: int = 1) -> None:
         self.rejects[reason] += more
@@ -300,13 +312,15 @@ class McuSession:
             return
         if link != before[0] or self.blocked > before[3]:
             plain = not (self.blocked or link_diagnosis.damaged(self._link, check))
-            text = self.lateness.describe(link) if plain else self.describe_link()
+            why = self.lateness.describe(link) if plain else self.describe_link()
             good = link in ("up", "booting") and not self.blocked
-            self.events.append(Event(NAMES[link], text, "info" if good else "warning"))
+            level: Level = "info" if good else "warning"
+            self.events.append(Event(NAMES[link], why.text, level, code=why.code))
         if check.in_force != before[1] and not check.asking:
             self.events.append(link_diagnosis.check_event(check, self._wants_samples))
         if check.trouble and not before[2]:
-            self.events.append(Event("link_check", ADVICE[check.trouble], "error"))
+            trouble = TROUBLES[check.trouble]
+            self.events.append(Event("link_check", trouble.text, "error", code=trouble.code))
 
     # lines
 

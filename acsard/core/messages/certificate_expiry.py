@@ -6,6 +6,7 @@ The messages `state` and `diagnostics` and the command `acsard doctor` show thes
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
 from acsard.core.values import NS_PER_S
 
@@ -16,10 +17,14 @@ warning."""
 DAY_NS = 86400 * NS_PER_S
 
 
-def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
-    """Return a pair: a level (0 ok, 1 warning, 2 error) and a text about the certificates.
+CertificateCode = Literal["valid", "expires", "expired", "unknown"]
 
-    The text is about the certificate that expires first. It begins with "valid" only at level 0.
+CERTIFICATE_LEVELS: dict[str, int] = {"valid": 0, "expires": 1, "expired": 2, "unknown": 1}
+"""Diagnostic level of each code: 0 ok, 1 warning, 2 error."""
+
+
+def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[CertificateCode, str]:
+    """Return a pair: a code, and a text about the certificate that expires first.
 
     Args:
         ends: the time at which each certificate that TLS needs expires, wall-clock ns since 1970,
@@ -29,7 +34,7 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
     """
     if not ends:
         return (
-            1,
+            "unknown",
             "unknown: the TLS gateway is not running, or the library that reads certificates is "
             "missing (`acsard doctor` says which)",
         )
@@ -37,10 +42,10 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[int, str]:
     of = f" (certificate of {whose})" if whose else ""
     days = (ends_ns - now_ns) / DAY_NS
     if days < 0:
-        return 2, f"expired {-days:.0f} days ago{of}{_effect(ends, now_ns)}"
+        return "expired", f"expired {-days:.0f} days ago{of}{_effect(ends, now_ns)}"
     if days < EXPIRY_DAYS:
-        return 1, f"expires in {days:.0f} days{of}"
-    return 0, f"valid for {days:.0f} days{of}"
+        return "expires", f"expires in {days:.0f} days{of}"
+    return "valid", f"valid for {days:.0f} days{of}"
 
 
 def _effect(ends: Mapping[str, int], now_ns: int) -> str:

@@ -19,11 +19,11 @@ from msgspec import Struct
 from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_use
 from acsard.core.formatting import many
+from acsard.core.messages.certificate_expiry import CERTIFICATE_LEVELS
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus, Header, KeyValue, Time
 from acsard.core.motion import battery
 from acsard.core.motion.arbiter_text import waiting
-from acsard.core.motion.bumpers import SILENT_REASON as SILENT_BUMPERS
-from acsard.core.motion.bumpers import missing_text
+from acsard.core.motion.bumpers import missing_reason
 from acsard.core.motion.emergency_stop import (
     DRIVER_FAULT_REASON,
     MISSING_REASON,
@@ -52,8 +52,8 @@ MODE_LEVELS = {"stopped": WARN, "fault": ERROR}
 BOARD = {
     "": (OK, "no emergency-stop input"),
     "released": (OK, "emergency stop released"),
-    "pressed": (WARN, PRESSED_REASON),
-    "silent": (ERROR, SILENT_REASON),
+    "pressed": (WARN, PRESSED_REASON.text),
+    "silent": (ERROR, SILENT_REASON.text),
 }
 """Maps each state of the emergency-stop input to the diagnostic level and the text to show. The
 state "" means that the board has never reported the input."""
@@ -87,7 +87,7 @@ def diagnostics(
     config: Config,
     outputs: Outputs,
     snapshot: Snapshot,
-    certificate: tuple[int, str],
+    certificate: tuple[str, str],
 ) -> DiagnosticArray:
     """Return the message `diagnostics` with one row for each part of the robot.
 
@@ -95,8 +95,8 @@ def diagnostics(
         config: the configuration in force.
         outputs: the outputs of the last step.
         snapshot: the other values of the robot.
-        certificate: the diagnostic level and the text about the TLS certificates, as `expiry`
-            returns them. If the text is "", the message has no row about certificates.
+        certificate: the code and the text about the TLS certificates, as `expiry` returns them.
+            If both are "", the message has no row about certificates.
     """
     mode = {"mode": outputs.mode, "source": outputs.source}
     rows = [
@@ -111,7 +111,7 @@ def diagnostics(
         *_routers(config.bus.connect, snapshot.routers),
         *_recording(snapshot.recording),
         *_latch_file(snapshot.latch_file),
-        *([Row("certificate", *certificate, {})] if certificate[1] else []),
+        *_certificate(*certificate),
     ]
     return DiagnosticArray(
         Header(Time.from_ns(outputs.now.wall_ns)),
@@ -160,7 +160,7 @@ def _control_loop(snapshot: Snapshot) -> Row:
 
 
 def _commands(outputs: Outputs, snapshot: Snapshot) -> Row:
-    values = {s.name: waiting(s.waits_for) or "driving" for s in snapshot.sources}
+    values = {s.name: waiting(s.waits_for).text or "driving" for s in snapshot.sources}
     values |= _counted(snapshot.counters, "command")
     message = f"commanded by {outputs.source}" if outputs.source else "waiting for a command"
     if snapshot.speed_limit:
@@ -200,15 +200,16 @@ def _board(config: Config, snapshot: Snapshot) -> list[Row]:
         return []
     findings = [BOARD[snapshot.estop]]
     if required and not snapshot.estop:
-        findings = [(ERROR, MISSING_REASON)]
-    if snapshot.bumper:
-        findings.append((ERROR if snapshot.bumper == SILENT_BUMPERS else WARN, snapshot.bumper))
+        findings = [(ERROR, MISSING_REASON.text)]
+    if snapshot.bumper is not None:
+        level = ERROR if snapshot.bumper.code == "bumpers_silent" else WARN
+        findings.append((level, snapshot.bumper.text))
     elif bumpers is not None:
         findings.append((OK, f"{many(len(bumpers), 'bumper')} released"))
     elif safety.needs_bumpers:
-        findings.append((ERROR, missing_text(safety)))
+        findings.append((ERROR, missing_reason(safety).text))
     if snapshot.board.get("motor_driver") == "fault":
-        findings.append((ERROR, DRIVER_FAULT_REASON))
+        findings.append((ERROR, DRIVER_FAULT_REASON.text))
     counted: dict[str, str] = {}
     for kind in ("line_status", "emergency", "bumper"):
         counted |= _counted(snapshot.counters, kind)
@@ -278,6 +279,10 @@ def _recording(recording: Recording) -> list[Row]:
     missing = {"steps_missing": str(recording.missing)}
     level, message = WARN if recording.trouble else OK, recording.trouble or "on"
     return [Row("recording", level, message, missing)]
+
+
+def _certificate(code: str, text: str) -> list[Row]:
+    return [Row("certificate", CERTIFICATE_LEVELS[code], text, {})] if code else []
 
 
 def _latch_file(trouble: str | None) -> list[Row]:

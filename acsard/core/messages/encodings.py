@@ -17,6 +17,7 @@ from typing import Generic, Literal, TypeVar, get_args
 
 import msgspec
 
+from acsard.core.codes import RefusalCode
 from acsard.core.messages.cdr import Cdr, CdrError
 from acsard.core.values import AcsardError
 
@@ -39,7 +40,7 @@ class DecodeError(AcsardError):
     `command_malformed`.
     """
 
-    def __init__(self, reason: str, text: str) -> None:
+    def __init__(self, reason: RefusalCode, text: str) -> None:
         super().__init__(text)
         self.reason = reason
 

@@ -71,4 +71,6 @@ def _time(row: _Row) -> Time:
 
 def _log_event(row: _Row) -> LogEvent:
     event = row.event
-    return LogEvent(_time(row), event.name, event.level, event.text, event.by, event.count)
+    return LogEvent(
+        _time(row), event.name, event.level, event.text, event.by, event.count, event.code
+    )

@@ -248,10 +248,12 @@ class Report:
         return TwistStamped(header, _twist(outputs.applied))
 
     def _state(self, outputs: Outputs, snapshot: Snapshot) -> RobotState:
+        certificate, expiry_text = self._certificate(outputs.now)
         return RobotState(
             stamp=Time.from_ns(outputs.now.wall_ns),
             mode=outputs.mode,
             reason=outputs.reason,
+            code=outputs.code,
             x=snapshot.pose.x,
             y=snapshot.pose.y,
             yaw=snapshot.pose.yaw,
@@ -261,11 +263,14 @@ class Report:
             link=outputs.link,
             source=outputs.source,
             sources=[
-                SourceState(s.name, s.priority, s.age_s, waiting(s.waits_for), s.waits_for.what)
+                SourceState(
+                    s.name, s.priority, s.age_s, waiting(s.waits_for).text, s.waits_for.what
+                )
                 for s in snapshot.sources
             ],
             refused=snapshot.refused,
-            certificate_expiry=self._certificate(outputs.now)[1],
+            certificate=certificate,
+            certificate_expiry=expiry_text,
             counters=snapshot.counters,
             latencies={
                 name: Latency(_spread(figure.since_start), _spread(figure.last_minute))
@@ -316,9 +321,9 @@ class Report:
             present=battery.reported_ns is not None,
         )
 
-    def _certificate(self, now: Instant) -> tuple[int, str]:
+    def _certificate(self, now: Instant) -> tuple[str, str]:
         if not self._config.bus.tls:
-            return 0, ""
+            return "", ""
         return expiry(self.certificate_ends, now.wall_ns)
 
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:

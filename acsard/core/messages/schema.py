@@ -12,7 +12,9 @@ from typing import Annotated, get_args
 
 from msgspec import Meta, Struct
 
+from acsard.core.codes import Code, StateCode, WaitCode
 from acsard.core.link.link_state import State
+from acsard.core.messages.certificate_expiry import CertificateCode
 from acsard.core.messages.keys_and_roles import Direction
 from acsard.core.motion.modes import Mode
 from acsard.core.values import (
@@ -24,7 +26,6 @@ from acsard.core.values import (
     GyroDoes,
     Level,
     Plain,
-    WaitKind,
 )
 
 # These annotations tell `cdr.py` the width of a number and the fixed length of an array.
@@ -293,7 +294,7 @@ class SourceState(Message, frozen=True):
     It is empty while the source drives the robot. It is a text for people; programs use `wait`.
     """
     # Only `RobotState.reason` says that zeros keep the robot at rest. No source waits for "zeros".
-    wait: Annotated[str, one_of(kind for kind in get_args(WaitKind) if kind != "zeros")]
+    wait: Annotated[str, one_of(code for code in get_args(WaitCode) if code != "zeros")]
     """Kind of the condition `waits_for`.
 
     - nothing: the source need not wait.
@@ -332,6 +333,7 @@ class RobotState(Message, frozen=True):
     stamp: Time
     mode: Annotated[str, one_of(mode.value for mode in Mode)]
     reason: str
+    """Why the robot moves or does not move. It is a text for people; programs use `code`."""
     x: float
     y: float
     yaw: float
@@ -347,10 +349,7 @@ class RobotState(Message, frozen=True):
     counters: dict[str, int]
     """Counters since the start of the daemon, by name."""
     certificate_expiry: str = ""
-    """Remaining validity of the TLS certificates of the bus, in words; empty without TLS.
-
-    The text begins with "valid" while at least 30 days remain.
-    """
+    """Remaining validity of the TLS certificates of the bus, in words; empty without TLS."""
     latencies: dict[str, Latency] = {}
     """Latencies of the daemon by name (`daemon/latencies.py`). They are up to one second old."""
     gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
@@ -424,6 +423,16 @@ class RobotState(Message, frozen=True):
 
     It is negative after this time. It is null without TLS, or while the time is unknown.
     """
+    certificate: Annotated[str, one_of(("", *get_args(CertificateCode)))] = ""
+    """Whether the TLS certificates of the bus are valid; empty without TLS.
+
+    - valid: at least 30 days remain.
+    - expires: fewer than 30 days remain.
+    - expired: a certificate has expired.
+    - unknown: the time at which they expire is unknown.
+    """
+    code: Annotated[str, one_of(get_args(StateCode))] = ""
+    """Code of `reason`. If several latches are set, it is the code of `latch`."""
 
 
 class GatewayState(Message, frozen=True):
@@ -485,6 +494,11 @@ class LogEvent(Message, frozen=True):
     If an event only repeats an earlier event of the last minute, both share one row, and this
     number grows.
     """
+    code: Annotated[str, one_of(("", *get_args(Code)))] = ""
+    """Code of the cause; empty if `name` says everything.
+
+    If the event stands for several events, it is the code of the last one.
+    """
 
 
 class Events(Message, frozen=True):
@@ -505,11 +519,29 @@ class Events(Message, frozen=True):
     events: list[LogEvent]
 
 
+class Change(Message, frozen=True):
+    """The old and the new value of a setting."""
+
+    old: Plain
+    new: Plain
+
+
+class ReplyData(Message, frozen=True):
+    """What a service call has changed, for programs."""
+
+    latch: LatchNumber = 0
+    """Number of the latch that the call has set or released; 0 if it did neither."""
+    changes: dict[str, Change] = {}
+    """The settings that the call has changed, by dotted key."""
+
+
 class ServiceReply(Message, frozen=True):
     """Result of a service call. `message` gives the outcome, or the mistake and its fix."""
 
     success: bool
     message: str
+    """A text for people; programs use `data`."""
+    data: ReplyData = ReplyData()
 
 
 class SetPose(Message, frozen=True):

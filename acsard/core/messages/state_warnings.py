@@ -7,7 +7,6 @@ read the same facts from the fields of the message `state`.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from typing import Literal, get_args
 
@@ -36,6 +35,14 @@ BATTERY = {
     "unknown": "battery level unknown",
 }
 """Words for each level of the battery except `ok`."""
+
+
+CERTIFICATE = {
+    "expires": "certificate expires in {days:.0f} days",
+    "expired": "certificate expired {days:.0f} days ago",
+    "unknown": "certificate unknown",
+}
+"""Words for each state of the certificates except `valid`."""
 
 
 class StateWarning(Struct, frozen=True):
@@ -85,12 +92,9 @@ def _warnings(state: RobotState) -> Iterator[StateWarning]:
         left = charge(state.battery)
         words = BATTERY[state.battery.level]
         yield StateWarning("battery", f"{words} ({left})" if left else words)
-    expiry = state.certificate_expiry
-    if expiry and not expiry.startswith("valid"):
-        brief = re.split(r"[:,]| \(", expiry, maxsplit=1)[0]
-        yield StateWarning(
-            "certificate", f"certificate {brief}", expiry.removeprefix(brief).lstrip(":, ")
-        )
+    if state.certificate in CERTIFICATE:
+        brief = CERTIFICATE[state.certificate].format(days=abs(state.certificate_days or 0.0))
+        yield StateWarning("certificate", brief, state.certificate_expiry)
     if state.recording_error:
         yield StateWarning("recording", "recording fails", state.recording_error)
     if state.latch_file_error:

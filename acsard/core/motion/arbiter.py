@@ -24,8 +24,7 @@ from acsard.core.values import NS_PER_S, REST, Command, Ns, SourceStatus, Twist,
 # Limit per source. A sender that may keep control (`Sender.holds`) is never replaced by a new one.
 MAX_SENDERS = 16
 
-# "": accepted.
-Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
+Objection = Literal["unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
 
 # Durations of zeros only, or of speeds without being armed, to which `state` rounds down.
 REPORTED_DURATIONS_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
@@ -204,7 +203,7 @@ class Arbiter:
                 sender.resume(before_ns, now_ns)
         return True
 
-    def accept(self, command: Command) -> Objection:
+    def accept(self, command: Command) -> Objection | Literal[""]:
         """Process a command. Return "" if it is accepted, otherwise the reason to refuse it."""
         source = self._sources.get(command.source)
         if source is None:

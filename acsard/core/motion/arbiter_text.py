@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import get_args
+
+from acsard.core.codes import Reason, sentence
 from acsard.core.formatting import lasting, many
-from acsard.core.motion.arbiter import MAX_SENDERS, Choice
+from acsard.core.motion.arbiter import MAX_SENDERS, Choice, Objection
 from acsard.core.motion.modes import Mode
 from acsard.core.values import NS_PER_S, Event, Ns, Refusal, Wait
-
-REFUSED = {
-    "unknown_source": "this source is not in commands.sources",
-    "not_finite": "the command contains NaN or infinity",
-    "too_many_senders": f"{MAX_SENDERS} other senders of this source are active; end one first",
-    "unproven": "this sender is new: the robot follows a sender only after the sender's commands "
-    "have arrived with steady delays; this is not an error",
-    "stale": "the command is older than the source's timeout allows, or older than one that the "
-    "robot has already accepted: the network delayed it, or the sender's clock was set",
-}
 
 # A public name has at most 57 characters, a certificate adds 67. A name of a Zenoh key is cut.
 MAX_SENDER_LENGTH = 124
@@ -26,53 +20,54 @@ ROS_NEVER = (
 )
 
 
-def chosen(choice: Choice) -> str:
-    """Return the source that drives the robot, or why no source does, as text."""
-    if choice.wait.what == "command":
-        return "waiting for a command: no source has sent one within its timeout"
-    return waiting(choice.wait) or f"commanded by {choice.source}"
+def chosen(choice: Choice) -> Reason:
+    """Return the source that drives the robot, or why no source does."""
+    match choice.wait.what:
+        case "nothing":
+            return _commanded(choice.source)
+        case "command":
+            return NO_COMMAND
+        case _:
+            return waiting(choice.wait)
 
 
-def waiting(wait: Wait) -> str:
-    """Return the condition that a source waits for, as text."""
+NO_COMMAND, NOTHING, COMMAND = sentence("no_command"), sentence("nothing"), sentence("command")
+
+
+# A format string takes longer than the cache, and a driving robot needs this text in every step.
+@lru_cache(64)
+def _commanded(source: str) -> Reason:
+    return sentence("commanded", source=source)
+
+
+def waiting(wait: Wait) -> Reason:
+    """Return the condition that a source waits for. Its text is "" if the source need not wait."""
     match wait.what:
         case "nothing":
-            return ""
+            return NOTHING
         case "command":
-            return "a command"
-        case "proof":
-            return (
-                f"{wait.source} is new: the robot follows it when its commands have arrived with "
-                f"steady delays for {wait.seconds:g} s"
-            )
-        case "late":
-            return (
-                f"commands of {wait.source} arrive more than {wait.seconds:g} s too late: the "
-                "network delays them, or the sender's clock was set; if this goes on, check the "
-                "network, then restart the sender"
-            )
-        case "stalled":
-            return f"the daemon stalled: waiting for the next command of {wait.source}"
+            return COMMAND
         case "neutral":
-            lasts = f"; it has sent speeds for over {lasting(wait.lasts)}" if wait.lasts else ""
-            alone = f", and then no speed for {wait.seconds:g} s," if wait.shared else ""
-            return (
-                f"send a zero first: {wait.source} must send a zero{alone} before it can drive"
-                f"{lasts}{ROS_NEVER if wait.ros else ''}"
+            return sentence(
+                "neutral",
+                source=wait.source,
+                alone=f", and then no speed for {wait.seconds:g} s," if wait.shared else "",
+                lasts=f"; it has sent speeds for over {lasting(wait.lasts)}" if wait.lasts else "",
+                ros=ROS_NEVER if wait.ros else "",
             )
         case "zeros":
             note = f"; the speeds of {wait.kept} have no effect" if wait.kept else ""
-            zeros = f"only zeros for over {lasting(wait.lasts)}"
-            return f"{wait.source} commands zero speed: it has sent {zeros}{note}"
-        case "higher":
-            return f"{wait.source} has priority: wait until it is silent"
-        case "equal":
-            return f"{wait.source} has the same priority and came first: wait until it is silent"
+            return sentence("zeros", source=wait.source, lasts=lasting(wait.lasts), note=note)
         case "senders":
-            return (
-                f"{many(wait.senders, 'other sender')} of this source must wait until the sender "
-                "that drives falls silent"
-            )
+            return sentence("senders", others=many(wait.senders, "other sender"))
+        case _:
+            return sentence(wait.what, source=wait.source, seconds=wait.seconds)
+
+
+OBJECTIONS: dict[str, str] = {
+    code: sentence(code, most=MAX_SENDERS).text for code in get_args(Objection)
+}
+"""The text for each command that the arbiter refuses."""
 
 
 def missed(periods: int, period_ns: Ns) -> Event:
@@ -86,8 +81,8 @@ def refused(refusal: Refusal) -> Event:
     """Return the event `command_refused`, or `new_sender` if its clock is not proven yet."""
     by, kind = refusal.sender[:MAX_SENDER_LENGTH], refusal.reason
     if kind == "unproven":
-        return Event("new_sender", refusal.text, by=by, news=False)
-    return Event("command_refused", refusal.text, "warning", by, kind, news=False)
+        return Event("new_sender", refusal.text, by=by, news=False, code=kind)
+    return Event("command_refused", refusal.text, "warning", by, kind, news=False, code=kind)
 
 
 class CommandEvents:
@@ -97,7 +92,7 @@ class CommandEvents:
         self._mode, self._commander = mode, ("", "")
         self._kept = ""  # source whose speeds have no effect, by the last event
 
-    def changes(self, mode: Mode, choice: Choice, why: str) -> list[Event]:
+    def changes(self, mode: Mode, choice: Choice, why: Reason) -> list[Event]:
         """Return the events for a new mode, a new commander, and speeds without effect.
 
         A commander that drives again after a pause is not new. `why` is the reason of the mode.
@@ -107,8 +102,9 @@ class CommandEvents:
             self._commander = (choice.source, choice.sender)
         self._mode, events = mode, []
         if mode is not before:
-            text, by = (chosen(choice), _name(self._commander)) if drives else (why, "")
-            events.append(Event("mode", text, by=by, kind=f"{before} -> {mode}"))
+            why, by = (chosen(choice), _name(self._commander)) if drives else (why, "")
+            kind = f"{before} -> {mode}"
+            events.append(Event("mode", why.text, by=by, kind=kind, code=why.code))
         if self._commander != last:
             by = _name(self._commander)
             events.append(Event("commander", "", by=by, kind=f"{_name(last)} -> {by}"))
@@ -125,7 +121,8 @@ class CommandEvents:
             return []
         self._kept = source
         by = _name((choice.source, choice.sender))
-        return [Event("commands_without_effect", waiting(wait), "warning", by, source)]
+        why = waiting(wait)
+        return [Event("commands_without_effect", why.text, "warning", by, source, code=why.code)]
 
 
 def _name(commander: tuple[str, str]) -> str:

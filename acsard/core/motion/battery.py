@@ -11,6 +11,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import get_args
 
+from msgspec.structs import replace
+
+from acsard.core.codes import Reason, reason
 from acsard.core.config.settings import BatteryConfig
 from acsard.core.link.board_status import BoardStatus
 from acsard.core.values import NS_PER_S, BatteryLevel, BatteryStatus, Event, Ns
@@ -28,8 +31,6 @@ SILENCE_TIMEOUT_S = 5.0  # at one report a second, four in a row may be lost
 # Longest time that one report stands for, that of a motor start, or it weighs too much after a gap.
 # At one report a second, the mean has a third of its speed.
 MAX_WEIGHT_NS = 300_000_000
-
-EMPTY_REASON = "battery below "  # begins `Battery.why`
 
 LEVELS_BY_URGENCY: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]  # without "unknown"
 
@@ -95,17 +96,19 @@ class Battery:
         return self._known == "stop"
 
     @property
-    def why(self) -> str:
+    def why(self) -> Reason:
         """Reason of a stop by an empty battery, without measured values."""
-        return f"{EMPTY_REASON}{_threshold(self._config, 'stop')}"
+        config = self._config
+        charged = _with_unit(config, config.stop_below + config.hysteresis)
+        return reason("battery_empty", threshold=_threshold(config, "stop"), charged=charged)
 
     @property
-    def mend(self) -> str:
-        """Advice on how to end the level "stop", without measured values."""
-        if self.refuses_clear and self._told is None:
-            return "wait until the board has reported its battery for some seconds"
-        config = self._config
-        return f"charge the battery to {_with_unit(config, config.stop_below + config.hysteresis)}"
+    def refusal(self) -> Reason:
+        """Reason why `clear` is refused while `refuses_clear` is true."""
+        if self._told is None:
+            advice = "wait until the board has reported its battery for some seconds"
+            return replace(self.why, advice=advice)
+        return self.why
 
     def reopen(self) -> None:
         """Record that the port was opened: another board may answer from now on."""
@@ -199,7 +202,9 @@ class Battery:
         assert self.status is not None
         text = status_text(self._config, self.status)
         if level == "stop":
-            return Event("battery_stop", f"{text}; {self.mend}, then call srv/clear", "error")
+            why = self.why
+            text = f"{text}; {why.advice}, then call srv/clear"
+            return Event("battery_stop", text, "error", code=why.code)
         if before == "stop" and level != "unknown":
             text = f"{text}; the robot stays stopped until srv/clear is called"
         return Event("battery", text, "info" if level == "ok" else "warning", kind=level)

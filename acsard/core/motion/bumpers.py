@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from acsard.core.codes import Reason, reason, sentence
 from acsard.core.config.settings import Place, SafetyConfig
 from acsard.core.formatting import many
 from acsard.core.link.board_status import BoardStatus
@@ -24,18 +25,13 @@ DIRECTIONS: dict[Place, int] = {"front": -1, "rear": 1, "left": 0, "right": 0}
 
 ALLOWED = {-1: "backwards", 1: "forwards"}
 
-SILENT_REASON = (
-    f"the board has not reported its bumpers for {SILENCE_TIMEOUT_S:g} s, so they count as pressed"
-)
+SILENT_REASON = reason("bumpers_silent", seconds=SILENCE_TIMEOUT_S)
 
 
-def missing_text(safety: SafetyConfig) -> str:
+def missing_reason(safety: SafetyConfig) -> Reason:
     count = len(safety.bumpers)
-    return (
-        f"safety.bumpers has {many(count, 'place')}, but the microcontroller has not reported "
-        f"{many(count, 'bumper')}: does its firmware send status lines with "
-        f"`bumpers={'.' * count}`?"
-    )
+    places, bumpers = many(count, "place"), many(count, "bumper")
+    return sentence("bumpers_missing", places=places, bumpers=bumpers, dots="." * count)
 
 
 def pressed_words(places: Sequence[Place], pressed: Sequence[bool]) -> str:
@@ -74,9 +70,9 @@ class Bumpers(BoardInput):
         return not self._away or self.state == "silent"
 
     @property
-    def clear_refusal(self) -> str:
-        """Why `clear` must not release a stop now; "" if the bumpers allow it."""
-        return self.why if self.latching else ""
+    def clear_refusal(self) -> Reason | None:
+        """Why `clear` must not release a stop now; None if the bumpers allow it."""
+        return self.why if self.latching else None
 
     def away(self, twist: Twist) -> Twist | None:
         """Return the allowed part of `twist` (rest, or straight away at `AWAY_SPEED`), or None."""
@@ -85,14 +81,12 @@ class Bumpers(BoardInput):
         speed = twist.linear * self._direction()
         return Twist(self._direction() * min(speed, AWAY_SPEED)) if speed > 0.0 else None
 
-    def note(self) -> str:
-        allowed = ALLOWED.get(self._direction())
+    def limit(self) -> Reason:
+        """Return a reason that names the pressed bumpers, with the allowed motion as the advice."""
+        bumpers, allowed = self.pressed_reason().text, ALLOWED.get(self._direction())
         if allowed is None:
-            return (
-                f"{self.why}: no straight motion leads away from the pressed bumpers, so the robot "
-                "stands still until the bumpers are released"
-            )
-        return f"{self.why}: the robot drives only straight {allowed}, at most {AWAY_SPEED:g} m/s"
+            return reason("bumper_blocks", bumpers=bumpers)
+        return reason("bumper_away", bumpers=bumpers, direction=allowed, speed=AWAY_SPEED)
 
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
         # A line with an unexpected number of bumpers may lack a pressed one, so it is not used.
@@ -106,11 +100,12 @@ class Bumpers(BoardInput):
             return bumpers
         return None
 
-    def reason_text(self) -> str:
-        return pressed_words(self._places, self.pressed or ())
+    def pressed_reason(self) -> Reason:
+        words = pressed_words(self._places, self.pressed or ())
+        return reason("bumper", part=words, bumpers=words)
 
-    def advice(self) -> str:
-        return self.note().partition(": ")[2] if self.limiting else super().advice()
+    def advice(self, why: Reason) -> str:
+        return self.limit().advice if self.limiting else super().advice(why)
 
     def released(self, before: EstopState) -> str:
         if not before:

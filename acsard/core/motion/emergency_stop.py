@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from itertools import zip_longest
 from typing import Literal
 
+from acsard.core.codes import Reason, reason, sentence
 from acsard.core.config.settings import EstopUse
 from acsard.core.link.board_status import BoardStatus
 from acsard.core.values import NS_PER_S, EstopState, Event, EventName, Ns
@@ -38,28 +39,17 @@ LATE_STEP_NS = 150_000_000  # between two control steps; the longest control per
 # After a late step, until what arrived meanwhile is read, the board is not silent.
 CATCH_UP_NS = 100_000_000
 
-PRESSED_REASON = "emergency stop pressed at the robot"
-SILENT_REASON = (
-    f"the board has not reported its emergency stop for {SILENCE_TIMEOUT_S:g} s, "
-    "so it counts as pressed"
-)
-
-RELEASE, CHECK = "release it at the robot", "check the board and its cable"
-
-MISSING_REASON = (
-    'safety.estop = "required", but the microcontroller has not reported an emergency-stop input: '
-    "does its firmware send status lines with `estop=`?"
-)
-
-DRIVER_FAULT_REASON = "the board reports a fault of a motor driver"
-DRIVER_FAULT_ADVICE = "repair the driver, or switch the robot off and on"
+PRESSED_REASON = reason("emergency_stop")
+SILENT_REASON = reason("emergency_stop_silent", seconds=SILENCE_TIMEOUT_S)
+MISSING_REASON = sentence("emergency_stop_missing")
+DRIVER_FAULT_REASON = reason("driver_fault")
 
 
 class BoardInput(ABC):
     """The state of one safety input, or of several that the board always reports together."""
 
     table = TRANSITIONS
-    silent: str  # reason of a stop that is latched because the inputs are not reported
+    silent: Reason  # of a stop that is latched because the inputs are not reported
     events: tuple[EventName, EventName]  # for a press and for a release
 
     def __init__(self, use: EstopUse) -> None:
@@ -67,22 +57,17 @@ class BoardInput(ABC):
         self.state: EstopState = ""  # "" if never reported
         self.pressed: tuple[bool, ...] | None = None  # None if never reported
         self._awaited = True  # until the board on the newly opened port reports the inputs
-        # Reason, if an input began to count as pressed in the last `process_reports`.
-        self.pressed_now = ""
+        # The reason, if an input began to count as pressed in the last `process_reports`.
+        self.pressed_now: Reason | None = None
         self._reported_ns = self._looked_ns = 0
         self._excused = False
 
     @property
-    def why(self) -> str:
-        """Why an input counts as pressed; "" if none does."""
+    def why(self) -> Reason | None:
+        """Why an input counts as pressed; None if none does."""
         if self.state == "silent":
             return self.silent
-        return self.reason_text() if self.state == "pressed" else ""
-
-    @property
-    def mend(self) -> str:
-        """Advice to the operator about a pressed input."""
-        return CHECK if self.state == "silent" else RELEASE
+        return self.pressed_reason() if self.state == "pressed" else None
 
     @property
     def missing(self) -> bool:
@@ -108,7 +93,7 @@ class BoardInput(ABC):
         self, reports: Sequence[tuple[int, BoardStatus]], now_ns: Ns
     ) -> list[Event]:
         """Process status lines with their arrival; return the events of changes."""
-        self.pressed_now = ""
+        self.pressed_now = None
         if self.use == "off":
             return []
         events: list[Event] = []
@@ -132,16 +117,16 @@ class BoardInput(ABC):
         """Return whether each input is pressed; None if `status` does not report them."""
 
     @abstractmethod
-    def reason_text(self) -> str:
+    def pressed_reason(self) -> Reason:
         """Return which inputs are pressed, as the reason of a stop."""
 
     @abstractmethod
     def released(self, before: EstopState) -> str:
         """Return the text of a release; `before` is "" for the first report of the inputs."""
 
-    def advice(self) -> str:
+    def advice(self, why: Reason) -> str:
         """Return the instruction to the operator when an input is pressed."""
-        return f"{self.mend}, then call srv/clear"
+        return f"{why.advice}, then call srv/clear"
 
     def _take(self, sign: Sign, pressed: tuple[bool, ...]) -> list[Event]:
         before, was = self.state, self.pressed or ()
@@ -150,9 +135,10 @@ class BoardInput(ABC):
         if self.state == before and not more:
             return []
         why = self.why
-        if why:
+        if why is not None:
             self.pressed_now = why
-            return [Event(self.events[0], f"{why}; {self.advice()}", "error")]
+            text = f"{why.text}; {self.advice(why)}"
+            return [Event(self.events[0], text, "error", code=why.code)]
         return [Event(self.events[1], self.released(before))]
 
 
@@ -172,7 +158,7 @@ class EmergencyStop(BoardInput):
     def process_reports(
         self, reports: Sequence[tuple[int, BoardStatus]], now_ns: Ns
     ) -> list[Event]:
-        self.driver_fault, pressed = False, bool(self.why)
+        self.driver_fault, pressed = False, self.why is not None
         self._unpowered |= self.state == "pressed"
         for _, status in reports:
             if self.use != "off" and status.estop is not None:
@@ -180,7 +166,7 @@ class EmergencyStop(BoardInput):
                 self._unpowered |= pressed
             self.driver_fault |= bool(status.driver_fault) and not (pressed or self._unpowered)
         events = super().process_reports(reports, now_ns)
-        if self.why:
+        if self.why is not None:
             self.driver_fault = False
         return events
 
@@ -191,7 +177,7 @@ class EmergencyStop(BoardInput):
     def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
         return None if status.estop is None else (status.estop,)
 
-    def reason_text(self) -> str:
+    def pressed_reason(self) -> Reason:
         return PRESSED_REASON
 
     def released(self, before: EstopState) -> str:

@@ -10,6 +10,8 @@ import re
 from collections import Counter
 from typing import get_args
 
+from msgspec.structs import replace
+
 from acsard.core.values import NS_PER_S, Event, EventName, Level, Ns
 
 BURST = 5  # lines of one name without a delay: enough for a person who presses buttons
@@ -40,7 +42,9 @@ class _Held:
             what = f"{what or f'{self.count} times'}; the last"
         text = ": ".join(part for part in (what, last.text) if part)
         level, by = LEVELS[self._level], ", ".join(self._by)
-        return Event(last.name, text, level, by, count=self.count, news=self.news)
+        return replace(
+            last, text=text, level=level, by=by, kind="", count=self.count, news=self.news
+        )
 
 
 class EventThrottle:
@@ -95,7 +99,8 @@ def merge(before: Event, line: Event) -> Event:
     by = [name for name in names if name != "others"]
     more = ["others"] if len(by) > MAX_LISTED or "others" in names else []
     text = f"{count} times; the last: {last}"
-    return Event(line.name, text, level, ", ".join(by[:MAX_LISTED] + more), count=count, news=False)
+    by_text = ", ".join(by[:MAX_LISTED] + more)
+    return replace(line, text=text, level=level, by=by_text, count=count, news=False)
 
 
 def _count(counts: Counter[str], what: str, times: int) -> None:

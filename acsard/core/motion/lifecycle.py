@@ -11,10 +11,11 @@ operator reads all.
 from __future__ import annotations
 
 import math
-import re
+from collections.abc import Sequence
 
 from msgspec.structs import replace
 
+from acsard.core.codes import Reason, reason, sentence
 from acsard.core.formatting import utc
 from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError, mode_of, require_allowed
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches, Ns
@@ -31,7 +32,7 @@ MAX_FAULTS = 32  # the daemon knows fewer different ones
 
 LONG_AGO_NS = -(2**62)  # "never"
 
-_VALUES = re.compile(r"[(\d]")  # begin of the measured values in the text of a fault
+NAMELESS = "request"  # in a text, a client that has no name
 
 
 class Lifecycle:
@@ -49,7 +50,7 @@ class Lifecycle:
         self._cleared_ns = LONG_AGO_NS  # a fault was last cleared
         self._stop_asked_ns = LONG_AGO_NS  # latest arrival of a client's stop
         self._off_ns = LONG_AGO_NS  # last switched off
-        self._held = self._mend = ""  # why `clear` is refused now, and advice
+        self._held: Reason | None = None  # why `clear` is refused now
         # Last step in which the cause of a latch ended or came again; no earlier `clear` counts.
         self._freed_ns = LONG_AGO_NS
         self._began_ns: Ns | None = None  # first step, or first after the last stall
@@ -78,16 +79,16 @@ class Lifecycle:
             self._commanded = fresh
             self._derive()
 
-    def press(self, why: str, now: Instant) -> None:
+    def press(self, why: Reason, now: Instant) -> None:
         """Latch a stop with a new number, for the cause that the board reports."""
         self._stopped_ns = now.mono_ns
         self._latch(stop=self._stop(now, "", why))
 
-    def refuse_clear(self, why: str, mend: str, now_ns: Ns) -> None:
-        """Record why the board's reports forbid `clear` now, with advice, or "" and ""."""
-        if self._held and not why:
+    def refuse_clear(self, why: Reason | None, now_ns: Ns) -> None:
+        """Record why the board's reports forbid `clear` now, or None."""
+        if self._held is not None and why is None:
             self._freed_ns = now_ns
-        self._held, self._mend = why, mend
+        self._held = why
 
     def caused_again(self, now_ns: Ns) -> None:
         """Record that the cause of the fault came again; no earlier `clear` counts."""
@@ -98,15 +99,12 @@ class Lifecycle:
         self._shutting_down = True
         self._derive()
 
-    def fault(self, why: str, now: Instant) -> bool:
-        """Latch a fault and return True, or False if its cause is latched or there is no room.
-
-        Texts that are equal up to the first digit or bracket have the same cause.
-        """
+    def fault(self, why: Reason, now: Instant) -> bool:
+        """Latch a fault and return True, or False if its cause is latched or there is no room."""
         latch = self.latches.fault
         if latch is not None:
-            known = [_without_values(cause.why) for cause in latch.causes]
-            if _without_values(why) in known or len(known) >= MAX_FAULTS:
+            causes = latch.causes
+            if len(causes) >= MAX_FAULTS or _is_latched(why, causes):
                 return False
         self._faulted_ns = now.mono_ns
         self._latch(fault=with_causes(self._new_latch(now, "", why), latch))
@@ -120,14 +118,14 @@ class Lifecycle:
         A repetition changes nothing: the latch names this client, and an accepted stop arrived at
         `asked_ns` or later.
         """
-        latch, why = self.latches.stop, f"stopped by {by or 'request'}"
-        named = latch is not None and any(cause.why == why for cause in latch.causes)
+        latch, why = self.latches.stop, reason("stopped", by=by or NAMELESS)
+        named = latch is not None and (why.code, "", by) in [cause.cause for cause in latch.causes]
         if not (named and asked_ns <= self._stop_asked_ns):
             self._stopped_ns = now.mono_ns
             self._stop_asked_ns = max(self._stop_asked_ns, asked_ns)
             self._latch(stop=self._stop(now, by, why))
         if self._shutting_down:
-            return f"stopped and latched; {SHUTDOWN_REASON}"
+            return f"stopped and latched; {SHUTDOWN_REASON.text}"
         if self.latches.fault is not None:
             return (
                 "stopped and latched; call srv/clear twice, "
@@ -144,7 +142,8 @@ class Lifecycle:
         """
         require_allowed(self.mode, "clear")
         if self._held:
-            raise RefusedError(f"{self._held}: {self._mend}, then call srv/clear again")
+            held = self._held
+            raise RefusedError(f"{held.text}: {held.advice}, then call srv/clear again")
         latches, latch = self.latches, self.latches.next
         if latch is None:
             return ""
@@ -226,29 +225,32 @@ class Lifecycle:
         """Switch the robot off with a new latch, and return a text for the client."""
         require_allowed(self.mode, "deactivate")
         self._off_ns = now.mono_ns
-        self._latch(inactive=self._new_latch(now, by, f"switched off by {by or 'request'}"))
+        why = reason("switched_off", by=by or NAMELESS)
+        self._latch(inactive=self._new_latch(now, by, why))
         return "inactive: the robot brakes to rest; call srv/activate to switch it on again"
 
     @property
-    def why(self) -> str:
+    def why(self) -> Reason:
         """The reason of the mode `fault`, `stopped` or `inactive`, and the call that ends it."""
-        latches, reason = self.latches, self._held
+        latches, held = self.latches, self._held
         if latches.next is not None:
             fault, stop = latches.fault, latches.stop
             faults = () if fault is None else fault.causes
             parts = [f"{cause.why}, latched {_when(cause)}" for cause in faults]
             causes = () if stop is None else stop.causes
-            if reason and reason not in [latch.why for latch in (*faults, *causes)]:
+            if held is not None and not _is_latched(held, (*faults, *causes)):
                 # The cause that lasts differs from all latched causes. For example, one of two
                 # pressed bumpers has been released.
-                parts.append(reason)
+                parts.append(held.text)
             parts += [_latch_text(cause) for cause in causes]
-            before = f"{self._mend}, then " if reason else ""
+            before = "" if held is None else f"{held.advice}, then "
             twice = f" twice, {LATCH_REQUIRED_S:g} s apart" if fault and stop else ""
-            return f"{'; also '.join(parts)}; {before}call srv/clear{twice}"
+            text = f"{'; also '.join(parts)}; {before}call srv/clear{twice}"
+            return Reason(latches.next.code, text)
         if latches.inactive is not None:
-            return f"{_latch_text(latches.inactive)}; call srv/activate"
-        return "switched off; call srv/activate"
+            latch = latches.inactive
+            return Reason(latch.code, f"{_latch_text(latch)}; call srv/activate")
+        return sentence("not_activated")
 
     # latches and mode
 
@@ -256,14 +258,14 @@ class Lifecycle:
     def _off(self) -> bool:
         return self._dormant or self.latches.inactive is not None
 
-    def _new_latch(self, now: Instant, by: str, why: str) -> Latch:
+    def _new_latch(self, now: Instant, by: str, why: Reason) -> Latch:
         if self._numbered:
             self._number = max(self._number + 1, now.wall_ns // 1_000_000)
         else:
             self._numbered, self._number = True, number_after_restart(self._number, now)
-        return Latch(self._number, now.wall_ns, by, why)
+        return latch_of(self._number, now.wall_ns, by, why)
 
-    def _stop(self, now: Instant, by: str, why: str) -> Latch:
+    def _stop(self, now: Instant, by: str, why: Reason) -> Latch:
         return with_causes(self._new_latch(now, by, why), self.latches.stop)
 
     def _latch(self, **changes: Latch | None) -> None:
@@ -321,13 +323,18 @@ def with_causes(latch: Latch, before: Latch | None) -> Latch:
     Of those from clients, the oldest `MAX_CLIENTS` are kept.
     """
     causes = () if before is None else before.causes
-    earlier = [replace(cause, earlier=()) for cause in causes if cause.why != latch.why]
+    earlier = [replace(cause, earlier=()) for cause in causes if cause.cause != latch.cause]
     surplus = [cause for cause in earlier if cause.by][:-MAX_CLIENTS]
     return replace(latch, earlier=tuple([cause for cause in earlier if cause not in surplus]))
 
 
-def _without_values(why: str) -> str:
-    return _VALUES.split(why, maxsplit=1)[0]
+def latch_of(number: int, at_ns: int, by: str, why: Reason) -> Latch:
+    """Return a latch with the cause `why`."""
+    return Latch(number, at_ns, by, why.text, why.code, why.part)
+
+
+def _is_latched(why: Reason, causes: Sequence[Latch]) -> bool:
+    return any(cause.code == why.code and cause.part == why.part for cause in causes)
 
 
 def number_after_restart(last_number: int, now: Instant) -> int:
@@ -367,8 +374,7 @@ def _when(latch: Latch) -> str:
 
 
 def _asked_for(latch: Latch) -> bool:
-    # by a client
-    return latch.why.endswith(f" by {latch.by or 'request'}")
+    return latch.code in ("stopped", "switched_off")  # by a client
 
 
 def _latch_text(latch: Latch) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 
+from acsard.core.codes import reason
 from acsard.core.values import AcsardError, Verb
 
 
@@ -52,13 +53,13 @@ def mode_of(
     return Mode.DRIVING if commanded else Mode.READY
 
 
-SHUTDOWN_REASON = "the daemon is shutting down"
+SHUTDOWN_REASON = reason("shutting_down")
 
 # For the client.
 REFUSALS: dict[tuple[Mode, Verb], str] = {
-    (Mode.SHUTDOWN, "clear"): SHUTDOWN_REASON,
-    (Mode.SHUTDOWN, "activate"): SHUTDOWN_REASON,
-    (Mode.SHUTDOWN, "deactivate"): SHUTDOWN_REASON,
+    (Mode.SHUTDOWN, "clear"): SHUTDOWN_REASON.text,
+    (Mode.SHUTDOWN, "activate"): SHUTDOWN_REASON.text,
+    (Mode.SHUTDOWN, "deactivate"): SHUTDOWN_REASON.text,
     (Mode.FAULT, "activate"): "the robot is in fault: call srv/clear first",
     (Mode.FAULT, "deactivate"): "the robot is in fault and cannot move: call srv/clear first",
     (Mode.STOPPED, "activate"): "the robot is stopped: call srv/clear first",

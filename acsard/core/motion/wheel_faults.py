@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from typing import Literal
 
+from acsard.core.codes import Reason, reason
 from acsard.core.config.motion_rules import MIN_EVIDENCE_LINES
 from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.codec import Motors
@@ -21,7 +22,7 @@ from acsard.core.motion.error_model import ASSUMED_PERIOD_S, PERIOD_GAIN
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.suspect_wheel import FAULT_TEXTS, Stuck, Suspect, WheelFault, was_faulty
 from acsard.core.motion.wheel_residual import TIME_CONSTANT_S, Residual
-from acsard.core.motion.wheel_witness import MIN_FAULT_SPEED, WITNESS_TEXTS, Expected, Witness
+from acsard.core.motion.wheel_witness import MIN_FAULT_SPEED, WITNESS_CODES, Expected, Witness
 from acsard.core.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 
 # rad of one count that is learned if the number of counts is not configured.
@@ -148,7 +149,7 @@ class _Side:
         angles, self._unfollowed = self._unfollowed, (0.0, 0.0)
         return angles
 
-    def fault(self, speeds: Motors, limit: float) -> str:
+    def fault(self, speeds: Motors, limit: float) -> Reason | None:
         for i, witness in enumerate(self.witnesses):
             evidence = dict(witness.evidence)
             if i == self.out:
@@ -156,11 +157,10 @@ class _Side:
             for kind, lasted in evidence.items():
                 if lasted > limit:
                     wheel, command = self.wheels[i], self.expected.commanded
-                    return (
-                        f"{WHEELS[wheel]} wheel {WITNESS_TEXTS[kind]} (commanded {command:.1f}, "
-                        f"measured {speeds[wheel]:.1f} rad/s)"
-                    )
-        return ""
+                    name = WHEELS[wheel]
+                    figures = f"(commanded {command:.1f}, measured {speeds[wheel]:.1f} rad/s)"
+                    return reason(WITNESS_CODES[kind], part=name, wheel=name, figures=figures)
+        return None
 
     def agree(self, dt: float) -> None:
         """Process a line of `dt` s in which the wheels agree."""
@@ -365,8 +365,10 @@ class WheelFaults:
             if not any(witness.suspected for witness in side.witnesses):
                 side.expected.slow_down(speeds[front], speeds[rear])
 
-    def watch(self, commanded: WheelSpeeds | None, wheel_speeds: WheelSpeeds, dt: float) -> str:
-        """Compare a line with the commands; return a fault that names a wheel, or "".
+    def watch(
+        self, commanded: WheelSpeeds | None, wheel_speeds: WheelSpeeds, dt: float
+    ) -> Reason | None:
+        """Compare a line with the commands; return a fault that names a wheel, or None.
 
         `commanded` is None while the emergency stop may cut the motors' power. Call `check_line`
         next.
@@ -377,7 +379,7 @@ class WheelFaults:
                 side.forget()
                 for wheel, witness in zip(side.wheels, side.witnesses, strict=True):
                     witness.coast(speeds[wheel], dt, self._count)
-            return ""
+            return None
         limit, lag = self._settings.fault_time, self._settings.response_time
         left, right = self._left, self._right
         front_right, front_left, rear_left, rear_right = speeds
@@ -394,7 +396,7 @@ class WheelFaults:
         bad_right = right.watch(speeds, dt, most, count, still)
         self._notice(speeds, dt, still)
         if not (limit and (bad_left or bad_right)):
-            return ""
+            return None
         return right.fault(speeds, limit) or left.fault(speeds, limit)
 
     def _notice(self, speeds: Motors, dt: float, still: bool) -> None:

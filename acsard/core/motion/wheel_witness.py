@@ -12,6 +12,8 @@ from __future__ import annotations
 import math
 from typing import Literal
 
+from acsard.core.codes import FaultCode
+
 # rad/s; below it, coarse encoders and a robot at rest can look like any fault.
 MIN_FAULT_SPEED = 2.0
 
@@ -31,13 +33,11 @@ TOO_SLOW, FAST_ENOUGH = 0.7, 0.8
 
 FaultKind = Literal["dead", "reversed", "runaway", "stuck"]
 
-WITNESS_TEXTS: dict[FaultKind, str] = {
-    "dead": "does not turn, or its encoder is dead: check cable, motor and encoder, and for "
-    "motor d also the setting mcu.trailing_comma",
-    "reversed": "turns against its command: check the leads of its motor, the wires A and B of its "
-    "encoder, and the wheel's sign in mcu.wheels",
-    "runaway": "turns faster than commanded: check the motor driver and the encoder",
-    "stuck": "reports a speed that never changes: its encoder is stuck",
+WITNESS_CODES: dict[FaultKind, FaultCode] = {
+    "dead": "wheel_dead",
+    "reversed": "wheel_reversed",
+    "runaway": "wheel_runaway",
+    "stuck": "wheel_stuck",
 }
 
 
@@ -100,7 +100,7 @@ class Witness:
         self.speed = 0.0  # smoothed, rad/s
         self._seen, self._begins = 0.0, True
         # s for which each fault was shown.
-        self.evidence: dict[FaultKind, float] = dict.fromkeys(WITNESS_TEXTS, 0.0)
+        self.evidence: dict[FaultKind, float] = dict.fromkeys(WITNESS_CODES, 0.0)
         self.suspected = False
         # Because of the infinity, the first line counts as approaching the command. With 0, a wheel
         # that was already too fast would never count as slowing down, and slow motors would latch
@@ -177,7 +177,7 @@ class Witness:
         if bad or self.suspected:
             self.suspected = bad
             signs = dead and wrong, against and wrong, fast and wrong, stuck
-            for kind, sign in zip(WITNESS_TEXTS, signs, strict=True):
+            for kind, sign in zip(WITNESS_CODES, signs, strict=True):
                 self.evidence[kind] = self.evidence[kind] + min(dt, most) if sign else 0.0
         return bad
 

@@ -83,9 +83,10 @@ rcl_interfaces/msg/Log: \
     builtin_interfaces/msg/Time stamp, uint8 level, string name, string msg, \
     string file, string function, uint32 line
 acsard/msg/Counter: string name, int64 count
-acsard/msg/SourceState: string name, int64 priority, float64 age, string waits_for
+acsard/msg/SourceState: string name, int64 priority, float64 age, string waits_for, \
+    string wait
 acsard/msg/RobotState: \
-    std_msgs/msg/Header header, string mode, string reason, \
+    std_msgs/msg/Header header, string mode, string code, string reason, \
     float64 x, float64 y, float64 yaw, float64 linear, float64 angular, float64[] wheels, \
     float64 feedback_age, string link, string source, string sender, \
     acsard/msg/SourceState[] sources, \

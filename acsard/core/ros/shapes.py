@@ -75,6 +75,13 @@ def command_message(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped
     )
 
 
+class Trigger(Struct, frozen=True):
+    """The response of the ROS service type std_srvs/srv/Trigger."""
+
+    success: bool
+    message: str
+
+
 class Counter(Struct, frozen=True):
     """The name of a counter and its value since the start of the daemon."""
 
@@ -83,12 +90,13 @@ class Counter(Struct, frozen=True):
 
 
 class Source(Struct, frozen=True):
-    """A command source, with the fields of the native `SourceState` except `wait`."""
+    """A command source, with the fields of the native `SourceState`."""
 
     name: str
     priority: Whole
     age: float | None
     waits_for: str
+    wait: str
 
 
 class State(Struct, frozen=True):
@@ -96,6 +104,7 @@ class State(Struct, frozen=True):
 
     header: Header
     mode: str
+    code: str
     reason: str
     x: float
     y: float
@@ -123,7 +132,9 @@ def state(message: RobotState) -> State:
     """Convert a native `RobotState` to a message of the ROS type acsard/msg/RobotState."""
     converted: dict[str, Any] = {
         "header": Header(message.stamp),
-        "sources": [Source(s.name, s.priority, s.age, s.waits_for) for s in message.sources],
+        "sources": [
+            Source(s.name, s.priority, s.age, s.waits_for, s.wait) for s in message.sources
+        ],
         "bumpers": message.bumpers or [],
         "counters": [Counter(name, count) for name, count in message.counters.items()],
     }

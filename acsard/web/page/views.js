@@ -84,7 +84,7 @@ export function banner(state, locked, own) {
     alone ? "Nobody can stop the motors from here: use the robot's own switch." : "",
     BATTERY[state.battery?.level] ?? "", pressed(state.bumpers),
     state.wheel_fault, state.recording_error, state.latch_file_error,
-    /^(valid|$)/.test(state.certificate_expiry) ? "" : `certificate ${state.certificate_expiry}`,
+    ["valid", ""].includes(state.certificate) ? "" : `certificate ${state.certificate_expiry}`,
   ];
   doubted(warned.filter(Boolean).join("; "));
   powered(state.battery);

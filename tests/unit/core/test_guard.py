@@ -24,7 +24,7 @@ from acsard.core.config.settings import (
     Source,
     WheelMap,
 )
-from acsard.core.guard import RAMP_MARGIN_NS, Guard, Memory
+from acsard.core.guard import RAMP_MARGIN_NS, Guard, Memory, Trip
 from acsard.core.link.checked_line import seal
 from acsard.core.link.codec import Codec
 from acsard.core.motion.kinematics import Kinematics
@@ -52,13 +52,11 @@ SOURCES = (Source("app", 50), Source("slow", 10, timeout=1.0))
 CODEC = Codec(WheelMap())
 STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 
-NOT_A_LINE = "the line is not complete, or does not have four wheel speeds"
-TOO_FAST = "the line moves a wheel faster than limits.wheel_speed"
-NO_LINK = "the line moves a wheel while the serial link is not up"
-GROWS = (
-    "the line speeds up a wheel although no command is fresh, or although the mode is not driving"
-)
-LATE = "the line still moves a wheel although the longest ramp to zero has ended"
+NOT_A_LINE = "guard_line_damaged"
+TOO_FAST = "guard_too_fast"
+NO_LINK = "guard_no_link"
+GROWS = "guard_no_command"
+LATE = "guard_too_long"
 
 
 def line(*wheels: float) -> bytes:
@@ -88,6 +86,7 @@ def outputs(
         linked=linked,
         estimates=(),
         mode=mode,
+        code="commanded",
         reason="",
         link="up" if linked else "down",
         source=source,
@@ -118,7 +117,7 @@ class Guarded:
         )
         self.guard = Guard(stop, config)
         self._passed = stop
-        self.trip = ""
+        self.trip: Trip = ""
 
     def check(self, result: Outputs) -> bytes | None:
         line, self.trip = self.guard.check(result)
@@ -577,7 +576,7 @@ class Loop:
         self.now_ns = NOW_NS
         self.opened = 1
         self.superseded = False
-        self.trip = ""
+        self.trip: Trip = ""
         self.trips: list[str] = []
         self.events: list[str] = []
         self.wire: list[tuple[bytes, Outputs]] = []
@@ -635,7 +634,7 @@ def test_one_trip_causes_one_fault_that_names_its_reason() -> None:
         result = loop.step(loop.command(1.0))
     assert loop.trips == [TOO_FAST]
     assert loop.events.count("fault") == 1
-    assert TOO_FAST in result.reason
+    assert result.code == TOO_FAST
     assert loop.wire[-1][0] == STOP
 
 
@@ -802,7 +801,7 @@ def test_a_healthy_robot_never_trips_the_guard_and_speeds_up_only_by_fresh_comma
 
 # the checked line
 
-NO_CHECK = "the line moves a wheel without the checksum that mcu.link_check requires"
+NO_CHECK = "guard_no_checksum"
 
 
 @pytest.mark.parametrize("comma", [False, True])

@@ -13,6 +13,7 @@ from itertools import pairwise
 import pytest
 from msgspec.structs import replace
 
+from acsard.core.codes import reason
 from acsard.core.config.settings import (
     BatteryConfig,
     CommandsConfig,
@@ -25,8 +26,9 @@ from acsard.core.config.settings import (
     SafetyConfig,
     Source,
 )
+from acsard.core.guard import Trip
 from acsard.core.link.codec import Codec
-from acsard.core.motion.arbiter_text import MAX_SENDER_LENGTH, waiting
+from acsard.core.motion.arbiter_text import MAX_SENDER_LENGTH
 from acsard.core.robot import Robot
 from acsard.core.values import (
     NS_PER_S,
@@ -96,7 +98,7 @@ class Bench:
         ms: float | None = None,
         tick: bool = True,
         superseded: bool = False,
-        guard_trip: str = "",
+        guard_trip: Trip = "",
         refusals: tuple[Refusal, ...] = (),
         gyro: float | None = None,
         late_ms: float | None = None,
@@ -303,7 +305,7 @@ def test_a_press_is_latched_in_every_mode(before: str) -> None:
         case "stopped":
             bench.step(ask="stop")
         case "fault":
-            bench.step(guard_trip="the line is not complete, or does not have four wheel speeds")
+            bench.step(guard_trip="guard_line_damaged")
         case "inactive":
             bench.step(ask="deactivate")
         case "waiting":
@@ -432,7 +434,9 @@ def test_a_bumper_stops_the_robot_immediately_until_a_clear_after_the_release() 
     assert {"bumper_pressed", "mode"} <= set(names(out))
     assert bench.counters()["bumper_presses"] == 1
     snapshot = bench.robot.snapshot(bench.now_ns)
-    assert (snapshot.bumpers, snapshot.bumper) == ((True, False), "bumper 1 pressed")
+    assert snapshot.bumpers == (True, False)
+    assert snapshot.bumper is not None
+    assert snapshot.bumper.code == "bumper"
     answer = bench.answer("clear")
     assert answer.message == "bumper 1 pressed: release it at the robot, then call srv/clear again"
     bench.status(FREE).step(GO)
@@ -460,7 +464,7 @@ def test_a_bumper_that_limits_stops_the_robot_and_each_sender_must_send_a_zero()
         assert out.applied.angular == 0.0
     assert (out.mode, out.applied.linear) == ("driving", -0.1)
     assert out.reason == (
-        "driving: commanded by app; front bumper pressed: the robot drives only straight "
+        "commanded by app; front bumper pressed: the robot drives only straight "
         "backwards, at most 0.1 m/s"
     )
 
@@ -501,7 +505,7 @@ def test_a_retreat_goes_on_after_the_release_without_its_limits() -> None:
     for _ in range(100):
         out = bench.step(BACK)
     assert (out.mode, out.applied) == ("driving", BACK)
-    assert out.reason == "driving: commanded by app"
+    assert out.reason == "commanded by app"
 
 
 def test_a_press_of_the_bumper_in_the_direction_of_the_retreat_ends_the_retreat() -> None:
@@ -609,10 +613,8 @@ def test_a_clear_in_the_step_of_a_repeated_driver_fault_does_not_release_the_fau
 def test_a_clear_in_the_step_of_a_repeated_guard_trip_does_not_release_the_fault() -> None:
     bench = Bench()
     bench.driving()
-    bench.step(guard_trip="the line is not complete, or does not have four wheel speeds")
-    (answer,) = bench.step(
-        guard_trip="the line is not complete, or does not have four wheel speeds", ask="clear"
-    ).answers
+    bench.step(guard_trip="guard_line_damaged")
+    (answer,) = bench.step(guard_trip="guard_line_damaged", ask="clear").answers
     assert not answer.success
     assert bench.mode() == "fault"
     assert bench.answer("clear").success
@@ -680,7 +682,7 @@ def test_after_a_clear_of_only_the_fault_drivers_may_still_lack_power() -> None:
     bench = Button(OK_LINE + DRIVER_OK)
     bench.linked()
     bench.status(PRESSED_LINE).step()
-    bench.status(OK_LINE + DRIVER_OK).step(guard_trip="the line does not end")
+    bench.status(OK_LINE + DRIVER_OK).step(guard_trip="guard_line_damaged")
     assert bench.mode() == "fault"
     bench.step()
     assert bench.answer("clear").success
@@ -1073,7 +1075,7 @@ def test_after_a_zero_a_command_drives() -> None:
     bench = Bench().linked()
     bench.step(REST)
     out = bench.step(GO)
-    assert (out.mode, out.reason) == ("driving", "driving: commanded by app")
+    assert (out.mode, out.reason) == ("driving", "commanded by app")
     assert (out.source, out.command_ns) == ("app", bench.now_ns)
     assert out.applied.linear == pytest.approx(0.01)
 
@@ -1175,9 +1177,9 @@ def test_the_higher_source_drives_and_the_snapshot_names_it_to_the_lower_source(
     bench.step(REST, source="teleop")
     assert bench.step(GO).source == "teleop"
     snapshot = bench.robot.snapshot(bench.now_ns)
-    waits = {source.name: waiting(source.waits_for) for source in snapshot.sources}
-    assert waits["app"] == "teleop has priority: wait until it is silent"
-    assert waits["teleop"] == ""
+    waits = {source.name: source.waits_for.what for source in snapshot.sources}
+    assert waits["app"] == "higher"
+    assert waits["teleop"] == "nothing"
 
 
 # a lost link
@@ -1210,8 +1212,8 @@ def test_without_neutral_first_no_source_waits_for_a_zero_before_the_port_opens(
     bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).unplug()
     bench.opened = 0  # the port was never open
     bench.step(GO)
-    waits = {s.name: waiting(s.waits_for) for s in bench.robot.snapshot(bench.now_ns).sources}
-    assert waits["app"] == ""
+    waits = {s.name: s.waits_for.what for s in bench.robot.snapshot(bench.now_ns).sources}
+    assert waits["app"] == "nothing"
 
 
 def test_a_silent_mcu_makes_the_link_stale_and_the_speed_zero() -> None:
@@ -1294,7 +1296,9 @@ def test_a_zero_sent_while_the_port_was_closed_does_not_count_as_neutral() -> No
 def test_a_stop_brakes_by_its_own_deceleration_and_is_latched() -> None:
     bench = Bench().driving()
     answer = bench.answer("stop")
-    assert answer == Answer(7, True, "stopped and latched; srv/clear releases it")
+    stop = bench.robot.latches.stop
+    assert stop is not None
+    assert answer == Answer(7, True, "stopped and latched; srv/clear releases it", stop.number)
     # 3 m/s2 is 0.03 m/s per step; 0.5 m/s take 17 steps.
     path = [bench.out.applied.linear, *(bench.step(GO).applied.linear for _ in range(17))]
     assert path == pytest.approx([max(0.5 - 0.03 * step, 0.0) for step in range(1, 19)], abs=1e-12)
@@ -1342,7 +1346,9 @@ def test_after_clear_the_robot_is_ready_and_each_source_must_be_neutral() -> Non
     bench = Bench().driving()
     bench.step(ask="stop")
     answer = bench.answer("clear")
-    assert answer == Answer(7, True, "cleared; each sender must send a zero before it drives")
+    text = "cleared; each sender must send a zero before it drives"
+    assert answer == Answer(7, True, text, answer.latch)
+    assert answer.latch
     assert bench.mode() == "ready"
     for _ in range(20):
         bench.step(GO)
@@ -1354,21 +1360,24 @@ def test_after_clear_the_robot_is_ready_and_each_source_must_be_neutral() -> Non
 def test_deactivating_ramps_to_zero_by_the_normal_deceleration() -> None:
     bench = Bench().driving()
     answer = bench.answer("deactivate")
-    assert answer == Answer(
-        7, True, "inactive: the robot brakes to rest; call srv/activate to switch it on again"
-    )
+    off = bench.robot.latches.inactive
+    assert off is not None
+    text = "inactive: the robot brakes to rest; call srv/activate to switch it on again"
+    assert answer == Answer(7, True, text, off.number)
     assert bench.out.applied.linear == pytest.approx(0.49)
     for _ in range(50):
         bench.step(GO)
     assert (bench.mode(), bench.out.applied) == ("inactive", REST)
-    off = "switched off by request at 2027-01-15 08:00:50 UTC; call srv/activate"
-    assert bench.out.reason == off
+    why = "switched off by request at 2027-01-15 08:00:50 UTC; call srv/activate"
+    assert bench.out.reason == why
 
 
 def test_after_an_activation_each_source_must_be_neutral() -> None:
     bench = Bench().driving()
     bench.step(ask="deactivate")
-    assert bench.answer("activate") == Answer(7, True, "active")
+    off = bench.robot.latches.inactive
+    assert off is not None
+    assert bench.answer("activate") == Answer(7, True, "active", off.number)
     for _ in range(20):
         bench.step(GO)
     assert bench.mode() == "ready"
@@ -1567,17 +1576,14 @@ def test_after_a_silence_a_line_that_the_next_one_confirms_is_used_with_it() -> 
 
 def test_a_guard_trip_is_a_latched_fault_and_an_error_event() -> None:
     bench = Bench().driving()
-    out = bench.step(GO, guard_trip="a wheel is too fast")
+    out = bench.step(GO, guard_trip="guard_too_fast")
     assert out.mode == "fault"
     at = "latched at 2027-01-15 08:00:50 UTC"
-    trip = "the daemon's guard replaced a line for the board with zeros: a wheel is too fast"
-    assert out.reason == f"{trip}, {at}; call srv/clear"
+    trip = reason("guard_too_fast").text
+    assert (out.code, out.reason) == ("guard_too_fast", f"{trip}, {at}; call srv/clear")
     event, mode = out.events
     assert (event.name, event.level) == ("fault", "error")
-    assert mode.text.startswith(
-        "driving -> fault: the daemon's guard replaced a line for the board with zeros: a wheel is "
-        "too fast"
-    )
+    assert (event.code, mode.code) == ("guard_too_fast", "guard_too_fast")
     for _ in range(50):
         bench.step(REST)
         bench.step(GO)
@@ -1586,7 +1592,7 @@ def test_a_guard_trip_is_a_latched_fault_and_an_error_event() -> None:
 
 def test_after_a_guard_trip_the_robot_continues_from_the_stop_that_was_sent() -> None:
     bench = Bench().driving()
-    assert bench.step(GO, guard_trip="a wheel is too fast").line == ZERO_LINE
+    assert bench.step(GO, guard_trip="guard_too_fast").line == ZERO_LINE
 
 
 def impossible(bench: Bench, lines: int) -> Bench:
@@ -1609,14 +1615,11 @@ def test_impossible_speeds_of_any_wheel_are_one_cause_and_hide_no_later_cause() 
     latch = bench.robot.latches.fault
     assert latch is not None
     assert len(latch.causes) == 1
-    bench.step(GO, guard_trip="a wheel is too fast")
+    bench.step(GO, guard_trip="guard_too_fast")
     newest = bench.robot.latches.fault
     assert newest is not None
     assert newest.number != latch.number
-    assert [cause.why.split(" (")[0] for cause in newest.causes] == [
-        "the daemon's guard replaced a line for the board with zeros: a wheel is too fast",
-        "the board reports impossible speeds",
-    ]
+    assert [cause.code for cause in newest.causes] == ["guard_too_fast", "impossible_speeds"]
 
 
 def test_a_third_impossible_line_is_a_fault_that_brakes_by_the_stop_deceleration() -> None:
@@ -1642,7 +1645,7 @@ def test_a_lost_link_resets_the_count_of_impossible_lines() -> None:
 
 def test_a_fault_clears_every_command() -> None:
     bench = Bench().driving()
-    bench.step(guard_trip="a wheel is too fast")
+    bench.step(guard_trip="guard_too_fast")
     sources = bench.robot.snapshot(bench.now_ns).sources
     assert {source.age_s for source in sources} == {None}
 
@@ -1656,7 +1659,7 @@ def test_clear_resets_the_count_of_impossible_lines() -> None:
 
 def test_after_a_fault_each_source_must_be_neutral() -> None:
     bench = Bench().driving()
-    bench.step(GO, guard_trip="a wheel is too fast")
+    bench.step(GO, guard_trip="guard_too_fast")
     bench.step(GO, ask="clear")
     for _ in range(20):
         bench.step(GO)
@@ -1679,7 +1682,9 @@ def test_shutting_down_is_one_event() -> None:
     bench = Bench().driving()
     bench.shutting_down = True
     (event,) = bench.step().events
-    assert event == Event("mode", "driving -> shutdown: the daemon is shutting down")
+    assert event == Event(
+        "mode", "driving -> shutdown: the daemon is shutting down", code="shutting_down"
+    )
     assert names(bench.step()) == []
 
 
@@ -1857,9 +1862,9 @@ def test_without_auto_activate_a_robot_is_ready_in_the_step_of_the_activation() 
 # the latches that a robot starts with
 
 
-STOPPED = Latches(stop=Latch(7, WALL_NS, "ann", "stopped by ann", kept=True))
-FAULTED = Latches(fault=Latch(8, WALL_NS, "", "a wheel is dead", kept=True))
-OFF = Latches(inactive=Latch(9, WALL_NS, "joe", "switched off by joe", kept=True))
+STOPPED = Latches(stop=Latch(7, WALL_NS, "ann", "stopped by ann", "stopped", kept=True))
+FAULTED = Latches(fault=Latch(8, WALL_NS, "", "a wheel is dead", "wheel_dead", kept=True))
+OFF = Latches(inactive=Latch(9, WALL_NS, "joe", "switched off by joe", "switched_off", kept=True))
 
 
 @pytest.mark.parametrize(
@@ -1883,7 +1888,7 @@ def test_a_robot_starts_in_the_mode_of_its_latches_with_one_event(
     assert bench.out.latches is latches
     (event,) = bench.out.events
     assert event == Event(
-        "mode", f"start -> {mode}: {why}; call {release}", "warning", kind=event.kind
+        "mode", f"start -> {mode}: {why}; call {release}", "warning", code=bench.out.code
     )
     bench.linked().step(REST)
     for _ in range(100):

@@ -31,7 +31,7 @@ from acsard.core.config.settings import (
     McuConfig,
     Source,
 )
-from acsard.core.guard import Guard
+from acsard.core.guard import Guard, Trip
 from acsard.core.link.sample_time import MAX_FILLED_GAP_S
 from acsard.core.motion.arbiter_text import waiting
 from acsard.core.motion.odometry import MAX_RECOMPUTED_LINES
@@ -77,9 +77,9 @@ CONFIGS = [
     Config(commands=COMMANDS, control=ControlConfig(rate=250.0, auto_activate=False)),
 ]
 
-STOP = Latch(5, 0, "ann", "stopped by ann", kept=True)
-FAULT = Latch(6, 0, "", "a wheel is dead", kept=True)
-OFF = Latch(7, 0, "joe", "switched off by joe", kept=True)
+STOP = Latch(5, 0, "ann", "stopped by ann", "stopped", kept=True)
+FAULT = Latch(6, 0, "", "a wheel is dead", "wheel_dead", kept=True)
+OFF = Latch(7, 0, "joe", "switched off by joe", "switched_off", kept=True)
 
 KEPT = [
     Latches(),
@@ -191,7 +191,8 @@ class RobotMachine(RuleBasedStateMachine):
         self.reported_ns = self.late_ns = 0
         """Time of the last report, and the longest time between two steps since then."""
         self.port_open, self.opened, self.blocked, self.shutting_down = True, 1, False, False
-        self.trip, self.superseded = "", False
+        self.trip: Trip = ""
+        self.superseded = False
         self.commands: list[Command] = []
         self.requests: list[Request] = []
         self.received: list[Received] = []
@@ -624,7 +625,7 @@ class RobotMachine(RuleBasedStateMachine):
                 or "is new: the robot follows it" in outputs.reason
             )
         if mode == "driving":
-            assert outputs.reason.startswith("driving: ")
+            assert outputs.code in ("commanded", "zeros", "limits_zero")
             assert outputs.linked
 
     def check_latches(self, outputs: Outputs, requests: tuple[Request, ...]) -> None:

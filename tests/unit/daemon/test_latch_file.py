@@ -27,8 +27,10 @@ from acsard.host.errors import InUseError
 from tests.system.harness import until
 
 NOW = Instant(7_000_000_000, 1_800_000_000_000_000_000)
-STOP = Latches(stop=Latch(1_800_000_000_000, NOW.wall_ns, "joe", "stopped by joe"))
-FAULT = Latches(fault=Latch(1_800_000_000_001, NOW.wall_ns, "", "front_left turns by itself"))
+STOP = Latches(stop=Latch(1_800_000_000_000, NOW.wall_ns, "joe", "stopped by joe", "stopped"))
+FAULT = Latches(
+    fault=Latch(1_800_000_000_001, NOW.wall_ns, "", "front_left turns by itself", "wheel_runaway")
+)
 NAME = "acsar.latches.json"
 
 Started = Callable[..., tuple[LatchFile, Latches]]
@@ -421,7 +423,7 @@ def test_a_flood_of_stops_is_written_at_a_pace(
     monkeypatch.setattr(module, "replace", counted)
     began = time.monotonic()
     for number in range(40):
-        file.keep(Latches(stop=Latch(number, NOW.wall_ns, "joe", "stopped by joe")))
+        file.keep(Latches(stop=Latch(number, NOW.wall_ns, "joe", "stopped by joe", "stopped")))
         time.sleep(0.005)
     end(file)
     assert len(contents) <= (time.monotonic() - began) / module.MIN_WRITE_PAUSE_S + 2
@@ -512,7 +514,7 @@ def test_the_close_waits_for_a_stuck_disk_only_until_its_timeout(
 
 
 OFF = Latches(
-    inactive=Latch(1_800_000_000_002, NOW.wall_ns, "page", "switched off by page"),
+    inactive=Latch(1_800_000_000_002, NOW.wall_ns, "page", "switched off by page", "switched_off"),
 )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import get_args
 
 import msgspec
 import pytest
@@ -10,15 +11,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from acsard.core.codes import Code, reason
 from acsard.core.motion.lifecycle import Lifecycle
 from acsard.core.values import NS_PER_S, Event, Instant, Latch, Latches
 from acsard.daemon.latch_rules import (
+    FORMAT,
     MAX_ANSWER_DELAY_NS,
     MAX_BYTES,
     MAX_NUMBER,
     Handover,
     LatchFileError,
     after_failed_write,
+    at_start,
     decode,
     encode,
     stopped,
@@ -28,15 +32,28 @@ from tests.each import each
 NOW = Instant(7_000_000_000, 1_800_000_000_000_000_000)
 
 STOP = Latch(
-    1_800_000_000_000, NOW.wall_ns, "joe@laptop (native)", "stopped by joe@laptop (native)"
+    1_800_000_000_000,
+    NOW.wall_ns,
+    "joe@laptop (native)",
+    "stopped by joe@laptop (native)",
+    "stopped",
 )
-FAULT = Latch(1_800_000_000_001, NOW.wall_ns, "", "front_left turns by itself")
-INACTIVE = Latch(1_800_000_000_002, NOW.wall_ns, "page", "switched off by page")
+FAULT = Latch(1_800_000_000_001, NOW.wall_ns, "", "front_left turns by itself", "wheel_runaway")
+INACTIVE = Latch(1_800_000_000_002, NOW.wall_ns, "page", "switched off by page", "switched_off")
 ALL = Latches(STOP, FAULT, INACTIVE)
+
+CANNOT_BE_READ = at_start("the file cannot be read")
 
 texts = st.text(st.characters(codec=None), max_size=600)
 latch = st.builds(
-    Latch, st.integers(0, MAX_NUMBER), st.integers(0, 2**63 - 1), texts, texts, st.booleans()
+    Latch,
+    st.integers(0, MAX_NUMBER),
+    st.integers(0, 2**63 - 1),
+    texts,
+    texts,
+    st.sampled_from(get_args(Code)),
+    texts,
+    st.booleans(),
 )
 several = st.builds(
     Latches,
@@ -75,7 +92,7 @@ def test_an_earlier_cause_with_earlier_causes_of_its_own_is_refused(name: str, d
     for _ in range(depth):
         nested = f'{cause[:-1]}, "earlier": [{nested}]}}'
     latches = f'{{"stop": null, "fault": null, "inactive": null, "{name}": {nested}}}'
-    data = f'{{"format": 1, "robot": "acsar", "latches": {latches}}}'.encode()
+    data = f'{{"format": {FORMAT}, "robot": "acsar", "latches": {latches}}}'.encode()
     if depth == 1:
         assert decode("acsar", data) is not None
         return
@@ -150,7 +167,7 @@ def test_a_file_without_one_of_its_names_is_refused() -> None:
 
 
 @each(
-    ("data", "reason"),
+    ("data", "words"),
     [
         (b"", "it is empty"),
         (b"\0" * 512, "it is empty"),
@@ -158,45 +175,47 @@ def test_a_file_without_one_of_its_names_is_refused() -> None:
         (b"[1, 2]", "it is damaged"),
         (b'{"format": "2"}', "it is damaged"),
         (
-            encode("acsar", ALL).replace(b'"format": 1', b'"format": 2'),
+            encode("acsar", ALL).replace(b'"format": 2', b'"format": 3'),
             "another version of acsard wrote the file",
         ),
-        (b'{"format": 2, "all": "new"}', "another version of acsard wrote the file"),
+        (b'{"format": 3, "all": "new"}', "another version of acsard wrote the file"),
         (encode("other", ALL), "belongs to the robot 'other'"),
     ],
 )
-def test_the_reason_says_how_the_file_is_wrong(data: bytes, reason: str) -> None:
-    with pytest.raises(LatchFileError, match=reason):
+def test_the_reason_says_how_the_file_is_wrong(data: bytes, words: str) -> None:
+    with pytest.raises(LatchFileError, match=words):
         decode("acsar", data)
 
 
 def test_a_stop_by_the_daemon_is_newer_than_the_latches_beside_it() -> None:
     late = replace(FAULT, number=1_900_000_000_000)
-    made = stopped(Latches(fault=late), "the file cannot be read", NOW)
+    made = stopped(Latches(fault=late), CANNOT_BE_READ, NOW)
     assert made.fault == late
     number = late.number + 1 + NOW.mono_ns // 1_000_000
-    assert made.stop == Latch(number, NOW.wall_ns, "acsard", "the file cannot be read")
+    assert made.stop == Latch(
+        number, NOW.wall_ns, "acsard", CANNOT_BE_READ.text, "stopped_at_start"
+    )
 
 
 def test_the_number_of_a_stop_by_the_daemon_is_the_wall_time_in_ms() -> None:
-    made = stopped(Latches(), "the file cannot be read", NOW)
+    made = stopped(Latches(), CANNOT_BE_READ, NOW)
     assert made.stop is not None
     assert made.stop.number == 1_800_000_000_000
 
 
 @pytest.mark.parametrize("wall_ns", [0, -NS_PER_S])
 def test_a_wall_clock_that_was_never_set_gives_a_stop_the_number_0(wall_ns: int) -> None:
-    latches = stopped(Latches(), "stopped", Instant(1, wall_ns))
+    latches = stopped(Latches(), CANNOT_BE_READ, Instant(1, wall_ns))
     assert latches.stop
     assert latches.stop.number == 0
 
 
 def test_a_stop_by_the_daemon_does_not_replace_a_latched_stop() -> None:
-    assert stopped(ALL, "the file cannot be read", NOW) is ALL
+    assert stopped(ALL, CANNOT_BE_READ, NOW) is ALL
 
 
 def test_each_latch_of_a_file_that_cannot_be_written_takes_a_new_number() -> None:
-    made = after_failed_write(ALL, "the file cannot be written", NOW)
+    made = after_failed_write(ALL, at_start("the file cannot be written"), NOW)
     old = {latch.number for latch in (ALL.stop, ALL.fault, ALL.inactive) if latch}
     new = [latch.number for latch in (made.fault, made.inactive, made.stop) if latch]
     assert len(new) == 3
@@ -215,7 +234,7 @@ def test_two_unwritable_starts_with_a_wall_clock_set_back_have_different_numbers
     """
     wall_ns = NOW.wall_ns - 40_828_000_000_000
     starts = [
-        after_failed_write(ALL, "", Instant(mono_ns, wall_ns))
+        after_failed_write(ALL, CANNOT_BE_READ, Instant(mono_ns, wall_ns))
         for mono_ns in (76 * 10**9, 78 * 10**9)
     ]
     numbers = [
@@ -226,9 +245,10 @@ def test_two_unwritable_starts_with_a_wall_clock_set_back_have_different_numbers
 
 
 def test_a_file_without_a_stop_that_cannot_be_written_starts_the_robot_stopped() -> None:
-    made = after_failed_write(Latches(), "the file cannot be written", NOW)
+    made = after_failed_write(Latches(), at_start("the file cannot be written"), NOW)
     assert made.stop
-    assert made.stop.why == "the file cannot be written"
+    assert made.stop.code == "stopped_at_start"
+    assert "the file cannot be written" in made.stop.why
 
 
 class Keeper:
@@ -286,7 +306,7 @@ def test_a_stop_that_no_step_served_keeps_the_causes_of_the_stop_before_it() -> 
     keeper = Keeper()
     life = Lifecycle(active=True)
     life.stop("ann", 1, NOW)
-    life.press("a bumper is pressed", NOW)
+    life.press(reason("bumper", bumpers="a bumper is pressed"), NOW)
     Handover(life.latches, keeper).take_stops(life.latches, ["joe"], NOW)
     (latches,) = keeper.given
     assert latches.stop is not None
@@ -298,7 +318,7 @@ def test_a_stop_that_no_step_served_keeps_the_causes_of_the_stop_before_it() -> 
 def test_every_cause_of_a_stop_is_in_the_file_with_at_most_500_characters() -> None:
     life = Lifecycle(active=True)
     life.stop("a" * 600, 1, NOW)
-    life.press("a bumper is pressed", NOW)
+    life.press(reason("bumper", bumpers="a bumper is pressed"), NOW)
     latches = decode("r", encode("r", life.latches))
     assert latches.stop is not None
     first, second = latches.stop.causes
@@ -311,7 +331,7 @@ def test_every_cause_of_a_stop_is_in_the_file_with_at_most_500_characters() -> N
 
 @pytest.mark.parametrize("ahead", [-5, 0, 5])
 def test_a_stop_that_no_step_served_is_newer_than_the_stop_before_it(ahead: int) -> None:
-    earlier = Latch(NOW.wall_ns // 1_000_000 + ahead, 0, "anna", "stopped by anna")
+    earlier = Latch(NOW.wall_ns // 1_000_000 + ahead, 0, "anna", "stopped by anna", "stopped")
     keeper = Keeper()
     Handover(Latches(), keeper).take_stops(Latches(stop=earlier), ["joe"], NOW)
     (latches,) = keeper.given

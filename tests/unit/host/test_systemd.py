@@ -74,6 +74,7 @@ def outputs(
         linked=True,
         estimates=(),
         mode=mode,
+        code="commanded",
         reason=reason,
         link="up",
         source=source,

@@ -95,7 +95,7 @@ def test_a_recorded_drive_replays_bit_by_bit(bench: Bench) -> None:
 def test_a_drive_that_begins_with_kept_latches_replays_bit_by_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stop = Latch(5, START.wall_ns, "ann", "stopped by ann", kept=True)
+    stop = Latch(5, START.wall_ns, "ann", "stopped by ann", "stopped", kept=True)
     latches = Latches(stop=stop)
     bench = Bench(tmp_path, monkeypatch, latches=latches)
     bench.world.drive(0.5, 0.2, seconds=1.0)

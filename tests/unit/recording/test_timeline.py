@@ -291,7 +291,7 @@ def test_reasons_that_alternate_in_every_step_make_an_entry_a_second() -> None:
     steps, changes = tape.steps()[-500:], ReasonChanges()
     entries = list[TimelineEntry]()
     for number, step in enumerate(steps):
-        status = ("ready", "one" if number % 2 else "another", "up", "")
+        status = ("ready", "one" if number % 2 else "another", "up", "", "late")
         entries += changes.step(replace(step, recorded=replace(step.recorded, status=status)))
     seconds = (steps[-1].inputs.now.wall_ns - steps[0].inputs.now.wall_ns) / 1e9
     assert seconds - 1 < len(entries) <= seconds + 1
@@ -302,7 +302,7 @@ def test_reasons_that_differ_in_a_number_are_one_reason_but_names_with_digits_di
 
     def entries(reason: str, seconds: float) -> list[TimelineEntry]:
         now = replace(step.inputs.now, mono_ns=step.inputs.now.mono_ns + int(seconds * 1e9))
-        recorded = replace(step.recorded, status=("ready", reason, "up", ""))
+        recorded = replace(step.recorded, status=("ready", reason, "up", "", "late"))
         inputs = replace(step.inputs, now=now)
         return [*changes.step(replace(step, inputs=inputs, recorded=recorded))]
 

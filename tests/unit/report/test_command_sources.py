@@ -9,7 +9,7 @@ import pytest
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Twist, Vector3
 from acsard.core.messages.signature import Signature
-from acsard.core.motion.arbiter_text import REFUSED
+from acsard.core.motion.arbiter_text import OBJECTIONS
 from acsard.core.thinning import Span
 from acsard.recording.state import thaw
 from acsard.report.command_sources import OTHER_SOURCES
@@ -90,7 +90,7 @@ def test_a_report_of_a_later_file_does_not_give_the_reasons_of_earlier_refusals(
     ((first, state),) = tape.states.items()
     report = report_from(tape.steps(first), state=thaw(state))
     (refused,) = [s for s in report.sources.bands["app"].spans() if s.kind == "refused"]
-    assert refused.words == REFUSED["stale"]
+    assert refused.words == OBJECTIONS["stale"]
 
 
 def test_the_refusal_of_a_command_has_no_reason_of_an_earlier_step_without_commands() -> None:
@@ -103,7 +103,7 @@ def test_the_refusal_of_a_command_has_no_reason_of_an_earlier_step_without_comma
 
     report, _ = report_of(delayed)
     (refused,) = [s for s in report.sources.bands["app"].spans() if s.kind == "refused"]
-    assert refused.words == REFUSED["stale"]
+    assert refused.words == OBJECTIONS["stale"]
 
 
 def test_a_source_that_never_sent_has_no_band() -> None:

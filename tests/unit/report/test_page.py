@@ -68,10 +68,10 @@ def evil_steps() -> list[RecordedStep]:
         if n == 150:
             now_ns = inputs.now.mono_ns
             command = Command(EVIL, Twist(), now_ns, sender=EVIL)
-            refusal = Refusal("undecodable", f"cmd/nav: {EVIL}", "nav", EVIL, now_ns)
+            refusal = Refusal("malformed", f"cmd/nav: {EVIL}", "nav", EVIL, now_ns)
             inputs = replace(inputs, commands=(command,), refusals=(refusal,))
             event = Event("stop", EVIL, by=EVIL)
-            record = replace(record, events=(event,), status=(EVIL, EVIL, EVIL, EVIL))
+            record = replace(record, events=(event,), status=(EVIL,) * 5)
         new_steps.append(replace(step, inputs=inputs, recorded=record))
     return new_steps
 

@@ -119,7 +119,7 @@ def test_a_put_on_a_wildcard_is_not_a_state(robot: Robot) -> None:
 
 def test_a_state_of_another_version_is_reported_as_such(robot: Robot) -> None:
     feed = feed_of(robot)
-    robot.state = DecodeError("bad", "unknown field")
+    robot.state = DecodeError("wrong_shape", "unknown field")
     with pytest.raises(ReplyError, match="a different version"):
         feed.query_state()
     assert feed.screen_data().undecodable == 1

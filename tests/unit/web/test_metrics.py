@@ -66,7 +66,7 @@ def test_without_feedback_no_speed_is_reported() -> None:
 
 def test_each_warning_of_a_later_failure_is_a_sample() -> None:
     own = ("robot", "acsar")
-    ends = replace(STATE, certificate_expiry="expires in 10 days", certificate_days=10.0)
+    ends = replace(STATE, certificate="expires", certificate_days=10.0)
     samples = parsed(text("acsar", "0.1.0+g1a2b3c4d5", ends, True, 0, {}, {}))
     assert samples["acsard_info", frozenset({own, ("version", "0.1.0+g1a2b3c4d5")})] == 1
     warned = {dict(labels)["what"]: n for (name, labels), n in samples.items() if "warning" in name}

@@ -13,7 +13,6 @@ from acsard.calibration.guided.leg_driver import STALL_REASON, LegDriver, Phase
 from acsard.client.commander import OPEN_TIMEOUT_S
 from acsard.client.follower import MAX_STATE_AGE_S
 from acsard.core.config.settings import Config, DriveConfig, LimitsConfig
-from acsard.core.link.link_diagnosis import HOST_STALL
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.limits import Limiter
@@ -183,7 +182,7 @@ def of_two(leg: Leg, sender: str) -> World:
 
 def test_a_link_that_was_lost_because_this_computer_did_not_run_is_a_passing_disturbance() -> None:
     world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
-    world.tells = changed(mode="waiting", reason=f"{HOST_STALL} 0.4 s")
+    world.tells = changed(mode="waiting", code="host_late")
     assert world.run(1.0).driver.disturbed
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.config.live import LIVE, changed, find_live_setting, flat
+from acsard.core.config.live import LIVE, changed, describe_changes, find_live_setting, flat
 from acsard.core.config.parsing import ConfigError, effective, parse
 from acsard.core.config.settings import Config, LimitsConfig, RobotConfig
 from acsard.core.config.toml_text import document
@@ -74,7 +74,9 @@ def test_a_change_sets_exactly_the_given_keys() -> None:
     after = dict(flat(effective(made)))
     assert {key for key in KEYS if KEYS[key] != after[key]} == {"limits.linear_speed", "log.level"}
     assert (made.limits.linear_speed, made.log.level) == (0.8, "debug")
-    assert news == 'limits.linear_speed = 0.8 (was 1.0), log.level = "debug" (was "info")'
+    assert news == {"limits.linear_speed": (1.0, 0.8), "log.level": ("info", "debug")}
+    text = 'limits.linear_speed = 0.8 (was 1.0), log.level = "debug" (was "info")'
+    assert describe_changes(news) == text
 
 
 def test_the_timeout_of_a_source_is_set_by_the_name_of_the_source() -> None:
@@ -109,7 +111,7 @@ def test_whole_numbers_are_accepted_as_floats() -> None:
     ],
 )
 def test_setting_a_key_to_its_present_value_changes_nothing(wishes: dict[str, object]) -> None:
-    assert changed(CONFIG, wishes, False) == (CONFIG, "")
+    assert changed(CONFIG, wishes, False) == (CONFIG, {})
 
 
 VALUES: dict[str, list[object]] = {

@@ -37,6 +37,7 @@ from acsard.core.messages.schema import MESSAGES, Info, Interfaces, Message, Ser
 from acsard.core.messages.signature import public_name
 from acsard.core.ros import parameters as rcl
 from acsard.core.ros.attachments import Attachment, unpack
+from acsard.core.ros.shapes import Trigger
 from acsard.core.ros.transports import PARAMETER_SERVICES
 from acsard.core.values import ROLES, Answer, Outputs, Plain, Pose, Request
 from tests.each import each
@@ -415,7 +416,8 @@ def test_a_service_answers_in_the_requested_format_or_else_in_that_of_the_payloa
     assert isinstance(made.serve(asked, nothing, None), Request)
     reply = made.answered(Answer(7, True, "done"), WALL_NS)
     assert reply is not None
-    assert reply.payload == encode(ServiceReply(True, "done"), form)
+    message = Trigger(True, "done") if form == "cdr" else ServiceReply(True, "done")
+    assert reply.payload == encode(message, form)
     assert reply.encoding == encoding_name(form, "ServiceReply")
 
 
@@ -489,7 +491,7 @@ def test_a_ros_trigger_makes_a_request_to_the_robot_and_its_answer_is_cdr(
     assert request == Request(verb, 7, asked_ns=99, by=by)  # type: ignore[arg-type]
     reply = made.answered(Answer(7, True, "done"), WALL_NS)
     assert reply is not None
-    assert Cdr(ServiceReply).decode(reply.payload) == ServiceReply(True, "done")
+    assert Cdr(Trigger).decode(reply.payload) == Trigger(True, "done")
     assert reply.ok
 
 
@@ -603,7 +605,7 @@ def test_a_rejected_ros_trigger_gets_a_reply_with_the_reason(via: str) -> None:
     reply = refused(ros_query("srv/clear", via), BUSY, WALL_NS)
     assert reply is not None
     assert (reply.ok, reply.key, reply.ticket) == (True, "srv/clear", 7)
-    assert Cdr(ServiceReply).decode(reply.payload) == ServiceReply(False, BUSY)
+    assert Cdr(Trigger).decode(reply.payload) == Trigger(False, BUSY)
 
 
 def test_a_rejected_native_query_gets_an_error_with_the_reason() -> None:
@@ -632,7 +634,7 @@ def test_replies_to_ros_callers_name_the_services_as_ros_does(
     words = "call srv/clear first; srv/activate switches it on, not srv/clearance"
     reply = made.answered(Answer(7, True, words), WALL_NS)
     assert reply is not None
-    message = Cdr(ServiceReply).decode(reply.payload).message
+    message = Cdr(Trigger).decode(reply.payload).message
     assert message == f"call {clear} first; {activate} switches it on, not srv/clearance"
 
 

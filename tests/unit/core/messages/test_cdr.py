@@ -41,7 +41,6 @@ from acsard.core.messages.schema import (
     PoseWithCovariance,
     Quaternion,
     RobotState,
-    ServiceReply,
     TFMessage,
     Time,
     Transform,
@@ -52,6 +51,7 @@ from acsard.core.messages.schema import (
     Vector3,
 )
 from acsard.core.ros.parameters import ListRequest, Names, SetRequest
+from acsard.core.ros.shapes import Trigger
 from tests.each import each
 
 LITTLE, BIG = b"\x00\x01\x00\x00", b"\x00\x00\x00\x00"
@@ -79,7 +79,7 @@ ROS_NAMES: dict[type[Struct], str] = {
     Battery: "sensor_msgs/msg/BatteryState",
     PoseStamped: "geometry_msgs/msg/PoseStamped",
     DiagnosticArray: "diagnostic_msgs/msg/DiagnosticArray",
-    ServiceReply: "std_srvs/msg/Trigger",
+    Trigger: "std_srvs/msg/Trigger",
 }
 
 
@@ -153,8 +153,8 @@ def odometry(frame: str, child: str) -> Odometry:
     ("message", "golden"),
     [
         (Twist(Vector3(0.5), Vector3(z=0.25)), HALF + "00" * 32 + QUARTER),
-        (ServiceReply(True, "ok"), "01000000 03000000 6f6b00"),
-        (ServiceReply(False, ""), "00000000 01000000 00"),
+        (Trigger(True, "ok"), "01000000 03000000 6f6b00"),
+        (Trigger(False, ""), "00000000 01000000 00"),
         (Empty(), "00"),
         (TFMessage([]), "00000000"),
         (
@@ -192,7 +192,7 @@ def test_a_message_has_the_expected_bytes(message: Struct, golden: str) -> None:
         (TwistStamped(Header(Time(), "base_link"), Twist(Vector3(), Vector3())), 76),
         (odometry("odom", "base_link"), 724),
         (odometry("", ""), 708),
-        (ServiceReply(True, "ok"), 15),
+        (Trigger(True, "ok"), 15),
         (Empty(), 5),
     ],
 )
@@ -235,7 +235,7 @@ maybe = float32 | st.none()
 byte = st.integers(0, 255)
 cells = st.lists(float32, max_size=9)
 
-MESSAGES: dict[type[Message], st.SearchStrategy[Any]] = {
+MESSAGES: dict[type[Any], st.SearchStrategy[Any]] = {
     Twist: twist,
     TwistStamped: st.builds(TwistStamped, header, twist),
     Odometry: st.builds(
@@ -250,7 +250,7 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Any]] = {
         JointState, header, st.lists(text, max_size=5), numbers, numbers, numbers
     ),
     DiagnosticArray: st.builds(DiagnosticArray, header, st.lists(status, max_size=4)),
-    ServiceReply: st.builds(ServiceReply, st.booleans(), text),
+    Trigger: st.builds(Trigger, st.booleans(), text),
     Battery: st.builds(
         Battery, header, *[maybe] * 7, *[byte] * 3, st.booleans(), cells, cells, text, text
     ),
@@ -323,9 +323,9 @@ def test_a_level_is_one_unsigned_byte(level: int) -> None:
 
 @pytest.mark.parametrize("length", [70_000, 1_000_000])
 def test_a_very_long_text_is_encoded_like_in_ros(length: int) -> None:
-    message = ServiceReply(True, "ä" * length)
+    message = Trigger(True, "ä" * length)
     assert encoded(message) == oracle_bytes(message)
-    assert Cdr(ServiceReply).decode(encoded(message)) == message
+    assert Cdr(Trigger).decode(encoded(message)) == message
 
 
 @each("value", [math.inf, -math.inf, -0.0, 5e-324, 1.7976931348623157e308])
@@ -635,10 +635,10 @@ def test_a_time_with_a_billion_or_more_nanoseconds_is_refused() -> None:
 def test_a_boolean_other_than_zero_or_one_is_refused(value: int) -> None:
     payload = LITTLE + bytes([value, 0, 0, 0]) + struct.pack("<I1s", 1, b"\0")
     if value < 2:
-        assert Cdr(ServiceReply).decode(payload) == ServiceReply(bool(value), "")
+        assert Cdr(Trigger).decode(payload) == Trigger(bool(value), "")
         return
     with pytest.raises(CdrError):
-        Cdr(ServiceReply).decode(payload)
+        Cdr(Trigger).decode(payload)
 
 
 @pytest.mark.parametrize("value", [2, 0xFF])
@@ -670,17 +670,17 @@ def reply_saying(length: int, raw: bytes) -> bytes:
 )
 def test_a_string_without_terminator_or_not_utf8_is_refused(length: int, raw: bytes) -> None:
     with pytest.raises(CdrError):
-        Cdr(ServiceReply).decode(reply_saying(length, raw))
+        Cdr(Trigger).decode(reply_saying(length, raw))
 
 
 def test_a_string_of_length_zero_is_empty() -> None:
-    assert Cdr(ServiceReply).decode(reply_saying(0, b"")) == ServiceReply(True, "")
+    assert Cdr(Trigger).decode(reply_saying(0, b"")) == Trigger(True, "")
 
 
 @each("length", [2**32 - 1, 2**31, 2**31 - 1, 10**6, 4])
 def test_a_string_longer_than_the_payload_is_refused(length: int) -> None:
     with pytest.raises(CdrError, match=str(length)):
-        Cdr(ServiceReply).decode(reply_saying(length, b"ok\0"))
+        Cdr(Trigger).decode(reply_saying(length, b"ok\0"))
 
 
 NO_ITEMS: list[tuple[Message, int]] = [
@@ -821,7 +821,7 @@ def test_decoding_many_sequence_lengths_keeps_no_memory_per_length() -> None:
 # damage
 
 
-def samples() -> list[Message]:
+def samples() -> list[Any]:
     turned = Transform(Vector3(1.0, 2.0, 3.0), Quaternion(0.0, 0.0, 0.6, 0.8))
     speed = Twist(Vector3(0.5), Vector3(z=-0.25))
     now = Time(1_700_000_000, 123_456_789)
@@ -838,7 +838,7 @@ def samples() -> list[Message]:
                 DiagnosticStatus(0, "", "", "", []),
             ],
         ),
-        ServiceReply(True, "stopped"),
+        Trigger(True, "stopped"),
         Battery(Header(now, ""), 24.25, None, -1.5, percentage=0.875, present=True, location="a"),
     ]
 

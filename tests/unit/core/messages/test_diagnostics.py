@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from acsard.core.codes import Reason, reason
 from acsard.core.config.settings import (
     BatteryConfig,
     BusConfig,
@@ -20,7 +21,7 @@ from acsard.core.messages.diagnostics import ERROR, OK, SHOW_REFUSAL_S, WARN, di
 from acsard.core.messages.schema import DiagnosticStatus
 from acsard.core.motion.battery import MISSING_REASON as MISSING_BATTERY
 from acsard.core.motion.bumpers import SILENT_REASON as SILENT_BUMPERS
-from acsard.core.motion.bumpers import missing_text
+from acsard.core.motion.bumpers import missing_reason
 from acsard.core.motion.emergency_stop import (
     DRIVER_FAULT_REASON,
     MISSING_REASON,
@@ -44,7 +45,7 @@ from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT
 
 CONFIG = Config(robot=RobotConfig("r7"), mcu=McuConfig(port="/dev/x"))
 BUMPERS = replace(CONFIG, safety=SafetyConfig(bumpers=("front", "rear")))
-NO_CERTIFICATE = (0, "")
+NO_CERTIFICATE = ("", "")
 
 
 def rows(
@@ -101,8 +102,8 @@ def test_a_configured_gyro_has_a_row_in_each_of_its_states(does: Any) -> None:
     [
         ("", OK, "no emergency-stop input"),
         ("released", OK, "emergency stop released"),
-        ("pressed", WARN, PRESSED_REASON),
-        ("silent", ERROR, SILENT_REASON),
+        ("pressed", WARN, PRESSED_REASON.text),
+        ("silent", ERROR, SILENT_REASON.text),
     ],
 )
 def test_a_board_that_sends_status_lines_has_a_row(estop: Any, level: int, message: str) -> None:
@@ -119,21 +120,26 @@ def test_a_board_that_sends_status_lines_has_a_row(estop: Any, level: int, messa
 def test_a_required_emergency_stop_has_a_row_before_the_board_reports_it() -> None:
     config = replace(CONFIG, safety=SafetyConfig(estop="required"))
     status = row("board", config)
-    assert (status.level, status.message) == (ERROR, MISSING_REASON)
+    assert (status.level, status.message) == (ERROR, MISSING_REASON.text)
     assert row("board", config, snapshot=changed_snapshot(estop="released")).level == OK
 
 
 @each(
     ("bumpers", "why", "level", "message"),
     [
-        (None, "", ERROR, missing_text(BUMPERS.safety)),
-        ((False, False), "", OK, "2 bumpers released"),
-        ((True, False), "front bumper pressed", WARN, "front bumper pressed"),
-        ((True, True), SILENT_BUMPERS, ERROR, SILENT_BUMPERS),
+        (None, None, ERROR, missing_reason(BUMPERS.safety).text),
+        ((False, False), None, OK, "2 bumpers released"),
+        (
+            (True, False),
+            reason("bumper", bumpers="front bumper pressed"),
+            WARN,
+            "front bumper pressed",
+        ),
+        ((True, True), SILENT_BUMPERS, ERROR, SILENT_BUMPERS.text),
     ],
 )
 def test_the_row_of_the_board_shows_the_state_of_its_bumpers(
-    bumpers: Any, why: str, level: int, message: str
+    bumpers: Any, why: Reason | None, level: int, message: str
 ) -> None:
     counters = {"bumper_presses": 1, "lines": 9}
     snapshot = changed_snapshot(estop="released", bumpers=bumpers, bumper=why, counters=counters)
@@ -151,7 +157,7 @@ def test_a_motor_drivers_fault_is_an_error_of_the_board() -> None:
     status = row("board", snapshot=changed_snapshot(board={"motor_driver": "fault"}))
     assert (status.level, status.message) == (
         ERROR,
-        f"no emergency-stop input; {DRIVER_FAULT_REASON}",
+        f"no emergency-stop input; {DRIVER_FAULT_REASON.text}",
     )
 
 

@@ -265,7 +265,8 @@ def test_state_is_the_summary_of_outputs_and_snapshot() -> None:
     assert published()["state"] == RobotState(
         stamp=Time(1_700_000_003, 254_000_002),
         mode="driving",
-        reason="driving: commanded by app",
+        code="commanded",
+        reason="commanded by app",
         x=1.6,
         y=-2.6,
         yaw=0.6,

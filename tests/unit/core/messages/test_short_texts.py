@@ -83,7 +83,7 @@ def test_the_line_of_a_state_ends_with_its_warnings() -> None:
     )  # fmt: skip
     assert short(state).endswith("  ready: waiting for a command")
     bad = replace(
-        state, recording_error="the disk is full", certificate_expiry="expires in 10 days"
+        state, recording_error="the disk is full", certificate="expires", certificate_days=10.0
     )
     assert short(bad).endswith("  WARNING: certificate expires in 10 days, recording fails")
     full = replace(state, battery=BatterySummary(24.5, 87.0, None, "ok"))

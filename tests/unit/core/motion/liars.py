@@ -15,6 +15,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from acsard.core.codes import Reason
 from acsard.core.config.settings import DriveConfig, OdometryConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.kinematics import Kinematics
@@ -131,7 +132,7 @@ def odometry(counts: int = 0) -> Odometry:
     return Odometry(OdometryConfig(), Kinematics(DriveConfig()), counts)
 
 
-def fold(robot: Odometry, line: Feedback, commanded: WheelSpeeds) -> tuple[Estimate, str]:
+def fold(robot: Odometry, line: Feedback, commanded: WheelSpeeds) -> tuple[Estimate, Reason | None]:
     """Return the estimate after a line, and the wheel fault that it proves."""
     fault = robot.checks.wheels.watch(commanded, line.speeds, line.dt)
     return robot.fold(line), fault

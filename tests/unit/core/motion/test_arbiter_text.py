@@ -6,10 +6,10 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from acsard.core.motion.arbiter import Choice, Objection
+from acsard.core.codes import Code, Reason
+from acsard.core.motion.arbiter import Choice
 from acsard.core.motion.arbiter_text import (
     MAX_SENDER_LENGTH,
-    REFUSED,
     CommandEvents,
     chosen,
     missed,
@@ -80,7 +80,7 @@ SENTENCES = [
 
 @each(("wait", "text"), SENTENCES)
 def test_the_text_of_a_wait_says_what_the_source_waits_for(wait: Wait, text: str) -> None:
-    assert waiting(wait) == text
+    assert (waiting(wait).code, waiting(wait).text) == (wait.what, text)
 
 
 def test_the_table_of_sentences_has_every_kind_of_wait() -> None:
@@ -107,14 +107,11 @@ def test_the_table_of_sentences_has_every_kind_of_wait() -> None:
 def test_the_text_of_a_choice_names_the_followed_source_or_what_is_missing(
     choice: Choice, text: str
 ) -> None:
-    assert chosen(choice) == text
+    assert chosen(choice).text == text
 
 
-def test_every_reason_to_refuse_a_command_has_a_text() -> None:
-    assert {"", *REFUSED} == {*get_args(Objection)}
-    assert (
-        REFUSED["too_many_senders"] == "16 other senders of this source are active; end one first"
-    )
+def why(code: Code) -> Reason:
+    return Reason(code, "")
 
 
 NOBODY = Choice()
@@ -125,54 +122,55 @@ def by(source: str, sender: str) -> Choice:
 
 
 def test_the_first_mode_is_not_reported() -> None:
-    assert CommandEvents(Mode.WAITING).changes(Mode.WAITING, NOBODY, "no link") == []
+    assert CommandEvents(Mode.WAITING).changes(Mode.WAITING, NOBODY, why("booting")) == []
 
 
 def test_a_change_of_mode_is_reported_once_with_its_reason() -> None:
     reporter = CommandEvents(Mode.WAITING)
-    assert reporter.changes(Mode.READY, NOBODY, "waiting for a command") == [
-        Event("mode", "waiting for a command", kind="waiting -> ready")
+    assert reporter.changes(Mode.READY, NOBODY, why("no_command")) == [
+        Event("mode", "", kind="waiting -> ready", code="no_command")
     ]
-    assert reporter.changes(Mode.READY, NOBODY, "another reason") == []
+    assert reporter.changes(Mode.READY, NOBODY, why("late")) == []
 
 
 def test_a_new_commander_is_reported_with_the_mode_and_as_the_commander() -> None:
     mode, commander = CommandEvents(Mode.READY).changes(
-        Mode.DRIVING, by("app", "joe"), "driving: by app"
+        Mode.DRIVING, by("app", "joe"), why("commanded")
     )
-    assert mode == Event("mode", "commanded by app", by="app (joe)", kind="ready -> driving")
+    kind = "ready -> driving"
+    assert mode == Event("mode", "commanded by app", by="app (joe)", kind=kind, code="commanded")
     assert commander == Event("commander", "", by="app (joe)", kind="no sender -> app (joe)")
 
 
 def test_a_change_of_commander_is_reported_with_the_previous_commander() -> None:
     reporter = CommandEvents(Mode.READY)
-    reporter.changes(Mode.DRIVING, by("app", "joe"), "")
-    (source,) = reporter.changes(Mode.DRIVING, by("nav", "joe"), "")
-    (sender,) = reporter.changes(Mode.DRIVING, by("nav", "ann"), "")
+    reporter.changes(Mode.DRIVING, by("app", "joe"), why("commanded"))
+    (source,) = reporter.changes(Mode.DRIVING, by("nav", "joe"), why("commanded"))
+    (sender,) = reporter.changes(Mode.DRIVING, by("nav", "ann"), why("commanded"))
     assert (source.kind, source.by) == ("app (joe) -> nav (joe)", "nav (joe)")
     assert sender.kind == "nav (joe) -> nav (ann)"
 
 
 def test_a_commander_that_drives_on_after_a_rest_is_not_reported_again() -> None:
     reporter = CommandEvents(Mode.READY)
-    reporter.changes(Mode.DRIVING, by("app", "joe"), "")
-    reporter.changes(Mode.READY, NOBODY, "waiting for a command")
-    (event,) = reporter.changes(Mode.DRIVING, by("app", "joe"), "")
+    reporter.changes(Mode.DRIVING, by("app", "joe"), why("commanded"))
+    reporter.changes(Mode.READY, NOBODY, why("no_command"))
+    (event,) = reporter.changes(Mode.DRIVING, by("app", "joe"), why("commanded"))
     assert event.name == "mode"
 
 
 def test_a_sender_to_a_stopped_robot_is_not_reported_as_commander() -> None:
     reporter = CommandEvents(Mode.STOPPED)
     choice = Choice("app", Twist(1.0, 0.0), Wait("nothing"), 1, "joe")
-    assert reporter.changes(Mode.STOPPED, choice, "stopped") == []
+    assert reporter.changes(Mode.STOPPED, choice, why("stopped")) == []
 
 
 def test_a_source_whose_speeds_have_no_effect_for_three_seconds_is_reported_once() -> None:
     reporter = CommandEvents(Mode.READY)
     early = Choice("nav", None, Wait("neutral", "nav", 1.0, ros=True), sender="joe")
-    assert reporter.changes(Mode.READY, early, "") == []
+    assert reporter.changes(Mode.READY, early, why("neutral")) == []
     late = Choice("nav", None, Wait("neutral", "nav", 1.0, lasts=3.0, ros=True), sender="joe")
-    (event,) = reporter.changes(Mode.READY, late, "")
+    (event,) = reporter.changes(Mode.READY, late, why("commanded"))
     assert (event.name, event.level, event.by) == (
         "commands_without_effect",
         "warning",
@@ -180,18 +178,18 @@ def test_a_source_whose_speeds_have_no_effect_for_three_seconds_is_reported_once
     )
     assert "ros2 topic pub" in event.text
     later = Choice("nav", None, Wait("neutral", "nav", 1.0, lasts=10.0, ros=True), sender="joe")
-    assert reporter.changes(Mode.READY, later, "") == []
-    reporter.changes(Mode.READY, NOBODY, "")
-    assert len(reporter.changes(Mode.READY, late, "")) == 1
+    assert reporter.changes(Mode.READY, later, why("neutral")) == []
+    reporter.changes(Mode.READY, NOBODY, why("commanded"))
+    assert len(reporter.changes(Mode.READY, late, why("neutral"))) == 1
 
 
 def test_a_source_held_up_by_zeros_is_reported_once_however_often_it_pauses() -> None:
     reporter = CommandEvents(Mode.READY)
-    reporter.changes(Mode.DRIVING, by("app", "joe"), "")
+    reporter.changes(Mode.DRIVING, by("app", "joe"), why("commanded"))
 
     def zeros(source: str) -> list[Event]:
         choice = Choice("app", REST, Wait("zeros", "app", lasts=3.0, kept=source), 1, "joe")
-        return reporter.changes(Mode.DRIVING, choice, "")
+        return reporter.changes(Mode.DRIVING, choice, why("commanded"))
 
     assert zeros("") == []
     (event,) = zeros("nav")
@@ -203,7 +201,7 @@ def test_a_source_held_up_by_zeros_is_reported_once_however_often_it_pauses() ->
 
 def test_a_sender_to_a_stopped_robot_is_not_reported_as_waiting() -> None:
     choice = Choice("nav", None, Wait("neutral", "nav", 1.0, lasts=3.0), sender="joe")
-    assert CommandEvents(Mode.STOPPED).changes(Mode.STOPPED, choice, "stopped") == []
+    assert CommandEvents(Mode.STOPPED).changes(Mode.STOPPED, choice, why("stopped")) == []
 
 
 def test_the_event_of_a_refusal_has_its_reason_its_text_and_its_sender() -> None:
@@ -215,6 +213,7 @@ def test_the_event_of_a_refusal_has_its_reason_its_text_and_its_sender() -> None
         ("joe" * 100)[:MAX_SENDER_LENGTH],
         "stale",
         news=False,
+        code="stale",
     )
 
 

@@ -150,8 +150,8 @@ def test_the_stop_is_reported_once_and_held_until_the_hysteresis() -> None:
     pack = Pack()
     pack.at(20.9, 5.0)
     assert (pack.stops, pack.battery.refuses_clear) == (1, True)
-    assert pack.battery.why == "battery below battery.stop_below = 21 V"
-    assert pack.battery.mend == "charge the battery to 21.4 V"
+    assert pack.battery.why.text == "battery below battery.stop_below = 21 V"
+    assert pack.battery.refusal.advice == "charge the battery to 21.4 V"
     pack.at(21.3, 60.0)
     assert pack.battery.refuses_clear
     pack.at(24.0, 10.0)

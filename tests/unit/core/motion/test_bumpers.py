@@ -8,16 +8,16 @@ from typing import get_args
 
 import pytest
 
+from acsard.core.codes import Reason, joined, reason
 from acsard.core.config.settings import Place, SafetyConfig
 from acsard.core.link.board_status import BoardStatus
 from acsard.core.motion.bumpers import (
     DIRECTIONS,
     SILENT_REASON,
     Bumpers,
-    missing_text,
+    missing_reason,
     pressed_words,
 )
-from acsard.core.motion.emergency_stop import CHECK, RELEASE
 from acsard.core.values import REST, Event, Twist
 
 MS = 1_000_000
@@ -82,12 +82,21 @@ def test_each_place_allows_only_the_straight_motion_that_leads_away(
             assert allowed == Twist(sign * min(0.1, abs(twist.linear)), 0.0)
 
 
+def words(why: Reason | None) -> str:
+    return "" if why is None else why.text
+
+
+def pressed(bumpers: str) -> Reason:
+    words = f"{bumpers} pressed"
+    return reason("bumper", part=words, bumpers=words)
+
+
 def test_two_bumpers_at_one_place_allow_the_same_motion_as_one() -> None:
     pins = away("front", "front", "rear")
     for pressed in ("X..", ".X.", "XX."):
         pins.step(pressed)
         assert pins.bumpers.away(Twist(-0.5, 1.0)) == Twist(-0.1, 0.0)
-        assert pins.bumpers.note() == (
+        assert joined(pins.bumpers.limit()).text == (
             "front bumper pressed: the robot drives only straight backwards, at most 0.1 m/s"
         )
 
@@ -112,10 +121,10 @@ def test_a_pressed_bumper_that_limits_says_which_motion_it_allows(pressed: str, 
     pins.step("....")
     pins.step(pressed)
     assert pins.bumpers.limiting
-    assert pins.bumpers.clear_refusal == ""
-    assert pins.bumpers.note() == note
+    assert pins.bumpers.clear_refusal is None
+    assert joined(pins.bumpers.limit()).text == note
     why, _, rest = note.partition(": ")
-    assert pins.events[-1] == Event("bumper_pressed", f"{why}; {rest}", "error")
+    assert pins.events[-1] == Event("bumper_pressed", f"{why}; {rest}", "error", code="bumper")
 
 
 def test_the_text_names_the_place_or_the_number_of_each_pressed_bumper() -> None:
@@ -129,18 +138,19 @@ def test_a_press_counts_immediately_until_the_release() -> None:
     pins.step("..")
     assert pins.step("X.") == "pressed"
     assert pins.bumpers.pressed == (True, False)
-    assert pins.bumpers.pressed_now == pins.bumpers.clear_refusal == "front bumper pressed"
-    assert pins.bumpers.mend == RELEASE
+    assert pins.bumpers.pressed_now == pins.bumpers.clear_refusal == pressed("front bumper")
     assert not pins.bumpers.limiting
     pins.step("X.")
-    assert (pins.bumpers.pressed_now, pins.bumpers.clear_refusal) == ("", "front bumper pressed")
+    assert words(pins.bumpers.pressed_now) == ""
+    assert words(pins.bumpers.clear_refusal) == "front bumper pressed"
     assert pins.step("..") == "released"
-    assert (pins.bumpers.clear_refusal, pins.bumpers.pressed) == ("", (False, False))
+    assert (words(pins.bumpers.clear_refusal), pins.bumpers.pressed) == ("", (False, False))
     assert pins.events == [
         Event("bumper_released", "the board reports 2 bumpers, and none is pressed"),
         Event("bumper_pressed",
               "front bumper pressed; release it at the robot, then call srv/clear",
-              "error"),
+              "error",
+              code="bumper"),
         Event("bumper_released",
               "the bumpers are released; a latched stop lasts until srv/clear is called"),
     ]  # fmt: skip
@@ -150,13 +160,14 @@ def test_a_second_pressed_bumper_is_a_new_press_but_the_release_of_one_bumper_is
     pins = stop("front", "rear")
     pins.step("X.")
     pins.step("XX")
-    assert pins.bumpers.pressed_now == "front and rear bumpers pressed"
+    assert pins.bumpers.pressed_now == pressed("front and rear bumpers")
     pins.step(".X")
-    assert (pins.bumpers.pressed_now, pins.bumpers.clear_refusal) == ("", "rear bumper pressed")
+    assert words(pins.bumpers.pressed_now) == ""
+    assert words(pins.bumpers.clear_refusal) == "rear bumper pressed"
     assert len(pins.events) == 2
     pins.step("XX", ".X", "..")
     assert (pins.bumpers.pressed_now, pins.bumpers.state) == (
-        "front and rear bumpers pressed", "released",
+        pressed("front and rear bumpers"), "released",
     )  # fmt: skip
 
 
@@ -171,9 +182,10 @@ def test_half_a_second_of_silence_latches_with_both_choices(
     assert pins.step("") == "silent"
     assert pins.bumpers.pressed == (True, True)
     assert pins.bumpers.pressed_now == pins.bumpers.clear_refusal == SILENT_REASON
-    assert pins.bumpers.mend == CHECK
     assert not pins.bumpers.limiting
-    assert pins.events[-1].text == f"{SILENT_REASON}; {CHECK}, then call srv/clear"
+    assert (
+        pins.events[-1].text == f"{SILENT_REASON.text}; {SILENT_REASON.advice}, then call srv/clear"
+    )
     assert pins.step("..") == "released"
 
 
@@ -200,7 +212,7 @@ def test_bumpers_with_places_are_missing_until_the_board_reports_their_number() 
 
 
 def test_the_missing_bumpers_are_named_with_the_field_of_the_line() -> None:
-    assert missing_text(SafetyConfig(bumpers=("front",))) == (
+    assert missing_reason(SafetyConfig(bumpers=("front",))).text == (
         "safety.bumpers has 1 place, but the microcontroller has not reported 1 bumper: does its "
         "firmware send status lines with `bumpers=.`?"
     )
@@ -220,7 +232,7 @@ def test_without_places_every_bumper_counts_wherever_it_is() -> None:
     assert pins.step("....") == ""
     assert pins.step("....") == "released"
     assert pins.step("..X.") == "pressed"
-    assert pins.bumpers.clear_refusal == "bumper 3 pressed"
+    assert pins.bumpers.clear_refusal == pressed("bumper 3")
 
 
 def test_without_places_the_first_line_with_another_number_of_bumpers_releases_nothing() -> None:
@@ -230,13 +242,13 @@ def test_without_places_the_first_line_with_another_number_of_bumpers_releases_n
     assert pins.step("....") == "pressed"
     assert pins.step("....") == "released"
     assert pins.step("X") == "pressed"
-    assert pins.bumpers.pressed_now == "bumper 1 pressed"
+    assert pins.bumpers.pressed_now == pressed("bumper 1")
 
 
 def test_without_places_no_motion_leads_away_so_a_press_latches() -> None:
     pins = away()
     pins.step("X")
-    assert (pins.bumpers.limiting, pins.bumpers.clear_refusal) == (False, "bumper 1 pressed")
+    assert (pins.bumpers.limiting, pins.bumpers.clear_refusal) == (False, pressed("bumper 1"))
 
 
 def test_bumpers_that_are_off_are_ignored() -> None:

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import pytest
 
-from acsard.core.motion.emergency_stop import CHECK, PRESSED_REASON, RELEASE, SILENT_REASON
+from acsard.core.codes import Reason
+from acsard.core.motion.emergency_stop import PRESSED_REASON, SILENT_REASON
 from acsard.core.motion.lifecycle import LATCH_REQUIRED_S, MAX_FAULTS, Lifecycle
 from acsard.core.motion.modes import Mode, RefusedError, mode_of
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
@@ -48,9 +49,17 @@ def activate(life: Lifecycle, seconds: float, number: int | None = None) -> bool
     return life.activate(number, ns(seconds), at(seconds))
 
 
-def press(life: Lifecycle, seconds: float, why: str = PRESSED_REASON) -> None:
+PRESSED, SILENT = PRESSED_REASON.text, SILENT_REASON.text
+
+
+def press(life: Lifecycle, seconds: float, why: Reason = PRESSED_REASON) -> None:
     life.press(why, at(seconds))
-    life.refuse_clear(why, CHECK if why == SILENT_REASON else RELEASE, ns(seconds))
+    life.refuse_clear(why, ns(seconds))
+
+
+def cause(text: str, advice: str = "") -> Reason:
+    """Return a cause of which the text up to a bracket is the identity."""
+    return Reason("driver_fault", text, advice, text.partition(" (")[0])
 
 
 def number(life: Lifecycle) -> int:
@@ -72,13 +81,13 @@ def mode(life: Lifecycle) -> Mode:
 def test_the_robot_starts_waiting_for_its_link_or_switched_off() -> None:
     assert Lifecycle(active=True).mode is Mode.WAITING
     off = Lifecycle(active=False)
-    assert (off.mode, off.why) == (Mode.INACTIVE, "switched off; call srv/activate")
+    assert (off.mode, off.why.text) == (Mode.INACTIVE, "switched off; call srv/activate")
     assert off.latches == Latches()
 
 
-STOP = Latch(7, WALL_NS, "ann", "stopped by ann", kept=True)
-FAULT = Latch(8, WALL_NS, "", "a wheel is dead", kept=True)
-OFF = Latch(9, WALL_NS, "joe", "switched off by joe", kept=True)
+STOP = Latch(7, WALL_NS, "ann", "stopped by ann", "stopped", kept=True)
+FAULT = Latch(8, WALL_NS, "", "a wheel is dead", "wheel_dead", kept=True)
+OFF = Latch(9, WALL_NS, "joe", "switched off by joe", "switched_off", kept=True)
 
 
 @each(
@@ -106,10 +115,18 @@ OFF = Latch(9, WALL_NS, "joe", "switched off by joe", kept=True)
             f"at {AT}:00 UTC, before the restart; call srv/clear twice, 2 s apart",
         ),
         (
-            Latches(stop=Latch(7, WALL_NS, "acsard", "stopped at the start, because", kept=True)),
+            Latches(
+                stop=Latch(
+                    7,
+                    WALL_NS,
+                    "acsard",
+                    "stopped at the start",
+                    "stopped_at_start",
+                    kept=True,
+                )
+            ),
             Mode.STOPPED,
-            f"stopped at the start, because (latched at {AT}:00 UTC, before the restart); "
-            "call srv/clear",
+            f"stopped at the start (latched at {AT}:00 UTC, before the restart); call srv/clear",
         ),
     ],
 )
@@ -117,12 +134,12 @@ def test_the_robot_starts_as_its_latches_say(latches: Latches, begins: Mode, why
     life = Lifecycle(active=True, latches=latches)
     life.link(up=True)
     life.command(fresh=True)
-    assert (life.mode, life.why) == (begins, why)
+    assert (life.mode, life.why.text) == (begins, why)
     assert life.latches is latches
 
 
 def test_after_restart_marks_every_latch_as_kept_and_changes_nothing_else() -> None:
-    fresh = [Latch(x.number, x.at_ns, x.by, x.why) for x in (STOP, FAULT, OFF)]
+    fresh = [Latch(x.number, x.at_ns, x.by, x.why, x.code) for x in (STOP, FAULT, OFF)]
     assert Latches(fresh[0], fresh[1], fresh[2]).after_restart() == Latches(STOP, FAULT, OFF)
     assert Latches().after_restart() == Latches()
 
@@ -134,7 +151,7 @@ def test_a_stop_latches_until_a_later_clear() -> None:
     life = ready()
     assert stop(life, 1.0) == "stopped and latched; srv/clear releases it"
     assert mode(life) is Mode.STOPPED
-    assert life.why == f"stopped by ann at {AT}:01 UTC; call srv/clear"
+    assert life.why.text == f"stopped by ann at {AT}:01 UTC; call srv/clear"
     done = clear(life, 1.5, number(life))
     assert done == "cleared; each sender must send a zero before it drives"
     assert (life.mode, life.latches) == (Mode.READY, Latches())
@@ -207,23 +224,23 @@ def test_a_press_keeps_the_name_of_the_client_that_stopped_the_robot() -> None:
     stop(life, 1.0)
     latch = number(life)
     press(life, 2.0)
-    life.refuse_clear("", "", ns(3.0))
-    both = f"{PRESSED_REASON} (latched at {AT}:02 UTC); also stopped by ann at {AT}:01 UTC"
-    assert life.why == f"{both}; call srv/clear"
+    life.refuse_clear(None, ns(3.0))
+    both = f"{PRESSED} (latched at {AT}:02 UTC); also stopped by ann at {AT}:01 UTC"
+    assert life.why.text == f"{both}; call srv/clear"
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, latch)
-    assert f"still stopped ({PRESSED_REASON}) and stopped by ann: look at" in str(caught.value)
+    assert f"still stopped ({PRESSED}) and stopped by ann: look at" in str(caught.value)
     assert clear(life, 9.0, number(life)).startswith("cleared; ")
     assert mode(life) is Mode.READY
     press(life, 10.0)
-    assert "ann" not in life.why
+    assert "ann" not in life.why.text
 
 
 def test_each_client_that_stopped_the_robot_is_named_and_the_last_one_first() -> None:
     life = ready()
     for seconds, name in ((1.0, "ann"), (2.0, "joe"), (3.0, "ann")):
         stop(life, seconds, name)
-    assert life.why == (
+    assert life.why.text == (
         f"stopped by ann at {AT}:03 UTC; also stopped by joe at {AT}:02 UTC; call srv/clear"
     )
 
@@ -236,23 +253,22 @@ def test_a_cause_that_comes_many_times_is_named_once_under_the_newest_number() -
         press(life, seconds + 0.5)
         numbers.append(number(life))
     assert numbers == sorted(set(numbers))
-    life.refuse_clear("", "", ns(60.0))
-    assert life.why == (
-        f"{PRESSED_REASON} (latched at {AT}:49 UTC); also stopped by ann at {AT}:49 UTC; call "
-        f"srv/clear"
+    life.refuse_clear(None, ns(60.0))
+    assert life.why.text == (
+        f"{PRESSED} (latched at {AT}:49 UTC); also stopped by ann at {AT}:49 UTC; call srv/clear"
     )
 
 
 def test_the_reason_after_many_stops_names_the_first_clients_the_last_and_each_press() -> None:
     life = ready()
     press(life, 0.5)
-    life.refuse_clear("", "", ns(0.6))
+    life.refuse_clear(None, ns(0.6))
     for client in range(1000):
         stop(life, 1.0 + client / 100, f"client {client}")
     press(life, 20.0, SILENT_REASON)
-    life.refuse_clear("", "", ns(21.0))
+    life.refuse_clear(None, ns(21.0))
     stop(life, 30.0, "joe")
-    why = life.why.replace(SILENT_REASON, "silent")
+    why = life.why.text.replace(SILENT, "silent")
     assert re.findall(r"(client \d+|joe|silent|pressed) ", why) == [
         "joe", "silent", "client 3", "client 2", "client 1", "client 0", "pressed",
     ]  # fmt: skip
@@ -263,7 +279,7 @@ def test_a_stop_in_the_step_of_a_press_is_named_although_it_arrived_before_the_p
     press(life, 1.0)
     pressed = number(life)
     life.stop("ann", ns(0.999), at(1.0))
-    assert life.why.startswith(f"stopped by ann at {AT}:01 UTC; also {PRESSED_REASON} (latched at ")
+    assert life.why.text.startswith(f"stopped by ann at {AT}:01 UTC; also {PRESSED} (latched at ")
     latched = life.latches
     assert number(life) > pressed
     press(life, 1.1, SILENT_REASON)
@@ -278,8 +294,8 @@ def test_two_stops_are_named_in_whichever_order_a_step_takes_them() -> None:
     life.stop("ann", ns(1.1), at(1.2))
     life.stop("joe", ns(1.0), at(1.2))
     latched = life.latches
-    assert "stopped by ann" in life.why
-    assert "stopped by joe" in life.why
+    assert "stopped by ann" in life.why.text
+    assert "stopped by joe" in life.why.text
     life.stop("ann", ns(1.1), at(1.3))
     life.stop("joe", ns(1.0), at(1.3))
     assert life.latches is latched
@@ -291,16 +307,16 @@ def test_every_cause_survives_restarts() -> None:
     press(life, 2.0)
     for _ in range(3):
         life = Lifecycle(active=True, latches=life.latches.after_restart())
-        assert life.why == (
-            f"{PRESSED_REASON} (latched at {AT}:02 UTC, before the restart); also was stopped by "
+        assert life.why.text == (
+            f"{PRESSED} (latched at {AT}:02 UTC, before the restart); also was stopped by "
             f"ann at {AT}:01 UTC, before the restart; call srv/clear"
         )
     press(life, 5.0, SILENT_REASON)
     life = Lifecycle(active=True, latches=life.latches.after_restart())
     press(life, 6.0)
-    life.refuse_clear("", "", ns(7.0))
-    assert life.why == (
-        f"{PRESSED_REASON} (latched at {AT}:06 UTC); also {SILENT_REASON} (latched at {AT}:05 UTC, "
+    life.refuse_clear(None, ns(7.0))
+    assert life.why.text == (
+        f"{PRESSED} (latched at {AT}:06 UTC); also {SILENT} (latched at {AT}:05 UTC, "
         f"before the restart); also was stopped by ann at {AT}:01 UTC, before the restart; call "
         "srv/clear"
     )
@@ -413,7 +429,7 @@ def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
     For a latch from the file they begin with the first step, because a booting computer's clock may
     be wrong by years.
     """
-    stop_at_start = Latch(7, WALL_NS, "ann", "stopped by ann", saved)
+    stop_at_start = Latch(7, WALL_NS, "ann", "stopped by ann", "stopped", kept=saved)
     life = Lifecycle(active=True, latches=Latches(stop=stop_at_start))
     for step_s in (10.0, 10.01, 11.5):
         life.begin(Instant(ns(step_s), WALL_NS + ns(wall_s)))
@@ -448,21 +464,21 @@ def test_a_named_clear_releases_a_stop_from_the_start_immediately() -> None:
 def both() -> Lifecycle:
     life = ready()
     stop(life, 1.0)
-    assert life.fault("a wheel is dead", at(2.0))
+    assert life.fault(cause("a wheel is dead"), at(2.0))
     return life
 
 
 def test_each_cause_of_a_fault_is_latched_once_with_a_new_number() -> None:
     """Two faults have the same cause if their texts differ only in measured values."""
     life = ready()
-    assert life.fault("the left wheel is slow (3 %)", at(1.0))
+    assert life.fault(cause("the left wheel is slow (3 %)"), at(1.0))
     first = life.latches.fault
-    assert not life.fault("the left wheel is slow (4 %)", at(2.0))
+    assert not life.fault(cause("the left wheel is slow (4 %)"), at(2.0))
     assert life.latches.fault == first
-    assert life.fault("the driver failed", at(3.0))
-    assert not life.fault("the left wheel is slow (5 %)", at(4.0))
+    assert life.fault(cause("the driver failed"), at(3.0))
+    assert not life.fault(cause("the left wheel is slow (5 %)"), at(4.0))
     assert mode(life) is Mode.FAULT
-    assert life.why == (
+    assert life.why.text == (
         f"the driver failed, latched at {AT}:03 UTC; also the left wheel is slow (3 %), latched at "
         f"{AT}:01 UTC; call srv/clear"
     )
@@ -476,14 +492,16 @@ def test_each_cause_of_a_fault_is_latched_once_with_a_new_number() -> None:
 
 def test_the_number_of_causes_of_a_fault_is_limited() -> None:
     life = ready()
-    latched = [life.fault(chr(65 + number), at(1.0 + number)) for number in range(MAX_FAULTS + 2)]
+    latched = [
+        life.fault(cause(chr(65 + number)), at(1.0 + number)) for number in range(MAX_FAULTS + 2)
+    ]
     assert latched == [True] * MAX_FAULTS + [False] * 2
 
 
 def test_a_fault_keeps_the_stop_and_each_is_cleared_separately() -> None:
     life = both()
     assert mode(life) is Mode.FAULT
-    assert life.why == (
+    assert life.why.text == (
         f"a wheel is dead, latched at {AT}:02 UTC; also stopped by ann at {AT}:01 UTC; "
         "call srv/clear twice, 2 s apart"
     )
@@ -503,7 +521,7 @@ def test_a_fault_keeps_the_stop_and_each_is_cleared_separately() -> None:
 
 def test_a_stop_keeps_the_fault() -> None:
     life = ready()
-    life.fault("a wheel is dead", at(1.0))
+    life.fault(cause("a wheel is dead"), at(1.0))
     message = stop(life, 2.0)
     assert message == (
         "stopped and latched; call srv/clear twice, 2 s apart: the first call releases the fault, "
@@ -518,7 +536,7 @@ def test_a_clear_named_for_a_stop_is_refused_when_a_fault_has_come() -> None:
     life = ready()
     stop(life, 1.0)
     latch = number(life)
-    life.fault("a wheel is dead", at(2.0))
+    life.fault(cause("a wheel is dead"), at(2.0))
     with pytest.raises(RefusedError, match=r"still in fault \(a wheel is dead\)"):
         clear(life, 9.0, latch)
     assert life.latches.stop is not None
@@ -526,10 +544,10 @@ def test_a_clear_named_for_a_stop_is_refused_when_a_fault_has_come() -> None:
 
 def test_a_clear_without_a_number_releases_a_fault_only_when_the_client_may_have_seen_it() -> None:
     life = ready()
-    life.fault("a wheel is dead", at(3.0))
+    life.fault(cause("a wheel is dead"), at(3.0))
     with pytest.raises(RefusedError, match=r"went into fault \(a wheel is dead\) 1\.5 s ago"):
         clear(life, 4.5)
-    life.fault("the driver failed", at(5.0))
+    life.fault(cause("the driver failed"), at(5.0))
     with pytest.raises(RefusedError, match=r"went into fault \(the driver failed\) 1\.9 s ago"):
         clear(life, 4.9 + LATCH_REQUIRED_S)
     clear(life, 5.0 + LATCH_REQUIRED_S)
@@ -538,9 +556,9 @@ def test_a_clear_without_a_number_releases_a_fault_only_when_the_client_may_have
 
 def test_the_second_delivery_of_a_clear_does_not_release_a_fault_that_came_between() -> None:
     life = ready()
-    life.fault("a wheel is dead", at(1.0))
+    life.fault(cause("a wheel is dead"), at(1.0))
     clear(life, 5.0)
-    life.fault("a wheel is dead", at(5.05))
+    life.fault(cause("a wheel is dead"), at(5.05))
     with pytest.raises(RefusedError, match=r"went into fault \(a wheel is dead\) 0\.1 s ago"):
         clear(life, 5.16)
     clear(life, 5.2, number(life))
@@ -559,7 +577,7 @@ def test_a_clear_without_a_number_is_refused_while_the_newest_of_fault_and_stop_
 
 def test_a_fault_from_before_a_restart_needs_a_number_in_the_first_two_seconds() -> None:
     before = ready()
-    before.fault("a wheel is dead", at(1.0))
+    before.fault(cause("a wheel is dead"), at(1.0))
     life = Lifecycle(True, before.latches)
     life.begin(at(10.0))
     life.link(up=True)
@@ -576,17 +594,15 @@ def test_a_pressed_emergency_stop_is_latched_and_says_what_to_do() -> None:
     life = ready()
     press(life, 1.0)
     assert mode(life) is Mode.STOPPED
-    latched = f"{PRESSED_REASON} (latched at {AT}:01 UTC)"
-    assert life.why == f"{latched}; release it at the robot, then call srv/clear"
+    latched = f"{PRESSED} (latched at {AT}:01 UTC)"
+    assert life.why.text == f"{latched}; release it at the robot, then call srv/clear"
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, number(life))
-    assert (
-        str(caught.value) == f"{PRESSED_REASON}: release it at the robot, then call srv/clear again"
-    )
-    life.refuse_clear("", "", ns(9.2))
+    assert str(caught.value) == f"{PRESSED}: release it at the robot, then call srv/clear again"
+    life.refuse_clear(None, ns(9.2))
     with pytest.raises(RefusedError, match="before the cause of the stop or fault had ended"):
         life.clear(number(life), ns(9.2), at(9.3))
-    assert (mode(life), life.why) == (Mode.STOPPED, f"{latched}; call srv/clear")
+    assert (mode(life), life.why.text) == (Mode.STOPPED, f"{latched}; call srv/clear")
     assert clear(life, 9.5, number(life)).startswith("cleared; ")
     assert mode(life) is Mode.READY
 
@@ -594,9 +610,8 @@ def test_a_pressed_emergency_stop_is_latched_and_says_what_to_do() -> None:
 def test_a_silent_input_names_the_board_and_its_cable() -> None:
     life = ready()
     press(life, 1.0, SILENT_REASON)
-    assert life.why == (
-        f"{SILENT_REASON} (latched at {AT}:01 UTC); check the board and its cable, then call "
-        f"srv/clear"
+    assert life.why.text == (
+        f"{SILENT} (latched at {AT}:01 UTC); check the board and its cable, then call srv/clear"
     )
 
 
@@ -604,32 +619,32 @@ def test_a_stop_and_a_fault_beside_a_pressed_emergency_stop_are_named_with_it() 
     life = ready()
     press(life, 1.0)
     stop(life, 2.0, "joe")
-    stopped = f"stopped by joe at {AT}:02 UTC; also {PRESSED_REASON} (latched at {AT}:01 UTC)"
-    assert life.why == f"{stopped}; release it at the robot, then call srv/clear"
-    life.fault("a wheel is dead", at(3.0))
-    assert life.why == (
+    stopped = f"stopped by joe at {AT}:02 UTC; also {PRESSED} (latched at {AT}:01 UTC)"
+    assert life.why.text == f"{stopped}; release it at the robot, then call srv/clear"
+    life.fault(cause("a wheel is dead"), at(3.0))
+    assert life.why.text == (
         f"a wheel is dead, latched at {AT}:03 UTC; also {stopped}; release it at the robot, then "
         "call srv/clear twice, 2 s apart"
     )
-    life.refuse_clear("", "", ns(8.0))
+    life.refuse_clear(None, ns(8.0))
     assert clear(life, 9.0) == (
         "fault cleared, but the robot is still stopped by joe and "
-        f"stopped ({PRESSED_REASON}): call srv/clear again in 2 s"
+        f"stopped ({PRESSED}): call srv/clear again in 2 s"
     )
-    assert life.why == f"{stopped}; call srv/clear"
+    assert life.why.text == f"{stopped}; call srv/clear"
 
 
 def test_a_fault_that_the_board_still_reports_is_not_cleared() -> None:
     life = ready()
-    life.fault("a motor driver is hot", at(1.0))
-    life.refuse_clear("a motor driver is hot", "let it cool", ns(1.0))
+    life.fault(cause("a motor driver is hot"), at(1.0))
+    life.refuse_clear(cause("a motor driver is hot", "let it cool"), ns(1.0))
     fault = f"a motor driver is hot, latched at {AT}:01 UTC"
-    assert life.why == f"{fault}; let it cool, then call srv/clear"
+    assert life.why.text == f"{fault}; let it cool, then call srv/clear"
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, number(life))
     assert str(caught.value) == "a motor driver is hot: let it cool, then call srv/clear again"
     stop(life, 10.0, "joe")
-    assert life.why == (
+    assert life.why.text == (
         f"{fault}; also stopped by joe at {AT}:10 UTC; let it cool, then call srv/clear twice, "
         "2 s apart"
     )
@@ -637,9 +652,9 @@ def test_a_fault_that_the_board_still_reports_is_not_cleared() -> None:
 
 def test_a_fault_beside_one_that_the_board_reports_names_both() -> None:
     life = ready()
-    life.fault("a wheel is dead", at(1.0))
-    life.refuse_clear("a motor driver is hot", "let it cool", ns(1.0))
-    assert life.why == (
+    life.fault(cause("a wheel is dead"), at(1.0))
+    life.refuse_clear(cause("a motor driver is hot", "let it cool"), ns(1.0))
+    assert life.why.text == (
         f"a wheel is dead, latched at {AT}:01 UTC; also a motor driver is hot; let it cool, then "
         "call srv/clear"
     )
@@ -649,14 +664,14 @@ def test_a_press_after_a_release_is_a_new_latch() -> None:
     life = ready()
     press(life, 1.0)
     latch = number(life)
-    life.refuse_clear("", "", ns(8.0))
+    life.refuse_clear(None, ns(8.0))
     press(life, 5.0)
-    life.refuse_clear("", "", ns(8.0))
+    life.refuse_clear(None, ns(8.0))
     with pytest.raises(RefusedError) as caught:
         clear(life, 9.0, latch)
     assert str(caught.value) == (
         f"latch {latch} is not the latch that srv/clear would release now; the robot is "
-        f"still stopped ({PRESSED_REASON}): look at the robot, then call srv/clear again with the "
+        f"still stopped ({PRESSED}): look at the robot, then call srv/clear again with the "
         "present `latch` in `state`"
     )
 
@@ -664,12 +679,10 @@ def test_a_press_after_a_release_is_a_new_latch() -> None:
 def test_a_plain_clear_is_refused_right_after_a_press() -> None:
     life = ready()
     press(life, 1.0)
-    life.refuse_clear("", "", ns(1.2))
+    life.refuse_clear(None, ns(1.2))
     with pytest.raises(RefusedError) as caught:
         clear(life, 1.5)
-    assert str(caught.value).startswith(
-        f"the robot was stopped ({PRESSED_REASON}) 0.5 s ago: look at"
-    )
+    assert str(caught.value).startswith(f"the robot was stopped ({PRESSED}) 0.5 s ago: look at")
     assert clear(life, 3.0)
 
 
@@ -687,7 +700,7 @@ def test_each_deactivate_has_a_new_number_and_the_last_is_the_one_that_is_report
     first = number(life)
     life.deactivate("ann", at(2.0))
     assert number(life) > first
-    assert life.why == f"switched off by ann at {AT}:02 UTC; call srv/activate"
+    assert life.why.text == f"switched off by ann at {AT}:02 UTC; call srv/activate"
 
 
 def test_an_activate_of_an_active_robot_changes_nothing_whatever_number_is_named() -> None:
@@ -707,13 +720,13 @@ def test_a_robot_that_starts_switched_off_has_the_number_0() -> None:
     assert activate(life, 1.0, 0)
 
 
-@each("cause", ["stop", "fault"])
-def test_a_clear_of_a_robot_that_is_switched_off_says_so_and_names_activate(cause: str) -> None:
+@each("latched", ["stop", "fault"])
+def test_a_clear_of_a_robot_that_is_switched_off_says_so_and_names_activate(latched: str) -> None:
     life = off()
-    if cause == "stop":
+    if latched == "stop":
         stop(life, 2.0)
     else:
-        life.fault("a wheel is dead", at(2.0))
+        life.fault(cause("a wheel is dead"), at(2.0))
     assert clear(life, 5.0) == (
         "cleared, but the robot is still switched off: call srv/activate to switch it on, then "
         "each sender must send a zero before it drives"
@@ -735,7 +748,7 @@ def test_a_stop_and_a_fault_during_the_shutdown_are_latched_for_the_next_start()
     life = ready()
     life.leave()
     assert stop(life, 1.0) == "stopped and latched; the daemon is shutting down"
-    assert life.fault("a wheel is dead", at(2.0))
+    assert life.fault(cause("a wheel is dead"), at(2.0))
     assert mode(life) is Mode.SHUTDOWN
     assert life.latches.stop is not None
     assert life.latches.fault is not None
@@ -766,10 +779,10 @@ FACTS: dict[str, Do] = {
     "link lost": lambda life, _: life.link(up=False),
     "command": lambda life, _: life.command(fresh=True),
     "no command": lambda life, _: life.command(fresh=False),
-    "fault": lambda life, now: life.fault("a wheel is dead", at(now)),
+    "fault": lambda life, now: life.fault(cause("a wheel is dead"), at(now)),
     "leave": lambda life, _: life.leave(),
     "press": lambda life, now: press(life, now),
-    "release": lambda life, _: life.refuse_clear("", "", ns(8.0)),
+    "release": lambda life, _: life.refuse_clear(None, ns(8.0)),
 }
 
 REQUESTS: dict[str, Do] = {

@@ -21,7 +21,7 @@ STORE.register(get_types_from_msg(CHANNEL.schema, CHANNEL.schema_name))
 STATE = RobotState(
     stamp=Time(5, 6),
     mode="driving",
-    reason="driving: app",
+    reason="commanded by app",
     x=1.0,
     y=2.0,
     yaw=0.5,
@@ -66,7 +66,7 @@ def test_a_log_line_without_actor_or_repetition_has_the_text_alone() -> None:
 
 def test_a_source_without_commands_has_no_age() -> None:
     assert state(STATE).sources == [
-        Source("app", 50, 0.1, ""), Source("nav", 10, None, "a command")
+        Source("app", 50, 0.1, "", "nothing"), Source("nav", 10, None, "a command", "command")
     ]  # fmt: skip
 
 
@@ -92,5 +92,5 @@ def test_the_ros_state_equals_the_native_state_field_by_field() -> None:
     # makes knows no speed limit, only the setting that it lowers. The battery has its own topic.
     assert left_out == {
         "stamp", "latencies", "encoder_counts", "latch", "latch_file_error", "settings_differ",
-        "speed_limit", "battery", "certificate_days",
+        "speed_limit", "battery", "certificate_days", "certificate",
     }  # fmt: skip

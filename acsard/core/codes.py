@@ -1,0 +1,339 @@
+"""The codes of reasons: one table `code -> (text, advice)`.
+
+Programs read the code, and people read the text. `state`, its sources, the events and the latches
+carry a code of this table. No program reads a text. A text or an advice is a format string, into
+which `reason` or `sentence` inserts the values. The advice follows `->` and says what the operator
+can do. To add a code, add its entry to the table and its name to one of the types below.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Literal, get_args
+
+from msgspec import Struct
+
+WaitCode = Literal[
+    "nothing", "command", "proof", "late", "stalled", "neutral", "zeros", "higher", "equal",
+    "senders",
+]  # fmt: skip
+"""Codes of the conditions that a command source waits for (`values.Wait` explains them)."""
+
+LinkCode = Literal[
+    "port_closed", "port_trouble", "port_blocked", "booting", "link_up", "link_silent", "host_late",
+    "simulator_fault", "echo", "checksum_lost", "no_checksum", "replies_damaged", "lines_too_rare",
+    "reply_period", "received_nothing", "received_statuses", "received_cut", "received_foreign",
+    "received_garbage", "received_few", "received_sparse",
+]  # fmt: skip
+"""Codes of the states of the link to the board."""
+
+HOST_CODES: tuple[LinkCode, ...] = ("host_late", "simulator_fault")
+"""Codes of a silence for which this computer or the built-in simulator is to blame."""
+
+StopCode = Literal[
+    "stopped", "stopped_at_start", "emergency_stop", "emergency_stop_silent", "bumper",
+    "bumpers_silent", "battery_empty",
+]  # fmt: skip
+"""Codes of the causes of a latched stop."""
+
+GuardCode = Literal[
+    "guard_line_damaged", "guard_too_fast", "guard_no_link", "guard_no_checksum",
+    "guard_no_command", "guard_too_long",
+]  # fmt: skip
+"""Codes of the reasons for which the guard replaces a line. Each of them is a defect of acsard."""
+
+GUARD_CODES: tuple[GuardCode, ...] = get_args(GuardCode)
+
+FaultCode = Literal[
+    GuardCode, "driver_fault", "impossible_speeds", "wheel_dead", "wheel_reversed",
+    "wheel_runaway", "wheel_stuck",
+]  # fmt: skip
+"""Codes of the causes of a latched fault."""
+
+StateCode = Literal[
+    StopCode, FaultCode, LinkCode, WaitCode, "switched_off", "not_activated", "shutting_down",
+    "emergency_stop_missing", "bumpers_missing", "commanded", "limits_zero", "no_command",
+    "bumper_away", "bumper_blocks",
+]  # fmt: skip
+"""Codes of `state`."""
+
+RefusalCode = Literal[
+    "unknown_source", "not_finite", "too_many_senders", "unproven", "stale", "malformed",
+    "wrong_shape", "wrong_wheels", "unknown_encoding", "too_big", "not_a_put", "wildcard",
+    "displaced", "other_certificate", "second_sender", "no_rate", "out_of_range", "no_attachment",
+    "bad_attachment", "unknown_format",
+]  # fmt: skip
+"""Codes of the reasons for which a message of a client is refused."""
+
+Code = Literal[StateCode, RefusalCode]
+
+TABLE = """
+commanded
+    commanded by {source}
+limits_zero
+    commanded by {source}, but the robot cannot move: limits.linear_speed and limits.angular_speed
+    are 0;
+    -> set a higher limit
+no_command
+    waiting for a command: no source has sent one within its timeout
+nothing
+command
+    a command
+proof
+    {source} is new: the robot follows it when its commands have arrived with steady delays for
+    {seconds:g} s
+late
+    commands of {source} arrive more than {seconds:g} s too late: the network delays them, or the
+    sender's clock was set;
+    -> if this goes on, check the network, then restart the sender
+stalled
+    the daemon stalled: waiting for the next command of {source}
+neutral
+    send a zero first: {source} must send a zero{alone} before it can drive{lasts}{ros}
+zeros
+    {source} commands zero speed: it has sent only zeros for over {lasts}{note}
+higher
+    {source} has priority:
+    -> wait until it is silent
+equal
+    {source} has the same priority and came first:
+    -> wait until it is silent
+senders
+    {others} of this source must wait until the sender that drives falls silent
+bumper_away
+    {bumpers}:
+    -> the robot drives only straight {direction}, at most {speed:g} m/s
+bumper_blocks
+    {bumpers}:
+    -> no straight motion leads away from the pressed bumpers, so the robot stands still until the
+    bumpers are released
+
+shutting_down
+    the daemon is shutting down
+not_activated
+    switched off;
+    -> call srv/activate
+switched_off
+    switched off by {by}
+stopped
+    stopped by {by}
+stopped_at_start
+    stopped when the daemon started, because {cause}
+emergency_stop
+    emergency stop pressed at the robot
+    -> release it at the robot
+emergency_stop_silent
+    the board has not reported its emergency stop for {seconds:g} s, so it counts as pressed
+    -> check the board and its cable
+emergency_stop_missing
+    safety.estop = "required", but the microcontroller has not reported an emergency-stop input:
+    -> does its firmware send status lines with `estop=`?
+bumper
+    {bumpers}
+    -> release it at the robot
+bumpers_silent
+    the board has not reported its bumpers for {seconds:g} s, so they count as pressed
+    -> check the board and its cable
+bumpers_missing
+    safety.bumpers has {places}, but the microcontroller has not reported {bumpers}:
+    -> does its firmware send status lines with `bumpers={dots}`?
+battery_empty
+    battery below {threshold}
+    -> charge the battery to {charged}
+
+driver_fault
+    the board reports a fault of a motor driver
+    -> repair the driver, or switch the robot off and on
+impossible_speeds
+    the board reports impossible speeds ({cause})
+wheel_dead
+    {wheel} wheel does not turn, or its encoder is dead: check cable, motor and encoder, and for
+    motor d also the setting mcu.trailing_comma {figures}
+wheel_reversed
+    {wheel} wheel turns against its command: check the leads of its motor, the wires A and B of its
+    encoder, and the wheel's sign in mcu.wheels {figures}
+wheel_runaway
+    {wheel} wheel turns faster than commanded: check the motor driver and the encoder {figures}
+wheel_stuck
+    {wheel} wheel reports a speed that never changes: its encoder is stuck {figures}
+guard_line_damaged
+    the daemon's guard replaced a line for the board with zeros: the line is not complete, or does
+    not have four wheel speeds
+guard_too_fast
+    the daemon's guard replaced a line for the board with zeros: the line moves a wheel faster than
+    limits.wheel_speed
+guard_no_link
+    the daemon's guard replaced a line for the board with zeros: the line moves a wheel while the
+    serial link is not up
+guard_no_checksum
+    the daemon's guard replaced a line for the board with zeros: the line moves a wheel without the
+    checksum that mcu.link_check requires
+guard_no_command
+    the daemon's guard replaced a line for the board with zeros: the line speeds up a wheel although
+    no command is fresh, or although the mode is not driving
+guard_too_long
+    the daemon's guard replaced a line for the board with zeros: the line still moves a wheel
+    although the longest ramp to zero has ended
+
+port_closed
+    the serial port is closed; it is being reopened
+port_trouble
+    {trouble}
+booting
+    the port is open; waiting for the microcontroller's first good lines
+link_up
+    the link to the microcontroller is up
+link_silent
+    the microcontroller has fallen silent
+host_late
+    this computer did not run the daemon for {seconds:.2f} s, so the daemon received {received}:
+    -> the Linux command `top` shows which other program uses the processor; acsard has priority if
+    it runs as the systemd service
+simulator_fault
+    the built-in simulator is silent because of a fault in sim.faults, or because the daemon, which
+    runs the simulator, is late:
+    -> the Linux command `top` shows which other program uses the processor; acsard has priority if
+    it runs as the systemd service
+port_blocked
+    the serial port sends nothing, because its driver accepts no bytes:
+    -> unplug the adapter and plug it in again
+echo
+    the daemon's own lines come back: TX and RX are connected to each other, or a terminal or the
+    RS-485 adapter echoes, or the board reports the commanded speeds instead of the measured ones;
+    -> remove the cause, then unplug the board and plug it in again
+checksum_lost
+    the microcontroller answered with a checksum before and now answers without one:
+    -> either its replies are damaged (check cable and baud rate), or it runs other firmware (then
+    unplug it and plug it in again)
+no_checksum
+    the microcontroller answers without a checksum, but mcu.link_check = "require" lets the robot
+    drive only with one:
+    -> install firmware that supports the checksum, or write mcu.link_check = "auto"
+replies_damaged
+    the microcontroller's replies arrive damaged, so the daemon asks it for the checksum again;
+    -> check cable and ground
+lines_too_rare
+    the microcontroller sends a line only every {apart} s, and no value of mcu.reply_period allows
+    that;
+    -> firmware that reports by its own clock must send a line at least every {longest:g} s
+reply_period
+    the microcontroller's lines come {apart} s apart;
+    -> if it reports by its own clock, set mcu.reply_period = {apart}
+received_nothing
+    no link to the microcontroller: {received};
+    -> does the board have power, is mcu.port its port, is mcu.baud_rate right, are TX and RX
+    swapped? `acsard mcu check` finds out more
+received_statuses
+    no link to the microcontroller: {received};
+    -> is TX of this computer connected to RX of the board? `acsard mcu check` finds out more
+received_cut
+    no link to the microcontroller: {received};
+    -> does the board cut its lines short, or omit the line ends? `acsard mcu check` finds out more
+received_foreign
+    no link to the microcontroller: {received};
+    -> is there noise on the cable, or does another program send on the cable too? `acsard mcu
+    check` finds out more
+received_garbage
+    no link to the microcontroller: {received};
+    -> is mcu.baud_rate the baud rate of the board? `acsard mcu check` finds out more
+received_few
+    no link to the microcontroller: {received};
+    -> check the cable, the ground and the baud rate; `acsard mcu check` finds out more
+received_sparse
+    no link to the microcontroller: {received};
+    -> if the board reports by its own clock, set mcu.reply_period to the seconds between its lines;
+    `acsard mcu check` finds out more
+
+unknown_source
+    this source is not in commands.sources
+not_finite
+    the command contains NaN or infinity
+too_many_senders
+    {most} other senders of this source are active;
+    -> end one first
+unproven
+    this sender is new: the robot follows a sender only after the sender's commands have arrived
+    with steady delays; this is not an error
+stale
+    the command is older than the source's timeout allows, or older than one that the robot has
+    already accepted: the network delayed it, or the sender's clock was set
+malformed
+    the payload is not valid JSON, msgpack or CDR
+wrong_shape
+    the payload is not a message of the type of its key
+wrong_wheels
+    the message does not have one velocity for each wheel
+unknown_encoding
+    the payload is not a JSON object, a msgpack map or CDR
+unknown_format
+    the message has no form in the requested format
+too_big
+    the payload is too long
+not_a_put
+    the message is a DELETE
+    -> send a PUT
+wildcard
+    a command came on a key with a wildcard
+displaced
+    messages came too fast, so older ones were dropped
+other_certificate
+    another certificate already uses this sender id
+second_sender
+    the daemon already uses the gyro of another sender
+no_rate
+    the IMU does not measure the angular velocity
+out_of_range
+    the turn rate or its variance is out of range
+no_attachment
+    a ROS message has no attachment
+bad_attachment
+    a ROS message has a damaged attachment
+"""
+
+
+class Entry(Struct, frozen=True):
+    """The text of a code, and the advice to the operator; "" if there is none."""
+
+    text: str
+    advice: str
+
+
+class Reason(Struct, frozen=True, gc=False):
+    """A code with its text for people."""
+
+    code: Code
+    text: str
+    advice: str = ""
+    part: str = ""
+    """The part of the robot, such as a wheel. It distinguishes reasons of the same code."""
+
+
+def _parse(table: str) -> dict[str, Entry]:
+    entries = {}
+    for entry in re.split(r"\n+(?! )", table.strip()):
+        code, *lines = entry.splitlines()
+        text, _, advice = " ".join(line.strip() for line in lines).partition("-> ")
+        entries[code] = Entry(text.strip(), advice)
+    return entries
+
+
+CODES: dict[str, Entry] = _parse(TABLE)
+"""Maps each code to its text and its advice."""
+
+
+def reason(code: Code, part: str = "", **values: object) -> Reason:
+    """Return the reason of a code, with the values in its text and its advice."""
+    entry = CODES[code]
+    return Reason(code, entry.text.format(**values), entry.advice.format(**values), part)
+
+
+def sentence(code: Code, **values: object) -> Reason:
+    """Return the reason of a code, with its advice at the end of its text."""
+    entry = CODES[code]
+    text = f"{entry.text} {entry.advice}" if entry.advice else entry.text
+    return Reason(code, text.format(**values))
+
+
+def joined(why: Reason) -> Reason:
+    """Return a reason with its advice at the end of its text."""
+    return Reason(why.code, f"{why.text} {why.advice}") if why.advice else why
