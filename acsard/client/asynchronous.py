@@ -1,7 +1,7 @@
 """The client for asyncio programs.
 
-Calls that wait for a reply run in threads. Commands are sent in the event loop. A command blocks
-the loop for up to 3 ms (`MIN_SPACING_S`) if another command was sent just before it.
+Calls that wait for a reply run in threads. Commands are sent in the event loop, which one blocks
+for up to 3 ms (`MIN_SPACING_S`) directly after another.
 """
 
 from __future__ import annotations
@@ -25,13 +25,11 @@ from acsard.host.threads import in_thread
 
 T = TypeVar("T")
 
+# The longest call is a `clear`, up to 15 s: it queries the state, for 3 s while the daemon is busy,
+# calls the service, and finds out why no reply came.
 CALL_TIMEOUT_S = 6 * REPLY_TIMEOUT_S
-"""Time within which a call must end, s. The longest call is a `clear`, which takes up to 15 s. It
-queries the state, and repeats this query for 3 s while the daemon is busy. Then it calls the
-service, and finds out why no reply came."""
 
-CLOSE_TIMEOUT_S = 5.0
-"""Time within which a connection must close, s."""
+CLOSE_TIMEOUT_S = 5.0  # for a connection
 
 
 @asynccontextmanager
@@ -69,11 +67,8 @@ async def connect_async(
 async def _in_thread(
     call: Callable[[], T], timeout_s: float | None = None, late: Callable[[T], None] | None = None
 ) -> T:
-    """Call `call` in a new thread, and return its result, as `in_thread` does.
-
-    Raises `NoAnswerError` if `call` has not returned after `timeout_s` s (None means
-    `CALL_TIMEOUT_S`), or if no thread can be started.
-    """
+    # Raises `NoAnswerError` after `timeout_s` (None: `CALL_TIMEOUT_S`), or if no thread can be
+    # started.
     timeout_s = CALL_TIMEOUT_S if timeout_s is None else timeout_s
     try:
         return await in_thread(call, timeout_s, late)

@@ -1,12 +1,9 @@
 """The rules for a sender of commands: what it sends and when, and why a command has no effect.
 
-This module is pure: times and commands come in as arguments. Every program that commands the robot
-uses the time limits of this module. A program that forwards the commands of a person, for example
-from a panel in a browser, passes each command as a `Wish` to a `Commander`.
-
-A `Commander` never repeats a command, so the robot stops when the person, the panel or the network
-falls silent. A new command replaces a command that still waits to be sent. A zero is sent even if
-it is old. A drive ends with a zero.
+This module is pure, and every program that commands the robot uses its time limits. One that
+forwards a person's commands passes each as a `Wish` to a `Commander`, which never repeats one: the
+robot stops when the person, the panel or the network falls silent. A new command replaces one that
+waits. A zero is sent even if it is old, and ends a drive.
 """
 
 from __future__ import annotations
@@ -15,144 +12,103 @@ from msgspec import Struct
 
 from acsard.core.messages.schema import RobotState, SourceState
 from acsard.core.messages.signature import Signature
-from acsard.core.values import NS_PER_S, REST, Twist
+from acsard.core.values import NS_PER_S, REST, Ns, Twist
 
-SEND_PERIOD_S = 0.05
-"""Pause between two commands of a drive, s. At 20 Hz, a source sends five commands within its
-default timeout of 0.25 s."""
+SEND_PERIOD_S = 0.05  # of a drive: five commands within a source's default timeout of 0.25 s
 
-MIN_SPACING_S = 0.003
-"""Shortest pause between two commands on one connection, s. The daemon drops commands at rates
-above 1000 per second."""
+MIN_SPACING_S = 0.003  # on one connection: the daemon drops commands above 1000 per second
 
+# Zeros at the beginning: the daemon checks for 0.25 s whether a new sender is late, and with many
+# zeros the jitter of a busy machine does not prolong that.
 OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
-"""Duration and period of the zeros that a client sends at the beginning of a drive, s. The daemon
-checks for 0.25 s whether the commands of a new sender are late. With many zeros in this time, the
-jitter of a busy machine does not prolong the check."""
 
+# Time for these zeros to be accepted: up to 2 s by a source's long timeout, and time for another
+# sender to finish its drive.
 OPEN_TIMEOUT_S = 4.0
-"""Time within which the daemon must accept the zeros at the beginning of a drive, s. Otherwise the
-drive fails. If the source has a long timeout, the daemon checks the delay of a new sender for up to
-2 s. The rest of the time is for another sender that must finish its drive first."""
 
+# Least zeros at the end of a drive. A hiccup of the network may lose all, so a sender that follows
+# the state uses `FinalZeros`.
 ZEROS = 3
-"""Smallest number of zeros that a sender sends at the end of a drive. A hiccup of the network may
-lose all of them. A sender that follows the robot's state therefore uses `FinalZeros`."""
 
+# Commands may have no effect, or be missing, for so long before a drive ends: longer than 0.25 s
+# for a new sender, and than a short delay.
 GRACE_S = 0.5
-"""Longest time for which commands may have no effect, s. After this time, the program informs the
-operator or ends the drive. A drive also ends if the program itself sends no command for longer than
-this. The time must be longer than 0.25 s, because the first commands of a new sender have no effect
-for that long. It must also be longer than a short delay of a known sender."""
 
+# Without a command: a little longer than a source's default timeout of 0.25 s.
 BRAKING_AFTER_NS = 3 * NS_PER_S // 10
-"""Time without a command after which the robot is assumed to brake, ns. It is a little longer than
-a source's default timeout of 0.25 s."""
 
+# Without input a held key counts as released. A panel of Foxglove sends once a second, and after 2
+# s the daemon forgets a new sender's zero.
 RELEASE_TIMEOUT_NS = 3 * NS_PER_S // 2
-"""Time without input after which a button or a key that was held counts as released, ns. A shorter
-silence may be a pause of the network. A panel of Foxglove publishes once a second by default, and
-must not seem released between its messages. The time must be shorter than 2 s: if a new sender is
-silent for 2 s after its zero, the daemon forgets the zero."""
 
+# Wait of the first command after a silence: a panel at 20 Hz sends at most one in it, so more are a
+# burst. After one over `MAX_BURST_COMMANDS`, the next waits too.
 BURST_WINDOW_NS = NS_PER_S // 25
-"""Time for which the first command after a silence waits to be sent, ns. The wait shows whether a
-burst follows: a panel that sends at 20 Hz sends at most one command in this time. After a burst of
-more than `MAX_BURST_COMMANDS` commands, the next command waits too."""
 
+# Commands of a panel in the window (125 Hz); more have waited in a queue, which may have further
+# ones.
 MAX_BURST_COMMANDS = 5
-"""Largest number of commands that a panel is assumed to send within `BURST_WINDOW_NS` (125 Hz). If
-more commands arrive, they have waited in a queue, which may contain further commands."""
 
-STALE_NS = NS_PER_S // 10
-"""Largest age of a nonzero command that is still sent, ns. An older one is dropped, because the
-operator may no longer want it."""
+STALE_NS = NS_PER_S // 10  # age of a speed that the operator may no longer want
 
-DRIVING_TIMEOUT_NS = NS_PER_S // 2
-"""Time for which a sender still counts as driving after its last nonzero command, ns."""
+DRIVING_TIMEOUT_NS = NS_PER_S // 2  # since the last speed, while a sender counts as driving
 
-MAX_SOURCE_TIMEOUT_S = 10.0
-"""Longest timeout that a command source may have, s. The robot follows no command older than
-this."""
+MAX_SOURCE_TIMEOUT_S = 10.0  # of any source: the robot follows no older command
 
+# That no command moves and that do not end by themselves.
 NEVER_DRIVING_MODES = ("inactive", "stopped", "fault", "shutdown")
-"""Modes in which no command moves the robot, and which do not end by themselves."""
 
 
 class Wish(Struct, frozen=True):
-    """A command to forward: the twist that a person requests.
-
-    `stamp_ns` is the time of the command on the sender's clock, ns; None if the sender has no
-    clock.
-    """
+    """A twist that a person requests, with the time on the sender's clock, if it has one."""
 
     twist: Twist
-    stamp_ns: int | None = None
-    steady: bool = False
-    """Whether the clock of `stamp_ns` is steady, which means that nothing adjusts it."""
+    stamp_ns: Ns | None = None
+    steady: bool = False  # nothing adjusts that clock
 
 
 class Commander:
     """Decides when to send the commands of one sender, and which commands to drop.
 
-    At most one command waits to be sent. A newer command replaces the waiting command. All times
-    are monotonic times in ns.
+    At most one waits, and a newer one replaces it.
 
     Args:
-        sends_leading_zero: whether to send a zero (a command with the speed 0) before the first
-            command, and before the first command after each silence longer than
-            `RELEASE_TIMEOUT_NS`. The daemon requires a zero before a sender may move the robot, so
-            set this for a sender that never sends zeros itself. No zero is sent after a shorter
-            silence, because the person may still hold a button. After a stop and a `clear`, such a
-            zero would arm the sender, and the held button would drive the robot again.
-        connected_ns: the monotonic time of the sender's connection, ns. Set this for a sender that
-            may connect while a button is held. If its first command arrives within
-            `RELEASE_TIMEOUT_NS` after this time, no zero is sent before that command. None means
-            that no button was held.
-        detects_bursts: whether the first command after a silence waits for `BURST_WINDOW_NS`. If
-            several commands arrive in this time, a congested link or a stalled process has delayed
-            these commands. In this case they are dropped, except the last one if it is a zero. Set
-            this for a sender without stamps, because the daemon cannot measure the delay of its
-            commands.
+        sends_leading_zero: send a zero before the first command, and after a silence of
+            `RELEASE_TIMEOUT_NS`, for a sender that never sends one. After a shorter silence a
+            button may be held, and after a stop and a `clear` a zero would arm it.
+        connected_ns: connection of a sender that may hold a button then: a first command within
+            `RELEASE_TIMEOUT_NS` gets no zero.
+        detects_bursts: let the first command after a silence wait for `BURST_WINDOW_NS`, and drop a
+            burst except for a last zero: a link or a process has delayed it. This is for a sender
+            without stamps, whose delay the daemon cannot measure.
     """
 
     def __init__(
         self,
         *,
         sends_leading_zero: bool = False,
-        connected_ns: int | None = None,
+        connected_ns: Ns | None = None,
         detects_bursts: bool = False,
     ) -> None:
-        self.replaced = self.stale = 0
-        """Two counters of commands that were not sent. `replaced` counts the commands that a newer
-        command replaced, and `stale` counts the commands that were too old or came in a burst."""
+        self.replaced = self.stale = 0  # not sent: replaced by a newer one; too old or in a burst
         self._sends_leading_zero = sends_leading_zero
         self._gather_ns = BURST_WINDOW_NS if detects_bursts else 0
         self._wish: Wish | None = None
-        self._last = Wish(REST)
-        """The newest command, sent or not."""
+        self._last = Wish(REST)  # sent or not
         self._came_ns = 0
         self._connected_ns = connected_ns
-        """Monotonic time of the sender's connection, ns; None if no button was held then."""
-        self._heard_ns: int | None = None
-        """Monotonic time of the newest command, ns; None before the first command."""
+        self._heard_ns: Ns | None = None  # newest command
         self._lead = False
         self._hold_until_ns = 0
-        self._burst = 0
-        """Number of commands that have arrived while the first of these commands waits (see
-        `BURST_WINDOW_NS`). The method `send()` resets this number."""
-        self._crowded = False
-        """Whether the last burst had more than `MAX_BURST_COMMANDS` commands."""
-        self._moved_ns: int | None = None
-        """Monotonic time at which a nonzero command was last sent, ns; None after a zero."""
-        self._asked_ns: int | None = None
-        """Monotonic time at which a nonzero command last arrived, ns; None after a zero."""
+        self._burst = 0  # commands since the first that waits, until `send()`
+        self._crowded = False  # the last burst was over `MAX_BURST_COMMANDS`
+        self._moved_ns: Ns | None = None  # a speed was last sent; None after a zero
+        self._asked_ns: Ns | None = None  # a speed last arrived; None after a zero
 
-    def take(self, wish: Wish, now_ns: int) -> int | None:
-        """Store a command that has arrived. It replaces a command that still waits to be sent.
+    def take(self, wish: Wish, now_ns: Ns) -> int | None:
+        """Store a command, which replaces one that waits.
 
-        Returns the time since the previous command arrived, if this time is longer than
-        `BRAKING_AFTER_NS`. Returns None after a shorter time, and for the first command.
+        Return the time since the previous command if it is over `BRAKING_AFTER_NS`.
         """
         silence = None if self._heard_ns is None else now_ns - self._heard_ns
         begins = silence is None or silence > BRAKING_AFTER_NS
@@ -171,17 +127,14 @@ class Commander:
         self._asked_ns = None if wish.twist == REST else now_ns
         return silence if begins else None
 
-    def due_ns(self) -> int | None:
-        """Return the time at which the caller must call `send`; None if nothing waits."""
+    def due_ns(self) -> Ns | None:
+        """Return when the caller must call `send`; None if nothing waits."""
         if self._lead:
             return self._came_ns
         return None if self._wish is None else self._hold_until_ns
 
-    def send(self, now_ns: int) -> Wish | None:
-        """Return the command that the caller must send now, or None.
-
-        A nonzero command is dropped if it is older than `STALE_NS`, or if it came in a burst.
-        """
+    def send(self, now_ns: Ns) -> Wish | None:
+        """Return the command to send now, or None; drop a speed that is old or in a burst."""
         if self._lead:
             self._lead = False
             # If the zero had a later stamp than the command after it, the daemon would refuse the
@@ -200,13 +153,11 @@ class Commander:
         self._moved_ns = now_ns if moves else None
         return wish
 
-    def end(self, now_ns: int, timeout_s: float = MAX_SOURCE_TIMEOUT_S) -> Wish | None:
-        """End the drive of this sender, and return a zero to send, or None.
+    def end(self, now_ns: Ns, timeout_s: float = MAX_SOURCE_TIMEOUT_S) -> Wish | None:
+        """End the drive, discard what waits, and return a zero to send, or None.
 
-        The command that waits to be sent is discarded. The result is a zero if the robot may still
-        follow a nonzero command of this sender. The result is None if the last command was a zero,
-        or if the timeout has passed since the last nonzero command, because a zero would then only
-        stop the next sender. `timeout_s` is the timeout of this sender's source, s.
+        After a zero, or the source's timeout since the last speed, another zero would only stop the
+        next sender.
         """
         moved_ns, self._moved_ns = self._moved_ns, None
         self._wish = self._asked_ns = None
@@ -216,7 +167,7 @@ class Commander:
             return None
         return self._zero(now_ns)
 
-    def _zero(self, at_ns: int) -> Wish:
+    def _zero(self, at_ns: Ns) -> Wish:
         # With a stamp from another clock, the daemon would assume that the sender's clock has
         # jumped.
         stamp_ns = self._last.stamp_ns
@@ -226,31 +177,23 @@ class Commander:
 
     @property
     def last_is_nonzero(self) -> bool:
-        """Whether the last command that arrived was not zero, even if it arrived long ago."""
+        """Whether the last command was not zero, even if it arrived long ago."""
         return self._asked_ns is not None
 
-    def is_driving(self, now_ns: int) -> bool:
-        """Return whether the last command was not zero and arrived within `DRIVING_TIMEOUT_NS`."""
+    def is_driving(self, now_ns: Ns) -> bool:
+        """Return whether the last command was not zero, within `DRIVING_TIMEOUT_NS`."""
         return self._asked_ns is not None and now_ns - self._asked_ns <= DRIVING_TIMEOUT_NS
 
 
 class CommandSigner:
-    """Signs and numbers the commands of one sender."""
-
     def __init__(self, sender_id: str) -> None:
         self._id, self._sequence, self._newest_ns = sender_id, 0, 0
 
-    def sign(self, stamp_ns: int | None, *, steady: bool, zero: bool = False) -> Signature:
+    def sign(self, stamp_ns: Ns | None, *, steady: bool, zero: bool = False) -> Signature:
         """Return the signature of the next command, with its sequence number.
 
-        If this sender has already used a later stamp, a zero gets that later stamp, so that the
-        daemon does not refuse the zero because its stamp is older.
-
-        Args:
-            stamp_ns: the time of the command on the sender's clock, ns; None if the sender has no
-                clock.
-            steady: whether this clock is steady, which means that nothing adjusts it.
-            zero: whether the command is a zero.
+        A zero gets a later stamp of this sender, so that it is not refused as older. `steady` says
+        that nothing adjusts the clock of the stamp.
         """
         self._sequence += 1
         # The daemon refuses a command whose stamp is older than that of an earlier command. If a
@@ -262,13 +205,7 @@ class CommandSigner:
 
 
 def objection(state: RobotState, source: str, sender: str) -> str:
-    """Return why the robot does not follow the commands of a sender; "" if it follows them.
-
-    Args:
-        state: the newest state of the robot.
-        source: the command source of the sender's commands.
-        sender: the public name of the sender.
-    """
+    """Return why the robot does not follow a sender (by public name); "" if it does."""
     if state.mode in NEVER_DRIVING_MODES:
         return state.reason
     ours = _entry(state, source)
@@ -306,9 +243,8 @@ def no_command(source: str) -> str:
 def must_release_key(state: RobotState, source: str) -> bool:
     """Return whether the operator must release a held key and press it again to drive.
 
-    The operator must do so in two cases: the robot cannot drive in its present mode (a mode in
-    `NEVER_DRIVING_MODES`, or "waiting"), or `source` must first send a zero. Otherwise, a held key
-    would move the robot as soon as the robot can drive again, which the operator may not expect.
+    Otherwise the key would move the robot as soon as the mode allows it, or after a zero, which the
+    operator may not expect.
     """
     return not can_drive(state) or only_needs_zero(state, source)
 
@@ -325,20 +261,13 @@ def can_drive(state: RobotState) -> bool:
 
 
 def receives_commands(state: RobotState, source: str) -> bool:
-    """Return whether `state` shows that the daemon receives commands of this source.
-
-    Late commands count too.
-    """
+    """Return whether the daemon receives commands of this source, even late ones."""
     ours = _entry(state, source)
     return ours is not None and ours.wait != "command"
 
 
 def refuses_for_good(state: RobotState, source: str) -> bool:
-    """Return whether the daemon will keep refusing the commands of this source.
-
-    If so, waiting cannot help: no command moves the robot in its present mode, or the source is not
-    configured.
-    """
+    """Return whether waiting cannot help: no command moves the robot, or there is no source."""
     return state.mode in NEVER_DRIVING_MODES or _entry(state, source) is None
 
 

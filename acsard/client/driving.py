@@ -1,8 +1,7 @@
 """Sends the commands of one drive of `acsard.client`, and checks that the robot follows them.
 
-The daemon does not answer commands. It reports in `state` why the robot does not follow a command,
-so a drive subscribes to `state`. If the robot does not follow, the drive ends with an error that
-gives the daemon's reason. A drive also ends with an error if this program sent no command for some
+The daemon does not answer commands, but says in `state` why the robot does not follow. Then the
+drive ends with an error with that reason, and also if this program has sent no command for some
 time, because the operator may no longer want the drive.
 """
 
@@ -31,9 +30,8 @@ from acsard.client.follower import MAX_STATE_AGE_S, SETTLED_S, Followed, Watch
 from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 
+# After a drive, the speed must fall below this share of its lowest so far, each time in so many s.
 SLOWER, SLOWS_S = 0.97, 1.0
-"""The test whether the robot slows down after a drive: every `SLOWS_S` s, its speed must fall below
-`SLOWER` times its lowest speed so far."""
 
 
 CONNECTION_CLOSED = "the connection to the daemon was closed while the robot was driving"
@@ -47,8 +45,7 @@ class CommandClient(Followed, Protocol):
     """The part of a client that `drive` uses."""
 
     source: str
-    sender: str
-    """Public name by which the daemon identifies the sender of this client's commands."""
+    sender: str  # public name of this client's sender
 
     def send(self, linear: float, angular: float = 0.0) -> None:
         """Send one command: `linear` m/s, `angular` rad/s (left is +)."""
@@ -57,23 +54,16 @@ class CommandClient(Followed, Protocol):
 def drive(
     robot: CommandClient, linear: float, angular: float, seconds: float
 ) -> Generator[float, None, None]:
-    """Drive for `seconds`, then send zeros until the robot stands still.
+    """Drive for `seconds` at m/s and rad/s (left is +), then send zeros until the robot stands.
 
-    This generator yields the time, s, for which the caller must wait before resuming the generator.
-    Before the drive, the generator sends zeros until the daemon accepts the commands.
-
-    Args:
-        robot: the client that sends the commands.
-        linear: linear speed, m/s.
-        angular: turn rate, rad/s, positive to the left.
-        seconds: duration of the drive, s.
+    The generator yields the time to wait before resuming it, s. It begins with zeros until the
+    daemon accepts the commands.
 
     Raises:
-        NotDrivenError: The robot does not follow the commands; the text is the daemon's reason. Or
-            this program paused for more than `GRACE_S` s between two commands. A pause between the
-            zeros at the end is not an error.
-        NoAnswerError: The daemon is silent, or the connection to it was closed.
-        UsageError: An argument is not a finite number, or `seconds` is not above 0.
+        NotDrivenError: the robot does not follow, with the daemon's reason; or this program paused
+            for more than `GRACE_S` between two commands (not zeros at the end).
+        NoAnswerError: the daemon is silent, or the connection was closed.
+        UsageError: an argument is not finite, or `seconds` is not above 0.
     """
     _require(linear=linear, angular=angular, seconds=seconds)
     if seconds <= 0:
@@ -102,14 +92,11 @@ def drive(
 
 
 def repeat_zeros(robot: CommandClient, idle_s: float = 0.0) -> Generator[float, None, None]:
-    """Send zeros until the robot's `state` shows that the robot has stopped.
+    """Send zeros until the `state` shows that the robot has stopped, when a drive ends early.
 
-    Call this when a drive ends early, and in place of the next speed. This generator yields the
-    time, s, for which the caller must wait before resuming the generator. It ends after `MAX_END_S`
-    at the latest, or when the connection is closed.
-
-    `idle_s` is the time since the last command, s. After more than `GRACE_S`, the robot may follow
-    another sender, whom a zero would stop. So if the state shows this, no zero is sent.
+    The generator yields the time to wait, s, and ends after `MAX_END_S` or with the connection.
+    `idle_s` after the last command (over `GRACE_S`), the robot may follow another sender: if the
+    state shows that, no zero is sent, which would stop it.
     """
     # If the connection is closed, sending raises one of these errors, and subscribing the other.
     with suppress(zenoh.ZError, NoAnswerError):
@@ -160,12 +147,8 @@ def _opening(checks: _Drive) -> Iterator[float]:
 
 
 def _stopping(checks: _Drive) -> Iterator[float]:
-    """Send zeros until the robot stands still, and yield the time to wait after each zero, s.
-
-    Also end if the robot has not become slower for `SLOWS_S` s. In this case, something else moves
-    the robot, or the board sends no feedback. Raises `NotDrivenError` if the daemon will keep
-    refusing the commands, and `NoAnswerError` if the daemon is silent.
-    """
+    # Also ends after `SLOWS_S` without slowing down: something else moves the robot, or there is no
+    # feedback. Raises `NotDrivenError` and `NoAnswerError`.
     begun = since = clock.steady_s()
     watch, slowest = checks.watch, math.inf
     while since + SLOWS_S > (now := clock.steady_s()) or watch.age(now) > MAX_STATE_AGE_S:
@@ -188,16 +171,14 @@ def _stopping(checks: _Drive) -> Iterator[float]:
 
 
 class _Drive:
-    """Checks, from the daemon's `state`, whether the robot follows the commands of this client."""
-
+    # Checks, from `state`, whether the robot follows the commands of this client.
     def __init__(self, robot: CommandClient) -> None:
         self._robot = robot
         self.watch = Watch(robot, clock.steady_s())
         # Read the clock again here, because the subscription above may take long.
         self._followed_s = self._last_command_s = clock.steady_s()
+        # Why it does not; "" if it does, None before the first state.
         self.objection: str | None = None
-        """Reason why the robot does not follow the commands; "" if it follows them, None before the
-        first state."""
 
     @property
     def refuses_for_good(self) -> bool:
@@ -244,10 +225,9 @@ class _Drive:
             )
 
     def require(self, grace: float) -> None:
-        """Raise `NotDrivenError` if the robot has not followed the commands for `grace` s.
+        """Raise `NotDrivenError` if the robot has not followed for `grace` s, or never will.
 
-        Raise it immediately if the daemon will keep refusing the commands. If the daemon receives
-        no commands of this client's source, the error is an `UnheardError`.
+        It is an `UnheardError` if the daemon receives nothing from this source.
         """
         self.process_states()
         if not self.objection:

@@ -1,12 +1,9 @@
 """Decides how long a sender repeats the zero that ends its drive.
 
-A few zeros are not enough. If the network or the daemon stands still for a moment, all commands of
-this time arrive within 1 ms. The daemon accepts the oldest one, which may be a speed, and drops the
-others, because they come too fast. So a sender repeats the zero until the robot's `state` shows
-that the robot has received it. The sender must then be silent, because repeated zeros keep other
-senders from driving.
-
-This module is pure: times and states come in as arguments.
+A few are not enough: after a stall of the network or the daemon, all commands arrive within 1 ms,
+and the daemon accepts the oldest, maybe a speed, and drops the others as too fast. So the zero is
+repeated until the `state` shows that it has arrived. Then the sender must be silent, because zeros
+keep others from driving. This module is pure.
 """
 
 from __future__ import annotations
@@ -16,37 +13,29 @@ import math
 from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, NEVER_DRIVING_MODES
 from acsard.client.follower import SETTLED_S
 from acsard.core.messages.schema import RobotState
+from acsard.core.values import Seconds
 
-STANDSTILL = 0.01, 0.02
-"""Linear speed, m/s, and turn rate, rad/s, below which the robot counts as standing still."""
+STANDSTILL = 0.01, 0.02  # m/s and rad/s
 
+# Longest repetition by a program that ends. The robot usually shows within 0.6 s that it has
+# stopped; the rest is for a hiccup of the network or a stall of the daemon.
 MAX_END_S = 2.0
-"""Longest time for which a program that ends repeats its zero, s. The robot usually shows within
-0.6 s that it has stopped. The rest of the time lets a hiccup of the network or a stall of the
-daemon end."""
 
 
 class FinalZeros:
-    """Says whether a sender must repeat its zero. All times are on one monotonic clock, s.
-
-    Args:
-        source: the command source of the sender's commands.
-        sender: the public name of the sender.
-    """
+    """Says whether a sender must repeat its zero. All times are on one monotonic clock, s."""
 
     def __init__(self, source: str, sender: str) -> None:
         self._source, self._sender = source, sender
+        # Last speed; since when all states show that this sender no longer drives, or inf.
         self._drove, self._stopped_since = -math.inf, math.inf
-        """`_drove` is the time of the last nonzero command, s. `_stopped_since` is the time since
-        which all states have shown that this sender no longer drives the robot, s. It is infinite
-        if the newest state does not show that."""
 
-    def drove(self, now: float) -> None:
-        """Record that the sender sends a nonzero command at the time `now`, s."""
+    def drove(self, now: Seconds) -> None:
+        """Record that the sender sends a speed."""
         self._drove, self._stopped_since = now, math.inf
 
-    def received(self, state: RobotState, now: float) -> None:
-        """Process a state that arrived at the time `now`, s."""
+    def received(self, state: RobotState, now: Seconds) -> None:
+        """Process a state."""
         if not self._has_stopped(state):
             self._stopped_since = math.inf
         elif self._stopped_since == math.inf:
@@ -55,11 +44,11 @@ class FinalZeros:
             # The first of these states may be older than the last speed. This state is not.
             self._drove = -math.inf
 
-    def wanted(self, now: float) -> bool:
-        """Return whether a sender that does not drive must send a zero at the time `now`, s.
+    def wanted(self, now: Seconds) -> bool:
+        """Return whether a sender that does not drive must send a zero.
 
-        The result is False after the longest timeout of a source, because the robot then follows
-        no speed of this sender.
+        The result is False after the longest timeout of a source, when the robot follows no speed
+        of it.
         """
         return now - self._drove < MAX_SOURCE_TIMEOUT_S
 

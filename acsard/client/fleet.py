@@ -1,9 +1,8 @@
 """Follows many robots: whether each daemon is present, its newest state and its version.
 
-A daemon is present while Zenoh shows its liveliness token. Zenoh's threads store the newest states
-undecoded, and the thread that calls `Fleet.rows()` decodes them. This thread also calls
-`Fleet.due()` and `Fleet.send_queries()`. Of these three methods, only `Fleet.send_queries()` may
-wait for the bus.
+A daemon is present while Zenoh shows its liveliness token. Zenoh's threads store the newest states,
+and one thread decodes them with `Fleet.rows()` and calls `due()` and `send_queries()`, of which
+only the last may wait for the bus.
 """
 
 from __future__ import annotations
@@ -26,31 +25,23 @@ from acsard.core.messages.schema import Info, RobotState
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
-MAX_ROBOTS = 1000
-"""Default maximum number of robots. There is a maximum because any client of the bus can invent
-robot ids."""
+MAX_ROBOTS = 1000  # any client of the bus can invent robot ids
 
 
 class Row(Struct, frozen=True):
-    """A robot on the bus, with its id, its newest state and its version."""
-
     robot_id: str
-    here: bool
-    """Whether the liveliness token of the robot's daemon is present."""
+    here: bool  # the daemon's liveliness token is present
     state: RobotState | None
-    age: float
-    """Age of `state`, s; infinite before the first state that proves that the daemon runs."""
+    age: float  # of `state`, s; inf before the first that proves that the daemon runs
     version: str
-    silent: bool = False
-    """Whether the robot counts as silent, because no new state has arrived (see `Follower`)."""
+    silent: bool = False  # `Follower.silent`
 
 
 class _TrackedRobot:
     def __init__(self) -> None:
         self.here = False
         self.version = ""
-        self.newest = Mailbox[tuple[zenoh.Sample, float]](1)
-        """The newest published state, undecoded, with its time of arrival, s."""
+        self.newest = Mailbox[tuple[zenoh.Sample, float]](1)  # undecoded, with its arrival
         self.begin()
 
     def begin(self) -> None:
@@ -63,21 +54,11 @@ class Fleet:
     """Follows several robots, or all robots on the bus, and returns a row for each."""
 
     def __init__(self, robot: Client, ids: Sequence[str], most: int = MAX_ROBOTS) -> None:
-        """Subscribe to the states and liveliness tokens of the robots. This may wait for the bus.
-
-        Raises `ZError` if the session cannot subscribe.
-
-        Args:
-            robot: A client of any robot on the same bus.
-            ids: The ids of the robots. The id "*" stands for all robots.
-            most: Maximum number of robots. When it is reached, a new robot replaces a robot that
-                `ids` does not name and whose liveliness token is absent. If there is no such robot,
-                the new robot is left out.
-        """
+        # Raises `ZError`. "*" in `ids` is all robots. Beyond `most`, a new robot replaces an absent
+        # one that `ids` does not name, or is left out.
         self._robot, self._ids, self._most = robot, ids, most
         self._lock = Lock()
-        self.left_out = False
-        """Whether a robot was left out because there were already `most` robots."""
+        self.left_out = False  # a robot, because of `most`
         self._known = {robot_id: _TrackedRobot() for robot_id in ids if robot_id != ALL_ROBOTS}
         self._states, self._infos = Decoder(RobotState), Decoder(Info)
         self._declared: list[Any] = []
@@ -102,11 +83,7 @@ class Fleet:
             return [self._row(name, robot, now) for name, robot in self._known.items()]
 
     def due(self) -> list[tuple[str, str]]:
-        """Return the queries that are due now, as pairs of robot id and key.
-
-        Pass them to `send_queries()`. The method also sets the times of the next queries, so a
-        query is returned only once.
-        """
+        """Return the queries (robot id and key) that are due, once, for `send_queries()`."""
         now, due = clock.steady_s(), []
         with self._lock:
             for name, robot in self._known.items():
@@ -119,7 +96,7 @@ class Fleet:
         return due
 
     def send_queries(self, due: Sequence[tuple[str, str]]) -> None:
-        """Send the queries that `due()` returned. This may wait for the bus. Raises `ZError`."""
+        """Send queries of `due()`. This may wait for the bus. Raises `ZError`."""
         for name, key in due:
             self._robot.sibling(name).start_query(
                 key, self._answer if key == "state" else self._info

@@ -1,12 +1,8 @@
 """Follows the `state` of one robot: its newest value, its age, and whether the daemon is silent.
 
-`Follower` is pure, and `Watch` connects it to the bus. All programs use the time limits of this
-module, so all programs report a silent robot after the same time.
-
-A Zenoh router may have a storage, which keeps the last messages and answers queries too. If the
-robot is off, the storage sends the last state of this robot. A published state never comes from a
-storage, so it always proves that the daemon runs. An answer to a query proves this only if it is
-newer than an earlier state.
+`Follower` is pure, `Watch` connects it to the bus, and all programs share its time limits. A
+storage of a Zenoh router answers queries with the last state of a robot that is off. So a published
+state proves that the daemon runs, and an answer only if it is newer than an earlier state.
 """
 
 from __future__ import annotations
@@ -20,68 +16,50 @@ from acsard.bus.subscription import MAX_QUEUED_SAMPLES, Subscription, encoded
 from acsard.client.commander import objection
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import RobotState
+from acsard.core.values import Seconds
 from acsard.host.mailbox import Mailbox
 
-QUERY_PERIOD_S = 0.3
-"""Time without a new state after which the client queries `state`, s. Without queries, the client
-could not follow a robot that is configured to publish its state seldom."""
+QUERY_PERIOD_S = 0.3  # without a new state: the robot may be configured to publish seldom
 
-SETTLED_S = 0.2
-"""Longest time that a message on `state` takes to arrive, s. So a state that arrives more than
-`SETTLED_S` after an action shows the robot after the action."""
+SETTLED_S = 0.2  # for a message on `state` to arrive: a later one shows the robot after an action
 
-MAX_STATE_AGE_S = 0.5
-"""A program must not base an action on a state that is older than this, s."""
+MAX_STATE_AGE_S = 0.5  # for an action that a program bases on it
 
-ROBOT_SILENCE_TIMEOUT_S = 1.0
-"""If the last state is older than this, s, the robot counts as silent, and a drive ends."""
+ROBOT_SILENCE_TIMEOUT_S = 1.0  # a drive ends then, too
 
-FIRST_STATE_TIMEOUT_S = 2.0
-"""A robot that works normally sends its first message on a key within this time, s."""
+FIRST_STATE_TIMEOUT_S = 2.0  # of a key, from a robot that works normally
 
-FLEET_QUERY_PERIOD_S = 2.0
-"""If a program follows many robots, and one of them has sent no new state for this time, s, the
-program queries the `state` of that robot. The time is longer than `QUERY_PERIOD_S`, because such a
-program sends many queries."""
+FLEET_QUERY_PERIOD_S = 2.0  # of a program that follows many robots and so sends many queries
 
+# Counters of `state` that decrease only when the daemon restarts.
 MONOTONIC_COUNTERS = ("lines", "lines_sent", "commands")
-"""Names of counters in `state` that decrease only when the daemon restarts."""
 
 
 class Follower:
-    """The newest state of one robot, with its age. All times are in s on the same monotonic clock.
+    """The newest state of one robot, with its age, by a clock that a suspend does not stop, s.
 
-    This clock must also advance while the computer is suspended, as `clock.steady_s` does. `now` is
-    the present time, s. `query_period_s` is the time without a new state after which the caller
-    must query `state`, s.
+    `query_period_s` is the time without a new state after which the caller must query `state`.
     """
 
-    def __init__(self, now: float, query_period_s: float = QUERY_PERIOD_S) -> None:
-        self.state: RobotState | None = None
-        """The newest state; None before the first state. Until `is_confirmed` is true, it may be an
-        old state from the storage of a router."""
-        self.is_confirmed = False
-        """Whether a state has proved that the daemon runs (see `answered()`)."""
-        self.last_seen = now
-        """Arrival time of the last state that proved that the daemon runs, s. Before the first such
-        state, it is the time at which this object was created, s."""
-        self.due = now + query_period_s
-        """Time of the next query, unless a state arrives before this time."""
-        self.unreadable = 0
-        """Number of consecutive messages on `state` that could not be decoded."""
+    def __init__(self, now: Seconds, query_period_s: float = QUERY_PERIOD_S) -> None:
+        self.state: RobotState | None = None  # maybe old and from a storage until `is_confirmed`
+        self.is_confirmed = False  # a state has proved that the daemon runs
+        self.last_seen = now  # arrival of the last such state, or the creation of this object
+        self.due = now + query_period_s  # of the next query
+        self.unreadable = 0  # messages in a row that could not be decoded
         self._query_period_s = query_period_s
         self._answer: RobotState | None = None
 
-    def published(self, state: RobotState, now: float) -> None:
-        """Store a state that the daemon published. It arrived at the time `now`, s."""
+    def published(self, state: RobotState, now: Seconds) -> None:
+        """Store a state that the daemon published."""
         self.state, self.last_seen, self.is_confirmed = state, now, True
         self.due, self.unreadable = now + self._query_period_s, 0
 
-    def answered(self, state: RobotState, now: float) -> bool:
-        """Process an answer to a query of `state`. Return whether it proves that the daemon runs.
+    def answered(self, state: RobotState, now: Seconds) -> bool:
+        """Process an answer to a query, and return whether it proves that the daemon runs.
 
-        The answer may be an old state from the storage of a router. Therefore, it is a proof only
-        if its stamp is newer than the stamp of `self.state` or of the previous answer.
+        It may come from a router's storage, so it must be newer than `self.state` or the previous
+        one.
         """
         # The previous answer is compared too, because the robot's clock may have been set back
         # since `self.state`.
@@ -98,24 +76,20 @@ class Follower:
             self.state, self.due = state, now
         return False
 
-    def query_is_due(self, now: float) -> bool:
-        """Return whether the caller must query `state` now. If so, set the time of the next one."""
+    def query_is_due(self, now: Seconds) -> bool:
+        """Return whether the caller must query `state` now, and set the time of the next query."""
         if now < self.due:
             return False
         self.due = now + self._query_period_s
         return True
 
-    def age(self, now: float) -> float:
-        """Return the time since the running daemon last sent a state, s.
-
-        An old state from the storage of a router does not count. Before the first state, return the
-        time since this object was created.
-        """
+    def age(self, now: Seconds) -> float:
+        """Return the time since the running daemon last sent a state, or since the creation."""
         return max(0.0, now - self.last_seen)
 
     @property
     def silence_timeout_s(self) -> float:
-        """The robot counts as silent if its last state is older than this, s."""
+        """Age of the last state, s, above which the robot counts as silent."""
         # If a robot publishes seldom, only answers arrive, at intervals of `query_period_s`.
         return (
             (ROBOT_SILENCE_TIMEOUT_S if self.is_confirmed else FIRST_STATE_TIMEOUT_S)
@@ -123,17 +97,12 @@ class Follower:
             - QUERY_PERIOD_S
         )
 
-    def silent(self, now: float) -> bool:
-        """Return whether the robot counts as silent at the time `now`, s."""
+    def silent(self, now: Seconds) -> bool:
         return self.age(now) > self.silence_timeout_s
 
 
 def restarted(before: RobotState | None, state: RobotState) -> bool:
-    """Return whether the daemon restarted between the states `before` and `state`.
-
-    The sign of a restart is that a counter in `MONOTONIC_COUNTERS` is lower in `state` than in
-    `before`. Returns False if `before` is None.
-    """
+    """Return whether one of `MONOTONIC_COUNTERS` has decreased, so the daemon restarted."""
     return before is not None and any(
         state.counters.get(name, 0) < before.counters.get(name, 0) for name in MONOTONIC_COUNTERS
     )
@@ -146,34 +115,26 @@ class Followed(Protocol):
         """Subscribe to a key."""
 
     def start_query(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        """Query a key. Call `take` with each reply that arrives."""
+        """Query a key, and call `take` with each reply."""
 
 
 class Watch(Follower):
     """Follows the `state` of one robot over the bus. Only one thread may use an instance."""
 
     def __init__(
-        self, robot: Followed, now: float, wake: Callable[[], object] | None = None
+        self, robot: Followed, now: Seconds, wake: Callable[[], object] | None = None
     ) -> None:
-        """Subscribe to the state of the robot to which the client `robot` is connected.
-
-        A thread of Zenoh calls `wake` each time a state arrives.
-        """
+        # A thread of Zenoh calls `wake` each time a state arrives.
         super().__init__(now)
         self._robot, self._decoder = robot, Decoder(RobotState)
         self._states = robot.subscribe("state")
         if wake is not None:
             self._states.wakes(wake)
+        # Replies of the daemon and of each storage, by a thread of Zenoh.
         self._answers = Mailbox[zenoh.Sample](16)
-        """Replies to queries, which a thread of Zenoh adds. The daemon and each storage send one
-        reply to a query."""
 
-    def poll(self, now: float) -> list[RobotState]:
-        """Process the states that have arrived, and return the new states.
-
-        If no state has arrived for some time, also send a query. A later call processes the reply.
-        Raises `ZError` if the session was closed.
-        """
+    def poll(self, now: Seconds) -> list[RobotState]:
+        """Return the new states, and send a query if it is due. Raises `ZError` if closed."""
         states = []
         for _ in range(MAX_QUEUED_SAMPLES):  # bounded, so that a flood cannot block the caller
             sample = self._states.try_recv()
@@ -200,12 +161,8 @@ class Watch(Follower):
             self.unreadable += 1
             return None
 
-    def objection(self, source: str, sender: str, now: float) -> str:
-        """Return why the robot does not follow the commands of a sender; "" if it follows them.
-
-        Before the first state arrives, the result is "" until the robot counts as silent. `source`
-        and `sender` are those of the function `objection`.
-        """
+    def objection(self, source: str, sender: str, now: Seconds) -> str:
+        """Return why the robot does not follow a sender; "" if it does, or may not be known yet."""
         if self.silent(now):
             return (
                 "nothing received from the daemon: does the daemon run? `acsard doctor` on the "

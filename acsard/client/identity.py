@@ -1,9 +1,8 @@
 """Finds out which role this client has at a robot, and which certificate the client uses.
 
-Zenoh does not tell the daemon over which link a query came. Therefore, each role has a key, and the
-access rules let a client query only the keys of its own role and of lower roles. The client queries
-the keys of all roles. Its role is the highest one whose query is answered. The certificate's name
-comes from the client's own file.
+Zenoh does not tell the daemon over which link a query came. So each role has a key, and the access
+rules let a client query those of its own role and lower ones: the highest that answers is its role.
+The certificate's name comes from the client's own file.
 """
 
 from __future__ import annotations
@@ -22,35 +21,23 @@ from acsard.core.messages.permissions import ROLE_TEXTS, has, least_role
 from acsard.core.values import NS_PER_S, ROLES, Role
 from acsard.host import clock
 
-WHOAMI_S, WHOAMI_MORE_S = 2.0, 0.3
-"""`WHOAMI_S` is the longest wait for the first answer to the queries for the role, s. After that
-answer, the client waits `WHOAMI_MORE_S` for further answers, s."""
+WHOAMI_S, WHOAMI_MORE_S = 2.0, 0.3  # for the first answer, and then for further ones
 
+# Queries a key, and calls the callback with each sample of the reply.
 Ask = Callable[[str, Callable[[zenoh.Sample], object]], None]
-"""Function that queries a key of the robot. It calls the callback with each sample of the reply."""
 
 
 class ClientIdentity(Struct, frozen=True):
-    """The identity of a client at a robot: its role, its certificate and its name."""
-
-    role: Role | Literal[""]
-    """The role of the client; "" if the robot answered none of the queries for the role."""
-    certificate: str
-    """The common name of the client's certificate; "" if the client has no certificate."""
-    sender: str
-    """The name that the daemon gives to this client as a sender of commands."""
+    role: Role | Literal[""]  # "" if no query was answered
+    certificate: str  # common name, if there is one
+    sender: str  # as the daemon names it
     robot: str = ""
     endpoint: str = ""
 
     def lacks(self, key: str) -> str:
-        """Return the reason, in words, why this client may not use a Zenoh key of the robot.
+        """Return why this client may not use a key (without the robot's id), or "".
 
-        Return "" if the client may use the key. If the role is unknown, because the robot answered
-        no query for it, return the likely reasons for the robot's silence. For a client without a
-        certificate, return "" in this case.
-
-        Args:
-            key: the part of the Zenoh key after the robot's id, such as `state`.
+        If the role is unknown, return likely reasons for the silence, or "" without a certificate.
         """
         least = least_role(key)
         if not self.role:
@@ -61,11 +48,9 @@ class ClientIdentity(Struct, frozen=True):
 
     @property
     def silence(self) -> str:
-        """Likely reasons why the robot answered no query for the client's role, in words.
+        """Likely reasons why the robot answered no query; "" if it did, or without a certificate.
 
-        The text names several reasons, because a client cannot tell whether the robot is absent,
-        hangs, or does not list the client's certificate. The text is "" if the robot answered a
-        query, or if the client connects without a certificate.
+        A client cannot tell whether the robot is absent, hangs, or does not list the certificate.
         """
         return "" if self.role or not self.certificate else self._nobody()
 
@@ -86,10 +71,7 @@ class ClientIdentity(Struct, frozen=True):
         )
 
     def describe(self) -> str:
-        """Return a sentence about the client's role and certificate.
-
-        If the role is unknown, the text says instead why the robot may not have answered.
-        """
+        """Return a sentence about role and certificate, or about the silence."""
         if not self.role:
             return self._nobody()
         owner = (
@@ -103,11 +85,7 @@ class ClientIdentity(Struct, frozen=True):
 def identity(
     ask: Ask, tls: str, sender: str, robot: str = "", endpoint: str = ""
 ) -> ClientIdentity:
-    """Query the robot for this client's role, and return the client's identity.
-
-    Blocks for up to `WHOAMI_S`. `tls` is the directory of the client's certificate, or "" without a
-    certificate. The other arguments, except `ask`, become fields of the result.
-    """
+    """Query the robot for this client's role, for at most `WHOAMI_S`."""
     answers: SimpleQueue[str] = SimpleQueue()
     for role in ROLES:
         ask(whoami_key(role), lambda sample: answers.put(str(sample.key_expr)))

@@ -1,8 +1,8 @@
 """Sends the commands of several senders from one thread, so that no caller waits for the bus.
 
-Each sender has a `Commander`, which keeps only the newest command of that sender. When a sender
-leaves, the program must call `Outbox.release()`. The thread then sends a zero if the robot may
-still follow the sender's last command. It does so even if the bus was blocked for a long time.
+Each has a `Commander`, which keeps only its newest command. When it leaves, the program calls
+`release()`, and the thread sends a zero if the robot may still follow, even if the bus was blocked
+for long.
 """
 
 from __future__ import annotations
@@ -16,31 +16,24 @@ from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, Commander, Wish
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
-Put = Callable[[Wish], object]
-"""Function that sends one command on the bus. It may block."""
+Put = Callable[[Wish], object]  # sends one command, and may block
 
 
 class Outbox:
-    """Sends the commands of several senders to the robot from a separate thread."""
-
     def __init__(self, dropped: Callable[[], object] = lambda: None) -> None:
-        """Start the thread. It calls `dropped` for each command that `Commander.send` drops."""
+        # `dropped` is called for each command that `Commander.send` drops.
         self._dropped = dropped
         self._senders: dict[Commander, Put] = {}
         self._zeros: list[tuple[Put, Wish]] = []
         self._news = Condition()
         self._busy = self._ended = False
+        # Gets an exception that ends the thread; otherwise pending.
         self.dead: Future[Never] = Future()
-        """If an exception ends the thread, this future gets the exception, and no further command
-        is sent. While the thread runs, and if `end` ends it, the future stays pending."""
         self._thread = Thread(target=self._run, name="outbox", daemon=True)
         self._thread.start()
 
     def take(self, commander: Commander, put: Put, wish: Wish) -> int | None:
-        """Queue the command `wish` of the sender `commander`. The thread calls `put` to send it.
-
-        Returns the time since the sender's previous command, ns, or None (see `Commander.take`).
-        """
+        """Queue a sender's command, which the thread sends by `put`; see `Commander.take`."""
         with self._news:
             silence = commander.take(wish, clock.steady_ns())
             self._senders[commander] = put
@@ -48,11 +41,7 @@ class Outbox:
         return silence
 
     def release(self, commander: Commander, timeout_s: float = MAX_SOURCE_TIMEOUT_S) -> None:
-        """Remove the sender `commander`, and queue a zero if necessary.
-
-        A zero is necessary if the robot may still follow the last command of this sender.
-        `timeout_s` is the timeout of the sender's source, s.
-        """
+        """Remove a sender, and queue a zero if the robot may still follow it."""
         with self._news:
             put = self._senders.pop(commander, None)
             zero = commander.end(clock.steady_ns(), timeout_s)
@@ -82,7 +71,6 @@ class Outbox:
             self.dead.set_exception(error)
 
     def _round(self) -> bool:
-        """Wait until commands are due, and send them. Return False if the thread must end."""
         with self._news:
             self._busy = False
             self._news.notify_all()

@@ -53,7 +53,7 @@ from acsard.core.messages.keys_and_roles import (
 )
 from acsard.core.messages.permissions import COMMAND_ROLE, has
 from acsard.core.messages.signature import Signature, public_name
-from acsard.core.values import Plain, Pose
+from acsard.core.values import Ns, Plain, Pose
 from acsard.host import clock
 from acsard.host.errors import (
     MendableError,
@@ -67,9 +67,8 @@ from acsard.host.own_identity import new_secret, own_name, sender_id
 
 REPLY_TIMEOUT_S = 3.0
 
+# Zenoh's error reply to a query that reached the other side but was not answered in time.
 TIMED_OUT = "Timeout"
-"""Text of Zenoh's error reply to a query that reached the other side but was not answered in
-time."""
 
 
 @contextmanager
@@ -105,15 +104,14 @@ def connect(
         robot.end()
 
 
+# Open connections, with the process and the thread that opened each.
 _open: dict[Client, tuple[int, threading.Thread]] = {}
-"""The clients whose connection is open, each with the process and the thread that opened it."""
 
 
 def end_at_exit(client: Client) -> None:
-    """End a connection when the program ends, unless `Client.end` was called before.
+    """End a connection when the program ends, unless `Client.end` was called.
 
-    If Python ended with an open connection, a thread of Zenoh or a thread that waits for messages
-    could block it or abort it.
+    A thread of Zenoh or one that waits for messages could block or abort Python's end.
     """
     _open[client] = os.getpid(), threading.current_thread()
 
@@ -138,7 +136,7 @@ atexit.register(_end_all)
 
 
 def _end(clients: Sequence[Client]) -> None:
-    """Close the connections of these clients. First stop each robot that may still follow them."""
+    # First stop each robot that may still follow them.
     now, ends = clock.steady_s(), []
     for client in clients:
         _open.pop(client, None)
@@ -156,7 +154,7 @@ def _end(clients: Sequence[Client]) -> None:
 
 
 def close(session: zenoh.Session) -> None:
-    """Close a Zenoh session. Ignore the error if the other side does not respond."""
+    """Close a Zenoh session, even if the other side does not respond."""
     try:
         session.close()
     except zenoh.ZError:
@@ -164,30 +162,23 @@ def close(session: zenoh.Session) -> None:
 
 
 class _CommandSpacing:
-    """Keeps a minimum pause between the commands of all clients on one connection.
-
-    The daemon accepts at most 1000 commands a second per connection and key. Without the pause, the
-    daemon would drop a zero that is sent directly after another command.
-    """
-
+    # The daemon drops commands above 1000 a second per connection and key, and so would drop a zero
+    # directly after another one.
     def __init__(self) -> None:
         # The lock is reentrant: a signal handler may also send while the same thread holds it.
         self._lock, self._next_s, self._last_s = threading.RLock(), 0.0, 0.0
-        self.moving: dict[Client, float] = {}
-        """The monotonic time of the last command, s, for each client whose last command was not
-        zero."""
-        self.ending = False
-        """Whether the connection is being closed, so that only zeros may be sent."""
+        self.moving: dict[Client, float] = {}  # last command of each client, unless it was zero, s
+        self.ending = False  # only zeros may be sent
 
     def end(self) -> list[tuple[Client, float]]:
-        """Permit only zeros from now on. Return the clients in `moving` with their times."""
+        """Permit only zeros from now on, and return `moving`."""
         with self._lock:
             self.ending = True
             return list(self.moving.items())
 
     @contextmanager
     def wait(self) -> Iterator[None]:
-        """Wait until the next command may be sent. The caller sends it in the `with` block."""
+        """Wait until the next command may be sent, which the `with` block does."""
         # Each thread reserves a time and waits for it without the lock. Otherwise a thread that
         # sends without end would take the lock again and again before the others.
         with self._lock:
@@ -216,13 +207,10 @@ class Client:
     ) -> None:
         self.session, self.source = session, source
         self.where = Address(endpoint, robot_id, tls)
-        self.name = own_name()
-        """Name of this client in the daemon's log of service calls. You may change it."""
+        self.name = own_name()  # in the daemon's log of service calls; you may change it
         self._opened = False
         self._spacing = _CommandSpacing()
-        self.certificate = shown_at(endpoint, tls)
-        """Common name of the certificate that this client shows to the daemon; "" if it shows no
-        certificate."""
+        self.certificate = shown_at(endpoint, tls)  # common name that the daemon sees
         # The secret identifies this program as a caller of services. Clients made by `sibling`
         # share it, although they may send commands under another name.
         self._secret = new_secret()
@@ -234,9 +222,8 @@ class Client:
     def _sign_as(self, name: str) -> None:
         whole = sender_id(name)
         self._sender = CommandSigner(whole)
+        # `state.sender` while this client drives.
         self.sender = public_name(whole, self.certificate)
-        """Public name of this client as a sender of commands. While the client drives,
-        `state.sender` has this value."""
 
     @property
     def caller(self) -> str:
@@ -284,22 +271,19 @@ class Client:
                 self._opened = True
                 self._put(0.0, 0.0, None)
 
-    def forward(self, linear: float, angular: float, *, stamp_ns: int | None = None) -> None:
-        """Send a command that this program has received, for example from a panel of Foxglove.
+    def forward(self, linear: float, angular: float, *, stamp_ns: Ns | None = None) -> None:
+        """Send a command that this program has received, never a zero in its place.
 
-        Unlike `send`, this method never sends a zero in place of the command. `linear` is in m/s,
-        and `angular` in rad/s (left is +). `stamp_ns` is the time of the command on the clock of
-        the panel, ns. None means the present time of this computer.
+        It is in m/s and rad/s (left is +). `stamp_ns` is by the clock of its origin, or now.
         """
         with self._spacing.wait():
             self._put(linear, angular, stamp_ns)
 
     def end(self) -> None:
-        """Close the connection. `connect` calls this at the end of its `with` block.
+        """Close the connection, as `connect` does at the end of its `with` block.
 
-        First stop each robot that may still follow a client of this connection (`repeat_zeros`).
-        Without a zero, the robot would drive on until the timeout of the source, which may be 10 s.
-        From this call on, other threads and tasks can send only zeros.
+        First stop each robot that may still follow: without a zero, it would drive on until the
+        source's timeout, up to 10 s. From now on, other threads can send only zeros.
         """
         _end([self])
 
@@ -434,11 +418,7 @@ class Client:
             yield reader.decode(*encoded(sample))
 
     def samples(self, name: str, timeout: float | None = None) -> Iterator[zenoh.Sample]:
-        """Yield the undecoded samples of any key or wildcard below the robot's id, as they arrive.
-
-        The iterator ends after `timeout` s without a sample, and when the connection is closed.
-        Without a `timeout`, it ends only when the connection is closed.
-        """
+        """Yield samples of a key or wildcard below the robot's id, until a `timeout`, s."""
         yield from Subscription(self._queue(name)).until_silence(timeout)
 
     def listen(self, name: str, callback: Callable[[zenoh.Sample], None]) -> Any:
@@ -504,7 +484,7 @@ class Client:
             timestamp=self.session.new_timestamp(),
         )
 
-    def _put(self, linear: float, angular: float, stamp_ns: int | None) -> None:
+    def _put(self, linear: float, angular: float, stamp_ns: Ns | None) -> None:
         if self._spacing.ending and (linear or angular):
             raise NoAnswerError("the connection to the daemon is being closed: connect again")
         steady = stamp_ns is None
@@ -564,11 +544,7 @@ class Client:
         )
 
     def explain_error(self, error: UnheardError | NoAnswerError) -> MendableError:
-        """Return the error to raise in place of `error`, which ended a drive or a query.
-
-        The returned error has one of the types that `acsard.client` documents. If the role of this
-        client may be the reason, the text of the returned error names the role.
-        """
+        """Return the error to raise instead, which names the role if that may be the cause."""
         if isinstance(error, UnheardError) and not self.where.tls:
             return NotDrivenError(str(error))
         if not self.where.tls:
@@ -586,8 +562,7 @@ class Client:
 
 
 class _PartialImu(schema.Imu, frozen=True, kw_only=True):
-    """An `Imu` in which all fields except `angular_velocity` may be missing."""
-
+    # In JSON and msgpack only `angular_velocity` is required.
     header: schema.Header = schema.Header()
     orientation: schema.Quaternion = schema.Quaternion()
     orientation_covariance: schema.Covariance3 = field(default_factory=UNKNOWN_COVARIANCE.copy)
@@ -600,11 +575,6 @@ class _PartialImu(schema.Imu, frozen=True, kw_only=True):
 
 
 class _ImuDecoder(Decoder[schema.Imu]):
-    """Decoder that accepts each form of an `Imu` that the daemon accepts.
-
-    In JSON and msgpack only `angular_velocity` is required.
-    """
-
     def __init__(self) -> None:
         super().__init__(_PartialImu)
 
@@ -621,10 +591,7 @@ def decoder_of(kind: type) -> Decoder[Any]:
 
 @lru_cache(maxsize=64)
 def decoder(name: str) -> Decoder[Any]:
-    """Return the decoder for the messages of the key `name`.
-
-    Messages of keys without a message type (config, schema/…) are decoded to dictionaries.
-    """
+    """Return the decoder for a key; those without a message type (config) give dictionaries."""
     topic = by_key(name)
     cls = None if topic is None else schema.MESSAGES.get(topic.type)
     return decoder_of(cls or dict)
