@@ -1,9 +1,8 @@
 """Creates the certificate authority of a robot, and the certificates that the authority signs.
 
-All certificates and keys are files. The keys are P-256 keys, in files that only their owner can
-read. Users make their phones trust the authority. So the authority's certificate limits the hosts
-for which the authority may sign: a thief of the authority's key can pose as a robot or as a host of
-a private network, but not as a web site on the Internet.
+Keys are P-256, in files that only their owner can read. Users make their phones trust the
+authority, so its certificate limits the hosts: a thief of its key can pose as a robot or as a host
+of a private network, but not as a web site on the Internet.
 """
 
 from __future__ import annotations
@@ -25,23 +24,19 @@ from acsard.host.atomic_file import replace
 from acsard.host.errors import MendableError
 from acsard.machine.certificates import CA_KEY
 
+# An authority may sign for these, and for all names below them.
 LOCAL_NAMES = ("local", "localhost")
-"""Host names for which every authority may sign certificates. An authority may also sign for all
-names below these names, such as `robot.local`."""
 
+# No host on the Internet has such an address.
 PRIVATE_NETWORKS = (
     "10.0.0.0/8", "100.64.0.0/10", "127.0.0.0/8", "169.254.0.0/16", "172.16.0.0/12",
     "192.168.0.0/16", "::1/128", "fc00::/7", "fe80::/10",
 )  # fmt: skip
-"""Networks for whose IP addresses every authority may sign certificates. No host on the Internet
-has such an address."""
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 
 class Authority:
-    """A certificate authority: a certificate and the key that signs other certificates."""
-
     def __init__(self, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
         self._certificate, self._key = certificate, key
 
@@ -49,19 +44,10 @@ class Authority:
     def make(
         cls, directory: Path, name: str, days: int, addresses: Sequence[str] = ()
     ) -> Authority:
-        """Create an authority, and write its certificate and its key into `directory`.
+        """Create an authority in `directory`, for certificates with any common name (of a client).
 
-        The authority may sign certificates with any common name. The common names identify clients
-        on the bus.
-
-        Args:
-            directory: existing or new directory for the files.
-            name: common name of the authority.
-            days: usual validity of the certificates that the authority signs, days. The authority's
-                own certificate is valid for five times as long.
-            addresses: host names and IP addresses for which the authority may sign, in addition to
-                `LOCAL_NAMES` and `PRIVATE_NETWORKS`. A host name also permits all names below it,
-                and an IPv6 address also permits its /64 network.
+        `days` is the validity of its certificates; its own is five times as long. It may also sign
+        for `addresses`: host names with all below them, and IPv6 addresses with their /64 network.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -80,11 +66,9 @@ class Authority:
 
     @classmethod
     def load(cls, directory: Path, password: Callable[[], str]) -> Authority:
-        """Load the authority from its files in `directory`.
+        """Load the authority; `password` is called if its key is encrypted.
 
-        `password` is a function that returns the password of the private key. It is called only if
-        the key is encrypted. Raises `OSError` or `ValueError` if the authority cannot be loaded or
-        has expired.
+        Raises `OSError` or `ValueError`, also for one that has expired.
         """
         data = (directory / CA_KEY).read_bytes()
         try:
@@ -106,12 +90,10 @@ class Authority:
         return cls(certificate, key)
 
     def permits(self, address: str) -> bool:
-        """Return whether this authority may sign a certificate for a host name or IP address.
+        """Return whether the authority may sign for a host name or IP address.
 
-        The authority's certificate may list permitted and excluded host names and networks. If it
-        lists no permitted names, it permits all names that it does not exclude. The same holds for
-        networks. The certificate of an authority that acsard has made lists permitted names and
-        networks.
+        Without permitted names in its certificate, all are permitted that it does not exclude; so
+        are networks.
         """
         try:
             constraints = self._certificate.extensions.get_extension_for_class(x509.NameConstraints)
@@ -125,10 +107,7 @@ class Authority:
         return not permitted or any(_within(address, name) for name in permitted)
 
     def names_in(self, directory: Path) -> list[str]:
-        """Return the host names and IP addresses in the certificate in `directory`.
-
-        Return [] if the certificate cannot be read, or if it does not contain any.
-        """
+        """Return the host names and IP addresses in the certificate in `directory`."""
         try:
             certificate = x509.load_pem_x509_certificate((directory / CERTIFICATE).read_bytes())
             names = certificate.extensions.get_extension_for_class(
@@ -140,16 +119,7 @@ class Authority:
         return [*names.get_values_for_type(x509.DNSName), *map(str, addresses)]
 
     def issue(self, directory: Path, name: str, addresses: list[str], days: float) -> None:
-        """Create a key, and sign a certificate with which a program can be server and client.
-
-        Write the key, the certificate and the authority's own certificate into `directory`.
-
-        Args:
-            directory: existing or new directory for the files.
-            name: common name of the certificate.
-            addresses: host names and IP addresses for which the certificate is valid.
-            days: validity of the certificate, days.
-        """
+        """Create a key and a certificate for server and client, beside the authority's."""
         key = ec.generate_private_key(ec.SECP256R1())
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
         both = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
@@ -240,10 +210,7 @@ def _general_name(address: str) -> x509.GeneralName:
 
 
 def _within(address: str, subtree: x509.GeneralName) -> bool:
-    """Return whether the name constraint `subtree` includes `address`, by the rules of OpenSSL.
-
-    If `subtree` is a network, `address` must be an IP address. Otherwise both must be host names.
-    """
+    # By the rules of OpenSSL: a network matches IP addresses, a name host names.
     if isinstance(subtree, x509.IPAddress):
         return ipaddress.ip_address(address) in ipaddress.ip_network(str(subtree.value))
     name, base = address.lower(), str(subtree.value).lower()
@@ -264,11 +231,8 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(files: Mapping[Path, tuple[bytes, int]]) -> None:
-    """Write all of these files, or none of them: a key and its certificate belong together.
-
-    `files` contains the content and the mode of each file. A file never has more permissions than
-    its mode, not even during the write. Raises `MendableError` if the disk refuses a file.
-    """
+    # All or none: a key and its certificate belong together. Never with more permissions than the
+    # mode. Raises `MendableError`.
     new = {path: path.with_name(f"{path.name}.new") for path in files}
     try:
         for path, (data, mode) in files.items():

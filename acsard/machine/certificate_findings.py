@@ -33,10 +33,7 @@ from acsard.machine.finding import LEVELS, Finding
 
 
 def certificates(tls: str) -> Iterator[Finding]:
-    """Yield findings about this machine's certificates, which are in the directory `tls`.
-
-    Yield nothing if `tls` is "".
-    """
+    """Yield findings about this machine's certificates, if there are any."""
     if not tls:
         return
     directory = Path(tls)
@@ -81,11 +78,9 @@ def certificates(tls: str) -> Iterator[Finding]:
 
 
 def renewal(tls: str, whose: str) -> str:
-    """Return advice on how to replace a certificate that expires soon, with the commands to run.
+    """Return how to replace a certificate that expires soon: "" is this machine's own.
 
-    `tls` is the directory of this machine's certificate. `whose` says which certificate expires: ""
-    for this machine's certificate, `AUTHORITY` for the certificate of the authority, or a text such
-    as "the router tls/HOST:PORT".
+    `whose` may also be `AUTHORITY` or a text such as "the router tls/HOST:PORT".
     """
     directory, name = Path(tls), common_name(tls)
     if whose == AUTHORITY:
@@ -143,10 +138,7 @@ def _command(action: str, directory: Path) -> str:
 
 
 def router_certificates(config: Config) -> Iterator[Finding]:
-    """Yield a finding about the certificate of each router in `bus.connect` that uses TLS.
-
-    Yield nothing about a router that does not answer.
-    """
+    """Yield a finding about the certificate of each TLS router in `bus.connect` that answers."""
     tls = config.bus.tls
     for whose, ends_ns in router_expiry_times(config.bus.tls_routers, tls).items():
         code, words = expiry({whose: ends_ns}, now().wall_ns)

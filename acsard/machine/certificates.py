@@ -1,7 +1,7 @@
 """Creates the certificates of the authority, of the robot and of its clients, and renews them.
 
-The robot admits a client if the robot's authority has signed the client's certificate. The common
-name in that certificate determines the client's permissions (`[access]` in acsard.toml).
+The robot admits clients whose certificate its authority has signed. The common name determines
+their permissions (`[access]`).
 """
 
 from __future__ import annotations
@@ -27,34 +27,23 @@ if TYPE_CHECKING:
     from acsard.machine.authority import Authority
 
 PORT = 7449
-CA_KEY = "ca-key.pem"
-"""Name of the file with the authority's private key. This file is never copied to a client."""
+CA_KEY = "ca-key.pem"  # never copied to a client
 
-ROBOT_NAME = "robot"
-"""Common name of the certificate that `tls init` makes for the robot itself."""
+ROBOT_NAME = "robot"  # common name of the robot's own certificate
 
+# A host name or an IP address.
 ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
-"""Regular expression of a host name or an IP address."""
 
 LABEL = r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?"
+# A common name that looks like a host name or an address.
 HOST_LIKE = re.compile(rf"{LABEL}(\.{LABEL})*\Z")
-"""Regular expression of a common name that looks like a host name. It also matches addresses such
-as `10.0.0.5`."""
 
 
 def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -> list[str]:
     """Create an authority, the robot's certificate and a client certificate for each role.
 
-    Return the host names and addresses in the robot's certificate.
-
-    Args:
-        directory: directory for all files.
-        addresses: host names and addresses for the robot's certificate, in addition to those of
-            this machine.
-        days: validity of the robot's and the clients' certificates, days. The authority's
-            certificate is valid for five times as long.
-        force: whether to replace an authority, a key or a certificate that `directory` already
-            contains. If it is false, raise `MendableError` for such a directory.
+    Return the names and addresses in the robot's: this machine's and `addresses`. `force` replaces
+    existing files. Raises `MendableError`.
     """
     for name in () if force else (CA, CA_KEY, CERTIFICATE, KEY):
         if (directory / name).exists():
@@ -78,17 +67,9 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
 
 
 def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
-    """Create a client certificate, and return the directory of its files.
+    """Create a client certificate, and return its directory.
 
-    Args:
-        directory: directory that contains the authority.
-        name: common name of the certificate.
-        addresses: host names and addresses of the client for the certificate.
-        days: validity of the certificate, days.
-
-    Raises:
-        MendableError: a directory for this client exists already, the authority may not sign for
-            one of the addresses, or the authority cannot be used.
+    Raises `MendableError`: it exists, or the authority is unusable or may not sign this.
     """
     authority = _load(directory)
     place = directory / "clients" / name
@@ -101,12 +82,9 @@ def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path
 
 
 def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
-    """Replace the client certificate with the common name `name`, and return its directory.
+    """Replace a client's certificate, and return its directory.
 
-    The new certificate contains `addresses`, and those host names and addresses in the old
-    certificate that the authority permits. The new certificate is valid for `days` days.
-    `directory` contains the authority. Raises `MendableError` if the client has no certificate, if
-    the authority may not sign for one of the addresses, or if the authority cannot be used.
+    The old names and addresses stay if permitted. Raises `MendableError`.
     """
     authority = _load(directory)
     clients = directory / "clients"
@@ -125,13 +103,9 @@ def renew_client(directory: Path, name: str, addresses: Sequence[str], days: int
 
 
 def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
-    """Replace the robot's certificate; return the names and addresses in the new certificate.
+    """Replace the robot's certificate; return the names and addresses in the new one.
 
-    The new certificate contains `addresses`. It also contains the names and addresses of this
-    machine and those in the old certificate, as far as the authority permits them. The new
-    certificate is valid for `days` days. `directory` contains the authority and the robot's
-    certificate. Raises `MendableError` if the authority may not sign for one of the addresses, or
-    cannot be used.
+    Those of this machine and of the old one are included if permitted. Raises `MendableError`.
     """
     authority = _load(directory)
     _require_permitted(authority, addresses)
@@ -172,12 +146,7 @@ def _robot_names(more: Sequence[str]) -> list[str]:
 
 
 def keys(config: Config, directory: Path) -> dict[str, object]:
-    """Return values of `bus.listen` and `bus.tls` with which other machines can connect over TLS.
-
-    The new `bus.listen` contains the endpoints of `config`, the present configuration. If none of
-    these endpoints uses TLS, the new `bus.listen` also contains a TLS endpoint at port `PORT`. The
-    new `bus.tls` is `directory`, which contains the robot's certificate.
-    """
+    """Return `bus.listen`, with a TLS endpoint at `PORT` if it has none, and `bus.tls`."""
     listen = list(config.bus.listen)
     if not any(map(is_tls, listen)):
         listen.append(f"tls/0.0.0.0:{PORT}")
@@ -185,10 +154,7 @@ def keys(config: Config, directory: Path) -> dict[str, object]:
 
 
 def port(config: Config) -> str:
-    """Return the TCP port of the first TLS endpoint in `config`, or `PORT` if no endpoint uses TLS.
-
-    The settings that `keys` returns let the robot listen on this port.
-    """
+    """Return the TCP port of the first TLS endpoint, or `PORT`, as `keys` sets it."""
     ports = [at.rpartition(":")[2] for at in config.bus.listen if is_tls(at)]
     return ports[0] if ports else str(PORT)
 

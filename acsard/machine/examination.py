@@ -1,12 +1,8 @@
 """Runs all examinations of `acsard doctor` in order.
 
-`certificate_findings.py` examines the certificates, and `daemon_findings.py` examines the daemon
-and its serial link. The doctor opens no serial port, and sends only queries to a robot.
-
-If a daemon runs, the doctor examines the daemon's configuration and not the configuration file. The
-file may have been edited since the daemon's start, or the daemon may have been started with
-options. If the daemon runs on another machine, the doctor examines the daemon's reports and this
-machine's certificates, because the daemon's port, files and gateway are on the other machine.
+The doctor opens no serial port, and sends only queries. Of a daemon that runs, it examines the
+configuration in force, not the file, which may have changed. On another machine, it examines the
+daemon's reports and this machine's certificates, because port, files and gateway are there.
 """
 
 from __future__ import annotations
@@ -21,7 +17,7 @@ from acsard.bus.address import Address, address_of
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.config.settings import Config
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Ns
 from acsard.host import clock, real_time
 from acsard.host.kernel_counters import Kernel, Reading
 from acsard.host.processes import holders, is_running
@@ -39,7 +35,7 @@ from acsard.machine.serial_ports import BOARDS, serial_devices
 
 
 def port_grabbers() -> Iterator[Finding]:
-    """Yield findings about running programs that take over serial ports or send data to them."""
+    """Yield findings about programs that take over serial ports or send data to them."""
     if is_running("brltty"):
         mend = (
             "run `sudo apt remove brltty`, unless you use a Braille display: brltty takes the "
@@ -57,10 +53,7 @@ def port_grabbers() -> Iterator[Finding]:
 
 
 def clock_year() -> Iterator[Finding]:
-    """Yield a finding about whether this computer's wall clock shows a plausible year.
-
-    The time stamps of all messages come from this clock.
-    """
+    """Yield a finding on whether the wall clock, which stamps all messages, is plausible."""
     year = time.gmtime(clock.now().wall_ns / NS_PER_S).tm_year
     if year < 2026:  # a computer without a battery for its clock starts with an old date
         mend = (
@@ -73,11 +66,9 @@ def clock_year() -> Iterator[Finding]:
 
 
 def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
-    """Yield a finding about whether the daemon has real-time scheduling.
+    """Yield a finding on real-time scheduling of the daemon, or of one that this user starts.
 
-    If no daemon runs, the finding says whether a daemon of this user would get real-time
-    scheduling. `wanted` is the setting `control.real_time`, and `pid` is the process id of the
-    running daemon, or None if no daemon runs.
+    `wanted` is `control.real_time`.
     """
     has = None if pid is None else real_time.is_real_time(pid)
     level: Level = "ok"
@@ -100,22 +91,15 @@ def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
     yield Finding("real time", level, text, "" if level == "ok" else mend)
 
 
-MEASUREMENT_S = 0.3
-"""Time between the two readings of the kernel's counters, s. The kernel updates its counters at
-each clock tick, and there are 30 ticks in this time."""
+MEASUREMENT_S = 0.3  # between two readings of the kernel's counters: 30 clock ticks
 
 
+# Share of the time in which the host of a virtual machine took the processor.
 MAX_STEAL_FRACTION = 0.02
-"""Share of the measurement above which steal time is reported. Steal time is time in which the host
-of a virtual machine took the processor away."""
 
 
 def slowness(kernel: Kernel | None = None) -> Iterator[Finding]:
-    """Yield findings about present conditions of this computer that slow down programs.
-
-    An example is an overheated processor. `kernel` reads the kernel's counters; None means a new
-    reader.
-    """
+    """Yield findings about what slows programs down now, such as an overheated processor."""
     kernel = kernel or Kernel()
     before, began_ns = kernel.read(), clock.mono_ns()
     time.sleep(MEASUREMENT_S)
@@ -130,11 +114,8 @@ def slowness(kernel: Kernel | None = None) -> Iterator[Finding]:
         yield Finding("computer", "ok", text)
 
 
-def slowdowns(before: Reading, after: Reading, within_ns: int) -> list[tuple[str, str]]:
-    """Return the causes that slow down every program on this computer now, each with advice.
-
-    `before` and `after` are two readings of the kernel's counters, made `within_ns` apart.
-    """
+def slowdowns(before: Reading, after: Reading, within_ns: Ns) -> list[tuple[str, str]]:
+    """Return the causes that slow down every program now, each with advice."""
     causes, now = [], after.conditions
     if now.undervoltage:
         text = "the supply voltage is too low, which slows the processor"
@@ -156,11 +137,7 @@ def slowdowns(before: Reading, after: Reading, within_ns: int) -> list[tuple[str
 
 
 def serial_port(config: Config) -> Iterator[Finding]:
-    """Yield findings about the serial port `mcu.port` of the configuration.
-
-    They say whether the port exists, whether this user may open it, and which programs use it.
-    There is also a finding about unknown or slow USB hardware of the port.
-    """
+    """Yield findings about `mcu.port`: whether it exists, who may open and uses it, its USB."""
     path = config.mcu.port
     if config.mcu.simulated:
         mend = (
@@ -240,16 +217,9 @@ def examine(
     overrides: dict[str, dict[str, object]],
     find_address: Callable[[Config], Address] = address_of,
 ) -> Iterator[Finding]:
-    """Yield all findings of the doctor.
+    """Yield all findings of the doctor. Raises `UsageError` for an invalid endpoint.
 
-    Args:
-        where: the path of the configuration file, for messages.
-        text: the content of the configuration file.
-        overrides: the values that replace values in the file, by table and key.
-        find_address: function that returns the daemon's address for a configuration.
-
-    Raises:
-        UsageError: the daemon's address contains an invalid endpoint.
+    `overrides` replace values of the file by table and key. `where` is its path.
     """
     try:
         config = parse(text, overrides)

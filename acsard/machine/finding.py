@@ -7,17 +7,12 @@ from typing import Literal
 from msgspec import Struct
 
 Level = Literal["ok", "warning", "failure"]
+# Mild to severe; the index is the number in ROS diagnostics.
 LEVELS: tuple[Level, ...] = ("ok", "warning", "failure")
-"""The levels of findings, from mild to severe. The index of a level is also its number in ROS
-diagnostics."""
 
 
 class Finding(Struct, frozen=True):
-    """One result of `acsard doctor`.
-
-    `subject` is the name of the examined part, `text` is the result in words, and `mend` is the
-    advice to the user, or "" if no advice is needed.
-    """
+    """One result of `acsard doctor`, with advice in `mend` if any is needed."""
 
     subject: str
     level: Level

@@ -1,8 +1,7 @@
 """Makes the configuration file of a fleet's router.
 
-The template `deploy/zenoh/router.json5` is for one robot. `router_file` repeats the template's
-lines between the marks ROBOT and END for each robot. It repeats the lines between PERSON
-and END PERSON for each certificate that may command.
+It repeats lines of `deploy/zenoh/router.json5`, the template for one robot: those between ROBOT and
+END for each robot, and those between PERSON and END PERSON for each certificate that may command.
 """
 
 from __future__ import annotations
@@ -15,19 +14,15 @@ from collections.abc import Mapping, Sequence
 from acsard.core.values import ROLES, Role
 from acsard.host.errors import UsageError
 
-EXAMPLE_ROBOT = "robot1"
-"""Id of the example robot in `router.json5`, which is the template."""
+EXAMPLE_ROBOT = "robot1"  # id in the template
 
+# The ids of the robots replace {}.
 ROBOTS_COMMENT = "// This file is for {}. To make a file for your own robots:\n"
-"""Comment near the top of the template and of the router's file. The ids of the robots replace
-{}."""
 
 _BLOCK = re.compile(r"^ *// ROBOT\n(.*?)^ *// END\n", re.M | re.S)
 _NAME = re.compile(rf"\b{EXAMPLE_ROBOT}\b")
 
-EXAMPLE_OPERATOR: Role = "operator"
-"""Example name in the template's lines between PERSON and END PERSON. The common name of each
-certificate that may command replaces this name."""
+EXAMPLE_OPERATOR: Role = "operator"  # the common name of a certificate that may command replaces it
 
 _PERSONS = re.compile(r"^ *// PERSON\n(.*?)^ *// END PERSON\n", re.M | re.S)
 # Match a whole name or the last part of a key, but not the beginning of a robot's id "operator-1".
@@ -35,17 +30,9 @@ _PERSON = re.compile(rf'(?<=[/" ]){EXAMPLE_OPERATOR}(?=")')
 
 
 def router_file(template: str, robots: Sequence[str], people: Mapping[Role, Sequence[str]]) -> str:
-    """Return the text of the router's configuration file.
+    """Return the text of the router's file. Raises `UsageError` if a name occurs twice.
 
-    Raises `UsageError` if a name occurs twice, because a certificate belongs either to one robot or
-    to one role.
-
-    Args:
-        template: the text of `deploy/zenoh/router.json5`.
-        robots: the robots' ids.
-        people: maps each role to the common names of the certificates with this role. The
-            certificates "viewer", "operator" and "maintainer" always have the role of their name,
-            so leave them out.
+    `people` are the common names of each role, without those of the name of their role.
     """
     names = [*robots, *ROLES, *(name for role in ROLES for name in people.get(role, ()))]
     twice = [name for name, count in Counter(names).items() if count > 1]
@@ -73,8 +60,8 @@ def router_file(template: str, robots: Sequence[str], people: Mapping[Role, Sequ
     )
 
 
+# Lists the certificates of a role.
 _SUBJECT = 'id: "{}", link_protocols: ["tls"], cert_common_names: [{}]'
-"""Line of the template that lists the certificates of a role."""
 
 
 def _with(pattern: re.Pattern[str], name: str, block: str) -> str:

@@ -13,6 +13,7 @@ from serial.tools import list_ports
 
 from acsard.host.processes import Holder, holders
 
+# Names by USB id. A test checks that deploy/udev/70-acsar.rules has the same ids.
 BOARDS: dict[str, str] = {
     "2341:0010": "Arduino Mega 2560",
     "2341:0042": "Arduino Mega 2560 R3",
@@ -23,29 +24,22 @@ BOARDS: dict[str, str] = {
     "0403:6015": "FTDI FT-X",
     "10c4:ea60": "Silicon Labs CP210x",
 }
-"""Maps the USB ids of common microcontroller boards and USB-to-serial chips to their names. A test
-checks that deploy/udev/70-acsar.rules contains the same ids."""
 
 BY_ID = Path("/dev/serial/by-id")
 
 
 class SerialDevice(Struct, frozen=True):
     device: str
-    names: list[str]
-    """Paths of the symbolic links to the port. They stay the same when the device is plugged in
-    again."""
+    names: list[str]  # symbolic links, which stay when the device is plugged in again
     driver: str
-    usb_id: str
-    """USB id in the form `vid:pid`, hexadecimal; "" if the port is not on USB."""
+    usb_id: str  # `vid:pid`, hexadecimal
     description: str
-    board: str
-    """Name of the board or chip with this USB id; "" if `BOARDS` does not contain the id."""
-    holders: list[Holder]
-    """Processes that use the port."""
+    board: str  # by `BOARDS`
+    holders: list[Holder]  # that use the port
 
 
 def serial_devices() -> list[SerialDevice]:
-    """Return the serial ports of this machine that have hardware, sorted by device name."""
+    """Return the serial ports with hardware, sorted by device name."""
     links = _links()
     devices = []
     for port in sorted(list_ports.comports(), key=lambda p: str(p.device)):

@@ -1,8 +1,7 @@
 """Installs acsard as a systemd service, or removes the service.
 
-The files of the service come from `deploy/`, with the path of this installation in the units. A
-file that a user has changed is replaced or removed only with `force` or `purge`. The installation
-and the removal are lists of steps, so that the user can read all steps before they are carried out.
+The files come from `deploy/`, with the path of this installation. A file that a user has changed
+goes only with `force` or `purge`. Both are lists of steps, which the user can read before.
 """
 
 from __future__ import annotations
@@ -25,16 +24,13 @@ from acsard.host.child import how_it_ended
 from acsard.host.errors import MendableError, NotPermittedError
 from acsard.host.processes import run_command
 
-HOME = "/opt/acsard/venv"
-"""Path of the venv in the unit files of `deploy/`. The installed unit files contain the path of the
-venv that runs the installation instead."""
+HOME = "/opt/acsard/venv"  # of the venv in `deploy/`, replaced by the one that runs this
 
+# Group of the service in its unit, and the program that runs `acsard-stop`.
 GROUP, SETPRIV = "dialout", "/usr/bin/setpriv"
-"""`GROUP` is the group of the service in the unit files. `SETPRIV` is the program with which the
-daemon's unit runs `acsard-stop`."""
 
+# systemd hides these from the service.
 HIDDEN_DIRECTORIES = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
-"""Directories that systemd hides from the service."""
 
 
 def unusable_location(
@@ -43,14 +39,7 @@ def unusable_location(
     executable: str = sys.executable,
     hidden: Sequence[str] = HIDDEN_DIRECTORIES,
 ) -> str:
-    """Return the reason why a service cannot run this installation of acsard, or "" if it can.
-
-    Args:
-        prefix: directory of the venv that runs acsard.
-        base: directory of the Python from which the venv was made.
-        executable: path of the Python interpreter.
-        hidden: directories that systemd hides from the service.
-    """
+    """Return why a service cannot run this installation, or ""."""
     if prefix == base:
         return (
             f"acsard runs from {prefix}, which is not a venv, but a service needs a venv; install "
@@ -80,10 +69,7 @@ def unusable_location(
 
 
 def missing_prerequisite(group: str = GROUP, program: str = SETPRIV) -> str:
-    """Return an error text if this system does not have the service's group or a needed program.
-
-    Return "" if the system has the group `group` and the program `program`.
-    """
+    """Return an error text if the service's group or a program is missing, or ""."""
     if not os.access(program, os.X_OK):
         return (
             f"{program} is missing, but the service needs it to stop the wheels after the daemon's "
@@ -111,7 +97,7 @@ def _hidden(path: Path, hidden: Sequence[str]) -> bool:
 
 
 def _inaccessible_part(path: Path) -> Path | None:
-    """Return the outermost part of `path` that the service's user may not enter, or None."""
+    # Which the service's user may not enter.
     for place in (*reversed(path.parents), path):
         try:
             mode = place.stat().st_mode
@@ -126,20 +112,13 @@ def _inaccessible_part(path: Path) -> Path | None:
 
 
 class File(Struct, frozen=True):
-    """A file that the installation writes."""
-
     path: Path
     content: bytes
     mode: int = 0o644
-    kept: bool = False
-    """True for a file that users are expected to change, such as the configuration. An installation
-    never replaces such a file. If a user has changed the file, only a purge removes it."""
+    kept: bool = False  # users change it: never replaced, and if changed, removed only by a purge
 
     def current_content(self) -> bytes | None:
-        """Return the present content of the file, or None if it does not exist.
-
-        Raises `MendableError` if the file cannot be read.
-        """
+        """Return the content, or None if there is no file. Raises `MendableError`."""
         try:
             return self.path.read_bytes()
         except FileNotFoundError:
@@ -148,22 +127,14 @@ class File(Struct, frozen=True):
             raise _unreadable(self.path, error) from None
 
     def is_as_written(self) -> bool:
-        """Return whether the existing file has the permission bits `mode` and the owner root.
-
-        Return True for each symbolic link, and for each file that the user may change (`kept` is
-        true), because the user decides about their mode and owner. Raises `OSError` if the file
-        does not exist.
-        """
+        """Return whether mode and owner are right, or the user's affair. Raises `OSError`."""
         status = self.path.lstat()
         if self.kept or stat.S_ISLNK(status.st_mode):
             return True
         return (stat.S_IMODE(status.st_mode), status.st_uid) == (self.mode, 0)
 
     def condition(self) -> str:
-        """Return the condition of the file on this system, in words.
-
-        The result is "missing", "as installed", "changed", "wrong mode or owner" or "unreadable".
-        """
+        """Return "missing", "as installed", "changed", "wrong mode or owner" or "unreadable"."""
         try:
             content = self.current_content()
         except MendableError:
@@ -179,7 +150,7 @@ WRONG_MODE = "wrong mode or owner"
 
 
 class Write(Struct, frozen=True):
-    """Step that writes a file. `why` is the reason in words for the user, or ""."""
+    """Writes a file, for the reason `why`."""
 
     file: File
     why: str = ""
@@ -190,7 +161,7 @@ class Write(Struct, frozen=True):
         return f"write   {self.file.path}  ({size} bytes, mode {mode:o}{why})"
 
     def do(self) -> None:
-        """Write the file. Create missing directories with permission for all users to enter."""
+        # Every user may enter new directories.
         path = self.file.path
         made = [place for place in path.parents if not place.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -201,7 +172,7 @@ class Write(Struct, frozen=True):
 
 
 class Remove(Struct, frozen=True):
-    """Step that deletes a file, or a directory with everything in it."""
+    """Deletes a file, or a directory with everything in it."""
 
     path: Path
 
@@ -213,7 +184,7 @@ class Remove(Struct, frozen=True):
         return self.path.is_dir() and not self.path.is_symlink()
 
     def do(self) -> None:
-        """Delete the file or directory. Also delete acsard's own directories that become empty."""
+        # Also acsard's own directories that become empty.
         if self._is_directory:
             shutil.rmtree(self.path)
         else:
@@ -229,7 +200,7 @@ class Remove(Struct, frozen=True):
 
 
 class Keep(Struct, frozen=True):
-    """Step that leaves a file or directory as it is. `why` is the reason in words, or ""."""
+    """Leaves a file or directory as it is, for the reason `why`."""
 
     path: Path
     why: str = ""
@@ -237,24 +208,18 @@ class Keep(Struct, frozen=True):
     def __str__(self) -> str:
         return f"keep    {self.path}" + (f"  ({self.why})" if self.why else "")
 
-    def do(self) -> None:
-        """Do nothing."""
+    def do(self) -> None: ...
 
 
 class Run(Struct, frozen=True):
     words: tuple[str, ...]
-    may_fail: bool = False
-    """True if a failure of this command does not matter, for example on a system without udev."""
+    may_fail: bool = False  # does not matter, for example on a system without udev
 
     def __str__(self) -> str:
         return f"run     {' '.join(self.words)}"
 
     def do(self) -> None:
-        """Run the command.
-
-        Raises `MendableError` with the command's error output if the command fails, unless
-        `may_fail` is true.
-        """
+        # Raises `MendableError` with the command's error output.
         try:
             done = run_command(self.words, 60.0)
             code = done.returncode
@@ -276,15 +241,14 @@ def _unreadable(path: Path, error: OSError) -> MendableError:
 
 UNIT, GATEWAY, PAGE = "acsard.service", "acsard-gateway.service", "acsard-web.service"
 ALL_UNITS = (UNIT, GATEWAY, PAGE)
+# Removed when they become empty.
 OWN_DIRECTORIES = ("bin", "acsard", *(f"{unit}.d" for unit in ALL_UNITS))
-"""Names of acsard's own directories. The removal of the service also deletes such a directory if
-the directory has become empty."""
 STOP_PROGRAM = "acsard-stop"
 UNIT_DIRECTORY = Path("/etc/systemd/system")
 CONFIG_DIRECTORY = Path("/etc/acsard")
 LAN_DROP_IN = "lan.conf"
-TLS_DIRECTORY = "/etc/acsard/tls"
-"""Directory of the certificates, as the drop-in file `lan.conf` names it."""
+TLS_DIRECTORY = "/etc/acsard/tls"  # in the drop-in `lan.conf`
+# Directories by unit, with their content.
 STATE_DIRECTORIES = {
     UNIT: (
         Path("/var/lib/acsard"),
@@ -292,10 +256,8 @@ STATE_DIRECTORIES = {
     ),
     PAGE: (Path("/var/lib/acsard-web"), "invitations to the page"),
 }
-"""Maps each unit that has a state directory to this directory and a description of its content."""
 
-Found = Mapping[Path, bytes | None]
-"""Maps the path of a file to its present content, or to None if the file does not exist."""
+Found = Mapping[Path, bytes | None]  # by path; None without a file
 
 RELOAD_COMMANDS = (
     Run(("systemctl", "daemon-reload")),
@@ -344,11 +306,7 @@ def _unit(name: str) -> File:
 
 
 def lan_drop_in(unit: str) -> File:
-    """Return the drop-in file `lan.conf` of a unit.
-
-    The drop-in file lets the unit use the local network and the certificates. `unit` is the unit's
-    file name.
-    """
+    """Return the drop-in `lan.conf`: local network and certificates for a unit."""
     return File(
         UNIT_DIRECTORY / f"{unit}.d" / LAN_DROP_IN,
         (source() / "systemd" / LAN_DROP_IN).read_bytes(),
@@ -356,12 +314,10 @@ def lan_drop_in(unit: str) -> File:
 
 
 def admitting(directory: Path) -> Write | Keep | None:
-    """Return the step that lets the service's TLS gateway use the certificates in `directory`.
+    """Return the step that lets the service's TLS gateway use these certificates.
 
-    The step writes a drop-in file for the gateway's unit. Without this file, the gateway may use
-    only loopback, and cannot read root's files. If the drop-in file exists, the step changes only
-    the paths in it. The networks in it stay, because the user may have restricted them. Return None
-    if the service is not installed, or if this program does not run as root.
+    Its drop-in permits more than loopback, and root's files. Of an existing one only the paths
+    change: the user may have restricted the networks. Return None without the service or root.
     """
     if os.geteuid() != 0 or not (UNIT_DIRECTORY / GATEWAY).exists():
         return None
@@ -370,16 +326,7 @@ def admitting(directory: Path) -> Write | Keep | None:
 
 
 def admitted(file: File, content: bytes | None, directory: Path) -> Write | Keep:
-    """Return the step that writes the certificates' directory into a drop-in file.
-
-    If the drop-in file already names the directory, return a `Keep` step.
-
-    Args:
-        file: the drop-in file as the installation writes it.
-        content: the present content of the drop-in file, which the step changes; None if the
-            drop-in file does not exist.
-        directory: the directory of the certificates.
-    """
+    """Return the step that writes the directory of certificates into a drop-in, if needed."""
     place = str(directory).encode()
     text = re.sub(
         rb'(?m)^(LoadCredential=[\w.-]+:|ExecReload=.*cd ")[^"\n]*(/[^/"\n]+|" && .*)$',
@@ -392,10 +339,7 @@ def admitted(file: File, content: bytes | None, directory: Path) -> Write | Keep
 
 
 def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
-    """Return the present content of each file, by path.
-
-    The content is None if the file does not exist. Raises `MendableError` if a file cannot be read.
-    """
+    """Return the present contents by path. Raises `MendableError`."""
     return {file.path: file.current_content() for file in wanted}
 
 
@@ -407,18 +351,9 @@ def wrong_modes(wanted: Iterable[File]) -> set[Path]:
 def installing(
     wanted: Iterable[File], contents: Found, wrong: Container[Path], *, force: bool
 ) -> list[Step]:
-    """Return the steps that install the service.
+    """Return the steps that install the service, with files in `wrong` modes again.
 
-    The steps never change an existing file that the user may change (`File.kept` is true).
-
-    Args:
-        wanted: the files of the installation.
-        contents: the present content of each file, by path; None for a file that does not exist.
-        wrong: the paths of the existing files whose mode or owner is wrong. The steps write these
-            files again.
-        force: whether to overwrite other existing files whose content differs from the
-            installation. If `force` is false and such a file exists, the function raises
-            `MendableError`.
+    Files with `kept` stay. Others that differ are overwritten by `force`, or raise `MendableError`.
     """
     steps: list[Step] = []
     changed: list[str] = []
@@ -461,21 +396,11 @@ def uninstalling(
     purge: bool = False,
     stateful: Iterable[str] = (),
 ) -> list[Step]:
-    """Return the steps that remove the service.
+    """Return the steps that remove the service, with a `Keep` for all that stays.
 
-    For each file or directory that stays, the result contains a `Keep` step with the reason.
-
-    Args:
-        wanted: the files of the installation.
-        contents: the present content of each file, by path; None for a file that does not exist.
-        others: other paths in the service's directories. Only `purge` removes them.
-        force: whether to remove files whose content was changed, too. Even then, a changed file
-            stays if it is meant for the user's changes (`File.kept` is true).
-        purge: whether to remove everything, including all changed files, the paths in `others` and
-            the state directories.
-        stateful: the units that have a state directory. Only `purge` removes these directories. If
-            such a unit is missing, a purge first installs it again, because only systemd can remove
-            the directory.
+    Changed files go with `force`, unless they are `kept`. `purge` removes everything, with `others`
+    and the directories of `stateful` units, which it may have to install again: only systemd can
+    remove them.
     """
     wanted, stateful = list(wanted), list(stateful)
     # Only systemd knows the real path of a state directory, and only while the unit is installed.
@@ -523,10 +448,7 @@ def uninstalling(
 
 
 def state(unit: str) -> str:
-    """Return the state of a systemd unit as lines `NAME=value`.
-
-    If systemctl fails, return its error text. If systemctl cannot be run or hangs, return "".
-    """
+    """Return a unit's state as lines `NAME=value`, systemctl's error text, or ""."""
     about = "--property=ActiveState,SubState,StatusText,NRestarts"
     try:
         done = run_command(("systemctl", "show", unit, about), 10.0)
@@ -536,11 +458,7 @@ def state(unit: str) -> str:
 
 
 def source() -> Path:
-    """Return the path of the directory `deploy/`.
-
-    In an installed package, this directory is inside the package. In a git clone, it is beside the
-    package. Raises `MendableError` if the directory is missing.
-    """
+    """Return `deploy/`, inside the package or beside it in a clone. Raises `MendableError`."""
     package = Path(acsard.__file__).parent
     inside = package / "deploy"
     if inside.is_dir():
@@ -555,10 +473,6 @@ def source() -> Path:
 
 
 def _reference() -> Path:
-    """Return the path of the reference configuration `acsard.toml`.
-
-    In an installed package, this file is inside the directory `deploy/`. In a git clone, it is
-    beside this directory.
-    """
+    # Inside `deploy/` of a package, or beside it in a clone.
     inside = source() / "acsard.toml"
     return inside if inside.is_file() else source().parent / "acsard.toml"
