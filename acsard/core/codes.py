@@ -1,9 +1,9 @@
 """The codes of reasons: one table `code -> (text, advice)`.
 
-Programs read the code, and people read the text. `state`, its sources, the events and the latches
-carry a code of this table. No program reads a text. A text or an advice is a format string, into
-which `reason` or `sentence` inserts the values. The advice follows `->` and says what the operator
-can do. To add a code, add its entry to the table and its name to one of the types below.
+Programs read the code, and people the text. State, sources, events and latches carry a code. A text
+or an advice is a format string, into which `reason` or `sentence` inserts the values. The advice,
+behind `->`, says what the operator can do. To add a code, add its entry to the table and its name
+to one of the types below.
 """
 
 from __future__ import annotations
@@ -13,57 +13,56 @@ from typing import Literal, get_args
 
 from msgspec import Struct
 
+# Conditions that a command source waits for (`values.Wait`)
 WaitCode = Literal[
     "nothing", "command", "proof", "late", "stalled", "neutral", "zeros", "higher", "equal",
     "senders",
 ]  # fmt: skip
-"""Codes of the conditions that a command source waits for (`values.Wait` explains them)."""
 
+# States of the link.
 LinkCode = Literal[
     "port_closed", "port_trouble", "port_blocked", "booting", "link_up", "link_silent", "host_late",
     "simulator_fault", "echo", "checksum_lost", "no_checksum", "replies_damaged", "lines_too_rare",
     "reply_period", "received_nothing", "received_statuses", "received_cut", "received_foreign",
     "received_garbage", "received_few", "received_sparse",
 ]  # fmt: skip
-"""Codes of the states of the link to the board."""
 
+# This computer or the built-in simulator is to blame.
 HOST_CODES: tuple[LinkCode, ...] = ("host_late", "simulator_fault")
-"""Codes of a silence for which this computer or the built-in simulator is to blame."""
 
+# Causes of a latched stop.
 StopCode = Literal[
     "stopped", "stopped_at_start", "emergency_stop", "emergency_stop_silent", "bumper",
     "bumpers_silent", "battery_empty",
 ]  # fmt: skip
-"""Codes of the causes of a latched stop."""
 
+# For which the guard replaces a line; each is a defect of acsard.
 GuardCode = Literal[
     "guard_line_damaged", "guard_too_fast", "guard_no_link", "guard_no_checksum",
     "guard_no_command", "guard_too_long",
 ]  # fmt: skip
-"""Codes of the reasons for which the guard replaces a line. Each of them is a defect of acsard."""
 
 GUARD_CODES: tuple[GuardCode, ...] = get_args(GuardCode)
 
+# Causes of a latched fault.
 FaultCode = Literal[
     GuardCode, "driver_fault", "impossible_speeds", "wheel_dead", "wheel_reversed",
     "wheel_runaway", "wheel_stuck",
 ]  # fmt: skip
-"""Codes of the causes of a latched fault."""
 
 StateCode = Literal[
     StopCode, FaultCode, LinkCode, WaitCode, "switched_off", "not_activated", "shutting_down",
     "emergency_stop_missing", "bumpers_missing", "commanded", "limits_zero", "no_command",
     "bumper_away", "bumper_blocks",
 ]  # fmt: skip
-"""Codes of `state`."""
 
+# For which a message of a client is refused.
 RefusalCode = Literal[
     "unknown_source", "not_finite", "too_many_senders", "unproven", "stale", "malformed",
     "wrong_shape", "wrong_wheels", "unknown_encoding", "too_big", "not_a_put", "wildcard",
     "displaced", "other_certificate", "second_sender", "no_rate", "out_of_range", "no_attachment",
     "bad_attachment", "unknown_format",
 ]  # fmt: skip
-"""Codes of the reasons for which a message of a client is refused."""
 
 Code = Literal[StateCode, RefusalCode]
 
@@ -304,8 +303,7 @@ class Reason(Struct, frozen=True, gc=False):
     code: Code
     text: str
     advice: str = ""
-    part: str = ""
-    """The part of the robot, such as a wheel. It distinguishes reasons of the same code."""
+    part: str = ""  # such as a wheel; it distinguishes reasons of the same code
 
 
 def _parse(table: str) -> dict[str, Entry]:
@@ -318,7 +316,6 @@ def _parse(table: str) -> dict[str, Entry]:
 
 
 CODES: dict[str, Entry] = _parse(TABLE)
-"""Maps each code to its text and its advice."""
 
 
 def reason(code: Code, part: str = "", **values: object) -> Reason:
