@@ -21,8 +21,7 @@ from acsard.core.values import NS_PER_S, Ns, Outputs
 
 Wheels = tuple[int, int, int, int]  # speeds of the motors a to d, in hundredths of rad/s
 
-Trip = GuardCode | Literal[""]
-"""Why the guard replaced a line with the stop line; "" if it did not."""
+Trip = GuardCode | Literal[""]  # why the guard replaced a line
 
 _ZERO: Wheels = (0, 0, 0, 0)
 _COLUMNS = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")

@@ -67,7 +67,6 @@ def waiting(wait: Wait) -> Reason:
 OBJECTIONS: dict[str, str] = {
     code: sentence(code, most=MAX_SENDERS).text for code in get_args(Objection)
 }
-"""The text for each command that the arbiter refuses."""
 
 
 def missed(periods: int, period_ns: Ns) -> Event:
