@@ -325,13 +325,13 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/pip install '.[foxglove]'": UntestedCommand(
         "an install with extras is made by other tests"
     ),
-    ".venv/bin/acsard foxglove --drive": Elsewhere(
-        FOXGLOVE, "test_a_held_button_drives_and_its_release_stops_the_robot"
+    ".venv/bin/acsard foxglove": Elsewhere(
+        FOXGLOVE, "test_a_viewer_can_stop_the_robot_and_do_nothing_else"
     ),
     "ssh -N -L 8765:127.0.0.1:8765 USER@ROBOT": TWO_MACHINES,
-    "acsard foxglove --drive --connect tls/robot.local:7449 --tls clients/viewer": Elsewhere(
+    "acsard foxglove --connect tls/robot.local:7449 --tls clients/viewer": Elsewhere(
         "tests/system/test_whoami.py",
-        "test_foxglove_with_a_viewer_s_certificate_shows_its_permissions",
+        "test_foxglove_with_a_viewer_s_certificate_shows_and_stops_the_robot",
     ),
     # deploy/firmware
     "sudo apt install make gcc-avr avr-libc binutils-avr avrdude": InCi("gcc-avr"),

@@ -1,7 +1,6 @@
 """Serve the robot's topics, and the service that stops the robot, to Foxglove and Lichtblick (2026
-and later) on this machine until Ctrl-C. With --drive, also offer the other services and the
-settings, and let a Teleop panel drive the robot on /cmd_vel as source `app`. In Foxglove, open a
-connection of the type `Foxglove WebSocket`.
+and later) on this machine until Ctrl-C. In Foxglove, open a connection of the type `Foxglove
+WebSocket`. The robot's page drives the robot: `acsard web`.
 """
 
 from __future__ import annotations
@@ -28,12 +27,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="HOST:PORT",
         help=f"address to listen at; it must be a loopback address (default: {DEFAULT_ADDRESS})",
     )
-    parser.add_argument(
-        "--drive",
-        action="store_true",
-        help="also accept commands, service calls and settings from Foxglove. While this command "
-        "runs, any page that is open in a browser on this machine can send them, too",
-    )
     add_bus(parser)
 
 
@@ -44,14 +37,12 @@ def main(args: argparse.Namespace) -> int:
         raise missing("foxglove-sdk", "foxglove") from None
     address = loopback(args.address)
     with connected(args) as robot:
-        bridge = Bridge(robot, address, _print_message, acts=args.drive)
+        bridge = Bridge(robot, address, _print_message)
         for number in end_signals():
             signal.signal(number, lambda *_: bridge.end())
         try:
-            may = "; Foxglove can show and stop the robot. To drive it from Foxglove, add --drive"
             where = f"ws://{address[0]}:{address[1]}: connect Foxglove to this address"
-            text = f"{robot.where.robot_id} at {where}{'' if args.drive else may}"
-            print(text, flush=True)
+            print(f"{robot.where.robot_id} at {where}", flush=True)
             bridge.run()
         finally:
             bridge.close()
@@ -74,7 +65,7 @@ def loopback(text: str) -> tuple[str, int]:
     if not address.is_loopback:
         raise UsageError(
             f"other machines could reach {text}, but this protocol has no authentication: every "
-            "client that connects could stop the robot, and with --drive could drive it. Listen on "
+            "client that connects could stop the robot. Listen on "
             f"127.0.0.1:{port} and, on the other machine, open a tunnel: "
             f"ssh -N -L {port}:127.0.0.1:{port} USER@ROBOT"
         )

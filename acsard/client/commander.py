@@ -34,24 +34,10 @@ ZEROS = 3
 # for a new sender, and than a short delay.
 GRACE_S = 0.5
 
-# Without a command: a little longer than a source's default timeout of 0.25 s.
-BRAKING_AFTER_NS = 3 * NS_PER_S // 10
-
-# Without input a held key counts as released. A panel of Foxglove sends once a second, and after 2
-# s the daemon forgets a new sender's zero.
+# Without input a held key counts as released. After 2 s the daemon forgets a new sender's zero.
 RELEASE_TIMEOUT_NS = 3 * NS_PER_S // 2
 
-# Wait of the first command after a silence: a panel at 20 Hz sends at most one in it, so more are a
-# burst. After one over `MAX_BURST_COMMANDS`, the next waits too.
-BURST_WINDOW_NS = NS_PER_S // 25
-
-# Commands of a panel in the window (125 Hz); more have waited in a queue, which may have further
-# ones.
-MAX_BURST_COMMANDS = 5
-
 STALE_NS = NS_PER_S // 10  # age of a speed that the operator may no longer want
-
-DRIVING_TIMEOUT_NS = NS_PER_S // 2  # since the last speed, while a sender counts as driving
 
 MAX_SOURCE_TIMEOUT_S = 10.0  # of any source: the robot follows no older command
 
@@ -76,78 +62,47 @@ class Commander:
         sends_leading_zero: send a zero before the first command, and after a silence of
             `RELEASE_TIMEOUT_NS`, for a sender that never sends one. After a shorter silence a
             button may be held, and after a stop and a `clear` a zero would arm it.
-        connected_ns: connection of a sender that may hold a button then: a first command within
-            `RELEASE_TIMEOUT_NS` gets no zero.
-        detects_bursts: let the first command after a silence wait for `BURST_WINDOW_NS`, and drop a
-            burst except for a last zero: a link or a process has delayed it. This is for a sender
-            without stamps, whose delay the daemon cannot measure.
     """
 
-    def __init__(
-        self,
-        *,
-        sends_leading_zero: bool = False,
-        connected_ns: Ns | None = None,
-        detects_bursts: bool = False,
-    ) -> None:
-        self.replaced = self.stale = 0  # not sent: replaced by a newer one; too old or in a burst
+    def __init__(self, *, sends_leading_zero: bool = False) -> None:
+        self.replaced = self.stale = 0  # not sent: replaced by a newer one; too old
         self._sends_leading_zero = sends_leading_zero
-        self._gather_ns = BURST_WINDOW_NS if detects_bursts else 0
         self._wish: Wish | None = None
         self._last = Wish(REST)  # sent or not
-        self._came_ns = 0
-        self._connected_ns = connected_ns
-        self._heard_ns: Ns | None = None  # newest command
+        self._came_ns: Ns | None = None  # newest command
         self._lead = False
-        self._hold_until_ns = 0
-        self._burst = 0  # commands since the first that waits, until `send()`
-        self._crowded = False  # the last burst was over `MAX_BURST_COMMANDS`
         self._moved_ns: Ns | None = None  # a speed was last sent; None after a zero
         self._asked_ns: Ns | None = None  # a speed last arrived; None after a zero
 
-    def take(self, wish: Wish, now_ns: Ns) -> int | None:
-        """Store a command, which replaces one that waits.
-
-        Return the time since the previous command if it is over `BRAKING_AFTER_NS`.
-        """
-        silence = None if self._heard_ns is None else now_ns - self._heard_ns
-        begins = silence is None or silence > BRAKING_AFTER_NS
-        before_ns = self._connected_ns if self._heard_ns is None else self._heard_ns
-        if before_ns is None or now_ns - before_ns > RELEASE_TIMEOUT_NS:
+    def take(self, wish: Wish, now_ns: Ns) -> None:
+        """Store a command, which replaces one that waits."""
+        if self._came_ns is None or now_ns - self._came_ns > RELEASE_TIMEOUT_NS:
             self._lead = self._sends_leading_zero
-        if begins or (self._crowded and now_ns >= self._hold_until_ns):
-            self._burst, self._crowded = 0, False
-            self._hold_until_ns = now_ns + self._gather_ns
-        if now_ns < self._hold_until_ns:
-            self._burst += 1
         if self._wish is not None:
             self.replaced += 1
         self._wish = self._last = wish
-        self._came_ns = self._heard_ns = now_ns
+        self._came_ns = now_ns
         self._asked_ns = None if wish.twist == REST else now_ns
-        return silence if begins else None
 
-    def due_ns(self) -> Ns | None:
-        """Return when the caller must call `send`; None if nothing waits."""
-        if self._lead:
-            return self._came_ns
-        return None if self._wish is None else self._hold_until_ns
+    @property
+    def waits(self) -> bool:
+        """Whether a command waits to be sent."""
+        return self._lead or self._wish is not None
 
     def send(self, now_ns: Ns) -> Wish | None:
-        """Return the command to send now, or None; drop a speed that is old or in a burst."""
+        """Return the command to send now, or None; drop a speed that is old."""
+        if self._came_ns is None:
+            return None
         if self._lead:
             self._lead = False
             # If the zero had a later stamp than the command after it, the daemon would refuse the
-            # command. The command leaves `_gather_ns` after the zero. With this stamp both have the
-            # same delay, so the daemon need not test the delays of a new sender for longer.
-            return self._zero(self._came_ns - max(1, self._gather_ns))
-        if self._wish is None or now_ns < self._hold_until_ns:
-            return None
+            # command.
+            return self._zero(self._came_ns - 1)
         wish, self._wish = self._wish, None
-        burst, self._burst = self._burst, 0
-        self._crowded = burst > MAX_BURST_COMMANDS
+        if wish is None:
+            return None
         moves = wish.twist != REST
-        if moves and (burst > 1 or now_ns - self._came_ns > STALE_NS):
+        if moves and now_ns - self._came_ns > STALE_NS:
             self.stale += 1
             return None
         self._moved_ns = now_ns if moves else None
@@ -171,7 +126,7 @@ class Commander:
         # With a stamp from another clock, the daemon would assume that the sender's clock has
         # jumped.
         stamp_ns = self._last.stamp_ns
-        if stamp_ns is not None:
+        if stamp_ns is not None and self._came_ns is not None:
             stamp_ns += at_ns - self._came_ns
         return Wish(REST, stamp_ns, self._last.steady)
 
@@ -179,10 +134,6 @@ class Commander:
     def last_is_nonzero(self) -> bool:
         """Whether the last command was not zero, even if it arrived long ago."""
         return self._asked_ns is not None
-
-    def is_driving(self, now_ns: Ns) -> bool:
-        """Return whether the last command was not zero, within `DRIVING_TIMEOUT_NS`."""
-        return self._asked_ns is not None and now_ns - self._asked_ns <= DRIVING_TIMEOUT_NS
 
 
 class CommandSigner:
@@ -246,13 +197,8 @@ def must_release_key(state: RobotState, source: str) -> bool:
     Otherwise the key would move the robot as soon as the mode allows it, or after a zero, which the
     operator may not expect.
     """
-    return not can_drive(state) or only_needs_zero(state, source)
-
-
-def only_needs_zero(state: RobotState, source: str) -> bool:
-    """Return whether the robot can drive, and `source` can drive it after a zero."""
     ours = _entry(state, source)
-    return ours is not None and ours.wait == "neutral" and can_drive(state)
+    return not can_drive(state) or (ours is not None and ours.wait == "neutral")
 
 
 def can_drive(state: RobotState) -> bool:

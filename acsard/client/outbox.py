@@ -13,7 +13,6 @@ from threading import Condition, Thread
 from typing import Never
 
 from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, Commander, Wish
-from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
 Put = Callable[[Wish], object]  # sends one command, and may block
@@ -26,19 +25,17 @@ class Outbox:
         self._senders: dict[Commander, Put] = {}
         self._zeros: list[tuple[Put, Wish]] = []
         self._news = Condition()
-        self._busy = self._ended = False
+        self._busy = False
         # Gets an exception that ends the thread; otherwise pending.
         self.dead: Future[Never] = Future()
-        self._thread = Thread(target=self._run, name="outbox", daemon=True)
-        self._thread.start()
+        Thread(target=self._run, name="outbox", daemon=True).start()
 
-    def take(self, commander: Commander, put: Put, wish: Wish) -> int | None:
-        """Queue a sender's command, which the thread sends by `put`; see `Commander.take`."""
+    def take(self, commander: Commander, put: Put, wish: Wish) -> None:
+        """Queue a sender's command, which the thread sends by `put`."""
         with self._news:
-            silence = commander.take(wish, clock.steady_ns())
+            commander.take(wish, clock.steady_ns())
             self._senders[commander] = put
             self._news.notify_all()
-        return silence
 
     def release(self, commander: Commander, timeout_s: float = MAX_SOURCE_TIMEOUT_S) -> None:
         """Remove a sender, and queue a zero if the robot may still follow it."""
@@ -53,36 +50,27 @@ class Outbox:
         """Wait until all queued commands have been sent, but at most `seconds`."""
         with self._news:
             self._news.wait_for(
-                lambda: not (self._busy or self._zeros or self._times()), timeout=seconds
+                lambda: not (self._busy or self._zeros or self._waiting()), timeout=seconds
             )
-
-    def end(self, seconds: float) -> None:
-        """End the thread after it has sent the commands that are due. Wait at most `seconds`."""
-        with self._news:
-            self._ended = True
-            self._news.notify_all()
-        self._thread.join(seconds)
 
     def _run(self) -> None:
         try:
-            while self._round():
-                pass
+            while True:
+                self._round()
         except BaseException as error:  # noqa: BLE001 - passed on to the program
             self.dead.set_exception(error)
 
-    def _round(self) -> bool:
+    def _round(self) -> None:
         with self._news:
             self._busy = False
             self._news.notify_all()
-            while not ((due := self._due()) or self._zeros or self._ended):
-                times = self._times()
-                left_ns = min(times) - clock.steady_ns() if times else None
-                self._news.wait(None if left_ns is None else max(0, left_ns) / NS_PER_S)
+            while not ((waiting := self._waiting()) or self._zeros):
+                self._news.wait()
             self._busy = True
             zeros, self._zeros = self._zeros, []
         for put, zero in zeros:
             put(zero)
-        for commander, put in due:
+        for commander, put in waiting:
             # The bus may have blocked the previous command, so read the clock again for the age.
             with self._news:
                 stale = commander.stale
@@ -91,16 +79,6 @@ class Outbox:
                 put(wish)
             elif commander.stale > stale:
                 self._dropped()
-        return bool(zeros or due)
 
-    def _times(self) -> list[int]:
-        times = (commander.due_ns() for commander in self._senders)
-        return [due_ns for due_ns in times if due_ns is not None]
-
-    def _due(self) -> list[tuple[Commander, Put]]:
-        now_ns = clock.steady_ns()
-        return [
-            (commander, put)
-            for commander, put in self._senders.items()
-            if (due_ns := commander.due_ns()) is not None and due_ns <= now_ns
-        ]
+    def _waiting(self) -> list[tuple[Commander, Put]]:
+        return [(commander, put) for commander, put in self._senders.items() if commander.waits]

@@ -16,12 +16,9 @@ from typing import Literal
 import msgspec
 import pytest
 
-from acsard.client.commander import Commander, Wish, must_release_key
-from acsard.core.config.parsing import parse
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Header, JointState, Time, Twist, TwistStamped, Vector3
 from acsard.core.values import NS_PER_S
-from acsard.core.values import Twist as BodyTwist
 from tests.scenarios.speakers import Speaker, moved
 from tests.scenarios.world import World
 
@@ -42,7 +39,6 @@ TOOLS = {
     "`drive.py`",
     "Nav2",
     "ros2_control",
-    "Foxglove's Teleop panel",
 }
 """The tools that this module imitates."""
 
@@ -724,97 +720,3 @@ def test_ros2_control_that_sends_zeros_through_a_clear_is_armed_by_them(
     stop_and_clear(world, lambda: control.cycle(CLEAR_S))
     control.cycle(1.1)
     drives(world, lambda: control.cycle(0.5, FAST))
-
-
-# Foxglove's Teleop panel, by `acsard foxglove --drive`
-
-
-class Panel(Speaker):
-    """Foxglove's teleop panel: it publishes a speed at 10 Hz, but only while a button is held.
-
-    `acsard foxglove` adds a zero before the first speed after a silence of 1.5 s. If `stamped` is
-    true, the panel's messages have stamps, as in a `TwistStamped`.
-    """
-
-    def __init__(self, world: World, stamped: bool = False) -> None:
-        super().__init__(world, "signed")
-        self._server = Commander(sends_leading_zero=True, detects_bursts=True)
-        self._stamped = stamped
-
-    def connect(self) -> None:
-        """Let the panel connect again, as a new sender."""
-        self.name += "+"
-        self._server = Commander(
-            sends_leading_zero=True, detects_bursts=True, connected_ns=self.world.now_ns
-        )
-
-    def button(self, linear: float, seconds: float, period: float = 0.1) -> None:
-        """Hold a button with this speed for `seconds`. The panel publishes once per `period`."""
-        for _ in range(round(seconds / period)):
-            stamp_ns = self.world.instant.wall_ns if self._stamped else None
-            self._server.take(Wish(BodyTwist(linear, 0.0), stamp_ns), self.world.now_ns)
-            self.release(period)
-
-    def release(self, seconds: float) -> None:
-        """Release all buttons for `seconds`."""
-        for _ in range(round(seconds * 100.0)):
-            self.world.run(0.001)  # the program sends a moment after a message has arrived
-            due_ns = self._server.due_ns()
-            if due_ns is not None and due_ns <= self.world.now_ns:
-                wish = self._server.send(self.world.now_ns)
-                if wish is not None:
-                    linear, now_ns, number = self.message(wish.twist.linear)
-                    self.deliver((linear, wish.stamp_ns or now_ns, number))
-            self.world.run(0.009)
-
-
-def test_the_foxglove_panel_drives_when_its_button_is_released_and_pressed_again(
-    world: World,
-) -> None:
-    panel = Panel(world)
-    drives(world, lambda: panel.button(FAST, 1.0))
-    stop_and_clear(world, lambda: panel.button(FAST, CLEAR_S))
-    check_stays_at_rest(world, lambda: panel.button(FAST, 2.0))
-    assert must_release_key(world.state, "app")
-    panel.release(2.0)
-    drives(world, lambda: panel.button(FAST, 0.5))
-    assert not must_release_key(world.state, "app")
-
-
-def test_a_new_connection_does_not_arm_a_panel_whose_button_is_held(world: World) -> None:
-    panel = Panel(world)
-    drives(world, lambda: panel.button(FAST, 1.0))
-    stop_and_clear(world, lambda: panel.button(FAST, CLEAR_S))
-    panel.connect()
-    check_stays_at_rest(world, lambda: panel.button(FAST, 4.0))
-    panel.release(2.0)
-    drives(world, lambda: panel.button(FAST, 0.5))
-
-
-@pytest.mark.parametrize(("period", "pause"), [(0.1, 0.35), (0.1, 1.2), (0.5, 0.7), (1.0, 0.2)])
-def test_a_pause_of_the_network_does_not_arm_a_panel_whose_button_is_held(
-    world: World, period: float, pause: float
-) -> None:
-    panel = Panel(world)
-    panel.button(FAST, 4.0, period)
-    assert moved(world, world.now_ns - NS_PER_S)
-    stop_and_clear(world, lambda: panel.button(FAST, 3.0, period))
-    since_ns = world.now_ns
-    for _ in range(3):
-        panel.button(FAST, 1.0, period)
-        panel.release(pause)
-    assert not moved(world, since_ns)
-    panel.release(2.0)
-    drives(world, lambda: panel.button(FAST, 0.2))
-
-
-@pytest.mark.parametrize("period", [0.1, 0.35, 0.5])
-def test_no_command_of_a_foxglove_panel_that_sends_stamps_is_refused(period: float) -> None:
-    world = World(parse(b'[[commands.sources]]\nname = "app"\npriority = 50\ntimeout = 1.0\n'))
-    world.run(0.3)
-    panel = Panel(world, stamped=True)
-    for _ in range(3):
-        drives(world, lambda: panel.button(FAST, 4.0, period))
-        assert world.state.linear == pytest.approx(FAST, abs=0.05)
-        panel.release(2.0)
-    assert "command_stale" not in world.state.counters

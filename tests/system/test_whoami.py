@@ -199,33 +199,17 @@ def test_a_drive_with_an_unlisted_certificate_says_that_it_is_unlisted(robot: Ro
         client.drive(0.3, seconds=1.0)
 
 
-def test_foxglove_with_a_viewer_s_certificate_shows_its_permissions(robot: Robot) -> None:
-    may = f"your certificate viewer has the role viewer: {VIEWER_MAY}"
+def test_foxglove_with_a_viewer_s_certificate_shows_and_stops_the_robot(robot: Robot) -> None:
     port = int(free_endpoint().rpartition(":")[2])
-    words = ["foxglove", "--drive", "--address", f"127.0.0.1:{port}", "--connect", robot.tls]
+    words = ["foxglove", "--address", f"127.0.0.1:{port}", "--connect", robot.tls]
     where = robot.daemon.config.parent
     with Program(acsard(*words, "--tls", robot.own("viewer")), where) as program:
         program.says("ws://")
         with Viewer(port) as viewer:
             viewer.show("/odom").first()
-            send, _ = viewer.publish_on("/cmd_vel", "json", "geometry_msgs/Twist")
-            send(b'{"linear": {"x": 0.3}, "angular": {}}')
-            viewer.status(may)
-            assert may in viewer.call("/acsard/clear", {})["message"]
-            viewer.set({"limits.linear_speed": 0.5})
-            viewer.status(f"not set: {may}")
             assert viewer.call("/acsard/stop", {})["success"]
-            for source in ("nav", "app"):
-                viewer.show(f"/cmd_vel_in/{source}")
-            deaf = "clients over TLS cannot receive the commands that programs send to the robot"
-            viewer.status(deaf)
-        with Viewer(port) as late:
-            late.show("/odom").first()
-            late.status(deaf)
-        assert program.stderr.count(deaf) == 1
     with Bus(robot.plain) as bus:
         assert bus.get("srv/clear")["success"]
-        assert bus.count("commands") == 0
 
 
 @pytest.mark.slow

@@ -26,11 +26,6 @@ MESSAGE, CALL, ANSWER = 1, 2, 3
 
 
 RULE = "=" * 80
-TWIST = (
-    f"geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n{RULE}\n"
-    "MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
-)
-"""The definition that a panel sends with its CDR messages."""
 
 
 class Came(NamedTuple):
@@ -60,9 +55,6 @@ class Viewer:
         self.services: dict[str, dict[str, Any]] = {}
         self.statuses: list[dict[str, Any]] = []
         self.removed: list[str] = []
-        self.parameters: dict[str, Any] = {}
-        self.replies: dict[str, dict[str, Any]] = {}
-        """The answers about parameters, by the id of the request."""
         self._came: dict[int, list[Came]] = {}
         self._answers: dict[int, tuple[bool, str]] = {}
         self._numbers = iter(range(1, 1 << 30))
@@ -80,10 +72,6 @@ class Viewer:
     def __exit__(self, *error: object) -> None:
         self._opened.close()
         self._thread.join(5.0)
-
-    def cut(self) -> None:
-        """Cut the connection without a closing handshake, as if the cable were pulled."""
-        self._socket.socket.shutdown(2)
 
     def _listen(self) -> None:
         try:
@@ -107,11 +95,6 @@ class Viewer:
                 self.statuses.append(message)
             case "removeStatus":
                 self.removed += message["statusIds"]
-            case "parameterValues":
-                self.parameters |= {
-                    entry["name"]: entry.get("value") for entry in message["parameters"]
-                }
-                self.replies[message.get("id", "")] = message
             case "serviceCallFailure":
                 self._answers[message["callId"]] = False, message["message"]
 
@@ -152,20 +135,12 @@ class Viewer:
 
     # acting
 
-    def publish_on(
-        self, topic: str, encoding: str, schema_name: str
-    ) -> tuple[Callable[[bytes], None], int]:
-        """Advertise a channel of this viewer. Return the function that sends on it, and its id."""
+    def publish_on(self, topic: str, schema_name: str) -> Callable[[bytes], None]:
+        """Advertise a channel of this viewer in JSON, and return the function that sends on it."""
         number = next(self._numbers)
-        channel = {"id": number, "topic": topic, "encoding": encoding, "schemaName": schema_name}
-        if encoding == "cdr":
-            channel |= {"schemaEncoding": "ros2msg", "schema": TWIST}
+        channel = {"id": number, "topic": topic, "encoding": "json", "schemaName": schema_name}
         self._send("advertise", channels=[channel])
-        return lambda data: self._socket.send(struct.pack("<BI", MESSAGE, number) + data), number
-
-    def withdraw(self, number: int) -> None:
-        """Unadvertise a channel of this viewer."""
-        self._send("unadvertise", channelIds=[number])
+        return lambda data: self._socket.send(struct.pack("<BI", MESSAGE, number) + data)
 
     def call(self, service: str, request: object) -> Any:
         """Return the answer of a service. Fails if it refuses."""
@@ -175,25 +150,6 @@ class Viewer:
         done, text = until(lambda: self._answers.get(number), 5.0, f"an answer of {service}")
         assert done, text
         return json.loads(text)
-
-    def get(self) -> dict[str, Any]:
-        """Return all parameters."""
-        return self._request_parameters("getParameters", parameterNames=[])
-
-    def follow(self, *names: str) -> None:
-        """Subscribe to changes of parameters. The changes appear in `parameters`."""
-        self._send("subscribeParameterUpdates", parameterNames=names)
-
-    def set(self, wishes: Mapping[str, Any]) -> dict[str, Any]:
-        """Ask for these values; return the present values of the parameters."""
-        wanted = [{"name": name, "value": value} for name, value in wishes.items()]
-        return self._request_parameters("setParameters", parameters=wanted)
-
-    def _request_parameters(self, op: str, **fields: Any) -> dict[str, Any]:
-        number = f"q{next(self._numbers)}"
-        self._send(op, id=number, **fields)
-        reply = until(lambda: self.replies.get(number), 5.0, f"an answer to {op}")
-        return {parameter["name"]: parameter.get("value") for parameter in reply["parameters"]}
 
 
 class SubscribedTopic:

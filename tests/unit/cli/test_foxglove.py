@@ -54,7 +54,7 @@ def test_an_address_beyond_this_machine_is_refused_and_the_message_names_a_tunne
     with pytest.raises(UsageError, match="has no authentication") as refused:
         foxglove.loopback(text)
     error = str(refused.value)
-    assert "could stop the robot, and with --drive could drive it" in error
+    assert "every client that connects could stop the robot" in error
     assert f"Listen on 127.0.0.1:{port} and" in error
     assert f"ssh -N -L {port}:127.0.0.1:{port} USER@ROBOT" in error
 

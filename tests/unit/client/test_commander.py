@@ -5,9 +5,6 @@ from __future__ import annotations
 import pytest
 
 from acsard.client.commander import (
-    BRAKING_AFTER_NS,
-    BURST_WINDOW_NS,
-    DRIVING_TIMEOUT_NS,
     MAX_SOURCE_TIMEOUT_S,
     RELEASE_TIMEOUT_NS,
     STALE_NS,
@@ -25,21 +22,16 @@ class Panel:
     """A commander with a clock and a record of the twists it sent."""
 
     def __init__(self) -> None:
-        self.commander, self.now = (
-            Commander(sends_leading_zero=True, detects_bursts=True),
-            10 * NS_PER_S,
-        )
+        self.commander, self.now = Commander(sends_leading_zero=True), 10 * NS_PER_S
         self.gone: list[Twist] = []
 
     def wait(self, span_ns: int) -> None:
-        """Let this time pass, and send every command when it is due."""
-        end = self.now + span_ns
-        while (due := self.commander.due_ns()) is not None and due <= end:
-            self.now = max(self.now, due)
+        """Send every command that waits, and let this time pass."""
+        while self.commander.waits:
             wish = self.commander.send(self.now)
             if wish is not None:
                 self.gone.append(wish.twist)
-        self.now = end
+        self.now += span_ns
 
     def press(self, twist: Twist, times: int = 1, every_ns: int = 100 * MS) -> None:
         for _ in range(times):
@@ -57,23 +49,12 @@ def test_each_wish_is_sent_once_after_one_zero(panel: Panel) -> None:
     assert panel.gone == [REST, *[AHEAD] * 5]
 
 
-@pytest.mark.parametrize("sends_zero", [False, True])
-def test_a_button_that_may_be_held_since_before_the_connection_gets_no_zero(
-    sends_zero: bool,
-) -> None:
-    since_ns = 10 * NS_PER_S
-    commander = Commander(sends_leading_zero=True, connected_ns=since_ns)
-    now_ns = since_ns + RELEASE_TIMEOUT_NS + sends_zero
-    assert commander.take(Wish(AHEAD), now_ns) is None
-    assert commander.send(now_ns) == Wish(REST if sends_zero else AHEAD)
-
-
 def test_no_command_is_sent_without_a_new_wish(panel: Panel) -> None:
     panel.press(AHEAD, times=2)
     before = len(panel.gone)
     panel.wait(100 * NS_PER_S)
     assert len(panel.gone) == before
-    assert panel.commander.due_ns() is None
+    assert not panel.commander.waits
 
 
 def test_the_first_command_after_a_release_is_preceded_by_a_zero(panel: Panel) -> None:
@@ -83,50 +64,12 @@ def test_the_first_command_after_a_release_is_preceded_by_a_zero(panel: Panel) -
     assert panel.gone == [REST, AHEAD, REST, LEFT]
 
 
-@pytest.mark.parametrize("every_ns", [BRAKING_AFTER_NS + 50 * MS, NS_PER_S, 1400 * MS])
+@pytest.mark.parametrize("every_ns", [350 * MS, NS_PER_S, 1400 * MS])
 def test_no_zero_is_added_to_the_commands_of_a_held_button_that_come_with_pauses(
     panel: Panel, every_ns: int
 ) -> None:
     panel.press(AHEAD, times=4, every_ns=every_ns)
     assert panel.gone == [REST, *[AHEAD] * 4]
-
-
-def test_a_delayed_burst_of_commands_does_not_move_the_robot(panel: Panel) -> None:
-    panel.press(AHEAD, times=3)
-    panel.wait(2 * NS_PER_S)
-    for _ in range(20):
-        panel.commander.take(Wish(AHEAD), panel.now)
-        panel.now += MS
-    panel.wait(NS_PER_S)
-    assert panel.gone == [REST, *[AHEAD] * 3, REST]
-    assert panel.commander.stale == 1
-    assert panel.commander.replaced == 19
-
-
-@pytest.mark.parametrize("sizes", [(200,), (10, 20, 40, 30)])
-def test_a_delayed_burst_longer_than_the_gathering_time_does_not_move_the_robot(
-    panel: Panel, sizes: tuple[int, ...]
-) -> None:
-    panel.press(AHEAD, times=3)
-    panel.wait(2 * NS_PER_S)
-    for size in sizes:
-        panel.press(AHEAD, times=size, every_ns=MS)
-        panel.wait(150 * MS)
-    assert panel.gone == [REST, *[AHEAD] * 3, REST]
-    panel.press(LEFT, times=2)
-    assert panel.gone[-2:] == [LEFT, LEFT]
-
-
-def test_a_panel_that_sends_often_drives_after_the_first_wait(panel: Panel) -> None:
-    panel.press(AHEAD, times=100, every_ns=10 * MS)
-    assert len(panel.gone) > 90
-
-
-def test_after_a_burst_the_newest_wish_is_sent(panel: Panel) -> None:
-    panel.press(AHEAD, times=4, every_ns=0)
-    panel.wait(100 * MS)
-    panel.press(LEFT, times=2)
-    assert panel.gone == [REST, LEFT, LEFT]
 
 
 def test_only_the_newest_of_several_waiting_wishes_is_sent(panel: Panel) -> None:
@@ -143,17 +86,7 @@ def test_a_speed_that_waited_too_long_is_not_sent(panel: Panel) -> None:
     panel.commander.take(Wish(AHEAD), panel.now)
     assert panel.commander.send(panel.now + STALE_NS + 1) is None
     assert panel.commander.stale == 1
-    assert panel.commander.due_ns() is None
-
-
-def test_only_the_first_wish_after_a_silence_waits_for_a_burst(panel: Panel) -> None:
-    panel.commander.take(Wish(AHEAD), panel.now)
-    assert panel.commander.send(panel.now) == Wish(REST)
-    assert panel.commander.send(panel.now + BURST_WINDOW_NS - 1) is None
-    assert panel.commander.send(panel.now + BURST_WINDOW_NS) == Wish(AHEAD)
-    panel.now += 100 * MS
-    panel.commander.take(Wish(AHEAD), panel.now)
-    assert panel.commander.send(panel.now) == Wish(AHEAD)
+    assert not panel.commander.waits
 
 
 def test_a_sender_that_leaves_while_driving_sends_one_zero(panel: Panel) -> None:
@@ -161,7 +94,7 @@ def test_a_sender_that_leaves_while_driving_sends_one_zero(panel: Panel) -> None
     panel.commander.take(Wish(AHEAD), panel.now)
     assert panel.commander.end(panel.now) == Wish(REST)
     assert panel.commander.end(panel.now) is None
-    assert panel.commander.due_ns() is None
+    assert not panel.commander.waits
 
 
 def test_a_sender_that_leaves_while_not_driving_sends_no_zero(panel: Panel) -> None:
@@ -179,31 +112,14 @@ def test_a_sender_that_leaves_after_its_timeout_stops_no_other_driver(panel: Pan
         assert panel.commander.end(panel.now + int(late * NS_PER_S), 0.25) == zero
 
 
-def test_a_sender_drives_while_its_newest_wish_has_a_speed(panel: Panel) -> None:
-    assert not panel.commander.is_driving(panel.now)
-    panel.press(AHEAD)
-    assert panel.commander.is_driving(panel.now)
-    assert not panel.commander.is_driving(panel.now + DRIVING_TIMEOUT_NS)
-    panel.press(REST)
-    assert not panel.commander.is_driving(panel.now)
-
-
-def test_a_wish_keeps_its_stamp_and_the_zero_before_it_is_stamped_earlier(panel: Panel) -> None:
-    stamp_ns = 1000 * NS_PER_S
-    panel.commander.take(Wish(AHEAD, stamp_ns), panel.now)
-    assert panel.commander.send(panel.now + 3) == Wish(REST, stamp_ns - BURST_WINDOW_NS)
-    panel.now += BURST_WINDOW_NS
-    assert panel.commander.send(panel.now) == Wish(AHEAD, stamp_ns)
-    panel.commander.take(Wish(LEFT, stamp_ns + 2 * BURST_WINDOW_NS), panel.now)
-    assert panel.commander.send(panel.now) == Wish(LEFT, stamp_ns + 2 * BURST_WINDOW_NS)
-    assert panel.commander.end(panel.now + 5) == Wish(REST, stamp_ns + 5 + 2 * BURST_WINDOW_NS)
-
-
-def test_a_zero_is_stamped_earlier_than_a_command_that_need_not_wait() -> None:
+def test_a_wish_keeps_its_stamp_and_the_zero_before_it_is_stamped_earlier() -> None:
     commander = Commander(sends_leading_zero=True)
     commander.take(Wish(AHEAD, 1000), NS_PER_S)
     assert commander.send(NS_PER_S + 3) == Wish(REST, 999)
     assert commander.send(NS_PER_S + 3) == Wish(AHEAD, 1000)
+    commander.take(Wish(LEFT, 2000), NS_PER_S + 1000)
+    assert commander.send(NS_PER_S + 1000) == Wish(LEFT, 2000)
+    assert commander.end(NS_PER_S + 1005) == Wish(REST, 2005)
 
 
 def test_a_sender_that_stopped_stamping_has_zeros_without_a_stamp(panel: Panel) -> None:
@@ -218,20 +134,12 @@ def test_a_zero_is_never_too_old_to_be_sent(panel: Panel) -> None:
     assert panel.commander.send(panel.now + 100 * STALE_NS) == Wish(REST)
 
 
-def test_a_zero_at_the_end_of_a_burst_is_sent(panel: Panel) -> None:
-    for twist in (AHEAD, AHEAD, REST):
-        panel.commander.take(Wish(twist), panel.now)
-    panel.wait(NS_PER_S)
-    assert panel.gone == [REST, REST]
-
-
 def test_commands_of_a_sender_with_its_own_zeros_and_stamps_are_passed_on_unchanged() -> None:
     commander = Commander()
     for n, wish in enumerate((Wish(AHEAD, 1), Wish(AHEAD, 2, True), Wish(REST, 3))):
         commander.take(wish, n * NS_PER_S)
-        assert commander.due_ns() == n * NS_PER_S
         assert commander.send(n * NS_PER_S) == wish
-        assert commander.due_ns() is None
+        assert not commander.waits
 
 
 def test_the_last_zero_of_a_sender_with_a_steady_clock_has_a_stamp_of_that_clock() -> None:

@@ -74,14 +74,14 @@ def test_an_outdated_speed_is_dropped_but_a_zero_is_sent_at_any_age(bus: Bus) ->
     assert dropped == [True]
 
 
-def test_a_speed_that_waited_for_a_burst_during_a_suspend_is_dropped(
+def test_a_speed_that_waited_during_a_suspend_is_dropped(
     bus: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The age of a command must include the suspend, in which the monotonic clock stands still."""
     asleep_ns = 0
     monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns)
     dropped: list[bool] = []
-    outbox, commander = Outbox(lambda: dropped.append(True)), Commander(detects_bursts=True)
+    outbox, commander = Outbox(lambda: dropped.append(True)), Commander()
     with outbox._news:  # the thread cannot send the command before the suspend
         outbox.take(commander, bus.put, AHEAD)
         asleep_ns = 3600 * NS_PER_S
@@ -100,7 +100,7 @@ def test_no_zero_is_sent_for_a_drive_that_ended_before_a_suspend(
     outbox.flush(PATIENCE_S)
     asleep_ns = 3600 * NS_PER_S
     outbox.release(commander, 0.25)
-    outbox.end(PATIENCE_S)
+    outbox.flush(PATIENCE_S)
     assert bus.sent == [AHEAD]
 
 
@@ -114,16 +114,6 @@ def test_the_zero_of_a_sender_that_leaves_while_the_bus_is_blocked_is_sent(bus: 
     bus.free.set()
     outbox.flush(PATIENCE_S)
     assert bus.sent == [AHEAD, ZERO]
-
-
-def test_the_last_zero_is_sent_before_the_thread_ends(bus: Bus) -> None:
-    outbox, commander = Outbox(), Commander()
-    outbox.take(commander, bus.put, AHEAD)
-    outbox.flush(PATIENCE_S)
-    outbox.release(commander)
-    outbox.end(PATIENCE_S)
-    assert bus.sent == [AHEAD, ZERO]
-    assert not outbox.dead.done()
 
 
 def test_the_death_of_the_sending_thread_is_reported() -> None:

@@ -1,28 +1,24 @@
-"""The Foxglove bridge reads the facts about its robot again after each restart of the daemon."""
+"""The Foxglove bridge reads its robot's configuration again after each restart of the daemon."""
 
 from __future__ import annotations
 
-import logging
-import threading
-import time
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import zenoh
 from msgspec.structs import replace
 
 from acsard.client import Client, synchronous
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, RosConfig
 from acsard.core.messages.signature import public_name
+from acsard.core.ros.names import full_name
 from acsard.core.values import NS_PER_S
 from acsard.foxglove import bridge as module
 from acsard.foxglove.bridge import Bridge
-from acsard.foxglove.robot_facts import Facts
 from acsard.host import clock
-from acsard.host.errors import NoAnswerError, ReplyError
-from tests.unit.foxglove.status_messages import Server
+from acsard.host.errors import ReplyError
 
 UNREADABLE = ReplyError("cannot read the robot's state; use the same version here")
 
@@ -30,19 +26,31 @@ GONE = "the daemon of robot acsar is gone; `acsard foxglove` waits for it"
 BACK = "the daemon of robot acsar is back"
 
 
+class Server:
+    """The server's messages to its viewers."""
+
+    def __init__(self) -> None:
+        self.shown: list[str] = []
+
+    def publish_status(self, text: str, level: object, status_id: str) -> None:
+        self.shown.append(text)
+
+    def remove_status(self, status_ids: list[str]) -> None:
+        self.shown.append(f"without {status_ids[0]}")
+
+
 class World:
     """A bridge in virtual time, whose daemon restarts when the test says so."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now_ns, self.queries = 100 * NS_PER_S, 0
-        self.facts = Facts(Config(), None, ("app",), "")
+        self.config = Config()
         self.during_query: Callable[[], object] = lambda: None
         self.printed: list[str] = []
         self.server = Server()
         monkeypatch.setattr(clock, "mono_ns", lambda: self.now_ns)
-        monkeypatch.setattr(module, "learn", self._learn)
+        monkeypatch.setattr(module, "configuration", self._configuration)
         monkeypatch.setattr(module, "start", lambda *_, **__: self.server)
-        monkeypatch.setattr(logging.getLogger("foxglove"), "handlers", [])
         session: Any = SimpleNamespace(liveliness=lambda: self, zid=lambda: "0123456789abcdef")
         self.bridge = Bridge(Client(session, "acsar", "app"), ("", 0), self.printed.append)
         self.queries = 0
@@ -50,23 +58,24 @@ class World:
     def declare_subscriber(self, key: str, take: Callable[[Any], None], *, history: bool) -> None:
         self._take = take
 
-    def _learn(self, robot: Client) -> Facts:
-        facts, self.queries = self.facts, self.queries + 1
+    def _configuration(self, robot: Client) -> Config:
+        config, self.queries = self.config, self.queries + 1
         self.during_query()
-        return facts
+        return config
 
     def daemon(self, kind: zenoh.SampleKind) -> None:
         """Let the daemon start (PUT) or end (DELETE)."""
         self._take(SimpleNamespace(kind=kind))
 
     def restart(self) -> None:
-        """Restart the daemon with another timeout, so that the test can recognize the new facts."""
+        """Restart the daemon with another namespace."""
         self.daemon(zenoh.SampleKind.DELETE)
-        (app,) = (source for source in self.facts.config.commands.sources if source.name == "app")
-        sources = (replace(app, timeout=app.timeout + 1.0),)
-        commands = replace(self.facts.config.commands, sources=sources)
-        self.facts = replace(self.facts, config=replace(Config(), commands=commands))
+        self.config = replace(self.config, ros=RosConfig(namespace=f"{self.namespace}x"))
         self.daemon(zenoh.SampleKind.PUT)
+
+    @property
+    def namespace(self) -> str:
+        return self.config.ros.namespace
 
     def passes(self, seconds: float) -> None:
         """Run the bridge for this time, in rounds with the pauses of its main loop."""
@@ -76,9 +85,8 @@ class World:
             self.bridge._wake.clear()
             self.bridge._round()
 
-    @property
-    def known_timeout_s(self) -> float:
-        return self.bridge._drives.timeout_s
+    def offers(self, namespace: str) -> bool:
+        return full_name(namespace, "odom") in self.bridge._relay._outs
 
 
 @pytest.fixture
@@ -113,7 +121,7 @@ def test_a_daemon_whose_reply_cannot_be_read_is_queried_once_a_second_and_report
     world.during_query = lambda: None
     world.passes(2.0)
     assert world.printed == [GONE, str(UNREADABLE), BACK]
-    assert world.server.shown[2:] == ["without daemon", BACK]
+    assert world.server.shown[2:] == ["without daemon"]
 
 
 def test_a_daemon_that_ends_after_an_unreadable_reply_is_reported_as_gone(world: World) -> None:
@@ -125,56 +133,32 @@ def test_a_daemon_that_ends_after_an_unreadable_reply_is_reported_as_gone(world:
     assert world.server.shown == [str(UNREADABLE), GONE]
 
 
-def test_the_facts_are_learned_after_a_restart_that_falls_into_one_round(
+def test_the_configuration_is_read_after_a_restart_that_falls_into_one_round(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def forward() -> None:
         monkeypatch.setattr(world.bridge._relay, "forward", usual)
         world.restart()
 
-    before_s, usual = world.known_timeout_s, world.bridge._relay.forward
+    usual = world.bridge._relay.forward
     monkeypatch.setattr(world.bridge._relay, "forward", forward)
     world.passes(1.0)
-    assert world.known_timeout_s == before_s + 1.0
-    assert world.server.shown == [BACK]
+    assert world.offers("x")
+    assert world.printed == [BACK]
 
 
-def test_the_facts_are_learned_again_if_the_daemon_restarts_while_it_is_queried(
+def test_the_configuration_is_read_again_if_the_daemon_restarts_while_it_is_queried(
     world: World,
 ) -> None:
     def restart_once() -> None:
         world.during_query = lambda: None
         world.restart()
 
-    before_s = world.known_timeout_s
     world.during_query = restart_once
     world.restart()
     world.passes(1.0)
     assert world.queries == 2
-    assert world.known_timeout_s == before_s + 2.0
-
-
-def test_a_change_that_the_daemon_does_not_answer_does_not_delay_the_topics(
-    world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    gave_up, rounds = threading.Event(), list[bool]()
-
-    def unanswered(_: object) -> None:
-        assert gave_up.wait(10.0), "the bridge waits for the daemon"
-        raise NoAnswerError("no answer")
-
-    monkeypatch.setattr(world.bridge._robot, "set", unanswered)
-    monkeypatch.setattr(world.bridge._relay, "forward", lambda: rounds.append(gave_up.is_set()))
-    for _ in range(2):
-        world.bridge._settings.set({"limits.linear_speed": 1.0})
-    world.passes(3.0)
-    assert len(rounds) >= 6
-    assert not any(rounds)
-    gave_up.set()
-    begun = time.monotonic()
-    while not world.printed and time.monotonic() - begun < 10.0:
-        world.passes(0.5)
-    assert world.printed == ["not set: no answer"]
+    assert world.offers("xx")
 
 
 class StartingWorld(World):
@@ -182,19 +166,28 @@ class StartingWorld(World):
 
     restarted = False
 
-    def _learn(self, robot: Client) -> Facts:
-        facts = super()._learn(robot)
+    def _configuration(self, robot: Client) -> Config:
+        config = super()._configuration(robot)
         if not self.restarted:
             self.restarted = True
             self.restart()
-        return facts
+        return config
 
 
 def test_a_restart_of_the_daemon_while_the_bridge_starts_is_noticed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     world = StartingWorld(monkeypatch)
-    before_s = world.known_timeout_s
     world.passes(1.0)
-    assert world.known_timeout_s == before_s + 1.0
+    assert world.offers("x")
     assert world.queries == 1
+
+
+def test_a_viewer_that_comes_while_the_daemon_is_gone_is_told(world: World) -> None:
+    world.daemon(zenoh.SampleKind.DELETE)
+    world.passes(1.0)
+    client, channel = SimpleNamespace(id=1), SimpleNamespace(topic="/odom")
+    world.bridge._shown_topics.on_subscribe(cast(Any, client), cast(Any, channel))
+    world.bridge._relay.follow = lambda *_: None  # type: ignore[method-assign]
+    world.passes(1.0)
+    assert world.server.shown == [GONE, GONE]
