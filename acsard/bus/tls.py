@@ -368,21 +368,31 @@ def _server_certificate_error(code: int, reason: str, host: str, directory: str)
     return f"the certificate of {host} is not valid ({reason}); to make another one, {RENEW_ADVICE}"
 
 
+CERTIFICATE_ALERTS = (
+    "SSLV3_ALERT_BAD_CERTIFICATE",
+    "SSLV3_ALERT_CERTIFICATE_REVOKED",
+    "SSLV3_ALERT_CERTIFICATE_UNKNOWN",
+    "SSLV3_ALERT_NO_CERTIFICATE",
+    "SSLV3_ALERT_UNSUPPORTED_CERTIFICATE",
+    "TLSV13_ALERT_CERTIFICATE_REQUIRED",
+)
+
+
 def _client_certificate_error(reason: str, host: str, directory: str) -> str:
     # `reason` is OpenSSL's name of the error, usually of an alert that the server sent.
     certificate = f"{directory}/{CERTIFICATE}"
-    if "CERTIFICATE_EXPIRED" in reason:
+    if reason == "SSLV3_ALERT_CERTIFICATE_EXPIRED":
         return (
             f"{host} says that {certificate} has expired or is not valid yet: either make a new "
             "one with `acsard tls add` on the machine that has ca-key.pem, or set the clocks of "
             "this machine and of that host (`timedatectl`)"
         )
-    if "UNKNOWN_CA" in reason or "DECRYPT" in reason:
+    if reason in ("TLSV1_ALERT_UNKNOWN_CA", "TLSV1_ALERT_DECRYPT_ERROR"):
         return (
             f"{host} does not accept {certificate}: the robot's authority did not sign this "
             "certificate; get a certificate that `acsard tls add` made for this robot"
         )
-    if "CERTIFICATE" in reason:
+    if reason in CERTIFICATE_ALERTS:
         return (
             f"{host} does not accept {certificate} ({reason}); get a certificate that `acsard tls "
             "add` made for this robot"

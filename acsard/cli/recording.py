@@ -55,7 +55,7 @@ from acsard.recording.time_span import (
     resolve,
     span,
 )
-from acsard.recording.timeline import TimelineEntry, TimelineWriter, is_serious
+from acsard.recording.timeline import TimelineEntry, TimelineWriter
 from acsard.report.page import make_report
 from acsard.terminal.output import show, table
 
@@ -269,7 +269,7 @@ def main(args: argparse.Namespace) -> int:
 def _row(path: Path, end: EndRecord, note: str) -> tuple[str, ...]:
     began = clock(end.wall_ns / 1e9, day=True)
     seconds, size = (end.last_ns - end.wall_ns) / 1e9, path.stat().st_size / 1000
-    mark = "! " if is_serious(end.said) or end.cut in CRASH_CUTS else "  "
+    mark = "! " if end.serious or end.cut in CRASH_CUTS else "  "
     text = end.said + _bracketed(ending_text(end.cut, end.why)) + _bracketed(note)
     return path.name, began, f"{seconds:.0f} s", f"{size:.0f} kB", mark + printable(text).strip()
 

@@ -169,7 +169,10 @@ def objection(state: RobotState, source: str, sender: str) -> str:
     if state.mode == "waiting":
         return state.reason
     if ours.wait == "command":
-        return no_command(source)
+        return (
+            f"the daemon receives no command of source {source}; `acsard top` shows whether the "
+            "daemon refuses commands"
+        )
     if state.source != source:
         return ours.waits_for or state.reason
     # The robot is `ready`: the zeros of this client arrive, but do not let it drive yet.
@@ -180,14 +183,6 @@ def objection(state: RobotState, source: str, sender: str) -> str:
     return (
         f"another program, {state.sender}, drives the robot as source {source}: end that program, "
         "or wait until it sends no commands"
-    )
-
-
-def no_command(source: str) -> str:
-    """Return the message for the operator if no command of `source` reaches the daemon."""
-    return (
-        f"the daemon receives no command of source {source}; `acsard top` shows whether the daemon "
-        "refuses commands"
     )
 
 
@@ -204,6 +199,13 @@ def must_release_key(state: RobotState, source: str) -> bool:
 def can_drive(state: RobotState) -> bool:
     """Return whether some command can move the robot in its present mode."""
     return state.mode not in NEVER_DRIVING_MODES and state.mode != "waiting"
+
+
+def lacks_only_commands(state: RobotState, source: str) -> bool:
+    """Return whether the robot would drive if the commands of this source reached the daemon."""
+    ours = _entry(state, source)
+    never = state.mode in (*NEVER_DRIVING_MODES, "waiting")
+    return ours is not None and ours.wait == "command" and not never
 
 
 def receives_commands(state: RobotState, source: str) -> bool:

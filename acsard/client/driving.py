@@ -21,6 +21,7 @@ from acsard.client.commander import (
     OPENING_PERIOD_S,
     OPENING_S,
     SEND_PERIOD_S,
+    lacks_only_commands,
     objection,
     receives_commands,
     refuses_for_good,
@@ -39,6 +40,10 @@ CONNECTION_CLOSED = "the connection to the daemon was closed while the robot was
 
 class UnheardError(NotDrivenError):
     """The daemon receives no commands from this client's command source, so the drive has ended."""
+
+    def __init__(self, text: str, *, lacks_only_commands: bool) -> None:
+        super().__init__(text)
+        self.lacks_only_commands = lacks_only_commands
 
 
 class CommandClient(Followed, Protocol):
@@ -234,5 +239,8 @@ class _Drive:
             return
         if self.refuses_for_good or clock.steady_s() - self._followed_s >= grace:
             state = self.watch.state
-            arrives = state is None or receives_commands(state, self._robot.source)
-            raise (NotDrivenError if arrives else UnheardError)(self.objection)
+            source = self._robot.source
+            if state is None or receives_commands(state, source):
+                raise NotDrivenError(self.objection)
+            lacks = lacks_only_commands(state, source)
+            raise UnheardError(self.objection, lacks_only_commands=lacks)

@@ -26,7 +26,6 @@ from acsard.client.commander import (
     MIN_SPACING_S,
     SEND_PERIOD_S,
     CommandSigner,
-    no_command,
 )
 from acsard.client.driving import UnheardError, drive, repeat_zeros
 from acsard.client.identity import ClientIdentity, identity
@@ -557,8 +556,8 @@ class Client:
         if us.role and not has(us.role, COMMAND_ROLE):
             return NotPermittedError(us.describe())
         # The role may explain why no command arrives, but not a fault or a stop.
-        unexplained = str(error) == no_command(self.source)
-        return NotDrivenError(f"{error}; {us.describe()}" if unexplained else str(error))
+        explains = error.lacks_only_commands
+        return NotDrivenError(f"{error}; {us.describe()}" if explains else str(error))
 
 
 class _PartialImu(schema.Imu, frozen=True, kw_only=True):

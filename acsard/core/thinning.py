@@ -107,13 +107,14 @@ def _halved(bins: list[_Bin]) -> Iterator[_Bin]:
 class Span(NamedTuple):
     """A time interval in which the state is `kind`. `begin` and `end` are in s.
 
-    `words` is the reason of the state.
+    `words` is the reason of the state, and `code` its code.
     """
 
     begin: float
     end: float
     kind: str
     words: str
+    code: str = ""
 
 
 class Band:
@@ -134,17 +135,18 @@ class Band:
         self._most, self._least = most, FIRST_WIDTH
         self._spans: list[Span] = []
 
-    def add(self, t: float, kind: str, words: str = "") -> None:
+    def add(self, t: float, kind: str, words: str = "", code: str = "") -> None:
         """Record that the state is `kind` from the time `t` s on.
 
-        If `kind` is "", there is no state from this time on. `words` is the reason of the state.
+        If `kind` is "", there is no state from this time on. `words` is the reason of the state,
+        and `code` its code.
         """
         spans = self._spans
         if spans:
             last = spans[-1] = spans[-1]._replace(end=max(t, spans[-1].end))
             if (last.kind, last.words) == (kind, words):
                 return
-        spans.append(Span(t, t, kind, words))
+        spans.append(Span(t, t, kind, words, code))
         while len(spans) > self._most:
             self._least *= 2
             self._spans = spans = self._wider(spans)

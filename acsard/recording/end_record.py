@@ -53,6 +53,7 @@ class EndRecord(Struct, frozen=True):
     why: str = ""  # of `bug`: the exception, and the number of a failed step
     # Earliest of any message: before `wall_ns` if the clock was set back.
     earliest_ns: Ns | None = None
+    serious: bool = False  # `timeline.is_serious`
 
 
 CRASH_CUTS = frozenset({"bug", "crash"})  # a failure of the daemon or of its computer

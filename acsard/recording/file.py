@@ -51,7 +51,7 @@ from acsard.recording.mcap_records import GROWING_HEAD, MAGIC, GrowingChunk, Mes
 from acsard.recording.recorded_steps import Unfinished, UnfinishedError, unfinished
 from acsard.recording.rows import FORMAT, Batch, Row, first_of
 from acsard.recording.state import Checkpoint
-from acsard.recording.timeline import INCIDENT_WORDS, TimelineEntry, summary
+from acsard.recording.timeline import INCIDENT_WORDS, TimelineEntry, is_serious, summary
 
 # Longest time in an MCAP chunk: longer ones save little, and damage to one would destroy more.
 CHUNK_NS = 10 * NS_PER_S
@@ -136,8 +136,8 @@ class EndRecordBuilder:
 
     def end_record(self, cut: str = "", why: str = "") -> EndRecord:
         """Return the end record so far; `cut` is a key of `CUT_TEXTS` or ""."""
-        text = summary(self._incidents, self._starts)
-        return EndRecord(self._wall_ns, self._last_ns, text, cut, why, self._earliest_ns)
+        text, serious = summary(self._incidents, self._starts), is_serious(self._incidents)
+        return EndRecord(self._wall_ns, self._last_ns, text, cut, why, self._earliest_ns, serious)
 
 
 class Index:

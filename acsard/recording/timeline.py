@@ -45,9 +45,6 @@ MAX_IDENTITY_BYTES = 256  # of the line that names a board; the reference firmwa
 
 MAX_WAITING = 16  # tracked: a hostile client may use many names
 
-# Not a digit in a name; reasons that differ only in numbers are equal.
-NUMBER = re.compile(r"\b\d+(\.\d+)?\b")
-
 
 def clock_change_ns(before: Instant, after: Instant) -> Ns:
     """Return by how much the wall clock was set forward between two times."""
@@ -104,7 +101,7 @@ class ReasonChanges:
     """Makes an entry `reason` when the reason of the robot's mode changes, but not the mode."""
 
     def __init__(self) -> None:
-        self._mode = self._reason = ""  # last ones shown, with `#` for numbers
+        self._shown = ("", "", "")  # mode, code and source last shown
         self._reported_ns = -MIN_REASON_NS  # last entry `reason` or event of the mode `waiting`
         self._sender = ("", "")  # last followed source, and the sender of its last command
 
@@ -113,14 +110,15 @@ class ReasonChanges:
 
         There is none if an event reports it, or while the robot drives.
         """
-        mode, text, _, source, _ = step.recorded.status
-        now, reason = step.inputs.now, NUMBER.sub("#", text)
+        mode, text, _, source, code = step.recorded.status
+        now, shown = step.inputs.now, (mode, code, source if mode == "ready" else "")
         for command in step.inputs.commands:
             if command.source == source:
                 self._sender = (source, command.sender)
-        if reason == self._reason and mode == self._mode:
+        if shown == self._shown:
             return
-        reported = mode != self._mode or any(event.text == text for event in step.recorded.events)
+        codes = [event.code for event in step.recorded.events]
+        reported = mode != self._shown[0] or code in codes
         if reported and mode == "waiting":
             # If a link was lost for less than a second, the event about the loss is sufficient.
             self._reported_ns = now.mono_ns
@@ -130,7 +128,7 @@ class ReasonChanges:
             self._reported_ns = now.mono_ns
             by = _named(*self._sender) if source and source == self._sender[0] else source
             yield TimelineEntry(now.wall_ns / 1e9, "reason", f"{mode}: {text}", by=by)
-        self._mode, self._reason = mode, reason
+        self._shown = shown
 
 
 _IDENTITY = re.compile(re.escape(IDENTITY) + rb"([^\r\n]*)[\r\n]")
@@ -375,7 +373,7 @@ class TimelineWriter:
             text = f"was driving, {self._driven(self._now.mono_ns)} so far{self._since}"
             yield TimelineEntry(wall_s, "drive", text, by=", ".join(self._sources))
         if ending:
-            yield TimelineEntry(wall_s, "cut", ending.removeprefix("cut: "), "warning")
+            yield TimelineEntry(wall_s, "cut", ending, "warning")
 
     def _driven(self, now_ns: Ns) -> str:
         seconds = (now_ns - (self._began_ns or now_ns)) / 1e9
@@ -400,14 +398,12 @@ INCIDENT_WORDS = {
 }
 
 
-# Not a wheel fault.
-SERIOUS_SUMMARY = re.compile(r"(^|, )\d+ (emergency stop|bumper hit|battery stop|stop|fault)s?\b")
+SERIOUS = frozenset({"fault", "stop", "emergency_stop", "bumper_pressed", "battery_stop"})
 
 
-def is_serious(text: str) -> bool:
-    """Return whether a `summary` has a stop, a bumper hit or a fault (not of a wheel)."""
-    # Ignore the names of the clients, because a name may look like a fault.
-    return SERIOUS_SUMMARY.search(text.partition(" (stopped by ")[0]) is not None
+def is_serious(events: Iterable[TimelineEntry]) -> bool:
+    """Return whether the events have a stop, a bumper hit or a fault (not of a wheel)."""
+    return any(event.name in SERIOUS for event in events)
 
 
 def summary(events: Iterable[TimelineEntry], starts: bool = False) -> str:

@@ -69,9 +69,9 @@ class CommandSources:
         self._counted: Counter[str] = Counter()
         """Maps each reason for a refusal to the number of commands that `_robot` has refused so far
         for this reason."""
-        self._refused: dict[str, tuple[float, str]] = {}
-        """Maps the name of each refused source to a pair: the time at which the refusal ends, s
-        since the first step of the report, and the reason in words."""
+        self._refused: dict[str, tuple[float, str, str]] = {}
+        """Maps the name of each refused source to a triple: the time at which the refusal ends, s
+        since the first step of the report, the reason in words, and its code."""
 
     def name(self, source: str) -> str:
         """Return the name of a source, or `OTHER_SOURCES` if the source is not configured."""
@@ -95,7 +95,7 @@ class CommandSources:
             del self._newest[next(iter(self._newest))]
         for refusal in step.inputs.refusals:
             if refusal.source:
-                self._refuse(refusal.source, t, refusal.text)
+                self._refuse(refusal.source, t, refusal.text, refusal.reason)
         if commands or step.inputs.refusals or robot is not self._robot:
             self._find_refused(step, t, robot)
         return before != self._refused
@@ -115,11 +115,11 @@ class CommandSources:
         for command in step.inputs.commands:
             age_s = ages.get(command.source)
             if age_s is None or age_s * NS_PER_S > now_ns - command.arrived_ns + 1:
-                self._refuse(command.source, t, words)
+                self._refuse(command.source, t, words, " ".join(new))
 
-    def _refuse(self, source: str, t: float, words: str) -> None:
+    def _refuse(self, source: str, t: float, words: str, code: str) -> None:
         until = t + self._timeouts.get(source, SAMPLE_PERIOD_S)
-        self._refused[self.name(source)] = until, words[:MAX_TEXT_LENGTH]
+        self._refused[self.name(source)] = until, words[:MAX_TEXT_LENGTH], code
 
     def commanded(self, outputs: Outputs) -> Twist | None:
         """Return the twist of the command that the robot follows, or None if it follows none."""
@@ -138,27 +138,30 @@ class CommandSources:
             t: the time of the step, s since the first step of the report.
             robot: the robot, which has just replayed the step.
         """
-        for name, state, words in self._states(step, t, robot):
-            self.bands[name].add(t, state, words)
+        for name, state, words, code in self._states(step, t, robot):
+            self.bands[name].add(t, state, words, code)
 
-    def _states(self, step: RecordedStep, t: float, robot: Robot) -> Iterator[tuple[str, str, str]]:
-        """Yield the name, state and reason of each source. A silent source has the state ""."""
-        mode, reason, _, driver, _ = step.recorded.status
+    def _states(
+        self, step: RecordedStep, t: float, robot: Robot
+    ) -> Iterator[tuple[str, str, str, str]]:
+        """Yield the name, state, reason and code of each source. A silent source has no state."""
+        mode, reason, _, driver, code = step.recorded.status
         for source in self._reader.sources(robot, step.inputs.now.mono_ns):
             refusal, wait = self._refusal(source.name, t), source.waits_for
+            why = waiting(wait)
             if mode == "driving" and source.name == driver:
-                yield source.name, "drives", waiting(wait).text
-            elif refusal:
-                yield source.name, "refused", refusal
+                yield source.name, "drives", why.text, why.code
+            elif refusal[0]:
+                yield source.name, "refused", *refusal
             elif wait.what == "command":
-                yield source.name, "", ""
+                yield source.name, "", "", ""
             elif mode not in FOLLOWING_MODES or wait.what in ("nothing", "senders"):
-                yield source.name, "sends", f"{mode}: {reason}"[:MAX_TEXT_LENGTH]
+                yield source.name, "sends", f"{mode}: {reason}"[:MAX_TEXT_LENGTH], code
             else:
-                yield source.name, "waits", waiting(wait).text
+                yield source.name, "waits", why.text, why.code
         refusal = self._refusal(OTHER_SOURCES, t)
-        yield OTHER_SOURCES, "refused" if refusal else "", refusal
+        yield OTHER_SOURCES, "refused" if refusal[0] else "", *refusal
 
-    def _refusal(self, name: str, t: float) -> str:
-        until, words = self._refused.get(name, (-math.inf, ""))
-        return words if t < until else ""
+    def _refusal(self, name: str, t: float) -> tuple[str, str]:
+        until, words, code = self._refused.get(name, (-math.inf, "", ""))
+        return (words, code) if t < until else ("", "")

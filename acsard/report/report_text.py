@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -27,10 +26,6 @@ the date.
 
 MAX_REASONS = 8
 """Maximum number of rows in the table of the reasons why command sources did not drive."""
-
-NUMBER = re.compile(r"\d+(\.\d+)?")
-"""Pattern for a number in a reason. In the table, reasons that differ only in numbers share a row.
-"""
 
 MAX_POINT_S = 0.05
 """If a point of a picture covers more than this time, s, the report has a note about it."""
@@ -123,15 +118,14 @@ def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
     """Return the rows of the table with the reasons why command sources did not drive.
 
     Each row contains the source, its state, the reason in words, and the total time for which the
-    reason applied, s. Reasons that differ only in numbers share a row. The result contains the
+    reason applied, s. Reasons with the same code share a row. The result contains the
     `MAX_REASONS` rows with the longest times, the longest first.
     """
     durations: dict[tuple[str, str, str], dict[str, float]] = {}
     for name, band in data.sources.bands.items():
         for span in band.spans():
             if span.kind != "drives":
-                alike = NUMBER.sub("#", span.words)
-                seconds = durations.setdefault((name, span.kind, alike), defaultdict(float))
+                seconds = durations.setdefault((name, span.kind, span.code), defaultdict(float))
                 seconds[span.words] += span.end - span.begin
     table_rows = [
         (name, state, max(seconds, key=seconds.__getitem__), math.fsum(seconds.values()))

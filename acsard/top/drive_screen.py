@@ -59,7 +59,7 @@ def lines(teleop: Teleop, width: int, height: int | None = None) -> list[Text]:
     if teleop.state is not None:
         state = teleop.state
         mode = f" {printable(state.mode).upper()} "
-        mode_lines = _wrapped(f"{mode} {reason(state)}", width, "bold")
+        mode_lines = _wrapped(f"{mode} {printable(state.reason)}", width, "bold")
         for first in mode_lines[:1]:
             first.stylize(MODE_STYLES.get(state.mode, "reverse"), 0, len(mode))
         rows += mode_lines
@@ -88,7 +88,7 @@ def report_lines(teleop: Teleop, width: int) -> list[str]:
         return _wrap_parts([silence(teleop), *parts], width)
     if teleop.objection:
         parts.insert(0, refused(teleop))
-    why = f"{printable(teleop.state.mode)}: {reason(teleop.state)}"
+    why = f"{printable(teleop.state.mode)}: {printable(teleop.state.reason)}"
     return _wrap_parts([why, *parts], width, measured(teleop.state))
 
 
@@ -103,7 +103,7 @@ def last_report_lines(teleop: Teleop, width: int) -> list[str]:
     what = "still moves" if moves(teleop.state) else "stands still"
     if teleop.state.linear is None:
         what = "reports no speed"
-    why = f"{printable(teleop.state.mode)}: {reason(teleop.state)}"
+    why = f"{printable(teleop.state.mode)}: {printable(teleop.state.reason)}"
     return _wrap_parts([f"drive ended: the robot {what}", why], width, measured(teleop.state))
 
 
@@ -127,11 +127,6 @@ def silence(teleop: Teleop) -> str:
     if teleop.state is None and not teleop.silent:
         return "waiting for the first state message of the daemon"
     return f"nothing received from the daemon for {teleop.age:.0f} s: is the daemon running?"
-
-
-def reason(state: RobotState) -> str:
-    """Return the reason of the robot's mode, without the name of the mode at its beginning."""
-    return printable(state.reason.removeprefix(f"{state.mode}: "))
 
 
 def refused(teleop: Teleop) -> str:

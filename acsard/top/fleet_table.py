@@ -10,8 +10,7 @@ from acsard.bus.robot_discovery import ALL_ROBOTS, count_text, no_robot_text
 from acsard.client.fleet import Fleet, Row
 from acsard.core.formatting import printable, rough, signed
 from acsard.core.messages.schema import RobotState
-from acsard.core.messages.state_warnings import brief, charge, warnings
-from acsard.top.drive_screen import reason
+from acsard.core.messages.state_warnings import SAME_AS_REASON, brief, charge, warnings
 
 COLUMN_HEADS = ("ROBOT", "MODE", "M/S", "LINK", "BATTERY", "PLACE", "VERSION", "SEEN", "WHY")
 
@@ -108,8 +107,9 @@ def row_cells(row: Row) -> tuple[str, ...]:
 
 
 def _why(state: RobotState) -> str:
-    why = reason(state)
-    problems, parts = [warning for warning in warnings(state) if warning.brief not in why], [why]
+    same = SAME_AS_REASON.get(state.code)
+    problems = [warning for warning in warnings(state) if warning.what != same]
+    parts = [printable(state.reason)]
     if problems:
         parts.insert(1 if state.mode in URGENT else 0, brief(problems))
     details = [(warning.what.replace("_", " "), warning.text) for warning in problems]

@@ -138,21 +138,14 @@ class RouterFollower:
         made = [endpoint for endpoint in status.connected if endpoint not in before.connected]
         if lost:
             counters["router_missing"] = counters.get("router_missing", 0) + len(lost)
-            events.append(
-                Event("router_missing", _connection_text("not connected to", lost), "warning")
-            )
+            text = f"not connected to {', '.join(lost)}; {TRIED_AGAIN}"
+            events.append(Event("router_missing", text, "warning"))
         if made:
-            events.append(Event("router_found", _connection_text("connected to", made)))
+            events.append(Event("router_found", f"connected to {', '.join(made)}"))
         peers = [endpoint for endpoint in status.peers if endpoint not in before.peers]
         if peers:
             text = f"these endpoints are peers, not routers: {', '.join(peers)}. {PEER_ADVICE}"
             events.append(Event("not_a_router", text, "warning"))
 
 
-def _connection_text(what: str, endpoints: list[str]) -> str:
-    tried = (
-        "; the daemon tries again until it connects, and the robot can drive meanwhile"
-        if what.startswith("not")
-        else ""
-    )
-    return f"{what} {', '.join(endpoints)}{tried}"
+TRIED_AGAIN = "the daemon tries again until it connects, and the robot can drive meanwhile"

@@ -50,8 +50,7 @@ def _odometry(odom: Odometry) -> list[str]:
 
 
 def _state(state: RobotState) -> list[str]:
-    reason = state.reason.removeprefix(f"{state.mode}: ")
-    mode = printable(f"{state.mode}: {reason}")
+    mode = printable(f"{state.mode}: {state.reason}")
     parts = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular), mode]
     left = charge(state.battery)
     return [*parts, *filter(None, (left and f"battery {left}", brief(warnings(state))))]

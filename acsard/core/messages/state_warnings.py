@@ -45,6 +45,17 @@ CERTIFICATE = {
 """Words for each state of the certificates except `valid`."""
 
 
+SAME_AS_REASON: dict[str, What] = {
+    "emergency_stop": "emergency_stop",
+    "emergency_stop_silent": "emergency_stop",
+    "bumper": "bumper",
+    "bumpers_silent": "bumper",
+    "bumper_away": "bumper",
+    "bumper_blocks": "bumper",
+}
+"""Maps a code of `state` to the warning that would only repeat the reason."""
+
+
 class StateWarning(Struct, frozen=True):
     """A warning about a robot. `what` is the part of the robot that it is about."""
 

@@ -10,7 +10,7 @@ import { Minute } from "./plots.js";
 import { Recordings } from "./recordings.js";
 import { Settings } from "./settings.js";
 import * as views from "./views.js";
-import { RELEASE, figure, named, person, said as clickable, spot, yaw } from "./words.js";
+import { RELEASE, figure, person, spot, yaw } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 const { stopping } = window; // of stop.js, which has run before
@@ -20,7 +20,6 @@ if (!stopping) {
   throw new Error("stop.js did not run, and a page without STOP does not drive");
 }
 const VIEWS = ["drive", "status", "events", "set"];
-const words = (told) => clickable(named(told));
 const READ = 8000; // time that a person needs to read a message, ms
 const LATCHED = ["stopped", "fault"];
 const ON = { activate: "the robot is already on" };
@@ -95,7 +94,7 @@ function answered(told) {
 /** Show in every view why a button failed, until `why` is "". */
 function complain(why) {
   complaint = { why, at: performance.now() };
-  views.complain(words(why));
+  views.complain(why);
 }
 
 /** Call the service `verb` to release the latch that this page shows. Without a state, the page shows none, and the
@@ -113,12 +112,12 @@ async function set(payload) {
 /** Show the message `why` at the stick. A reason that the banner shows already is not repeated. */
 function told(why) {
   note = { why, at: performance.now(), objects: Boolean(why) && why === objection(state, SOURCE, hello?.sender) };
-  views.text("told", why && why === state?.reason ? "not driving: the reason is shown above" : words(why));
+  views.text("told", why && why === state?.reason ? "not driving: the reason is shown above" : why);
 }
 
 function said(told) {
   $("set-told").classList.toggle("error", !told.ok);
-  views.text("set-told", words(told.text));
+  views.text("set-told", told.text);
 }
 
 async function got(path) {

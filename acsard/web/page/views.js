@@ -1,7 +1,7 @@
 // Fills the views from the messages of the bus. Text is inserted as text, never as HTML.
 
 import { boarded } from "./commander.js";
-import { RELEASE, age, ago, clock, logged, person, reason, said, signed } from "./words.js";
+import { RELEASE, age, ago, clock, person, reason, signed } from "./words.js";
 
 const DOUBTFUL = "STOP may not reach the robot from here: use its own switch.";
 const BATTERY = {
@@ -62,9 +62,9 @@ export function folded(events) {
 
 export function happened(list, told) {
   const rows = folded([...told.events].reverse()).map((one) => {
-    const by = `${one.by && !one.text.endsWith(one.by) ? ` — ${logged(one.by)}` : ""}${one.equal > 1 ? ` ×${one.equal}` : ""}`;
+    const by = `${one.by ? ` — ${one.by}` : ""}${one.equal > 1 ? ` ×${one.equal}` : ""}`;
     const head = made("strong", "", one.name.replaceAll("_", " "));
-    return made("li", one.level, made("span", "quiet", clock(one.stamp, new Date())), " ", head, ` ${said(logged(one.text))}${by}`);
+    return made("li", one.level, made("span", "quiet", clock(one.stamp, new Date())), " ", head, ` ${one.text}${by}`);
   });
   list.replaceChildren(...rows);
 }
@@ -77,9 +77,8 @@ export function banner(state, locked, own) {
   if (alone && state.mode === "waiting") mode("noboard", "NO BOARD");
   else mode(state.mode, alone ? `${words} · NO BOARD` : words);
   const why = state.mode === "driving" && state.sender ? `Driven by ${person(state.sender, own)}.` : reason(state);
-  const button = RELEASE[state.mode];
-  const does = state.mode === "inactive" ? "an operator switches it on" : "an operator releases it";
-  text("reason", locked && button ? why.replace(`press ${button}`, does) : why);
+  const does = RELEASE[state.mode] && (state.mode === "inactive" ? "an operator switches it on" : "an operator releases it");
+  text("reason", locked && does ? `${why} (${does})` : why);
   const warned = [
     alone ? "Nobody can stop the motors from here: use the robot's own switch." : "",
     BATTERY[state.battery?.level] ?? "", pressed(state.bumpers),

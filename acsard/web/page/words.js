@@ -4,7 +4,6 @@
 export const RELEASE = { stopped: "Release STOP", fault: "Release fault", inactive: "Switch on" };
 
 const NAMELESS = "a program without a name";
-const UTC = /\b(\d{4}-\d\d-\d\d) (\d\d:\d\d:\d\d) UTC\b/g;
 
 export function signed(value, decimals) {
   const text = value.toFixed(decimals);
@@ -74,38 +73,7 @@ export function person(sender, own = "") {
   return name || certificate || NAMELESS;
 }
 
-/** Return the reason of the mode without the name of the mode, which the banner shows above the reason. */
+/** Return why the robot moves or does not move. */
 export function reason(state) {
-  if (state.mode === "ready" && state.reason.startsWith("waiting for a command")) return "Nobody drives.";
-  const before = `${state.mode}: `;
-  const words = said(named(state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason));
-  return words.replace("press Release", `press ${RELEASE[state.mode] ?? "Release"}`);
-}
-
-/** Return a sentence in which the technical names of senders are replaced by names for people. */
-export function named(text) {
-  return text
-    .replace(/\/[0-9a-f]{16}\b/g, "")
-    .replace(/\b(?:session )?[0-9a-f]{16}\b(?: \[(.*?)\])?/g, (_, certificate) => certificate || NAMELESS)
-    .replaceAll(" (native)", "")
-    .replace(/\bby unnamed\b/g, `by ${NAMELESS}`)
-    .replaceAll("here@page", "a page on the robot itself");
-}
-
-/** Return a sentence of the log with each sender id cut to four digits, which distinguish senders of the same name. */
-export function logged(text) {
-  return text.replace(/\b([0-9a-f]{4})[0-9a-f]{12}\b/g, "$1");
-}
-
-const BUTTONS = {
-  "call srv/clear": "press Release",
-  "srv/clear": "Release",
-  "then call srv/activate": "then press Switch on",
-  "call srv/activate": "press Switch on",
-};
-
-/** Replace the names of services by those of this page's buttons, and times in UTC by local times. */
-export function said(text, now = new Date()) {
-  const local = text.replace(UTC, (_, day, time) => clock({ sec: Date.parse(`${day}T${time}Z`) / 1000, nanosec: 0 }, now));
-  return Object.entries(BUTTONS).reduce((words, [call, button]) => words.replace(call, button), local);
+  return state.code === "no_command" ? "Nobody drives." : state.reason;
 }

@@ -22,7 +22,6 @@ from acsard.recording.directory import RecordingDirectory
 from acsard.recording.file import About, Recording, RecordingWriter
 from acsard.recording.recorded_steps import FinishedStep, Unfinished
 from acsard.recording.recovery import recover
-from acsard.recording.timeline import is_serious
 from tests.scenarios.taped import Tape, chunks, recorded_world
 from tests.scenarios.world import START, World
 from tests.system.typed import typed
@@ -92,12 +91,6 @@ def test_the_list_marks_a_crash(cut: str, tmp_path: Path) -> None:
     writing.finish(cut, "why")
     (row,) = log(tmp_path)[1].splitlines()
     assert ("  ! [cut" in row) is (cut != "disk")
-
-
-def test_a_client_with_the_name_of_a_fault_marks_no_recording() -> None:
-    assert is_serious("start, 1 stop (stopped by anna)")
-    assert is_serious("2 faults")
-    assert not is_serious("start, 1 wheel fault (stopped by x, 1 fault)")
 
 
 def test_the_list_can_be_restricted_to_a_range_of_time(tmp_path: Path) -> None:

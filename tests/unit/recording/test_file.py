@@ -425,7 +425,7 @@ def test_the_end_record_summarizes_the_recording(tape: Tape, whole: Path, tmp_pa
     rewrite(Recording(cut), new)
     assert read_end(new) == replace(ending, cut="open")
     assert ending == EndRecord(
-        ending.wall_ns, ending.last_ns, ending.said, earliest_ns=ending.wall_ns
+        ending.wall_ns, ending.last_ns, ending.said, earliest_ns=ending.wall_ns, serious=True
     )
     rewrite(Recording(new), tmp_path / "again.mcap", "crash")
     assert read_end(tmp_path / "again.mcap") == read_end(new), "it was finished before"

@@ -101,5 +101,5 @@ def test_the_lines_after_the_last_step_have_the_drive_and_the_ending() -> None:
         list(publisher.step(step, replay_step(robot, step)))
     drive, cut = [line.message for line in publisher.end("cut: the disk accepted no more data")]
     assert (drive.name, drive.msg[:13]) == ("drive", "was driving, ")
-    assert (cut.name, cut.msg, cut.level) == ("cut", "the disk accepted no more data", 30)
+    assert (cut.name, cut.msg, cut.level) == ("cut", "cut: the disk accepted no more data", 30)
     assert drive.stamp == cut.stamp == Time.from_ns(tape.taken[-1].inputs.now.wall_ns)

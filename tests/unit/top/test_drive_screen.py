@@ -84,8 +84,8 @@ def test_a_silence_is_reported_with_its_length() -> None:
 
 
 @each("mode", list(Mode))
-def test_the_mode_is_not_repeated_in_its_reason(mode: Mode) -> None:
-    data = of(mode=mode.value, reason=f"{mode.value}: because")
+def test_the_mode_is_shown_once_with_its_reason(mode: Mode) -> None:
+    data = of(mode=mode.value, reason="because")
     assert texts(data, 80)[1].split() == [mode.value.upper(), "because"]
     assert report_lines(data, 80)[0].startswith(f"{mode.value}: because; ")
 

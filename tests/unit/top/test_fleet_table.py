@@ -24,7 +24,7 @@ from acsard.top.fleet_table import COLUMN_HEADS, Roster, table
 from tests.each import each
 from tests.unit.top.screens import STATE, sample_of
 
-ROW = Row("robot1", True, replace(STATE, reason="driving: commanded by app"), 0.1, "0.1.0")
+ROW = Row("robot1", True, replace(STATE, reason="commanded by app"), 0.1, "0.1.0")
 
 
 def test_a_line_has_every_column_of_a_robot() -> None:
@@ -107,6 +107,7 @@ def test_the_reason_of_a_fault_comes_before_the_warnings() -> None:
 def test_a_warning_that_is_in_the_reason_is_not_repeated() -> None:
     why = "emergency stop pressed at the robot; release it at the robot, then call srv/clear"
     state = replace(STATE, mode="stopped", reason=why, emergency_stop="pressed")
+    state = replace(state, code="emergency_stop")
     (_, line) = table([replace(ROW, state=state)], 200)
     assert line.endswith(f"  {why}")
 

@@ -396,7 +396,7 @@ STOPPED = replace(STATE, mode="stopped", reason="stopped by request", source="")
 ZERO_FIRST = replace(
     STATE,
     mode="ready",
-    reason="ready: send a zero first: teleop must send a zero before it can drive",
+    reason="send a zero first: teleop must send a zero before it can drive",
     sources=[
         SourceState(
             "teleop", 10, 0.1, "send a zero first: teleop must send a zero before it can", "neutral"

@@ -56,7 +56,7 @@ def test_stopped_and_fault_share_a_style_that_no_other_mode_has() -> None:
     )
 
 
-def test_the_reason_does_not_repeat_the_mode() -> None:
+def test_the_mode_is_shown_once_with_its_reason() -> None:
     assert lines_of(SEEN)[1].strip() == "DRIVING   commanded by app"
 
 

@@ -82,7 +82,7 @@ def test_the_last_report_waits_until_the_robot_no_longer_follows_the_drive(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("os.isatty", lambda _: True)
-    moving = replace(STATE, source="teleop", reason="driving: commanded by teleop")
+    moving = replace(STATE, source="teleop", reason="commanded by teleop")
     still = replace(moving, linear=0.0, angular=0.0, wheels=[0.0] * 4)
     ready = replace(still, mode="ready", reason="waiting for a command", source="")
     print_last_report(cast(KeyboardDrive, Ended(moving, moving, still, still, ready)))
@@ -90,7 +90,7 @@ def test_the_last_report_waits_until_the_robot_no_longer_follows_the_drive(
         "drive ended: the robot stands still; ready: waiting for a command"
         in capsys.readouterr().out
     )
-    other = replace(still, reason="driving: commanded by nav", source="nav")
+    other = replace(still, reason="commanded by nav", source="nav")
     print_last_report(cast(KeyboardDrive, Ended(still, still, other, ready)))
     assert (
         "drive ended: the robot stands still; driving: commanded by nav" in capsys.readouterr().out

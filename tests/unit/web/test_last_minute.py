@@ -24,7 +24,7 @@ from tests.each import each
 SPREAD = Spread(10, 5.0, 20.0, 80.0)
 
 STATE = RobotState(
-    Time(1, 0), "driving", "driving: commanded by app", 1.0, 2.0, 0.5, 0.25, -0.5,
+    Time(1, 0), "driving", "commanded by app", 1.0, 2.0, 0.5, 0.25, -0.5,
     [1.0, 2.0, 3.0, 4.0], "up", "app", [], "", {},
     latencies={"period_lateness": Latency(SPREAD, SPREAD)},
 )  # fmt: skip

@@ -12,7 +12,7 @@ from acsard.web.metrics import MAX_COUNTED_CLIENTS, MAX_NAMED, Counts, text
 SPREAD = Spread(10, 5.0, 20.0, 80.0)
 
 STATE = RobotState(
-    Time(1, 0), "driving", "driving: commanded by app", 1.0, 2.0, 0.5, 0.25, -0.5,
+    Time(1, 0), "driving", "commanded by app", 1.0, 2.0, 0.5, 0.25, -0.5,
     [1.0, 2.0, 3.0, 4.0], "up", "app", [], "", {"lines": 7, "missed_periods": 2},
     latencies={"period_lateness": Latency(SPREAD, SPREAD)},
 )  # fmt: skip
