@@ -1,10 +1,8 @@
 """The robot as one pure object. `Robot.step(Inputs) -> Outputs` calls all its parts in order.
 
-A step updates the odometry with the feedback from the board, and chooses one command. It checks
-that the mode allows this command, limits the command, and converts it to wheel speeds. A step does
-no I/O: its inputs are time, bytes and commands, and its outputs are decisions. Only `step` changes
-the state of a `Robot`, except that its caller may add to `counters`. The control loop reads and
-writes the port, and `core/guard.py` checks each line before it is written.
+A step updates the odometry, chooses one command, checks the mode, limits the command and converts
+it to wheel speeds. Only `step` changes the state, except that its caller may add to `counters`. The
+control loop reads and writes the port, and `core/guard.py` checks each line.
 """
 
 from __future__ import annotations
@@ -53,6 +51,7 @@ from acsard.core.values import (
     Inputs,
     Instant,
     Latches,
+    Ns,
     Outputs,
     Plain,
     Pose,
@@ -62,24 +61,21 @@ from acsard.core.values import (
     SpeedCap,
 )
 
+# For the limiter, s: after a longer stall the speed does not jump. At least 1.5 control periods.
 MAX_DT = 0.05
-"""Largest time step with which the limiter moves the speed towards a command, s. If the process
-stalls for longer, the rest of the time is ignored, so that the speed does not jump. If 1.5 control
-periods are longer than this constant, they are the limit instead."""
 
+# Without a line for so long, the next acceleration starts from rest, because the board may have
+# stopped the motors: its clock may be slightly fast.
 WRITE_PAUSE_S = WATCHDOG_S - 0.05
-"""If no line was written to the port for this time, s, the next acceleration starts from rest,
-because the board may have stopped the motors. The board stops them after `WATCHDOG_S` without a
-line. The margin of 0.05 s allows for a board whose clock is slightly fast."""
 
+# In "wait until the board has reported ...".
 INPUT_NAMES = {
     "estop": "its emergency stop",
     "bumpers": "its bumpers",
     "driver": "its motor drivers",
 }
-"""Maps each input of the board to its words in the text "wait until the board has reported
-..."."""
 
+# The input that causes a latch.
 INPUT_OF: dict[Code, str] = {
     "emergency_stop": "estop",
     "emergency_stop_silent": "estop",
@@ -87,30 +83,20 @@ INPUT_OF: dict[Code, str] = {
     "bumpers_silent": "bumpers",
     "driver_fault": "driver",
 }
-"""Maps the cause of a latch to the input of the board that caused it, as in `INPUT_NAMES`."""
 
-HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
-"""Modes in which the robot brakes at the stop deceleration."""
+HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)  # modes with the stop deceleration
 
 NS_PER_MS = 1_000_000
 
 NOTHING_CHANGED = "nothing changed: all settings already have these values"
 
-MAX_REFUSAL_LENGTH = 200
-"""Largest number of characters of the text in `state` about a refused message. The text may quote
-the message of a client, which can be long."""
+MAX_REFUSAL_LENGTH = 200  # characters in `state`: the text may quote the message of a client
 
 
 class Robot:
-    """One robot: its link to the board, its pose, its mode and its command sources."""
-
     def __init__(self, config: Config, latches: Latches = Latches()) -> None:  # noqa: B008
-        """Create a robot as it is after a start of the daemon.
-
-        `latches` decides the first mode.
-        """
-        self.config = config
-        """The configuration in force. A step that executes a `set` request replaces it."""
+        # As after a start of the daemon; `latches` decides the first mode.
+        self.config = config  # in force; a `set` replaces it
         longest_s = longest_reply(config.feedback.fault_time)
         self.session = McuSession(
             config.mcu, config.rate_hz, config.feedback.wheel_speed, longest_s
@@ -134,33 +120,25 @@ class Robot:
             self._first_event = Event("mode", why.text, "warning", kind=kind, code=why.code)
         self._choice = Choice()
         self._speeds = STILL
+        # Of the last line, and of the last one on the port: after a press of the emergency stop,
+        # the wheels turn so until the zeros are written.
         self._computed = self._written = STILL
-        """`_computed` are the wheel speeds of the last computed line. `_written` are those of the
-        last line that was written to the port. After a press of the emergency stop, the wheels
-        still turn as in `_written` until the line of zeros is written."""
+        # Arrival of the command, and the mode, of the last line. None after a press: a new line is
+        # due.
         self._made_of: tuple[int | None, Mode] | None = (None, self._life.mode)
-        """The command and the mode from which the last line was computed. The command is given by
-        its arrival time (monotonic, ns), or None without a command. After a press of the emergency
-        stop or a bumper, the whole pair is None, so that a new line is due immediately."""
+        # Last line, and last press of the emergency stop or a bumper.
         self._made_ns = self._pressed_ns = 0
-        """Monotonic times, ns: of the last computed line, and of the last press of the emergency
-        stop or a bumper."""
+        # State of the limiter and its time, of the last line and of the last one on the port, to
+        # which `_settle` returns. At rest after a press and without a link.
         self._made = self._said = (self._limiter.state, 0)
-        """Two pairs: a limiter state, and its monotonic time, ns. `_made` is the pair of the last
-        computed line, and `_said` is the pair of the last line that was written to the port. If a
-        line was not written, `_settle` sets `_made` back to `_said`. After a press of the emergency
-        stop or a bumper, and while the link is not up, both contain the state of a robot at
-        rest."""
         self._status: tuple[str, Code, str, str, str] = ("", "booting", "", "", "")
-        self._battery_level = ""
-        """Level of the battery in the previous step; "" before the board's first report."""
+        self._battery_level = ""  # in the previous step
+        # Since the start: `commands` (accepted), `command_<reason>` (refused),
+        # `commands_of_new_senders` (not proved yet), and events. The control loop adds those of the
+        # port and the bus.
         self.counters: Counter[str] = Counter()
-        """Counters since the start of the daemon. `commands` counts accepted commands, and
-        `command_<reason>` counts refused commands. `commands_of_new_senders` counts the commands of
-        senders that still have to prove that their delays are steady. Other counters count events.
-        The control loop adds the counters of the port and of the bus."""
         self._refused = ""
-        self._refused_ns: int | None = None
+        self._refused_ns: Ns | None = None
         self._sanity = Sanity(config.feedback)
         latched = [latch for latch in (latches.fault, latches.stop) if latch is not None]
         causes = [cause for latch in latched for cause in latch.causes]
@@ -168,28 +146,23 @@ class Robot:
         self._estop = EmergencyStop(config.safety.estop, "emergency_stop" in codes)
         self._bumpers = Bumpers(config.safety)
         self._battery = Battery(config.battery, "battery_empty" in codes)
+        # Inputs that caused a latch in an earlier run, until the board reports them: no `clear`
+        # before.
         self._unreported = {
             INPUT_OF[cause.code]: cause for cause in causes if cause.code in INPUT_OF
         }
-        """The inputs of the board that caused a latch in an earlier run of the daemon, if the board
-        has not reported them in this run. The keys are those of `INPUT_NAMES`, and the values are
-        the causes. While the map is not empty, a `clear` is refused."""
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
+        # Verb, client and arrival of the last request: a call of `srv/stop` arrives as two, and the
+        # second, which leads to the reply, is not logged.
         self._asked: tuple[str, str, int | None] = ("", "", None)
-        """Verb, client and arrival time (monotonic, ns) of the last request. A call of `srv/stop`
-        arrives as two requests: the first one stops the robot, and the second one leads to the
-        reply. The robot recognizes the second request by this value and does not log it."""
         self._told = CommandEvents(self._life.mode)
         self._port_trouble = ""
         self._linked_once = False
         self._arbiter.require_neutral()
 
-    def snapshot(self, now_ns: int) -> Snapshot:
-        """Return the values that `state` and `diagnostics` need beyond the outputs of a step.
-
-        `now_ns` is the monotonic time, ns. The method is too slow to call in every step.
-        """
+    def snapshot(self, now_ns: Ns) -> Snapshot:
+        """Return what `state` and `diagnostics` need beyond outputs; too slow for every step."""
         session, since, silent = self.session, self._refused_ns, self.session.silent(now_ns)
         counters = {"lines": session.good_lines} | self._odometry.missed()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
@@ -222,10 +195,7 @@ class Robot:
 
     @property
     def latches(self) -> Latches:
-        """The stop, the fault and the other latches in force.
-
-        The value is correct even after an exception in a step.
-        """
+        """The latches in force, even after an exception in a step."""
         return self._life.latches
 
     @property
@@ -234,10 +204,7 @@ class Robot:
         return self._odometry.travelled
 
     def step(self, inputs: Inputs) -> Outputs:
-        """Process the inputs since the previous step, and return the decisions of this step.
-
-        The decisions include the line for the board, the odometry and the events to log.
-        """
+        """Process the inputs since the previous step, and return the decisions of this step."""
         events = list(inputs.events)
         self._life.begin(inputs.now, stalled=self._arbiter.begin(inputs.now.mono_ns))
         if self._first_event is not None:
@@ -299,11 +266,8 @@ class Robot:
     # The outcome of the previous line.
 
     def _settle(self, inputs: Inputs) -> None:
-        """Set the limiter to the state of the last line that was written to the port.
-
-        If the guard replaced the last line by zeros, the limiter continues from zero. If the last
-        line was not written, the limiter continues from the line before it.
-        """
+        # To the last line on the port: from zero if the guard replaced it, from the one before if
+        # it was not written.
         if inputs.guard_trip:
             # The guard has replaced the line with the stop line, which contains zeros.
             self._limiter.cut()
@@ -374,11 +338,7 @@ class Robot:
         self._odometry.checks.wheels.forget()
 
     def _watch_inputs(self, now: Instant, events: list[Event]) -> None:
-        """Process the board's reports on emergency stop, bumpers, motor drivers and battery.
-
-        A press of the emergency stop or of a bumper stops the robot even if the press began and
-        ended between two steps.
-        """
+        # A press stops the robot even if it began and ended between two steps.
         estop, bumpers, statuses = self._estop, self._bumpers, self.session.statuses
         events += estop.process_reports(statuses, now.mono_ns)
         if estop.pressed_now is not None:
@@ -419,11 +379,8 @@ class Robot:
         self._life.refuse_clear(refusal, now.mono_ns)
 
     def _awaited_report(self) -> Reason | None:
-        """Return the cause of a latch from an earlier run of the daemon, and advice about it.
-
-        An input of the board caused this latch. Until the board reports this input again, `clear`
-        is refused. If there is no such latch, the result is None.
-        """
+        # Until the board reports an input that caused a latch in an earlier run, `clear` is
+        # refused.
         reported = {
             "estop": self._estop.use == "off" or bool(self._estop.state),
             "bumpers": self._bumpers.use == "off" or bool(self._bumpers.state),
@@ -436,12 +393,9 @@ class Robot:
             return Reason(cause.code, cause.why, advice, cause.part)
         return None
 
-    def _limit_by_bumpers(self, now_ns: int) -> None:
-        """Reduce the command to motion that leads away from the pressed bumpers.
-
-        If no motion remains, each sender must send a zero before it drives again. Without this
-        rule, the robot would drive against the obstacle as soon as the bumper is released.
-        """
+    def _limit_by_bumpers(self, now_ns: Ns) -> None:
+        # If no motion remains, each sender must send a zero, or the robot would drive against the
+        # obstacle as soon as the bumper is released.
         twist = self._choice.twist
         if twist is None:
             return
@@ -453,7 +407,7 @@ class Robot:
         elif away != twist:
             self._choice = replace(self._choice, twist=away)
 
-    def _board(self, now_ns: int) -> dict[str, str]:
+    def _board(self, now_ns: Ns) -> dict[str, str]:
         status_ns = self.session.status_ns
         if status_ns is None:
             return {}
@@ -461,10 +415,7 @@ class Robot:
         return as_text(self.session.status) | {"age_s": f"{age_s:.1f}"}
 
     def _plausible(self, line: Feedback, now: Instant, events: list[Event]) -> list[Feedback]:
-        """Return the feedback lines that the odometry may use now, the oldest first.
-
-        A line after a long gap may wait for a later line that confirms its speeds.
-        """
+        # A line after a long gap may wait for one that confirms its speeds.
         why = self._sanity.impossible(line)
         if self._sanity.warning is not None:
             events.append(self._sanity.warning)
@@ -572,7 +523,7 @@ class Robot:
         pose = self._odometry.pose
         return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 
-    def _set(self, settings: dict[str, Plain], now_ns: int) -> Changes:
+    def _set(self, settings: dict[str, Plain], now_ns: Ns) -> Changes:
         # The robot is at rest only if two lines are zero: the last one that was written to the
         # port, which the wheels follow, and the last one that was computed.
         sent_twist, made = self._said[0].twist, self._limiter.twist
@@ -621,7 +572,7 @@ class Robot:
             else:
                 self.counters["commands"] += 1
 
-    def _refuse(self, refusal: Refusal, now_ns: int, events: list[Event]) -> None:
+    def _refuse(self, refusal: Refusal, now_ns: Ns, events: list[Event]) -> None:
         events.append(refused(refusal))
         # Every sender that stamps its commands is unproven at first. This is normal, so `state`
         # must not show it as a refusal.
@@ -702,7 +653,7 @@ class Robot:
 
 
 def _changed_latch(before: Latches, after: Latches) -> int:
-    """Return the number of the latch that was set or released; 0 if none was."""
+    # 0: none was set or released.
     pairs = (
         (before.fault, after.fault),
         (before.stop, after.stop),
