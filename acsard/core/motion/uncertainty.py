@@ -98,14 +98,13 @@ class PoseUncertainty:
 
     def advance(
         self, distance: float, turn: float, dx: float, dy: float, heading: float,
-        variance: float | None = None, slips: bool = False, scale: float | None = None,
+        variance: float | None = None, slips: bool = False,
     ) -> None:  # fmt: skip
         """Update the covariance after an arc of `distance` m through `turn` rad.
 
         `dx` and `dy` are its displacement, m, and `heading` the direction of its chord in odom,
         rad. A gyro gives `variance` of the turn, rad2, and the parameters then affect only the
-        distance; `scale` is its relative standard deviation, by default `odometry.gyro_scale_std`.
-        Wheels that slip have `SLIP_FACTOR` times the noise.
+        distance. Wheels that slip have `SLIP_FACTOR` times the noise.
         """
         if self._lost:
             self._mark_unknown(distance, turn)
@@ -116,12 +115,12 @@ class PoseUncertainty:
             along, yaw, both = SLIP_FACTOR * along, SLIP_FACTOR * yaw, SLIP_FACTOR * both
         if variance is not None:
             yaw, both = variance, 0.0
-            scale = self._model.settings.gyro_scale_std if scale is None else scale
+        scale = None if variance is None else self._model.settings.gyro_scale_std
         self._p = stepped(self._p, dx, dy, along, yaw, both, c, s)
-        if variance is not None and scale and self._of_gyro < 0:
+        if scale and self._of_gyro < 0:
             self._of_gyro = self._widen()
         if self._effects:
-            self._bend(distance, turn, dx, dy, None if variance is None else scale)
+            self._bend(distance, turn, dx, dy, scale)
         self._dx += dx
         self._dy += dy
         self._rolled += abs(distance) + self._model.track / 2 * abs(turn)
