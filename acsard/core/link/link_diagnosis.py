@@ -17,13 +17,11 @@ from acsard.core.link.codec import TOKENS
 from acsard.core.link.link_state import Link
 from acsard.core.link.link_state import State as LinkState
 from acsard.core.link.negotiation import TROUBLES, Negotiation
-from acsard.core.values import NS_PER_S, Event
+from acsard.core.values import NS_PER_S, Event, Ns
 
+# Share of `Link.quiet_ns` between two steps that makes the second late. A silence that ends with a
+# late step is this computer's fault, which did not run the daemon.
 LATE_STEP_FRACTION = 0.5
-"""Least time between two control steps that makes the second step late, as a share of
-`Link.quiet_ns`. `Link.quiet_ns` is the duration of silence after which the link is stale. If a
-silence ends with a late step, this computer has caused the silence, because it did not run the
-daemon."""
 
 BUSY_ADVICE = CODES["host_late"].advice
 
@@ -35,24 +33,14 @@ STATE_REASONS: dict[LinkState, Reason] = {
 }
 SIMULATOR_FAULT = sentence("simulator_fault")
 
-FIRST_DIAGNOSIS_NS = 3 * NS_PER_S
-"""Time without a link until the first diagnosis, ns. A board that is only booting answers within
-this time."""
+FIRST_DIAGNOSIS_NS = 3 * NS_PER_S  # a board that is only booting answers within this time
 
-MAX_SHOWN_BYTES = 64
-"""Largest number of bytes that a diagnosis shows: enough for a complete line and some noise."""
+MAX_SHOWN_BYTES = 64  # a complete line and some noise
 
+# statuses: only status lines. cut: pieces of valid lines, or no line ends. foreign: valid lines
+# within other bytes. garbage: nothing like a line. few: good lines, and bad ones. sparse: too few
+# lines.
 ReceivedClass = Literal["nothing", "statuses", "cut", "foreign", "garbage", "few", "sparse"]
-"""The class of the bytes that the board sent while the link was not up.
-
-- nothing: no byte at all
-- statuses: status lines of the board, but no reply
-- cut: pieces of valid lines, or lines without a line end
-- foreign: valid lines with other bytes before or after them
-- garbage: nothing that resembles a line
-- few: some good lines, and also bad ones
-- sparse: only good lines, but too few of them
-"""
 
 RECEIVED_CODES: dict[ReceivedClass, LinkCode] = {
     "nothing": "received_nothing",
@@ -65,50 +53,35 @@ RECEIVED_CODES: dict[ReceivedClass, LinkCode] = {
 }
 
 _RIGHT = re.compile(TOKENS)
+# Only characters that a reply can contain.
 _PIECE = re.compile(rb"[abcdpn0-9A-F., #@*\r\n]+")
-"""Pattern of bytes that may be a piece of a reply: only characters that a reply can contain."""
 
 PORT_BLOCKED = sentence("port_blocked")
 
-WINDOW_LINES = 1000
-"""Number of sent lines after which `UnansweredLines` counts the answers to these lines. At 100 Hz,
-this takes 10 s."""
+WINDOW_LINES = 1000  # sent lines whose answers are counted: 10 s at 100 Hz
 
-MAX_UNANSWERED_FRACTION = 0.02
-"""Share of unanswered lines above which `UnansweredLines` warns. A good link loses no answer."""
+MAX_UNANSWERED_FRACTION = 0.02  # a good link loses no answer
 
 
 class Lateness:
-    """Detector of control steps that come too late.
+    """Detects control steps that come too late.
 
-    The daemon reads the lines of the board only in its control steps. So if a silence ends with a
-    late step, this computer has caused the silence, and the board is not to blame.
+    The daemon reads the board's lines only in its steps, so the board is not to blame for a silence
+    that ends with a late one.
     """
 
-    def __init__(self, simulated: bool, quiet_ns: int) -> None:
-        """Create the detector before the first control step.
-
-        `simulated` is true if the built-in simulator takes the place of the board. `quiet_ns` is
-        the duration of silence after which the link is stale, ns.
-        """
+    def __init__(self, simulated: bool, quiet_ns: Ns) -> None:
         self._simulated, self._least_ns = simulated, LATE_STEP_FRACTION * quiet_ns
-        self._looked_ns: int | None = None
+        self._looked_ns: Ns | None = None
+        # Longest time between two steps since the last good line, if one was late.
         self.late_s = 0.0
-        """Longest time between two control steps since the last good line, s; 0 if no control step
-        was late."""
-        self.step_s = 0.0
-        """Time between the last two control steps, s, if the last step was late; otherwise 0."""
+        self.step_s = 0.0  # between the last two steps, if the last was late
 
-    def record_step(self, now_ns: int, good: bool) -> bool:
-        """Record a control step. Return whether this step ends a silence that this computer caused.
+    def record_step(self, now_ns: Ns, good: bool) -> bool:
+        """Record a step, and return whether it ends a silence that this computer caused.
 
-        Only a good line from the board ends a silence. The built-in simulator runs on this
-        computer, so this computer causes each of the simulator's silences. With the simulator, the
-        result is therefore True for every good line, even if no silence came before the line.
-
-        Args:
-            now_ns: the monotonic time of the control step, ns.
-            good: whether the control step received a good line.
+        Only a good line ends one. The built-in simulator runs on this computer, so with it the
+        result is True for every good line.
         """
         before_ns, self._looked_ns = self._looked_ns, now_ns
         passed_ns = 0 if before_ns is None else now_ns - before_ns
@@ -118,11 +91,7 @@ class Lateness:
         return good and (late_s > 0.0 or self._simulated)
 
     def describe(self, link: LinkState) -> Reason:
-        """Return a sentence that describes the state `link` for the operator.
-
-        If the link is stale because a control step was late, the sentence blames this computer. If
-        the link to the built-in simulator is stale, the sentence blames the simulator.
-        """
+        """Return a sentence about the link, which may blame this computer or the simulator."""
         if link == "stale" and self.late_s:
             received = "nothing from the microcontroller"
             return sentence("host_late", seconds=self.late_s, received=received)
@@ -132,29 +101,23 @@ class Lateness:
 
 
 class Heard(Struct):
-    """A summary of the bytes and lines that the daemon received in an interval without a link."""
+    """What the daemon received in an interval without a link."""
 
-    size: int = 0
-    """Number of received bytes, without the bytes of status lines."""
-    lines: int = 0
-    """Number of received lines, good and bad, without the status lines."""
+    size: int = 0  # bytes, without status lines
+    lines: int = 0  # good and bad, without status lines
     good: int = 0
-    """Number of good lines."""
     statuses: int = 0
-    """Number of the board's status lines."""
-    last: bytes = b""
-    """The last bad line, or the last received bytes if no line is complete yet."""
-    late_s: float = 0.0
-    """Longest time in the interval in which this computer did not run the daemon, s."""
+    last: bytes = b""  # last bad line, or incomplete bytes
+    late_s: float = 0.0  # longest time in which this computer did not run the daemon
 
     def take(self, data: bytes) -> None:
-        """Add received bytes. Call this method before `line` adds the lines in these bytes."""
+        """Add received bytes, before `line` adds the lines in them."""
         self.size += len(data)
         if not self.lines:
             self.last = (self.last + data)[-MAX_SHOWN_BYTES:]
 
     def line(self, line: bytes, good: bool) -> None:
-        """Add a received line without its line end. `good` is true if the line is a valid reply."""
+        """Add a line without its end; `good` if it is a valid reply."""
         self.lines += 1
         self.good += good
         if not good:
@@ -162,7 +125,7 @@ class Heard(Struct):
 
     @property
     def looks(self) -> ReceivedClass:
-        """The class of the received bytes. `ReceivedClass` explains the classes."""
+        """The class of the received bytes."""
         if self.statuses and not self.lines:
             return "statuses"
         if not self.size:
@@ -175,7 +138,7 @@ class Heard(Struct):
 
     @property
     def counted(self) -> str:
-        """The number of received lines and the last bad line (or the last bytes), as text."""
+        """The number of lines, and the last bad one or the last bytes, as text."""
         if self.statuses and not self.lines:
             return "only status lines were received"
         if not self.size:
@@ -196,7 +159,7 @@ class Heard(Struct):
 
     @property
     def diagnosis(self) -> Reason:
-        """The complete diagnosis as a sentence for the message `state`."""
+        """The complete diagnosis, for `state`."""
         if self.looks == "sparse" and self.late_s:
             received = "too few lines for a link"
             return sentence("host_late", seconds=self.late_s, received=received)
@@ -204,31 +167,19 @@ class Heard(Struct):
 
 
 class SilenceDiagnosis:
-    """The diagnosis of why the link is not up, renewed every 3 s (`FIRST_DIAGNOSIS_NS`)."""
+    """The diagnosis of why the link is not up, renewed every `FIRST_DIAGNOSIS_NS`."""
 
     def __init__(self) -> None:
-        self.heard: Heard | None = None
-        """The bytes and lines of the last complete interval. None while there is no diagnosis."""
-        self.now = Heard()
-        """The bytes and lines received in the present interval so far."""
-        self._since_ns: int | None = None
+        self.heard: Heard | None = None  # of the last complete interval, if there is a diagnosis
+        self.now = Heard()  # of the present interval
+        self._since_ns: Ns | None = None
 
     def forget(self) -> None:
-        """Discard the diagnosis. The next call of `judge` begins a new interval.
-
-        The caller does this if the link is up, if the output is blocked, or if the port was opened
-        or closed.
-        """
+        """Discard the diagnosis: the link is up, the output blocked, or the port changed."""
         self.heard, self.now, self._since_ns = None, Heard(), None
 
-    def judge(self, now_ns: int, late_s: float = 0.0) -> bool:
-        """Process a control step without a link, and return whether the diagnosis is new.
-
-        Every 3 s (`FIRST_DIAGNOSIS_NS`), the received bytes give a new diagnosis. The result is
-        True for the first diagnosis. It is also True if the class of the received bytes
-        (`ReceivedClass`) differs from the class in the previous diagnosis. `late_s` is the time
-        since the previous step, s, if this step is late; otherwise 0.
-        """
+    def judge(self, now_ns: Ns, late_s: float = 0.0) -> bool:
+        """Process a step without a link, and return whether the diagnosis is of a new class."""
         if self._since_ns is None:
             # The interval begins with this step, so the time before it does not belong to it.
             self._since_ns = now_ns
@@ -242,33 +193,21 @@ class SilenceDiagnosis:
 
 
 class UnansweredLines:
-    """The warning that the board does not answer all lines while the link is up.
+    """Warns that the board does not answer all lines while the link is up.
 
-    After every `WINDOW_LINES` sent lines, the class compares the number of sent lines with the
-    number of good lines received. If too many answers are missing, the class warns. It does not
-    repeat the warning until the board has answered enough of a later series of `WINDOW_LINES`
-    lines, or the link was lost.
-
-    A healthy board also causes the warning if it reports by its own clock, sends fewer lines than
-    the daemon, and `mcu.reply_period` is not set.
+    After every `WINDOW_LINES`, the lines sent and received are compared. A warning is repeated only
+    after enough answers, or a lost link. A healthy board with its own clock and fewer lines causes
+    it, too, without `mcu.reply_period`.
     """
 
     def __init__(self, reply_period: float) -> None:
-        """Start before the first line was sent.
-
-        `reply_period` is the setting `mcu.reply_period`, s. If it is not 0, the board does not
-        answer lines but reports by its own clock, so the class never warns.
-        """
+        # With `reply_period` the board does not answer lines, so there is no warning.
         self._own_clock = reply_period > 0.0
         self._since: tuple[int, int] | None = None
         self._told = False
 
     def check(self, sent: int, good: int, linked: bool) -> Event | None:
-        """Return the warning if it is due, else None.
-
-        `sent` is the number of lines sent, and `good` the number of good lines received, both since
-        the daemon started. `linked` is true if the link is up.
-        """
+        """Return the warning if it is due; `sent` and `good` lines are since the start."""
         if not linked or self._own_clock:
             self._since, self._told = None, False
             return None
@@ -291,7 +230,7 @@ class UnansweredLines:
 
 
 def damaged(link: Link, check: Negotiation) -> bool:
-    """Return whether the daemon asks for checked lines again because replies were damaged."""
+    """Return whether checked lines are negotiated again because replies were damaged."""
     return link.damaged and check.asking
 
 
@@ -302,11 +241,9 @@ def describe_link(
     lateness: Lateness,
     longest_reply: float,
 ) -> Reason:
-    """Return a sentence for the operator about the state of the link while the port is open.
+    """Return a sentence about the link while the port is open.
 
-    `check` is the negotiation of the checksum, `silence` is the diagnosis of a silence, and
-    `lateness` is the detector of late control steps. `longest_reply` is the highest value that the
-    setting `mcu.reply_period` may have, s.
+    `longest_reply` is the highest value that `mcu.reply_period` may have, s.
     """
     if link.state in ("booting", "stale"):
         traffic = silence.heard
@@ -331,11 +268,9 @@ def _sparse(sparse_s: float, longest_reply: float) -> Reason:
 
 
 def check_event(check: Negotiation, wants_samples: bool) -> Event:
-    """Return the log event that says whether the lines on the wire are now plain or checked.
+    """Return the event that says whether lines are plain or checked.
 
-    A checked line has a checksum. The event is a warning if the board does not support the
-    checksum. It is also a warning if `wants_samples` is true and the board does not send its
-    encoder counts.
+    It is a warning without the checksum, or without the counts that `wants_samples` asks for.
     """
     fallen = check.state == "plain" or (wants_samples and check.state == "checked")
     text = f"the lines on the serial port are now {check.in_force}"
