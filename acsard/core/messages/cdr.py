@@ -1,9 +1,8 @@
 """Encodes msgspec structs as CDR, the encoding of ROS 2, and decodes them.
 
-The codec is derived from the type of the struct. `incoming/commands.py` uses it to decode velocity
-commands. The codec writes plain CDR (XCDR1), little endian, after the encapsulation header of 4
-bytes. It reads both byte orders. Numbers are aligned relative to the byte after the header. For
-speed, neighboring numbers are packed by a single call.
+The codec follows from the struct's type. It writes plain CDR (XCDR1), little endian, after the
+encapsulation header of 4 bytes, and reads both byte orders. Numbers are aligned relative to the
+byte after the header, and neighbors are packed by one call, for speed.
 """
 
 from __future__ import annotations
@@ -32,14 +31,13 @@ from acsard.core.values import AcsardError
 
 T = TypeVar("T")
 
-HEADER = b"\x00\x01\x00\x00"
-"""Encapsulation header of plain CDR, little endian."""
+HEADER = b"\x00\x01\x00\x00"  # plain CDR, little endian
 
 _ORDERS = {b"\x00\x00": ">", b"\x00\x01": "<"}
 
 
 class CdrError(AcsardError):
-    """Error for bytes that are not a valid message of the expected type."""
+    """The bytes are not a valid message of the expected type."""
 
 
 class Cdr(Generic[T]):
@@ -52,7 +50,7 @@ class Cdr(Generic[T]):
         self._parts, self._build = _compiled(of_type)
 
     def encode(self, message: T) -> bytes:
-        """Encode a message as CDR with its header, little endian, without trailing padding."""
+        """Encode a message as CDR with its header, without trailing padding."""
         out = bytearray(HEADER)
         for part in self._parts:
             part.write(out, message)
@@ -62,10 +60,7 @@ class Cdr(Generic[T]):
         return bytes(out)
 
     def decode(self, payload: bytes) -> T:
-        """Decode the message in a CDR payload. Trailing bytes are ignored.
-
-        Raises `CdrError` and no other exception if the payload is not valid.
-        """
+        """Decode a CDR payload, without trailing bytes. Raises only `CdrError`."""
         order = _ORDERS.get(payload[:2])
         if order is None or len(payload) < 4:
             raise CdrError(
@@ -80,8 +75,7 @@ class Cdr(Generic[T]):
 
 
 class _Source:
-    """Reads the values of a payload in order, and never beyond its end."""
-
+    # Reads the values of a payload in order, and never beyond its end.
     def __init__(self, data: bytes, order: str) -> None:
         self.data, self.order = data, order
         self.at = len(HEADER)
@@ -106,11 +100,7 @@ class _Source:
         return layout.unpack_from(self.data, start)
 
     def count(self, least: int) -> int:
-        """Read the number of items of a sequence.
-
-        `least` is the smallest size of an item, bytes. Raises `CdrError` if the payload cannot
-        contain all items.
-        """
+        """Read the number of items, of at least so many bytes each. Raises `CdrError`."""
         (count,) = self.take("I")
         if count * least > len(self.data) - self.at:
             raise CdrError(
@@ -140,11 +130,7 @@ def _whole(code: str, value: Any) -> Any:
 
 @cache
 def _layout(order: str, codes: str, start: int) -> struct.Struct:
-    """Return the layout of neighboring numbers, each aligned to its size.
-
-    `order` is the byte order and `codes` are the format characters in Python's `struct`. `start` is
-    the position of the first number modulo 8, counted from the end of the CDR header.
-    """
+    # Numbers aligned to their size, from position `start` modulo 8 after the header.
     text, at = order, start
     for code in codes:
         pad = -at % SIZES[code]
@@ -154,11 +140,7 @@ def _layout(order: str, codes: str, start: int) -> struct.Struct:
 
 
 def _packs(codes: str) -> tuple[Callable[..., bytes], ...]:
-    """Return eight functions that pack numbers, one for each start position modulo 8.
-
-    `codes` are the format characters of the numbers in Python's `struct`. A start position is
-    counted from the end of the CDR header.
-    """
+    # One function for each start position modulo 8 after the header.
     return tuple(_layout("<", codes, start).pack for start in range(8))
 
 
@@ -181,8 +163,7 @@ Get = Callable[[Any], Any]
 
 
 class _Numbers:
-    """Codec of neighboring numbers in a message. They may belong to different nested structs."""
-
+    # Neighboring numbers, maybe of different nested structs.
     def __init__(self, run: list[tuple[str, inspect.Type]]) -> None:
         self._codes = "".join(number_code(kind) for _, kind in run)
         self._packs = _packs(self._codes)
@@ -221,11 +202,7 @@ class _Text:
 
 
 class _List:
-    """Codec of one list: an array of `most` items if `fixed` is true, otherwise a sequence.
-
-    A sequence has up to `most` items, or any number if `most` is None.
-    """
-
+    # An array if `fixed`, otherwise a sequence of up to `most` items (None: any number).
     def __init__(self, get: Get, kind: inspect.Type, most: int | None, fixed: bool) -> None:
         self._get, self._most = get, most
         self._fixed = most if fixed else None
@@ -288,7 +265,7 @@ _Part = _Numbers | _Text | _List
 
 @cache
 def _compiled(cls: Any) -> tuple[tuple[_Part, ...], Build]:
-    """Return the codecs of the parts of `cls`, and a function that builds a `cls` from values."""
+    # The codecs of the parts, and a function that builds a `cls`.
     info = struct_info(cls)
     parts: list[_Part] = []
     run: list[tuple[str, inspect.Type]] = []

@@ -1,9 +1,8 @@
 """Reads the type of a struct for `cdr.py`: its fields in order, and how to build an instance.
 
-A number declares its width with `Meta(extra={"cdr": code})`. The code is a format character of
-Python's module `struct`: one of `B i I q Q`, or `f` for a float32. A `float` without a code is a
-float64. In a field of type `float | None`, None is encoded as NaN. A list whose `Meta` fixes its
-length is an array.
+A number declares its width with `Meta(extra={"cdr": code})`, a format character of Python's
+`struct` (`B i I q Q`, or `f`); a `float` without one is a float64. None in a `float | None` is NaN.
+A list whose `Meta` fixes its length is an array.
 """
 
 from __future__ import annotations
@@ -13,19 +12,17 @@ from typing import Any
 
 from msgspec import inspect
 
+# Bytes, also the alignment, by Python's `struct`.
 SIZES = {"d": 8, "f": 4, "q": 8, "Q": 8, "i": 4, "I": 4, "B": 1, "?": 1}
-"""Size and alignment of a number in CDR, bytes, by its format character in Python's `struct`."""
 
+# Builds a struct from the values of its fields in order, those of nested structs one by one.
 Build = Callable[[Iterator[object]], object]
-"""Function that builds a struct from an iterator over the values of its fields, in order. For a
-nested struct, the iterator yields the values of the nested fields one by one."""
 
-Limit = tuple[float, float]
-"""Least and greatest value of a number."""
+Limit = tuple[float, float]  # least and greatest value of a number
 
 
 def struct_info(cls: Any) -> inspect.StructType:
-    """Return the type information of a struct type. Raises `TypeError` for any other type."""
+    """Return the information of a struct type. Raises `TypeError` for any other type."""
     info = inspect.type_info(cls)
     if not isinstance(info, inspect.StructType):
         raise TypeError(f"{cls} is not a struct")
@@ -33,11 +30,7 @@ def struct_info(cls: Any) -> inspect.StructType:
 
 
 def leaves(info: inspect.StructType, path: str = "") -> Iterator[tuple[str, inspect.Type]]:
-    """Yield the dotted path and the type of each field that is not itself a struct.
-
-    Fields of nested structs are included. `path` is a prefix for each path. It ends with a dot, or
-    is "".
-    """
+    """Yield the dotted path, after a prefix, and the type of each field that is no struct."""
     for field in info.fields:
         kind = plain(field.type)
         if isinstance(kind, inspect.StructType):
@@ -47,7 +40,7 @@ def leaves(info: inspect.StructType, path: str = "") -> Iterator[tuple[str, insp
 
 
 def builder(info: inspect.StructType) -> Build:
-    """Return a function that builds the struct from the values of its `leaves`, in order."""
+    """Return a function that builds the struct from the values of its `leaves`."""
     kinds = [plain(field.type) for field in info.fields]
     children = [builder(kind) if isinstance(kind, inspect.StructType) else next for kind in kinds]
     return lambda values: info.cls(*[child(values) for child in children])
@@ -59,9 +52,9 @@ def plain(kind: inspect.Type) -> inspect.Type:
 
 
 def number_code(kind: inspect.Type) -> str:
-    """Return the format character in Python's `struct` for a number type; "" for other types.
+    """Return the character in Python's `struct` of a number type; "" for others.
 
-    Raises `TypeError` for an int type that does not declare its width.
+    Raises `TypeError` for an int that does not declare its width.
     """
     extra = kind.extra if isinstance(kind, inspect.Metadata) else None
     code = str((extra or {}).get("cdr", ""))
@@ -84,15 +77,12 @@ def _is_float(kind: inspect.Type) -> bool:
 
 
 def nullable(kind: inspect.Type) -> bool:
-    """Return whether the type `kind` allows None, which CDR encodes as NaN."""
+    """Return whether the type allows None, which CDR encodes as NaN."""
     return isinstance(plain(kind), inspect.UnionType)
 
 
 def limit(kind: inspect.Type) -> Limit | None:
-    """Return the least and the greatest allowed value of an int type.
-
-    Return None for an int type without bounds, and for any other type.
-    """
+    """Return the least and the greatest value of an int type with bounds, or None."""
     number = plain(kind)
     if not isinstance(number, inspect.IntType):
         return None

@@ -1,36 +1,27 @@
-"""Describes in words how long the TLS certificates stay valid.
-
-The messages `state` and `diagnostics` and the command `acsard doctor` show these words.
-"""
+"""Describes in words how long the TLS certificates stay valid."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Literal
 
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, WallNs
 
-EXPIRY_DAYS = 30
-"""Remaining validity of a certificate, days, below which `state` and `diagnostics` show a
-warning."""
+EXPIRY_DAYS = 30  # remaining, below which `state` and `diagnostics` warn
 
 DAY_NS = 86400 * NS_PER_S
 
 
 CertificateCode = Literal["valid", "expires", "expired", "unknown"]
 
+# 0 ok, 1 warning, 2 error.
 CERTIFICATE_LEVELS: dict[str, int] = {"valid": 0, "expires": 1, "expired": 2, "unknown": 1}
-"""Diagnostic level of each code: 0 ok, 1 warning, 2 error."""
 
 
-def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[CertificateCode, str]:
-    """Return a pair: a code, and a text about the certificate that expires first.
+def expiry(ends: Mapping[str, WallNs], now_ns: WallNs) -> tuple[CertificateCode, str]:
+    """Return a code and a text about the certificate that expires first.
 
-    Args:
-        ends: the time at which each certificate that TLS needs expires, wall-clock ns since 1970,
-            by the owner of the certificate. The owner of the robot's own certificate is "". The
-            mapping is empty if no expiry time is known.
-        now_ns: the present wall-clock time, ns since 1970.
+    `ends` is by owner, "" for the robot's own, and empty if nothing is known.
     """
     if not ends:
         return (
@@ -48,7 +39,7 @@ def expiry(ends: Mapping[str, int], now_ns: int) -> tuple[CertificateCode, str]:
     return "valid", f"valid for {days:.0f} days{of}"
 
 
-def _effect(ends: Mapping[str, int], now_ns: int) -> str:
+def _effect(ends: Mapping[str, WallNs], now_ns: WallNs) -> str:
     # Zenoh ignores the dates of an authority, so TLS refuses clients only if the robot's own
     # certificate has expired.
     own_ns, others = ends.get("", now_ns), [ends_ns for owner, ends_ns in ends.items() if owner]
@@ -60,12 +51,10 @@ def _effect(ends: Mapping[str, int], now_ns: int) -> str:
     return ": TLS refuses every client"
 
 
-def first_expiry(ends: Mapping[str, int]) -> tuple[str, int]:
-    """Return the certificate that expires first, as a pair: its owner and its expiry time.
+def first_expiry(ends: Mapping[str, WallNs]) -> tuple[str, WallNs]:
+    """Return the owner and the time of the certificate that expires first.
 
-    `ends` maps owners to expiry times, wall-clock ns since 1970. The owner "" stands for the
-    robot's own certificate, or for the report of the TLS gateway, which does not name the owner. If
-    a certificate with a named owner expires at the same time, the report is about that certificate.
-    Therefore the result then names this owner.
+    "" is the robot's own or the TLS gateway's report. An owner with the same time is the one that
+    it is about, so it is named.
     """
     return min(ends.items(), key=lambda pair: (pair[1], pair[0] == ""))

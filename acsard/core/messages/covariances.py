@@ -15,10 +15,9 @@ UNKNOWN_COVARIANCE = [UNMEASURED if cell % 7 == 0 else 0.0 for cell in range(36)
 
 
 def pose_covariance(p: PoseCovariance) -> list[float]:
-    """Return the covariance of the pose in the frame odom, in m2, m rad and rad2.
+    """Return the covariance of the pose in the frame odom, m2, m rad and rad2.
 
-    Roll, pitch and yaw are rotations about axes through the robot that are parallel to the axes of
-    odom.
+    The rotations are about axes through the robot that are parallel to those of odom.
     """
     u = UNMEASURED
     # fmt: off
@@ -34,7 +33,7 @@ def pose_covariance(p: PoseCovariance) -> list[float]:
 
 
 def twist_covariance(v: TwistVariances) -> list[float]:
-    """Return the covariance of the twist in the frame base_link, in m2/s2 and rad2/s2."""
+    """Return the covariance of the twist in the frame base_link, m2/s2 and rad2/s2."""
     cells = [0.0] * 36
     cells[::7] = (v.linear, v.lateral, UNMEASURED, UNMEASURED, UNMEASURED, v.angular)
     return cells

@@ -1,13 +1,9 @@
 """Makes the rows of the message `diagnostics`, which rqt_robot_monitor shows.
 
-- OK: the robot needs no attention.
-- WARN: a person should know about a condition.
-- ERROR: a condition keeps the robot from driving.
-
-Each message has the same rows, because rqt_robot_monitor shows a missing row as stale. There are
-two exceptions: the row of the board's inputs and the row of its battery. Each appears when the
-board first reports a value for it, or from the start if the configuration requires such values. It
-stays until a board without these values is connected.
+OK needs no attention, WARN a person should know, ERROR keeps the robot from driving. Each message
+has the same rows, because a missing one is shown as stale. Only those of the board's inputs and
+battery appear with the first report, or from the start if they are required, until a board without
+them.
 """
 
 from __future__ import annotations
@@ -46,36 +42,27 @@ from acsard.core.values import (
 
 OK, WARN, ERROR = 0, 1, 2
 
-MODE_LEVELS = {"stopped": WARN, "fault": ERROR}
-"""Diagnostic levels of the modes `stopped` and `fault`. All other modes have the level OK."""
+MODE_LEVELS = {"stopped": WARN, "fault": ERROR}  # of modes; others are OK
 
+# Rows by the state of the emergency-stop input.
 BOARD = {
     "": (OK, "no emergency-stop input"),
     "released": (OK, "emergency stop released"),
     "pressed": (WARN, PRESSED_REASON.text),
     "silent": (ERROR, SILENT_REASON.text),
 }
-"""Maps each state of the emergency-stop input to the diagnostic level and the text to show. The
-state "" means that the board has never reported the input."""
 
 BATTERY_LEVELS = {"ok": OK, "warning": WARN, "return": WARN, "stop": ERROR, "unknown": WARN}
-"""Maps each battery level, such as "return", to the diagnostic level to show for it."""
 
-SHOW_REFUSAL_S = 2.0
-"""Time for which `diagnostics` shows a refused command, s. At the default 1 Hz, this is long enough
-for two messages."""
+SHOW_REFUSAL_S = 2.0  # two messages at the default 1 Hz
 
-MAX_MISSED_FRACTION = 0.01
-"""Fraction of missed control periods in the last minute above which `diagnostics` warns."""
+MAX_MISSED_FRACTION = 0.01  # of the last minute's periods, above which this warns
 
 NO_ROUTER, NOT_YET = "a peer, not a router", "not connected yet"
 
 
 class Row(Struct, frozen=True):
-    """A row of `diagnostics` about one part of the robot.
-
-    `values` contains details as text, by name.
-    """
+    """A row about one part of the robot, with details as text in `values`."""
 
     name: str
     level: int
@@ -89,14 +76,9 @@ def diagnostics(
     snapshot: Snapshot,
     certificate: tuple[str, str],
 ) -> DiagnosticArray:
-    """Return the message `diagnostics` with one row for each part of the robot.
+    """Return the message with one row for each part of the robot.
 
-    Args:
-        config: the configuration in force.
-        outputs: the outputs of the last step.
-        snapshot: the other values of the robot.
-        certificate: the code and the text about the TLS certificates, as `expiry` returns them.
-            If both are "", the message has no row about certificates.
+    `certificate` is the result of `expiry`, or two "" for no such row.
     """
     mode = {"mode": outputs.mode, "source": outputs.source}
     rows = [

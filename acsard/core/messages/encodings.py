@@ -1,13 +1,7 @@
 """Encodes and decodes messages in msgpack, JSON and CDR.
 
-The Zenoh Encoding of an incoming payload names its format. If it names none of the three formats,
-the first bytes of the payload decide:
-
-- JSON: `{`, also after white space
-- msgpack: the header of a map
-- CDR: `00 00` or `00 01`
-
-Decoding raises `DecodeError` and no other exception.
+The Zenoh Encoding names the format of a payload, or its first bytes: `{`, also after white space
+(JSON), the header of a map (msgpack), `00 00` or `00 01` (CDR). Decoding raises only `DecodeError`.
 """
 
 from __future__ import annotations
@@ -33,12 +27,7 @@ _text = msgspec.json.Encoder()
 
 
 class DecodeError(AcsardError):
-    """Error for a payload that cannot be decoded.
-
-    `reason` is the kind of the error, such as "malformed". The daemon counts these errors by
-    reason. For example, an error with the reason "malformed" adds 1 to the counter
-    `command_malformed`.
-    """
+    """The payload cannot be decoded. `reason` is the kind, such as "malformed", for counters."""
 
     def __init__(self, reason: RefusalCode, text: str) -> None:
         super().__init__(text)
@@ -49,15 +38,12 @@ _AT_BYTE = re.compile(r"JSON is malformed: (.*) \(byte (\d+)\)")
 
 
 def encoding_name(form: Format, type_name: str = "") -> str:
-    """Return the Zenoh Encoding for an outgoing payload in the format `form`.
-
-    If `type_name` is not "", the Encoding also contains this type of the message.
-    """
+    """Return the Zenoh Encoding of a format, with the message's type if it is given."""
     return f"application/{form}" + (f";acsard.{type_name}.v1" if type_name else "")
 
 
 def encode(message: object, form: Format) -> bytes:
-    """Encode a message in the format `form`. Raises `DecodeError` if the type has no CDR form."""
+    """Encode a message. Raises `DecodeError` if the type has no CDR form."""
     if form == "cdr":
         return _codec(type(message)).encode(message)
     return _pack.encode(message) if form == "msgpack" else _text.encode(message)
@@ -73,11 +59,7 @@ def _codec(cls: type[T]) -> Cdr[T]:
 
 
 def detect(encoding: str, payload: bytes) -> Format:
-    """Return the format of a received payload: "json", "msgpack" or "cdr".
-
-    `encoding` is the Zenoh Encoding of the payload. If it does not name the format, the first
-    bytes of the payload decide. Raises `DecodeError` if the payload has none of the formats.
-    """
+    """Return the format by the Encoding or the first bytes. Raises `DecodeError`."""
     form = _FORM_OF.get(encoding.partition(";")[0])
     if form is not None:
         return form
@@ -103,15 +85,11 @@ class Decoder(Generic[T]):
         self._text = msgspec.json.Decoder(cls)
 
     def decode(self, encoding: str, payload: bytes) -> T:
-        """Decode a payload, or raise `DecodeError`.
-
-        `encoding` is the Zenoh Encoding of the payload. If it does not name the format, the first
-        bytes of the payload decide.
-        """
+        """Decode a payload by its Encoding or its first bytes. Raises `DecodeError`."""
         return self.decode_as(detect(encoding, payload), payload)
 
     def decode_as(self, form: Format, payload: bytes) -> T:
-        """Decode a payload in the format `form`, or raise `DecodeError`."""
+        """Decode a payload of this format. Raises `DecodeError`."""
         if form == "cdr":
             return decode_cdr(self._cls, payload)
         try:
@@ -124,7 +102,7 @@ class Decoder(Generic[T]):
 
 
 def _where(words: str, payload: bytes) -> str:
-    """Put a line and a column in place of the byte offset in an error text of msgspec."""
+    # A line and a column in place of msgspec's byte offset.
     match = _AT_BYTE.fullmatch(words)
     if match is None:
         return words
@@ -136,7 +114,7 @@ def _where(words: str, payload: bytes) -> str:
 
 
 def decode_cdr(cls: type[T], payload: bytes) -> T:
-    """Decode a CDR payload to a message of type `cls`. Raises `DecodeError` if it is not valid."""
+    """Decode a CDR payload. Raises `DecodeError`."""
     try:
         return _codec(cls).decode(payload)
     except CdrError as error:

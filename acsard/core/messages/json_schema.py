@@ -1,9 +1,8 @@
 """Makes the JSON Schemas of the message types and of `Config`, for the key `schema/<Type>`.
 
-A message that the daemon publishes has all its fields, and a later version may add more. Its schema
-therefore requires all fields and allows others. A message that the daemon receives may omit fields
-with a default, but must not have unknown fields. A type that is used in both directions has two
-schemas, for example `Imu` for messages of the daemon and `ImuIn` for messages to the daemon.
+A published message has all fields, and a later version may add more: its schema requires all and
+allows others. A received one may omit fields with a default and must not have unknown ones. A type
+for both has two, such as `Imu` and `ImuIn` (to the daemon).
 """
 
 from __future__ import annotations
@@ -29,20 +28,19 @@ INCOMING_ONLY = {
     *(service.payload for service in SERVICES.values()),
 }
 
+# Fields of received messages; those of other types need all fields without a default.
 REQUIRED_FIELDS: dict[type, list[str]] = {
     TwistStamped: ["twist"],
     JointState: ["name", "velocity"],
     Imu: ["angular_velocity"],
     SpeedLimit: ["speed_limit"],
 }
-"""Fields that a received message of one of these types must have. A message of any other type must
-have all fields without a default."""
 
 Schema = dict[str, Any]
 
 
 def going_out(cls: type, name: str) -> Schema:
-    """Return the schema `name` of messages of type `cls` that the daemon publishes."""
+    """Return the schema of messages that the daemon publishes."""
     schema = _described(cls, name)
     for part in (schema, *schema["$defs"].values()):
         if "properties" in part:
@@ -54,7 +52,7 @@ def going_out(cls: type, name: str) -> Schema:
 
 
 def coming_in(cls: type, name: str) -> Schema:
-    """Return the schema `name` of messages of type `cls` that the daemon accepts from clients."""
+    """Return the schema of messages that the daemon accepts from clients."""
     schema = _described(cls, name)
     return schema | {"required": REQUIRED_FIELDS[cls]} if cls in REQUIRED_FIELDS else schema
 
@@ -69,6 +67,7 @@ def _described(cls: type, name: str) -> Schema:
     return {"$schema": dialect, "$id": f"urn:acsard:{name}.v1"} | top | {"$defs": parts}
 
 
+# Schemas by name, as in `schema/<Type>`.
 SCHEMAS: dict[str, Schema] = {
     **{
         name: (coming_in if name in INCOMING_ONLY else going_out)(cls, name)
@@ -80,4 +79,3 @@ SCHEMAS: dict[str, Schema] = {
     },
     "Config": going_out(Config, "Config"),
 }
-"""Maps the name of each schema, as in the key `schema/<Type>`, to the schema."""

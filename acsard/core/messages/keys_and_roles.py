@@ -1,8 +1,7 @@
 """The table of all keys below `acsard/<id>/`: direction, type, rate, meaning and required roles.
 
-A key that is not in the table does not exist. The bus declares its keys from this table, and
-`permissions.py` derives the permissions of the roles from it. `acsard topics`, the README and the
-reply to the query `topics` show the table.
+A key that is not in it does not exist: the bus declares its keys, and `permissions.py` derives the
+roles' permissions from it. `acsard topics`, the README and the reply to `topics` show it.
 """
 
 from __future__ import annotations
@@ -20,64 +19,41 @@ from acsard.core.values import ROOT_KEY, Role, Verb
 
 _PLACE = re.compile("<[A-Za-z]+>")
 
+# out: the daemon publishes. in: clients put. query: the daemon answers, also to wildcards. service:
+# only a query for exactly this key.
 Direction = Literal["out", "in", "query", "service"]
-"""Direction of a key.
-
-- out: the daemon publishes on the key.
-- in: clients put messages on the key.
-- query: the daemon answers queries for the key, including queries with a wildcard.
-- service: a query for exactly this key calls a service.
-"""
 
 
 class Topic(Struct, frozen=True):
-    """One row of the table of keys (`TOPICS`)."""
-
-    key: str
-    """The key below the robot's id, with placeholders such as `<source>`."""
+    key: str  # below the robot's id, with placeholders such as `<source>`
     direction: Direction
-    type: str
-    """Name of the message type in `MESSAGES`. If the type is not in `MESSAGES`, this is a
-    description of the type."""
-    rate: str
-    """How often messages are published or accepted, in words; "" for a query."""
+    type: str  # name in `MESSAGES`, or a description
+    rate: str  # in words
     note: str
-    publish: Role | None = None
-    """Lowest role that may put on the key. None means that no client may put on it."""
-    subscribe: Role | None = None
-    """Lowest role that may subscribe to the key. None means that no client may subscribe."""
+    publish: Role | None = None  # lowest role; None: no client
+    subscribe: Role | None = None  # lowest role; None: no client
+    # Lowest role; `<role>`: the last part of the queried key.
     query: Role | Literal["<role>"] | None = None
-    """Lowest role that may query the key. None means that no client may query it. `<role>` means
-    that the last part of the queried key is the lowest role, as in `whoami/operator`."""
-    local: bool = False
-    """True for a key that only programs on the robot's own machine may use."""
-    latched: bool = False
-    """True if each new subscriber immediately receives the last message on the key."""
-    simulated: bool = False
-    """True for a key that exists only with the built-in simulator."""
-    gyro: bool = False
-    """True for a key that exists only with `[odometry] gyro = true`."""
+    local: bool = False  # only for programs on the robot's own machine
+    latched: bool = False  # a new subscriber gets the last message
+    simulated: bool = False  # only with the built-in simulator
+    gyro: bool = False  # only with `[odometry] gyro = true`
 
     @property
     def pattern(self) -> str:
-        """The key with each placeholder replaced by a Zenoh wildcard."""
+        """The key with Zenoh wildcards as placeholders."""
         return _PLACE.sub("*", self.key.replace("<key>", "**"))
 
 
 class Service(NamedTuple):
-    """One row of the table of services (`SERVICES`)."""
-
-    least: Role
-    """Lowest role that may call the service."""
+    least: Role  # lowest role
     note: str
-    payload: str = ""
-    """Type of the payload, a name in `MESSAGES`; "" for a service without a payload."""
-    example: str = ""
-    """An example payload in JSON."""
-    optional: bool = False
-    """True for a service that may also be called without its payload."""
+    payload: str = ""  # name in `MESSAGES`
+    example: str = ""  # payload in JSON
+    optional: bool = False  # the payload
 
 
+# The services for the bus, ROS, the page and the tools.
 SERVICES: dict[Verb, Service] = {
     "stop": Service("viewer", "stop the robot; it stays stopped until srv/clear is called"),
     "clear": Service(
@@ -113,35 +89,27 @@ SERVICES: dict[Verb, Service] = {
         '{"settings": {"limits.linear_speed": 0.8}}',
     ),
 }
-"""All services, by verb. The bus, ROS, the page and the tools use this table."""
 
+# Callable without a payload.
 PLAIN_SERVICES = tuple(
     verb for verb, service in SERVICES.items() if service.optional or not service.payload
 )
-"""The services that can be called without a payload."""
 
-IMU = "imu"
-"""Key on which the samples of the gyro arrive, whether the gyro is real or simulated."""
+IMU = "imu"  # samples of the real or simulated gyro
 
-SPEED_LIMIT = "speed_limit"
-"""Key on which a client, such as Nav2's speed filter, lowers the robot's highest speed."""
+SPEED_LIMIT = "speed_limit"  # lowers the highest speed, for example by Nav2's speed filter
 
+# The access rules let a client query only the keys of its role and lower ones, so an answer proves
+# at least the role of the key.
 WHOAMI = "whoami/<role>"
-"""Pattern of the keys with which a client finds out its role. There is one key for each role.
-Zenoh's access rules let a client query only the keys of its own role and of lower roles. So a
-client that gets an answer on a key has at least the role of that key."""
 
 
 def whoami_key(role: str) -> str:
-    """Return the key with which a client finds out whether it has the role `role` or a higher one.
-
-    Only clients with such a role can query the key.
-    """
+    """Return the key that only clients with this role or a higher one can query."""
     return WHOAMI.replace("<role>", role)
 
 
 def service_key(verb: str) -> str:
-    """Return the key of the service `verb`, such as `srv/stop`."""
     return f"srv/{verb}"
 
 
@@ -149,12 +117,11 @@ JSON_TREE = "json/"
 
 
 def json_key(key: str) -> str:
-    """Return the key on which the daemon publishes the messages of `key` in JSON."""
     return JSON_TREE + key
 
 
+# Verbs by key, such as `srv/stop`.
 VERBS: dict[str, Verb] = {service_key(verb): verb for verb in SERVICES}
-"""Maps the key of each service to its verb, such as `srv/stop` to "stop"."""
 
 
 def _out(
@@ -243,26 +210,17 @@ TOPICS: tuple[Topic, ...] = (
     ),
 )  # fmt: skip
 
+# Keys that are published, and the gyro's; not `json/<key>`.
 FOLLOWED: tuple[Topic, ...] = tuple(
     topic for topic in TOPICS if topic.subscribe and topic.query and "<" not in topic.key
 )
-"""The rows of `TOPICS` for the keys that clients may both subscribe to and query. These are the
-keys on which the daemon publishes messages, and the key of the gyro. The row `json/<key>`, which
-stands for the JSON copies of all keys, is not included."""
 
+# A query returns the present message.
 PUBLISHED: tuple[Topic, ...] = tuple(topic for topic in FOLLOWED if topic.direction == "out")
-"""The rows of `TOPICS` for the keys on which the daemon publishes messages. A query for such a key
-returns the present message. The row `json/<key>`, which stands for the JSON copies of all keys, is
-not included."""
 
 
 def offered(config: Config) -> tuple[Topic, ...]:
-    """Return the rows of `TOPICS` whose keys exist on the bus with the configuration `config`.
-
-    `TOPICS` has a row for each Zenoh key. Some keys exist only with the built-in simulator or with
-    `[odometry] gyro = true`. The result leaves out the rows whose condition `config` does not
-    fulfill.
-    """
+    """Return the rows of `TOPICS` whose keys exist with this configuration."""
     simulated, gyro = config.mcu.simulated, config.odometry.gyro
     return tuple(
         topic for topic in TOPICS if (simulated or not topic.simulated) and (gyro or not topic.gyro)
@@ -270,12 +228,7 @@ def offered(config: Config) -> tuple[Topic, ...]:
 
 
 def published(config: Config) -> tuple[Topic, ...]:
-    """Return the rows of `TOPICS` for the keys on which this daemon publishes messages.
-
-    `config` is the configuration of the daemon. With the built-in simulator and `odometry.gyro =
-    true`, the result includes the key of the gyro, because the daemon publishes the samples of the
-    simulated gyro.
-    """
+    """Return the rows of `TOPICS` on which this daemon publishes, the simulated gyro's too."""
     own = config.mcu.simulated
     return tuple(t for t in offered(config) if t in PUBLISHED or (own and t.key == IMU))
 
@@ -285,37 +238,25 @@ def full_key(robot_id: str, key: str) -> str:
     return f"{ROOT_KEY}/{robot_id}/{key}"
 
 
-COMMANDS = ("cmd", "wheel_cmd")
-"""First part of each key on which commands arrive."""
+COMMANDS = ("cmd", "wheel_cmd")  # first parts of command keys
 
 
 def command_key(kind: str, source: str, certificate: str = "") -> str:
     """Return the key, below the robot's id, on which a sender puts its commands.
 
-    Args:
-        kind: the first part of the key, one of `COMMANDS`.
-        source: the name of the command source.
-        certificate: the common name of the sender's certificate if the sender connects over TLS.
-            Only this sender may put on the key. It is "" for a program on the robot's own machine.
+    Over TLS it ends with the certificate's common name, and only this sender may use it.
     """
     return f"{kind}/{source}/{certificate}" if certificate else f"{kind}/{source}"
 
 
 def source_keys(sources: Iterable[str], certificate: str = "") -> list[str]:
-    """Return the two command keys of each source in `sources`, without the robot's id.
-
-    `certificate` is the common name of the senders' certificate, or "*" for any certificate. It is
-    "" for programs on the robot's own machine.
-    """
+    """Return both command keys of each source; "*" stands for any certificate."""
     names = list(sources)
     return [command_key(kind, name, certificate) for kind in COMMANDS for name in names]
 
 
 def unknown(key: str) -> bool:
-    """Return True if `key` matches no row of `TOPICS`. `key` does not contain the robot's id.
-
-    Keys that begin with `json/`, `cmd/` or `wheel_cmd/` always count as known.
-    """
+    """Return whether a key matches no row; those of `json/`, `cmd/` and `wheel_cmd/` do."""
     return row_of(key) is None and not key.startswith((JSON_TREE, "cmd/", "wheel_cmd/"))
 
 
@@ -326,16 +267,12 @@ def key_hint(key: str) -> str:
 
 
 def by_key(key: str) -> Topic | None:
-    """Return the row of `TOPICS` whose key is exactly `key`, such as `cmd/<source>`, or None."""
+    """Return the row whose key is exactly this one, such as `cmd/<source>`, or None."""
     return next((topic for topic in TOPICS if topic.key == key), None)
 
 
 def row_of(key: str) -> Topic | None:
-    """Return the row of `TOPICS` that describes a key, or None.
-
-    `key` is the part after the robot's id. For example, the result for `cmd/app` is the row of
-    `cmd/<source>`.
-    """
+    """Return the row that describes a key without the robot's id, such as `cmd/app`, or None."""
     return next((topic for topic in TOPICS if _pattern(topic.key).fullmatch(key)), None)
 
 

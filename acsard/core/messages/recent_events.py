@@ -1,9 +1,8 @@
 """Keeps the last events for the topic `events`.
 
-An event whose `news` is true always gets its own row. Other events repeat often: an event and its
-repetitions share one row with a count. If each repetition had its own row, a computer that misses a
-control period every second would push a fault out of the twenty rows within 20 s. The log has its
-own limit (`event_throttle.py`).
+An event with `news` has its own row. Others share one with their repetitions and a count, or a
+period missed each second would push a fault out within 20 s. The log has its own limit
+(`event_throttle.py`).
 """
 
 from __future__ import annotations
@@ -17,13 +16,9 @@ from acsard.core.messages.schema import Events, LogEvent, Time
 from acsard.core.motion.event_throttle import merge
 from acsard.core.values import NS_PER_S, Event, Instant
 
-MAX_ROWS = 20
-"""Largest number of rows in the message `events`. With this number, even a client that polls slowly
-seldom misses an event."""
+MAX_ROWS = 20  # even a client that polls slowly seldom misses an event
 
-NEW_ROW_AFTER_NS = 60 * NS_PER_S
-"""Longest time between two events of the same name that share a row, ns. After a longer pause, an
-event gets a new row."""
+NEW_ROW_AFTER_NS = 60 * NS_PER_S  # between two events that share a row
 
 
 class _Row(Struct, frozen=True):
@@ -32,17 +27,13 @@ class _Row(Struct, frozen=True):
 
 
 class RecentEvents:
-    """Keeps the rows of the last events, oldest first.
-
-    If an event repeats, its row moves to the end.
-    """
+    """The rows of the last events, oldest first; a repetition moves its row to the end."""
 
     def __init__(self) -> None:
         self._rows: deque[_Row] = deque(maxlen=MAX_ROWS)
         self._total = 0
 
     def add(self, events: Iterable[Event], now: Instant) -> None:
-        """Add the events of a step. `now` is the time of the step."""
         for event in events:
             self._total += 1
             same = None if event.news else self._same(event, now)
@@ -52,7 +43,7 @@ class RecentEvents:
             self._rows.append(_Row(now, event))
 
     def message(self) -> Events | None:
-        """Return the message `events` with all rows, or None before the first event."""
+        """Return the message with all rows, or None before the first event."""
         if not self._rows:
             return None
         return Events(_time(self._rows[-1]), self._total, [_log_event(row) for row in self._rows])

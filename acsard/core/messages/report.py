@@ -1,7 +1,6 @@
 """Builds the messages that are due after a control step, and the present message of a key.
 
-A message is built only if its key has a subscriber or was queried. All messages that come from the
-same feedback line have the stamp of that line.
+Only those with a subscriber or a query are built. All of a feedback line have its stamp.
 """
 
 from __future__ import annotations
@@ -46,7 +45,9 @@ from acsard.core.values import (
     BatteryStatus,
     Estimate,
     Instant,
+    Ns,
     Outputs,
+    Rad,
     Snapshot,
 )
 from acsard.core.values import Spread as Measurements
@@ -54,21 +55,19 @@ from acsard.core.values import Twist as BodyTwist
 
 GetSnapshot = Callable[[], Snapshot]
 
-UNKNOWN_STATUS, CHARGING, DISCHARGING, NOT_CHARGING = range(4)
-"""Values of `Battery.power_supply_status`."""
+UNKNOWN_STATUS, CHARGING, DISCHARGING, NOT_CHARGING = range(4)  # `Battery.power_supply_status`
 
 
 BATTERY_HZ = 1.0
 
 
 class _Rate:
-    """Limits how often messages of one key are published. 0 Hz means no limit."""
-
+    # Messages of one key; 0 Hz is no limit.
     def __init__(self, hz: float) -> None:
         self._period_ns = int(NS_PER_S / hz) if hz else 0
         self._next_ns = -2 * self._period_ns
 
-    def due(self, now_ns: int, at_once: bool = False) -> bool:
+    def due(self, now_ns: Ns, at_once: bool = False) -> bool:
         # Allow a twentieth of the period as grace. Otherwise a step that is a microsecond early
         # would wait for the next period.
         if not at_once and now_ns < self._next_ns - self._period_ns // 20:
@@ -79,36 +78,30 @@ class _Rate:
 
 
 class Report:
-    """Builds the messages that the daemon publishes.
-
-    It stores the last outputs, the last estimate and the last events, and when the next message of
-    each key with a limited rate is due.
-    """
+    """Builds the messages that the daemon publishes, and knows when each is due."""
 
     def __init__(
         self, config: Config, start: Instant, certificate_ends: Mapping[str, int] | None = None
     ) -> None:
+        # Expiry by owner, "" for the robot's own (maybe by the TLS gateway's report), ns since
+        # 1970.
         self.certificate_ends = dict(certificate_ends or {})
-        """Maps the owner of each TLS certificate to the time at which it expires, wall-clock ns
-        since 1970. The owner of the robot's own certificate is "". If the daemon may not read this
-        certificate, its time comes from a report of the TLS gateway."""
         self._names = list(config.joints.as_tuple())
         self._start = start
         self._estimate: Estimate | None = None
         self._outputs: Outputs | None = None
         self._happened = RecentEvents()
+        # Builders by key, at their own rate and with `status_changed`. None: there is no message
+        # now.
         self._summaries: dict[str, Callable[[Outputs, Snapshot], Message | None]] = {
             "state": self._state,
             "diagnostics": self._diagnostics,
             "battery": self._battery,
         }
-        """The methods that build a message from a `Snapshot`, by key. These messages are published
-        at their own rate, and immediately when the status changes (`Outputs.status_changed`). A
-        method returns None if there is no message now."""
         self.use(config)
 
     def use(self, config: Config) -> None:
-        """Use the rates and frames of `config` from the next message on."""
+        """Use other rates and frames from the next message on."""
         self._config = config
         rates = config.rates
         self._rates = {
@@ -123,16 +116,9 @@ class Report:
     def due(
         self, outputs: Outputs, wanted: Collection[str], get_snapshot: GetSnapshot
     ) -> Iterator[tuple[str, Message]]:
-        """Return an iterator over the pairs of key and message to publish after this step.
+        """Return an iterator over the keys and messages to publish after this step.
 
-        The messages of the feedback (`odom`, `tf`, `wheel_states`) come first, because `state`
-        takes ten times as long to build.
-
-        Args:
-            outputs: the outputs of the step.
-            wanted: the keys that have a subscriber.
-            get_snapshot: function that returns the robot's `Snapshot`. It is called only if a
-                message needs it.
+        Those of the feedback come first, because `state` takes ten times as long.
         """
         self._outputs = outputs
         if outputs.events:
@@ -174,11 +160,7 @@ class Report:
                     yield key, message
 
     def current(self, key: str, get_snapshot: GetSnapshot) -> Message | None:
-        """Return the present message of a published key, or None if there is none.
-
-        `get_snapshot` is a function that returns the robot's `Snapshot`. It is called only if the
-        message needs it.
-        """
+        """Return the present message of a published key, or None if there is none."""
         estimate, outputs = self._estimate, self._outputs
         match key:
             case "tf_static":
@@ -204,7 +186,7 @@ class Report:
                 return build(outputs, get_snapshot()) if build and outputs else None
 
     def tf_static(self) -> TFMessage:
-        """Return the message with the transform of the lidar, empty if it is switched off."""
+        """Return the transform of the lidar, empty if it is switched off."""
         lidar = self._config.lidar
         if not lidar.publish_tf:
             return TFMessage([])
@@ -214,11 +196,7 @@ class Report:
         return TFMessage([TransformStamped(base, lidar.lidar_frame, pose)])
 
     def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
-        """Return the message `odom`.
-
-        If `live` is False, the board no longer sends feedback. The twist is then 0, with the
-        covariance `UNKNOWN_COVARIANCE`.
-        """
+        # Not `live`: without feedback, the twist is 0 and of `UNKNOWN_COVARIANCE`.
         frames, pose = self._config.odometry, estimate.pose
         of_pose = pose_covariance(estimate.covariance)
         of_twist = twist_covariance(estimate.twist_variances) if live else UNKNOWN_COVARIANCE
@@ -299,11 +277,7 @@ class Report:
         return round((first_expiry(self.certificate_ends)[1] - now.wall_ns) / DAY_NS, 2)
 
     def _battery(self, outputs: Outputs, snapshot: Snapshot) -> Battery | None:
-        """Return the message `battery`, or None if no battery status is known.
-
-        The stamp of the message is the time of the board's last report, or now if the reports have
-        stopped.
-        """
+        # Stamped with the last report, or now if the reports have stopped.
         battery, now = snapshot.battery, outputs.now
         if battery is None:
             return None
@@ -345,6 +319,6 @@ def _twist(twist: BodyTwist) -> Twist:
     return Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))
 
 
-def from_yaw(yaw: float) -> Quaternion:
-    """Return the rotation by `yaw` rad about z."""
+def from_yaw(yaw: Rad) -> Quaternion:
+    """Return the rotation by `yaw` about z."""
     return Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))

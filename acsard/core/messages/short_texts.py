@@ -21,10 +21,7 @@ from acsard.core.messages.state_warnings import brief, charge, warnings
 
 
 def place(x: float, y: float, yaw: float) -> list[str]:
-    """Return texts for the x, y and yaw of a pose, with units, such as "yaw +90.0°".
-
-    `x` and `y` are in m, and `yaw` is in rad.
-    """
+    """Return texts for a pose, m and rad, such as "yaw +90.0°"."""
     return [
         f"x {signed(x, 3, 8)} m",
         f"y {signed(y, 3, 8)} m",
@@ -33,15 +30,12 @@ def place(x: float, y: float, yaw: float) -> list[str]:
 
 
 def speeds(linear: float | None, angular: float | None) -> list[str]:
-    """Return texts for the forward speed and the turn rate, such as "forward +0.50 m/s".
-
-    `linear` is in m/s and `angular` in rad/s. None means that the speed is unknown.
-    """
+    """Return texts for m/s and rad/s, such as "forward +0.50 m/s"; None is unknown."""
     return [f"forward {signed(linear, 2, 5)} m/s", f"turn {signed(angular, 2, 5)} rad/s"]
 
 
 def short(message: object) -> str:
-    """Format a message as one line. The type of the message must be in `SHORT_TEXTS`."""
+    """Format a message, of a type in `SHORT_TEXTS`, as one line."""
     return "  ".join(SHORT_TEXTS[type(message)](message))
 
 
@@ -57,10 +51,7 @@ def _state(state: RobotState) -> list[str]:
 
 
 def power(battery: BatterySummary) -> list[str]:
-    """Return texts for the voltage, the current and the charge of a battery, with units.
-
-    An unknown value is shown as "-".
-    """
+    """Return texts for voltage, current and charge, "-" if unknown."""
     return [
         f"{signed(battery.volts, 2, 6).strip().removeprefix('+')} V",
         f"{signed(battery.amps, 2, 7).strip()} A",
@@ -82,6 +73,7 @@ def _twist(twist: Twist) -> list[str]:
     return speeds(twist.linear.x, twist.angular.z)
 
 
+# Parts of the line, by type.
 SHORT_TEXTS: dict[type, Callable[[Any], list[str]]] = {
     Odometry: _odometry,
     RobotState: _state,
@@ -89,5 +81,3 @@ SHORT_TEXTS: dict[type, Callable[[Any], list[str]]] = {
     PoseStamped: lambda message: _pose(message.pose),
     TwistStamped: lambda message: _twist(message.twist),
 }
-"""Maps each message type that has a one-line form to a function that returns the parts of the
-line."""

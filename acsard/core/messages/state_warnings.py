@@ -1,8 +1,6 @@
-"""Lists the warnings about a robot, such as a low battery.
+"""Lists the warnings about a robot, such as a low battery, which it may have even if `ready`.
 
-Even a robot in the mode `ready` may have warnings. `acsard fleet`, `acsard top`, `acsard echo
---short`, `/metrics` and the web page show the warnings in the words of this module. Programs can
-read the same facts from the fields of the message `state`.
+All tools show them in these words; programs read the fields of `state`.
 """
 
 from __future__ import annotations
@@ -20,31 +18,30 @@ What = Literal[
     "settings",
 ]  # fmt: skip
 
-WARNING_KINDS: tuple[What, ...] = get_args(What)
-"""All values of `StateWarning.what`, from the most to the least urgent."""
+WARNING_KINDS: tuple[What, ...] = get_args(What)  # most urgent first
 
-WARNING = "WARNING"
-"""Word that begins a text with a list of warnings."""
+WARNING = "WARNING"  # begins a list of warnings
 
 ESTOP = {"pressed": "emergency stop pressed", "silent": "emergency stop not reported"}
 
+# Words by level.
 BATTERY = {
     "warning": "battery low",
     "return": "battery low, return",
     "stop": "battery empty",
     "unknown": "battery level unknown",
 }
-"""Words for each level of the battery except `ok`."""
 
 
+# Words by code.
 CERTIFICATE = {
     "expires": "certificate expires in {days:.0f} days",
     "expired": "certificate expired {days:.0f} days ago",
     "unknown": "certificate unknown",
 }
-"""Words for each state of the certificates except `valid`."""
 
 
+# Warnings that only repeat the reason, by its code.
 SAME_AS_REASON: dict[str, What] = {
     "emergency_stop": "emergency_stop",
     "emergency_stop_silent": "emergency_stop",
@@ -53,17 +50,14 @@ SAME_AS_REASON: dict[str, What] = {
     "bumper_away": "bumper",
     "bumper_blocks": "bumper",
 }
-"""Maps a code of `state` to the warning that would only repeat the reason."""
 
 
 class StateWarning(Struct, frozen=True):
-    """A warning about a robot. `what` is the part of the robot that it is about."""
+    """A warning about a part of the robot, `what`."""
 
     what: What
-    brief: str
-    """The warning in a few words, short enough for a column of a table."""
-    text: str = ""
-    """The details that the robot reports; "" if `brief` already says everything."""
+    brief: str  # for a column of a table
+    text: str = ""  # details
 
     def __str__(self) -> str:
         return printable(f"{self.brief}: {self.text}" if self.text else self.brief)
@@ -75,17 +69,13 @@ def warnings(state: RobotState) -> list[StateWarning]:
 
 
 def brief(state_warnings: Sequence[StateWarning]) -> str:
-    """Return the warnings as one text, such as "WARNING: recording fails"; "" for no warnings."""
+    """Return the warnings as one text, such as "WARNING: recording fails", or ""."""
     words = ", ".join(printable(warning.brief) for warning in state_warnings)
     return f"{WARNING}: {words}" if words else ""
 
 
 def charge(battery: BatterySummary | None) -> str:
-    """Return the charge of a battery as text, such as "80 %".
-
-    If the charge is unknown, return the voltage, such as "24.1 V". If that is unknown too, return
-    "".
-    """
+    """Return the charge of a battery as text, otherwise the voltage, otherwise ""."""
     if battery is None:
         return ""
     if battery.percent is not None:
