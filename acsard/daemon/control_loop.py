@@ -1,8 +1,7 @@
 """Collects the inputs of a control step, calls `Robot.step`, and delivers the outputs of the step.
 
-All decisions about the motion are made in `Robot.step`, not in the control loop. The control loop
-is synchronous, so that the daemon can call `ControlLoop.step` from one task and the tests can call
-it in virtual time.
+All decisions about the motion are made there. The loop is synchronous, so that the daemon can call
+`step` from one task, and the tests in virtual time.
 """
 
 from __future__ import annotations
@@ -45,6 +44,7 @@ from acsard.core.values import (
     Inputs,
     Instant,
     Latches,
+    Ns,
     Outputs,
     Recording,
     Refusal,
@@ -57,28 +57,21 @@ from acsard.daemon.latencies import Stopwatch
 from acsard.daemon.pacing import NO_PERIOD, Pace, Period
 from acsard.recording.recorded_steps import StepRecorder, count_superseded
 
-FEEDBACK_TOPICS = ("odom", "tf", "wheel_states")
-"""Topics whose messages are made from the feedback lines of the board."""
+FEEDBACK_TOPICS = ("odom", "tf", "wheel_states")  # with messages of the board's feedback lines
 
+# Limit of a step, and one slow query (`set`, ROS parameters) besides: a flood costs no period.
 QUERIES_PER_STEP = 8
-"""Largest number of queries that one control step takes from the bus. In addition, a step may take
-one slow query: a `set` request or a query for ROS parameters. Further queries wait for the next
-step, so that a flood of queries does not make the control loop miss a period."""
 
+# Least delay of a line; less is reported as 0, as the estimated sample times are less exact.
 MIN_WRITE_DELAY_NS = 1_000_000
-"""Smallest write delay that the control loop reports to the robot, ns. The write delay is the time
-from the start of a step to the write of its line. A smaller delay is reported as 0, because the
-error of the estimated sample times is larger."""
 
-MAX_NAMED = 3
-"""Largest number of settings that `settings_differ` of the message `state` names."""
+MAX_NAMED = 3  # settings in `settings_differ`
 
+# Added to an answer while a slow disk lacks the newest latches.
 NOT_STORED = (
     "the new state is not on the disk yet; if the daemon restarts before the disk has this state, "
     "it may lose a stop"
 )
-"""Text that the daemon adds to the answer to a successful request if a slow disk has not stored the
-newest latches yet."""
 
 BUS_STUCK = Event(
     "bus_stuck",
@@ -107,33 +100,12 @@ class ControlLoop:
         latches: Latches = Latches(),  # noqa: B008
         keeper: LatchKeeper | None = None,
     ) -> None:
-        """Create the robot and the parts that convert its inputs and outputs.
-
-        Args:
-            config: the configuration at the start of the daemon.
-            info: the answer to queries of the key `info`.
-            port: the serial port to the board.
-            bus: the robot's keys on the Zenoh bus.
-            start: the time at which the daemon started.
-            log: function that writes an event to the log.
-            mono_ns: function that returns the monotonic time, ns.
-            certificate_ends: maps the name of each TLS certificate to the time at which the
-                certificate expires, ns since 1970. None or empty without TLS.
-            others: list to which other parts of the daemon append events. Each step passes these
-                events to the robot and empties the list.
-            beside: function that returns the newest message of a key that another part of the
-                daemon, such as the simulator, publishes. It returns None for any other key.
-            adopted: function that is called with each new configuration that comes into force after
-                the start.
-            recorder: the black box, which records each step. With None, nothing is recorded.
-            latches: the latches (stop, fault, "inactive") with which the robot starts.
-            keeper: stores the latches, so that they survive a restart of the daemon. With None, the
-                latches are not stored.
-        """
+        # `others` collects events of other parts, which each step logs. `beside` returns the newest
+        # message of a key of another part, such as the simulator. `adopted` gets each new
+        # configuration. `latches` are those at the start, which `keeper` stores over a restart.
         self.robot = Robot(config, latches)
         self.report = Report(config, start, certificate_ends)
-        self.shutting_down = False
-        """True once the shutdown has begun. The robot then ramps to zero and stays at rest."""
+        self.shutting_down = False  # the robot ramps to zero and stays at rest
         self.outputs: Outputs | None = None
         self._start_ns = start.mono_ns
         self._others = [] if others is None else others
@@ -142,11 +114,9 @@ class ControlLoop:
         self._started, self._changed_settings = config, ""
         self._recorder, self._handover = recorder, Handover(latches, keeper)
         self._speed_cap: SpeedCap | None = None
+        # Answers, with the time at which each was queued, until the latches are in their file.
         self._answers: deque[tuple[int, Answer]] = deque()
-        """Answers that wait until the latch file contains the newest latches. Each answer is paired
-        with the monotonic time at which it was queued, ns."""
-        self._bus_input = NO_INPUT
-        """The input that the present step has taken from the bus."""
+        self._bus_input = NO_INPUT  # of the present step
         stop = self.robot.session.codec.stop
         self._guard = Guard(stop, config)
         if recorder is not None and latches != Latches():
@@ -156,15 +126,12 @@ class ControlLoop:
         self._queries = Queries(config, info)
         self._gateway, self._imu = GatewayFollower(), GyroFollower(config.mcu.simulated)
         self._routers = RouterFollower()
-        self._turn_rates: list[GyroSample] = []
-        """Gyro samples that have arrived since the last step."""
+        self._turn_rates: list[GyroSample] = []  # since the last step
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
         self._superseded, self._late_ns = False, 0
+        # About the last line: not sent, so a newer one must replace it; why the guard replaced it;
+        # from its step to the write, if over `MIN_WRITE_DELAY_NS`.
         self._trip: Trip = ""
-        """Three facts about the last line to the board. `_superseded` is true if the port did not
-        send the line, so that a newer line must replace it. `_trip` is the reason why the guard
-        replaced the line with zeros, or "". `_late_ns` is the time from the start of the step to
-        the write of the line, ns. It is 0 if this time is below `MIN_WRITE_DELAY_NS`."""
         # Use the longest line of both directions, because answers must not queue in the MCU either.
         line_ns = wire_ns(config.mcu.line_bytes, config.mcu.baud_rate)
         self.pace = Pace(line_ns, config.period_ns)
@@ -172,36 +139,25 @@ class ControlLoop:
 
     @property
     def at_rest(self) -> bool:
-        """True if the last control step commanded zero speed; False before the first step.
-
-        While the serial port is closed, every step commands zero speed.
-        """
+        """Whether the last step commanded zero, as every step with a closed port does."""
         outputs = self.outputs
         return outputs is not None and not any(outputs.speeds.as_tuple())
 
-    def totals(self, now_ns: int) -> dict[str, float]:
-        """Return the fields of the log event `ended`: run time in s, distance in m, and counters.
-
-        `now_ns` is the present monotonic time, ns.
-        """
+    def totals(self, now_ns: Ns) -> dict[str, float]:
+        """Return the fields of the event `ended`: run time in s, distance in m, counters."""
         seconds, metres = (now_ns - self._start_ns) / NS_PER_S, self.robot.travelled
         shot = self.robot.snapshot(now_ns)
         return {"seconds": round(seconds, 1), "metres": round(metres, 2), **shot.counters}
 
     @property
-    def retry_ns(self) -> int | None:
-        """Monotonic time at which a step between two periods can send the waiting command, ns.
-
-        A command waits if it arrived too soon after the last line to the board. None means that no
-        command waits.
-        """
+    def retry_ns(self) -> Ns | None:
+        """When a step between periods can send a command that came too soon after a line."""
         return self.pace.retry_ns(self._port.sent_ns)
 
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
-        """Run one control step at the time `now`, and return the robot's outputs.
+        """Run one control step, and return the robot's outputs.
 
-        `period` says how many periods have ended since the last step. For an extra step between the
-        ends of two periods, it is `NO_PERIOD`.
+        `period` says how many periods have ended; `NO_PERIOD` is for an extra step.
         """
         self._bus_input = NO_INPUT
         try:
@@ -265,7 +221,7 @@ class ControlLoop:
         return outputs
 
     def _decided(self, inputs: Inputs) -> tuple[Outputs, bool]:
-        """Run the robot's step. Return its outputs, and whether the port wrote the line."""
+        # Also returns whether the port wrote the line.
         try:
             outputs = self.outputs = self.robot.step(inputs)
             self._handover.take(outputs.latches)
@@ -373,10 +329,7 @@ class ControlLoop:
             self._others.append(BUS_STUCK)
 
     def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
-        """Answer a query, or return it as a request if the robot must process it.
-
-        Return None if this method has answered the query.
-        """
+        # None: answered here.
         try:
             served = self._queries.serve(query, self._current, self.outputs)
         except DecodeError as error:
@@ -391,10 +344,7 @@ class ControlLoop:
         return None
 
     def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
-        """Write the line of a step to the port. Return the line, or None if it was not written.
-
-        `tick` is false for a line between two control periods.
-        """
+        # None: not written. `tick` is false between two periods.
         line, self._trip = self._guard.check(outputs)
         self._superseded, self._late_ns = False, 0
         if line is None:
@@ -432,11 +382,7 @@ class ControlLoop:
             self._log(event)
 
     def _answer(self, now: Instant, *, last: bool = False) -> None:
-        """Send the queued answers.
-
-        Unless `last` is true, an answer waits until the latches are stored, but at most for
-        `MAX_ANSWER_DELAY_NS`.
-        """
+        # Unless `last`, an answer waits until the latches are stored, for `MAX_ANSWER_DELAY_NS`.
         is_stored, before_ns = self._handover.is_stored, now.mono_ns - MAX_ANSWER_DELAY_NS
         trouble = "" if is_stored else self._handover.trouble or NOT_STORED
         while self._answers and (is_stored or last or self._answers[0][0] < before_ns):
@@ -467,10 +413,7 @@ class ControlLoop:
 
 
 def _stops(batch: BusInput) -> list[str]:
-    """Return the name of the sender of each stop in the inputs of a step.
-
-    A call of `srv/stop` counts, too, because the inbox adds a stop for each such call.
-    """
+    # A call of `srv/stop` counts, because the inbox adds a stop for it.
     return [
         caller_name(arrival.via, arrival.attachment, arrival.sender)
         for arrival in batch.arrivals

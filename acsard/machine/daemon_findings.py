@@ -1,7 +1,7 @@
 """Examines whether the daemon can be reached, and evaluates the daemon's reports.
 
-`acsard doctor` queries the daemon's configuration once, and its state twice, a second apart. The
-differences between the counters of the two states show how well the serial link works.
+The doctor queries the configuration once and the state twice, a second apart: the counters'
+differences show how well the serial link works.
 """
 
 from __future__ import annotations
@@ -41,27 +41,33 @@ from acsard.core.motion.emergency_stop import (
     SILENT_REASON,
 )
 from acsard.core.motion.gyro import STATUS_TEXTS
-from acsard.core.values import NS_PER_S, AcsardError, BatteryLevel, BatteryStatus, GyroDoes
+from acsard.core.values import (
+    NS_PER_S,
+    AcsardError,
+    BatteryLevel,
+    BatteryStatus,
+    GyroDoes,
+    Ns,
+    WallNs,
+)
 from acsard.host import clock
 from acsard.host.errors import MendableError, NoAnswerError
 from acsard.host.processes import is_daemon_here
 from acsard.machine.finding import LEVELS, Finding, Level
 
-MIN_JUDGED_LINES = 40
-"""If the daemon sends fewer lines than this between the two queries, the doctor does not judge the
-share of lost lines, because the share is not significant."""
+MIN_JUDGED_LINES = 40  # fewer lines between the queries say nothing about lost lines
 
-MAX_KEYS = 6
-"""Maximum number of configuration keys that one finding of `compared` names."""
+MAX_KEYS = 6  # in one finding of `compared`
 
 
+# Set by options of `acsard run`, so a difference to the file is probably intended.
 OPTION_KEYS = (
     "mcu.port", "mcu.baud_rate", "robot.id", "bus.listen", "bus.connect", "record.directory",
     "ros.namespace",
 )  # fmt: skip
-"""Configuration keys that options of `acsard run` can set. If the daemon's value of such a key
-differs from the value in the file, the user has probably intended this."""
 
+# Why a value may differ from the file: for which keys, level, reason, advice (`{which}`: "this
+# value" or "these values"; `{lines}`: lines for the file).
 DIFFERENCE_REASONS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
         lambda key: key in OPTION_KEYS,
@@ -88,43 +94,26 @@ DIFFERENCE_REASONS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = 
         "writes a value into the file",
     ),
 )
-"""Reasons why the daemon's value of a configuration key may differ from the value in the file.
-
-Each row has four items: a function that returns whether the reason can apply to a key, the level of
-the finding, the reason in words, and the advice to the user. In the advice, `{which}` stands for
-"this value" or "these values", and `{lines}` stands for lines of a configuration file.
-"""
 
 
 class Running(Struct, frozen=True):
-    """The answers of a running daemon to the queries of `acsard doctor`.
-
-    `before` is the answer to the first query of the state, and `state` to the second query.
-    """
+    """The answers of a running daemon, with its state a second before in `before`."""
 
     info: Info
     config: Config
     before: RobotState
     state: RobotState
-    queried_ns: int
-    """Time halfway between sending the query of `state` and receiving its answer, by this machine's
-    wall clock, ns."""
-    round_trip_ns: int = 0
-    """Time from sending the query of `state` to receiving its answer, ns."""
-    rows: tuple[DiagnosticStatus, ...] = ()
-    """Rows of the daemon's diagnostics."""
-    is_local: bool = True
-    """Whether the daemon runs on this machine."""
-    role: str = ""
-    """The role, certificate and name that this client has at the daemon, in words."""
+    queried_ns: WallNs  # middle of the query of `state`, by this machine's wall clock
+    round_trip_ns: Ns = 0  # of the query of `state`
+    rows: tuple[DiagnosticStatus, ...] = ()  # of the diagnostics
+    is_local: bool = True  # it runs on this machine
+    role: str = ""  # this client's role, certificate and name at the daemon
 
 
 def query(config: Config, address: Address) -> Running:
-    """Query the daemon at `address`, and return its answers. This takes about a second.
+    """Query the daemon for about a second. Raises an `AcsardError` without an answer.
 
-    `config` is the configuration in the local file. If the daemon does not return its own
-    configuration, use `config` instead, with the values from the daemon's `info`. Raises an
-    `AcsardError` if the daemon does not answer.
+    The local `config`, with the values of `info`, stands in for one that is not returned.
     """
     endpoint, robot_id, tls = address
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
@@ -142,11 +131,7 @@ def query(config: Config, address: Address) -> Running:
 
 
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
-    """Return the daemon's configuration.
-
-    If the daemon does not return it, return `file`, the configuration in the local file, with the
-    values that `info` contains.
-    """
+    # Otherwise `file`, with the values of `info`.
     try:
         return from_builtins(robot.get("config"))
     except (AcsardError, msgspec.ValidationError):  # not permitted, or a daemon of another version
@@ -156,12 +141,7 @@ def _configuration(robot: Client, info: Info, file: Config) -> Config:
 
 
 def compared(running: Running, file: Config) -> Iterator[Finding]:
-    """Yield findings about configuration keys with different values in the daemon and in the file.
-
-    `file` is the configuration in the file. There is one finding for each row of
-    `DIFFERENCE_REASONS` that applies to any of these keys. If no value differs, there is one
-    finding with the level "ok".
-    """
+    """Yield a finding for each row of `DIFFERENCE_REASONS` with keys that differ, or one ok."""
     info, others = running.info, differences(running.config, file)
     daemon_name = f"acsard {info.version}, pid {info.pid}"
     if not others:
@@ -185,19 +165,13 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
 
 
 def _tables(differing: Mapping[str, Difference]) -> str:
-    """Return the lines that the user must write into the configuration file.
-
-    With these lines, the file contains the values that the running daemon has.
-    """
+    # The lines with which the file has the running daemon's values.
     parts = [(key.rpartition("."), write(difference.its)) for key, difference in differing.items()]
     return "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in parts)
 
 
 def link(running: Running) -> Iterator[Finding]:
-    """Yield findings about the serial link, and about the board's inputs and battery.
-
-    If the link is not up, yield only a finding about the link.
-    """
+    """Yield findings about the serial link and, if it is up, the board's inputs and battery."""
     config, state = running.config, running.state
     mend = check(running)
     if state.link != "up":
@@ -313,11 +287,9 @@ def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -
 
 
 def unanswered_lines(passed: Mapping[str, int], config: Config) -> Iterator[str]:
-    """Yield a warning text if the board answered too few of the daemon's lines.
+    """Yield a warning if too few lines were answered, by the counters' increase in a second.
 
-    Yield nothing for a free-running board (a board with a configured `mcu.reply_period`), because
-    such a board does not answer each line. `passed` maps the name of each of the daemon's counters
-    to its increase within about a second.
+    A free-running board (`mcu.reply_period`) does not answer each line.
     """
     sent, replies = passed.get("lines_sent", 0), passed.get("lines", 0)
     enough = replies >= (1 - MAX_UNANSWERED_FRACTION) * sent - 1
@@ -330,11 +302,7 @@ def unanswered_lines(passed: Mapping[str, int], config: Config) -> Iterator[str]
 
 
 def refused(counters: Mapping[str, int]) -> list[str]:
-    """Return a list with a warning text if the daemon rejected too many lines of the board.
-
-    Otherwise return []. `counters` maps the name of each of the daemon's counters to its value, or
-    to its increase within about a second.
-    """
+    """Return a warning, in a list, if too many lines of the board were rejected."""
     kinds = {
         name.removeprefix("line_"): count
         for name, count in counters.items()
@@ -347,11 +315,7 @@ def refused(counters: Mapping[str, int]) -> list[str]:
 
 
 def link_losses(counters: Mapping[str, int]) -> list[tuple[int, str]]:
-    """Return [(number of times that the link was lost, sentence about these losses)].
-
-    A loss does not count if it occurred because the computer did not run the daemon in time. Return
-    [] if no loss counts. `counters` are the daemon's counters.
-    """
+    """Return how often the link was lost, with a sentence; not because this computer was late."""
     times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)
     text = (
         f"the link was lost {many(times, 'time')} since the daemon's start: the board restarts, is "
@@ -369,6 +333,7 @@ def check(running: Running) -> str:
     )
 
 
+# Advice by the status in `state`.
 GYRO_MENDS: dict[GyroDoes, str] = {
     "used": "",
     "waiting for rest": "",
@@ -385,7 +350,6 @@ GYRO_MENDS: dict[GyroDoes, str] = {
     "not believed": "check that the gyro's z axis points up and that its driver sends rad/s; then "
     "measure the track width with `acsard calibrate`",
 }
-"""Advice to the user for each status of the gyro in the message `state`; "" if none is needed."""
 
 OTHER_VERSION_ADVICE = (
     "if the daemon has another version of acsard, run this tool from the same version"
@@ -403,11 +367,7 @@ START_ROUTER_ADVICE = (
 
 
 def routers(config: Config) -> Iterator[Finding]:
-    """Yield findings about the endpoints in `bus.connect`, to which the daemon connects.
-
-    There is a warning for each endpoint at which no program listens, and a warning for each
-    endpoint without TLS.
-    """
+    """Yield warnings about endpoints in `bus.connect` without a program, or without TLS."""
     for endpoint in config.bus.connect:
         if not answers(endpoint):
             yield Finding(
@@ -428,11 +388,7 @@ def routers(config: Config) -> Iterator[Finding]:
 
 
 def query_or_finding(config: Config, address: Address) -> Running | Finding:
-    """Return the answers of the daemon at `address`.
-
-    If the daemon does not answer, return a finding with the reason instead. `config` is the
-    configuration in the local file. Raises `UsageError` if the endpoint in `address` is not valid.
-    """
+    """Return the daemon's answers, or a finding. Raises `UsageError` for an invalid endpoint."""
     endpoint = address.endpoint
     if not answers(endpoint):
         if config.bus.mode == "client" and endpoint in map(reachable, config.bus.connect):
@@ -467,7 +423,7 @@ def query_or_finding(config: Config, address: Address) -> Running | Finding:
 
 
 def daemon(running: Running) -> Iterator[Finding]:
-    """Yield findings about the robot and its daemon, from the daemon's answers `running`."""
+    """Yield findings about the robot and its daemon."""
     state = running.state
     level: Level = "failure" if state.mode == "fault" else "ok"
     mend = (
@@ -510,11 +466,7 @@ def daemon(running: Running) -> Iterator[Finding]:
 
 
 def certificate(row: DiagnosticStatus | None, is_local: bool) -> Iterator[Finding]:
-    """Yield a finding if a certificate of the daemon or its TLS gateway expires soon.
-
-    `row` is the row about certificates in the daemon's diagnostics, or None if this row is missing.
-    `is_local` says whether the daemon runs on this machine.
-    """
+    """Yield a finding if a certificate of the daemon or its TLS gateway expires soon."""
     if row is None or not row.level:
         return
     mend = "run `acsard doctor` on the daemon's machine, where it examines the certificate files"
@@ -531,11 +483,7 @@ def certificate(row: DiagnosticStatus | None, is_local: bool) -> Iterator[Findin
 
 
 def late(running: Running) -> Iterator[Finding]:
-    """Yield findings about late control periods of the daemon.
-
-    There is a warning if the daemon has missed more than 1 % of the periods since its start, or if
-    its diagnostics report recently missed periods.
-    """
+    """Yield a warning about 1 % of missed periods since the start, or recent ones."""
     counters = running.state.counters
     missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
     messages = [
@@ -552,12 +500,10 @@ def late(running: Running) -> Iterator[Finding]:
 
 
 def clocks(running: Running) -> Iterator[Finding]:
-    """Yield findings about the clocks of the daemon and its clients.
+    """Yield warnings about clocks.
 
-    There is a warning if the daemon runs on another machine, and its clock differs from this
-    machine's clock by more than 0.4 s plus half of the duration of the query. There is also a
-    warning if Zenoh has replaced time stamps of commands, because a client's clock was more than
-    0.5 s ahead.
+    Another machine's differs by more than 0.4 s plus half of the query, or a client's was more than
+    0.5 s ahead, so that Zenoh replaced its stamps.
     """
     its_ns, counters = running.state.stamp.to_ns(), running.state.counters
     apart = (its_ns - running.queried_ns) / NS_PER_S
@@ -584,12 +530,7 @@ def clocks(running: Running) -> Iterator[Finding]:
 
 
 def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
-    """Yield findings about the gyro.
-
-    There is a finding about the gyro's status, unless the status is "off". There is also a warning
-    if the daemon has rejected gyro samples. `does` is the gyro's status in the message `state`, and
-    `counters` are the daemon's counters.
-    """
+    """Yield findings about the gyro's status and rejected samples."""
     if does != "off":
         status = cast(GyroDoes, does)  # a daemon of another version may have another status
         mend = GYRO_MENDS.get(
@@ -613,10 +554,7 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
 
 
 def linked(row: DiagnosticStatus | None) -> Iterator[Finding]:
-    """Yield a finding about the daemon's connection to routers.
-
-    `row` is the row about routers in the daemon's diagnostics. Yield nothing if this row is None.
-    """
+    """Yield a finding about the connection to routers, by the row of the diagnostics."""
     if row is not None:
         mend = START_ROUTER_ADVICE if row.level else ""
         if any(pair.value == NO_ROUTER for pair in row.values):
@@ -629,10 +567,7 @@ def linked(row: DiagnosticStatus | None) -> Iterator[Finding]:
 
 
 def gateway(config: Config) -> Iterator[Finding]:
-    """Yield a finding for each endpoint of the TLS gateway, about whether a program listens there.
-
-    `config` contains the endpoints.
-    """
+    """Yield a finding for each endpoint of the TLS gateway: does a program listen there?"""
     for endpoint in config.bus.outside:
         if answers(endpoint):
             yield Finding("gateway", "ok", f"open at {endpoint}")

@@ -1,1 +1,1 @@
-"""The processes that accept connections from the network: the TLS gateway and a fleet's router."""
+"""The TLS gateway, the process that accepts connections from the network."""

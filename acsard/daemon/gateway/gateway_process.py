@@ -1,9 +1,8 @@
 """Runs the TLS gateway's Zenoh session in a separate process that can be restarted.
 
-A malicious client can make Zenoh compare key expressions for ever, use all connections, or use much
-memory. This process then suffers, but the daemon does not. During such an attack a call to Zenoh
-may never return. So a separate thread observes the session, and the main thread checks that new
-observations keep coming.
+A malicious client can make Zenoh compare key expressions for ever, use all connections or much
+memory: this process suffers, the daemon does not. A call to Zenoh may then never return, so a
+thread observes the session, and the main thread checks that observations keep coming.
 """
 
 from __future__ import annotations
@@ -26,46 +25,29 @@ from acsard.host.errors import Exit
 from acsard.host.logs import Log
 from acsard.host.systemd import Systemd
 
-CHECK_PERIOD_S = 0.25
-"""Interval at which a thread observes the Zenoh session, s. At the same interval, the main thread
-checks that this thread still makes observations."""
+CHECK_PERIOD_S = 0.25  # of observations, and of the main thread's check
 
+# It needs 35 MB, or 72 MB with all connections. An attack uses 600 MB in a second, too fast for a
+# check, so the kernel refuses more, which ends the process.
 MAX_MEMORY_BYTES = 192 << 20
-"""Limit of the data memory of this process, bytes. The process needs 35 MB, or 72 MB if all
-connections are in use. An attack can use another 600 MB in each second, too fast for a periodic
-check. So the kernel enforces the limit: it refuses more memory, which ends the process."""
 
 
 class GatewayProcess:
-    """The main loop of the process that opens and observes the session of the gateway.
-
-    The loop ends when the process must end or be restarted.
-    """
+    """The main loop of the process, until it must end or be restarted."""
 
     def __init__(self, gateway: Gateway, log: Log, manager: Systemd, parent: int | None) -> None:
-        """Prepare the process; `run` runs it.
-
-        Args:
-            gateway: the session of this process.
-            log: the log of this process.
-            manager: the connection to systemd.
-            parent: file descriptor whose other end belongs to the parent process, or None. This
-                process ends when the parent closes that end. If the descriptor is a socket, this
-                process writes a sign of life to it in every period.
-        """
+        # The process ends when the parent closes its end of `parent`; a socket gets signs of life.
         self._gateway, self._log, self._manager = gateway, log, manager
         self._parent = None if parent is None else Parent(parent)
-        self._session: zenoh.Session | None = None
-        """The open session. It is never closed, because closing it could take for ever."""
+        self._session: zenoh.Session | None = None  # never closed, because that could take for ever
         self._observed = Observation(0)
         self._error: BaseException | None = None
         self._leaving = False
 
     def run(self) -> Exit:
-        """Run until the process must end, and return its exit code.
+        """Run until the process must end; FAILURE asks for a restart.
 
-        The code is OK after a signal or the end of the parent, and FAILURE if a restart is needed.
-        If the observing thread fails, raise its exception.
+        Raises an exception of the observing thread.
         """
         for number in end_signals():
             signal.signal(number, self._leave)
@@ -97,7 +79,7 @@ class GatewayProcess:
         return Exit.OK
 
     def _renewed(self) -> bool:
-        """Return whether the process must restart to use a new certificate."""
+        # There is a new certificate.
         files = self._gateway.files
         if not files.renewed():
             return False
@@ -114,7 +96,7 @@ class GatewayProcess:
         self._leaving = True
 
     def _wait(self) -> bool:
-        """Wait for `CHECK_PERIOD_S`, and return whether the process must end."""
+        # Wait for `CHECK_PERIOD_S`; True: the process must end.
         self._manager.alive()
         parent = self._parent
         if parent is None:

@@ -1,8 +1,7 @@
 """The TLS gateway between clients on other machines and the daemon on loopback.
 
-The gateway is a Zenoh router in a separate process. It forwards only the messages that the access
-rules allow. The worst effect that a client can have is a restart of the gateway
-(`gateway_process.py`), after which all clients reconnect.
+It is a Zenoh router in its own process that forwards what the access rules allow. The worst that a
+client can do is a restart (`gateway_process.py`), after which all clients reconnect.
 """
 
 from __future__ import annotations
@@ -20,34 +19,22 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.keys_and_roles import full_key
 from acsard.core.messages.schema import GatewayState
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Ns
 from acsard.daemon.gateway.session_health import Observation, SessionHealth
 from acsard.host import clock
 
-PROBE_TIMEOUT_NS = NS_PER_S
-"""Time between two queries to the daemon, ns. A query that has not ended when the next query is due
-counts as unanswered."""
+PROBE_TIMEOUT_NS = NS_PER_S  # between queries; one that has not ended by then is unanswered
 
-QUERY_TIMEOUT_S = 60.0
-"""Time after which Zenoh itself ends a query to the daemon, s. It is much longer than
-`PROBE_TIMEOUT_NS`, after which the query counts as unanswered."""
+QUERY_TIMEOUT_S = 60.0  # Zenoh's own, much longer than `PROBE_TIMEOUT_NS`
 
 
 class Gateway:
-    """The session of the TLS gateway.
+    """The session of the TLS gateway, which admits clients only while the daemon runs."""
 
-    The gateway admits clients only after the daemon has started. It tells the daemon how many
-    clients are connected.
-    """
-
-    most = MAX_SESSIONS - 1
-    """Largest number of connections from the network. One more connection is for the daemon."""
+    most = MAX_SESSIONS - 1  # from the network; one more is the daemon's
 
     def __init__(self, config: Config) -> None:
-        """Check the certificate files.
-
-        Raises `CertificateError` or `NotPermittedError` if they cannot be used.
-        """
+        # Raises `CertificateError` or `NotPermittedError`.
         self._config, self.where = config, ", ".join(config.bus.outside)
         require_usable(config.bus.tls)
         self.files = CertificateFiles(*files_in(config.bus.tls))
@@ -57,7 +44,7 @@ class Gateway:
         self._probe = DaemonProbe(full_key(config.robot.id, "info"))
 
     def ready(self) -> bool:
-        """Return whether the daemon accepts connections. The gateway is opened only then."""
+        """Return whether the daemon accepts connections, so that the gateway may be opened."""
         return answers(self._config.bus.plain[0])
 
     def open(self) -> zenoh.Session:
@@ -75,12 +62,7 @@ class Gateway:
         return Observation(clock.mono_ns(), holders, bool(local), unanswered)
 
     def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
-        """Publish the state of the gateway, which the daemon includes in the message `state`.
-
-        This state contains the number of connections, the opening time of the gateway, and the
-        earliest expiry time of its certificates. It also contains the number of observations in
-        which all connections were in use.
-        """
+        """Publish the gateway's part of `state`: connections, opening, expiry, fullness."""
         if self._publisher is None:
             self._ends_ns = min(expiry_times(self._config.bus.tls).values(), default=0)
             key, kind = full_key(self._config.robot.id, "gateway"), "GatewayState"
@@ -93,24 +75,18 @@ class Gateway:
 class DaemonProbe:
     """Queries the daemon repeatedly to detect a connection that is open but carries no data.
 
-    In a test on an overloaded machine, a connection stayed open for minutes, but the daemon's Zenoh
-    did not read from the connection.
+    On an overloaded machine, one stayed open for minutes without the daemon's Zenoh reading it.
     """
 
     def __init__(self, key: str) -> None:
-        """Prepare the probe. `key` is the full key of the queries, which the daemon must answer."""
+        # The daemon must answer queries of the full key `key`.
         self._key, self._asked_ns, self._unanswered = key, 0, 0
+        # Set when a query ends, even without a reply, and cleared before the next. Within
+        # `PROBE_TIMEOUT_NS` it has reached the daemon; a later end counts for the next query.
         self._ended = threading.Event()
-        """Set whenever a query ends, with or without a reply, and cleared before the next query is
-        sent. A query that ends within `PROBE_TIMEOUT_NS` has reached the daemon. A query that ends
-        later also sets the event, so that the query after it counts as answered."""
 
-    def unanswered(self, session: zenoh.Session, now_ns: int) -> int:
-        """Send the next query if it is due, and return the number of consecutive failed queries.
-
-        A query fails if it does not end within `PROBE_TIMEOUT_NS`. `now_ns` is the present
-        monotonic time, ns.
-        """
+    def unanswered(self, session: zenoh.Session, now_ns: Ns) -> int:
+        """Send the next query if it is due, and return the failed ones in a row."""
         if now_ns - self._asked_ns < PROBE_TIMEOUT_NS:
             return self._unanswered
         if self._asked_ns:
