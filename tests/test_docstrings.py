@@ -24,7 +24,6 @@ NOT_YET = (
     "core/motion/gyro_bias.py",
     "core/motion/gyro_match.py",
     "core/motion/gyro_trial.py",
-    "core/motion/learned_track.py",
     "core/motion/limits.py",
     "core/motion/odometry.py",
     "core/ros",

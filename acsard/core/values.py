@@ -183,7 +183,7 @@ EventName = Literal[
     "lines_rejected", "lines_implausible", "lines_lost", "uncommanded_motion", "wheel_fault",
     "emergency_stop", "emergency_stop_released", "bumper_pressed", "bumper_released",
     "battery", "battery_stop",
-    "gyro", "learned_track", "imu_refused",
+    "gyro", "imu_refused",
     "bus_stuck", "router_missing", "router_found", "not_a_router",
     "missed_periods", "recording", "latch_file",
     "gateway_open", "gateway_full", "gateway_stuck", "gateway_lost_daemon", "gateway_ended",
@@ -306,20 +306,12 @@ GyroDoes = Literal[
     "reversed", "in degrees", "dead", "not believed",
 ]  # fmt: skip
 
-# Whether the odometry uses the effective track that a gyro has taught it, or why not (`shown`:
-# `odometry.learned_track` is false).
-TrackUse = Literal["shown", "uncertain", "too far off", "used"]
-
 
 class GyroStatus(Struct, frozen=True):
-    """The state of the gyro and what was learned with it, None while unknown."""
+    """The state of the gyro."""
 
     does: GyroDoes = "off"
-    bias: float | None = None  # at rest, rad/s
-    delay: float = 0.0  # s by which the gyro is later than the wheels; negative if earlier
-    track: float | None = None  # effective over configured
-    track_deviation: float = 0.0  # standard deviation, relative
-    track_use: TrackUse = "shown"
+    bias: float | None = None  # at rest, rad/s; None while unknown
 
 
 # `silent`: no longer reported, which counts as pressed.

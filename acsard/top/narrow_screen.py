@@ -105,8 +105,6 @@ def link(data: ScreenData, state: RobotState, width: int) -> list[Text]:
     lines += flow([figure for figure in figures if figure], width, 0)
     if state.gyro != "off":
         lines += folded(f"gyro {clean(state.gyro)}", width, 2)
-    if state.effective_track:
-        lines += folded(f"track {clean(state.effective_track)}", width, 2)
     if inputs := board(state):
         lines += folded(f"board {inputs}", width, 2)
     kinds = refused(state, before)

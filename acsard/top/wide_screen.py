@@ -173,8 +173,6 @@ def link(data: ScreenData, state: RobotState, width: int) -> list[Text]:
         lines[-1].append("  ").append_text(lost)
     if state.gyro != "off":
         lines.append(_gyro(state.gyro))
-    if state.effective_track:
-        lines.append(row("track", clean(state.effective_track)))
     if inputs := board(state):
         lines.append(row("board", inputs))
     lines += _refusals(state, before)

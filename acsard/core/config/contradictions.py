@@ -235,15 +235,6 @@ def _frame_problems(config: Config) -> list[str]:
     return _repeated("frame", frames)
 
 
-def _gyro_problems(config: Config) -> list[str]:
-    if not config.odometry.learned_track or config.odometry.gyro:
-        return []
-    return [
-        "odometry.learned_track = true needs a gyro, but odometry.gyro = false; write "
-        "odometry.gyro = true or odometry.learned_track = false"
-    ]
-
-
 def _battery_problems(config: Config) -> list[str]:
     battery, errors = config.battery, []
     rows = [(f"battery.{level}_below", below) for level, below in battery.bounds.items()]
@@ -434,7 +425,6 @@ RULES: tuple[Rule, ...] = (
     _joint_problems,
     _source_name_problems,
     _frame_problems,
-    _gyro_problems,
     _battery_problems,
     *motion_rules.RULES,
     _source_problems,

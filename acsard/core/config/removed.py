@@ -14,6 +14,7 @@ REMOVED = {
     "lidar.lidar_z_offset": _LIDAR,
     "lidar.lidar_roll": _LIDAR,
     "lidar.lidar_pitch": _LIDAR,
+    "odometry.learned_track": "remove the key; `acsard calibrate` measures the track",
     "odometry.covariance": "remove the key: the daemon always computes the covariances",
     "odometry.pose_covariance_diagonal": _AXES,
     "odometry.twist_covariance_diagonal": _AXES,

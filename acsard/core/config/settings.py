@@ -291,7 +291,6 @@ class OdometryConfig(Struct, frozen=True):
     publish_tf: bool = True
     gyro: bool = False
     gyro_scale_std: Deviation = 0.004
-    learned_track: bool = False
     distance_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_radian: ErrorRate = 1e-2

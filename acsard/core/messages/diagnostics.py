@@ -27,7 +27,6 @@ from acsard.core.motion.emergency_stop import (
     SILENT_REASON,
 )
 from acsard.core.motion.gyro import STATUS_TEXTS
-from acsard.core.motion.learned_track import tracks
 from acsard.core.motion.wheel_faults import slow_text
 from acsard.core.values import (
     WHEELS,
@@ -89,7 +88,7 @@ def diagnostics(
         _wheels(snapshot.doubt, snapshot.counters),
         *_board(config, snapshot),
         *_battery(config, snapshot),
-        *_gyro(config, snapshot.gyro),
+        *_gyro(snapshot.gyro),
         *_routers(config.bus.connect, snapshot.routers),
         *_recording(snapshot.recording),
         *_latch_file(snapshot.latch_file),
@@ -222,22 +221,12 @@ def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
     ]
 
 
-def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:
+def _gyro(gyro: GyroStatus) -> list[Row]:
     if gyro.does == "off":
         return []
-    values, track = {"delay_s": f"{gyro.delay:.3f}"}, ""
-    if gyro.bias is not None:
-        values["bias_rad_s"] = f"{gyro.bias:.5f}"
-    if gyro.track is not None:
-        configured = config.drive.wheel_separation_multiplier
-        learned = configured * gyro.track
-        values["wheel_separation_multiplier"] = f"{configured:.3f}"
-        values["learned_multiplier"] = f"{learned:.3f}"
-        values["learned_multiplier_std"] = f"{learned * gyro.track_deviation:.3f}"
-        values["multiplier_in_use"] = f"{learned if gyro.track_use == 'used' else configured:.3f}"
-        track = f"; effective track: {tracks(gyro, configured)}"
+    values = {} if gyro.bias is None else {"bias_rad_s": f"{gyro.bias:.5f}"}
     level = OK if gyro.does in ("used", "waiting for rest", "waiting for turn") else WARN
-    return [Row("gyro", level, STATUS_TEXTS[gyro.does] + track, values)]
+    return [Row("gyro", level, STATUS_TEXTS[gyro.does], values)]
 
 
 def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:

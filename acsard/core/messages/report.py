@@ -38,7 +38,6 @@ from acsard.core.messages.schema import (
     Vector3,
 )
 from acsard.core.motion.arbiter_text import waiting
-from acsard.core.motion.learned_track import tracks
 from acsard.core.values import (
     NS_PER_S,
     REST,
@@ -255,7 +254,6 @@ class Report:
                 for name, figure in snapshot.figures.items()
             },
             gyro=snapshot.gyro.does,
-            effective_track=tracks(snapshot.gyro, self._config.drive.wheel_separation_multiplier),
             encoder_counts=list(snapshot.encoders),
             wheel_fault=snapshot.doubt.text,
             sender=snapshot.sender,

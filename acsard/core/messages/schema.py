@@ -375,12 +375,6 @@ class RobotState(Message, frozen=True):
     A selected sender does not always drive. It may still have to send a zero first, or a latch may
     keep the robot from driving.
     """
-    effective_track: str = ""
-    """Ratio of the effective track to the wheel separation, in words.
-
-    The text gives the configured ratio and the ratio that was learned with the gyro. It also says
-    which ratio is in use. It is empty until a ratio has been learned.
-    """
     recording_error: str = ""
     """Why recording fails at present, in words; empty if recording works or is switched off."""
     latch: LatchNumber = 0

@@ -1,27 +1,22 @@
 """Compares the wheels with each other, with their commands and with a gyro.
 
-`ConsistencyChecks` is the only interface to these checks. It uses three modules:
+`ConsistencyChecks` is the only interface to these checks. It uses two modules:
 
 - `wheel_faults.py` ignores a wheel whose encoder is faulty. If the wheels contradict each other or
   their commands for long, it reports a fault, which stops the robot.
 - `gyro.py` takes the heading from a gyro, and compares the gyro with the wheels that
   `wheel_faults.py` does not ignore.
-- `learned_track.py` chooses the effective track (the distance between the wheels that makes turns
-  come out right): the configured track, or a track learned from the comparison with a gyro.
 
 Some checks use the results of others. Only this module determines their order.
 """
 
 from __future__ import annotations
 
-from msgspec.structs import replace
-
 from acsard.core.config.settings import FeedbackConfig, OdometryConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.gap_filling import AT_REST, Rolled, plus
 from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.learned_track import LearnedTrack, Track
 from acsard.core.motion.wheel_faults import WheelFaults
 from acsard.core.values import Event, GyroSample, GyroStatus
 
@@ -29,7 +24,7 @@ from acsard.core.values import Event, GyroSample, GyroStatus
 class ConsistencyChecks:
     """All consistency checks of one robot.
 
-    For each feedback line, the odometry calls `check_line`, updates the pose, and calls `learn`.
+    For each feedback line, the odometry calls `check_line`, updates the pose, and calls `finish`.
     """
 
     def __init__(
@@ -46,8 +41,6 @@ class ConsistencyChecks:
         self._kinematics = kinematics
         self.wheels = WheelFaults(kinematics, encoder_counts, feedback)
         self.gyro = Gyro() if odometry.gyro else None
-        multiplier = kinematics.multipliers[2]
-        self._track = LearnedTrack(multiplier) if odometry.learned_track else None
         self._by_wheels = 0.0
         """Turn of the robot in the last feedback line according to the wheels, rad."""
         self.turn: Turn | None = None
@@ -63,9 +56,7 @@ class ConsistencyChecks:
 
     @property
     def gyro_status(self) -> GyroStatus:
-        """Status of the gyro, and whether the odometry uses the effective track learned from it."""
-        status = GyroStatus() if self.gyro is None else self.gyro.status
-        return status if self._track is None else replace(status, track_use=self._track.use)
+        return GyroStatus() if self.gyro is None else self.gyro.status
 
     def add_samples(self, samples: tuple[GyroSample, ...]) -> None:
         """Store the gyro `samples` since the last control step, in the order of arrival."""
@@ -112,24 +103,15 @@ class ConsistencyChecks:
         """
         return 0.0 if self.gyro is None else self.gyro.undo_recomputation(turn)
 
-    def learn(self, turned: float) -> Track | None:
-        """Finish the checks of the last feedback line, and return the effective track to use next.
+    def finish(self, turned: float) -> None:
+        """Finish the checks of the last feedback line, and set `events` to its log events.
 
-        `turned` is the angle by which this line turned the pose, rad. The method sets `events` to
-        the log events of the line. Return None without a gyro, or if `[odometry] learned_track` is
-        false.
+        `turned` is the angle by which this line turned the pose, rad.
         """
-        gyro, track, self.events = self.gyro, self._track, self.wheels.events
+        gyro, self.events = self.gyro, self.wheels.events
         if gyro is None:
-            return None
+            return
         if self.on_trial and turned != self._by_wheels:
             gyro.undo_recomputation(turned - self._by_wheels)
-        if track is None:
-            if gyro.events:
-                self.events = gyro.events + self.events
-            return None
-        track.choose(gyro.learned)
-        if gyro.events or track.event is not None:
-            of_track = [] if track.event is None else [track.event]
-            self.events = gyro.events + of_track + self.events
-        return track.used
+        if gyro.events:
+            self.events = gyro.events + self.events

@@ -22,7 +22,6 @@ import math
 
 from acsard.core.config.settings import OdometryConfig
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.values import Twist, TwistVariances
 
 Column = tuple[float, float, float, float]
@@ -97,38 +96,23 @@ class Noise:
 
 
 class ErrorModel:
-    """The noise of an odometry step, and the effects of parameter errors on this step.
-
-    The results are for the effective track in use, which may change (`use_track`).
-    """
+    """The noise of an odometry step, and the effects of parameter errors on this step."""
 
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics) -> None:
-        """Start with the configured effective track."""
-        self._declared, self._kinematics = odometry, kinematics
         self.radius = kinematics.radius
         """Mean radius of the wheels, m."""
         self.settings = odometry
-        self.use_track(CONFIGURED if odometry.learned_track else None)
+        self.track = kinematics.track
+        self.columns = columns(odometry, kinematics)
+        self.noise = Noise(odometry, self.track)
 
     def use(self, odometry: OdometryConfig) -> None:
         """Use the noise settings in `odometry` from now on, and keep the parameter errors."""
         self.settings = odometry
         self.noise = Noise(odometry, self.track)
 
-    def use_track(self, learned: Track | None) -> None:
-        """Use the effective track `learned` from now on.
 
-        None means the configured track, without a column for the error of a learned track.
-        """
-        self.track = self._kinematics.track * (learned or CONFIGURED).share
-        """Effective track in use, m."""
-        self.columns = columns(self._declared, self._kinematics, learned)
-        self.noise = Noise(self.settings, self.track)
-
-
-def columns(
-    odometry: OdometryConfig, kinematics: Kinematics, learned: Track | None = None
-) -> tuple[Column, ...]:
+def columns(odometry: OdometryConfig, kinematics: Kinematics) -> tuple[Column, ...]:
     """Return the effects of all uncertain parameters on a step: one `Column` for each parameter.
 
     The equations of a step are
@@ -143,12 +127,8 @@ def columns(
     scale and the slip share one column. The standard deviations of these parameters come from
     `odometry`. A parameter with a standard deviation of 0 has no column.
 
-    If `learned` is not None, the last column is for the error of the learned track. While a learned
-    track is in use, the numbers in the column of m_L are 0. While the configured track is in use,
-    the numbers in the last column are 0.
     """
-    used = learned or CONFIGURED
-    track = kinematics.track * used.share
+    track = kinematics.track
     left, right, separation = kinematics.multipliers
     rows = []
     if odometry.left_wheel_radius_multiplier_std:
@@ -158,7 +138,7 @@ def columns(
         share = odometry.right_wheel_radius_multiplier_std / right
         rows.append((share / 2, share * track / 4, share / track, share / 2))
     if odometry.wheel_separation_multiplier_std:
-        share = 0.0 if used.deviation else odometry.wheel_separation_multiplier_std / separation
+        share = odometry.wheel_separation_multiplier_std / separation
         rows.append((0.0, 0.0, 0.0, -share))
     if odometry.wheel_radius_ratio_std:
         # One radius is larger by half of the ratio's error, and the other is smaller by that half.
@@ -168,8 +148,6 @@ def columns(
     # the same effect on the distance.
     if scale := math.hypot(odometry.distance_scale_std, odometry.wheel_slip_std):
         rows.append((scale, 0.0, 0.0, 0.0))
-    if learned is not None:
-        rows.append((0.0, 0.0, 0.0, -learned.deviation))
     return tuple(rows)
 
 
@@ -203,14 +181,7 @@ class TwistUncertainty:
         # The errors of the four wheels are independent, and each side is the mean of two wheels.
         self._to_linear = model.radius**2 / 4 / 12
         self._period = ASSUMED_PERIOD_S
-        self.update_track()
-
-    def update_track(self) -> None:
-        """Use the present effective track of the error model from now on.
-
-        Call this after each change of the track.
-        """
-        self._to_angular = self._model.radius**2 / self._model.track**2 / 12
+        self._to_angular = model.radius**2 / model.track**2 / 12
 
     def of(self, twist: Twist, dt: float, step: float = 0.0) -> TwistVariances:
         """Return the variances of the twist of a feedback line.

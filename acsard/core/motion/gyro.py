@@ -3,7 +3,7 @@
 The method is gyrodometry (Borenstein & Feng, Gyrodometry: a new method for combining data from
 gyros and odometry in mobile robots, 1996): skidding wheels do not affect a gyro, and a gyro's bias
 does not affect the wheels. The gyro's reading at rest is its bias (`gyro_bias.py`). A comparison of
-gyro and wheels gives the gyro's delay and the effective track (`gyro_match.py`).
+gyro and wheels gives the ratio of their turns (`gyro_match.py`).
 
 Until gyro and wheels have agreed in a turn, the heading comes from the wheels. After that turn, the
 heading is corrected by the gyro's turn minus the wheels' turn up to then. A gyro that reads the
@@ -24,7 +24,6 @@ difference of their turns is then added to the uncertainty of the heading.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 
 from msgspec import Struct
@@ -33,7 +32,6 @@ from acsard.core.link.minimum_delay import MinimumDelay
 from acsard.core.motion.gyro_bias import LEARNING_TIME_S, MAX_BIAS, Bias
 from acsard.core.motion.gyro_match import WINDOW_S, Match
 from acsard.core.motion.gyro_trial import TURN_RATIO_RANGE, Trial
-from acsard.core.motion.learned_track import MIN_TRACK_STD, Track
 from acsard.core.values import NS_PER_S, Event, GyroDoes, GyroSample, GyroStatus, Level
 
 REST_S = 0.2
@@ -68,13 +66,6 @@ CATCH_UP_SPEED = 1.5
 """Ratio that shows a backlog of samples after a silence of the gyro: the time that the new samples
 cover, divided by the time of the feedback line. At a larger ratio, the gyro counts as silent until
 its last sample is less than `HOLE_PERIODS` sample periods old."""
-
-DELAY_RANGE_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
-"""Range of the gyro's delay relative to the wheels, ns. The delay is negative if the gyro reports a
-turn earlier than the wheels do."""
-
-MIN_DELAY_CORRECTION_S = 0.002
-"""Smallest measured error of the gyro's delay that is corrected, s."""
 
 SLIP_S = 0.5
 """Time for which the wheels count as slipping after they last contradicted the gyro, s."""
@@ -171,8 +162,6 @@ class Gyro:
 
     def __init__(self) -> None:
         self._rest_s = self._since_rest_s = 0.0
-        self._learned: Track | None = None
-        """The effective track that was learned with an earlier gyro, or None."""
         self.owes = False
         """Whether the wheels provided the turn of the last line because the gyro is not proven. A
         gyro is proven when it has agreed with the wheels in a turn. Then the heading is corrected
@@ -200,7 +189,6 @@ class Gyro:
         self._slipped_before = False
         """Whether gyro and wheels contradicted each other when the last used sample arrived."""
         self._last: GyroSample | None = None
-        self._delay_ns = 0
         self._told_ns: int | None = None
         """Monotonic time of the last sample that was used, ns; None before the first sample."""
         self._rate = 0.0
@@ -242,34 +230,18 @@ class Gyro:
 
     @property
     def status(self) -> GyroStatus:
-        """The present state of the gyro."""
-        known, learned = self._bias.value if self._bias.is_known else None, self.learned
-        track, deviation = (None, 0.0) if learned is None else (learned.share, learned.deviation)
-        return GyroStatus(self._does, known, self._delay_ns / NS_PER_S, track, deviation)
-
-    @property
-    def learned(self) -> Track | None:
-        """Effective track learned from this gyro or an earlier one.
-
-        It is None until the robot has turned enough.
-        """
-        match = self._match
-        if match.blocks < TRUSTED_BLOCKS or match.ratio <= 0.0:
-            return self._learned
-        return Track(1.0 / match.ratio, max(MIN_TRACK_STD, match.spread / match.ratio))
+        return GyroStatus(self._does, self._bias.value if self._bias.is_known else None)
 
     def add_samples(self, samples: tuple[GyroSample, ...]) -> None:
         """Store the `samples` that arrived since the last control step, in the order of arrival.
 
         A sample whose field `anew` is true is the first one of another gyro. The method then
-        forgets all values that were learned from the earlier gyro, except the effective track. If
+        forgets all values that were learned from the earlier gyro. If
         the earlier gyro contradicted the wheels, the difference of their turns makes the heading
         more uncertain.
         """
         for sample in samples:
             if sample.anew:
-                # The track is a property of wheels and floor, so it stays valid with another gyro.
-                self._learned = self.learned
                 self._end_contradiction()
                 self._drop_waiting_correction()
                 self._begin()
@@ -297,11 +269,11 @@ class Gyro:
         if self._told_ns != told_ns and not self._hole:
             self._guessed, self._slipped_before = 0.0, self._slip_s > 0.0
         ahead = SILENCE_TIMEOUT_NS if self._told_ns is None else at_ns - self._told_ns
-        age_ns = ahead - max(0, self._delay_ns)
+        age_ns = ahead
         if self._heard and self._told_ns is not None:
             # A sample that waits for the confirmation of its jump is not used yet, but the gyro is
             # not silent.
-            age_ns = min(age_ns, at_ns - self._heard[0][0] + min(0, self._delay_ns))
+            age_ns = min(age_ns, at_ns - self._heard[0][0])
         # Samples that catch up after a silence have the rates of an earlier motion.
         passed_ns = 0 if told_ns is None or self._told_ns is None else self._told_ns - told_ns
         catches_up = self._does == "silent" and passed_ns > CATCH_UP_SPEED * dt * NS_PER_S
@@ -320,8 +292,6 @@ class Gyro:
         tried = False if lost else self._try(wheels, angle, variance, dt, resting)
         if not lost and self._bias.is_known and dt > 0.0 and not self._trial.open:
             self._compare(wheels, angle, dt)
-        if resting:
-            self._shift()
         # While the robot rests, a rate that is only the bias counts as 0.
         if resting and self._rested_s >= FROZEN_S and self._rate != 0.0:
             self._frozen = True
@@ -418,7 +388,6 @@ class Gyro:
     def _take(self, until_ns: int, resting: bool) -> None:
         """Process the samples until `until_ns`: learn the bias at rest, else add their turn."""
         bias, samples = self._bias, self._heard
-        until_ns += self._delay_ns
         while samples and samples[0][0] <= until_ns:
             jump = 0.0 if self._reading is None else samples[0][1].rate - self._reading
             if abs(jump) > MAX_JUMP:
@@ -429,7 +398,6 @@ class Gyro:
                     samples.popleft()
                     continue
             time_ns, sample = samples.popleft()
-            time_ns -= self._delay_ns
             span_ns = SILENCE_TIMEOUT_NS if self._told_ns is None else time_ns - self._told_ns
             self._hole |= span_ns >= SILENCE_TIMEOUT_NS
             self._told_ns = time_ns if self._told_ns is None else max(time_ns, self._told_ns)
@@ -598,17 +566,6 @@ class Gyro:
             return None
         variance, self._doubt = self._doubt, 0.0
         return Turn(wheels + angle, variance, wheels / dt, noise)
-
-    def _shift(self) -> None:
-        """Correct the assumed delay of the gyro by the measured error.
-
-        Call this only while the robot is at rest. Otherwise the heading would jump.
-        """
-        delay = self._match.delay()
-        if delay is not None and abs(delay) >= MIN_DELAY_CORRECTION_S:
-            earliest, latest = DELAY_RANGE_NS
-            shifted = self._delay_ns + math.floor(delay * NS_PER_S)
-            self._delay_ns = min(max(earliest, shifted), latest)
 
     def _judge(self, silent: bool) -> None:
         match, before, verdict = self._match, self._does, self._trial.verdict

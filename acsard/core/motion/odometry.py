@@ -37,7 +37,6 @@ from acsard.core.motion.gap_filling import (
 )
 from acsard.core.motion.gyro import REST_S, Turn
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.motion.path import Path
 from acsard.core.motion.uncertainty import ASSUMED_COUNTS, Missed, PoseUncertainty
 from acsard.core.values import (
@@ -78,8 +77,6 @@ class Step(Struct, frozen=True, gc=False):
     on_trial: bool
     """Whether the wheels provided the turn because the gyro was not proven. A gyro is proven when
     it has agreed with the wheels in a turn."""
-    share: float = 1.0
-    """Effective track that was used for this feedback line, divided by the configured track."""
 
 
 class Odometry:
@@ -98,7 +95,7 @@ class Odometry:
         `encoder_counts` is the number of counts per revolution of a wheel; 0 if it is unknown.
         `quiet` is the time without feedback after which the daemon commands rest, s.
         """
-        self._kinematics, self._track = kinematics, CONFIGURED
+        self._kinematics = kinematics
         self._positions = AT_REST
         self._rolling = Rolling(quiet)
         self._confirmation = Confirmation(feedback)
@@ -143,14 +140,6 @@ class Odometry:
         The variances of the initial pose apply from the next call of `set_pose` on.
         """
         self._errors.use(odometry)
-
-    def use_track(self, track: Track) -> None:
-        """Use this effective track from now on to compute the robot's turns from the wheels."""
-        if track != self._track:
-            self._track = track
-            self._errors.use_track(track)
-            self._uncertainty.update_track()
-            self._twist_uncertainty.update_track()
 
     def set_pose(self, pose: Pose) -> None:
         """Set the pose of base_link in odom, with the uncertainty of an initial pose.
@@ -246,7 +235,7 @@ class Odometry:
         turn, slips = checks.turn, checks.slips
         believed = checks.wheels.believed(speeds.as_tuple())
         linear, angular = self._kinematics.moved(believed)
-        twist = Twist(linear, angular / self._track.share)
+        twist = Twist(linear, angular)
         own = dt - feedback.bridged
         self._still = self._still + own if believed == AT_REST else 0.0
         at_rest = self._still > REST_S
@@ -262,9 +251,7 @@ class Odometry:
         if turn is not None and dt > 0.0:
             twist = Twist(linear, turn.rate)
         self.twist, self.speeds, self._folded = twist, speeds, True
-        track = checks.learn(turned)
-        if track is not None:
-            self.use_track(track)
+        checks.finish(turned)
         return Estimate(
             feedback.at,
             self._path.pose,
@@ -308,7 +295,7 @@ class Odometry:
         self._path.set(wrong[-1].pose)
         on_trial = 0.0
         for step in reversed(wrong):
-            arcs = self._arcs(step.pieces, step.gyro, step.share)
+            arcs = self._arcs(step.pieces, step.gyro)
             for distance, angle in arcs:
                 self._path.advance(distance, angle)
             for piece in step.pieces:
@@ -320,20 +307,17 @@ class Odometry:
         if on_trial:
             self._path.turn(-self.checks.undo_recomputation(on_trial))
 
-    def _arcs(
-        self, pieces: tuple[Motors, ...], gyro: Turn | None, share: float
-    ) -> list[tuple[float, float]]:
+    def _arcs(self, pieces: tuple[Motors, ...], gyro: Turn | None) -> list[tuple[float, float]]:
         """Return the arcs that the robot drove, as pairs of distance (m) and turn (rad).
 
         `pieces` contains the angles that the wheels rolled, rad, one item for each arc. If `gyro`
-        is not None, the result is a single arc with the gyro's turn. `share` is the effective track
-        divided by the configured track.
+        is not None, the result is a single arc with the gyro's turn.
         """
         believed, kinematics = self.checks.wheels.believed, self._kinematics
         arcs = []
         for piece in pieces:
             distance, angle = kinematics.moved(believed(piece))
-            arcs.append((distance, angle / share))
+            arcs.append((distance, angle))
         if gyro is not None:
             return [(math.fsum([distance for distance, _ in arcs]), gyro.angle)]
         return arcs
@@ -350,13 +334,13 @@ class Odometry:
         pose, variance = path.pose, None if turn is None else turn.variance
         for piece in pieces:
             self._positions = plus(self._positions, piece)
-        for distance, angle in self._arcs(pieces, turn, self._track.share):
+        for distance, angle in self._arcs(pieces, turn):
             turned += angle
             self.travelled += abs(distance)
             dx, dy, heading = path.advance(distance, angle)
             self._uncertainty.advance(distance, angle, dx, dy, heading, variance, slips)
         on_trial = self.checks.on_trial
-        self._steps.append(Step(pose, pieces, turn, speeds, turned, on_trial, self._track.share))
+        self._steps.append(Step(pose, pieces, turn, speeds, turned, on_trial))
         return turned
 
     def _go_on(self, rolled: Rolled, feedback: Feedback, before: Twist, twist: Twist) -> None:
@@ -384,7 +368,7 @@ class Odometry:
         """
         distance, turn = self._kinematics.moved(angles)
         # A gyro does not miss a turn.
-        turn = turn / self._track.share if gyro is None else 0.0
+        turn = turn if gyro is None else 0.0
         self._uncertainty.miss(cause, MISSED_STD * distance, MISSED_STD * turn)
         if cause == "gap":
             # The board may also have received the command in some gaps and not in others. Motions

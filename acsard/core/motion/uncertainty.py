@@ -58,24 +58,13 @@ class PoseUncertainty:
         self._model = model
         self._parameters = self._effects = model.columns
         self._counted = counts > 0
-        self._count = 0.0
-        self._set_count_angle(math.tau / (counts or ASSUMED_COUNTS))
+        # The angle within which a wheel's position is unknown.
+        count, track = model.radius * math.tau / (counts or ASSUMED_COUNTS), model.track
+        self._play = count / track
+        self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / track**2, 0.0)
         # Since the last update of second order, m: displacement in odom, and rolled.
         self._dx = self._dy = self._rolled = 0.0
         self.set(0.0)
-
-    def update_track(self) -> None:
-        """Read the effective track and the columns of the error model again; their number stays."""
-        beside = self._effects[len(self._parameters) :]
-        self._parameters = self._model.columns
-        self._effects = (*self._parameters, *beside)
-        self._set_count_angle(self._count)
-
-    def _set_count_angle(self, angle: float) -> None:
-        # The angle within which a wheel's position is unknown.
-        self._count, count, track = angle, self._model.radius * angle, self._model.track
-        self._play = count / track
-        self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / track**2, 0.0)
 
     def set(self, yaw: Rad) -> None:
         """Reset the covariance to that of an initial pose with this heading."""

@@ -119,7 +119,6 @@ class State(Struct, frozen=True):
     sources: list[Source]
     refused: str
     gyro: str
-    effective_track: str
     wheel_fault: str
     emergency_stop: str
     bumpers: list[bool]

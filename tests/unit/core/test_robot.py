@@ -22,7 +22,6 @@ from acsard.core.config.settings import (
     FeedbackConfig,
     LimitsConfig,
     McuConfig,
-    OdometryConfig,
     SafetyConfig,
     Source,
 )
@@ -1933,26 +1932,6 @@ def test_a_flood_of_bytes_faster_than_the_wire_raises_no_error() -> None:
 
 
 # the gyro, the wheels and the clocks, as the robot reports them
-
-
-def test_a_track_learned_from_the_gyro_is_an_event_and_is_used_afterwards() -> None:
-    bench = Bench(Config(odometry=OdometryConfig(gyro=True, learned_track=True))).linked()
-    for _ in range(150):
-        bench.step(gyro=0.0)
-    events: list[Event] = []
-    for second in range(60):
-        # Opposite wheels turn by 1 rad/s at the configured track; the robot turns by 1/1.6 of that.
-        rate = (1.0, -1.0, 0.5, 0.0)[second % 4]
-        bench.reply = bench.codec.encode(bench.robot._kinematics.wheel_speeds(Twist(0.0, rate)))
-        for _ in range(100):
-            events += [
-                entry
-                for entry in bench.step(gyro=rate / 1.6).events
-                if entry.name == "learned_track"
-            ]
-    (event,) = events
-    assert event.text.endswith(" (in use), configured 1.000")
-    assert bench.robot.snapshot(bench.now_ns).gyro.track_use == "used"
 
 
 def test_the_distance_travelled_counts_forwards_and_backwards() -> None:

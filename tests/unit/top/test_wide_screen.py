@@ -110,12 +110,6 @@ def test_the_state_of_the_gyro_is_shown_if_there_is_one(does: str) -> None:
     assert not any("gyro" in line for line in lines_of(SEEN))
 
 
-def test_the_learned_track_is_shown_beside_the_configured_one() -> None:
-    text = "learned 1.603 ± 0.032 (only reported), configured 1.000 (in use)"
-    assert line_with("track", of(gyro="used", effective_track=text)).split(maxsplit=1)[1] == text
-    assert not any("track" in line for line in lines_of(of(gyro="used")))
-
-
 def test_samples_of_a_gyro_that_do_not_count_are_among_the_rejects() -> None:
     data = of(counters={"imu_second_sender": 1200, "imu_out_of_range": 3})
     assert "gyro second sender 1,200, out of range 3" in line_with("rejected", data)

@@ -18,7 +18,6 @@ from acsard.core.config.settings import (
     ControlConfig,
     FeedbackConfig,
     McuConfig,
-    OdometryConfig,
     RatesConfig,
     RosConfig,
     SafetyConfig,
@@ -266,13 +265,6 @@ def test_a_rate_of_publishing_is_zero_or_not_too_low(name: str) -> None:
         f"rates.{name} = 0.1 or more"
     )
     assert problems(rates=RatesConfig(**{name: 0.1})) == []
-
-
-def test_a_learned_track_needs_a_gyro() -> None:
-    (line,) = problems(odometry=OdometryConfig(learned_track=True))
-    assert line.startswith("odometry.learned_track = true needs a gyro")
-    assert "odometry.gyro = true" in line
-    assert problems(odometry=OdometryConfig(learned_track=True, gyro=True)) == []
 
 
 def test_an_ignored_emergency_stop_is_a_warning() -> None:

@@ -634,28 +634,6 @@ def test_without_a_gyro_the_state_is_off_and_diagnostics_have_no_row() -> None:
 def test_the_state_of_the_gyro_is_reported_with_its_level(does: GyroDoes, level: int) -> None:
     state, (row,) = with_gyro(GyroStatus(does))
     assert (state.gyro, row.level, row.message) == (does, level, STATUS_TEXTS[does])
-    assert {pair.key for pair in row.values} == {"delay_s"}
-
-
-def test_the_learned_track_is_shown_beside_the_configured_one() -> None:
-    learned = GyroStatus("used", bias=-0.0123, delay=0.02, track=1.2, track_deviation=0.05)
-    state, (row,) = with_gyro(learned)
-    fields = {
-        "delay_s": "0.020",
-        "bias_rad_s": "-0.01230",
-        "wheel_separation_multiplier": "1.500",
-        "learned_multiplier": "1.800",
-        "learned_multiplier_std": "0.090",
-    }
-    assert {pair.key: pair.value for pair in row.values} == fields | {"multiplier_in_use": "1.500"}
-    assert (
-        state.effective_track == "learned 1.800 ± 0.090 (only reported), configured 1.500 (in use)"
-    )
-    assert row.message == f"{STATUS_TEXTS['used']}; effective track: {state.effective_track}"
-    state, (row,) = with_gyro(replace(learned, track_use="used"))
-    assert {pair.key: pair.value for pair in row.values} == fields | {"multiplier_in_use": "1.800"}
-    assert state.effective_track == "learned 1.800 ± 0.090 (in use), configured 1.500"
-    assert with_gyro(GyroStatus("used"))[0].effective_track == ""
 
 
 # suspect wheels

@@ -19,7 +19,6 @@ from acsard.core.motion.error_model import (
     columns,
 )
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.values import REST, Twist
 from tests.vectors.drive import CALIBRATED
 
@@ -118,24 +117,6 @@ ALL = OdometryConfig(
     left_wheel_radius_multiplier_std=0.004,
     distance_scale_std=0.01,
 )
-
-
-def test_the_column_of_a_track_to_be_learned_is_the_last_and_is_zero_at_first() -> None:
-    kinematics = Kinematics(CALIBRATED)
-    *declared, learned = columns(ALL, kinematics, CONFIGURED)
-    assert tuple(declared) == columns(ALL, kinematics)
-    assert learned == (0.0, 0.0, 0.0, 0.0)
-
-
-def test_the_error_of_a_learned_track_replaces_that_of_the_configured_track() -> None:
-    kinematics = Kinematics(CALIBRATED)
-    left, separation, _, learned = columns(ALL, kinematics, Track(1.25, 0.03))
-    assert separation == (0.0, 0.0, 0.0, 0.0)
-    assert learned == (0.0, 0.0, 0.0, -0.03)
-    wider = replace(
-        CALIBRATED, wheel_separation_multiplier=1.25 * CALIBRATED.wheel_separation_multiplier
-    )
-    assert left == pytest.approx(columns(ALL, Kinematics(wider))[0])
 
 
 EXACT = OdometryConfig(

@@ -16,13 +16,11 @@ from acsard.core.config.settings import DriveConfig, OdometryConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.learned_track import Track
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.path import arc
 from acsard.core.motion.uncertainty import MAX_VARIANCE, START_VARIANCE, UNKNOWN_POSE
 from acsard.core.values import REST, Estimate, Instant, Pose, PoseCovariance, Twist, WheelSpeeds
 from tests.each import each
-from tests.unit.core.motion.liars import fold
 from tests.vectors.drive import (
     PATHS,
     SEED_STEP,
@@ -869,72 +867,3 @@ def test_an_unknown_encoder_leaves_the_twist_variance_finite() -> None:
 
 
 # a track that was learned
-
-
-@pytest.mark.parametrize("share", [0.7, 1.6])
-def test_another_track_changes_only_later_turns(share: float) -> None:
-    asked, plain = odometry(OdometryConfig(learned_track=True)), odometry()
-    for robot in (asked, plain):
-        robot.fold(feedback(4.0, 9.0, 1.0))
-    pose = asked.pose
-    asked.use_track(Track(share, 0.02))
-    assert asked.pose == pose == plain.pose
-    estimate, would = asked.fold(feedback(4.0, 9.0, 0.1)), plain.fold(feedback(4.0, 9.0, 0.1))
-    assert estimate.twist.linear == would.twist.linear
-    assert estimate.twist.angular == pytest.approx(would.twist.angular / share)
-    assert estimate.pose.yaw - pose.yaw == pytest.approx((would.pose.yaw - pose.yaw) / share)
-    assert asked.travelled == plain.travelled
-
-
-def test_an_enabled_learned_track_changes_nothing_until_it_is_known() -> None:
-    asked, plain = odometry(OdometryConfig(learned_track=True)), odometry()
-    for n in range(200):
-        line = feedback(math.sin(n), 9.0 + math.cos(n), 0.01)
-        estimate, would = asked.fold(line), plain.fold(line)
-        assert (estimate.pose, estimate.twist, estimate.covariance) == (
-            would.pose,
-            would.twist,
-            would.covariance,
-        )
-
-
-def test_a_corrected_turn_is_computed_with_the_track_at_the_time_of_that_turn() -> None:
-    """The front left wheel is dead.
-
-    The learned track changes before the daemon finds this wheel.
-    """
-    asked = OdometryConfig(learned_track=True)
-    liar, honest = (Odometry(asked, Kinematics(DriveConfig()), 3200) for _ in range(2))
-    speeds = Kinematics(DriveConfig()).wheel_speeds(Twist(0.5, 0.8))
-    dead = WheelSpeeds(speeds.front_right, 0.0, speeds.rear_left, speeds.rear_right)
-    for n in range(60):
-        fold(honest, Feedback(AT, speeds, 0.01), speeds)
-        fold(liar, Feedback(AT, speeds if n < 50 else dead, 0.01), speeds)
-        if n == 51:
-            assert not liar.checks.wheels.status.left_out
-            for robot in (liar, honest):
-                robot.use_track(Track(1.6, 0.02))
-    assert liar.checks.wheels.status.left_out == ("front_left",)
-    assert liar.pose.yaw == pytest.approx(honest.pose.yaw, abs=1e-4)
-
-
-@pytest.mark.parametrize("share", [0.5, 1.6])
-def test_a_learned_track_makes_the_estimate_as_uncertain_as_a_configured_one(share: float) -> None:
-    """A learned track changes more than its own contribution to the covariance.
-
-    The contributions of wheel noise and of encoder counts depend on the track as well.
-    """
-    asked = Odometry(OdometryConfig(learned_track=True), Kinematics(DriveConfig()), 400)
-    asked.use_track(Track(share, 0.02))
-    asked.use(OdometryConfig(learned_track=True))
-    asked.set_pose(Pose())
-    such = Kinematics(DriveConfig(wheel_separation_multiplier=share))
-    plain = Odometry(OdometryConfig(wheel_separation_multiplier_std=0.02 * share), such, 400)
-    for n in range(300):
-        line = feedback(5.0 + 4.0 * math.sin(n), 9.0 + 4.0 * math.cos(n), 0.01, 0.05 * (n == 150))
-        estimate, would = asked.fold(line), plain.fold(line)
-        variances, expected = estimate.twist_variances, would.twist_variances
-        assert (variances.linear, variances.angular) == pytest.approx(
-            (expected.linear, expected.angular)
-        )
-        assert matrix(estimate.covariance) == pytest.approx(matrix(would.covariance), rel=1e-6)

@@ -16,7 +16,6 @@ from acsard.core.config.settings import DriveConfig, OdometryConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.error_model import ErrorModel
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.uncertainty import PoseUncertainty
 from acsard.core.values import STILL, WheelSpeeds
@@ -281,28 +280,6 @@ def test_the_unknown_wheel_angle_within_a_count_adds_to_the_yaw_variance(
     )
     places = 2 * count**2 / 24 * 2 / TRACK**2
     assert known.yawyaw - unknown.yawyaw == pytest.approx(places), "at the start, and now"
-
-
-def test_the_error_of_a_track_counts_for_the_turns_that_it_made(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("acsard.core.motion.uncertainty.START_VARIANCE", 0.0)
-    none = replace(Model(0.0, 0.0, 0.0, track_std=0.05).config(), learned_track=True)
-    robot = Odometry(none, Kinematics(DriveConfig()))
-
-    def turned(rad: float) -> tuple[float, float]:
-        before = robot.pose.yaw
-        speed = rad * TRACK / 2 / RADIUS
-        line = Feedback(AT, WheelSpeeds(speed, -speed, -speed, speed), 1.0)
-        covariance = robot.fold(line).covariance
-        return robot.pose.yaw - before, covariance.yawyaw
-
-    assert turned(1.0) == pytest.approx((1.0, 0.05**2))
-    robot.use_track(Track(1.6, 0.02))
-    assert turned(1.0) == pytest.approx((1 / 1.6, 0.05**2 + (0.02 / 1.6) ** 2))
-    assert turned(0.5)[1] == pytest.approx(0.05**2 + (0.02 * 1.5 / 1.6) ** 2)
-    robot.use_track(CONFIGURED)
-    assert turned(-1.0)[1] == pytest.approx((0.02 * 1.5 / 1.6) ** 2)
 
 
 def test_the_yaw_errors_of_the_gyro_and_of_gaps_are_separate_whichever_came_first() -> None:
