@@ -35,22 +35,15 @@ class Source(IntEnum):
     # rad2/m.
     YAW = 1
     SKID = 2  # variance of the error of the heading, per radian that the robot turns, rad2/rad
-    # Variance of the fraction of the distance that is lost to slip in a window.
-    SLIP = 3
-    # Relative variance of the ratio of right to left radius, from window to window.
-    RATIO = 4
-    # Relative variance of the effective track, from window to window.
-    TRACK = 5
-    HEADING = 6  # variance of a measured heading, rad2
-    DRIFT = 7  # growth of the variance of the gyro's heading per second, rad2/s
-    PLACE = 8  # variance of a measured coordinate, m2
+    HEADING = 3  # variance of a measured heading, rad2
+    DRIFT = 4  # growth of the variance of the gyro's heading per second, rad2/s
+    PLACE = 5  # variance of a measured coordinate, m2
 
 
 SOURCE_COUNT = len(Source)
-SENSOR_SOURCES = np.arange(SOURCE_COUNT) > Source.TRACK
-ROLLING_SOURCES = np.arange(SOURCE_COUNT) < Source.SLIP
+SENSOR_SOURCES = np.arange(SOURCE_COUNT) >= Source.HEADING
 # Noise of each `Source` from which the search starts. The numbers only have to be positive.
-INITIAL_NOISE = np.array([1e-4, 1e-4, 1e-3, 1e-4, 1e-6, 1e-4, 1e-5, 1e-6, 1e-4])
+INITIAL_NOISE = np.array([1e-4, 1e-4, 1e-3, 1e-5, 1e-6, 1e-4])
 
 # Length of a window, or of a shorter drive, and time between the residuals in it.
 WINDOW_S, APART_S = 32.0, 4.0
@@ -61,7 +54,7 @@ MIN_INTERVALS = 4
 # Of more windows, only every n-th is used.
 MAX_WINDOWS = 80
 
-# `SLIP`, `RATIO` and `TRACK` are the same in all steps of a window, other errors are independent.
+# Errors are independent from step to step.
 STEP_S = 0.5
 
 # Groups of drives that are left out in turn, which takes two searches each.
@@ -78,10 +71,6 @@ MIN_VARIANCE = 1e-12
 
 # The fit of a short log often finds 0, and the odometry would state that the pose is exact.
 MIN_NOISE_RATIO = 0.25
-
-# Of the noise of `SLIP`, `RATIO` and `TRACK`, because a window does not show what lasts longer.
-# Without it, the pose covariance of one robot in eight was singular.
-MIN_CHANGING_FRACTION = 0.1
 
 # Mean loss of log likelihood per residual if each deviation is stated at twice its true value. A
 # larger gain is better even if its deviation is large.
@@ -121,14 +110,11 @@ class Windows(Struct, frozen=True):
     effects: Floats
     # Covariance due to the uncertain geometry and gyro bias, shape (windows, n, n).
     known: Floats
-    # Noise with the same effect in a window of average motion: `SLIP` to `DISTANCE` (m), `RATIO` to
-    # `YAW` (1/m) and `TRACK` to `SKID` (rad).
-    lasting: Floats
 
     def of(self, chosen: Mask | npt.NDArray[np.int64]) -> Windows:
         return Windows(
             self.drive[chosen], self.size[chosen], self.residual[chosen], self.effects[chosen],
-            self.known[chosen], self.lasting,
+            self.known[chosen],
         )  # fmt: skip
 
     def covariance(self, noise: Floats) -> Floats:
@@ -154,16 +140,12 @@ class Windows(Struct, frozen=True):
         # Windows overlap by half, so each residual counts as half a degree of freedom.
         shares = np.linalg.inv(self.covariance(noise))[:, None] @ self.effects
         free = noise * np.einsum("wkii->k", shares) / 2
-        noise = np.where(ROLLING_SOURCES, noise * student_factor(free), noise)
+        noise = np.where(SENSOR_SOURCES, noise, noise * student_factor(free))
         information = np.einsum("wkij,wkji->k", shares, shares) / 2
         least = np.where(
             information > 0.0, MIN_NOISE_RATIO / np.sqrt(np.maximum(information, 1e-300)), 0.0
         )
-        least[Source.SLIP :] = 0.0
-        lasting = noise[[Source.SLIP, Source.RATIO, Source.TRACK]]
-        least[: Source.SLIP] = np.maximum(
-            least[: Source.SLIP], MIN_CHANGING_FRACTION * self.lasting * lasting
-        )
+        least[SENSOR_SOURCES] = 0.0
         return np.asarray(np.maximum(noise, least))
 
     def likelihood(self, noise: Floats) -> Floats:
@@ -187,7 +169,6 @@ class LogNoise(Struct, frozen=True):
     # Whether the log has positions. Only positions show the noise of the distance.
     places: bool
     turning: float  # total turned angle per metre driven in this log, rad/m
-    track: Metres  # effective track
 
     @property
     def better(self) -> bool:
@@ -196,20 +177,16 @@ class LogNoise(Struct, frozen=True):
 
     def heading(self) -> tuple[float, float]:
         """Return the deviation of the heading after `REPORT_DISTANCE_M`, rad: configured, found."""
-        return self._after(Source.YAW, Source.RATIO, Source.SKID)
+        now, then = (
+            math.sqrt(REPORT_DISTANCE_M * (x[Source.YAW] + self.turning * x[Source.SKID]))
+            for x in (self.present, self.found)
+        )
+        return now, then
 
     def distance(self) -> tuple[float, float]:
         """Return the deviation of the distance after `REPORT_DISTANCE_M`, m: configured, found."""
-        return self._after(Source.DISTANCE, Source.SLIP, None)
-
-    def _after(self, rate: Source, lasting: Source, skid: Source | None) -> tuple[float, float]:
         now, then = (
-            math.sqrt(
-                REPORT_DISTANCE_M
-                * (x[rate] + (self.turning * x[skid] if skid is not None else 0.0))
-                + REPORT_DISTANCE_M**2 * x[lasting] / (self.track**2 if skid is not None else 1.0)
-            )
-            for x in (self.present, self.found)
+            math.sqrt(REPORT_DISTANCE_M * x[Source.DISTANCE]) for x in (self.present, self.found)
         )
         return now, then
 
@@ -223,12 +200,11 @@ def settings(
     `fixed` names the quantities that stay as configured: `plausibility.TRACK` and `RATIO`. `scaled`
     says whether the size of the wheels was measured.
     """
-    values, x = {}, np.zeros(SOURCE_COUNT) if log_noise is None else log_noise.found
-    if TRACK not in fixed or log_noise is not None:
-        std = math.hypot(known.track, math.sqrt(x[Source.TRACK]))
-        values["wheel_separation_multiplier_std"] = track * std
-    if RATIO not in fixed or log_noise is not None:
-        values["wheel_radius_ratio_std"] = math.hypot(known.ratio, math.sqrt(x[Source.RATIO]))
+    values: dict[str, float] = {}
+    if TRACK not in fixed:
+        values["wheel_separation_multiplier_std"] = track * known.track
+    if RATIO not in fixed:
+        values["wheel_radius_ratio_std"] = known.ratio
         # The deviation of the ratio of both radii replaces the deviations of the single radii.
         for side in ("left_wheel_radius_multiplier_std", "right_wheel_radius_multiplier_std"):
             if getattr(odometry, side):
@@ -236,11 +212,13 @@ def settings(
     if scaled:
         values["distance_scale_std"] = known.scale
     if log_noise is not None:
-        values["yaw_variance_per_metre"] = float(x[Source.YAW])
-        values["yaw_variance_per_radian"] = float(x[Source.SKID])
+        values["yaw_variance_per_metre"] = float(log_noise.found[Source.YAW])
+        values["yaw_variance_per_radian"] = float(log_noise.found[Source.SKID])
         if log_noise.places:
-            values["distance_variance_per_metre"] = float(x[Source.DISTANCE])
-            values["wheel_slip_std"] = math.sqrt(x[Source.SLIP])
+            values["distance_variance_per_metre"] = float(log_noise.found[Source.DISTANCE])
+            # The variance per metre replaces a configured slip.
+            if odometry.wheel_slip_std:
+                values["wheel_slip_std"] = 0.0
     return {
         name: 0.0 if name.endswith("_std") and value < MIN_STD else min(value, MAX_SETTING)
         for name, value in values.items()
@@ -273,7 +251,7 @@ def noise(
     present = INITIAL_NOISE.copy()
     present[: Source.HEADING] = (
         odometry.distance_variance_per_metre, odometry.yaw_variance_per_metre,
-        odometry.yaw_variance_per_radian, odometry.wheel_slip_std**2, 0.0, 0.0,
+        odometry.yaw_variance_per_radian,
     )  # fmt: skip
     every = np.ones(SOURCE_COUNT, dtype=bool)
     estimate = windows.search(INITIAL_NOISE, every)
@@ -289,13 +267,13 @@ def noise(
         gains.append((float(more.sum()), float(tested.size.sum())))
     estimate = windows.at_least(estimate)
     if not sensors.places:
-        estimate[[Source.DISTANCE, Source.SLIP]] = present[[Source.DISTANCE, Source.SLIP]]
+        estimate[Source.DISTANCE] = present[Source.DISTANCE]
     sums = np.array(gains)
     gain, gain_std = with_gain_std(
         lambda left: float(np.divide(*sums[left].sum(axis=0))), np.ones(len(sums), dtype=bool)
     )
     turning = sum(move.turned for move in motions) / max(0.1, sum(move.metres for move in motions))
-    return LogNoise(estimate, present, gain, gain_std, sensors.places, turning, motions[0].track)
+    return LogNoise(estimate, present, gain, gain_std, sensors.places, turning)
 
 
 class _Motion(Struct, frozen=True):
@@ -348,25 +326,19 @@ class _Window(Struct, frozen=True):
         effects[Source.DISTANCE] = (self.along * np.abs(distance)) @ self.along.T
         effects[Source.YAW] = (self.yaw * sides) @ self.yaw.T
         effects[Source.SKID] = (self.yaw * np.abs(turn)) @ self.yaw.T
-        for source, lasting in (
-            (Source.SLIP, self.along @ distance), (Source.TRACK, self.yaw @ turn),
-            (Source.RATIO, self.yaw @ distance / track),
-        ):  # fmt: skip
-            effects[source] = np.outer(lasting, lasting)
         for source, matrix in self.sensor.items():
             effects[source] = matrix
-        sure_of = (
-            known.scale**2 * effects[Source.SLIP] + known.ratio**2 * effects[Source.RATIO]
-            + known.track**2 * effects[Source.TRACK] + self.bias
-        )  # fmt: skip
+        sure_of = self.bias
+        for std, lasting in (
+            (known.scale, self.along @ distance), (known.ratio, self.yaw @ distance / track),
+            (known.track, self.yaw @ turn),
+        ):  # fmt: skip
+            sure_of = sure_of + std**2 * np.outer(lasting, lasting)
         basis = np.linalg.qr(self.start, mode="complete")[0][:, self.start.shape[1] :]
         return basis.T @ self.residual, basis.T @ effects @ basis, basis.T @ sure_of @ basis
 
 
 def _padded(numbered: Sequence[tuple[int, _Window]], known: Deviations) -> Windows:
-    motions = [window.motion for _, window in numbered]
-    metres, turned = np.mean([(motion.metres, motion.turned) for motion in motions], axis=0)
-    lasting = np.array([metres, metres / motions[0].track ** 2, turned])
     used = numbered[:: math.ceil(len(numbered) / MAX_WINDOWS)]
     rows = [(drive, *window.projected(known)) for drive, window in used]
     most = max(len(residual) for _, residual, _, _ in rows)
@@ -374,7 +346,7 @@ def _padded(numbered: Sequence[tuple[int, _Window]], known: Deviations) -> Windo
         np.array([drive for drive, *_ in rows]),
         np.array([float(len(residual)) for _, residual, *_ in rows]),
         np.zeros((len(rows), most)), np.zeros((len(rows), SOURCE_COUNT, most, most)),
-        np.tile(np.eye(most), (len(rows), 1, 1)), lasting,
+        np.tile(np.eye(most), (len(rows), 1, 1)),
     )  # fmt: skip
     for at, (_, residual, effects, sure_of) in enumerate(rows):
         size = len(residual)

@@ -394,17 +394,15 @@ def test_noise_that_is_already_right_stays_as_configured(found: Calibration) -> 
 
 @pytest.mark.slow
 def test_noise_of_a_robot_whose_geometry_is_right_is_written_alone(found: Calibration) -> None:
-    """The calibration replaces the configured deviation of each radius by that of their ratio."""
     geometry = configs(found)[0]
-    present = OdometryConfig(left_wheel_radius_multiplier_std=0.002)
+    present = OdometryConfig(wheel_slip_std=0.01)
     log = log_of_runs(LOG)
     again = calibrate(log, geometry, None, present)
     assert set(again.stays_configured) == {TRACK, RATIO}
     assert configs(again)[0] == geometry
     written = structs.replace(present, **again.odometry)
     assert written.yaw_variance_per_radian < present.yaw_variance_per_radian / 10
-    assert written.left_wheel_radius_multiplier_std == 0.0
-    assert written.wheel_radius_ratio_std >= 0.002
+    assert written.wheel_slip_std == 0.0
 
 
 def test_positions_that_are_recorded_a_second_later_give_the_same_window() -> None:
@@ -444,8 +442,8 @@ def test_a_negligible_deviation_is_written_as_zero_and_a_small_variance_is_kept(
 ) -> None:
     found = np.full(SOURCE_COUNT, size**2)
     made = settings(
-        Deviations(0.0, 0.0, size), 1.0, (TRACK, RATIO), OdometryConfig(),
-        LogNoise(found, INITIAL_NOISE, 1.0, 0.1, True, 1.0, 0.3), scaled=True,
+        Deviations(size, size, size), 1.0, (), OdometryConfig(),
+        LogNoise(found, INITIAL_NOISE, 1.0, 0.1, True, 1.0), scaled=True,
     )  # fmt: skip
     variances = {name: made.pop(name) for name in list(made) if "variance" in name}
     assert variances == dict.fromkeys(
@@ -454,28 +452,26 @@ def test_a_negligible_deviation_is_written_as_zero_and_a_small_variance_is_kept(
     )
     assert made == pytest.approx(
         dict.fromkeys(
-            ("wheel_separation_multiplier_std", "wheel_radius_ratio_std", "distance_scale_std",
-             "wheel_slip_std"), written,
+            ("wheel_separation_multiplier_std", "wheel_radius_ratio_std", "distance_scale_std"),
+            written,
         ), rel=1e-9, abs=0.0,
     )  # fmt: skip
 
 
 def test_the_search_finds_the_noise_that_made_the_residuals() -> None:
-    """The residuals contain noise per radian, noise that lasts, and noise of the sensor."""
+    """The residuals contain noise per radian, and noise of the sensor."""
     rng, size, count = np.random.default_rng(3), 8, 600
     effects = np.zeros((count, SOURCE_COUNT, size, size))
     sums = np.minimum.outer(np.arange(1.0, size + 1), np.arange(1.0, size + 1))
-    lasting = np.outer(np.arange(1.0, size + 1), np.arange(1.0, size + 1))
     true = np.zeros(SOURCE_COUNT)
     for source, matrix, amount in (
-        (Source.SKID, sums, 2e-3), (Source.TRACK, lasting, 1e-3),
-        (Source.HEADING, np.eye(size), 3e-3),
+        (Source.SKID, sums, 2e-3), (Source.HEADING, np.eye(size), 3e-3),
     ):  # fmt: skip
         effects[:, source], true[source] = matrix, amount
     windows = Windows(
         np.zeros(count, dtype=np.int64), np.full(count, float(size)),
         rng.multivariate_normal(np.zeros(size), np.tensordot(true, effects[0], 1), count),
-        effects, np.zeros((count, size, size)), np.zeros(3),
+        effects, np.zeros((count, size, size)),
     )  # fmt: skip
     noise = windows.search(INITIAL_NOISE, np.ones(SOURCE_COUNT, dtype=bool))
     used = true > 0.0
@@ -485,11 +481,9 @@ def test_the_search_finds_the_noise_that_made_the_residuals() -> None:
 
 @pytest.mark.parametrize(("count", "used"), [(79, 79), (80, 80), (81, 41), (159, 80), (160, 80)])
 def test_the_noise_is_computed_from_at_most_80_evenly_spaced_windows(count: int, used: int) -> None:
-    effects, motion = np.zeros((SOURCE_COUNT, 1, 1)), SimpleNamespace(metres=1.0, turned=1.0)
-    motion.track = 0.5
+    effects = np.zeros((SOURCE_COUNT, 1, 1))
     single: list[Any] = [
         SimpleNamespace(
-            motion=motion,
             projected=lambda _, n=number: (np.array([float(n)]), effects, np.zeros((1, 1))),
         )
         for number in range(count)
