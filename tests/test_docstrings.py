@@ -28,13 +28,9 @@ NOT_YET = (
     "core/motion/odometry.py",
     "core/ros",
     "core/thinning.py",
-    "foxglove",
     "host/config_file.py",
     "host/kernel_counters.py",
     "report",
-    "terminal",
-    "top",
-    "web",
 )
 
 TYPES_OF_USERS = ("core/config/settings.py", "core/messages/schema.py", "web/socket_messages.py")

@@ -33,10 +33,7 @@ from acsard.core.ros.transports import left_out
 
 
 class EventDeduplicator:
-    """Converts the daemon's lists of events to log messages.
-
-    Successive lists overlap, but each event becomes one log message only.
-    """
+    """Converts the daemon's lists of events, which overlap, to one log message of each event."""
 
     def __init__(self) -> None:
         self._total = self._stamp_ns = 0
@@ -45,8 +42,8 @@ class EventDeduplicator:
     def of(self, events: Events) -> list[Log]:
         """Return a log message for each event that was in no earlier list.
 
-        After a restart of the daemon, all events are new. If the wall clock was also set back, some
-        of them may be left out. A list that is older than an earlier list adds no messages.
+        After a restart of the daemon all events are new; if the wall clock was also set back, some
+        may be left out.
         """
         known, previous, stamp_ns = self._total, self._reported, events.stamp.to_ns()
         before_ns = self._stamp_ns
@@ -86,8 +83,7 @@ class Relay:
         self._followed: dict[str, Subscription] = {}
         self._deduplicator = EventDeduplicator()
         self._log_topic = ""
-        self.unreadable = 0
-        """Number of samples that could not be decoded."""
+        self.unreadable = 0  # samples that could not be decoded
 
     def offer(self, config: Config) -> None:
         """Offer the robot's topics to the viewers. Topics that were offered before remain."""
@@ -107,10 +103,9 @@ class Relay:
                 self._outs[topic] = _Out(row, row.native, channel)
 
     def follow(self, topics: Collection[str], fresh: Collection[str]) -> None:
-        """Subscribe to the keys of the topics that viewers show, and to no other keys.
+        """Subscribe to the keys of the topics that viewers show.
 
-        `fresh` are the topics with a new viewer. If such a topic is published rarely, its last
-        message is sent again for the new viewer.
+        A topic in `fresh` has a new viewer, which gets the last message of a rare key again.
         """
         if self._log_topic in fresh:
             # A viewer that opens the log receives the last events too.

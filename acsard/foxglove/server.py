@@ -54,10 +54,7 @@ class ShownTopics:
         self._wake()
 
     def take(self) -> tuple[set[str], set[str]]:
-        """Return two sets: the topics with any viewer, and the topics with a new viewer.
-
-        A viewer of a topic is new if it has subscribed to the topic since the last call.
-        """
+        """Return the topics with any viewer, and those with a new viewer since the last call."""
         with self._lock:
             fresh, self._fresh = self._fresh, set()
             return set(self._viewers), fresh
@@ -70,10 +67,7 @@ def start(
     shown_topics: ShownTopics,
     context: foxglove.Context,
 ) -> WebSocketServer:
-    """Start the server, and return it.
-
-    Raises `InUseError` if the port is in use, and `NotPermittedError` if the port needs root.
-    """
+    """Start the server. Raises `InUseError`, or `NotPermittedError` if the port needs root."""
     host, port = address
     try:
         return foxglove.start_server(

@@ -17,12 +17,11 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+# At this width no row is wrapped, so that a person can copy one from the terminal.
 UNLIMITED_WIDTH = 10_000
-"""Width that is larger than any row of a table, characters. At this width no row is wrapped, so a
-person can copy a row from the terminal."""
 
+# Widest line of output that contains sentences.
 MAX_TEXT_WIDTH = 100
-"""Largest line width of output that contains sentences, characters."""
 
 
 def table(
@@ -31,11 +30,8 @@ def table(
     right: Collection[int] = (),
     gap: int = 2,
 ) -> Table:
-    """Return a table with the given rows.
-
-    `heads` contains the headings of the columns; without headings the table has no head. `right`
-    contains the numbers of the right-aligned columns, counted from 0. `gap` is the number of spaces
-    between columns.
+    """Return a table; `right` has the numbers of its right-aligned columns, `gap` the spaces
+    between.
     """
     cells = list(rows)
     made = Table(
@@ -55,7 +51,7 @@ def has_screen() -> bool:
 
 
 def has_room(stream: TextIO) -> bool:
-    """Return whether a short text can be written to a stream now, without a wait for its reader."""
+    """Return whether a short text can be written now, without a wait for its reader."""
     try:
         return bool(select.select([], [stream], [], 0.0)[1])
     except (OSError, ValueError):
@@ -63,11 +59,7 @@ def has_room(stream: TextIO) -> bool:
 
 
 def show(*parts: RenderableType, most: int = UNLIMITED_WIDTH) -> None:
-    """Print each part, such as a table or a text, on its own lines.
-
-    A line has at most `most` characters; longer text is wrapped. With the default, no row of a
-    table is wrapped.
-    """
+    """Print each part, such as a table or a text, in lines of at most `most` characters."""
     console = _console(sys.stdout)
     if console.is_terminal and most < UNLIMITED_WIDTH:
         console.print(Group(*parts), width=min(most, console.width))
@@ -76,7 +68,7 @@ def show(*parts: RenderableType, most: int = UNLIMITED_WIDTH) -> None:
 
 
 def show_whole(text: Text) -> None:
-    """Print a text without wrapping its lines, so that a person can copy a command from it."""
+    """Print a text without wrapping, so that a person can copy a command from it."""
     console = _console(sys.stdout)
     if console.is_terminal:
         console.print(text, soft_wrap=True)

@@ -31,12 +31,9 @@ QUIT_KEY = "q"
 
 COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red", "SKIPPED": "bright_black"}
 
+# They end a subcommand that moves something: also Ctrl-Z (SIGTSTP), because a suspended
+# subcommand would leave a wheel turning.
 PROMPT_END_SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
-"""The signals that end a subcommand that moves something.
-
-The signal of Ctrl-Z (SIGTSTP) is one of them, because a suspended subcommand would leave a wheel
-turning.
-"""
 
 
 class NobodyError(AcsardError):
@@ -44,26 +41,19 @@ class NobodyError(AcsardError):
 
 
 class NumberQuestion(Struct, frozen=True):
-    """A question whose answer is a number, such as a distance that a person measures by tape.
-
-    `words` is the text of the question, and `unit` is the unit of the answer. The number must be
-    from `least` to `most`.
-    """
+    """A question whose answer is a number from `least` to `most`, such as a measured distance."""
 
     words: str
     unit: str
     least: float
     most: float
-    usual: float | None = None
-    """Default, which an empty answer selects, or None without a default."""
-    name: str = ""
-    """Name under which the method of calibration stores the answer."""
+    usual: float | None = None  # for an empty answer
+    name: str = ""  # under which a method stores the answer
 
     def number(self, text: str) -> float:
-        """Return the number in the answer `text`, or the default if `text` is empty.
+        """Return the number of an answer, which may have a decimal comma, or the default.
 
-        The number may have a decimal comma. Raises `ValueError` with a description of valid numbers
-        if the number is not valid, or if `text` is empty and a default is missing.
+        Raises `ValueError` with a description of valid numbers.
         """
         try:
             number = self.usual if not text else float(text.replace(",", "."))
@@ -77,9 +67,8 @@ class NumberQuestion(Struct, frozen=True):
 class Prompt:
     """Shows the output of a subcommand, and answers its questions without a person.
 
-    It confirms each question that has only one possible answer, starts every drive without a wait,
-    and returns the default of each number. If `as_json` is true, it shows only texts and questions,
-    because the subcommand prints one JSON object as its result.
+    It confirms a question with only one answer, starts drives without a wait, and returns defaults.
+    If `as_json` is true, it shows only texts and questions, because the result is one JSON object.
     """
 
     def __init__(self, as_json: bool = False) -> None:
@@ -149,17 +138,13 @@ class Prompt:
 
 
 class TerminalPrompt(Prompt):
-    """Prompt that asks a person on standard error and reads the answers from standard input.
+    """Asks a person on standard error, and reads the answers from standard input.
 
-    Outside the context `host.terminal_modes.single_key_mode`, a key press takes effect only after
-    Enter. Use that context if a single key press must stop the robot.
+    A key press takes effect only after Enter, unless `host.terminal_modes.single_key_mode` is
+    active.
     """
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
-        """Ask a question until the person types one of `answers`, and return this answer.
-
-        Raises `KeyboardInterrupt` if the person types "q", or if standard input ends.
-        """
         self._clear()
         choice = f" [{'/'.join((*answers, QUIT_KEY))}]" if len(answers) > 1 else ""
         with _lines() if sys.stdin.isatty() else nullcontext():
@@ -213,7 +198,7 @@ class TerminalPrompt(Prompt):
 
 
 def row(finding: Finding) -> Table:
-    """Return a table that shows a finding: verdict, name, measurement, meaning and remedy."""
+    """Return a table of a finding: verdict, name, measurement, meaning and remedy."""
     verdict = Text(f"{finding.verdict:<7}", COLOURS[finding.verdict])
     below = [finding.text, f"-> {finding.mend}" if finding.mend else ""]
     head = f"{finding.name:<22} {finding.figure}"
@@ -222,7 +207,6 @@ def row(finding: Finding) -> Table:
 
 @contextmanager
 def _quits_if_closed() -> Iterator[None]:
-    """Raise `KeyboardInterrupt` if the terminal has been closed."""
     try:
         yield
     except (OSError, termios.error):
@@ -253,7 +237,6 @@ def _forget_input() -> None:
 
 @contextmanager
 def _lines() -> Iterator[None]:
-    """Let the terminal deliver and echo whole lines of input in the `with` block."""
     with _quits_if_closed():
         before = termios.tcgetattr(sys.stdin)
         cooked = list(before)
@@ -270,7 +253,6 @@ def _lines() -> Iterator[None]:
 
 
 def _columns() -> int:
-    """Return the width of the terminal at stderr, or 80 if stderr is not a terminal."""
     with suppress(OSError):
         return os.get_terminal_size(sys.stderr.fileno()).columns or 80
     return 80
@@ -284,9 +266,9 @@ def _wrapped(text: str) -> str:
 def ended_by_signals(notice: str = "", *, exits: bool = False) -> Iterator[None]:
     """Raise `KeyboardInterrupt` in the `with` block when one of `PROMPT_END_SIGNALS` arrives.
 
-    Further signals are then ignored until the end of the block, so that the block's cleanup can
-    send zero speeds. `notice` is printed when the signal arrives. If `exits` is true, a signal
-    other than SIGINT raises `SystemExit` instead, with 128 plus the number of the signal.
+    `notice` is then printed, and further signals are ignored until the end of the block, so that it
+    can send zeros. If `exits` is true, a signal other than SIGINT raises `SystemExit` with 128 plus
+    its number.
     """
     before = [signal.getsignal(number) for number in PROMPT_END_SIGNALS]
 

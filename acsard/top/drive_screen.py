@@ -27,30 +27,21 @@ HELP = (
 
 
 class Teleop(Struct, frozen=True):
-    """The data that `acsard drive` shows: the robot's state and the speeds that the keys set."""
+    """What `acsard drive` shows: the robot's state and the speeds that the keys set."""
 
     robot_id: str
     endpoint: str
     source: str
-    linear: float
-    """Forward speed that a driving key requests, m/s."""
-    angular: float
-    """Turn rate that a driving key requests, rad/s."""
+    linear: float  # of a driving key, m/s
+    angular: float  # of a driving key, rad/s
     state: RobotState | None
-    age: float
-    """Seconds since `state` arrived, or since the wait for the first state began."""
-    objection: str = ""
-    """Reason why the robot does not follow the keys, in words; "" if it follows the keys."""
-    silent: bool = False
-    """True if no state has arrived for too long, so the shown data is old."""
+    age: float  # since `state` arrived, or since the wait for the first one began
+    objection: str = ""  # why the robot does not follow the keys, or ""
+    silent: bool = False  # no state has arrived for too long
 
 
 def lines(teleop: Teleop, width: int, height: int | None = None) -> list[Text]:
-    """Return the lines of the screen of `acsard drive`.
-
-    There are at most `height` lines, or any number if `height` is None. A line has at most `width`
-    character cells. A `width` below 20 counts as 20.
-    """
+    """Return the screen of `acsard drive`, in lines of at most `width` cells (at least 20)."""
     width = max(20, width)
     head = printable(f"{teleop.robot_id} as {teleop.source}  {teleop.endpoint}")
     rows = [Text(head, "bold")]
@@ -78,11 +69,7 @@ def lines(teleop: Teleop, width: int, height: int | None = None) -> list[Text]:
 
 
 def report_lines(teleop: Teleop, width: int) -> list[str]:
-    """Return the lines of a report about the robot, for a terminal that cannot show a screen.
-
-    The report has the content of the screen, but not the help about the keys. A line has at most
-    `width` characters. A `width` below 20 counts as 20.
-    """
+    """Return a report with the content of the screen, for a terminal that cannot show one."""
     parts = [f"keys ask for {selected_speeds(teleop)}"]
     if teleop.state is None or teleop.silent:
         return _wrap_parts([silence(teleop), *parts], width)
@@ -93,11 +80,7 @@ def report_lines(teleop: Teleop, width: int) -> list[str]:
 
 
 def last_report_lines(teleop: Teleop, width: int) -> list[str]:
-    """Return the lines of the last report, which is printed when `acsard drive` ends.
-
-    The report says whether the robot still moves, and contains its mode with the reason, its pose
-    and its speeds. A line has at most `width` characters.
-    """
+    """Return the last report: whether the robot moves, its mode, pose and speeds."""
     if teleop.state is None or teleop.silent:
         return _wrap_parts([f"drive ended: {silence(teleop)}"], width)
     what = "still moves" if moves(teleop.state) else "stands still"
@@ -108,29 +91,26 @@ def last_report_lines(teleop: Teleop, width: int) -> list[str]:
 
 
 def released(teleop: Teleop) -> bool:
-    """Return whether the robot stands still and no longer follows this drive's command source.
-
-    Return False if no state has arrived. A robot without a measured speed counts as standing still.
-    """
+    """Return whether the robot does not follow this source, and has no measured speed."""
     if teleop.state is None or moves(teleop.state):
         return False
     return teleop.state.mode != Mode.DRIVING or teleop.state.source != teleop.source
 
 
 def moves(state: RobotState) -> bool:
-    """Return whether any measured speed is not zero. Return False if no speed is known."""
+    """Return whether any measured speed is not zero."""
     return any((state.linear, state.angular, *state.wheels))
 
 
 def silence(teleop: Teleop) -> str:
-    """Return a sentence which says that the first state, or a newer state, has not arrived yet."""
+    """Say that the first state, or a newer one, has not arrived yet."""
     if teleop.state is None and not teleop.silent:
         return "waiting for the first state message of the daemon"
     return f"nothing received from the daemon for {teleop.age:.0f} s: is the daemon running?"
 
 
 def refused(teleop: Teleop) -> str:
-    """Return a sentence which says that the keys do not drive the robot, and why."""
+    """Say that the keys do not drive the robot, and why."""
     return f"your keys do not drive the robot: {printable(teleop.objection)}"
 
 
@@ -139,7 +119,7 @@ def selected_speeds(teleop: Teleop) -> str:
 
 
 def measured(state: RobotState) -> list[Text]:
-    """Return the robot's pose and measured twist as short texts with units."""
+    """Return pose and measured twist as short texts with units."""
     texts = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular)]
     return [Text(text) for text in texts]
 

@@ -24,10 +24,7 @@ class Feed:
         self._past: deque[tuple[float, RobotState]] = deque()
 
     def query_state(self) -> None:
-        """Query the robot's present state, without waiting for the next published state.
-
-        Raises `ReplyError` if the reply cannot be decoded, and the errors of `Client.get`.
-        """
+        """Query the present state. Raises `ReplyError`, and the errors of `Client.get`."""
         try:
             state: RobotState = self._robot.get("state")
         except DecodeError as error:
@@ -44,7 +41,7 @@ class Feed:
             self._take(state, now)
 
     def poll(self) -> None:
-        """Store the newest of the states that have arrived since the last call, if any."""
+        """Store the newest state that has arrived since the last call."""
         now = clock.steady_s()
         for state in self._watch.poll(now)[-1:]:
             self._take(state, now)
@@ -59,10 +56,7 @@ class Feed:
             self._past.popleft()
 
     def screen_data(self, hint: str = "") -> ScreenData:
-        """Return the data for the screen of `acsard top`.
-
-        `hint` is a text for the header of the screen, such as the key that quits.
-        """
+        """Return what the screen of `acsard top` shows, with a text for its header."""
         now, watch, past = clock.steady_s(), self._watch, self._past
         return ScreenData(
             self._robot.where.robot_id,

@@ -14,31 +14,23 @@ from acsard.core.messages.state_warnings import SAME_AS_REASON, brief, charge, w
 
 COLUMN_HEADS = ("ROBOT", "MODE", "M/S", "LINK", "BATTERY", "PLACE", "VERSION", "SEEN", "WHY")
 
+# Maximum widths of all columns except the last, which gets the rest.
 COLUMN_WIDTHS = (32, 8, 6, 7, 7, 22, 21, 6)
-"""Maximum widths, in characters, of all columns except the last, which gets the remaining width."""
 
+# Minimum widths. On a narrow terminal, ROBOT shrinks to its minimum first.
 NAME, WHY = 12, 32
-"""Minimum widths of the columns ROBOT (`NAME`) and WHY (`WHY`), characters. On a narrow terminal,
-ROBOT shrinks to its minimum before WHY becomes shorter than its minimum."""
 
+# The table has this column only if any robot reports a battery.
 BATTERY_COLUMN = COLUMN_HEADS.index("BATTERY")
-"""Index of the column BATTERY.
 
-The table has this column only if any robot reports a battery.
-"""
-
+# Listed first, in this order; then robots with a warning.
 URGENT = ("fault", "stopped", "GONE", "SILENT")
-"""Modes and kinds of absence that need attention, the most urgent first.
-
-The table lists the robots in this order, and then all remaining robots, those with a warning first.
-"""
 
 
 def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[str]:
-    """Return a header line, and a line for each robot, the urgent robots first.
+    """Return a header line, and a line for each robot, the urgent ones first.
 
-    There are at most `height` lines, or any number if `height` is None. If some robots do not fit,
-    the last line says how many. A line has at most `width` characters.
+    If some do not fit into `height` lines, the last line says how many.
     """
     cells = [COLUMN_HEADS, *map(row_cells, sorted(rows, key=_order))]
     widest = [max(len(row[n]) for row in cells) for n in range(len(COLUMN_HEADS))]
@@ -66,11 +58,7 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
 
 
 def shortened(names: Sequence[str], room: int) -> list[str]:
-    """Return the names, each with at most `room` characters.
-
-    In a longer name, "…" replaces a part. The "…" is at the same position in all shortened names:
-    near the middle, or at another position if that keeps more names distinct.
-    """
+    """Return the names in at most `room` characters, with "…" where most of them stay distinct."""
     if all(len(name) <= room for name in names):
         return list(names)
 
@@ -86,8 +74,7 @@ def shortened(names: Sequence[str], room: int) -> list[str]:
 
 
 def row_cells(row: Row) -> tuple[str, ...]:
-    """Return the texts of the table cells for a robot, in the order of the headings
-    `COLUMN_HEADS`."""
+    """Return the texts of a robot's cells, in the order of `COLUMN_HEADS`."""
     name = printable(row.robot_id)
     if row.state is None:
         why = "waiting for its state" if row.here else "not there"
@@ -129,10 +116,6 @@ def _absence(row: Row) -> str:
 
 
 def _order(row: Row) -> tuple[int, str]:
-    """Return the sort key of a robot. Urgent robots come first (see `URGENT`).
-
-    The key of a robot that is gone or silent depends on this fact, and not on its last mode.
-    """
     what = _absence(row) or ("" if row.state is None else row.state.mode)
     if what in URGENT:
         return URGENT.index(what), row.robot_id
@@ -144,16 +127,14 @@ class Roster(Fleet):
     """The robots that `acsard fleet` shows, and the reason why robots may be missing."""
 
     def rows(self) -> list[Row]:
-        """Send the queries that are due, and return one row per robot."""
         self.send_queries(self.due())
         return super().rows()
 
     def gather(self) -> list[Row]:
-        """Wait for the first reports of the robots, and return one row per robot.
+        """Wait for the first reports, and return one row per robot.
 
-        The wait ends when all robots that the user named have reported, or after 1.5 s. If no robot
-        is present then, the wait goes on until a robot is present, because the first answer can be
-        late on a busy computer. If no robot is present after 3 s in all, return [].
+        The wait ends when all named robots have reported, or after 1.5 s; without any robot after 3
+        s, because the first answer can be late on a busy computer.
         """
         began, rows = time.monotonic(), self.rows()
         while not self.all_reported:
@@ -166,7 +147,7 @@ class Roster(Fleet):
 
     @property
     def all_reported(self) -> bool:
-        """Whether all robots that the user named have reported; False without named robots."""
+        """Whether all robots that the user named have reported."""
         with self._lock:
             known = list(self._known.values())
         named = ALL_ROBOTS not in self._ids
@@ -176,14 +157,14 @@ class Roster(Fleet):
 
     @property
     def presence_text(self) -> str:
-        """A sentence with the number of present robots; "" if the user named robots."""
+        """How many robots are present, or "" if the user named robots."""
         with self._lock:
             here = sum(robot.here for robot in self._known.values())
         return count_text(self._robot.where.endpoint, here) if ALL_ROBOTS in self._ids else ""
 
     @property
     def left_out_text(self) -> str:
-        """A sentence which says that the table leaves out some robots; "" if it leaves out none."""
+        """That the table leaves out some robots, or ""."""
         if not self.left_out:
             return ""
         return (
@@ -192,7 +173,7 @@ class Roster(Fleet):
         )
 
     def hint(self) -> str:
-        """Return a sentence for an empty table. It explains why no robot is shown."""
+        """Return why an empty table shows no robot."""
         if ALL_ROBOTS in self._ids:
             return no_robot_text(self._robot.where.endpoint)
         return (

@@ -1,16 +1,10 @@
 """Drives the robot from the keyboard with the keys of teleop_twist_keyboard.
 
-A terminal reports a key press but never its release. Each press therefore drives the robot for
-`KEY_HOLD_S`. From the third repeat (`REPEATS`) of a held key on, each repeat drives the robot
-for `REPEAT_S` only. When this time is over, `acsard drive` sends at least three zero commands, and
-more until the robot's state shows that the robot has stopped. Then it sends nothing. If this
-program was paused for more than 0.5 s, the keys that the operator typed during the pause do not
-drive the robot.
-
-A key that was held when the robot was stopped must not drive the robot after `acsard call clear`.
-This also holds if an SSH connection pauses, so that the key seems to be released. So if the robot
-stops following while a key is held, this key no longer drives the robot. Driving keys work again
-in two cases: a key that stops the robot arrives without delay, or no driving key arrives for 1.5 s.
+A terminal never reports the release of a key, so each press drives for `KEY_HOLD_S`, and each
+repeat of a held key for `REPEAT_S`. Then come zeros until the robot has stopped. Keys that were
+typed during a pause of this program do not drive. If the robot stops following while a key is held,
+this key drives again only after an undelayed key that stops the robot, or after 1.5 s without a
+driving key. Otherwise it would drive after a `clear`.
 """
 
 from __future__ import annotations
@@ -36,36 +30,25 @@ from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.host import clock
 from acsard.top.drive_screen import Teleop
 
+# One press drives for this time: longer than a keyboard's delay before the first repeat (0.25 to
+# 0.5 s).
 KEY_HOLD_S = 0.6
-"""Time for which one key press drives the robot, s.
 
-This time must be longer than a keyboard's delay before the first repeat (0.25 to 0.5 s).
-"""
-
+# A repeat drives for this time, and after so many a key counts as held. Keyboards repeat a key 10
+# to 30 times a second.
 REPEAT_S, REPEATS = 0.25, 3
-"""Time for which a repeat of a held key drives the robot, s (`REPEAT_S`), and number of repeats
-after which a key counts as held (`REPEATS`).
 
-Presses of the same key count as repeats if they are less than `REPEAT_S` apart. Keyboards repeat a
-key 10 to 30 times a second.
-"""
-
+# More keys at once were delayed, usually by a stalled SSH connection, and may have been released.
 MAX_BURST_KEYS = 8
-"""Largest number of keys that may arrive together and still drive the robot.
 
-If more keys arrive together, something has delayed them, usually a stalled SSH connection. The
-operator may have released the key long ago.
-"""
-
+# After delayed keys, all further ones count as delayed too: one read may not return all.
 BURST_S = 0.2
-"""Time after the arrival of delayed keys, s, in which all further keys count as delayed too,
-because one read from the terminal may not return all delayed keys."""
 
+# Shown if a held key does not drive although the robot could follow.
 RELEASE_REASON = (
     "the robot did not follow this program while you held the key, so the key is ignored: press "
     "space, then press the key again"
 )
-"""Text for the operator if a held key does not drive the robot although the robot could follow."""
 
 _MOVES = {
     "i": (1, 0), "o": (1, -1), "u": (1, 1), "j": (0, 1), "l": (0, -1),
@@ -79,30 +62,26 @@ _SPEEDS = {
 
 
 class Keyboard:
-    """Converts key presses to velocity commands. The class is pure."""
+    """Converts key presses to velocity commands. Times are monotonic, s. The class is pure."""
 
     def __init__(self, linear: float, angular: float) -> None:
         self.linear, self.angular = linear, angular
         self._move = (0, 0)
+        # Last press of a driving key (minus infinity after a stop), and its repeats.
         self._pressed, self._repeats = -math.inf, 0
-        """Monotonic time of the last press of a driving key, s, and number of repeats of this key.
-        After a key that stops the robot, the time is minus infinity."""
+        # Of the present hold: driving keys at most `RELEASE_TIMEOUT_NS` apart. `end_hold` may have
+        # ended it.
         self._begun, self._over = 0.0, False
-        """Monotonic time at which the present hold began, s, and whether `end_hold` has ended this
-        hold. A hold is a series of driving keys that are at most `RELEASE_TIMEOUT_NS` apart."""
         self._until = 0.0
-        self._old_until = 0.0
-        """Monotonic time until which all keys count as delayed and only stop the robot, s."""
+        self._old_until = 0.0  # all keys count as delayed until then
         self._zeros = ZEROS
 
     def take(self, text: str, now: float, waited: float = 0.0) -> None:
-        """Process the keys of one read from the terminal.
+        """Process the keys of one read, which have waited at most `waited` s.
 
-        `text` contains the keys, and `now` is the time of the read (monotonic clock, s). `waited`
-        is the time since the previous read, s, for which the keys may have waited. The keys count
-        as delayed if `waited` is above `GRACE_S`, or if more than `MAX_BURST_KEYS` keys arrive
-        together. Delayed keys do not show what the operator wants now, so they only stop the robot.
-        If `waited` is above `GRACE_S`, an earlier press does not drive the robot any more either.
+        They count as delayed if they waited for longer than `GRACE_S`, or if more than
+        `MAX_BURST_KEYS` come together. Delayed keys only stop the robot. After such a wait, an
+        earlier press does not drive any more either.
         """
         # A delayed key that stops the robot does not let a held key drive again, because a stalled
         # connection may deliver this key first, and the keys that were typed after it only later.
@@ -119,10 +98,7 @@ class Keyboard:
             self.press(key, now)
 
     def press(self, key: str, now: float) -> None:
-        """Process a key that was pressed at `now` (monotonic clock, s).
-
-        `key` is one character, or the escape sequence of an arrow key.
-        """
+        """Process one character, or the escape sequence of an arrow key."""
         if key in _SPEEDS:
             self.linear *= _SPEEDS[key][0]
             self.angular *= _SPEEDS[key][1]
@@ -141,14 +117,11 @@ class Keyboard:
             self._stop(now)
 
     def end_hold(self, now: float) -> None:
-        """Stop the robot, and ignore the key that is held at `now` (monotonic clock, s).
+        """Stop the robot, and ignore the held key, because the robot does not follow.
 
-        Call this when a state shows that the robot does not follow. There are two special cases:
-
-        - The operator began to hold the key less than `SETTLED_S` ago. Then do nothing, because the
-          state may be older than the key press.
-        - No key seems to be held. Then the network may be delaying the repeats of a held key. If
-          more than `MAX_BURST_KEYS` repeats arrive together later, ignore this key too.
+        Do nothing if the hold began less than `SETTLED_S` ago, because the state may be older. If
+        no key seems held, the network may be delaying repeats: a later burst of them is ignored
+        too.
         """
         key_down = self._key_is_down(now)
         if self._over or (key_down and now - self._begun <= SETTLED_S):
@@ -158,10 +131,7 @@ class Keyboard:
             self._stop(now)
 
     def ignores(self, now: float) -> bool:
-        """Return whether the operator holds a key that is ignored because of `end_hold`.
-
-        `now` is the present time on the monotonic clock, s.
-        """
+        """Return whether a key is held that is ignored because of `end_hold`."""
         return self._over and self._key_is_down(now)
 
     def _key_is_down(self, now: float) -> bool:
@@ -171,10 +141,7 @@ class Keyboard:
         self._move, self._until, self._zeros = (0, 0), now, ZEROS
 
     def wish(self, now: float) -> Twist | None:
-        """Return the command to send at `now` (monotonic clock, s), or None to send nothing.
-
-        Each call that returns a final zero reduces the number of zeros that are still to be sent.
-        """
+        """Return the command to send, or None. Each call consumes one of the final zeros."""
         if now < self._until:
             return Twist(self.linear * self._move[0], self.angular * self._move[1])
         if self._zeros:
@@ -197,10 +164,7 @@ class KeyboardDrive:
         self._fine = self._stepped = clock.steady_s()
 
     def step(self, typed: str) -> None:
-        """Process the typed keys, send the command that is due, and process the received states.
-
-        `typed` contains the keys of one read from the terminal; "" if no key was typed.
-        """
+        """Process the keys of one read, send the command that is due, and process the states."""
         now = clock.steady_s()
         now_ns = round(now * NS_PER_S)
         waited, self._stepped = now - self._stepped, now
@@ -222,7 +186,7 @@ class KeyboardDrive:
         self.take()
 
     def take(self) -> None:
-        """Process the states that have arrived. If no state has arrived for some time, query it."""
+        """Process the states that have arrived. If none has for some time, query it."""
         now, before = clock.steady_s(), self._watch.state
         for state in self._watch.poll(now):
             self._final_zeros.received(state, now)
@@ -231,10 +195,9 @@ class KeyboardDrive:
             before = state
 
     def end(self) -> None:
-        """Send zero commands until the robot has stopped, but for at most `MAX_END_S`.
+        """Send zeros until the robot has stopped, but for at most `MAX_END_S`.
 
-        The states that arrive meanwhile are processed, so that the last report shows the robot as
-        it is then.
+        States are processed meanwhile, so the last report shows the robot as it is then.
         """
         if not self._final_zeros.wanted(clock.steady_s()):
             return
@@ -263,7 +226,7 @@ class KeyboardDrive:
 
 
 def split(text: str) -> list[str]:
-    """Split the text of one read from the terminal into keys. An arrow key has three characters."""
+    """Split the text of one read into keys. An arrow key has three characters."""
     keys, at = [], 0
     while at < len(text):
         size = 3 if text.startswith("\x1b[", at) else 1

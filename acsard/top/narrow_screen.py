@@ -32,14 +32,14 @@ from acsard.top.wide_screen import (
     wheel,
 )
 
+# Terminals with fewer cells per line get the narrow layout.
 MIN_WIDE_COLUMNS = 80
-"""Terminals with fewer character cells per line than this number get the narrow layout."""
 
 BAR_WIDTH = 4
 
 
 def motion(state: RobotState, width: int) -> list[Text]:
-    """Return lines with pose and twist, then lines with the speeds of the front and rear wheels."""
+    """Return lines with pose and twist, then with the speeds of the front and rear wheels."""
     figures = [
         f"x {signed(state.x, 3, 8)} m",
         f"y {signed(state.y, 3, 8)} m",
@@ -60,10 +60,9 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """Return lines about each command source: its priority, last command's age, and status.
+    """Return lines about each command source: priority, age of the last command, status.
 
-    If the sources need more than about `room` lines, the last line counts the sources that do not
-    fit, and names the first of them. A line has at most `width` character cells.
+    If they need more than about `room` lines, the last one counts the sources that do not fit.
     """
     lines = [rule(width, [(0, "sources"), (16, "priority"), (26, "seen")])]
     left = list(state.sources)
@@ -84,10 +83,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
 
 
 def link(data: ScreenData, state: RobotState, width: int) -> list[Text]:
-    """Return the lines about the serial link, the commands and the rejected inputs.
-
-    A line has at most `width` character cells.
-    """
+    """Return lines about the serial link, the commands and the rejected inputs."""
     before = data.before or state
     lines = [rule(width, [(0, title(data, state))])]
     if state.certificate_expiry:
@@ -128,10 +124,7 @@ def timing(state: RobotState, width: int) -> list[Text]:
 
 
 def folded(text: str, width: int, inset: int) -> list[Text]:
-    """Wrap a text to `width` character cells, and indent its lines by `inset` cells.
-
-    If the text begins with a label such as "gyro", its first line is not indented.
-    """
+    """Wrap a text, with lines indented by `inset` cells, except a first line with a label."""
     first = "" if text.startswith(("gyro ", "track ", "board ", "last one ")) else " " * inset
     wide = max((cell_len(piece) for piece in text), default=1)  # a character may be two cells wide
     room, rest = max(inset + 1, width // max(1, wide)), " " * inset

@@ -25,12 +25,7 @@ MAX_SOURCES = 32
 
 
 def screen(data: ScreenData, width: int, height: int | None = None) -> Group:
-    """Return the screen of `acsard top`.
-
-    The screen has at most `height` lines, or any number if `height` is None. A line has at most
-    `width` character cells. A `width` below 20 counts as 20, and a `width` above `MAX_COLUMNS`
-    counts as `MAX_COLUMNS`.
-    """
+    """Return the screen of `acsard top`, in lines of `width` cells (20 to `MAX_COLUMNS`)."""
     width = max(20, min(MAX_COLUMNS, width))
     head = [_header(data, width), *(_no_news(data, width) if data.silent else _mode(data, width))]
     if data.state is not None:
@@ -62,7 +57,6 @@ def screen(data: ScreenData, width: int, height: int | None = None) -> Group:
 
 
 def _unmeasured(state: RobotState) -> RobotState:
-    """Return `state` without its speeds, which are outdated while the link is not up."""
     return replace(state, linear=math.nan, angular=math.nan, wheels=[])
 
 

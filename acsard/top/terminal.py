@@ -46,17 +46,12 @@ from acsard.top.keyboard import KeyboardDrive
 from acsard.top.screen import screen
 
 DRAW_PERIOD_S = 0.25
-"""Time between two updates of a screen, s."""
 
+# Longest wait for a key before `acsard drive` does its other work.
 KEY_POLL_S = 0.05
-"""Longest time for which `acsard drive` waits for a key before it does its other work, s."""
 
+# Least time between two printed reports: of other content, while the robot moves, and at rest.
 CHANGED_REPORT_S, MOVING_REPORT_S, RESTING_REPORT_S = 0.5, 1.0, 10.0
-"""Shortest time between two printed reports of `acsard drive`, s.
-
-If the content has changed since the last report, this time is `CHANGED_REPORT_S`. Otherwise it is
-`MOVING_REPORT_S` while the robot moves, and `RESTING_REPORT_S` while the robot stands still.
-"""
 
 NO_END = 10**9
 
@@ -86,10 +81,7 @@ def show_live(feed: Feed) -> None:
 
 
 def drive(ride: KeyboardDrive) -> None:
-    """Drive the robot with the typed keys, and show its state.
-
-    The function returns when the input ends or a signal arrives.
-    """
+    """Drive the robot with the typed keys, until the input ends or a signal arrives."""
     if has_screen():
         _run_suspendable(partial(_steer, ride))
     else:
@@ -97,10 +89,7 @@ def drive(ride: KeyboardDrive) -> None:
 
 
 def print_last_report(ride: KeyboardDrive) -> None:
-    """Wait until the robot has stopped, but at most 2 s, and print a last report.
-
-    If standard input or output is not a terminal, do nothing.
-    """
+    """Wait until the robot has stopped, at most 2 s, and print a last report on a terminal."""
     # Without the wait, the report would say that the robot still moves, or that it still follows
     # the source of this drive. The daemon follows a source until its timeout, 0.25 s by default.
     left = clock.steady_s()
@@ -146,7 +135,6 @@ def _watch(draw: Callable[[int, int], RenderableType], suspend: list[bool]) -> b
 
 
 def _terminal_reads() -> bool:
-    """Return whether the terminal has accepted all earlier output."""
     return not isinstance(sys.stdout, Writer) or sys.stdout.is_idle
 
 
@@ -161,12 +149,6 @@ def _screen() -> Live:
 
 
 def _run_suspendable(shows: Callable[[list[bool]], bool]) -> None:
-    """Call `shows` repeatedly until it returns False or a signal arrives.
-
-    The argument of `shows` is an empty list. When the user presses Ctrl-Z, an element is added to
-    this list. Then `shows` must close the screen and return True, and this program is suspended.
-    When the user resumes the program, `shows` is called again.
-    """
     _be_lenient()
     suspend: list[bool] = []
     signal.signal(signal.SIGTSTP, lambda *_: suspend.append(True))
@@ -180,10 +162,6 @@ def _run_suspendable(shows: Callable[[list[bool]], bool]) -> None:
 
 
 def _steer(ride: KeyboardDrive, suspend: list[bool]) -> bool:
-    """Drive the robot with the typed keys, and show the screen.
-
-    Return True if the user pressed Ctrl-Z, and False at the end of the input.
-    """
     with keys() as read, _screen() as display:
         due = 0.0
         while not suspend:
@@ -210,8 +188,8 @@ def _be_lenient() -> None:
 def until_signal() -> Iterator[None]:
     """End the `with` block when a signal of `SCREEN_END_SIGNALS` arrives or the terminal closes.
 
-    Further signals are ignored, even after the block, because two signals arrive when a terminal
-    with a shell closes. The second one must not interrupt the zero commands that end a drive.
+    Further signals are ignored, also after it: two arrive when a terminal with a shell closes, and
+    the second one must not interrupt the zeros that end a drive.
     """
 
     def ignore_signals() -> None:
@@ -239,10 +217,9 @@ def until_signal() -> Iterator[None]:
 
 @contextmanager
 def keys() -> Iterator[Callable[[float], str | None]]:
-    """Yield a function that reads the keyboard. Its argument is the maximum time to wait, s.
+    """Yield a function that waits for typed text: "" without any, None at the end of the input.
 
-    The function returns the typed text, "" if nothing was typed in this time, and None when the
-    input has ended. If the input is not a terminal, the function always waits and returns "".
+    If the input is not a terminal, it always waits and returns "".
     """
 
     def read(seconds: float) -> str | None:
@@ -277,10 +254,7 @@ def _drive_in_lines(ride: KeyboardDrive) -> None:
 
 
 def output_size() -> os.terminal_size:
-    """Return the size of the terminal that shows the standard output, in columns and lines.
-
-    If the standard output is a file or a pipe, return a practically unlimited size.
-    """
+    """Return columns and lines of the terminal; a file or pipe has practically no limit."""
     unlimited = os.terminal_size((NO_END, NO_END))
     return shutil.get_terminal_size() if sys.stdout.isatty() else unlimited
 
@@ -293,11 +267,7 @@ class ReportThrottle:
         self._at = -RESTING_REPORT_S
 
     def should_print(self, teleop: Teleop, now: float) -> bool:
-        """Return whether the caller must print a report now.
-
-        If the result is True, the report counts as printed. `teleop` is the content of the report,
-        and `now` is the time on a monotonic clock, s.
-        """
+        """Return whether to print a report now, and count it as printed."""
         state = teleop.state
         words = ("", "") if state is None else (state.mode, state.reason)
         what = (*words, teleop.objection, teleop.linear, teleop.angular, teleop.silent)
@@ -315,16 +285,10 @@ class Page:
     """Repeats the help about the keys between printed reports, so that it stays in sight."""
 
     def __init__(self) -> None:
-        self._shown = NO_END
-        """Number of lines printed since the help was last printed, including the lines of the help.
-        It is `NO_END` before the help is first printed."""
+        self._shown = NO_END  # lines since the help began; `NO_END` before
 
     def with_help(self, report: list[str], height: int) -> list[str]:
-        """Return the lines of a report, with the help about the keys above them if necessary.
-
-        The help is necessary if the lines `report` would scroll the last printed help out of sight.
-        `height` is the number of lines of the terminal.
-        """
+        """Return a report, below the help if it would scroll the last one out of sight."""
         self._shown += len(report)
         if self._shown < height:
             return report

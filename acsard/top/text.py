@@ -16,6 +16,7 @@ from rich.text import Text
 from acsard.core.formatting import printable
 from acsard.core.messages.schema import Info, RobotState
 
+# Styles in the notation of rich.
 MODE_STYLES = {
     "driving": "bold white on green",
     "ready": "bold white on blue",
@@ -25,59 +26,42 @@ MODE_STYLES = {
     "stopped": "bold white on red",
     "fault": "bold white on red",
 }
-"""Style of each mode's label (color and weight), in the notation of the library rich."""
 
 
 class ScreenData(Struct, frozen=True):
-    """The data that the screen of `acsard top` shows.
-
-    Rates are computed from the counters in `state` and in the earlier state `before`.
-    """
+    """What the screen of `acsard top` shows. Rates compare `state` with the earlier `before`."""
 
     robot_id: str
     endpoint: str
     state: RobotState | None
     before: RobotState | None = None
-    age: float = 0.0
-    """Seconds since `state` arrived, or since the wait for the first state began."""
+    age: float = 0.0  # since `state` arrived, or since the wait for the first one began
     info: Info | None = None
-    undecodable: int = 0
-    """Number of messages that could not be decoded since the last readable state."""
+    undecodable: int = 0  # messages since the last readable state
     hint: str = ""
-    silent: bool = False
-    """True if no state has arrived for too long, so the shown data is old."""
+    silent: bool = False  # no state has arrived for too long
+    # s between `before` and `state` on this computer; other stamps: an adjusted clock
     passed: float = 0.0
-    """Seconds between the arrivals of `before` and `state`, on this computer's clock.
-
-    If the stamps of the two states differ by another time, the robot's clock was adjusted.
-    """
 
 
 _EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 
 def clean(text: str) -> str:
-    """Return at most 256 characters of a text, without invisible characters.
-
-    Control, invisible and zero-width characters are replaced by visible characters.
-    """
+    """Return at most 256 characters of a text, with visible ones instead of control characters."""
     # No screen shows more than 256 characters of a text.
     return "".join(c if cell_len(c) else "\ufffd" for c in printable(text[:256]))
 
 
 def count(number: int) -> str:
-    """Format an integer with thousands separators. From 10^10 on, use an exponent instead."""
+    """Format an integer with thousands separators, from 10^10 on with an exponent."""
     if abs(number) < 10**10:
         return f"{number:,}"
     return f"{float(max(-(10**300), min(10**300, number))):.1e}"
 
 
 def rate(later: int, earlier: int, seconds: float) -> str:
-    """Return a counter's increase per second as text, at least 7 characters long.
-
-    `seconds` is the time in which the counter rose from `earlier` to `later`. The text is "-/s" if
-    the time or the increase is not plausible.
-    """
+    """Return a counter's increase per second in at least 7 characters; "-/s" if not plausible."""
     # After a clock change or a restart of the daemon, a wrong rate must not be shown.
     if not 0.05 <= seconds <= 60.0 or not 0 <= later - earlier < 10**6:
         return "-/s".rjust(7)
@@ -86,11 +70,7 @@ def rate(later: int, earlier: int, seconds: float) -> str:
 
 
 def bar(value: float, scale: float, cells: int) -> str:
-    """Return a horizontal bar of block characters whose length is proportional to `value`.
-
-    The sign of `value` is ignored. If the magnitude is `scale` or more, the bar has `cells`
-    characters. If `value` is not finite, return "".
-    """
+    """Return a bar of block characters, `cells` long from the magnitude `scale` on."""
     if not math.isfinite(value):
         return ""
     eighths = round(min(1.0, abs(value) / scale) * cells * 8)
@@ -105,16 +85,13 @@ def row(label: str, value: str, style: str = "") -> Text:
 
 
 def ends(left: Text, right: Text, width: int) -> Text:
-    """Return a line of `width` cells with `left` at its left end and `right` at its right end.
-
-    If the line is too short, cut `left`.
-    """
+    """Return a line of `width` cells with a text at each end. If it is too short, `left` is cut."""
     left.truncate(max(0, width - right.cell_len - 2), overflow="ellipsis")
     return left.append(" " * (width - left.cell_len - right.cell_len)).append_text(right)
 
 
 def rule(width: int, titles: Sequence[tuple[int, str | Text]]) -> Text:
-    """Return a horizontal line with titles. `titles` are pairs: the column, and the title."""
+    """Return a horizontal line with titles, as pairs of column and title."""
     line = Text()
     for at, title in titles:
         if at:
@@ -126,8 +103,7 @@ def rule(width: int, titles: Sequence[tuple[int, str | Text]]) -> Text:
 def flow(parts: Sequence[Text], width: int, inset: int = 0) -> list[Text]:
     """Return lines of at most `width` cells, each with as many of the parts as fit.
 
-    A part of more than `width` cells is alone on a longer line. Lines after the first begin with
-    `inset` blanks.
+    A longer part is alone. Lines after the first begin with `inset` blanks.
     """
     lines: list[Text] = []
     for part in parts:

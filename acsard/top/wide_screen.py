@@ -18,13 +18,14 @@ from acsard.core.values import NS_PER_S
 from acsard.daemon.latencies import NAMES
 from acsard.top.text import ScreenData, bar, clean, count, rate, row, rule
 
+# Widest screen: longer lines are harder to read.
 MAX_COLUMNS = 116
-"""Maximum width of the screen in character cells. Longer lines are harder to read."""
 
 MOST_REASONS, MOST_PORT = 16, 34
 
 LINK_STYLES = {"up": "green", "booting": "yellow"}
 
+# A short and a long explanation: at most 21 and 56 cells. `a → b` is the time from a to b.
 LATENCY_ROWS = {
     "period_lateness": (
         "period due → step",
@@ -45,8 +46,6 @@ LATENCY_ROWS = {
         "from sending a line to its answer (checked link only)",
     ),
 }
-"""Maps the name of each latency to a short and a long explanation, which have at most 21 and 56
-character cells. `a → b` means the time from event a to event b."""
 
 
 def motion(state: RobotState, width: int) -> list[Text]:
@@ -68,21 +67,14 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def speeds(state: RobotState) -> tuple[tuple[float, ...], float]:
-    """Return a pair: the four measured wheel speeds, and the speed that a full bar shows, rad/s.
-
-    An unknown wheel speed is NaN.
-    """
+    """Return the measured wheel speeds, NaN if unknown, and that of a full bar, rad/s."""
     wheels = (*state.wheels[:4], *[math.nan] * (4 - len(state.wheels)))
     top = max((abs(speed) for speed in wheels if math.isfinite(speed)), default=0.0)
     return wheels, next((s for s in (20.0, 40.0, 80.0) if top <= s), 100.0)
 
 
 def wheel(speed: float, scale: float, cells: int) -> Text:
-    """Return a text that shows a wheel's speed: a symbol for the direction, a number, and a bar.
-
-    `speed` is in rad/s, or NaN if it is unknown. The bar has `cells` cells if the magnitude of the
-    speed is `scale` rad/s or more.
-    """
+    """Return a speed in rad/s (or NaN) as a symbol of its direction, a number and a bar."""
     if speed == 0.0 or not math.isfinite(speed):
         sign, style = "·", "dim"
     else:
@@ -94,11 +86,7 @@ def wheel(speed: float, scale: float, cells: int) -> Text:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """Return a heading, and at most `room` lines with one command source each.
-
-    If there are more sources than lines, the last line counts the remaining sources, and names the
-    first of them.
-    """
+    """Return a heading, and at most `room` lines, of which the last one counts the rest."""
     room_name = 13 + max(0, width - 80) // 2
     start = room_name + 3
     at = ((0, "sources"), (start, "priority"), (start + 10, "seen"), (start + 17, "waits for"))
@@ -111,10 +99,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
 
 
 def hidden(left: Sequence[SourceState]) -> str:
-    """Return a line about the command sources `left`, which do not fit on the screen.
-
-    The line contains their number, and the names of at most `MOST_REASONS` of them.
-    """
+    """Return a line that counts the sources that do not fit, and names some of them."""
     names = ", ".join(clean(source.name) for source in left[:MOST_REASONS])
     return f"  and {count(len(left))} more: {names}"
 
@@ -124,11 +109,7 @@ def drives(source: SourceState, state: RobotState) -> bool:
 
 
 def waits(source: SourceState, state: RobotState) -> str:
-    """Return a text which says why a command source does not drive the robot.
-
-    If the source drives, the text says so. If the source waits for nothing, the text names the
-    robot's mode.
-    """
+    """Return why a command source does not drive the robot, or that it drives."""
     if source.waits_for:
         return clean(source.waits_for)
     if drives(source, state):
@@ -147,11 +128,7 @@ def _source(source: SourceState, state: RobotState, room: int) -> Text:
 
 
 def link(data: ScreenData, state: RobotState, width: int) -> list[Text]:
-    """Return the lines about the serial link, the commands and the rejected inputs.
-
-    There are also lines about the gyro, the effective track and the board's inputs, if the robot
-    reports them.
-    """
+    """Return lines about the serial link, commands, rejected inputs and what the robot reports."""
     before = data.before or state
     head = title(data, state)
     titles: list[tuple[int, str | Text]] = [(0, head)]
@@ -180,7 +157,7 @@ def link(data: ScreenData, state: RobotState, width: int) -> list[Text]:
 
 
 def title(data: ScreenData, state: RobotState) -> Text:
-    """Return the heading of the lines about the serial link: the link's state and its port."""
+    """Return the heading of the serial link: its state and port."""
     heading = Text.assemble(
         "link ", (clean(state.link), f"bold {LINK_STYLES.get(state.link, 'red')}")
     )
@@ -196,11 +173,7 @@ def certificate(state: RobotState) -> Text:
 
 
 def rates(data: ScreenData, state: RobotState, before: RobotState) -> Callable[[str], str]:
-    """Return a function that returns a text with the rate and the total of a counter.
-
-    The function takes the name of the counter. The rate is the increase per second from the earlier
-    state `before` to `state`.
-    """
+    """Return a function that shows the rate since `before`, and the total, of a counter."""
     # The stamps give the exact time between the two states. If this time differs by more than 0.2 s
     # (a network's delay) from the time between the arrivals of the states, the robot's clock was
     # set. In this case, use the time between the arrivals.
@@ -216,11 +189,7 @@ def rates(data: ScreenData, state: RobotState, before: RobotState) -> Callable[[
 
 
 def board(state: RobotState) -> str:
-    """Return the emergency stop, the bumpers and the battery in words, as the board reports them.
-
-    The text leaves out everything that the board does not report. It is "" if the board reports
-    nothing.
-    """
+    """Return emergency stop, bumpers and battery in words, or ""."""
     parts = [f"emergency stop {clean(state.emergency_stop)}"] if state.emergency_stop else []
     if state.bumpers is not None:
         parts.append(f"bumpers {''.join('X' if bumper else '.' for bumper in state.bumpers)}")
@@ -230,10 +199,7 @@ def board(state: RobotState) -> str:
 
 
 def overrun(state: RobotState) -> Text:
-    """Return a text with the number of bus messages that the daemon dropped.
-
-    The daemon drops messages if too many arrive. If it has dropped no message, the text is empty.
-    """
+    """Say how many bus messages the daemon dropped because too many arrived."""
     lost = state.counters.get("bus_overrun", 0)
     return Text(f"bus overrun {count(lost)}" if lost else "", "yellow")
 
@@ -252,10 +218,7 @@ def _port(info: Info) -> str:
 
 
 def missed(state: RobotState, before: RobotState) -> Text:
-    """Return a text with the number of control periods that the daemon has missed.
-
-    The text is yellow if the number has increased since the earlier state `before`.
-    """
+    """Say how many control periods the daemon missed, in yellow if more than `before`."""
     missed = state.counters.get("missed_periods", 0)
     grows = missed > before.counters.get("missed_periods", 0)
     return Text(f"missed periods {count(missed)}", "yellow" if grows else "")
@@ -272,12 +235,7 @@ def _refusals(state: RobotState, before: RobotState) -> list[Text]:
 
 
 def refused(state: RobotState, before: RobotState) -> list[tuple[str, list[Text]]]:
-    """Return texts with the numbers of rejected inputs, as pairs of kind and texts.
-
-    The kinds are lines of the board, commands and gyro messages. Each text contains a reason for
-    the rejection and a number. The text is yellow if the number has increased since the earlier
-    state `before`.
-    """
+    """Return the rejected inputs by kind, each with its reason; yellow if more than `before`."""
     kinds = []
     for kind, prefix in (("lines", "line_"), ("commands", "command_"), ("gyro", "imu_")):
         counters = [(n, c) for n, c in state.counters.items() if n.startswith(prefix) and c]
@@ -309,9 +267,8 @@ def timing(state: RobotState, width: int) -> list[Text]:
 
 
 def spread(figures: Spread | None) -> Text:
-    """Return median, 99th percentile and maximum of a latency, in three columns of 7 cells.
-
-    `figures` is None if the latency is unknown. Each column then shows "-".
+    """Return median, 99th percentile and maximum of a latency in columns of 7 cells, "-" if
+    unknown.
     """
     if figures is None or figures.count <= 0:
         return Text("-".rjust(7) * 3, "dim")

@@ -1,13 +1,9 @@
 """Accepts TCP connections, and cuts connections beyond the limits before they use much memory.
 
-A connection goes through these states:
-
-1. silent: no byte has arrived yet. The connection costs only a file descriptor and an entry in
-   `Sockets`, because TLS starts with the first byte.
-2. waiting: the TLS handshake may not start yet. Either too many handshakes are running, or the
-   client's network has started handshakes too often.
-3. starting: the TLS handshake is running.
-4. open: aiohttp reads the connection's requests.
+A silent connection, from which no byte has arrived, costs only a file descriptor and an entry in
+`Sockets`, because TLS starts with the first byte. Then it waits until its TLS handshake may start:
+too many may run, or its network may have started them too often. At the end, aiohttp reads its
+requests.
 """
 
 from __future__ import annotations
@@ -40,36 +36,29 @@ from acsard.web.limits import (
 )
 from acsard.web.metrics import Counts
 
+# Time limit of one TLS handshake, and most handshakes at the same time.
 HANDSHAKE_S, HANDSHAKES_AT_ONCE = 3.0, 32
-"""Time limit for one TLS handshake, s (`HANDSHAKE_S`), and maximum number of TLS handshakes that
-run at the same time (`HANDSHAKES_AT_ONCE`)."""
 
+# An older handshake may be aborted for one that waits. Otherwise clients that stop sending would
+# delay a phone's handshake by up to `HANDSHAKE_S`.
 MIN_ABORT_AGE_S = 0.3
-"""While `HANDSHAKES_AT_ONCE` TLS handshakes run and another one waits, the server may abort a
-running handshake that is at least this old, s. Otherwise, clients that stop sending during their
-handshakes would delay the handshake of a phone by up to `HANDSHAKE_S`."""
 
+# From accepting a connection to the end of the headers of its first request.
 REQUEST_TIMEOUT_S = 10.0
-"""Time limit, s, from accepting a connection to the end of the headers of its first request."""
 
+# The kernel then ends a connection whose client acknowledges no data or keeps its window closed.
 UNREAD_TIMEOUT_S = 5.0
-"""Time, s, after which the kernel ends a connection whose client acknowledges no data or keeps its
-receive window closed."""
 
+# Read buffer of each TLS connection: it holds one TLS record. asyncio's default is 256 KiB.
 READ_BYTES = 16384
-"""Size of the read buffer of each TLS connection, bytes. One TLS record fits into the buffer.
-asyncio's default is 256 KiB."""
 
+# The server accepts no connections for this time when the process has no free file descriptor.
 NO_FILES_PAUSE_S = 0.05
-"""When the process runs out of file descriptors, the server accepts no connections for this time,
-s."""
 
 Factory = Callable[[], "Reader"]
 
 
 class _Listener(NamedTuple):
-    """The arguments of `Acceptor.listen`."""
-
     opened: socket.socket
     secure: ssl.SSLContext | None
     make: Factory
@@ -88,24 +77,18 @@ class Acceptor:
         self._here = Sockets["_Connection"](MAX_LOCAL_TCP_CONNECTIONS)
         self._away = Sockets["_Connection"](sockets_for(files))
         self._listeners: list[_Listener] = []
+        # Connections that wait for their handshake, by network. The networks take turns: one whose
+        # handshake starts moves to the end.
         self._waiting: dict[str, dict[_Connection, None]] = {}
-        """Connections that wait for their TLS handshake, by network. When a network's handshake
-        starts, the network moves to the end of this dict, so the networks take turns."""
         self._handshakes = Buckets(HANDSHAKE_RATE)
+        # Start time of each running handshake on the event loop's clock, oldest first.
         self._starting: dict[_Connection, float] = {}
-        """Start time of each running TLS handshake, s on the event loop's clock; oldest first."""
-        self._again: asyncio.TimerHandle | None = None
-        """Timer of the next call of `_next`, or None if no call is scheduled."""
+        self._again: asyncio.TimerHandle | None = None  # timer of the next call of `_next`
+        # connections without a valid token at the last call of `tidy()`
         self._ended: set[_Connection] = set()
-        """The connections whose token was not in the argument `valid` at the last call of
-        `tidy()`."""
 
     def listen(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
-        """Accept connections at the listening socket `opened`.
-
-        `secure` is the TLS context, or None for plain HTTP. `make` creates the HTTP handler of one
-        connection.
-        """
+        """Accept connections at a socket; `make` creates the HTTP handler of each."""
         sslproto.SSLProtocol.max_size = READ_BYTES
         # A browser waits for the answer before it sends the next request on a connection. aiohttp
         # would queue 32 requests, whose headers can take megabytes.
@@ -115,7 +98,7 @@ class Acceptor:
         self._resume(listener)
 
     def close(self) -> None:
-        """Stop accepting connections. Also cut the open connections of unidentified clients."""
+        """Stop accepting connections, and cut those of unidentified clients."""
         loop = asyncio.get_running_loop()
         for listener in self._listeners:
             loop.remove_reader(listener.opened)
@@ -126,32 +109,26 @@ class Acceptor:
                 connection.cut()
 
     def spoke(self, transport: asyncio.BaseTransport | None, body: StreamReader) -> None:
-        """Stop the timer that closes a connection whose client sends no complete request headers.
+        """Stop the timer of the request headers, which have arrived.
 
-        Call this when the headers of a request have arrived. `transport` identifies the connection,
-        and `body` is the stream from which the body of the request is read.
+        `body` is the stream of the body.
         """
         if (connection := _connection(transport)) is not None:
             connection.spoke(body)
 
     def admitted(self, transport: asyncio.BaseTransport | None, identity: AdmittedClient) -> None:
-        """Record that the client of a connection has been identified as `identity`.
+        """Record who the client of a connection is.
 
-        If the server must close connections to make room, it first closes connections whose client
-        is not identified. `transport` identifies the connection.
+        Unidentified clients make room for others first.
         """
         if (connection := _connection(transport)) is not None:
             connection.pool.prove(connection, identity.token)
 
     def tidy(self, valid: Collection[str]) -> None:
-        """Close the connections whose token is not valid any more.
+        """Close the connections that have had no valid token at two calls. Call this once a second.
 
-        Call this method once a second. A connection is closed if two successive calls find that its
-        token is not in `valid`. Between these calls, the server has time to tell a WebSocket client
-        why the connection ends.
-
-        Args:
-            valid: the digests of all valid tokens.
+        In between, the server can tell a WebSocket client why the connection ends. `valid` has the
+        digests of all valid tokens.
         """
         before = self._ended
         self._ended = {
@@ -181,10 +158,6 @@ class Acceptor:
             _Connection(self, pool, accepted, peer, listener).enter()
 
     def _no_file(self, listener: _Listener) -> None:
-        """Close an old connection, and accept no new ones at `listener` for `NO_FILES_PAUSE_S`.
-
-        Call this if the process has no free file descriptor.
-        """
         loop = asyncio.get_running_loop()
         loop.remove_reader(listener.opened)
         loop.call_later(NO_FILES_PAUSE_S, self._resume, listener)
@@ -247,12 +220,6 @@ class Acceptor:
         self._again = loop.call_later(0.005, self._next)
 
     def _has_room(self, now: float) -> bool:
-        """Return whether a TLS handshake may start now. `now` is in s on the event loop's clock.
-
-        If `HANDSHAKES_AT_ONCE` handshakes are running, first abort one of them: the oldest
-        handshake of the network with the most running handshakes. If this handshake is younger than
-        `MIN_ABORT_AGE_S`, do not abort it, and return False.
-        """
         if len(self._starting) < HANDSHAKES_AT_ONCE:
             return True
         # Only the network with the most handshakes loses one. So a slow client in another network
@@ -270,8 +237,6 @@ class Acceptor:
 
 
 class _Connection(asyncio.Protocol):
-    """One TCP connection. After the TLS handshake, if any, a `Reader` gets the received data."""
-
     def __init__(
         self,
         acceptor: Acceptor,
@@ -287,9 +252,7 @@ class _Connection(asyncio.Protocol):
         self._timer: asyncio.TimerHandle | None = None
         self._task: asyncio.Task[None] | None = None
         self._transport: asyncio.BaseTransport | None = None
-        self._head = 0
-        """Number of bytes of the present request's head (request line and headers) that have
-        arrived so far."""
+        self._head = 0  # bytes of the present request line and headers so far
         self._body: StreamReader | None = None
         self._inner: Reader | None = None
 
@@ -421,18 +384,17 @@ def _connection(transport: asyncio.BaseTransport | None) -> _Connection | None:
 
 
 class Reader(RequestHandler):
-    """aiohttp's handler of one connection, changed to answer invalid requests with JSON errors."""
+    """aiohttp's handler of one connection, which answers invalid requests with JSON errors."""
 
     def __init__(self, counts: Counts, server: Any) -> None:
-        """Create a handler. `server` is the attribute `server` of aiohttp's `AppRunner`."""
         super().__init__(server, loop=server._loop, **server._kwargs)
         self._counted = counts
 
     @property
     def reads_head(self) -> bool:
-        """Whether the next received bytes belong to the head of a request.
+        """Whether the next bytes belong to the head of a request.
 
-        This is False on a WebSocket, and while a received request waits for its handler.
+        This is not so on a WebSocket, nor while a request waits for its handler.
         """
         return not self._upgraded and not self._messages
 
@@ -443,11 +405,6 @@ class Reader(RequestHandler):
         exc: BaseException | None = None,
         message: str | None = None,
     ) -> web.StreamResponse:
-        """Return a JSON error as the answer to received bytes that are not a valid HTTP request.
-
-        If `status` is 500 or more, a handler has failed, and aiohttp makes the answer. This method
-        overrides aiohttp's method, because that method logs a traceback even for invalid bytes.
-        """
         if status >= 500:
             return super().handle_error(request, status, exc, message)
         nameless = (message or "").startswith("Missing 'Host'")

@@ -44,35 +44,28 @@ from acsard.web.socket_messages import MAX_MESSAGE_BYTES
 from acsard.web.tasks import shared
 from acsard.web.tokens import Token, Vault, owner_in
 
+# Strict, because the server copies the host into the content security policy of an answer.
 HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
-"""Pattern of a valid `Host` header. The pattern is strict, because the server copies the host into
-the content security policy of an answer."""
 
+# Reasons under which aiohttp's errors are counted; any other status counts as `malformed`.
 STATUS_REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
-"""Reason under which the server counts an error that aiohttp raises, by HTTP status of the error.
-An error with any other status counts as `malformed`."""
 
 STATUS_TEXTS = {
     404: "this address does not exist; GET /api lists all addresses",
     413: f"the request has more than {MAX_MESSAGE_BYTES} bytes: send less",
 }
 
+# Not in a request for a path that is open to every client.
 IDENTITY_KEY: web.RequestKey[AdmittedClient] = web.RequestKey("who", AdmittedClient)
-"""Key under which a request object contains the client's identity. The request contains no identity
-if its path is open to every client."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
+# Each read starts a thread. Without this limit, a flood of requests delayed a stop by 200 ms.
 MIN_READ_INTERVAL_S = 0.005
-"""Shortest interval between two reads of the token file, s. Each read starts a thread. Before this
-limit existed, a flood of requests started a thread per request, and delayed a stop by 200 ms."""
 
 
 class Lookups:
-    """Reads the token file for many requests at once.
-
-    All requests that arrive before a read starts share the result of that read.
-    """
+    """Reads the token file. All requests that arrive before a read starts share its result."""
 
     def __init__(self, vault: Vault) -> None:
         self._vault, self._lock = vault, asyncio.Lock()
@@ -80,10 +73,9 @@ class Lookups:
         self._read_s = -MIN_READ_INTERVAL_S
 
     async def read(self) -> Sequence[Token]:
-        """Read the token file, and return the robot's tokens.
+        """Return the tokens, with all changes before this call.
 
-        The result contains all changes of the file that were made before this call. Raises
-        `TimeoutError` if the disk does not answer.
+        Raises `TimeoutError` if the disk hangs.
         """
         if self._next is None:
             self._next = shared(self._later())
@@ -109,11 +101,6 @@ class Admission:
         counts: Counts,
         rules: WebConfig,
     ) -> None:
-        """Create the checks for the page of the robot with the id `robot`.
-
-        `names` are the robot's host names and addresses, in lower case. `rules` is the section
-        `web` of the configuration.
-        """
         self._local = AdmittedClient(rules.local, LOCAL_NAME)
         self._origins = frozenset(rules.origins)
         self._robot, self._names, self._vault = robot, names, vault
@@ -124,10 +111,7 @@ class Admission:
         self._rows: dict[web.AbstractRoute, Route] = {}
 
     def application(self, rows: Iterable[Route], page: object) -> web.Application:
-        """Return the application that serves the routes `rows`.
-
-        Each route's handler gets `page` as its first argument.
-        """
+        """Return the application that serves the routes; each handler gets `page` first."""
         app = web.Application(middlewares=[self._serve], client_max_size=MAX_MESSAGE_BYTES)
         app.on_response_prepare.append(secured)
         app.on_response_prepare.append(self._shared)
@@ -138,10 +122,9 @@ class Admission:
         return app
 
     async def owner(self, peer: str, texts: Sequence[str]) -> AdmittedClient:
-        """Return the owner of the first valid token in a request.
+        """Return the owner of the first valid token.
 
-        `peer` is the client's IP address, and `texts` contains the tokens in the request. Raises
-        `RequestRefusedError` if no token is valid, and `TimeoutError` if the disk does not answer.
+        Raises `RequestRefusedError` if no token is valid, and `TimeoutError` if the disk hangs.
         """
         if not any(texts):
             raise RequestRefusedError(
@@ -201,21 +184,10 @@ class Admission:
             return problem(error.status, STATUS_TEXTS.get(error.status, error.reason))
 
     async def _pace_stranger(self, request: web.Request) -> None:
-        """Delay a request if the client's network exceeds `STRANGER_RATE`.
-
-        Call this for each request without a valid token.
-        """
         if not self._strangers.take(network_of(peer_of(request)), clock.mono_ns()):
             await asyncio.sleep(REFUSAL_DELAY_S)
 
     async def _admit(self, request: web.Request, row: Route | None) -> bool:
-        """Check a request. Return True if the caller must delay it because of a rate limit.
-
-        `row` is the route of the request, or None for an unknown path. If the client exceeds its
-        rate limit, a request to a route with `row.waits` is delayed, and any other request is
-        refused. Raises `RequestRefusedError` for a refused request, and if the client may not use
-        the path.
-        """
         facts = request_facts(request)
         here = place(facts, self._names | {own_address(request)}) == "here"
         is_open = row is not None and row.least is None
@@ -274,7 +246,6 @@ class Admission:
         )
 
     async def _shared(self, request: web.Request, response: web.StreamResponse) -> None:
-        """Add the CORS headers that let a page in `web.origins` read the answer."""
         if self._origins:
             vary = response.headers.get("Vary", "")
             response.headers["Vary"] = f"{vary}, Origin" if vary else "Origin"
@@ -300,38 +271,25 @@ def request_facts(request: web.Request) -> RequestFacts:
 
 
 def peer_of(request: web.Request) -> str:
-    """Return the IP address of the client."""
     return unmapped(request.remote or "")
 
 
 def own_address(request: web.Request) -> str:
-    """Return the IP address of this machine to which the client has connected.
-
-    The address comes from the socket, so the client cannot forge it.
-    """
+    """Return this machine's IP address of the connection, which a client cannot forge."""
     return unmapped(_reached(request)[0].lower())
 
 
 def own_port(request: web.Request) -> int:
-    """Return the TCP port of this machine to which the client has connected."""
     return _reached(request)[1]
 
 
 def tokens_shown(request: web.Request, robot: str) -> list[str]:
-    """Return the tokens in the headers of a request, or if there are none, those in its cookies.
-
-    See `tokens_sent()` for the headers. `robot` is the robot's id, which the names of the cookies
-    contain.
-    """
+    """Return the tokens in the headers of a request or, if there are none, in its cookies."""
     return tokens_sent(request) or tokens_in(request.cookies, robot, own_port(request))
 
 
 def tokens_sent(request: web.Request) -> list[str]:
-    """Return the tokens in the headers of a request.
-
-    If the header `Authorization` contains a bearer token, return only this token. Otherwise return
-    the tokens in `Sec-WebSocket-Protocol`.
-    """
+    """Return the bearer token of a request, or else those in `Sec-WebSocket-Protocol`."""
     kind, _, text = request.headers.get("Authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return [text.strip()]

@@ -22,11 +22,10 @@ from acsard.web.callers import Reason
 from acsard.web.routes import JSON, Problem
 
 READ_TIMEOUT_S = 10.0
-"""Time limit for reading from a disk, s."""
 
 PIECE_BYTES = 32768
-"""Size of the pieces in which a large body is written to the network, bytes."""
 
+# By the reason of a refusal; 403 for any other one.
 STATUS_CODES: dict[Reason, int] = {
     "no_token": 401,
     "bad_token": 401,
@@ -35,8 +34,6 @@ STATUS_CODES: dict[Reason, int] = {
     "path": 404,
     "malformed": 400,
 }
-"""HTTP status of the answer to a refused request, by the reason of the refusal. The status is 403
-for any other reason."""
 
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -46,16 +43,14 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Server": "acsard",
 }
-"""Headers of every answer."""
 
 
+# `{connect}` becomes the page's WebSocket URLs, but not in an error answer, so the server never
+# copies a forged `Host` header.
 POLICY = (
     "default-src 'self'; connect-src 'self'{connect}; frame-ancestors 'none'; base-uri 'none'; "
     "form-action 'self'"
 )
-"""Content security policy of every answer. The server replaces `{connect}` with the
-page's WebSocket URLs. The policy of an error answer does not contain these URLs, so the server
-never copies a forged `Host` header into an answer."""
 
 
 class TroubleError(AcsardError):
@@ -67,7 +62,6 @@ class TroubleError(AcsardError):
 
 
 def reply(body: object, status: int = 200) -> web.Response:
-    """Return an HTTP answer with `body` as JSON."""
     return web.Response(body=msgspec.json.encode(body), content_type=JSON, status=status)
 
 
@@ -76,10 +70,7 @@ def problem(status: int, text: str) -> web.Response:
 
 
 def file_answer(request: web.Request, file: File) -> web.Response:
-    """Return the answer that contains a file of the page, compressed if the client accepts gzip.
-
-    If the client already has this version of the file, return an answer with the status 304.
-    """
+    """Return a file, as gzip if the client takes it, or 304 if it has this version."""
     headers = {"ETag": file.tag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
     # An answer with the status 304 contains the policy too, because the browser uses it in place of
     # the policy that it has stored with the file.
@@ -95,10 +86,7 @@ def file_answer(request: web.Request, file: File) -> web.Response:
 async def sent_in_pieces(
     request: web.Request, body: bytes, headers: Mapping[str, str], within: float
 ) -> web.StreamResponse:
-    """Send a large body in pieces, without copying it, and return the answer.
-
-    If sending takes longer than `within` s, cut the connection. For a HEAD request, send no body.
-    """
+    """Send a large body without copying it, and cut the connection after `within` s."""
     if request.method == "HEAD":
         return web.Response(body=body, headers=headers)
     answer = web.StreamResponse(headers=headers)
@@ -116,10 +104,10 @@ async def sent_in_pieces(
 
 
 def cut(transport: asyncio.BaseTransport | None) -> None:
-    """Abort a connection without waiting for the client. Do nothing if `transport` is None.
+    """Abort a connection without waiting for the client.
 
-    On Python 3.11.2, a TLS connection that was closed twice cannot be aborted. Such a connection
-    ends at the time limit of its TLS shutdown.
+    On Python 3.11.2, a TLS connection that was closed twice ends only at the time limit of its TLS
+    shutdown.
     """
     if transport is None:
         return
@@ -133,10 +121,7 @@ def cut(transport: asyncio.BaseTransport | None) -> None:
 
 
 async def secured(request: web.Request, response: web.StreamResponse) -> None:
-    """Add the security headers to an answer.
-
-    An answer that has a content security policy already, such as a file, keeps it.
-    """
+    """Add the security headers to an answer; a file keeps its own content security policy."""
     response.headers.update(HEADERS)
     policy = _policy(request) if response.status < 400 else POLICY.format(connect="")
     response.headers.setdefault("Content-Security-Policy", policy)
@@ -151,6 +136,7 @@ def _policy(request: web.Request, more: str = "") -> str:
 
 PAGE_DIRECTORY = Path(__file__).parent / "page"
 
+# The server sends no file with another suffix.
 CONTENT_TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -160,20 +146,15 @@ CONTENT_TYPES = {
     ".json": "application/json",
     ".webmanifest": "application/manifest+json",
 }
-"""Content type of a page file, by file suffix. The server sends no file with any other suffix."""
 
+# Files whose text is inserted into a file: the element that loads each, and the tag to put in its
+# place.
 INLINED = {
     "index.html": {
         "stop.js": (b'<script src="page/stop.js"></script>', "script"),
         "style.css": (b'<link rel="stylesheet" href="page/style.css">', "style"),
     }
 }
-"""Maps the name of a page file to the files whose text the server inserts into it.
-
-The inner dict maps the name of each inserted file to a pair: the HTML element that loads the file,
-and the tag of the HTML element with the text of the file. The server replaces the first element
-with the second.
-"""
 
 
 class File(Struct, frozen=True):
@@ -181,29 +162,24 @@ class File(Struct, frozen=True):
 
     kind: str
     body: bytes
-    packed: bytes | None
-    """The body in gzip form, or None if gzip does not make it shorter."""
+    packed: bytes | None  # gzip; None if that is not shorter
     tag: str
-    policy: str
-    """Directives that are appended to the content security policy `POLICY`. They allow the scripts
-    and styles of the files that are included in this file (see `INLINED`)."""
-    stamp: tuple[tuple[int, int], ...]
-    """Pairs of modification time, ns, and size, bytes. The first pair belongs to this file, and the
-    others to the files that are included in it."""
+    policy: str  # Appended to `POLICY`: allows the inserted scripts and styles.
+    stamp: tuple[tuple[int, int], ...]  # (mtime ns, bytes) of this file and of the inserted ones
 
 
 class Files:
-    """Cache of the page's files. A file is read again when it has changed on the disk."""
+    """Cache of the page's files, which reads a file again when it has changed on the disk."""
 
     def __init__(self, directory: Path = PAGE_DIRECTORY) -> None:
         self._directory = directory
         self._files: dict[str, File] = {}
 
     def get(self, name: str) -> File | None:
-        """Return the file `name`, or None if it does not exist, is unreadable or may not be sent.
+        """Return a file, or None if it may not be sent.
 
-        A file may be sent if its suffix is in `CONTENT_TYPES`, its name does not begin with a dot
-        and contains no directory, and the file is not a symbolic link.
+        That is so for another suffix, for a dot first or a path in the name, and for a symbolic
+        link.
         """
         kind = CONTENT_TYPES.get(Path(name).suffix)
         if kind is None or "/" in name or name.startswith("."):
@@ -223,10 +199,6 @@ class Files:
 
 
 def _load_file(paths: Sequence[Path], kind: str, stamp: tuple[tuple[int, int], ...]) -> File:
-    """Read a file of the page, and insert the files that `INLINED` lists for it.
-
-    The first path belongs to the file itself, and the other paths to the inserted files.
-    """
     whole, *parts = paths
     body, policy = whole.read_bytes(), ""
     for part in parts:

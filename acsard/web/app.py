@@ -49,8 +49,8 @@ from acsard.web.streams import as_json
 from acsard.web.tokens import Vault
 from acsard.web.viewer import PING_INTERVAL_S, Parts, Viewer
 
+# Most bodies have a few hundred bytes.
 BODY_TIMEOUT_S = 5.0
-"""Time limit for receiving the body of a request, s. Most bodies have a few hundred bytes."""
 
 
 class TokenForm(Struct, frozen=True):
@@ -84,7 +84,10 @@ class Setting(Struct, frozen=True, omit_defaults=True):
 
 
 class Page:
-    """The web application of the robot's page: the request handlers and the data they share."""
+    """The request handlers of the robot's page, and the data that they share.
+
+    `names` are the robot's host names and addresses, in lower case.
+    """
 
     def __init__(
         self,
@@ -94,39 +97,31 @@ class Page:
         acceptor: Acceptor,
         rules: WebConfig,
     ) -> None:
-        """Create the web application.
-
-        `names` are the robot's host names and addresses, in lower case.
-        """
         self._parts, self._vault, self._acceptor = parts, vault, acceptor
         self._robots, self._files = parts.robots, Files()
         self._box = BlackBox(parts.robots)
         self._websocket_limits, self._camera = WebSocketLimits(), Camera(rules.camera)
         self._has_camera = bool(rules.camera)
+        # Each page file, and when the disk was last checked for a change, on the event loop's
+        # clock.
         self._sent: dict[str, tuple[File, float]] = {}
-        """Maps the name of each page file to a pair: the file, and the time of the server's last
-        check whether the file has changed on the disk, s on the event loop's clock."""
         self._viewers: set[Viewer] = set()
+        # The last read of the token file, which may take any time.
         self._token_read: asyncio.Future[frozenset[str]] | None = None
-        """Task that last read, or still reads, the digests of all valid tokens from the disk. Its
-        duration is not limited."""
         self._admission = Admission(parts.robots.id, names, vault, acceptor, parts.counts, rules)
         self.app = self._admission.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:
-        """End every WebSocket, and stop reading the camera.
-
-        `why` is the reason that the clients receive, with at most 120 characters.
-        """
+        """End every WebSocket for a reason (120 characters at most), and the camera."""
         self._camera.close()
         for viewer in list(self._viewers):
             viewer.end(why)
 
     async def tidy(self) -> None:
-        """Close the connections whose token is not valid any more.
+        """Close the connections whose token is not valid any more. Call this once a second.
 
-        Call this method once a second. If the disk does not answer in time, no token counts as
-        valid. If no thread can be started to read the disk, all connections stay open.
+        If the disk hangs, no token counts as valid. If no thread can be started, all connections
+        stay.
         """
         # While the disk hangs, all calls wait for the same read. Otherwise, each call would leave
         # one more blocked thread.
@@ -172,10 +167,10 @@ class Page:
         return file_answer(request, file)
 
     async def token(self, request: web.Request) -> web.StreamResponse:
-        """Check the token in the request's body, and return it in a cookie that no script can read.
+        """Return the token of the body in a cookie that no script can read.
 
-        Raises `TroubleError` if the browser already has a cookie with more permissions and the
-        field `replace` of the body is false.
+        Raises `TroubleError` if the cookie would replace one with more permissions, unless
+        `replace` is true.
         """
         form = await _token_posted(request)
         if not request.secure:
@@ -258,10 +253,7 @@ class Page:
         return reply(settings_in(msgspec.json.decode(await self._value("config"))))
 
     async def service(self, request: web.Request) -> web.StreamResponse:
-        """Call the robot's service that the path names.
-
-        The arguments of the service are the fields of the JSON object in the request's body.
-        """
+        """Call the robot's service of the path, with the JSON object of the body."""
         verb, call = request.path.removeprefix("/api/srv/"), self._parts.calls.call
         # A stop has no arguments, so it does not wait for a body.
         arguments = {} if verb == "stop" else await _arguments_in(request)
@@ -269,11 +261,7 @@ class Page:
         return reply(answer, 200 if answer.success else 409)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
-        """Wait for a camera picture that the client does not have, and return the picture.
-
-        The client names its last picture in the header `If-None-Match`. If no other picture arrives
-        in time, return an answer with the status 304.
-        """
+        """Return a picture that the client does not have, or 304 if none comes in time."""
         etag = request.headers.get("If-None-Match", "").strip('"')
         begun_ns = clock.steady_ns()
         number = int(etag) if etag.isdecimal() and len(etag) < 16 else 0
@@ -314,10 +302,7 @@ class Page:
 
 
 def settings_in(config: Mapping[str, Any]) -> list[Setting]:
-    """Return the settings that may change while the daemon runs.
-
-    `config` is the daemon's configuration.
-    """
+    """Return the settings that may change while the daemon runs."""
     return [
         Setting(key, value, setting.what, WHEN_TEXTS[setting.when], **_allowed(key))
         for key, value in flat(config)
@@ -421,4 +406,3 @@ ROUTES: tuple[Route, ...] = (
 )  # fmt: skip
 
 OPENAPI_DOCUMENT = msgspec.json.encode(openapi.document(__version__, ROUTES))
-"""The body of the answer to `GET /api`: the OpenAPI document as JSON."""

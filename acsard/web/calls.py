@@ -25,16 +25,14 @@ from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.robots import Robots
 from acsard.web.tasks import shared
 
+# At the same time: queries and calls other than a stop, and stops.
 MAX_CALLS, MAX_STOPS = 16, 32
-"""`MAX_CALLS` is the maximum number of simultaneous queries and service calls; stops do not count.
-`MAX_STOPS` is the maximum number of simultaneous stops of the page's own robot."""
 
+# between two stops that are sent for one client
 MIN_STOP_INTERVAL_S = 0.02
-"""Shortest interval between two stops that the server sends for one client, s."""
 
+# `Client` has a shorter limit, and raises an error with a clear message.
 ANSWER_TIMEOUT_S = 8.0
-"""Time limit for an answer over the bus, s. `Client` has a shorter limit, and raises an error with
-a clear message."""
 
 T = TypeVar("T")
 
@@ -52,9 +50,9 @@ class Calls:
     async def call(
         self, identity: AdmittedClient, verb: str, payload: Mapping[str, Any]
     ) -> ServiceReply:
-        """Call the service `verb` for the client `identity`, and return the reply.
+        """Call a service for a client.
 
-        Raises `RequestRefusedError` if the client may not make this call.
+        Raises `RequestRefusedError` if the client may not do that.
         """
         require(identity, verb)
         client = self._robots.client
@@ -79,11 +77,10 @@ class Calls:
         return reply
 
     async def get(self, name: str) -> tuple[str, bytes]:
-        """Query the last value of a key as JSON, and return the pair (encoding, payload).
+        """Query the last value of a key as JSON: (encoding, payload).
 
-        Raises `MendableError` if there is no connection to the bus, if no answer arrives, or if
-        `MAX_CALLS` calls and queries are running already. Raises `TimeoutError` if the bus is stuck
-        for `ANSWER_TIMEOUT_S`.
+        Raises `MendableError` without bus or answer or if too many calls run, and `TimeoutError` if
+        the bus is stuck.
         """
         client = self._robots.client
         if client is None:
@@ -98,26 +95,20 @@ class Calls:
 
 
 class StopMerger:
-    """Merges the stops that one client requests in quick succession.
+    """Merges the stops of one client in quick succession.
 
-    The server sends the first stop immediately. All stops that the client requests within
-    `MIN_STOP_INTERVAL_S` after a sent stop share the next stop. So none of them is lost.
+    The first is sent at once. All within `MIN_STOP_INTERVAL_S` after a sent one share the next, so
+    none is lost.
     """
 
     def __init__(self) -> None:
+        # Set and removed `MIN_STOP_INTERVAL_S` after a client's last stop.
         self._rests: dict[str, asyncio.Event] = {}
-        """Maps a client to an event. `MIN_STOP_INTERVAL_S` after the last sent stop, the
-        event is removed from this dict and set."""
+        # waits for that event, then sends a stop
         self._next: dict[str, asyncio.Task[ServiceReply]] = {}
-        """Maps a client to the task that waits for the event in `_rests` and then sends a
-        stop."""
 
     async def send_stop(self, name: str, stop: Stop) -> ServiceReply:
-        """Send a stop by calling `stop`, and return the reply.
-
-        If another stop with the same `name` still waits to be sent, return the reply to that stop
-        instead. `name` identifies the client.
-        """
+        """Send a stop, or share the one of the client that waits; return the reply."""
         if name in self._next:
             return await asyncio.shield(self._next[name])
         rest = self._rests.get(name)
@@ -142,9 +133,9 @@ class StopMerger:
 
 
 class Stops:
-    """Limits the stops of the page's own robot to `MAX_STOPS` at the same time.
+    """Limits the stops at the same time.
 
-    All callers beyond this limit share one stop, which is sent when an earlier stop has ended.
+    All further callers share one, sent when an earlier one has ended.
     """
 
     def __init__(self) -> None:
@@ -152,11 +143,7 @@ class Stops:
         self._next: asyncio.Task[ServiceReply] | None = None
 
     async def send_stop(self, call: Callable[[], ServiceReply]) -> ServiceReply:
-        """Send a stop by calling `call`, and return the reply.
-
-        If `MAX_STOPS` stops are running, wait for the next stop, and return the reply to it.
-        All callers that wait get this reply.
-        """
+        """Send a stop by `call`, or wait for the shared one, and return the reply."""
         if not self._room.locked():
             async with self._room:
                 return await in_thread(call, ANSWER_TIMEOUT_S)

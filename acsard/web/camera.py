@@ -18,58 +18,51 @@ from email.message import Message
 import aiohttp
 from msgspec import Struct
 
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Ns
 from acsard.host import clock
 from acsard.host.rate_limits import Places
 from acsard.web.answers import TroubleError
 
+# For a new picture of the camera, and for the limit `SENDS` to let it be sent.
 PICTURE_TIMEOUT_S = 1.0
-"""Time limit, s, for each of two waits: until the camera sends a new picture, and until the limit
-`SENDS` lets the server send the picture to the client."""
 
+# For connecting to the camera's server, and for each wait for its data.
 CONNECT_S, SILENT_S = 3.0, 3.0
-"""Time limits, s: for connecting to the camera's server (`CONNECT_S`), and for each wait for data
-from that server (`SILENT_S`)."""
 
+# Bytes of a picture and of the lines before it. A full HD picture has a few hundred kB.
 MAX_PICTURE, MAX_HEAD = 1_000_000, 4096
-"""Maximum size of a picture (`MAX_PICTURE`), and of the header lines before a picture (`MAX_HEAD`),
-bytes. A full HD picture has a few hundred kB."""
 
+# Pictures that are sent at the same time: in total, and with one token.
 SENDS, SENDS_OF_TOKEN = 8, 2
-"""Maximum number of pictures that the server sends at the same time: in total (`SENDS`), and to the
-clients with one token (`SENDS_OF_TOKEN`)."""
 
+# The page in the browser waits no longer.
 SEND_TIMEOUT_S = 5.0
-"""Time limit for sending a picture, s. The page in the browser waits no longer than this."""
 
 _LENGTH = re.compile(rb"(?im)^content-length:[ \t]*(\d{1,8})[ \t]*\r?$")
 
 
 class Picture(Struct, frozen=True):
-    """One JPEG picture, its number, and its arrival time on the clock `steady_ns`, ns."""
+    """One JPEG picture, its number, and its arrival on the clock `steady_ns`."""
 
     body: bytes
     number: int
-    at_ns: int
+    at_ns: Ns
 
 
 class Parts:
-    """Splits a `multipart/x-mixed-replace` stream into pictures."""
+    """Splits a `multipart/x-mixed-replace` stream into pictures.
+
+    Dashes before the boundary in the content type are ignored.
+    """
 
     def __init__(self, boundary: str) -> None:
-        """Create a splitter for a stream with the boundary `boundary`, from its content type.
-
-        Some servers write the two dashes that precede each boundary in the stream also in the
-        content type. These dashes are ignored.
-        """
         self._end = b"\r\n--" + boundary.strip('"').removeprefix("--").encode()
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> bytes | None:
-        """Process the received bytes `data`, and return the newest picture that they complete.
+        """Return the newest picture that the bytes complete.
 
-        Return None if they complete no picture. Raises `ValueError` if a picture or its header
-        lines are too long.
+        Raises `ValueError` if one is too long.
         """
         self._buffer += data
         newest = None
@@ -104,9 +97,8 @@ class Camera:
 
     def __init__(self, url: str) -> None:
         self._url = url
+        # None after a failure, and 5 s after a client's last request
         self.newest: Picture | None = None
-        """The newest picture. It is None before the first picture, after a failure, and when the
-        last request of a client is more than 5 s old."""
         self._number = 0
         self._trouble = "the camera's stream has no picture yet"
         self._asked_ns = 0
@@ -115,11 +107,9 @@ class Camera:
         self._reading: asyncio.Task[None] | None = None
 
     async def after(self, number: int) -> Picture | None:
-        """Wait for a picture that the client does not have, and return the picture.
+        """Return a picture newer than `number`, or None if none comes in time.
 
-        `number` is the number of the client's last picture, or 0. Return None if the camera sends
-        no other picture within `PICTURE_TIMEOUT_S`. Raises `TroubleError` if no camera is
-        configured, if its stream cannot be read, or if it has not sent any picture yet.
+        Raises `TroubleError` if there is no camera, no readable stream or no picture yet.
         """
         if not self._url:
             raise TroubleError(
@@ -140,11 +130,9 @@ class Camera:
 
     @asynccontextmanager
     async def sending(self, token: str) -> AsyncIterator[None]:
-        """Limit how many pictures are sent at the same time. Send one picture in the `with` block.
+        """Limit the pictures that are sent at the same time.
 
-        If a limit is reached (`SENDS`, `SENDS_OF_TOKEN`), first wait until another picture has been
-        sent. `token` is the client's token. Raises `TroubleError` after a wait of
-        `PICTURE_TIMEOUT_S`.
+        Raises `TroubleError` after too long a wait.
         """
         try:
             async with asyncio.timeout(PICTURE_TIMEOUT_S):

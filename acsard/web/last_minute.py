@@ -13,28 +13,25 @@ from collections.abc import Sequence
 from msgspec import Struct
 
 from acsard.core.messages.schema import RobotState, Twist
-from acsard.core.values import NS_PER_S, WHEELS
+from acsard.core.values import NS_PER_S, WHEELS, Ns
 
 MINUTE_NS = 60 * NS_PER_S
 
+# About one pixel of a plot on a phone.
 STEP_NS = NS_PER_S // 5
-"""Nominal time between two rows of plotted values, ns. In a plot on a phone, this time is about one
-pixel wide."""
 
+# A state may become the next row this early.
 MAX_EARLY_NS = STEP_NS // 4
-"""A state becomes the next row even if it arrives up to this time before the row is due, ns."""
 
 MAX_ROWS = MINUTE_NS // (STEP_NS - MAX_EARLY_NS)
-"""Maximum number of rows in a minute."""
 
 MEASURED_COUNT = 2 + len(WHEELS)
 
+# Measured speeds, commanded twist (2), lateness (2) and voltage (1).
 ROW_LENGTH = MEASURED_COUNT + 5
-"""Number of values in a row: measured speeds (`MEASURED_COUNT`), commanded twist (2), lateness (2)
-and voltage (1)."""
 
+# A plotted line, oldest first; None where the value is unknown.
 Column = Sequence[float | None]
-"""The values of one plotted line, oldest first; None where the value is unknown."""
 
 
 class Plotted(Struct, frozen=True):
@@ -43,43 +40,28 @@ class Plotted(Struct, frozen=True):
     There are about five rows a second. All columns have the same length as `age`.
     """
 
-    age: Sequence[int]
-    """Age of each row, ms."""
-    linear: Column
-    """Measured forward speed, m/s; None without feedback from the board."""
-    angular: Column
-    """Measured turn rate, rad/s, positive to the left."""
-    wished_linear: Column
-    """Commanded forward speed after the limits, m/s. The server knows it only while a viewer is
-    subscribed to `cmd_vel_out`; otherwise the value is None."""
+    age: Sequence[int]  # ms
+    linear: Column  # m/s; None without feedback from the board
+    angular: Column  # rad/s, positive to the left
+    wished_linear: Column  # after the limits; known only while a viewer follows `cmd_vel_out`
     wished_angular: Column
-    """Commanded turn rate after the limits, rad/s. The server knows it only while a viewer is
-    subscribed to `cmd_vel_out`; otherwise the value is None."""
-    wheels: Sequence[Column]
-    """Measured wheel speeds in rad/s: front right, front left, rear left, rear right."""
-    late_p99: Column
-    """99th percentile of the lateness of the daemon's control periods, over the minute before the
-    row, ms."""
+    wheels: Sequence[Column]  # rad/s: front right, front left, rear left, rear right
+    late_p99: Column  # ms, of the minute before the row
     late_max: Column
-    """Maximum lateness of the daemon's control periods, over the minute before the row, ms."""
-    volts: Column
-    """Voltage of the battery, V; None if the board does not report it."""
+    volts: Column  # None if the board does not report it
 
 
 class Minute:
-    """The plotted values of the last minute. All times are in ns on the same monotonic clock."""
+    """The plotted values of the last minute, in the time of one monotonic clock."""
 
     def __init__(self) -> None:
         self._rows: deque[tuple[int, list[float | None]]] = deque(maxlen=MAX_ROWS)
 
-    def due(self, at_ns: int) -> bool:
+    def due(self, at_ns: Ns) -> bool:
         return not self._rows or at_ns - self._rows[-1][0] >= STEP_NS - MAX_EARLY_NS
 
-    def add(self, at_ns: int, state: RobotState, wished: Twist | None) -> None:
-        """Append a row with the values of `state`, which arrived at the time `at_ns`.
-
-        `wished` is the commanded twist after the limits, or None if it is unknown.
-        """
+    def add(self, at_ns: Ns, state: RobotState, wished: Twist | None) -> None:
+        """Append a row for a state of the time `at_ns`; `wished` is the twist after the limits."""
         measured: list[float | None] = [state.linear, state.angular, *state.wheels[: len(WHEELS)]]
         if len(measured) != MEASURED_COUNT:
             measured = [None] * MEASURED_COUNT
@@ -91,8 +73,8 @@ class Minute:
         row = [*measured, *twist, *lateness, volts]
         self._rows.append((at_ns, [None if value is None else round(value, 3) for value in row]))
 
-    def plotted(self, now_ns: int) -> Plotted:
-        """Return the values of the last minute before `now_ns`, as columns."""
+    def plotted(self, now_ns: Ns) -> Plotted:
+        """Return the last minute before `now_ns` as columns."""
         rows = [row for row in self._rows if now_ns - row[0] <= MINUTE_NS]
         columns = [[values[n] for _, values in rows] for n in range(ROW_LENGTH)]
         linear, angular, *wheels, wished_linear, wished_angular, late_p99, late_max, volts = columns

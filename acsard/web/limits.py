@@ -12,91 +12,71 @@ from typing import Generic, TypeVar
 from acsard.host.rate_limits import Places, Rate
 from acsard.web.callers import network_of
 
+# From other machines, and from the robot itself. A browser opens six besides its WebSocket.
 MAX_TCP_CONNECTIONS, MAX_LOCAL_TCP_CONNECTIONS = 256, 96
-"""Maximum number of TCP connections from other machines (`MAX_TCP_CONNECTIONS`), and from the robot
-itself (`MAX_LOCAL_TCP_CONNECTIONS`). A browser opens six connections in addition to its
-WebSocket."""
 
+# Without a valid token from one network, and with one valid token. Further ones with this token
+# count as ones without.
 MAX_TCP_OF_NETWORK, MAX_TCP_OF_TOKEN = 64, 64
-"""`MAX_TCP_OF_NETWORK` is the maximum number of TCP connections without a valid token from one
-network. `MAX_TCP_OF_TOKEN` is the maximum number of TCP connections with the same valid token. Any
-further connection with this token counts as a connection without a valid token."""
 
+# Each token keeps these connections, which one browser needs, even if all places are taken.
 RESERVED_TCP_OF_TOKEN = 7
-"""Number of TCP connections that each token keeps even if the limit on all connections is reached.
-One browser needs this number."""
 
+# From other machines, even if the process may open only few files.
 MIN_TCP_CONNECTIONS = 16
-"""Number of TCP connections from other machines that the server always allows, even if the process
-may open only few files."""
 
+# Files for other uses than connections. About 20 are always open.
 RESERVED_FILES = 128
-"""Number of open files that are reserved for uses other than TCP connections. About 20 such
-files are always open."""
 
+# Above this, a client's next request waits, and its WebSocket gets no new values. asyncio's default
+# for TLS is 512 KiB.
 MAX_UNREAD_BYTES = 32768
-"""Number of bytes that the server buffers for a client that does not read them. Above this number,
-the client's next request waits, and the client's WebSocket gets no new values. asyncio's default
-for TLS is 512 KiB."""
 
+# Messages beyond `MESSAGE_RATE` after which a WebSocket is closed.
 MAX_OVERRUNS = 600
-"""The server closes a WebSocket after this number of messages beyond the limit `MESSAGE_RATE`."""
 
+# From other machines: in total, per network, and per token.
 MAX_WEBSOCKETS, MAX_WEBSOCKETS_OF_NETWORK, MAX_WEBSOCKETS_OF_TOKEN = 100, 20, 30
-"""Maximum numbers of WebSockets from other machines: in total, per network, and per token."""
 
+# So one program cannot lock out other tokens in its network.
 MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK = 6
-"""Maximum number of WebSockets per token in one network. Because of this limit, one program cannot
-lock out other tokens in its network."""
 
+# From the robot itself. Others do not count here.
 MAX_LOCAL_WEBSOCKETS = 20
-"""Maximum number of WebSockets from the robot itself. WebSockets from other machines do not count
-here."""
 
+# HTTP requests per token; the page's static files are exempt.
 REQUEST_RATE = Rate(50.0, 200.0)
-"""Limit on HTTP requests per token, as a rate per second and a largest burst. The page's static
-files are exempt."""
 
+# Stops, pictures and new WebSockets of each token in each network; further ones wait. A page asks
+# for at most 20 pictures a second.
 STOPS, PICTURES, OPENINGS = Rate(50.0, 100.0), Rate(100.0, 200.0), Rate(4.0, 20.0)
-"""Limits on stops, camera pictures and new WebSockets, for each token in each network, as rates per
-second and largest bursts. Requests beyond a limit wait. A page asks for at most 20 pictures a
-second."""
 
+# Requests without a valid token from one network; further ones wait. A phone loads the page with
+# 16, so eight phones behind one address can do so at the same time.
 STRANGER_RATE = Rate(30.0, 150.0)
-"""Limit on requests without a valid token from one network, as a rate per second and a largest
-burst. Requests beyond the limit wait. A phone loads the page with 16 requests, so eight phones
-behind one address can load the page at the same time."""
 
+# TLS handshakes per network; further ones wait. A browser needs six to load the page.
 HANDSHAKE_RATE = Rate(30.0, 100.0)
-"""Limit on TLS handshakes per network, as a rate per second and a largest burst. Handshakes beyond
-the limit wait. A browser needs six to load the page."""
 
+# Delay of a request beyond a rate. An immediate refusal costs as much as an answer.
 REFUSAL_DELAY_S = 0.5
-"""Delay of a request beyond a rate limit, s. Refusing the request immediately would not help,
-because a refusal costs the server as much as an answer."""
 
+# Messages per WebSocket. A client sends a burst when its network returns.
 MESSAGE_RATE = Rate(200.0, 400.0)
-"""Limit on messages per WebSocket, as a rate per second and a largest burst. A client sends a burst
-when its network returns."""
 
+# Per token or local WebSocket; the stick sends 20. 24 WebSockets at 180 commands a second made the
+# daemon drop half of another driver's, because it takes 1000 from this server.
 COMMAND_RATE = Rate(60.0, 120.0)
-"""Limit on commands per token, or per WebSocket from the robot itself, as a rate per second and a
-largest burst. The page's stick sends 20 commands a second, and the daemon accepts 1000 a second
-from this server. Before this limit existed, 24 WebSockets with 180 commands a second each made the
-daemon drop half of the commands of a client that was driving."""
 
+# Wrong tokens from one network, and in total.
 GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
-"""Limits on wrong tokens, from one network and in total, as rates per second and largest bursts."""
 
 
 C = TypeVar("C", bound=Hashable)
 
 
 def sockets_for(files: int) -> int:
-    """Return the maximum number of TCP connections from other machines.
-
-    `files` is the number of files that this process may open.
-    """
+    """Return the most TCP connections from other machines of a process with so many files."""
     # A connection needs two files while it fetches a recording.
     return max(
         MIN_TCP_CONNECTIONS,
@@ -107,40 +87,25 @@ def sockets_for(files: int) -> int:
 class Sockets(Generic[C]):
     """The open TCP connections, up to a maximum number.
 
-    If the maximum is reached, each new connection displaces an older connection:
-
-    1. If there are connections without a valid token, the network with the most of them loses its
-       oldest connection without a valid token.
-    2. If every connection has shown a valid token, the token with the most connections loses its
-       oldest connection. However, if this token has at most `RESERVED_TCP_OF_TOKEN` connections,
-       the new connection is refused instead.
-
-    If a network has `MAX_TCP_OF_NETWORK` connections without a valid token, each new connection
-    from this network displaces the oldest of them, even if the maximum is not reached.
-
-    In these rules, a connection that exceeds `MAX_TCP_OF_TOKEN` counts as a connection without a
-    valid token.
+    If the maximum is reached, each new connection displaces an older one. The network with the most
+    connections without a valid token loses its oldest of them. If every connection has shown a
+    valid token, the token with the most connections loses its oldest. However, if this token has at
+    most `RESERVED_TCP_OF_TOKEN`, the new connection is refused instead. A network with
+    `MAX_TCP_OF_NETWORK` connections without a valid token displaces its own oldest in any case. A
+    connection beyond `MAX_TCP_OF_TOKEN` counts as one without a valid token.
     """
 
     def __init__(self, most: int) -> None:
         self._most = most
+        # without a valid token, by network, oldest first
         self._strangers: dict[str, dict[C, None]] = {}
-        """The connections without a valid token, by network, oldest first."""
         self._networks: dict[C, str] = {}
-        self._known: dict[C, str] = {}
-        """Maps each connection that counts toward the limit of its token (`MAX_TCP_OF_TOKEN`) to
-        this token."""
-        self._shown: dict[C, str] = {}
-        """The last valid token that each connection has shown. A connection beyond the limit
-        `MAX_TCP_OF_TOKEN` is in this dict too."""
+        self._known: dict[C, str] = {}  # those that count toward the limit of their token
+        self._shown: dict[C, str] = {}  # the last valid token, also beyond that limit
         self._tokens: Counter[str] = Counter()
 
     def enter(self, network: str, newcomer: C) -> C | None:
-        """Add the new connection `newcomer`, and return the connection that the caller must close.
-
-        Return None if the caller need not close any connection. If the new connection is refused,
-        do not add it, and return `newcomer` itself. `network` is the network of the client.
-        """
+        """Add a connection, and return the one to close, which may be `newcomer` itself."""
         own = self._strangers.get(network, {})
         victim = None
         if len(own) >= MAX_TCP_OF_NETWORK:
@@ -153,11 +118,7 @@ class Sockets(Generic[C]):
         return victim
 
     def displaced(self) -> C | None:
-        """Remove the connection that must make room for a new connection, and return it.
-
-        Return None if every connection has shown a valid token, and no token has more than
-        `RESERVED_TCP_OF_TOKEN` connections.
-        """
+        """Remove and return the connection that makes room, or None if all may stay."""
         if self._strangers:
             network = max(self._strangers, key=lambda name: len(self._strangers[name]))
             victim = next(iter(self._strangers[network]))
@@ -170,11 +131,10 @@ class Sockets(Generic[C]):
         return victim
 
     def prove(self, connection: C, token: str) -> None:
-        """Record that the connection `connection` has shown the valid token `token`.
+        """Record the valid token of a connection; "" on the robot itself.
 
-        `token` is "" for a client on the robot itself. A later token of the same connection
-        replaces the earlier token, because a browser may get another token. If the later token has
-        `MAX_TCP_OF_TOKEN` connections already, the connection still counts under the earlier token.
+        A later token replaces the earlier one, except that a token with `MAX_TCP_OF_TOKEN`
+        connections gets no further one.
         """
         network, before = self._networks.get(connection), self._known.get(connection)
         if network is None:
@@ -201,17 +161,13 @@ class Sockets(Generic[C]):
         self._fewer(token)
 
     def ended(self, valid: Collection[str]) -> list[C]:
-        """Return the connections whose token is not valid any more.
-
-        `valid` contains all tokens that are valid now. If a connection has shown several tokens,
-        the last of them counts.
-        """
+        """Return the connections whose last token is not in `valid`."""
         return [
             connection for connection, token in self._shown.items() if token and token not in valid
         ]
 
     def strangers(self) -> list[C]:
-        """Return the connections without a valid token, and those beyond `MAX_TCP_OF_TOKEN`."""
+        """Return those without a valid token, and those beyond `MAX_TCP_OF_TOKEN`."""
         return [connection for network in self._strangers.values() for connection in network]
 
     def _fewer(self, token: str) -> None:
@@ -226,10 +182,7 @@ class Sockets(Generic[C]):
 
 
 class WebSocketLimits:
-    """Limits the number of open WebSockets.
-
-    WebSockets from the robot itself are counted separately.
-    """
+    """Limits the open WebSockets; those of the robot itself are counted separately."""
 
     def __init__(self) -> None:
         self._here = Places(MAX_LOCAL_WEBSOCKETS, MAX_LOCAL_WEBSOCKETS)
@@ -245,7 +198,7 @@ class WebSocketLimits:
         return ""
 
     def enter(self, address: str, token: str) -> str:
-        """Count a new WebSocket and return "". If a limit forbids it, return reason and remedy."""
+        """Count a new WebSocket, or return the reason and the remedy."""
         if full := self.refusal(address, token):
             return full
         for places, name, _ in self._places(address, token):
@@ -257,11 +210,6 @@ class WebSocketLimits:
             places.leave(name)
 
     def _places(self, address: str, token: str) -> list[tuple[Places, str, str]]:
-        """Return a triple for each limit that applies to a WebSocket.
-
-        The triple contains the limit, the name under which the limit counts the WebSocket, and the
-        text for the client if the limit is reached.
-        """
         if not token:
             here = f"{MAX_LOCAL_WEBSOCKETS} pages are open on the robot itself: close some"
             return [(self._here, address, here)]

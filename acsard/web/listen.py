@@ -13,34 +13,31 @@ from acsard.host.errors import CertificateError, InUseError, UsageError
 from acsard.host.own_identity import own_addresses
 from acsard.web.callers import is_loopback
 
+# From the requested port on.
 MAX_PORTS_TRIED = 20
-"""Number of TCP ports that the server tries, one after another, from the requested port on."""
 
+# Wildcard addresses: all IPv4 addresses, and all IPv4 and IPv6 addresses of this machine.
 EVERYWHERE_4, EVERYWHERE_6 = "0.0.0.0", "::"
-"""Wildcard addresses: all IPv4 addresses of this machine (`EVERYWHERE_4`), and all IPv4 and IPv6
-addresses of this machine (`EVERYWHERE_6`)."""
 
 
 class Listen(Struct, frozen=True):
     """An address at which the page's server listens."""
 
-    secure: bool
-    """True for HTTPS."""
+    secure: bool  # HTTPS
     host: str
     port: int
 
     @property
     def everywhere(self) -> bool:
-        """Whether this is a wildcard address."""
         return self.host in (EVERYWHERE_4, EVERYWHERE_6)
 
     @property
     def url(self) -> str:
-        """The URL to open in a browser. For a wildcard address, it contains the machine's name."""
+        """URL to open in a browser, with the machine's name for a wildcard address."""
         return self.url_at(own_name() if self.everywhere else self.host)
 
     def url_at(self, host: str) -> str:
-        """Return the URL of this address with `host` in place of its own host name or address."""
+        """Return the URL with another host."""
         host = f"[{host}]" if ":" in host else host
         return f"http{'s' if self.secure else ''}://{host}:{self.port}/"
 
@@ -53,8 +50,7 @@ def own_name() -> str:
 def parse_listen(text: str) -> Listen:
     """Parse an address such as `https://0.0.0.0:8443`.
 
-    Raises `UsageError` if the address is not valid, or if it has the scheme `http` and is not a
-    loopback address.
+    Raises `UsageError` if it is not valid, or has the scheme `http` and is not a loopback address.
     """
     scheme, _, place = text.removesuffix("/").partition("://")
     host, _, port = place.rpartition(":")
@@ -72,12 +68,10 @@ def parse_listen(text: str) -> Listen:
 
 
 def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
-    """Return the URLs at which other machines can open the page, for an invitation.
+    """Return the HTTPS URLs for other machines, the most likely one to work first.
 
-    The first URL is the most likely to work. IP addresses come before names, because not every
-    phone resolves mDNS names. `listen` are the addresses of the server, of which only those with
-    HTTPS are used. `tls` is the directory of the robot's certificate. Call `require_certificate`
-    first.
+    IP addresses come before names, because not every phone resolves mDNS names. Call
+    `require_certificate` first; `tls` is the directory of the certificate.
     """
     urls: list[str] = []
     ipv4_ports = _ipv4_ports(listen)
@@ -99,18 +93,12 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
 
 
 def page_urls(address: Listen, tls: str) -> list[str]:
-    """Return the URLs of the page at the address `address`, the most reliable URL first.
-
-    `tls` is the directory of the robot's certificate.
-    """
+    """Return the URLs of the page at an address, the most reliable one first."""
     return invitations([address], tls) if address.secure else [address.url]
 
 
 def require_certificate(listen: Sequence[Listen], tls: str) -> None:
-    """Raise `MendableError` if an address in `listen` uses HTTPS without a usable certificate.
-
-    `tls` is the directory of the certificate, or "".
-    """
+    """Raise `MendableError` if an address uses HTTPS and `tls` has no usable certificate."""
     away = [address for address in listen if address.secure]
     if away and not tls:
         raise CertificateError(
@@ -124,29 +112,17 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
 def open_sockets(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socket.socket]]:
     """Open a listening socket at each address; return pairs of the used address and the socket.
 
-    If `next_port` is true and a port is in use, try the next ports, `MAX_PORTS_TRIED` ports in
-    total. The used address contains the port that was free. Raises `InUseError` if no socket can be
-    opened at an address.
+    If `next_port` is true, the next free port of `MAX_PORTS_TRIED` is used. Raises `InUseError`.
     """
     ipv4_ports = _ipv4_ports(listen)
     return [_open_socket(address, next_port, address.port not in ipv4_ports) for address in listen]
 
 
 def _ipv4_ports(listen: Sequence[Listen]) -> set[int]:
-    """Return the ports of the addresses in `listen` whose host is an IPv4 address or a name.
-
-    At these ports, a socket at `::` must not accept IPv4 connections, because another socket
-    accepts them.
-    """
     return {address.port for address in listen if ":" not in address.host}
 
 
 def _open_socket(addr: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:
-    """Open a listening socket at the address `addr`; return the used address and the socket.
-
-    `next_port` is explained at `open_sockets()`. If `both` is true, a socket at `::` accepts IPv4
-    connections too.
-    """
     ports = range(addr.port, min(65536, addr.port + MAX_PORTS_TRIED)) if next_port else [addr.port]
     both = both and addr.host == EVERYWHERE_6 and socket.has_dualstack_ipv6()
     trouble: OSError | None = None

@@ -126,12 +126,12 @@ def _add_state(metrics: Metrics, state: RobotState) -> None:
     metrics.gauges("latency_seconds", what, ("latency", "at"), latencies)
 
 
+# Clients with the most refusals that a log line names.
 MAX_NAMED = 5
-"""Maximum number of clients that a log line about refusals names: those with the most refusals."""
 
+# Counted separately between two log lines, because a client of many addresses could fill the
+# memory.
 MAX_COUNTED_CLIENTS = 1000
-"""Maximum number of clients whose refusals are counted separately between two log lines. Without
-this limit, a client that uses many addresses could fill the memory."""
 
 
 class Counts:
@@ -142,16 +142,14 @@ class Counts:
         self._counts: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()
         self._reported: Counter[str] = Counter()
-        self._origins: Counter[str] = Counter()
-        """Number of refusals since the last call of `new_refusals`, by the client's address and
-        name."""
+        self._origins: Counter[str] = Counter()  # refusals since the last call of `new_refusals`
 
     def add(self, name: str, more: int = 1) -> None:
         with self._lock:
             self._counts[name] += more
 
     def refuse(self, reason: Reason, origin: str = "") -> None:
-        """Count a refusal. `origin` is the client's address and name; "" if it is unknown."""
+        """Count a refusal of the client with an address and a name, if it is known."""
         with self._lock:
             self._refused[reason] += 1
             if origin and (origin in self._origins or len(self._origins) < MAX_COUNTED_CLIENTS):
@@ -166,10 +164,7 @@ class Counts:
             return dict(self._refused)
 
     def new_refusals(self) -> Event | None:
-        """Return a log event about the refusals since the last call of this method.
-
-        Return None if nothing was refused since then.
-        """
+        """Return a log event about the refusals since the last call, if there are any."""
         with self._lock:
             new = self._refused - self._reported
             self._reported = Counter(self._refused)

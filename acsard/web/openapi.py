@@ -20,15 +20,14 @@ from acsard.web.socket_messages import MESSAGE_TYPES
 
 Described = dict[str, Any]
 
+# References to the schemas, by type.
 Refs = dict[Any, Described]
-"""Maps each type to a reference to its schema."""
 
+# Schemas of the messages of clients, and of those of the server.
 TO_ROBOT, FROM_ROBOT = "ToRobot", "FromRobot"
-"""Names of the schemas of the WebSocket messages that clients send (`TO_ROBOT`), and of the
-WebSocket messages that the server sends (`FROM_ROBOT`)."""
 
+# Prefix of the schemas of the values of subscribed keys.
 VALUE_PREFIX = "Value."
-"""Prefix of the names of the schemas that describe the values of subscribed keys."""
 
 SENT_MESSAGES = (
     socket_messages.Hello, socket_messages.DrivenPath, socket_messages.LastMinute,
@@ -36,8 +35,8 @@ SENT_MESSAGES = (
     socket_messages.DaemonUnreachable,
 )  # fmt: skip
 
+# Message types of the keys to which clients can subscribe.
 KEYS = {topic.key: topic.type for topic in FOLLOWED}
-"""Name of the message type of each key to which clients can subscribe, by key."""
 
 
 def _ref(name: str) -> Described:
@@ -49,10 +48,6 @@ def _raw(schema: Described) -> Any:
 
 
 def _value(key: str, kind: str) -> type[Struct]:
-    """Return a new `Struct` type for the WebSocket messages about the bus key `key`.
-
-    Each message contains a value of the key. `kind` is the name of the schema of these values.
-    """
     return msgspec.defstruct(
         VALUE_PREFIX + key.replace("/", "."),
         [
@@ -69,6 +64,7 @@ def _value(key: str, kind: str) -> type[Struct]:
 
 VALUE_MESSAGES = tuple(_value(key, kind) for key, kind in KEYS.items())
 
+# Errors that any path may return, by HTTP status.
 ERRORS = {
     "401": "The token is missing or not valid.",
     "403": (
@@ -78,14 +74,10 @@ ERRORS = {
     "429": "Too many requests, or too many wrong tokens.",
     "default": "Any other failure.",
 }
-"""Description of each error that any path may return, by HTTP status."""
 
 
 def document(version: str, routes: Sequence[Route]) -> Described:
-    """Return the OpenAPI document of the paths `routes`. `version` is the version of acsard.
-
-    Routes without a summary are left out.
-    """
+    """Return the OpenAPI document of the routes that have a summary."""
     described = [row for row in routes if row.summary]
     bodies = [body.kind for row in described for body in row.gives.values()]
     bodies += [row.takes for row in described if row.takes is not None]
@@ -171,10 +163,6 @@ def _messages() -> Described:
 
 
 def _flat(node: Any, before: str) -> Any:
-    """Return `node`, a part of a JSON schema, with references to components instead of to `$defs`.
-
-    The name of each component is the old name with the prefix `before`.
-    """
     if isinstance(node, list):
         return [_flat(item, before) for item in node]
     if not isinstance(node, dict):
@@ -185,10 +173,6 @@ def _flat(node: Any, before: str) -> Any:
 
 
 def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
-    """Return the schemas by name, and the reference to the schema of each type in `kinds`.
-
-    The schemas also describe the types that are nested in these types.
-    """
     # Pass all types to msgspec in one call. Only then does msgspec give different schema names to
     # two types with equal names.
     unique = list(dict.fromkeys(kinds))

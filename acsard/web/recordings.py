@@ -39,18 +39,17 @@ class Recording(Struct, frozen=True):
 class BlackBox:
     """The recordings of the daemon of the page's robot.
 
-    Every method raises `TroubleError` if the recordings cannot be read, for example because they
-    are on another machine.
+    Every method raises `TroubleError` if they cannot be read, for example because they are
+    elsewhere.
     """
 
     def __init__(self, robots: Robots) -> None:
         self._robots = robots
         self._listing: asyncio.Task[list[Recording]] | None = None
-        self._listed_ns = 0
-        """Monotonic time at which the task `_listing` was started, ns."""
+        self._listed_ns = 0  # start of the task `_listing`
 
     async def rows(self) -> list[Recording]:
-        """Return all recordings, oldest first. The list may be up to `MIN_LIST_INTERVAL_NS` old."""
+        """Return all recordings, oldest first, as they were `MIN_LIST_INTERVAL_NS` ago or later."""
         # All requests within `MIN_LIST_INTERVAL_NS` share one list. Otherwise, a client that
         # requests the list all the time would use so much processor time that the stops of other
         # clients are late.
@@ -98,10 +97,7 @@ class BlackBox:
 
 
 def rows(directory: Path) -> list[Recording]:
-    """Return all recordings in a directory, oldest first. Raises `OSError` if reading fails.
-
-    If the directory does not exist, return [].
-    """
+    """Return all recordings in a directory, oldest first. Raises `OSError`."""
     recordings = []
     for path in _files(directory):
         # The daemon may rename or delete a file meanwhile.

@@ -19,7 +19,7 @@ from acsard.core.config.settings import RatesConfig
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import Info, PoseStamped, RobotState, Twist, TwistStamped
 from acsard.core.thinning import Place, Track
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Ns
 from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
 from acsard.host.threads import NoThreadError, in_thread
@@ -28,24 +28,20 @@ from acsard.web.metrics import Counts
 from acsard.web.streams import DECLARE_TIMEOUT_S, NOT_READY_ERRORS, Stream, Streams
 
 PROCESS_PERIOD_S = 0.1
-"""Interval at which the server processes the states that have arrived, s."""
 
+# After a daemon did not answer.
 RETRY_DELAY_S = 1.0
-"""Delay before the next attempt to reach a daemon that does not answer, s."""
 
+# Between two queries of `About`: after an answer, and after none.
 ABOUT_PERIOD_S, ABOUT_RETRY_S = 10.0, 1.0
-"""Delay before the next query of the values of `About`, s: after a query that the daemon has
-answered (`ABOUT_PERIOD_S`), and after a query without an answer (`ABOUT_RETRY_S`)."""
 
+# Of the drawn path: age and number of its points, and the least distance of two.
 PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.02
-"""Limits of the path that the page draws: maximum age of a point, s (`PATH_S`), maximum number of
-points (`PATH_POINTS`), and minimum distance between two points, m (`PATH_STEP_M`)."""
 
 T = TypeVar("T")
 
+# Blocks until the daemon is connected. Raises `UnreachableError`.
 Connect = Callable[[], Client]
-"""Function that connects to the daemon, and blocks until it is connected. It raises
-`UnreachableError` if the daemon is not reachable."""
 
 
 class About(Struct, frozen=True):
@@ -53,15 +49,11 @@ class About(Struct, frozen=True):
 
     version: str
     simulated: bool
-    linear: float
-    """Highest forward speed, m/s."""
-    angular: float
-    """Highest turn rate, rad/s."""
+    linear: float  # highest speed, m/s
+    angular: float  # rad/s
     state_hz: float
-    recordings: str
-    """Directory of the black box on the daemon's machine; "" if the daemon records nothing."""
-    timeouts: Mapping[str, float]
-    """Timeout of each command source, s, by the name of the source."""
+    recordings: str  # directory on the daemon's machine; "" if it records nothing
+    timeouts: Mapping[str, float]  # of the command sources, s
 
 
 def _path() -> Track:
@@ -71,8 +63,6 @@ def _path() -> Track:
 
 
 class _TaskQueries:
-    """Bus client for a `Watch`. Its queries run in threads, so the event loop never waits."""
-
     def __init__(self, client: Client) -> None:
         self.subscribe, self._client = client.subscribe, client
         self._asked: asyncio.Task[None] | None = None
@@ -87,23 +77,20 @@ class _TaskQueries:
 
 
 class Robots:
-    """The connection to the daemon of the page's robot, and the data for a newly opened page."""
+    """The connection to the daemon of the page's robot, and the data for a newly opened page.
+
+    `about` comes from the local configuration until the daemon answers.
+    """
 
     def __init__(self, address: Address, connect: Connect, about: About, counts: Counts) -> None:
-        """Create an instance without a connection. `run()` connects to the daemon.
-
-        `about` contains values from the local configuration, which are used until the daemon
-        answers.
-        """
         self.id, self.endpoint = address.robot_id, address.endpoint
+        # Common name of this server's TLS certificate, a part of the public names of all viewers.
         self.certificate = shown_at(address.endpoint, address.tls)
-        """Common name of the TLS certificate with which this server connects to the bus; "" without
-        TLS. It is a part of the public names of all viewers."""
         self.about = about
         self.client: Client | None = None
         self.streams = Streams()
+        # why the robot is not reachable, or ""
         self.gone = f"no daemon answers at {address.endpoint} yet"
-        """Reason why the robot is not reachable, in words; "" while it is reachable."""
         self._connect, self._counts = connect, counts
         self._paths = {"path": _path(), "truth": _path()}
         self._minute = Minute()
@@ -112,10 +99,9 @@ class Robots:
         self._watch: Watch | None = None
 
     async def run(self) -> None:
-        """Connect to the robot's daemon, and process the robot's states until cancelled.
+        """Connect to the robot's daemon again and again, and process its states until cancelled.
 
-        While the daemon is not reachable, try again every `RETRY_DELAY_S`. Raises `MendableError`
-        if the connection fails for a reason that another attempt cannot change.
+        Raises `MendableError` if another attempt cannot help.
         """
         client = self.client = await self._reached()
         asking = asyncio.create_task(self._ask_again_and_again())
@@ -132,18 +118,17 @@ class Robots:
 
     @property
     def state(self) -> RobotState | None:
-        """The newest state of the robot, or None before the first state."""
+        """Newest state, or None before the first."""
         return None if self._watch is None else self._watch.state
 
     def refresh_about(self) -> None:
-        """Query the values of `about` from the daemon now, before the next regular query."""
+        """Query `about` before the next regular query."""
         self._refresh_requested.set()
 
     def paths(self) -> dict[str, list[tuple[float, float]]]:
-        """Return the points (x, y) of two paths in the last ten minutes, m, by name of the path.
+        """Return the paths of the last ten minutes, points (x, y) in m.
 
-        "path" is the robot's path in the odom frame. "truth" is the true path of a simulated robot,
-        and is empty for a real robot.
+        "path" is the path in the odom frame, and "truth" the true one of a simulated robot.
         """
         return {
             name: [(round(place.x, 3), round(place.y, 3)) for place in path.places()]
@@ -203,19 +188,14 @@ class Robots:
                 self._take_truth(truth, now_ns)
             await asyncio.sleep(PROCESS_PERIOD_S)
 
-    def _take(self, before: RobotState | None, state: RobotState, now_ns: int) -> None:
+    def _take(self, before: RobotState | None, state: RobotState, now_ns: Ns) -> None:
         if restarted(before, state):
             self._paths = {name: _path() for name in self._paths}
         self._paths["path"].add(Place(now_ns / NS_PER_S, state.x, state.y, state.yaw))
         if self._minute.due(now_ns):
             self._minute.add(now_ns, state, self._wished(now_ns))
 
-    def _wished(self, now_ns: int) -> Twist | None:
-        """Return the newest twist that the robot was commanded to drive, after the limits.
-
-        Return None if no viewer is subscribed to `cmd_vel_out`, if the newest twist is older than
-        2 s, or if it cannot be decoded.
-        """
+    def _wished(self, now_ns: Ns) -> Twist | None:
         stream = self.streams.followed("cmd_vel_out")
         raw = None if stream is None else stream.raw()
         # A twist that is older than 2 s does not belong to the row that is plotted now.
@@ -230,7 +210,7 @@ class Robots:
         assert self.client is not None
         return await self.streams.follow(self.client, "sim/pose")
 
-    def _take_truth(self, truth: Stream, now_ns: int) -> None:
+    def _take_truth(self, truth: Stream, now_ns: Ns) -> None:
         raw = truth.raw()
         if raw is None:
             return

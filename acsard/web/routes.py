@@ -19,17 +19,15 @@ from acsard.core.values import ROLES, Role
 from acsard.host.rate_limits import Rate
 from acsard.web.limits import REQUEST_RATE, STOPS
 
+# Takes the `Page` and the request.
 Handler = Callable[[Any, Any], Awaitable[Any]]
-"""Coroutine function that takes the `Page` and the request, and returns the answer."""
 
 RECORDINGS_ROLE: Role = "operator"
-"""Lowest role that may download recordings."""
 
 JSON, FORM = "application/json", "application/x-www-form-urlencoded"
 
+# A path parameter with another name matches any text without a slash.
 PARAMETERS = {"type": "[A-Za-z0-9_]{1,80}"}
-"""Regular expression of a path parameter, by the parameter's name. A parameter with any other name
-matches any text without a slash."""
 
 _PARAMETER = re.compile(r"{(\w+)}")
 
@@ -43,44 +41,26 @@ class Problem(Struct, frozen=True):
 class Body(Struct, frozen=True):
     """Description of the body of an answer."""
 
-    what: str
-    """Description for the OpenAPI document."""
-    kind: Any = ""
-    """Type of the body, or the name of a bus message in `SCHEMAS`; "" if it may be any value."""
-    media: str = JSON
-    """Media type of the body; "" for an answer without a body."""
+    what: str  # for the OpenAPI document
+    kind: Any = ""  # type, or name of a bus message in `SCHEMAS`; "" for any value
+    media: str = JSON  # "" for an answer without a body
 
 
 class Route(Struct, frozen=True):
     """A row of the table `app.ROUTES`: a path with an HTTP method, and the rules for its use."""
 
-    method: Literal["GET", "POST"]
-    """HTTP method. A route for "GET" also accepts HEAD."""
-    path: str
-    """Path in the notation of OpenAPI, in which `{name}` is a parameter."""
-    least: Role | None
-    """Lowest role that may use the path. If it is None, every client may use the path, even without
-    a token."""
+    method: Literal["GET", "POST"]  # "GET" also takes HEAD
+    path: str  # in the notation of OpenAPI
+    least: Role | None  # None: also without a token
     handler: Handler
-    summary: str = ""
-    """Description for the OpenAPI document. If it is "", the document leaves the route out."""
-    takes: type | str | None = None
-    """Type of the request's body, or the name of a bus message in `SCHEMAS`; None if there is no
-    body."""
-    forms: tuple[str, ...] = (JSON,)
-    """Media types of the request's body."""
-    gives: Mapping[int, Body] = {}
-    """Maps an HTTP status to the body of the answer. An answer with any other status contains a
-    `Problem`."""
-    rate: Rate = REQUEST_RATE
-    """Limit on the requests with one token. All routes with the same rate share one limit."""
+    summary: str = ""  # "": not in the OpenAPI document
+    takes: type | str | None = None  # type, or name of a bus message in `SCHEMAS`
+    forms: tuple[str, ...] = (JSON,)  # media types of the body
+    gives: Mapping[int, Body] = {}  # by HTTP status; any other one gives a `Problem`
+    rate: Rate = REQUEST_RATE  # with one token; all routes with the same rate share one limit
+    # A request beyond `rate` waits; a POST acts at once, and only its answer waits. The rate then
+    # holds for each token in each network.
     waits: bool = False
-    """True if the server delays a request beyond `rate`; False if it refuses the request.
-
-    If it is True, the server performs a POST immediately and delays only the answer. `rate` then
-    applies to each token in each network separately. So a program cannot use up the limit of a page
-    that uses the same token in another network.
-    """
 
     @property
     def parameters(self) -> list[str]:
@@ -88,7 +68,7 @@ class Route(Struct, frozen=True):
 
     @property
     def pattern(self) -> str:
-        """Path in the notation of aiohttp's router, with a regular expression per parameter."""
+        """Path in the notation of aiohttp's router."""
         patterns = {name: PARAMETERS.get(name, "[^{}/]+") for name in self.parameters}
         return _PARAMETER.sub(lambda match: f"{{{match[1]}:{patterns[match[1]]}}}", self.path)
 

@@ -37,16 +37,13 @@ from acsard.web.tokens import Vault
 from acsard.web.viewer import Parts
 
 TIDY_S = 1.0
-"""Interval of the server's regular tasks, s."""
 
+# Of a request. A browser sends the cookies for all ports of a host in one header, so less could
+# lock it out.
 FIELD_BYTES, FIELDS = 8190, 64
-"""Maximum size of the request line and of each header, bytes (`FIELD_BYTES`), and maximum number of
-headers in a request (`FIELDS`). A browser sends the cookies for all ports of a host in one header,
-so a lower limit on the size could lock out a browser."""
 
+# For zeros to the robot of viewers that drive, and for running requests.
 SHUTDOWN_S = 0.3
-"""Time limit for two tasks at the server's shutdown, s: sending zero velocities for viewers that
-drive a robot, and waiting for running requests."""
 
 
 class ServerOptions(Struct, frozen=True):
@@ -55,13 +52,10 @@ class ServerOptions(Struct, frozen=True):
     config: Config
     address: Address
     listen: tuple[Listen, ...]
-    tls: str
-    """Directory of the robot's certificate, for HTTPS; "" without a certificate."""
-    state: Path
-    """Directory that contains the file with the access tokens."""
+    tls: str  # directory of the robot's certificate, or ""
+    state: Path  # directory of the token file
+    # started by the daemon: may use a later port, and ends when its standard input closes
     supervised: bool = False
-    """True if the daemon started this server. Such a server uses a later TCP port if the requested
-    port is in use, and ends when its standard input closes."""
 
 
 async def serve(
@@ -69,8 +63,7 @@ async def serve(
 ) -> None:
     """Run the page's server until a signal arrives, or until the daemon that started it ends.
 
-    `announce` is called with the addresses at which the server listens. Raises `MendableError` if
-    the server cannot start, or cannot connect to the bus.
+    `announce` gets the addresses. Raises `MendableError` if it cannot start or connect to the bus.
     """
     # While another thread holds the interpreter lock, a command or a stop waits for 0.5 ms at most.
     sys.setswitchinterval(0.0005)
@@ -148,10 +141,6 @@ async def _report_refusals(counts: Counts, log: Log) -> None:
 
 
 async def _watch_parent(leaving: asyncio.Event) -> None:
-    """Send signs of life to the parent process, the daemon, until this task is cancelled.
-
-    Set `leaving` when the parent closes this process's standard input.
-    """
     parent, loop = Parent(sys.stdin.fileno()), asyncio.get_running_loop()
 
     def leave_if_parent_is_gone() -> None:
@@ -186,11 +175,6 @@ def _about(options: ServerOptions) -> About:
 
 
 def _certified(options: ServerOptions) -> tuple[ssl.SSLContext | None, set[str]]:
-    """Return the TLS context, and the names and addresses by which others reach this machine.
-
-    Return None and an empty set if no address uses HTTPS. Raises `MendableError` if the certificate
-    is not usable.
-    """
     if not any(address.secure for address in options.listen):
         return None, set()
     require_certificate(options.listen, options.tls)

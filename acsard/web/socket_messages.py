@@ -1,11 +1,9 @@
 """The messages of `/ws`, in both directions. This module is pure.
 
-Each message is one JSON object. A message from a client is called a frame. A frame must contain
-exactly one of the fields in `MESSAGE_TYPES` (`subscribe`, `cmd`, `call`, ...), which gives its
-kind. The server refuses a frame with none or several of these fields, or with an unknown field.
-
-The first field of a message to a client gives its kind. The messages with the values of subscribed
-keys are built in `socket_sender.py`, because these values are JSON already.
+Each message is one JSON object. One from a client, a frame, has exactly one of the fields in
+`MESSAGE_TYPES`, which gives its kind; the server refuses any other, and unknown fields. The first
+field of a message to a client gives its kind. The messages with the values of subscribed keys are
+built in `socket_sender.py`, because these values are JSON already.
 """
 
 from __future__ import annotations
@@ -21,20 +19,18 @@ from acsard.core.messages.signature import MAX_INT64
 from acsard.core.values import AcsardError, Role
 from acsard.web.last_minute import Plotted
 
+# Of a client. A command has about a hundred bytes.
 MAX_MESSAGE_BYTES = 65536
-"""Maximum size of a message from a client, bytes. A command has about a hundred bytes."""
 
+# At which the values of a key are sent: the maximum, and the default.
 MAX_RATE, USUAL_RATE = 50.0, 10.0
-"""Rates at which the server sends the values of a subscribed key, Hz: the maximum (`MAX_RATE`), and
-the default (`USUAL_RATE`)."""
 
+# One day before the largest stamp that the daemon accepts, because the zero for a client that
+# disconnects has a later stamp than its last command.
 MAX_STAMP_MS = MAX_INT64 // 1_000_000 - 86_400_000.0
-"""Every stamp of a command must be below this limit, ms since 1970. The limit is one day before the
-largest stamp that the daemon accepts. This margin is needed because, when a client disconnects, the
-server sends a zero velocity with a later stamp than the client's last command."""
 
+# Of a command that names none. The page in the browser names `teleop`.
 DEFAULT_SOURCE = "app"
-"""Command source of a command that names no source. The page in the browser names `teleop`."""
 
 Short = Annotated[str, Meta(max_length=80)]
 
@@ -51,10 +47,7 @@ class FrameError(AcsardError):
 
 
 class _Frame(Struct, frozen=True, forbid_unknown_fields=True):
-    """Base class of the messages that a client sends. Unknown fields are not allowed."""
-
-    least: ClassVar[Role] = "viewer"
-    """Lowest role that may send the message. A `Call` also requires the role of its service."""
+    least: ClassVar[Role] = "viewer"  # A `Call` also requires the role of its service.
 
     @property
     def kind(self) -> str:
@@ -125,10 +118,10 @@ class Ping(_Frame, frozen=True):
 
 Frame = Subscribe | Unsubscribe | Command | Call | Ping
 
+# By kind, the name of the first field.
 MESSAGE_TYPES: dict[str, type[Frame]] = {
     kind.__struct_fields__[0]: kind for kind in get_args(Frame)
 }
-"""Type of a message from a client, by kind. The kind is the name of the first field."""
 
 _heads = msgspec.json.Decoder(dict[str, msgspec.Raw])
 _decoders: dict[str, msgspec.json.Decoder[Frame]] = {

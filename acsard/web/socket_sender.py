@@ -25,16 +25,14 @@ from acsard.web.robots import RETRY_DELAY_S, Robots
 from acsard.web.socket_messages import Refused, Subscribe, Unsubscribe
 from acsard.web.streams import NOT_READY_ERRORS, VIEWER_KEYS, Stream
 
+# Of reports about refused messages, for each kind of message and each reason.
 REPORT_RATE = Rate(1.0)
-"""Limit on the rate (per second) at which one client gets reports about its refused messages. The
-limit applies to each kind of message and each reason separately."""
 
 
 class Following:
     """A key to which the client is subscribed, and the time at which to send its next value."""
 
     def __init__(self, name: str, period: float) -> None:
-        """Create a subscription to the key `name`, with at most one value per `period` s."""
         self.name, self.period = name, period
         self.head = msgspec.json.encode({"key": name})[:-1] + b',"value":'
         self.stream: Stream | None = None
@@ -48,24 +46,18 @@ class Outgoing:
     def __init__(
         self, socket: web.WebSocketResponse, request: web.Request, counts: Counts, origin: str
     ) -> None:
-        """Create an instance for the WebSocket `socket`, which the request `request` has opened.
-
-        `origin` is the client's address and name for the log.
-        """
         self._socket, self._transport, self._counts = socket, request.transport, counts
         self._origin = origin
-        self.following: dict[str, Following] = {}
-        """Subscriptions by key."""
+        self.following: dict[str, Following] = {}  # by key
         # The queue is limited, because the client may have stopped reading.
         self._out: deque[bytes] = deque(maxlen=200)
-        self._pong: bytes | None = None
-        """Payload of the newest ping that is not answered yet, or None."""
+        self._pong: bytes | None = None  # payload of the newest unanswered ping
         self._news = asyncio.Event()
         self._reports = Buckets(REPORT_RATE)
         self._closing = False
 
     def enqueue(self, message: object) -> None:
-        """Queue a message. If more than 200 messages wait, the oldest message is dropped."""
+        """Queue a message. If more than 200 wait, the oldest one is dropped."""
         self._out.append(msgspec.json.encode(message))
         self._news.set()
 
@@ -73,11 +65,7 @@ class Outgoing:
         self._news.set()
 
     def refuse(self, what: str, reason: Reason, text: str) -> None:
-        """Count a refused message, and report the refusal to the client.
-
-        Reports beyond the limit `REPORT_RATE` are left out. `what` is the kind of the message, and
-        `text` is the reason in words.
-        """
+        """Count a refused message, and report it to the client within `REPORT_RATE`."""
         self._counts.refuse(reason, self._origin)
         if self._reports.take(f"{what} {reason}", clock.mono_ns()):
             self.enqueue(Refused(what, text))
@@ -85,8 +73,8 @@ class Outgoing:
     async def pump(self, look_around: Callable[[float], float]) -> None:
         """Send messages until the task is cancelled or the connection closes.
 
-        After each round of sending, call `look_around` with the present time. It returns the time
-        of its next call. Both times are in s on the event loop's clock.
+        After each round, `look_around` gets the time of the event loop's clock and returns its next
+        one.
         """
         loop = asyncio.get_running_loop()
         try:
@@ -108,10 +96,9 @@ class Outgoing:
             pass  # closing; `Viewer.run` notices
 
     async def close(self, why: str) -> None:
-        """Send a close frame with the reason `why`, and cut the connection 1 s later.
+        """Send a close frame with a reason (120 characters), and cut the connection 1 s later.
 
-        `why` has at most 120 characters. If the connection were cut immediately, many client
-        programs would report a network failure instead of the reason.
+        If it were cut at once, many clients would report a network failure instead of the reason.
         """
         if self._closing:
             return
@@ -123,15 +110,14 @@ class Outgoing:
             await self._socket.send_frame(payload, aiohttp.WSMsgType.CLOSE)
 
     def cut(self) -> None:
-        """End the connection without telling the client the reason."""
+        """End the connection without a reason."""
         self._closing = True
         cut(self._transport)
 
     def pong(self, data: bytes) -> None:
-        """Queue the answer to a ping with the payload `data`.
+        """Queue the answer to a ping.
 
-        The answer replaces an unsent answer to an earlier ping, as the WebSocket protocol allows.
-        Otherwise, a client that sends pings and does not read the answers could fill the memory.
+        It replaces an unsent one, so a client that reads nothing cannot fill the memory.
         """
         self._pong = data
         self._news.set()
@@ -148,11 +134,6 @@ class Outgoing:
             await self._send(self._out.popleft())
 
     async def _send_due(self, subscription: Following, now: float) -> float:
-        """Send the newest value of a key if the value is due and new.
-
-        Return the time at which the next value is due, s on the event loop's clock. `now` is the
-        present time on this clock.
-        """
         stream = subscription.stream
         if stream is None:
             return now + subscription.period  # `Keys._join` wakes the task when the stream exists
@@ -173,16 +154,12 @@ class Outgoing:
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
 
 
+# Sum of all keys of a WebSocket. More would take processor time from the commands.
 MAX_FRAMES_HZ = 300.0
-"""Maximum sum of the message rates of all keys of one WebSocket, Hz. A higher sum would take
-processor time from the commands."""
 
 
 class Keys:
-    """The subscriptions of one WebSocket, which its outgoing side `out` stores.
-
-    The function `start` starts a task, which ends with the WebSocket.
-    """
+    """The subscriptions of one WebSocket. `start` starts a task that ends with it."""
 
     def __init__(
         self,
@@ -193,10 +170,7 @@ class Keys:
         self._out, self._robots, self._start = out, robots, start
 
     def subscribe(self, frame: Subscribe) -> None:
-        """Subscribe to a key, or change the rate of a key that is subscribed already.
-
-        If the message is not valid or exceeds a limit, report the reason to the client instead.
-        """
+        """Subscribe to a key or change its rate, or report to the client why not."""
         key = frame.subscribe
         known = self._out.following.get(key)
         if (refusal := self._refusal(key, frame.rate, known)) is not None:

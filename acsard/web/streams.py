@@ -27,12 +27,11 @@ from acsard.web.tasks import start
 Take = Callable[[zenoh.Sample], None]
 
 VIEWER_KEYS = frozenset(topic.key for topic in FOLLOWED)
-"""Keys to which a viewer may subscribe."""
 
 DECLARE_TIMEOUT_S = 3.0
 
+# The bus is stuck or the session is closed. A later attempt may succeed.
 NOT_READY_ERRORS = (TimeoutError, zenoh.ZError, UsageError)
-"""Errors that mean that the bus is stuck or the session is closed. A later attempt may succeed."""
 
 
 class Stream:
@@ -48,12 +47,12 @@ class Stream:
 
     @property
     def number(self) -> int:
-        """Number of messages that have arrived. It is also the number of the newest message."""
+        """Number of messages so far, and of the newest one."""
         return self._newest[0]
 
     @property
     def at_ns(self) -> int:
-        """Arrival time of the newest message on the clock `steady_ns`, ns."""
+        """Arrival of the newest message on the clock `steady_ns`."""
         return self._newest[2]
 
     def take(self, sample: zenoh.Sample) -> None:
@@ -61,48 +60,35 @@ class Stream:
             self._newest = (self._newest[0] + 1, sample, clock.steady_ns())
 
     def answered(self, sample: zenoh.Sample) -> None:
-        """Store the answer to a query as the first message.
-
-        Ignore the answer if any message has already arrived, because that message may be newer.
-        """
+        """Store the answer to a query, unless a message has arrived, which may be newer."""
         with self._taking:
             if not self._newest[0]:
                 self._newest = (1, sample, clock.steady_ns())
 
     def value(self) -> tuple[int, bytes, float]:
-        """Return a triple for the newest message: its number, its JSON text, and its age in ms.
-
-        Before the first message, the number is 0 and the JSON text is null.
-        """
+        """Return number, JSON text and age in ms of the newest message, 0 and null before it."""
         number, sample, at_ns = self._newest
         if sample is not None and self._text[0] != number:
             self._text = number, as_json(*encoded(sample))
         return number, self._text[1], max(0.0, (clock.steady_ns() - at_ns) / 1e6)
 
     def raw(self) -> tuple[str, bytes] | None:
-        """Return the newest message as the pair (encoding, payload).
-
-        Return None before the first message.
-        """
+        """Return the newest message as (encoding, payload)."""
         sample = self._newest[1]
         return None if sample is None else encoded(sample)
 
 
 class Streams:
-    """Subscriptions to keys of the robot.
-
-    All users of a key share one subscription on the bus, which ends when the last user leaves.
-    """
+    """Subscriptions to keys of the robot, each shared by all its users."""
 
     def __init__(self) -> None:
         self._streams: dict[str, Stream] = {}
         self._ending: set[asyncio.Task[None]] = set()
 
     async def follow(self, client: Client, key: str) -> Stream:
-        """Return the stream of a key. Subscribe to the key if it has no user yet.
+        """Return the stream of a key, for which the caller must call `leave` later.
 
-        The caller must call `leave` after use. Raises one of `NOT_READY_ERRORS` if the bus is stuck
-        or closed.
+        Raises one of `NOT_READY_ERRORS`.
         """
         stream = self._streams.get(key)
         if stream is None:
@@ -118,14 +104,11 @@ class Streams:
         return stream
 
     def followed(self, key: str) -> Stream | None:
-        """Return the stream of a key, or None if the key has no user."""
+        """Return the stream of a key that has a user."""
         return self._streams.get(key)
 
     def leave(self, key: str) -> None:
-        """Remove one user of the stream of a key.
-
-        If no user is left, end the subscription in the background.
-        """
+        """Remove one user of a key; after the last one, the subscription ends in the background."""
         stream = self._streams.get(key)
         if stream is None:
             return
@@ -154,7 +137,7 @@ class Streams:
 
 
 async def attempt(call: Callable[[], object]) -> None:
-    """Make a call that waits for the bus, in a thread. Ignore that the bus is stuck or closed."""
+    """Make a call that waits for the bus, in a thread, even if the bus is stuck or closed."""
     with suppress(*NOT_READY_ERRORS):
         await in_thread(call, DECLARE_TIMEOUT_S)
 

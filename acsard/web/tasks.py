@@ -10,17 +10,16 @@ T = TypeVar("T")
 
 
 def start(work: Coroutine[Any, Any, None], tasks: set[asyncio.Task[None]]) -> None:
-    """Run `work` in a task, for which no caller waits. `tasks` contains the task until it ends."""
+    """Run `work` in a task that `tasks` contains until it ends."""
     task = asyncio.create_task(work)
     tasks.add(task)
     task.add_done_callback(tasks.discard)
 
 
 def shared(work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
-    """Run `work` in a task, and return the task. Each caller awaits it with `asyncio.shield`.
+    """Run `work` in a task, which each caller awaits with `asyncio.shield`.
 
-    All callers may have gone when the task fails. Therefore, this function retrieves the error too,
-    because asyncio logs every error that nothing retrieves.
+    Its error counts as retrieved even if all callers have gone, because asyncio logs any other.
     """
     task = asyncio.create_task(work)
     task.add_done_callback(lambda done: done.cancelled() or done.exception())

@@ -26,11 +26,11 @@ from acsard.web.callers import AdmittedClient
 
 FILE = "tokens.json"
 
+# State directory of the service `acsard-web`.
 SERVICE_DIRECTORY = Path("/var/lib/acsard-web")
-"""State directory of the systemd service that runs `acsard web`."""
 
+# of one robot
 MAX_TOKENS = 200
-"""Maximum number of tokens of one robot."""
 
 
 class Token(Struct, frozen=True):
@@ -39,12 +39,9 @@ class Token(Struct, frozen=True):
     name: str
     role: Role
     digest: str
-    made: int
-    """Creation time, seconds since 1970."""
-    ends: int
-    """Expiry time, seconds since 1970."""
-    robot: str
-    """Id of the robot whose page the token opens."""
+    made: int  # s since 1970
+    ends: int  # s since 1970
+    robot: str  # whose page it opens
 
 
 class Vault:
@@ -52,32 +49,21 @@ class Vault:
 
     def __init__(self, directory: Path, robot: str) -> None:
         self.path, self.robot = directory / FILE, robot
+        # The stamp of the file (mtime ns, inode) when it was read, and its tokens: a tuple, because
+        # several threads replace them.
         self._read: tuple[tuple[int, int] | None, list[Token]] = None, []
-        """Pair: the token file's stamp (modification time, ns, and inode number) when the file was
-        last read, and all tokens in the file. They are in one tuple, because several threads
-        replace them."""
 
     def find_owner(self, text: str) -> AdmittedClient | None:
-        """Return the owner of the token `text`, or None if the token is not valid.
-
-        This method does not read the token file. It uses the tokens that the last call of `all()`,
-        `valid_digests()` or `left_s()` has read.
-        """
+        """Return the owner of a valid token, as of the last call that read the token file."""
         return owner_in(self._own(self._read[1]), text)
 
     def left_s(self, digest: str) -> int:
-        """Return the time until the token with this digest expires, s.
-
-        Return 0 if the token has expired or is unknown.
-        """
+        """Return the time until a token expires; 0 if it has expired or is unknown."""
         ends = [token.ends for token in self.all() if token.digest == digest]
         return max(0, int(max(ends, default=0) - time.time()))
 
     def all(self) -> list[Token]:
-        """Return this robot's tokens, including expired tokens.
-
-        Return [] if the token file does not exist or cannot be read.
-        """
+        """Return this robot's tokens, also expired ones; [] if the file cannot be read."""
         return self._own(self._shared())
 
     def _own(self, tokens: list[Token]) -> list[Token]:
@@ -98,16 +84,11 @@ class Vault:
         return read[1]
 
     def valid_digests(self) -> frozenset[str]:
-        """Return the digests of the tokens that are valid now."""
         now_s = time.time()
         return frozenset(token.digest for token in self.all() if token.ends > now_s)
 
     def unknown_to(self, service: Path = SERVICE_DIRECTORY) -> str:
-        """Return a warning if the service `acsard-web` of this machine ignores these tokens.
-
-        This is the case if the service reads another token file. Return "" if the service reads
-        this token file or is not installed. `service` is the state directory of the service.
-        """
+        """Return a warning if the service `acsard-web` reads another token file, else ""."""
         if self.path.parent == service or not os.path.lexists(service):
             return ""
         return (
@@ -116,11 +97,9 @@ class Vault:
         )
 
     def invite(self, role: Role, name: str, days: int, hours: int = 0) -> tuple[str, Token]:
-        """Create a token that expires after `days` plus `hours`; return the pair (text, record).
+        """Create a token, and return its text, which is stored nowhere, and its record.
 
-        The text is the token itself. The text is not stored, so the caller must show it to the
-        user. Also delete the expired tokens of all robots. Raises `UsageError` if a token of this
-        robot has the same name, or if the robot has `MAX_TOKENS` tokens already.
+        Expired tokens are deleted. Raises `UsageError` for a name in use, or for too many tokens.
         """
         with self._changing() as tokens:
             now_s = int(time.time())
@@ -142,10 +121,7 @@ class Vault:
         return text, token
 
     def revoke(self, name: str) -> None:
-        """Delete the robot's token with this name, so that the token is not valid any more.
-
-        Raises `UsageError` if the robot has no token with this name.
-        """
+        """Delete the robot's token with this name. Raises `UsageError` if there is none."""
         with self._changing() as tokens:
             ours = self._own(tokens)
             if all(token.name != name for token in ours):
@@ -160,11 +136,6 @@ class Vault:
 
     @contextmanager
     def _changing(self) -> Iterator[list[Token]]:
-        """Lock the token file, and yield the list of all robots' tokens.
-
-        The `with` block may change the list. If the block ends without an exception, write the list
-        to the file.
-        """
         directory = self.path.parent
         try:
             directory.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -203,12 +174,7 @@ class Vault:
 
 
 def place() -> Path:
-    """Return the directory of the token file.
-
-    If this process is a systemd service, return the state directory of the service. If it runs as
-    root and `SERVICE_DIRECTORY` exists, return `SERVICE_DIRECTORY`. Otherwise, return a directory
-    for the user's state, usually in the home directory.
-    """
+    """Return the directory of the token file: for the service and for root that of the service."""
     if "STATE_DIRECTORY" in os.environ:
         return Path(os.environ["STATE_DIRECTORY"].partition(":")[0])
     if os.geteuid() == 0 and SERVICE_DIRECTORY.is_dir():
@@ -218,10 +184,7 @@ def place() -> Path:
 
 
 def owner_in(tokens: Sequence[Token], text: str) -> AdmittedClient | None:
-    """Return the owner of the token with the text `text`.
-
-    Return None if the token has expired, or if `tokens` does not contain it.
-    """
+    """Return the owner of a token that is in `tokens` and has not expired."""
     if not text or len(text) > 200:
         return None
     digest, match = _digest(text), None

@@ -45,44 +45,39 @@ from acsard.web.socket_messages import (
 from acsard.web.socket_sender import Keys, Outgoing
 from acsard.web.tasks import start
 
+# The page disables the controls of the actions that its user's role does not allow.
 ACTIONS: dict[str, Role] = {
     **{str(verb): role for verb, role in SERVICE_ROLES.items()},
     "drive": COMMAND_ROLE,
     "recordings": RECORDINGS_ROLE,
 }
-"""Maps the name of each action to the lowest role that may use the action. The page disables the
-controls of those actions that its user may not use."""
 
+# The connection ends if the client does not answer a ping within half of this time.
 PING_INTERVAL_S = 10.0
-"""Interval of the pings that the server sends, s. The connection ends if the client does not answer
-a ping within half of this time."""
 
 MAX_OPEN_CALLS = 8
 
 
 class ViewerCommands:
-    """Sends the newest velocity command of each viewer on the bus.
+    """Sends the newest velocity command of each viewer on the bus, once and with the viewer's
+    stamp.
 
-    Each command is sent at most once, with the stamp that its viewer has given to it. The server
-    itself creates only one kind of command: a zero velocity for a viewer that was driving and has
-    disconnected.
+    The server itself creates only zeros, for a viewer that was driving and has disconnected.
     """
 
     def __init__(self, client: Callable[[], Client | None], counts: Counts) -> None:
         self._client, self._counts = client, counts
         self._rates = Buckets(COMMAND_RATE)
+        # If an error ends its thread, the server must exit: it cannot stop the robot any more when
+        # a viewer disconnects.
         self.outbox = Outbox(partial(counts.add, "commands_dropped"))
-        """Queue of commands, with the thread that sends them. If an error ends the thread, the
-        server must exit, because it cannot stop the robot any more when a viewer disconnects."""
 
     def give(
         self, owner: str, source: str, commander: Commander, sender: CommandSigner, wish: Wish
     ) -> bool:
-        """Queue a command and return True. It replaces an unsent command of the same commander.
+        """Queue a command, which replaces an unsent one, unless the owner exceeds `COMMAND_RATE`.
 
-        If the owner exceeds the rate limit `COMMAND_RATE`, queue nothing and return False. However,
-        a zero command after a nonzero command is always queued. `owner` is the client's token, or
-        the public name of a viewer on the robot itself.
+        A zero after a speed is always queued. `owner` is the token, or the name of a local viewer.
         """
         ends = wish.twist == REST and commander.last_is_nonzero
         if not self._rates.take(owner, clock.mono_ns()) and not ends:
@@ -111,7 +106,7 @@ class ViewerCommands:
 
 
 class Parts:
-    """The objects that `Page` and all viewers share, such as the connection to the daemon."""
+    """What `Page` and all viewers share, such as the connection to the daemon."""
 
     def __init__(self, robots: Robots, counts: Counts) -> None:
         self.robots, self.counts = robots, counts
@@ -136,9 +131,8 @@ class Viewer:
         self._counts = parts.counts
         whole = sender_id(who.name)
         self._sender, self._commanders = CommandSigner(whole), dict[str, Commander]()
+        # Public name, in `state.sender` while the client drives; the sender id stays secret.
         self.sender = public_name(whole, parts.robots.certificate)
-        """Public name of this client, which `state.sender` contains while the client drives. It
-        does not reveal the secret sender id."""
         self._socket = socket
         self._bucket = Bucket(MESSAGE_RATE)
         self._overruns = self._calling = 0
@@ -147,8 +141,7 @@ class Viewer:
         self._tasks: set[asyncio.Task[None]] = set()
         self._stops: set[asyncio.Task[None]] = set()
         self._ended = False
-        self._stamp_ns = -1
-        """Stamp of the last command, ns since 1970; -1 before the first command."""
+        self._stamp_ns = -1  # of the last command
         self._unreachable_reason, self._about = "", parts.robots.about
 
     async def run(self) -> None:
@@ -168,9 +161,9 @@ class Viewer:
             self._keys.leave_all()
 
     def end(self, why: str) -> None:
-        """Stop the robot if this viewer may still be driving it, and close the connection.
+        """Stop the robot if this viewer may still drive it, and close the connection.
 
-        `why` is the reason that the client receives, with at most 120 characters.
+        The client receives the reason, at most 120 characters.
         """
         if self._ended:
             return
@@ -269,7 +262,6 @@ class Viewer:
             self._out.refuse("cmd", "too_fast", text)
 
     def _release(self) -> None:
-        """Queue a zero velocity for each source with which this viewer may still be driving."""
         timeouts = self._robots.about.timeouts
         for source, commander in self._commanders.items():
             self._commands.outbox.release(commander, timeouts.get(source, MAX_SOURCE_TIMEOUT_S))
@@ -285,11 +277,6 @@ class Viewer:
             self._start(self._answer(frame))
 
     def _refuse(self, frame: Frame, text: str) -> None:
-        """Refuse the message `frame`, because the client exceeds a limit. `text` is the reason.
-
-        The client waits for an answer to each call, so send `text` as the answer if the message is
-        a call.
-        """
         if isinstance(frame, Call):
             self._counts.refuse("too_fast", self.who.origin)
             self._out.enqueue(socket_messages.Answer(frame.id, False, text))
@@ -330,10 +317,6 @@ class Viewer:
         self._out.enqueue(socket_messages.Hello(greeting))
 
     def _look_around(self, now: float) -> float:
-        """Report changes to the client, and return the time of the next call.
-
-        `now` is the present time. Both times are in s on the event loop's clock.
-        """
         if self._robots.gone != self._unreachable_reason:
             self._unreachable_reason = self._robots.gone
             if self._unreachable_reason:
