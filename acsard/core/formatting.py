@@ -1,7 +1,6 @@
 """Formats texts and values for people to read.
 
-Before untrusted text is written to a terminal, it must go through `printable`, `lines` or
-`json_line`.
+Untrusted text goes to a terminal only through `printable`, `lines` or `json_line`.
 """
 
 from __future__ import annotations
@@ -13,31 +12,27 @@ from collections.abc import Sequence
 from functools import lru_cache
 from itertools import accumulate
 
-_DAYS_TO_1970 = 719_468
-"""Days from 0000-03-01 to 1970-01-01. `utc` counts years from March, so that the leap day is the
-last day of a year."""
+from acsard.core.values import WallNs
+
+_DAYS_TO_1970 = 719_468  # from 0000-03-01: in years from March, the leap day is the last one
 
 _DAYS_PER_400_YEARS = 146_097
 
 
 def printable(text: str) -> str:
-    """Return the text as one line without control characters, which is safe to print.
-
-    White space becomes " ". Other unprintable characters become U+FFFD.
-    """
+    """Return the text as one line that is safe to print; unprintable characters are U+FFFD."""
     return "".join(" " if c.isspace() else c if c.isprintable() else "\ufffd" for c in text)
 
 
 def lines(text: str) -> str:
-    """Return a text of several lines with `printable` applied to each line."""
+    """Return a text of several lines, each `printable`."""
     return "\n".join(map(printable, text.split("\n")))
 
 
 def printable_bytes(data: bytes, most: int, last: bool = False) -> str:
-    r"""Return bytes as a text of at most `most` characters, with "…" for the bytes left out.
+    r"""Return bytes as text of at most `most` characters, with "…" for those left out.
 
-    If the text is too long, it shows the first bytes, or the last bytes if `last` is true. The "…"
-    is an additional character. An unprintable byte is written as an escape such as `\x00`.
+    It has the first bytes, or the `last` ones. Unprintable bytes are escapes such as `\x00`.
     """
     texts = [repr(bytes([byte]))[2:-1] for byte in (reversed(data) if last else data)]
     ends = accumulate(map(len, texts))
@@ -50,7 +45,7 @@ _ABOVE_ASCII = re.compile(r"[^\x00-\x7e]")
 
 
 def json_line(text: str) -> str:
-    """Escape the unprintable characters of a JSON text without changing the encoded value."""
+    """Escape the unprintable characters of a JSON text, of which the value stays."""
     return _ABOVE_ASCII.sub(
         # JSON writes a character above U+FFFF as two escapes.
         lambda m: m[0] if m[0].isprintable() else json.dumps(m[0])[1:-1],
@@ -61,24 +56,22 @@ def json_line(text: str) -> str:
 def many(count: int, singular: str, more: str = "") -> str:
     """Return a count with its noun, such as `no lines`, `1 line` or `2 changes of mode`.
 
-    `singular` is the noun in the singular, such as `line` or `change of mode`. `more` is the
-    plural. Leave it out if the plural only adds an "s".
+    `more` is a plural without a mere "s".
     """
     noun, of, rest = singular.partition(" of ")
     return f"{count or 'no'} {singular if count == 1 else more or f'{noun}s{of}{rest}'}"
 
 
 def listed(items: Sequence[str], most: int, joint: str = ", ") -> str:
-    """Join the first `most` items with `joint`. If there are more items, append "and N more"."""
+    """Join the first `most` items, with "and N more" if there are more."""
     more = [f"and {len(items) - most} more"] if len(items) > most else []
     return joint.join([*items[:most], *more])
 
 
 def signed(value: float | None, decimals: int, width: int) -> str:
-    """Format a number with its sign, right-aligned in `width` characters.
+    """Format a number with its sign, right-aligned; None and NaN are "-".
 
-    `decimals` is the number of decimals. None and NaN become "-". A number that is too long for
-    `width` is written with one digit and an exponent.
+    One that is too long has one digit and an exponent.
     """
     if value is None or math.isnan(value):
         return "-".rjust(width)
@@ -92,10 +85,7 @@ _UNITS = (("d", 86_400), ("h", 3_600), ("min", 60), ("s", 1))
 
 
 def lasting(seconds: float) -> str:
-    """Format a duration in s with its two largest units, such as "2 h 5 min".
-
-    A duration below 1 min is written with one decimal, such as "7.3 s".
-    """
+    """Format s with the two largest units, such as "2 h 5 min", or "7.3 s" below 1 min."""
     if seconds < 59.95:
         return f"{round(seconds, 1):g} s"
     parts: list[tuple[int, str]] = []
@@ -107,19 +97,17 @@ def lasting(seconds: float) -> str:
     return " ".join(f"{count} {unit}" for count, unit in parts[:2] if count)
 
 
+# Unit, its size in s, and the duration in s of the next row.
 _ROUGH = (
     ("µs", 1e-6, 999.5e-6), ("ms", 1e-3, 0.9995), ("s", 1.0, 99.5), ("min", 60.0, 99.5 * 60),
     ("h", 3600.0, 99.5 * 3600), ("d", 86400.0, math.inf),
 )  # fmt: skip
-"""Units for `rough`. Each row contains a unit, its size in s, and the duration in s at which the
-next row begins."""
 
 
 def rough(seconds: float | None, finest: float = 1.0) -> str:
-    """Format a duration in s with one unit, such as "2.5 min", in at most 7 characters.
+    """Format s with one unit, not below `finest`, such as "2.5 min", in 7 characters.
 
-    `finest` is the size of the smallest unit to use, s. None and infinity become "never". NaN,
-    negative values and values of 1e9 s or more become "?".
+    None and inf are "never"; NaN, negative values and 1e9 s are "?".
     """
     if seconds is None or seconds == math.inf:
         return "never"
@@ -132,8 +120,8 @@ def rough(seconds: float | None, finest: float = 1.0) -> str:
 
 # The daemon publishes the times of up to 36 causes of latches in every step, so they are cached.
 @lru_cache(64)
-def utc(wall_ns: int) -> str:
-    """Return a time, ns since 1970, in the form `2026-11-22 13:05:07 UTC` (Gregorian calendar)."""
+def utc(wall_ns: WallNs) -> str:
+    """Return a time in the form `2026-11-22 13:05:07 UTC` (Gregorian calendar)."""
     days, seconds = divmod(wall_ns // 1_000_000_000, 86_400)
     era, day = divmod(days + _DAYS_TO_1970, _DAYS_PER_400_YEARS)
     year = (day - day // 1_460 + day // 36_524 - day // 146_096) // 365

@@ -1,8 +1,7 @@
 """Containers that store long curves, bands and paths in bounded memory.
 
-A curve is a value over time, a band is a state over time, and a path is a series of poses. Times
-are in s and never decrease. A full container halves its resolution: a curve or a band merges
-neighboring entries, and a path drops places. A curve keeps every peak.
+A curve is a value over time, a band a state over time, a path a series of poses. Times are in s and
+never decrease. A full container halves its resolution; a curve keeps every peak.
 """
 
 from __future__ import annotations
@@ -13,20 +12,15 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import NamedTuple
 
-MAX_BINS = 1500
-"""Largest number of time intervals (bins) of a curve: twice the width of a picture in pixels."""
+MAX_BINS = 1500  # time intervals of a curve: twice the width of a picture in pixels
 
-FIRST_WIDTH = 0.001
-"""Width of a bin in a new curve, s. It is shorter than the interval between the robot's steps, so
-a short recording is not thinned."""
+FIRST_WIDTH = 0.001  # s, shorter than the robot's steps: a short recording is not thinned
 
 MAX_SPANS = 1500
 
 MAX_PLACES = 4000
 
-FIRST_STRIDE = 0.001
-"""Smallest distance between neighboring places in a new path, m. It doubles when the path is
-full."""
+FIRST_STRIDE = 0.001  # m between places of a new path; doubles when it is full
 
 
 class Point(NamedTuple):
@@ -38,23 +32,18 @@ class _Bin(NamedTuple):
     number: int
     low: Point
     high: Point
-    breaks: bool = False
-    """True if the curve has a gap after this bin."""
+    breaks: bool = False  # a gap follows
 
 
 class Curve:
-    """A value over time, divided into time intervals (bins).
-
-    Each bin keeps only the lowest and the highest value.
-    """
+    """A value over time; each interval (bin) keeps its lowest and highest value."""
 
     def __init__(self, most: int = MAX_BINS) -> None:
         self._most, self._bins = most, list[_Bin]()
-        self.width = FIRST_WIDTH
-        """Width of a bin, s. It doubles when the curve has too many bins."""
+        self.width = FIRST_WIDTH  # of a bin, s; doubles when there are too many
 
     def add(self, t: float, value: float | None) -> None:
-        """Add a value at the time `t`, s. If it is None, NaN or infinite, the curve gets a gap."""
+        """Add a value at `t`, s; None, NaN and inf are a gap."""
         bins = self._bins
         if value is None or not math.isfinite(value):
             if bins:
@@ -72,7 +61,7 @@ class Curve:
             self._bins = bins = list(_halved(bins))
 
     def points(self) -> list[Point]:
-        """Return the points to draw, in order. A point with the value NaN marks a gap."""
+        """Return the points to draw, in order; NaN is a gap."""
         points: list[Point] = []
         for _, low, high, breaks in self._bins:
             points += [low] if low == high else sorted((low, high))
@@ -82,10 +71,7 @@ class Curve:
 
 
 def _merged(first: _Bin, other: _Bin) -> _Bin:
-    """Return one bin with the lowest and the highest value of two neighboring bins.
-
-    A gap between the two bins is dropped, because it would be too short to see.
-    """
+    # A gap between them would be too short to see.
     low = other.low if other.low.value < first.low.value else first.low
     high = other.high if other.high.value > first.high.value else first.high
     return _Bin(first.number, low, high, other.breaks)
@@ -105,10 +91,7 @@ def _halved(bins: list[_Bin]) -> Iterator[_Bin]:
 
 
 class Span(NamedTuple):
-    """A time interval in which the state is `kind`. `begin` and `end` are in s.
-
-    `words` is the reason of the state, and `code` its code.
-    """
+    """A time in which the state is `kind`, in s, with its reason in words and its code."""
 
     begin: float
     end: float
@@ -118,17 +101,10 @@ class Span(NamedTuple):
 
 
 class Band:
-    """A state over time, as a series of time spans.
-
-    If there are too many spans, short spans are merged with their neighbors.
-    """
+    """A state over time; short spans merge with neighbors if there are too many."""
 
     def __init__(self, ranks: Sequence[str], most: int = MAX_SPANS) -> None:
-        """Create an empty band that keeps at most `most` spans.
-
-        `ranks` lists the kinds of state, the most important first. If two spans are merged, the
-        result has the more important kind of the two. Raises `ValueError` if `most` is less than 2.
-        """
+        # `ranks` are the kinds, the most important first, which wins a merge. Raises `ValueError`.
         if most < 2:
             raise ValueError(f"a band must keep at least 2 spans, not {most}")
         self._rank = {kind: at for at, kind in enumerate(ranks)}
@@ -136,11 +112,7 @@ class Band:
         self._spans: list[Span] = []
 
     def add(self, t: float, kind: str, words: str = "", code: str = "") -> None:
-        """Record that the state is `kind` from the time `t` s on.
-
-        If `kind` is "", there is no state from this time on. `words` is the reason of the state,
-        and `code` its code.
-        """
+        """Record that the state is `kind` from `t` s on ("": none), for a reason."""
         spans = self._spans
         if spans:
             last = spans[-1] = spans[-1]._replace(end=max(t, spans[-1].end))
@@ -152,11 +124,11 @@ class Band:
             self._spans = spans = self._wider(spans)
 
     def end(self, t: float) -> None:
-        """End the last span at the time `t`, s."""
+        """End the last span at `t`, s."""
         self.add(t, "")
 
     def spans(self) -> list[Span]:
-        """Return the time spans in order. Times in which there is no state are left out."""
+        """Return the spans in order, without times of no state."""
         return [span for span in self._spans if span.kind]
 
     def _wider(self, spans: list[Span]) -> list[Span]:
@@ -173,11 +145,7 @@ class Band:
 
 
 class Place(NamedTuple):
-    """A pose in the frame odom at the time `t`, s: `x` and `y` in m, `yaw` in rad.
-
-    `new` is True if the robot did not drive to this place from the previous place, for example
-    because a client has set the pose.
-    """
+    """A pose in the frame odom, m and rad, at `t`, s; `new` if it was not driven to."""
 
     t: float
     x: float
@@ -187,10 +155,10 @@ class Place(NamedTuple):
 
 
 class Track:
-    """A path that keeps only some of the places that are added to it.
+    """A path that keeps some of its places.
 
-    Each dropped place is less than `2 * self.stride` m away from a kept place. There are two
-    exceptions: the path drops all places that are too old, and all places before a jump.
+    A dropped place is less than `2 * self.stride` m from a kept one, unless it is too old or before
+    a jump.
     """
 
     def __init__(
@@ -200,17 +168,8 @@ class Track:
         lasts: float = math.inf,
         jump: float = math.inf,
     ) -> None:
-        """Create an empty path.
-
-        Args:
-            most: the largest number of kept places. If there are more, the minimum distance is
-                doubled.
-            stride: the minimum distance between neighboring kept places at first, m.
-            lasts: the largest age of a kept place, s. The age of a place is the time from this
-                place to the newest place.
-            jump: a distance, m. If a new place is farther than this from the previous place, all
-                earlier places are dropped.
-        """
+        # `most` places, `stride` m apart at first, for `lasts` s. A step over `jump` m drops all
+        # earlier ones.
         self._most, self._lasts, self._jump = most, lasts, jump
         self._kept = deque[Place]()
         self.stride = stride
@@ -231,7 +190,7 @@ class Track:
             self._kept = places = self._wider(places)
 
     def places(self) -> list[Place]:
-        """Return the kept places in the order of time. The newest place is always included."""
+        """Return the kept places in the order of time, with the newest."""
         last = self._last
         return [*self._kept, *([last] if last and last != self._kept[-1] else [])]
 

@@ -19,11 +19,9 @@ SEARCH_PATHS = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
 
 
 def read(file: Path) -> bytes:
-    """Return the content of a configuration file, but at most `MAX_BYTES` + 1 bytes.
+    """Return at most `MAX_BYTES` + 1 bytes, which `parse` refuses. Raises `OSError`.
 
-    `parse` refuses more than `MAX_BYTES`. The daemon reads the file while it controls the robot, so
-    reading a huge file must not take much memory or time. Raises `OSError` if the file cannot be
-    read.
+    Reading a huge file must not take much memory or time.
     """
     with file.open("rb") as opened:
         return opened.read(MAX_BYTES + 1)
@@ -32,9 +30,8 @@ def read(file: Path) -> bytes:
 def find(path: str | None) -> tuple[str, bytes]:
     """Return the path and the content of the configuration file.
 
-    If `path` is None or "", the file is the one that $ACSARD_CONFIG names. If this variable is not
-    set, it is the first existing file of `SEARCH_PATHS`. If there is no such file, return
-    ("built-in defaults", b""). Raises `ExitError` if the file cannot be read.
+    Without `path`, it is that of $ACSARD_CONFIG, otherwise the first of `SEARCH_PATHS`, otherwise
+    ("built-in defaults", b""). Raises `ExitError`.
     """
     named = path or os.environ.get("ACSARD_CONFIG")
     if named:
@@ -61,11 +58,9 @@ def find(path: str | None) -> tuple[str, bytes]:
 
 
 def writable(path: str | None) -> Path:
-    """Return the path of the configuration file that the options --write and --keep change.
+    """Return the file that --write and --keep change; `path` is that of --config, or None.
 
-    `path` is the value of the option --config, or None. Raises `MendableError` if there is no
-    configuration file, if this user may not change the file, or if the library tomlkit is missing.
-    Raises `MendableError` too if the file is the `acsard.toml` of a clone of acsard.
+    Raises `MendableError`, also for the `acsard.toml` of a clone and without tomlkit.
     """
     require_tomlkit()
     where, text = find(path)
@@ -85,15 +80,11 @@ def writable(path: str | None) -> Path:
     return Path(where)
 
 
-Keys = Mapping[str, object]
-"""Maps dotted keys, such as "mcu.port", to configuration values."""
+Keys = Mapping[str, object]  # values by dotted key, such as "mcu.port"
 
 
 def _target(file: Path, new: bool = False) -> Path:
-    """Return the path of `file` without symbolic links. If `new` is true, the file may be missing.
-
-    Raises `OSError` if the links form a loop, or if the file is missing and `new` is false.
-    """
+    # Without symbolic links; `new` may be missing. Raises `OSError`.
     # `Path.resolve` of Python 3.11 raises RuntimeError for a loop.
     try:
         return Path(os.path.realpath(file, strict=True))
@@ -104,10 +95,7 @@ def _target(file: Path, new: bool = False) -> Path:
 
 
 def _require_writable(place: Path) -> None:
-    """Raise `ValueError` if this process may not replace the file at `place`.
-
-    `place` is a path without symbolic links.
-    """
+    # Raises `ValueError`.
     if not place.is_file():
         raise ValueError("it is not a regular file")
     # Check the mode bits too, because root may write every file, and because replacing a file needs
@@ -126,10 +114,7 @@ def _is_reference(file: Path) -> bool:
 
 
 def require_tomlkit() -> None:
-    """Raise `MendableError` if the library tomlkit is missing.
-
-    A tool that works for a long time should call this first, to avoid failing at the end.
-    """
+    """Raise `MendableError` without tomlkit, before a tool works for long and fails at the end."""
     try:
         import tomlkit  # noqa: F401
     except ImportError:
@@ -139,11 +124,10 @@ def require_tomlkit() -> None:
 
 
 def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False) -> Keys:
-    """Set keys in an `acsard.toml`, and return the keys with their new values.
+    """Set keys in an `acsard.toml`, and return them with their new values.
 
-    `keys` maps the keys to the new values, or is a function that computes this mapping from the
-    file's configuration. If `new` is true, a missing file is created. If the file cannot be
-    changed, raise `MendableError` and leave it unchanged.
+    They may be computed from the file's configuration. `new` may create the file. Raises
+    `MendableError` and then leaves it unchanged.
     """
     try:
         place, text, changes = _changed(file, keys, new)
@@ -156,10 +140,7 @@ def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = Fal
 def require_changeable(
     file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False
 ) -> None:
-    """Raise `MendableError` if `change` would fail with the same arguments.
-
-    A tool that works for a long time should call this first, to avoid failing at the end.
-    """
+    """Raise `MendableError` if `change` would fail, before a tool works for long."""
     try:
         place, _, _ = _changed(file, keys, new)
         if place.exists():

@@ -1,8 +1,7 @@
 """Reads counters of the Linux kernel that show why this computer is slow now.
 
-The counters show undervoltage, heat, clock limits and steal time. A counter reads as 0, and a
-condition as absent, if this kernel does not have the counter's file, or if this user may not read
-it.
+These are undervoltage, heat, clock limits and steal time. A counter that is missing or not readable
+is 0, and a condition absent.
 """
 
 from __future__ import annotations
@@ -13,14 +12,13 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Ns
 
+# Their governor `powersave` follows the load; others keep the lowest frequency.
 SELF_SCALING_DRIVERS = ("intel_pstate", "amd-pstate", "amd-pstate-epp")
-"""The cpufreq drivers whose governor `powersave` adapts the frequency to the load. With every other
-driver, the governor `powersave` keeps the lowest frequency."""
 
+# Begins of types in sysfs that slow a processor down.
 COOLING_TYPES = ("Processor", "cpufreq", "thermal-cpufreq", "thermal-idle", "intel_powerclamp")
-"""Beginnings of the types (in sysfs) of those cooling devices that slow a processor down."""
 
 
 class SlowClock(Struct, frozen=True):
@@ -32,31 +30,26 @@ class SlowClock(Struct, frozen=True):
 
 
 class Conditions(Struct, frozen=True, omit_defaults=True):
-    """Present conditions that slow the processors down: low voltage, heat or a clock limit."""
+    """Present conditions that slow the processors down."""
 
     undervoltage: bool = False
-    slowed_by_heat: bool = False
-    """Whether a cooling device or the firmware slows the processor down now."""
-    throttled: int = 0
-    """Total number of times that the processors have slowed down because of heat."""
+    slowed_by_heat: bool = False  # now, by a cooling device or the firmware
+    throttled: int = 0  # total number of slowdowns by heat
     slow_clock: SlowClock | None = None
 
 
 class Reading(Struct, frozen=True, omit_defaults=True):
-    """The steal time of each processor, and the conditions of the processors, at one moment."""
+    """The steal time and the conditions of the processors at one moment."""
 
+    # Total time of each processor for other work of this virtual machine's host.
     steal_ns: tuple[int, ...] = ()
-    """For each processor, the total time in which the host of this virtual machine ran other work,
-    ns."""
     conditions: Conditions = Conditions()
 
 
-def steal(text: str, tick_ns: int) -> tuple[int, ...]:
-    """Return the steal time of each processor, ns.
+def steal(text: str, tick_ns: Ns) -> tuple[int, ...]:
+    """Return each processor's time for other work of this virtual machine's host.
 
-    In this time, the host of this virtual machine ran other work on the processor. `text` is the
-    content of `/proc/stat`, which counts clock ticks. `tick_ns` is the duration of a clock tick,
-    ns.
+    `text` is `/proc/stat`, in ticks of `tick_ns`.
     """
     rows = [line.split() for line in text.splitlines() if line.startswith("cpu")]
     # The row "cpu" is the sum of all processors.
@@ -64,11 +57,10 @@ def steal(text: str, tick_ns: int) -> tuple[int, ...]:
 
 
 def slow_clock(policy: Mapping[str, str]) -> SlowClock | None:
-    """Return the frequency limit of a processor if the limit is below 0.6 of the full frequency.
+    """Return a frequency limit below 0.6 of the full frequency, or None.
 
-    Otherwise return None. `policy` maps the names of the files in the processor's `cpufreq`
-    directory to their contents. The present frequency is not used, because an idle processor runs
-    slowly anyway.
+    `policy` has the files of `cpufreq`. An idle processor is slow anyway, so the present frequency
+    is no sign.
     """
     governor, limit = policy.get("scaling_governor", ""), policy.get("scaling_max_freq", "")
     if governor == "powersave" and policy.get("scaling_driver") not in SELF_SCALING_DRIVERS:
@@ -85,7 +77,7 @@ class Kernel:
     """Reader of the kernel's counters."""
 
     def __init__(self, root: Path = Path("/")) -> None:
-        """Find the kernel's files below the directory `root`. Only tests pass another `root`."""
+        # Only tests pass another `root`.
         self._stat = root / "proc/stat"
         self._tick_ns = NS_PER_S // os.sysconf("SC_CLK_TCK")
         cpu, hwmon = root / "sys/devices/system/cpu", root / "sys/class/hwmon"
