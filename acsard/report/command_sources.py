@@ -1,7 +1,6 @@
-"""Determines the state of each command source over time.
+"""Determines the state of each command source over time, with a reason in words.
 
-The state says whether the source drove the robot, waited, sent commands without effect, was refused
-or was silent. A reason in words explains the state.
+It drove the robot, waited, sent commands without effect, was refused, or was silent.
 """
 
 from __future__ import annotations
@@ -18,75 +17,43 @@ from acsard.core.values import NS_PER_S, Command, Outputs, Twist
 from acsard.recording.recorded_steps import RecordedStep
 from acsard.report.robot_reader import RobotReader
 
+# Most important first, which wins a merge. `sends`: accepted, but the source does not drive.
 SOURCE_STATES = ("refused", "waits", "sends", "drives")
-"""States of a command source that is not silent, the most important state first.
 
-In the state `sends`, the robot accepts the source's commands, but the source does not drive the
-robot. If spans of time with different states are merged, the result has the most important state.
-"""
+FOLLOWING_MODES = ("ready", "driving")  # in others, the robot follows no source
 
-FOLLOWING_MODES = ("ready", "driving")
-"""Modes in which the robot can follow a command source. In any other mode it follows no source."""
+OTHER_SOURCES = "others"  # all sources that are not in the configuration
 
-OTHER_SOURCES = "others"
-"""Common name in a report for all command sources that are not in the configuration."""
-
+# A change of mode, reason, link or driving source causes an additional sample.
 SAMPLE_PERIOD_S = 0.1
-"""Longest time between two samples of the sources' states, s.
 
-A change of the mode, its reason, the link or the driving source causes an additional sample.
-"""
+MAX_TEXT_LENGTH = 300  # characters
 
-MAX_TEXT_LENGTH = 300
-"""Maximum length of a sentence or name from a recording, characters. The rest is cut off."""
-
-MAX_SENDERS = 256
-"""Maximum number of senders whose last command is kept."""
+MAX_SENDERS = 256  # whose last command is kept
 
 
 class CommandSources:
     """The states of all command sources over time."""
 
     def __init__(self, sources: Sequence[Source], reader: RobotReader) -> None:
-        """Prepare for the first step.
-
-        Args:
-            sources: the sources in the configuration.
-            reader: reads the values of the robot that replays the steps.
-        """
         self._reader = reader
         self._timeouts = {
             source.name: source.timeout for source in sorted(sources, key=lambda s: -s.priority)
         }
+        # Bands by source, the highest priority first.
         self.bands = {name: Band(SOURCE_STATES) for name in (*self._timeouts, OTHER_SOURCES)}
-        """Maps the name of each source to its states over time. Sources with a higher priority come
-        first."""
-        self._newest: dict[tuple[str, str], Command] = {}
-        """Maps the pair (source, sender) to the last command of this sender. The newest command
-        comes last."""
-        self._robot: Robot | None = None
-        """The robot that replayed the last step; None before the first step."""
-        self._counted: Counter[str] = Counter()
-        """Maps each reason for a refusal to the number of commands that `_robot` has refused so far
-        for this reason."""
+        self._newest: dict[tuple[str, str], Command] = {}  # by source and sender, the newest last
+        self._robot: Robot | None = None  # of the last step
+        self._counted: Counter[str] = Counter()  # refusals so far, by reason
+        # Refusals by source: end in s of the report, reason, code.
         self._refused: dict[str, tuple[float, str, str]] = {}
-        """Maps the name of each refused source to a triple: the time at which the refusal ends, s
-        since the first step of the report, the reason in words, and its code."""
 
     def name(self, source: str) -> str:
-        """Return the name of a source, or `OTHER_SOURCES` if the source is not configured."""
+        """Return the name of a source, or `OTHER_SOURCES`."""
         return source if source in self._timeouts else OTHER_SOURCES
 
     def take_commands(self, step: RecordedStep, t: float, robot: Robot) -> bool:
-        """Process the commands of a step.
-
-        Return True if a command was refused. The caller should then call `sample`.
-
-        Args:
-            step: the recorded step.
-            t: the time of the step, s since the first step of the report.
-            robot: the robot, which has just replayed the step.
-        """
+        """Process the commands of a step at `t`; True: one was refused, so call `sample`."""
         commands, before = step.inputs.commands, dict(self._refused)
         for command in commands:
             self._newest.pop((command.source, command.sender), None)
@@ -122,7 +89,7 @@ class CommandSources:
         self._refused[self.name(source)] = until, words[:MAX_TEXT_LENGTH], code
 
     def commanded(self, outputs: Outputs) -> Twist | None:
-        """Return the twist of the command that the robot follows, or None if it follows none."""
+        """Return the twist of the command that the robot follows, or None."""
         if outputs.command_ns is None:
             return None
         for command in reversed(self._newest.values()):
@@ -131,20 +98,14 @@ class CommandSources:
         return None
 
     def sample(self, step: RecordedStep, t: float, robot: Robot) -> None:
-        """Add the present state of each source to `bands`.
-
-        Args:
-            step: the recorded step.
-            t: the time of the step, s since the first step of the report.
-            robot: the robot, which has just replayed the step.
-        """
+        """Add the present state of each source to `bands`."""
         for name, state, words, code in self._states(step, t, robot):
             self.bands[name].add(t, state, words, code)
 
     def _states(
         self, step: RecordedStep, t: float, robot: Robot
     ) -> Iterator[tuple[str, str, str, str]]:
-        """Yield the name, state, reason and code of each source. A silent source has no state."""
+        # Name, state, reason and code; a silent source has no state.
         mode, reason, _, driver, code = step.recorded.status
         for source in self._reader.sources(robot, step.inputs.now.mono_ns):
             refusal, wait = self._refusal(source.name, t), source.waits_for

@@ -1,6 +1,6 @@
 """Draws the pictures of a report: the path of the robot, and all other data over time.
 
-The pictures contain times as ms since 1970 in local time, because plotly does not know time zones.
+Times are ms since 1970 in local time, because plotly does not know time zones.
 """
 
 from __future__ import annotations
@@ -40,68 +40,39 @@ class Line(NamedTuple):
     name: str
     colour: str
     points: Sequence[Point]
-    shape: str = "linear"
-    """Interpolation between two points: a value of plotly's attribute `line.shape`."""
-    width: float = 1.6
-    """Line width, px."""
-    values: Sequence[float] = ()
-    """For each point, the value that the page shows when the user points at it. If `values` is
-    empty, the page shows the values of `points`."""
+    shape: str = "linear"  # plotly's `line.shape`
+    width: float = 1.6  # px
+    values: Sequence[float] = ()  # shown at the pointer, if not those of `points`
 
 
-GAP_PX = 30
-"""Height of the gap above each diagram of a picture, px. The gap holds the diagram's title."""
+GAP_PX = 30  # above each diagram, for its title
 
-UNDER_CURVE_PX = 3.4
-"""Width of a curve that is drawn under another curve, px.
-
-It is larger than the width of the other curve, so that the lower curve stays visible on both sides.
-"""
+UNDER_CURVE_PX = 3.4  # wider than the curve above it, so visible on both sides
 
 
 class Clip(NamedTuple):
-    """An excursion of a curve: a time in which the curve exceeds the scale of its diagram.
+    """A time in which a curve exceeds its diagram's scale, and is drawn at the edge."""
 
-    During an excursion, the curve is drawn at the upper or lower edge of the diagram.
-    """
-
-    t: float
-    """Time at which the excursion begins, s since the first step of the report."""
-    edge: float
-    """Value at the edge of the diagram."""
-    value: float
-    """The largest value of the curve beyond the upper edge, or the smallest value beyond the lower
-    edge."""
+    t: float  # begin, s of the report
+    edge: float  # of the diagram
+    value: float  # furthest beyond the edge
 
 
+# Fraction of the width: closer excursions over an edge are one, with one triangle.
 MIN_MARK_DISTANCE = 0.02
-"""Smallest distance between two excursions, as a fraction of the diagram's width.
-
-Excursions beyond the same edge that are closer count as a single excursion with one triangle.
-"""
 
 # Leave space for a commanded speed that the robot reaches only after a ramp. Limit this space, so
 # that a command of 99 m/s does not flatten the other curves.
-HEADROOM = 0.5
-"""Space in a diagram above and below the limited and measured speeds, as a fraction of the span of
-these speeds."""
+HEADROOM = 0.5  # above and below the limited and measured speeds, as a fraction of their span
 
 
 def clipped(
     points: Sequence[Point], others: Sequence[Sequence[Point]], least: float, gap: float
 ) -> tuple[list[Point], list[Clip]]:
-    """Limit a curve to the scale of a diagram.
+    """Limit a curve to the scale of the others, and return its points and excursions.
 
-    Return a pair: the points of the limited curve, and the excursions of the curve.
-
-    Args:
-        points: the points of the curve. The value NaN makes a gap.
-        others: the other curves in the diagram, which determine the scale. `HEADROOM` is added
-            above and below them.
-        least: a range of values. If the values of the other curves have a smaller range, the scale
-            is computed for the range `least`.
-        gap: a time, s. Excursions beyond the same edge that are at most this time apart count as a
-            single excursion.
+    The scale has `HEADROOM` and covers at least `least`. Excursions over an edge within `gap` s are
+    one.
     """
     values = [0.0, *(p.value for curve in others for p in curve if math.isfinite(p.value))]
     room = HEADROOM * max(max(values) - min(values), least)
@@ -121,32 +92,23 @@ def clipped(
 
 
 class Part(NamedTuple):
-    """A diagram in a picture. All diagrams in a picture share the time axis."""
+    """A diagram in a picture, where all share the time axis."""
 
     title: str
     lines: list[Line]
-    beyond: Sequence[Clip] = ()
-    """The excursions of the first curve in `lines`."""
+    beyond: Sequence[Clip] = ()  # excursions of the first line
 
 
-Row = tuple[str, list[Span]]
-"""A row in the picture of the command sources: its name, and the spans of time that are drawn as
-bands."""
+Row = tuple[str, list[Span]]  # of the picture of the command sources: name, and bands
 
 
 class BandStyle(NamedTuple):
-    """Color and fill pattern of the bands that show one state of a command source over time.
+    """Color and pattern of the bands of one state; each source that drives has its own."""
 
-    The state "drives" has a separate style for each source that drove the robot.
-    """
-
-    kind: str
-    """State that the bands show, such as "waits"."""
-    source: str
-    """Name of the command source if `kind` is "drives"; "" for a style that applies to all rows."""
+    kind: str  # state, such as "waits"
+    source: str  # that drives; "" for all rows
     colour: str
-    pattern: str = ""
-    """Fill pattern, as in `FILL_PATTERNS`."""
+    pattern: str = ""  # one of `FILL_PATTERNS`
 
     @property
     def meaning(self) -> str:
@@ -154,7 +116,7 @@ class BandStyle(NamedTuple):
         return f"{self.source} {self.kind}".strip()
 
     def of(self, row: Row) -> list[Span]:
-        """Return the spans of time in `row` that are drawn as bands with this style."""
+        """Return the spans of a row with this style."""
         name, spans = row
         applies = self.source in ("", name)
         return [span for span in spans if span.kind == self.kind] if applies else []
@@ -180,9 +142,9 @@ def _keys(styles: list[BandStyle]) -> list[Key]:
     ]
 
 
-HEADING_ARROWS = 12
-"""Approximate number of arrows along the path that show the robot's heading."""
+HEADING_ARROWS = 12  # about so many along the path
 
+# Marks by event: symbol in the legend, plotly's name, color.
 EVENT_MARKS = {
     "fault": ("✖", "x", COLOURS["error"]),
     "stop": ("◆", "diamond", COLOURS["warning"]),
@@ -193,12 +155,10 @@ EVENT_MARKS = {
     "link_stale": ("▲", "triangle-up", "#e0b400"),
     "link_late": ("⬟", "pentagon", "#8f4f22"),
 }
-"""Maps the name of each event that is drawn on the path to a triple: the symbol in the legend,
-plotly's name for this symbol, and the color."""
 
 
 def path_figure(data: ReportData) -> Figure:
-    """Return the picture of the robot's path, with the positions of the events in `EVENT_MARKS`."""
+    """Return the picture of the path, with the events in `EVENT_MARKS`."""
     places = data.path.places()
     keys: list[Key] = []
     traces: list[Trace] = []
@@ -256,10 +216,7 @@ def _with_gaps(places: list[Place]) -> list[Place]:
 
 
 def _spread(places: list[Place]) -> list[Place]:
-    """Return the places on the path at which arrows show the robot's heading.
-
-    There are about `HEADING_ARROWS` places, at about equal distances along the path.
-    """
+    # Places of the arrows, about equally far apart.
     distances = [0.0]
     for before, after in pairwise(places):
         metres = 0.0 if after.new else math.hypot(after.x - before.x, after.y - before.y)
@@ -286,13 +243,12 @@ class TimeFigures:
     """Draws the pictures of a report that have a time axis."""
 
     def __init__(self, data: ReportData, offset_s: float) -> None:
-        """Prepare to draw `data`. `offset_s` is local time minus UTC, s."""
+        # `offset_s` is local time minus UTC.
         self._data = data
-        self._zero_ms = 1000 * ((data.began or 0.0) + offset_s)
-        """Local time of the first step of the report, ms since 1970."""
+        self._zero_ms = 1000 * ((data.began or 0.0) + offset_s)  # local time of the first step
 
     def all(self) -> list[Figure]:
-        """Return all pictures of the report in the order of the page, including the path."""
+        """Return all pictures in the order of the page."""
         return [
             path_figure(self._data), self.speeds(), self.sources(), self.events(), self.wheels(),
             self.serial(), self.loop(),
@@ -483,10 +439,7 @@ class TimeFigures:
         return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 44}}
 
     def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
-        """Return a picture of diagrams one below the other, with one time axis.
-
-        Each diagram is `px` px high.
-        """
+        # Diagrams of `px` px, one below the other.
         traces, notes = list[Trace](), list[dict[str, Any]]()
         axes = self._timed()
         axes["margin"] |= {"t": GAP_PX}

@@ -1,9 +1,8 @@
 """Makes the report: one HTML file that needs no other file.
 
-A text of unknown origin cannot become code in the file, because each text passes through `escaped`.
-The pictures are JSON without the character `<`, in a block that browsers do not execute. As a
-second barrier, the file's content security policy allows only the two scripts in the file, which it
-identifies by their hashes. It also forbids the page to load anything.
+No text of unknown origin becomes code: each passes through `escaped`, and the pictures are JSON
+without `<` in a block that browsers do not execute. As a second barrier, the content security
+policy allows only the file's two scripts, by their hashes, and nothing to load.
 """
 
 from __future__ import annotations
@@ -127,31 +126,18 @@ addEventListener("afterprint", () => paper(false));
 """
 
 
-MAX_UNFOLDED_EVENTS = 40
-"""If the report has at most this number of events, the list of events is unfolded when the page
-loads."""
+MAX_UNFOLDED_EVENTS = 40  # unfolded when the page loads
 
 
 def escaped(text: str) -> str:
-    """Return `text` escaped for HTML, so that a browser shows it and never interprets it as markup.
-
-    White space becomes " ", and other unprintable characters become U+FFFD.
-    """
+    """Return text escaped for HTML; unprintable characters are U+FFFD."""
     return html.escape(printable(text))
 
 
 def page(
     data: ReportData, origin: Origin, library: str, clock: Clock, offset_s: float = 0.0
 ) -> str:
-    """Return the report as the text of one HTML file.
-
-    Args:
-        data: the data of the report.
-        origin: the robot and the program that made the recording.
-        library: the JavaScript code of plotly.
-        clock: function that formats a time as local time.
-        offset_s: local time minus UTC, s.
-    """
+    """Return the report as one HTML file; `library` is plotly, `offset_s` local time minus UTC."""
     figures = TimeFigures(data, offset_s).all()
     title = escaped(f"{origin.robot}, {clock(data.began or 0.0, True)}")
     body = [
@@ -190,17 +176,9 @@ def page(
 def make_report(
     recording: Recording, span: Span = WHOLE_SPAN, progress: Progress = no_progress
 ) -> tuple[str, list[str]]:
-    """Replay a recording, and make the report of a part of it.
+    """Replay a part of a recording; return the HTML file and the report's notes.
 
-    Return a pair: the text of the HTML file, and the list of the notes in the report.
-
-    Args:
-        recording: the recording to replay.
-        span: the part of the recording that the report shows.
-        progress: shows the progress. It is called every `PROGRESS_STEPS` steps.
-
-    Raises:
-        RecordingError: the part has no step, or the recording cannot be replayed.
+    Raises `RecordingError`.
     """
     about, replayed = recording.about, DisplayReplay(recording)
     began = about.wall_ns / NS_PER_S

@@ -17,55 +17,37 @@ from acsard.core.formatting import lasting, listed, many
 from acsard.recording.timeline import INCIDENT_WORDS
 from acsard.report.report_data import Mark, ReportData
 
-Clock = Callable[[float, bool], str]
-"""Function that returns a time as text in local time.
+Clock = Callable[[float, bool], str]  # local time of s since 1970, and whether with the date
 
-The first argument is the time in s since 1970. If the second argument is true, the text contains
-the date.
-"""
+MAX_REASONS = 8  # of why sources did not drive
 
-MAX_REASONS = 8
-"""Maximum number of rows in the table of the reasons why command sources did not drive."""
+MAX_POINT_S = 0.05  # a coarser picture gets a note
 
-MAX_POINT_S = 0.05
-"""If a point of a picture covers more than this time, s, the report has a note about it."""
-
-MAX_NAMES = 5
-"""Maximum number of names or texts that are listed in one sentence."""
+MAX_NAMES = 5  # in one sentence
 
 
 class Origin(Struct, frozen=True):
-    """The robot and the program that made a recording."""
-
     file: str
     robot: str
-    version: str
-    """Version of the acsard that made the recording."""
+    version: str  # of acsard
     python: str
-    notes: tuple[str, ...] = ()
-    """Notes for the user, for example about missing parts of the recording."""
+    notes: tuple[str, ...] = ()  # for example about missing parts
 
 
 class Setting(NamedTuple):
-    """A setting that differs from its default. Its values are texts for the report."""
+    """A setting that differs from its default, as texts."""
 
     key: str
-    here: str
-    """Value in the recorded configuration; "-" if the recorded configuration lacks the setting."""
-    default: str
-    """Default value; "-" if the default configuration lacks the setting."""
+    here: str  # "-" if it is missing
+    default: str  # "-" if it is missing
 
 
+# Events in which the board stopped the robot.
 BOARD_STOPS = ("emergency_stop", "bumper_pressed", "battery_stop")
-"""Names of the events in which the board stopped the robot."""
 
 
 def differences(config: Config) -> list[Setting]:
-    """Return the settings in a configuration that differ from their defaults.
-
-    If only the configuration or only the default has a command source, the result includes all
-    settings of this source.
-    """
+    """Return the settings that differ from their defaults, all of an unmatched source."""
     here, default = (dict(flat(effective(each))) for each in (config, Config()))
     return [
         Setting(key, _cell_text(here, key), _cell_text(default, key))
@@ -83,11 +65,7 @@ def _cell_text(table: dict[str, object], key: str) -> str:
 
 
 def summary(data: ReportData) -> str:
-    """Return a summary of the recording in two sentences.
-
-    The first sentence says how far and how fast the robot drove. The second sentence contains the
-    numbers of faults, stops and other incidents.
-    """
+    """Return how far and fast the robot drove, and its incidents, in two sentences."""
     fast, counts = data.fastest, data.marks.counts
     driving_s = sum(driven.seconds for driven in data.driven.values())
     drive = (
@@ -115,11 +93,9 @@ def _names(marks: list[Mark]) -> str:
 
 
 def reasons(data: ReportData) -> list[tuple[str, str, str, float]]:
-    """Return the rows of the table with the reasons why command sources did not drive.
+    """Return source, state, reason and s of why sources did not drive, the longest first.
 
-    Each row contains the source, its state, the reason in words, and the total time for which the
-    reason applied, s. Reasons with the same code share a row. The result contains the
-    `MAX_REASONS` rows with the longest times, the longest first.
+    Reasons with the same code share a row.
     """
     durations: dict[tuple[str, str, str], dict[str, float]] = {}
     for name, band in data.sources.bands.items():
@@ -143,11 +119,7 @@ def _first_of_each(marks: list[Mark], clock: Clock) -> str:
 
 
 def notes(data: ReportData, origin: Origin) -> list[str]:
-    """Return the notes for the user of the report.
-
-    These are the notes of `origin`, and notes about missing steps, about a change of the clock, and
-    about the resolution of the pictures.
-    """
+    """Return the notes of `origin`, and on missing steps, the clock and the resolution."""
     texts = list(origin.notes)
     if data.missing:
         texts.append(
@@ -172,7 +144,7 @@ def notes(data: ReportData, origin: Origin) -> list[str]:
 
 
 def rows(data: ReportData, origin: Origin, clock: Clock) -> Iterator[tuple[str, str]]:
-    """Yield the label and the content of each row of the summary table."""
+    """Yield the label and the content of each row of the summary."""
     began, config = data.began or 0.0, data.config
     yield "When", f"{clock(began, True)} to {clock(data.ended, True)}"
     yield "Duration", f"{lasting(data.seconds)}, {data.steps} steps"

@@ -1,9 +1,8 @@
 """Reads the values that a report needs from the replayed robot, an object of the class `Robot`.
 
-The robot may come from a forged or damaged recorded state, so each of its parts may be wrong. Only
-this module reads the robot, in `with` blocks that report an exception as an error of the recording.
-Each value that leaves the module has the declared type. Therefore an exception in the rest of the
-report is a defect of the report, and not an error of the recording.
+A forged state may make any part wrong, so only this module reads it, in blocks that make an
+exception an error of the recording, and each value that leaves has its type. An exception elsewhere
+is a defect of the report.
 """
 
 from __future__ import annotations
@@ -16,11 +15,10 @@ import msgspec
 
 from acsard.core.motion.arbiter_text import OBJECTIONS
 from acsard.core.robot import Robot
-from acsard.core.values import Outputs, SourceStatus
+from acsard.core.values import Ns, Outputs, SourceStatus
 
+# Raises `RecordingError` for the errors of a wrong recorded state.
 RobotErrors = Callable[[], AbstractContextManager[None]]
-"""Function that returns a context manager, which raises `RecordingError` instead of the errors that
-a wrong recorded state of the robot causes."""
 
 
 class RobotReader:
@@ -30,10 +28,7 @@ class RobotReader:
         self._errors = errors
 
     def check(self, outputs: Outputs) -> None:
-        """Check that all speeds in the outputs have a numeric type.
-
-        A forged recording may contain other types. Infinite speeds and NaN are permitted.
-        """
+        """Check that all speeds in the outputs are numbers (inf and NaN too); a forger may lie."""
         with self._errors():
             for speeds, twist in (
                 (outputs.speeds, outputs.applied),
@@ -43,11 +38,7 @@ class RobotReader:
                     math.isfinite(number)  # raises TypeError for anything but a number
 
     def lines(self, robot: Robot) -> Mapping[str, int]:
-        """Return the robot's counters of lines from the board.
-
-        `lines` counts the readable lines, and each `line_...` counts the lines that were dropped
-        for one reason.
-        """
+        """Return the counters of lines: readable ones, and each `line_...` of dropped ones."""
         with self._errors():
             session = robot.session
             return msgspec.convert(
@@ -60,13 +51,13 @@ class RobotReader:
             )
 
     def refused(self, robot: Robot) -> Mapping[str, int]:
-        """Return how many commands the robot has refused for each reason in `OBJECTIONS`."""
+        """Return how many commands were refused, for each reason in `OBJECTIONS`."""
         with self._errors():
             return msgspec.convert(
                 {name: robot.counters[f"command_{name}"] for name in OBJECTIONS}, dict[str, int]
             )
 
-    def sources(self, robot: Robot, now_ns: int) -> tuple[SourceStatus, ...]:
+    def sources(self, robot: Robot, now_ns: Ns) -> tuple[SourceStatus, ...]:
         """Return the state of each command source at the monotonic time `now_ns`, ns."""
         with self._errors():
             sources = msgspec.to_builtins(robot.snapshot(now_ns).sources)
