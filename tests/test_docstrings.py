@@ -16,7 +16,6 @@ PACKAGE = Path(__file__).parents[1] / "acsard"
 NOT_YET = (
     "cli",
     "core/config",
-    "core/formatting.py",
     "core/incoming",
     "core/motion/consistency.py",
     "core/motion/error_model.py",
@@ -27,10 +26,6 @@ NOT_YET = (
     "core/motion/limits.py",
     "core/motion/odometry.py",
     "core/ros",
-    "core/thinning.py",
-    "host/config_file.py",
-    "host/kernel_counters.py",
-    "report",
 )
 
 TYPES_OF_USERS = ("core/config/settings.py", "core/messages/schema.py", "web/socket_messages.py")
