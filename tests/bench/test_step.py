@@ -53,7 +53,7 @@ ALL = Config(
         right_wheel_radius_multiplier_std=0.002,
         distance_scale_std=0.002,
     ),
-    sim=SimConfig(encoder_counts=400, track_multiplier=1.6, gyro_bias=0.01, gyro_noise=0.005),
+    sim=SimConfig(encoder_counts=400, track_multiplier=1.6),
     mcu=McuConfig(encoder_counts=400, link_check="off"),
 )
 """Every part has work: four parameters, a gyro at 100 Hz, and counts that plain lines show."""

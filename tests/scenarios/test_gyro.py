@@ -6,26 +6,28 @@ import math
 import random
 
 import pytest
-from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, OdometryConfig, SimConfig
 from acsard.core.messages.schema import DiagnosticArray
 from acsard.recording.recorded_steps import StepRecorder
+from tests.scenarios.imperfect_gyro import ImperfectGyro
 from tests.scenarios.world import World
 
-SKIDDING = SimConfig(
-    track_multiplier=1.6, track_rate_dependence=0.08, gyro_bias=0.01, gyro_noise=0.005
-)
+SKIDDING = SimConfig(track_multiplier=1.6)
 
 
 def world(
-    sim: SimConfig = SKIDDING,
+    imperfect: ImperfectGyro | None = None,
     gyro: bool = True,
     recorder: StepRecorder | None = None,
 ) -> World:
     """Return a world whose robot has been at rest for 1.5 s."""
     odometry = OdometryConfig(gyro=True)
-    made = World(Config(odometry=odometry, sim=sim), recorder=recorder)
+    made = World(
+        Config(odometry=odometry, sim=SKIDDING),
+        recorder=recorder,
+        gyro=imperfect or ImperfectGyro(bias=0.01, noise=0.005),
+    )
     made.gyro_dead = not gyro
     made.run(1.5)
     return made
@@ -95,7 +97,7 @@ def test_with_a_gyro_a_long_rotation_in_one_direction_has_a_small_heading_error(
 
 @pytest.mark.slow
 def test_a_gyro_that_is_40_ms_late_has_a_small_heading_error_too() -> None:
-    drive = wandering(world(replace(SKIDDING, gyro_delay=0.04)), 4)
+    drive = wandering(world(ImperfectGyro(bias=0.01, noise=0.005, late=4)), 4)
     print(f"with a late gyro {drive.error:.2%} of {drive.all:.1f} rad")
     assert drive.error < 0.01
     assert drive.world.state.gyro == "used"

@@ -8,7 +8,6 @@ from contextlib import ExitStack
 from typing import Literal
 
 import pytest
-from msgspec.structs import replace
 
 from acsard.core.config.settings import (
     Config,
@@ -21,28 +20,25 @@ from acsard.core.config.settings import (
 from acsard.core.link.feedback import Feedback
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus
 from acsard.core.simulator.faults import Fault
-from acsard.core.simulator.simulated_robot import WatchedMcu
 from acsard.core.values import NS_PER_S, WHEELS, Estimate
+from tests.scenarios.imperfect_gyro import ImperfectGyro
 from tests.scenarios.world import World
 from tests.unit.core.motion.liars import Plain
 
 
 def world(
-    gyro: bool = False, sim: SimConfig | None = None, fault_time: float = 0.0, share: float = 1.0
+    gyro: ImperfectGyro | None = None, sim: SimConfig | None = None, fault_time: float = 0.0
 ) -> World:
-    """Return a world in which a wheel fault latches nothing, so that the robot drives on.
-
-    The gyro reports `share` times the true turn rate.
-    """
+    """Return a world in which a wheel fault latches nothing, so that the robot drives on."""
     feedback = FeedbackConfig(fault_time=fault_time)
     made = World(
         Config(
-            feedback=feedback, odometry=OdometryConfig(gyro=gyro), sim=sim or SimConfig()
-        )
-    )  # fmt: skip
-    if isinstance(made.mcu, WatchedMcu):
-        see = made.mcu._see
-        made.mcu._see = lambda sight: see(replace(sight, gyro=sight.gyro * share))
+            feedback=feedback,
+            odometry=OdometryConfig(gyro=gyro is not None),
+            sim=sim or SimConfig(),
+        ),
+        gyro=gyro,
+    )
     made.run(1.5)
     return made
 
@@ -150,7 +146,7 @@ def test_an_encoder_that_works_again_is_used_again() -> None:
 
 @SLOW
 def test_with_a_gyro_and_a_wheel_fault_heading_and_distance_stay_right() -> None:
-    made = world(gyro=True, sim=SimConfig(track_multiplier=1.6, gyro_bias=0.01))
+    made = world(ImperfectGyro(bias=0.01), SimConfig(track_multiplier=1.6))
     made.drive(0.4, 0.8, seconds=3.0)
     with made.mcu.stuck_encoder(0):
         made.hold(0.4, 0.8, seconds=3.0)
@@ -351,11 +347,12 @@ def test_slip_makes_the_covariance_a_hundred_times_as_large() -> None:
 )
 def test_ordinary_drives_cause_no_wheel_fault(counts: int, seconds: int) -> None:
     """The robot skids on a slippery floor, has coarse encoders, and is sometimes pushed."""
-    sim = SimConfig(encoder_counts=counts, track_multiplier=1.6, turn_slip=0.5)
+    sim = SimConfig(encoder_counts=counts, track_multiplier=1.6)
     made, dice = world(sim=sim, fault_time=0.5), random.Random(counts)
     made.send(0.0)
     made.run(0.1)
     while made.now_ns < (6.5 + seconds) * NS_PER_S:
+        made.mcu.vehicle.turn_slip = dice.uniform(0.0, 0.5)
         made.hold(dice.uniform(-0.6, 1.0), dice.uniform(-3.0, 3.0), dice.uniform(0.5, 3.0))
         made.send(0.0)
         made.run(dice.uniform(0.1, 2.0))
@@ -379,7 +376,7 @@ def test_ordinary_drives_cause_no_wheel_fault(counts: int, seconds: int) -> None
     ],
 )
 def test_a_false_gyro_is_reported_in_the_first_turn_and_never_used(share: float, does: str) -> None:
-    made = world(gyro=True, sim=SimConfig(gyro_noise=0.002, gyro_bias=0.001), share=share)
+    made = world(ImperfectGyro(bias=0.001, noise=0.002, share=share))
     made.run(1.5)
     made.drive(0.2, 0.6, seconds=1.5)
     assert made.state.gyro == does

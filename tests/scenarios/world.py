@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Sequence
 
 import msgspec
+from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
 from acsard.core.incoming.bus_interface import NO_INPUT, BusInput
@@ -31,6 +32,7 @@ from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_rules import LatchKeeper
 from acsard.daemon.pacing import NO_PERIOD, Period
 from acsard.recording.recorded_steps import StepRecorder
+from tests.scenarios.imperfect_gyro import ImperfectGyro
 
 START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
 
@@ -153,6 +155,7 @@ class World:
         latches: Latches = Latches(),  # noqa: B008
         keeper: LatchKeeper | None = None,
         wanted: Collection[str] = (),
+        gyro: ImperfectGyro | None = None,
     ) -> None:
         """Start the daemon. It encodes messages only for the keys in `wanted`.
 
@@ -165,7 +168,7 @@ class World:
         self.next_period_ns = self.now_ns
         self.truth = Pose()
         """True pose, updated every 10 ms, but only with a gyro."""
-        self.gyro_dead = False
+        self.gyro, self.gyro_dead = gyro or ImperfectGyro(), False
         watched = self.config.odometry.gyro
         self.mcu = (
             WatchedMcu(self.config, self.now_ns, self._see)
@@ -207,8 +210,10 @@ class World:
     def _see(self, sight: Observation) -> None:
         self.truth = sight.pose
         if not self.gyro_dead:
-            wall_ns = sight.at_ns + self.wall_offset_ns - int(self.config.sim.gyro_delay * NS_PER_S)
-            message = turn_rate(sight, "base_link", self.config.sim.gyro_noise, wall_ns)
+            wall_ns = sight.at_ns + self.wall_offset_ns - self.gyro.delay_ns
+            made = turn_rate(replace(sight, gyro=self.gyro.rate(sight.gyro)), "base_link", wall_ns)
+            variance = [self.gyro.noise**2 if cell % 4 == 0 else 0.0 for cell in range(9)]
+            message = replace(made, angular_velocity_covariance=variance)
             payload, signed = encode(message, "msgpack"), Signature(SIMULATOR_SENDER).pack()
             self.bus.arrivals.append(
                 Arrival("imu", True, payload, "", sight.at_ns, None, "", "native", signed)

@@ -14,6 +14,8 @@ import itertools
 import random
 from typing import Any
 
+from tests.scenarios.imperfect_gyro import ImperfectGyro
+
 Plan = dict[str, Any]
 
 SAMPLE_S = 0.01
@@ -82,6 +84,10 @@ def _add_hangs(plan: Plan, dice: random.Random) -> None:
         plan["events"].append(event)
 
 
+GYRO_BIAS = 0.01
+"""Bias of the gyro, rad/s."""
+
+
 class GyroFaults:
     """The rates that a gyro reports instead of the measured ones."""
 
@@ -113,3 +119,14 @@ class GyroFaults:
             # It counts for its own interval, and until the next sample it is the present rate.
             self.spoiled += 2.0 * SAMPLE_S * abs(wrong - measured)
         return wrong
+
+
+class FaultyGyro(ImperfectGyro):
+    """The gyro of a plan's robot: it has a bias, noise, a delay of 10 ms, and the plan's faults."""
+
+    def __init__(self, faults: GyroFaults) -> None:
+        super().__init__(bias=GYRO_BIAS, noise=0.005, late=1)
+        self._faults = faults
+
+    def rate(self, true: float) -> float:
+        return self._faults.reported(super().rate(true))

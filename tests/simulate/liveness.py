@@ -263,7 +263,7 @@ class Liveness:
         judge_counts(run.true_ns, product.state(), run.witness.delivered - product.dropped)
         run.reports.judge_junk(run.true_ns, product.state(), product.dropped)
         self.weigh()
-        boots_ns = int((2.5 + run.plan["config"]["sim"].get("boot_time", 0)) * NS)
+        boots_ns = int(2.5 * NS)
         # The last sender of a source keeps it for the source's timeout.
         run.run_to(run.true_ns + max(boots_ns, *run.witness.timeout.values()))
         if "battery" in run.plan["config"]:

@@ -274,7 +274,7 @@ def _config(
             ),
             "wheel_speed": round(dice.uniform(10.0, 40.0), 2),
         },
-        "sim": {"motor_time_constant": round(dice.uniform(0.02, 0.12), 3), "seed": 1},
+        "sim": {"motor_time_constant": round(dice.uniform(0.02, 0.12), 3)},
         "commands": {
             "sources": [
                 {"name": name, "priority": priority, "timeout": dice.choice((0.25, 0.25, 0.5))}
@@ -309,7 +309,6 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
     wheels = ("front_right", "front_left", "rear_left", "rear_right")
     mcu["wheels"] = {w: s + m for w, s, m in zip(wheels, signs, letters, strict=True)}
     sim["encoder_counts"] = counts = dice.choice((96, 400, 1024, 3200))
-    sim["boot_time"] = dice.choice((0.0, 0.0, 0.5, 2.0))
     match dice.randrange(6):
         case 0:
             mcu["link_check"] = "auto"
@@ -338,7 +337,6 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
     ]
     if dice.random() < 0.3:
         config["odometry"] = {"gyro": True}
-        sim.update(gyro_bias=0.01, gyro_noise=0.005, gyro_delay=0.01)
 
 
 def _make_extreme(dice: random.Random, config: dict[str, Any]) -> None:

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-from tests.simulate.gyro_faults import GyroFaults
+from tests.simulate.gyro_faults import GYRO_BIAS, GyroFaults
 from tests.simulate.promises import BrokenError
 from tests.simulate.roads import NS
 
@@ -144,7 +144,6 @@ class PoseWitness:
         self._unproved: float | None = None
         """True turns since the wheels lied, rad, until a gyro has corrected the heading for that.
         None if no correction is possible."""
-        self._bias: float = config.get("sim", {}).get("gyro_bias", 0.0)
         self._hang: Hang | None = None
         """The present hang of the gyro."""
         self._settles_ns = self._settles_at_rest_ns = 0
@@ -191,7 +190,7 @@ class PoseWitness:
         self._spoiled = faults.spoiled
         if faults.hung is not None and self._hang is None:
             self.doubt()
-            self._hang = Hang(now_ns, faults.hung - self._bias)
+            self._hang = Hang(now_ns, faults.hung - GYRO_BIAS)
         elif faults.hung is None and self._hang is not None:
             self._settles_ns = now_ns + SETTLES_NS
             self._settles_at_rest_ns = 0 if self._hang.sure else now_ns

@@ -16,7 +16,6 @@ from itertools import repeat
 from typing import Any
 
 import msgspec
-from msgspec.structs import replace
 
 import acsard
 from acsard.core.config.parsing import ConfigError, parse
@@ -25,7 +24,7 @@ from acsard.core.incoming.queries import Query
 from acsard.core.messages.encodings import encode as encode_message
 from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.simulator.simulated_robot import Observation, WatchedMcu
+from acsard.core.simulator.simulated_robot import WatchedMcu
 from acsard.core.values import Estimate as Measured
 from acsard.core.values import Event, Instant, Latches, Outputs, Received
 from acsard.daemon.latch_rules import (
@@ -40,7 +39,7 @@ from acsard.daemon.latch_rules import (
 )
 from acsard.daemon.pacing import Period
 from tests.scenarios.world import START, World
-from tests.simulate.gyro_faults import GyroFaults
+from tests.simulate.gyro_faults import FaultyGyro, GyroFaults
 
 START_NS = START.mono_ns
 WALL_OFFSET_NS = START.wall_ns - START.mono_ns
@@ -183,17 +182,16 @@ class Product:
         """Called with the key of each sample that the inbox drops: the oldest unread one of it."""
         self.echo = False
         self.gyro = GyroFaults()
+        self._imperfect = FaultyGyro(self.gyro)
         self.unplugged_ns = self.plugged_ns = START_NS
         """When the board was last unplugged, and plugged in: a daemon that starts finds it so."""
-        self._world = World(self._config, keeper=self.disk)
+        self._world = World(self._config, keeper=self.disk, gyro=self._imperfect)
         self._began()
 
     def _began(self) -> None:
         world = self._world
         world.bus.wanted_keys = set()
         world.watch = self._watch
-        if isinstance(world.mcu, WatchedMcu):
-            world.mcu._see = self._sight
         self.dropped = 0
         feed = world.port.feed
 
@@ -202,9 +200,6 @@ class Product:
             feed(received)
 
         world.port.feed = noticed  # type: ignore[method-assign]
-
-    def _sight(self, sight: Observation) -> None:
-        self._world._see(replace(sight, gyro=self.gyro.reported(sight.gyro)))
 
     def _watch(self, outputs: Outputs) -> None:
         world = self._world
@@ -426,12 +421,11 @@ class Product:
             other = World(self._config, plugged=False).mcu
             other._now_ns = other._in_free_ns = other._out_free_ns = self.now_ns
             other._replied_ns = other._fed_ns = self.now_ns
-            other.reset(self.now_ns, int(self._config.sim.boot_time * 1e9))
+            other.reset(self.now_ns, 0)
             other.vehicle.pose = pose
             if isinstance(other, WatchedMcu):
                 other._look_ns = self.now_ns + 10_000_000
-                other._see = self._sight
-                other._history[0] = (self.now_ns, 0.0)
+                other._see = self._world._see
             world.mcu = other
             self.board(self._faults)
         else:
@@ -508,7 +502,9 @@ class Product:
         """Start the daemon again, on the same board."""
         old = self._world
         latches = self.disk.read(old.instant)
-        world = World(self._config, plugged=False, latches=latches, keeper=self.disk)
+        world = World(
+            self._config, plugged=False, latches=latches, keeper=self.disk, gyro=self._imperfect
+        )
         world.now_ns = world.next_period_ns = old.now_ns
         world.wall_offset_ns = old.wall_offset_ns
         world.mcu = old.mcu

@@ -81,7 +81,7 @@ def test_a_daemon_on_a_real_port_publishes_no_true_pose(real: Bus) -> None:
 @pytest.mark.slow
 def test_the_simulated_gyro_corrects_the_odometry_and_is_published_as_imu(tmp_path: Path) -> None:
     tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
-    tables["sim"] = {"track_multiplier": 1.6, "gyro_bias": 0.02}
+    tables["sim"] = {"track_multiplier": 1.6}
     with Daemon(tmp_path, config=tables) as daemon, Bus(daemon.endpoint) as bus:
         until(lambda: bus.state()["gyro"] == "waiting for turn", 10.0, "the gyro knows its bias")
         with bus.follow("imu") as samples, bus.commanding(0.0, 1.0):

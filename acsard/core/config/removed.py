@@ -8,6 +8,7 @@ from __future__ import annotations
 _LIDAR = "describe the lidar in the URDF and set lidar.publish_tf = false"
 _AXES = "remove the key: axes that wheels do not measure always have the variance 1e6"
 _RATE = "remove the key; rates.telemetry is the highest rate of all messages but odom and tf"
+_SIM = "remove the key: the simulated robot has an ideal gyro, even wheels and a dry floor"
 
 REMOVED = {
     "footprint": "remove this table, and give the URDF a fixed joint base_link -> base_footprint",
@@ -26,6 +27,15 @@ REMOVED = {
     "ros.node": 'remove the key: the node is "acsard", and ros.namespace tells robots apart',
     "ros.urdf": "remove the key: robot_state_publisher publishes robot_description",
     "ros.cmd_vel_type": "remove the key: cmd_vel accepts Twist and TwistStamped",
+    "sim.boot_time": _SIM,
+    "sim.left_radius_multiplier": _SIM,
+    "sim.right_radius_multiplier": _SIM,
+    "sim.track_rate_dependence": _SIM,
+    "sim.turn_slip": _SIM,
+    "sim.gyro_bias": _SIM,
+    "sim.gyro_noise": _SIM,
+    "sim.gyro_delay": _SIM,
+    "sim.seed": _SIM,
 }  # One line each: the advice completes the sentence "This setting no longer exists: ..."
 
 

@@ -416,16 +416,7 @@ class WebConfig(Struct, frozen=True):
 class SimConfig(Struct, frozen=True):
     motor_time_constant: Annotated[float, Meta(ge=0.0, le=5.0, extra={"unit": "s"})] = 0.05
     encoder_counts: Annotated[int, Meta(ge=16, le=1_000_000, extra={"unit": "per turn"})] = 3200
-    boot_time: Annotated[float, Meta(ge=0.0, le=10.0, extra={"unit": "s"})] = 0.0
     track_multiplier: Factor = 1.0
-    track_rate_dependence: Annotated[float, Meta(ge=-0.4, le=2.0)] = 0.0
-    left_radius_multiplier: Factor = 1.0
-    right_radius_multiplier: Factor = 1.0
-    turn_slip: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
-    gyro_bias: Annotated[float, Meta(ge=-0.2, le=0.2, extra={"unit": "rad/s"})] = 0.0
-    gyro_noise: Annotated[float, Meta(ge=0.0, le=1.0, extra={"unit": "rad/s"})] = 0.0
-    gyro_delay: Annotated[float, Meta(ge=0.0, le=0.2, extra={"unit": "s"})] = 0.0
-    seed: Annotated[int, Meta(ge=0, le=1_000_000_000)] = 1
     faults: tuple[FaultName, ...] = ()
 
 

@@ -64,9 +64,9 @@ class FakeMcu(Faults):
         self._processing = cycle(PROCESSING_MS)
         self._held = self._batch = b""
         self._in_free_ns = self._out_free_ns = now_ns
-        self._boot_until_ns = now_ns + int(config.sim.boot_time * NS_PER_S)
+        self._boot_until_ns = now_ns
         self._fed_ns = now_ns
-        self._on_ns = self._boot_until_ns
+        self._on_ns = now_ns
         self._angles: list[float] = []
         self._seen: list[int] = []  # counts of the motors a to d at `self._angles`
         self._window = (now_ns, self._encoders())
@@ -88,8 +88,6 @@ class FakeMcu(Faults):
         self._charge = self._capacity = 1.0  # 0 to 1, and ampere seconds
         # When the charge was computed, and when all set points were zero.
         self._drained_ns = self._rested_ns = now_ns
-        if config.sim.boot_time:
-            self._schedule(self._boot_until_ns, "booted", b"")
         self._lasting = ExitStack()
         for text in config.sim.faults:
             self._lasting.enter_context(self.switched_on(named(text)))

@@ -19,10 +19,9 @@ def true_pose(observation: Observation, wall_ns: WallNs) -> PoseStamped:
     return PoseStamped(Header(Time.from_ns(wall_ns), FRAME), where)
 
 
-def turn_rate(observation: Observation, frame: str, deviation: float, wall_ns: WallNs) -> Imu:
-    """Return the gyro's turn rate as an Imu message; `deviation` is of its noise, rad/s."""
-    unknown, variance = [-1.0] + [0.0] * 8, deviation * deviation
-    known = [variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance]
+def turn_rate(observation: Observation, frame: str, wall_ns: WallNs) -> Imu:
+    """Return the gyro's turn rate as an Imu message."""
+    unknown = [-1.0] + [0.0] * 8
     rate = Vector3(z=observation.gyro)
     header = Header(Time.from_ns(wall_ns), frame)
-    return Imu(header, Quaternion(), unknown, rate, known, Vector3(), unknown)
+    return Imu(header, Quaternion(), unknown, rate, [0.0] * 9, Vector3(), unknown)

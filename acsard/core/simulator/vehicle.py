@@ -1,10 +1,7 @@
 """Simulates the robot: four motors with lag, and the motion of the base on the floor.
 
-A motor is a first-order system. The true radii and the true track, which `[sim]` can make different
-from `[drive]`, give the motion. With L the configured effective track, m `track_multiplier`, k
-`track_rate_dependence`, and w the turn rate that the wheels give with the track m L, rad/s, the
-base turns at w / (1 + 2 k |w| / (1 + |w|)). So the true track is m L at very low turn rates, (1 +
-k) m L at 1 rad/s, and approaches (1 + 2 k) m L.
+A motor is a first-order system. The true track, which `[sim]` can make different from `[drive]`,
+gives the motion.
 """
 
 from __future__ import annotations
@@ -13,10 +10,7 @@ import math
 
 from acsard.core.config.settings import DriveConfig, SimConfig
 from acsard.core.motion.path import arc
-from acsard.core.simulator.noise import uniform
 from acsard.core.values import Pose
-
-GRIP_CHANGE_S = 0.25  # the random grip of the wheels on the floor changes so often
 
 PUSH_TIME_CONSTANT_S = 0.1  # of the wheel speeds, towards a person's who pushes the robot
 
@@ -26,13 +20,10 @@ class Vehicle:
 
     def __init__(self, sim: SimConfig, drive: DriveConfig) -> None:
         self._lag = sim.motor_time_constant
-        left, right = sim.left_radius_multiplier, sim.right_radius_multiplier
-        self._left_radius = drive.wheel_radius * drive.left_wheel_radius_multiplier * left
-        self._right_radius = drive.wheel_radius * drive.right_wheel_radius_multiplier * right
+        self._left_radius = drive.wheel_radius * drive.left_wheel_radius_multiplier
+        self._right_radius = drive.wheel_radius * drive.right_wheel_radius_multiplier
         track = drive.wheel_separation * drive.wheel_separation_multiplier
         self._track = track * sim.track_multiplier
-        self._rate_dependence = sim.track_rate_dependence
-        self._floor, self._seed, self._time = sim.turn_slip, sim.seed, 0.0
         self.set_points = [0.0] * 4
         self.speeds = [0.0] * 4
         self.angles = [0.0] * 4
@@ -46,10 +37,7 @@ class Vehicle:
         if dt <= 0.0:
             return
         if push is None and not (any(self.set_points) or any(self.speeds)):
-            self._time += dt
             return
-        grip = self._grip()
-        self._time += dt
         if push is not None:
             right, left = push / self._right_radius, push / self._left_radius
             goals, lag = [right, left, left, right], PUSH_TIME_CONSTANT_S
@@ -70,15 +58,6 @@ class Vehicle:
             angles[i] += angle
         left = self._left_radius * (turned[1] + turned[2]) / 2
         right = self._right_radius * (turned[0] + turned[3]) / 2
-        turn = (right - left) / self._track
-        rate = abs(turn) / dt
-        turn *= grip / (1.0 + 2.0 * self._rate_dependence * rate / (1.0 + rate))
+        turn = (right - left) / self._track * (1.0 - self.turn_slip)
         self.turned += turn
         self.pose = arc(self.pose, (left + right) / 2, turn)
-
-    def _grip(self) -> float:
-        # The fraction of a turn that remains although the wheels skid.
-        grip = 1.0 - self.turn_slip
-        if self._floor:
-            grip *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_CHANGE_S))
-        return grip

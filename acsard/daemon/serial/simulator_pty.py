@@ -21,7 +21,6 @@ from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.simulated_robot import Observation, WatchedMcu
 from acsard.core.simulator.true_messages import true_pose, turn_rate
-from acsard.core.values import NS_PER_S
 from acsard.daemon.serial.device import unlock
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
@@ -131,9 +130,7 @@ class Simulated(SimPty):
 
     def __init__(self, config: Config) -> None:
         super().__init__(WatchedMcu(config, clock.mono_ns(), self._see))
-        self._frame, self._noise = config.odometry.base_frame, config.sim.gyro_noise
-        self._gyro = config.odometry.gyro
-        self._delay_ns = int(config.sim.gyro_delay * NS_PER_S)
+        self._frame, self._gyro = config.odometry.base_frame, config.odometry.gyro
         self._bus: Bus | None = None
         self._last: tuple[Observation, int] | None = None
 
@@ -155,6 +152,5 @@ class Simulated(SimPty):
             bus.publish(TRUE_POSE_KEY, true_pose(sight, wall_ns))
         # The daemon receives this sample from the bus, like a sample of a gyro on a real robot.
         if self._gyro:
-            measured_ns = wall_ns - self._delay_ns
-            bus.publish(IMU, turn_rate(sight, self._frame, self._noise, measured_ns))
+            bus.publish(IMU, turn_rate(sight, self._frame, wall_ns))
         bus.flush()

@@ -17,7 +17,7 @@ from acsard.checkup.motion import SPEED
 from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.core.link.codec import Codec
 from acsard.core.simulator import protocol
-from acsard.core.values import WHEELS
+from acsard.core.values import NS_PER_S, WHEELS
 from tests.unit.checkup.robots import (
     MS,
     Busy,
@@ -764,7 +764,9 @@ def test_a_check_over_a_poor_line_leaves_no_motor_turning(fault: str) -> None:
 
 
 def test_the_check_waits_for_a_board_that_boots_when_the_port_opens() -> None:
-    assert check(config=Config(sim=SimConfig(boot_time=2.0))).failed == []
+    robot = Robot()
+    robot.mcu.reset(0, 2 * NS_PER_S)
+    assert Checked(robot).failed == []
 
 
 def test_no_motor_is_commanded_above_3_rad_s_or_for_4_s() -> None:

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.core.motion.gyro import SILENCE_TIMEOUT_NS, STATUS_TEXTS, Gyro, Turn
-from acsard.core.simulator.noise import gauss
 from acsard.core.values import NS_PER_S, GyroDoes, GyroSample
+from tests.noise import gauss
 
 MS = 1_000_000
 LINE_NS = 10 * MS

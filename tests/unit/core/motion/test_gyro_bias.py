@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.core.motion.gyro_bias import BIAS_RANDOM_WALK, LEARNING_TIME_S, MAX_BIAS, Bias
-from acsard.core.simulator.noise import gauss
+from tests.noise import gauss
 
 DT = 0.01
 

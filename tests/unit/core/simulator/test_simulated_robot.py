@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
-
 import pytest
 from msgspec.structs import replace
 
@@ -58,37 +56,7 @@ def test_the_next_observation_is_the_next_event_of_an_idle_board() -> None:
     assert mcu.next_ns() < 7 + OBSERVATION_PERIOD_NS
 
 
-def test_an_ideal_gyro_measures_the_true_turn_rate() -> None:
+def test_the_gyro_measures_the_true_turn_rate() -> None:
     sights = observations()
     assert [sight.gyro for sight in sights[50:]] == pytest.approx([RATE] * 50)
     assert sum(sight.gyro for sight in sights) * 0.01 == pytest.approx(sights[-1].pose.yaw)
-
-
-def test_the_gyro_bias_is_added_to_every_sample() -> None:
-    biased = observations(Config(sim=replace(TRUE.sim, gyro_bias=-0.03)))
-    assert [b.gyro - g.gyro for b, g in zip(biased, observations(), strict=True)] == pytest.approx(
-        [-0.03] * 100
-    )
-
-
-def test_the_gyro_noise_varies_and_depends_on_the_seed_only() -> None:
-    sim = replace(TRUE.sim, gyro_noise=0.02)
-    noise = [
-        b.gyro - g.gyro for b, g in zip(observations(Config(sim=sim)), observations(), strict=True)
-    ]
-    assert statistics.pstdev(noise) == pytest.approx(0.02, rel=0.3)
-    assert observations(Config(sim=sim)) == observations(Config(sim=sim))
-    assert observations(Config(sim=sim)) != observations(Config(sim=replace(sim, seed=2)))
-
-
-@pytest.mark.parametrize("periods", [1, 5, 20])
-def test_a_late_gyro_repeats_the_ideal_samples_later(periods: int) -> None:
-    late = observations(Config(sim=replace(TRUE.sim, gyro_delay=periods * 0.01)))
-    prompt = [0.0] * periods + [sight.gyro for sight in observations()]
-    assert [sight.gyro for sight in late] == pytest.approx(prompt[:100])
-
-
-def test_a_gyro_delay_between_two_observations_is_exact() -> None:
-    late = observations(Config(sim=replace(TRUE.sim, gyro_delay=0.025)))
-    turned = sum(sight.gyro for sight in late) * 0.01
-    assert turned == pytest.approx(observations()[-1].pose.yaw - RATE * 0.025)
