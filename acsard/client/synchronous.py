@@ -52,7 +52,7 @@ from acsard.core.messages.keys_and_roles import (
 )
 from acsard.core.messages.permissions import COMMAND_ROLE, has
 from acsard.core.messages.signature import Signature, public_name
-from acsard.core.values import Ns, Plain, Pose
+from acsard.core.values import Plain, Pose
 from acsard.host import clock
 from acsard.host.errors import (
     MendableError,
@@ -213,16 +213,14 @@ class Client:
         # The secret identifies this program as a caller of services. Clients made by `sibling`
         # share it, although they may send commands under another name.
         self._secret = new_secret()
-        self._sign_as(f"{platform.node()[:32]}/{os.getpid()}")
+        whole = sender_id(f"{platform.node()[:32]}/{os.getpid()}")
+        self._sender = CommandSigner(whole)
+        self.sender = public_name(
+            whole, self.certificate
+        )  # `state.sender` while this client drives
         # Compute stamps from the steady clock. If the stamps came from the wall clock, and a
         # program set this clock during a drive, the daemon would mistake the jump for a delay.
         self._wall_offset_ns = clock.now().wall_ns - clock.steady_ns()
-
-    def _sign_as(self, name: str) -> None:
-        whole = sender_id(name)
-        self._sender = CommandSigner(whole)
-        # `state.sender` while this client drives.
-        self.sender = public_name(whole, self.certificate)
 
     @property
     def caller(self) -> str:
@@ -232,18 +230,10 @@ class Client:
         """
         return sender_id(self.name, self._secret)
 
-    def sibling(self, robot_id: str, name: str = "") -> Client:
-        """Return a new client on the same connection, which is a separate sender of commands.
-
-        Args:
-            robot_id: the id of the robot that the new client commands. It may be the robot of this
-                client.
-            name: the name of the new client as a sender; "" means the host name and the process id.
-        """
+    def sibling(self, robot_id: str) -> Client:
+        """Return a client of a robot on the same connection, which is a separate sender."""
         other = Client(self.session, robot_id, self.source, self.where.tls, self.where.endpoint)
         other.name, other._secret, other._spacing = self.name, self._secret, self._spacing
-        if name:
-            other._sign_as(name)
         return other
 
     def key(self, name: str) -> str:
@@ -265,18 +255,10 @@ class Client:
         """
         with self._spacing.wait():
             if self._opened:
-                self._put(linear, angular, None)
+                self._put(linear, angular)
             else:
                 self._opened = True
-                self._put(0.0, 0.0, None)
-
-    def forward(self, linear: float, angular: float, *, stamp_ns: Ns | None = None) -> None:
-        """Send a command that this program has received, never a zero in its place.
-
-        It is in m/s and rad/s (left is +). `stamp_ns` is by the clock of its origin, or now.
-        """
-        with self._spacing.wait():
-            self._put(linear, angular, stamp_ns)
+                self._put(0.0, 0.0)
 
     def end(self) -> None:
         """Close the connection, as `connect` does at the end of its `with` block.
@@ -483,17 +465,15 @@ class Client:
             timestamp=self.session.new_timestamp(),
         )
 
-    def _put(self, linear: float, angular: float, stamp_ns: Ns | None) -> None:
+    def _put(self, linear: float, angular: float) -> None:
         if self._spacing.ending and (linear or angular):
             raise NoAnswerError("the connection to the daemon is being closed: connect again")
-        steady = stamp_ns is None
-        if stamp_ns is None:
-            stamp_ns = clock.steady_ns() + self._wall_offset_ns
+        stamp_ns = clock.steady_ns() + self._wall_offset_ns
         message = schema.TwistStamped(
             schema.Header(schema.Time.from_ns(stamp_ns)),
             schema.Twist(schema.Vector3(x=linear), schema.Vector3(z=angular)),
         )
-        self._publish(message, self._sender.sign(stamp_ns, steady=steady), self.source)
+        self._publish(message, self._sender.sign(stamp_ns, steady=True), self.source)
         if linear or angular:
             self._spacing.moving[self] = clock.steady_s()
         else:

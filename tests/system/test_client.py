@@ -585,8 +585,8 @@ async def test_a_zero_sent_right_after_a_command_is_not_lost(shared: Daemon, fre
     sent: list[float] = []
     original = Client._put
 
-    def put(self: Client, linear: float, angular: float, stamp_ns: int | None) -> None:
-        original(self, linear, angular, stamp_ns)
+    def put(self: Client, linear: float, angular: float) -> None:
+        original(self, linear, angular)
         sent.append(linear)
 
     with pytest.MonkeyPatch.context() as patch, fresh.follow("cmd/app") as commands:

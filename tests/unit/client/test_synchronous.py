@@ -153,8 +153,8 @@ def test_the_end_of_a_connection_sends_zeros_to_each_robot_that_may_still_move(
 ) -> None:
     monkeypatch.setattr(driving, "MAX_END_S", 0.12)
     robot = client_of(session)
-    other = robot.sibling("acsar", "other")
-    resting = robot.sibling("acsar", "resting")
+    other = robot.sibling("acsar")
+    resting = robot.sibling("acsar")
     for sender in (robot, other, resting):
         without_states(sender, monkeypatch)
         sender.send(0.0)
