@@ -738,7 +738,8 @@ class Run:
         )
         if any(name == "fault" for name, _, _ in snapshot.events):
             witness.faults.append(snapshot.decided_ns + offset)
-        witness.step(snapshot.decided_ns + offset, snapshot.mode, snapshot.reason, self._fed_ns)
+        seen = snapshot.mode, snapshot.code, snapshot.reason, snapshot.source
+        witness.step(snapshot.decided_ns + offset, *seen, self._fed_ns)
         if snapshot.link == "up" and self._link not in ("up", "stale"):
             # Commands that came before the link do not count.
             witness.disarmed_ns = max(witness.disarmed_ns, true_ns)

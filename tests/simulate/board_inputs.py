@@ -20,7 +20,7 @@ from typing import Any
 
 from tests.simulate.ages import MARGIN_NS
 from tests.simulate.product import StepResult
-from tests.simulate.promises import DRIVER, INPUTS, LINE, ZERO, BrokenError, Witness
+from tests.simulate.promises import INPUTS, LINE, ZERO, BrokenError, Witness
 from tests.simulate.roads import NS
 
 Plan = dict[str, Any]
@@ -58,9 +58,6 @@ CLIENT = re.compile(r"\bstopped (?:by|when the daemon started)\b")
 
 NEVER_S = 1e6
 """Time after which a board without a fault of a motor driver would report one, s."""
-
-PRESSED = "emergency stop pressed at the robot"
-"""Reason of a stop that the emergency stop has caused."""
 
 LONGEST = 4096
 """Bytes of a line that are kept. A status line is much shorter."""
@@ -578,7 +575,7 @@ class Inputs:
             raise BrokenError("a press stops the robot, however short", true_ns, text)
         if self._fresh and moving:
             raise BrokenError("a press is a zero at once", true_ns, str(moving))
-        if not self._mode and self._estopped and PRESSED in snapshot.reason:
+        if not self._mode and self._estopped and "emergency_stop" in snapshot.causes:
             # A new daemon knows a stop of the emergency stop from its latch file. Only `clear` ends
             # it, also if a full disk has lost the `clear` of the daemon before.
             self._powered = self._driver_faulted = False
@@ -634,9 +631,7 @@ class Inputs:
         free |= estop.is_known and estop.marks == b"." and not self._fresh
         pressed = estop.pressed_ns is not None and estop.pressed_ns < self._stepped_ns
         pressed |= not self._witness.driver_fault
-        began = (
-            snapshot.mode == "fault" != self._mode and DRIVER in snapshot.reason.partition(";")[0]
-        )
+        began = snapshot.mode == "fault" != self._mode and snapshot.code == "driver_fault"
         if self._driver_faulted and free:
             if snapshot.mode not in ("fault", "shutdown"):
                 text = f"{snapshot.mode}: {snapshot.reason}"

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from tests.simulate.ages import MARGIN_NS, Wish
 from tests.simulate.product import START_NS, WALL_OFFSET_NS
 from tests.simulate.promises import BrokenError
-from tests.simulate.reasons import kind_of
 from tests.simulate.reports import judge_counts
 from tests.simulate.roads import NS, STEADY, Message, Sample
 
@@ -223,9 +222,9 @@ class Liveness:
         if sender is not None and any(run.followed.wish or ()) and sole and not asks:
             self._followed_ns[sender["source"]] = now_ns
         witness = run.witness
-        if witness.mode != "ready" or "must send a zero" not in witness.reason or witness.pending:
+        if witness.mode != "ready" or witness.code != "neutral" or witness.pending:
             return
-        _, source = kind_of(witness.reason)
+        source = witness.source
         if not QUIET_FAULTS.issuperset(name for name, _ in run.active[len(run.lasting) :]):
             return
         followed_ns = self._followed_ns.get(source, -1)

@@ -61,7 +61,11 @@ class StepResult(msgspec.Struct, frozen=True, gc=False):
     decided_ns: int
     """When the step began: a stall may lie between this and `at_ns`."""
     mode: str
+    code: str
     reason: str
+    source: str
+    causes: frozenset[str]
+    """The codes of all latched causes of a fault or a stop."""
     followed_ns: int | None
     """Arrival of the command that is followed, None if none is."""
     link: str
@@ -79,6 +83,11 @@ def problems(config: dict[str, Any]) -> list[str]:
     except ConfigError as error:
         return error.problems
     return []
+
+
+def _causes(latches: Latches) -> frozenset[str]:
+    both = [latch for latch in (latches.fault, latches.stop) if latch is not None]
+    return frozenset(cause.code for latch in both for cause in latch.causes)
 
 
 def _plain(estimate: Measured) -> Estimate:
@@ -136,7 +145,7 @@ class Disk:
             case "zeros":
                 self._data = bytes(len(self._data))
             case "version":
-                self._data = self._data.replace(b'"format": 1', b'"format": 2')
+                self._data = self._data.replace(b'"format": 2', b'"format": 1')
 
     def end(self) -> None:
         """Note that the daemon has ended: it writes nothing any more."""
@@ -222,7 +231,10 @@ class Product:
                 world.now_ns,
                 outputs.now.mono_ns,
                 outputs.mode,
+                outputs.code,
                 outputs.reason,
+                outputs.source,
+                _causes(outputs.latches),
                 outputs.command_ns,
                 outputs.link,
                 lines,

@@ -14,8 +14,9 @@ import itertools
 import re
 from bisect import bisect_right
 from collections import Counter, deque
-from typing import Any
+from typing import Any, get_args
 
+from acsard.core.codes import GUARD_CODES, FaultCode, LinkCode, StopCode, WaitCode
 from tests.simulate.ages import MARGIN_NS, Ages, Sender, Wish
 from tests.simulate.jerk import STEP, Slope
 from tests.simulate.roads import NS, Message, Sample
@@ -25,7 +26,19 @@ SPEED = rb"[pn](\d\d?\.\d\d)"
 """The speed of a motor in a line of the board, behind the letter of the motor."""
 
 ZERO = (0.0, 0.0, 0.0, 0.0)
-MODES = {"shutdown", "fault", "stopped", "inactive", "waiting", "driving", "ready"}
+RESTING = {*get_args(WaitCode), "no_command"} - {"nothing", "command", "senders"}
+BUMPERS = {"bumper_away", "bumper_blocks"}
+
+CODES = {
+    "shutdown": {"shutting_down"},
+    "fault": {*get_args(FaultCode)},
+    "stopped": {*get_args(StopCode)},
+    "inactive": {"switched_off", "not_activated"},
+    "waiting": {*get_args(LinkCode), "emergency_stop_missing", "bumpers_missing"} - {"link_up"},
+    "driving": {"commanded", "limits_zero", "zeros", *BUMPERS},
+    "ready": RESTING | BUMPERS,
+}
+"""The codes that `state` may have in each mode."""
 
 RAMP_NS = 300_000_000
 """Allowed beyond the longest ramp: a pause of the daemon this long stops the board by itself."""
@@ -78,9 +91,6 @@ INPUTS = {
     "battery", "driver_fault",
 }  # fmt: skip
 """Faults of the simulated board that report inputs. They give no trouble to lines and wheels."""
-
-DRIVER = "reports a fault of a motor driver"
-"""Words in the reason of a fault that a motor driver has reported."""
 
 MAYBE_SPEEDS = ("garbage", "not a number", "huge", "fields")
 """Refused messages that may have been speeds of a program that shares its identity, so a zero
@@ -197,7 +207,7 @@ class Witness:
         self.pending: dict[str, int] = {}
         """The arrival of the latest call of each verb that waits for the disk with its answer, so
         it is not known yet whether it is in force."""
-        self.mode = self.reason = ""
+        self.mode = self.code = self.reason = self.source = ""
         self._decoded: dict[bytes, tuple[float, ...]] = {}
         self.new_life(0)
 
@@ -422,8 +432,13 @@ class Witness:
 
     # the steps and lines of the daemon
 
-    def step(self, at_ns: int, mode: str, reason: str, fed_ns: int = -1) -> None:
-        """Judge the mode and the reason. The daemon last received bytes of a board at `fed_ns`."""
+    def step(
+        self, at_ns: int, mode: str, code: str, reason: str = "", source: str = "", fed_ns: int = -1
+    ) -> None:
+        """Judge the mode and the code of its reason.
+
+        The daemon last received bytes of a board at `fed_ns`.
+        """
         if mode == "driving" and fed_ns >= 0:
             if self._silent(at_ns, fed_ns):
                 text = f"last heard {fed_ns / NS:.3f} s"
@@ -431,13 +446,11 @@ class Witness:
             if self.blocked_ns is not None and at_ns - self.blocked_ns > BLOCKED_NS:
                 text = f"no line left since {self.blocked_ns / NS:.3f} s"
                 raise BrokenError("a blocked board is not driven", at_ns, text)
-        if mode == self.mode and reason == self.reason:
+        if (mode, code, reason, source) == (self.mode, self.code, self.reason, self.source):
             return
-        if mode not in MODES or len(reason) < 6:
-            raise BrokenError("every state has a reason", at_ns, f"{mode}: {reason!r}")
-        if (mode == "driving") != reason.startswith("driving"):
-            raise BrokenError("every state has a reason", at_ns, f"{mode}: {reason!r}")
-        if "guard replaced a line" in reason:
+        if code not in CODES.get(mode, ()) or not reason:
+            raise BrokenError("every state has a reason", at_ns, f"{mode}: {code}: {reason!r}")
+        if code in GUARD_CODES:
             raise BrokenError("the guard never has to trip", at_ns, reason)
         if mode == "fault" != self.mode:
             self.counts["fault"] += 1
@@ -449,7 +462,7 @@ class Witness:
                 recent.remove("pushed")
             # Echoes pass the lines that a stalled adapter holds, and contradict them.
             caused = not set(recent) <= HARMLESS or {"echo", "stalls"} <= set(recent)
-            if DRIVER in reason.partition(";")[0]:
+            if code == "driver_fault":
                 caused = self.driver_fault
             if self.mode and self.fault_ns is None and not caused:
                 raise BrokenError("no fault without a cause", at_ns, f"{reason} (board: {recent})")
@@ -458,7 +471,7 @@ class Witness:
         if mode != self.mode:
             self.counts[f"mode {mode}"] += 1
             self.mode_ns = at_ns
-        self.mode, self.reason = mode, reason
+        self.mode, self.code, self.reason, self.source = mode, code, reason, source
 
     @property
     def must_rest(self) -> tuple[int, str] | None:

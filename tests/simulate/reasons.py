@@ -1,14 +1,12 @@
 """Compares the reason of a resting robot with the true cause, while a sender sends speeds.
 
-The documentation says that `state` has the reason of each refusal, in `reason` or in the source's
-`waits_for`. This module sorts the texts into kinds of causes and judges only the kind. A kind is
-right if the true events allow it. The module knows which senders stamp, how constant their delays
-are, when each message arrived, and when the last other event happened.
+The documentation says that `state` has the code of each refusal, in `code` or in the source's
+`wait`. A code is right if the true events allow it. The module knows which senders stamp, how
+constant their delays are, when each message arrived, and when the last other event happened.
 """
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING, Any
 
 from tests.simulate.ages import MARGIN_NS
@@ -18,16 +16,11 @@ from tests.simulate.roads import FOREIGN, NS, Message, Sample
 if TYPE_CHECKING:
     from tests.simulate.actors import Run
 
-KINDS = (
-    ("neutral", re.compile(r"\b(\w+) must send a zero\b")),
-    ("proof", re.compile(r"\b(\w+) is new: ")),
-    ("late", re.compile(r"\bcommands of (\w+) arrive .* too late\b")),
-    ("priority", re.compile(r"\b(\w+) has (?:priority|the same priority)\b")),
-    ("stalled", re.compile(r"\bthe daemon stalled: .* command of (\w+)")),
-    ("command", re.compile(r"^(?:waiting for )?a command()\b")),
-    ("", re.compile(r"^()$")),
-)
-"""The kinds of causes, and the words by which each is known, with the name of the source."""
+KINDS = {"nothing": "", "no_command": "command", "higher": "priority", "equal": "priority"}
+"""The codes whose kind of cause has another name."""
+
+BUMPERS = ("bumper_away", "bumper_blocks")
+"""The codes in `state` that hide the one of the source."""
 
 EVERY_NS = NS // 5
 """Time between two looks at `state`, which takes longer to build than a step."""
@@ -43,18 +36,6 @@ PROOF = 10
 
 FORGOTTEN_NS = 200 * NS
 """After a silence of this length a clock may be new again."""
-
-
-def kind_of(words: str) -> tuple[str, str]:
-    """Return the kind of cause in a text, and the source that it names.
-
-    The kind is "?" if no pattern matches.
-    """
-    for kind, pattern in KINDS:
-        match = pattern.search(words)
-        if match is not None:
-            return kind, match[1]
-    return "?", ""
 
 
 class _Clock:
@@ -105,6 +86,12 @@ class _LastMessage:
         does not know stamps like a session, so the robot may let such a zero wait for its pause."""
         self.stamped = False
         """A program of this identity has stamped its commands: its zeros may have been late."""
+
+
+def named_source(state: dict[str, Any]) -> str:
+    """Return the source that the reason of a resting robot is about; "" if there is none."""
+    waiting = (row["name"] for row in state["sources"] if row["wait"] == state["code"])
+    return state["source"] or next(waiting, "")
 
 
 class Reasons:
@@ -221,18 +208,19 @@ class Reasons:
         )
 
     def _judge(self, now_ns: int, wishing: list[str], state: dict[str, Any]) -> None:
-        """Compare the words of `state` with the possible causes."""
+        """Compare the codes of `state` with the possible causes."""
         self.run.counts["reason looks"] += 1
         name = "every refusal has its reason in state"
-        words = {source_row["name"]: source_row["waits_for"] for source_row in state["sources"]}
+        waits = {row["name"]: KINDS.get(row["wait"], row["wait"]) for row in state["sources"]}
         for source in wishing:
-            kind, _ = kind_of(words[source])
             allowed = self.allowed(source, now_ns)
-            if kind not in allowed:
-                text = f"{source} waits for {words[source]!r}, allowed is {sorted(allowed)}"
+            if waits[source] not in allowed:
+                text = f"{source} waits for {waits[source]!r}, allowed is {sorted(allowed)}"
                 raise BrokenError(name, now_ns, text)
-        kind, named = kind_of(state["reason"])
-        allowed = self.allowed(named, now_ns) - {"priority"} if named in words else set()
+        kind, named = KINDS.get(state["code"], state["code"]), named_source(state)
+        if state["code"] in BUMPERS:
+            kind = waits.get(named, "")
+        allowed = self.allowed(named, now_ns) - {"priority"} if named in waits else set()
         if kind not in allowed:
             text = f"{state['reason']!r}, allowed is {sorted(allowed)}, {wishing} wish a speed"
             raise BrokenError(name, now_ns, text)
