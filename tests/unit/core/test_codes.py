@@ -1,0 +1,67 @@
+"""Each code of the table is produced somewhere, and no other code is published."""
+
+from __future__ import annotations
+
+import ast
+import re
+import string
+from pathlib import Path
+from typing import get_args
+
+import acsard
+from acsard.core.codes import CODES, Code, StateCode, joined, reason, sentence
+from acsard.recording.file import Recording
+from acsard.recording.file_replay import steps
+from tests import recordings
+
+PACKAGE = Path(acsard.__file__).parent
+
+VALUES = {
+    "source": "app", "seconds": 0.5, "alone": "", "lasts": "", "ros": "", "note": "",
+    "others": "2 other senders", "bumpers": "front bumper pressed", "direction": "backwards",
+    "speed": 0.1, "by": "ann", "cause": "why", "places": "1 place", "dots": ".",
+    "threshold": "21 V", "charged": "21.4 V", "wheel": "rear_left", "figures": "(1 rad/s)",
+    "trouble": "why", "received": "nothing", "apart": "0.20", "longest": 0.25, "most": 16,
+}  # fmt: skip
+"""A value for each name in the texts."""
+
+
+def test_the_types_have_exactly_the_codes_of_the_table() -> None:
+    assert set(get_args(Code)) == set(CODES)
+
+
+def test_each_code_is_in_the_program() -> None:
+    """A code that is computed, such as a `WaitCode`, is in the module that computes it."""
+    found = set()
+    for path in PACKAGE.rglob("*.py"):
+        if path.name == "codes.py":
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.add(node.value)
+    assert not set(CODES) - found
+
+
+def test_the_recordings_publish_only_codes_of_the_table() -> None:
+    seen = set()
+    for path in Path(recordings.__file__).parent.glob("*.mcap"):
+        for step in steps(Recording(path)):
+            code = step.recorded.status[4]
+            assert code in get_args(StateCode)
+            seen.add(code)
+            assert {event.code for event in step.recorded.events} <= {"", *CODES}
+    assert len(seen) > 5
+
+
+def test_every_text_and_every_advice_is_a_sentence_that_needs_only_known_values() -> None:
+    names = set()
+    for code in get_args(Code):
+        entry = CODES[code]
+        for part in (entry.text, entry.advice):
+            names |= {name for _, name, _, _ in string.Formatter().parse(part) if name}
+        why = sentence(code, **VALUES)
+        assert why.code == code
+        assert why.text or code == "nothing"
+        assert not re.search(r"[;:]$|  ", why.text)
+        assert joined(reason(code, **VALUES)).text == why.text
+    assert names == set(VALUES)
