@@ -63,5 +63,5 @@ def test_every_text_and_every_advice_is_a_sentence_that_needs_only_known_values(
         assert why.code == code
         assert why.text or code == "nothing"
         assert not re.search(r"[;:]$|  ", why.text)
-        assert joined(reason(code, **VALUES)).text == why.text
+        assert joined(reason(code, "", **VALUES)).text == why.text
     assert names == set(VALUES)
