@@ -1,13 +1,8 @@
 """Compares the wheels with each other, with their commands and with a gyro.
 
-`ConsistencyChecks` is the only interface to these checks. It uses two modules:
-
-- `wheel_faults.py` ignores a wheel whose encoder is faulty. If the wheels contradict each other or
-  their commands for long, it reports a fault, which stops the robot.
-- `gyro.py` takes the heading from a gyro, and compares the gyro with the wheels that
-  `wheel_faults.py` does not ignore.
-
-Some checks use the results of others. Only this module determines their order.
+`wheel_faults.py` ignores a wheel with a faulty encoder, and reports a fault after a long
+contradiction. `gyro.py` takes the heading from a gyro, and compares it with the wheels that are not
+ignored. Only this module determines the order of these checks.
 """
 
 from __future__ import annotations
@@ -22,10 +17,7 @@ from acsard.core.values import Event, GyroSample, GyroStatus
 
 
 class ConsistencyChecks:
-    """All consistency checks of one robot.
-
-    For each feedback line, the odometry calls `check_line`, updates the pose, and calls `finish`.
-    """
+    """All consistency checks of one robot: `check_line`, then the pose, then `finish`."""
 
     def __init__(
         self,
@@ -34,46 +26,34 @@ class ConsistencyChecks:
         encoder_counts: int,
         feedback: FeedbackConfig,
     ) -> None:
-        """Start with no faulty wheel, and with an unproven gyro if the robot has one.
-
-        `encoder_counts` is the number of counts per revolution of a wheel; 0 if it is unknown.
-        """
         self._kinematics = kinematics
         self.wheels = WheelFaults(kinematics, encoder_counts, feedback)
         self.gyro = Gyro() if odometry.gyro else None
-        self._by_wheels = 0.0
-        """Turn of the robot in the last feedback line according to the wheels, rad."""
-        self.turn: Turn | None = None
-        """Turn of the robot in the last feedback line according to the gyro. If it is None, the
-        odometry must use the turn according to the wheels."""
+        self._by_wheels = 0.0  # turn of the last line by the wheels, rad
+        self.turn: Turn | None = None  # turn of the last line by the gyro; None: use the wheels
+        # The wheels gave the last turn, because the gyro has not agreed with them in a turn yet.
         self.on_trial = False
-        """Whether the wheels provided the turn of the last line because the gyro was not proven. A
-        gyro is proven when it has agreed with the wheels in a turn."""
-        self.slips = False
-        """Whether the wheels slip, which means that they contradict each other or the gyro."""
-        self.events: list[Event] = []
-        """Log events of the last feedback line."""
+        self.slips = False  # the wheels contradict each other or the gyro
+        self.events: list[Event] = []  # of the last line
 
     @property
     def gyro_status(self) -> GyroStatus:
         return GyroStatus() if self.gyro is None else self.gyro.status
 
     def add_samples(self, samples: tuple[GyroSample, ...]) -> None:
-        """Store the gyro `samples` since the last control step, in the order of arrival."""
+        """Store the samples since the last control step, in the order of arrival."""
         if self.gyro is not None:
             self.gyro.add_samples(samples)
 
     def drop_corrections(self) -> None:
-        """Drop the pending correction of the heading by the gyro, because a new pose was set."""
+        """Drop the gyro's pending correction of the heading, because a new pose was set."""
         if self.gyro is not None:
             self.gyro.drop_corrections()
 
     def check_line(self, line: Feedback, rolled: Rolled) -> bool:
-        """Check a feedback line, and return whether it has proved a wheel faulty.
+        """Check a line, and return whether it has proved a wheel faulty.
 
-        If it has, the caller must recompute the pose from the earlier lines without this wheel.
-        `rolled` contains the angles that the wheels rolled since the previous plausible feedback
-        line.
+        The caller must then recompute the pose from the earlier lines without this wheel.
         """
         wheels, gyro, turn, by_gyro = self.wheels, self.gyro, None, None
         if gyro is not None:
@@ -91,23 +71,14 @@ class ConsistencyChecks:
         return is_faulty
 
     def undo_recomputation(self, turn: float) -> float:
-        """Return the angle that the caller must subtract from the heading, rad.
+        """Return the angle to subtract from the heading after a wheel proved faulty.
 
-        Call this after a faulty wheel was found, and the pose was recomputed without it over
-        earlier feedback lines. `turn` is the change of the robot's turn by this recomputation, rad.
-        Only the lines with `on_trial` count, in which the gyro was not proven.
-
-        If the gyro is proven by now, the heading already agrees with the gyro. The caller must then
-        undo the change, so the result is `turn`. Otherwise the result is 0. If the test of the gyro
-        goes on, the method changes the pending correction of the heading by -`turn`.
+        See `Gyro.undo_recomputation`; `turn` is for lines with `on_trial`, rad.
         """
         return 0.0 if self.gyro is None else self.gyro.undo_recomputation(turn)
 
     def finish(self, turned: float) -> None:
-        """Finish the checks of the last feedback line, and set `events` to its log events.
-
-        `turned` is the angle by which this line turned the pose, rad.
-        """
+        """Finish the checks of a line that turned the pose by `turned`, and set `events`."""
         gyro, self.events = self.gyro, self.wheels.events
         if gyro is None:
             return

@@ -1,19 +1,11 @@
 """The error model of the odometry: noise of a step, errors of parameters, and errors of the twist.
 
-A step is the motion from one feedback line to the next. In a step, the left and the right side of
-the robot roll the distances dl and dr, m. The errors of these distances are independent and have
-the variances k |dl| and k |dr|, where k is in m (Siegwart, Nourbakhsh & Scaramuzza, Introduction to
-Autonomous Mobile Robots, 5.2.4). Let L be the effective track, m. The step has the distance d = (dl
-+ dr) / 2 and the turn dyaw = (dr - dl) / L. The errors of d and dyaw therefore have
-
-    var(d) = k (|dl| + |dr|) / 4
-    var(dyaw) = k (|dl| + |dr|) / L^2
-    cov(d, dyaw) = k (|dr| - |dl|) / (2 L)
-
-Skidding adds the variance `yaw_variance_per_radian` to dyaw for each radian that the robot turns.
-The errors of parameters, such as a wheel radius, do not average out, so they are not noise
+In a step, from line to line, the sides roll dl and dr, m, with independent errors of variances k
+|dl| and k |dr|, k in m (Siegwart, Nourbakhsh & Scaramuzza, Introduction to Autonomous Mobile
+Robots, 5.2.4). So d = (dl + dr) / 2 and dyaw = (dr - dl) / L, with the effective track L, have
+those of `Noise`. Errors of parameters do not average out, so they are no noise but `columns`
 (Borenstein & Feng, Measurement and Correction of Systematic Odometry Errors in Mobile Robots,
-1996). `columns` returns one `Column` for each parameter.
+1996).
 """
 
 from __future__ import annotations
@@ -24,43 +16,34 @@ from acsard.core.config.settings import OdometryConfig
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import Twist, TwistVariances
 
+# Error of a step for one standard deviation of a parameter: of the distance per m and per rad (m/m,
+# m/rad), and of the turn per m and per rad (rad/m, rad/rad).
 Column = tuple[float, float, float, float]
-"""Error of the distance and the turn of a step if one parameter is off by one standard deviation.
 
-The first two numbers are the error of the distance per m of distance and per rad of turn (m/m,
-m/rad). The last two numbers are the error of the turn per m of distance and per rad of turn (rad/m,
-rad/rad). A parameter is, for example, a wheel radius.
-"""
+SLIP_FACTOR = 100.0  # on the variances of a step and of the twist while the wheels slip
 
-SLIP_FACTOR = 100.0
-"""Factor by which slip of the wheels increases the variances of a step and of the twist."""
+SPEED_RESOLUTION = 0.01  # rad/s: a line has two decimals
 
-SPEED_RESOLUTION = 0.01
-"""Resolution of the wheel speeds in a feedback line, rad/s. The line has two decimals."""
+MAX_TWIST_VARIANCE = 1e9  # m2/s2 and rad2/s2: "unknown"
 
-MAX_TWIST_VARIANCE = 1e9
-"""Largest variance of a twist, m2/s2 and rad2/s2. It means "unknown"."""
+LATERAL_VARIANCE = 1e-3  # m2/s2 sideways, which wheels do not measure, while the robot moves
 
-LATERAL_VARIANCE = 1e-3
-"""Variance of the sideways speed of a robot that moves, m2/s2. Wheels do not measure this speed."""
+MIN_TWIST_VARIANCE = 1e-8  # filters that use the published twist treat less as an error
 
-MIN_TWIST_VARIANCE = 1e-8
-"""Smallest variance of a twist, m2/s2 and rad2/s2. Filters that use the published twist treat a
-smaller variance as an error."""
+ASSUMED_PERIOD_S = 0.01  # of the feedback lines, before it is measured
 
-ASSUMED_PERIOD_S = 0.01
-"""Assumed period of the feedback lines before it is measured, s."""
-
-PERIOD_GAIN = 0.05
-"""Weight of the newest period in the running mean of the time between feedback lines. The weight is
-small, because periods vary: several lines may be read at the same time."""
+PERIOD_GAIN = 0.05  # small, because several lines may be read at the same time
 
 
 class Noise:
-    """Computes the variances and the covariance of the errors of distance and turn in one step."""
+    """The variances and the covariance of the errors of distance and turn in one step.
+
+    var(d) = k (|dl| + |dr|) / 4
+    var(dyaw) = k (|dl| + |dr|) / L^2 + yaw_variance_per_radian |turned|, for skidding
+    cov(d, dyaw) = k (|dr| - |dl|) / (2 L)
+    """
 
     def __init__(self, odometry: OdometryConfig, track: float) -> None:
-        """Take the variances from `odometry`. `track` is the effective track, m."""
         # The settings can describe more errors than those of the two sides. If the sides were the
         # only cause of errors, `distance_variance_per_metre` D would be k / 2, and
         # `yaw_variance_per_metre` Y would be 2 k / L^2. Therefore the sides get k = min(2 D,
@@ -78,13 +61,9 @@ class Noise:
         self._to_both = wheels / (2 * track)
 
     def of(self, distance: float, turn: float, turned: float) -> tuple[float, float, float]:
-        """Return var(d) in m2, var(dyaw) in rad2 and cov(d, dyaw) in m rad for a step.
+        """Return var(d), m2, var(dyaw), rad2, and cov(d, dyaw), m rad, for a step.
 
-        Args:
-            distance: the distance d of the step, m.
-            turn: the turn dyaw of the step, rad.
-            turned: the part of |turn| that is a real turn and not encoder noise, rad. Only this
-                part has the variance for skidding.
+        `turned` is the part of |turn| that is a real turn and not encoder noise, rad.
         """
         left, right = abs(distance - self._half * turn), abs(distance + self._half * turn)
         path, sides = abs(distance), left + right
@@ -96,37 +75,30 @@ class Noise:
 
 
 class ErrorModel:
-    """The noise of an odometry step, and the effects of parameter errors on this step."""
+    """The noise of a step, and the effects of parameter errors on it."""
 
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics) -> None:
-        self.radius = kinematics.radius
-        """Mean radius of the wheels, m."""
+        self.radius = kinematics.radius  # mean of the wheels, m
         self.settings = odometry
         self.track = kinematics.track
         self.columns = columns(odometry, kinematics)
         self.noise = Noise(odometry, self.track)
 
     def use(self, odometry: OdometryConfig) -> None:
-        """Use the noise settings in `odometry` from now on, and keep the parameter errors."""
+        """Use other noise settings, and keep the parameter errors."""
         self.settings = odometry
         self.noise = Noise(odometry, self.track)
 
 
 def columns(odometry: OdometryConfig, kinematics: Kinematics) -> tuple[Column, ...]:
-    """Return the effects of all uncertain parameters on a step: one `Column` for each parameter.
+    """Return a `Column` for each uncertain parameter, those with a standard deviation.
 
-    The equations of a step are
+    The equations of a step are, with r `wheel_radius`, b `wheel_separation` and rolled angles phi,
 
         dl = r m_l phi_l,   dr = r m_r phi_r,   dyaw = (dr - dl) / (m_L b)
 
-    where r is `wheel_radius`, b is `wheel_separation`, and phi_l and phi_r are the angles that the
-    wheels rolled.
-
-    The parameters are the multipliers m_l, m_r and m_L, the ratio m_r / m_l, a scale that
-    multiplies all lengths, and the fraction of each distance that the wheels lose by slip. The
-    scale and the slip share one column. The standard deviations of these parameters come from
-    `odometry`. A parameter with a standard deviation of 0 has no column.
-
+    The parameters are m_l, m_r, m_L, m_r / m_l, and in one column the scale of all lengths and the
+    fraction that slip loses.
     """
     track = kinematics.track
     left, right, separation = kinematics.multipliers
@@ -152,30 +124,17 @@ def columns(odometry: OdometryConfig, kinematics: Kinematics) -> tuple[Column, .
 
 
 class TwistUncertainty:
-    """Computes the variances of the twist that a feedback line reports.
-
-    v is the linear speed and w the turn rate of the line. Their variances are
+    """The variances of the twist (v, w) that a line reports.
 
         var(v) = a_v q^2 / 12 + var(d) / T^2 + sum of (c_1 v + c_2 w)^2
         var(w) = a_w q^2 / 12 + var(dyaw) / T^2 + sum of (c_3 v + c_4 w)^2
 
-    - q is the quantization step of the wheel speeds. Each wheel has the variance q^2 / 12. a_v and
-      a_w follow from the kinematics, with two wheels on each side.
-    - T is the mean period of the feedback lines. A line reports the mean speed over one period.
-    - var(d) and var(dyaw) are the noise of one period. Because of these terms, a pose that a
-      program integrates from the twists is as uncertain as the pose of the odometry.
-    - The sums are over the uncertain parameters of the kinematics (c_1 to c_4: see `columns`).
-
-    If the wheels slip, `slipping` multiplies the variances by `SLIP_FACTOR`. For a robot at rest,
-    `at_rest` returns smaller variances: they cover only a motion that is too slow for the encoders
-    to show.
+    q is the quantization step of the speeds, with two wheels on each side in a_v and a_w, and T the
+    mean period. With var(d) and var(dyaw), the noise of one period, a pose that is integrated from
+    twists is as uncertain as the odometry's. The sums are over `columns`.
     """
 
     def __init__(self, model: ErrorModel, counts: int) -> None:
-        """Start with a feedback period of `ASSUMED_PERIOD_S`.
-
-        `counts` is the number of encoder counts per revolution of a wheel; 0 if it is unknown.
-        """
         self._model = model
         self._count = math.tau / counts if counts else 0.0
         # The errors of the four wheels are independent, and each side is the mean of two wheels.
@@ -184,14 +143,7 @@ class TwistUncertainty:
         self._to_angular = model.radius**2 / model.track**2 / 12
 
     def of(self, twist: Twist, dt: float, step: float = 0.0) -> TwistVariances:
-        """Return the variances of the twist of a feedback line.
-
-        Args:
-            twist: the twist that the line reports, m/s and rad/s.
-            dt: the time since the previous feedback line, s; 0 if it is unknown.
-            step: the quantization step of the wheel speeds in the feedback lines, rad/s; 0 if it is
-                unknown.
-        """
+        """Return the variances of a line's twist; `dt` and the speeds' step may be 0, unknown."""
         if dt > 0.0:
             # A single late line, or a line after lost lines, does not mean a longer period.
             self._period += PERIOD_GAIN * (min(dt, 2 * self._period) - self._period)
@@ -212,11 +164,7 @@ class TwistUncertainty:
         )
 
     def at_rest(self, seconds: float, step: float = 0.0) -> TwistVariances:
-        """Return the variances of the twist of a robot at rest.
-
-        `seconds` is the time for which all wheels have reported zero speed, s. `step` is the
-        quantization step of the wheel speeds, rad/s; 0 if it is unknown.
-        """
+        """Return the variances at rest: of a motion that no encoder shows in `seconds`."""
         linear, angular = self.rounding((max(self._count, step * self._period) / seconds) ** 2)
         return TwistVariances(
             max(MIN_TWIST_VARIANCE, linear),
@@ -225,19 +173,11 @@ class TwistUncertainty:
         )
 
     def rounding(self, square: float) -> tuple[float, float]:
-        """Return the variances of the twist that the quantization of the wheel speeds causes.
-
-        The result is a pair: the variances of the linear speed, m2/s2, and of the turn rate,
-        rad2/s2. `square` is the square of the quantization step, rad2/s2.
-        """
+        """Return the variances, m2/s2 and rad2/s2, by a squared quantization step, rad2/s2."""
         return self._to_linear * square, self._to_angular * square
 
     def slipping(self, variances: TwistVariances) -> TwistVariances:
-        """Return the variances of the twist while the wheels slip.
-
-        They are `variances` times `SLIP_FACTOR`, but at most `MAX_TWIST_VARIANCE`. The lateral
-        variance grows too, because the wheels may slip in any direction.
-        """
+        """Return the variances times `SLIP_FACTOR`: wheels slip in any direction."""
         return TwistVariances(
             min(SLIP_FACTOR * variances.linear, MAX_TWIST_VARIANCE),
             min(SLIP_FACTOR * variances.lateral, MAX_TWIST_VARIANCE),
@@ -245,10 +185,7 @@ class TwistUncertainty:
         )
 
     def with_gyro(self, variances: TwistVariances, angular: float) -> TwistVariances:
-        """Return `variances`, but with the variance of the turn rate replaced by `angular`.
-
-        `angular` is the variance of the turn rate that a gyro measured, rad2/s2.
-        """
+        """Return the variances with the gyro's variance of the turn rate, rad2/s2."""
         return TwistVariances(
             variances.linear,
             variances.lateral,

@@ -1,25 +1,11 @@
 """Takes the heading from a gyro, if there is one. The distance still comes from the wheels.
 
-The method is gyrodometry (Borenstein & Feng, Gyrodometry: a new method for combining data from
-gyros and odometry in mobile robots, 1996): skidding wheels do not affect a gyro, and a gyro's bias
-does not affect the wheels. The gyro's reading at rest is its bias (`gyro_bias.py`). A comparison of
-gyro and wheels gives the ratio of their turns (`gyro_match.py`).
-
-Until gyro and wheels have agreed in a turn, the heading comes from the wheels. After that turn, the
-heading is corrected by the gyro's turn minus the wheels' turn up to then. A gyro that reads the
-opposite sign, degrees or zero is reported and not used (`gyro_trial.py`). If a gyro is silent, or
-if its rate does not match the wheels at all, the heading comes from the wheels.
-
-A sample that arrives up to `SILENCE_TIMEOUT_NS` late is included in the turn of the next line, so
-no turn is lost. While the samples are later than that, the wheels provide the turn, and a backlog
-of samples changes nothing. Only stamps show how late samples are: without stamps, the daemon takes
-a backlog for the present motion. If samples are missing, the turn in between becomes uncertain.
-
-A sample whose rate jumps counts only if the next sample confirms the jump. A gyro that repeats one
-rate exactly while the wheels stand still is assumed to hang. The wheels' turn then replaces the
-turn that the gyro has measured since it began to repeat this rate. If gyro and wheels contradict
-each other for so long that the gyro is not used any more, either of them may be right. The
-difference of their turns is then added to the uncertainty of the heading.
+In gyrodometry (Borenstein & Feng, Gyrodometry: a new method for combining data from gyros and
+odometry in mobile robots, 1996), skidding does not affect a gyro, nor its bias the wheels. The
+reading at rest is the bias (`gyro_bias.py`), and a comparison gives the ratio of the turns
+(`gyro_match.py`). Until gyro and wheels have agreed in a turn (`gyro_trial.py`), the heading is the
+wheels'; then it is corrected by the difference so far. A gyro that is silent or does not match at
+all is not used.
 """
 
 from __future__ import annotations
@@ -32,84 +18,62 @@ from acsard.core.link.minimum_delay import MinimumDelay
 from acsard.core.motion.gyro_bias import LEARNING_TIME_S, MAX_BIAS, Bias
 from acsard.core.motion.gyro_match import WINDOW_S, Match
 from acsard.core.motion.gyro_trial import TURN_RATIO_RANGE, Trial
-from acsard.core.values import NS_PER_S, Event, GyroDoes, GyroSample, GyroStatus, Level
+from acsard.core.values import NS_PER_S, Event, GyroDoes, GyroSample, GyroStatus, Level, Ns
 
-REST_S = 0.2
-"""Time for which all four wheels must report zero speed before the robot counts as standing still,
-s."""
+REST_S = 0.2  # of zero speeds of all wheels, until the robot stands still
 
+# Age of the last sample at which the gyro is silent; until then, the robot goes on turning at its
+# rate.
 SILENCE_TIMEOUT_NS = NS_PER_S // 5
-"""Age of the gyro's last sample from which the gyro counts as silent, ns. Up to this age, the robot
-is assumed to continue turning at the rate of this sample."""
 
+# Excess over the least delay. A larger one shows a network that held the sample back, or a sender's
+# clock that was set.
 MAX_EXTRA_DELAY_NS = NS_PER_S // 4
-"""Largest normal excess of a sample's delay over the smallest delay of earlier samples, ns. A
-larger excess shows that the network held the sample back, or that the clock of the sender was
-set."""
 
+# Delays in such excess for this time that do not fall by this much show a clock that was set; a
+# backlog falls.
 STEADY_DELAY_NS, MAX_DELAY_FALL_NS = NS_PER_S, NS_PER_S // 50
-"""A delay is large if it exceeds the smallest delay by more than `MAX_EXTRA_DELAY_NS`. If the
-delays are large for `STEADY_DELAY_NS` and do not fall by more than `MAX_DELAY_FALL_NS`, the clock
-of the sender was set. While the network delivers a backlog instead, the delays fall."""
 
+# Step back of a stamp that shows that the sender's clock was set. Less is a driver that swaps
+# samples, or jitter.
 MIN_SET_BACK_NS = NS_PER_S // 50
-"""If a stamp is earlier than the previous stamp by more than this, ns, the clock of the sender was
-set back. A smaller step may have another cause: a driver may swap two samples or measure their
-times with some jitter."""
 
+# Sample periods without a sample after which some are missing; gain of the period, about 50
+# samples.
 HOLE_PERIODS, PERIOD_GAIN = 1.5, 0.02
-"""If the time between two samples exceeds `HOLE_PERIODS` sample periods, samples are assumed to be
-missing. `PERIOD_GAIN` is the weight of a new sample in the mean sample period, so about the last
-fifty samples count."""
 
+# Time of new samples over that of the line that shows a backlog after a silence. The gyro stays
+# silent until its last sample is younger than `HOLE_PERIODS`.
 CATCH_UP_SPEED = 1.5
-"""Ratio that shows a backlog of samples after a silence of the gyro: the time that the new samples
-cover, divided by the time of the feedback line. At a larger ratio, the gyro counts as silent until
-its last sample is less than `HOLE_PERIODS` sample periods old."""
 
-SLIP_S = 0.5
-"""Time for which the wheels count as slipping after they last contradicted the gyro, s."""
+SLIP_S = 0.5  # for which the wheels slip after a contradiction
 
-MAX_SLIP_S = 5.0
-"""Longest plausible slip, s. If gyro and wheels contradict each other for longer, the gyro is not
-used until they agree again."""
+MAX_SLIP_S = 5.0  # longer than this, the gyro is not used until gyro and wheels agree again
 
+# Rad/s to the next sample, which must confirm more. At 100 Hz 200 rad/s2 are a defect on the wire
+# or a push; at 10 Hz 20 rad/s2 are more than usual motors cause.
 MAX_JUMP = 2.0
-"""Change of the rate from one sample to the next, rad/s, above which the next sample must confirm
-it. At 100 samples per second, it is a change of 200 rad/s2: a defect on the wire, or a push. At 10
-samples per second, it is a change of 20 rad/s2, which is more than the motors of a usual robot
-cause."""
 
+# Age of the last sample from which nobody can tell any more who was right in a contradiction.
 LOST_NS = NS_PER_S
-"""Age of the gyro's last sample, ns, from which a contradiction between gyro and wheels remains
-unresolved. The daemon can then no longer find out whether gyro or wheels were right."""
 
+# Change of the bias, rad/s, learned from one exact rate: coarse gyros and simulated ones without
+# noise repeat theirs. One that hangs closer to the bias looks like a changed bias.
 MAX_BIAS_STEP = 0.06
-"""Largest change of the bias that is learned while a gyro at rest repeats one rate exactly, rad/s.
-The limit applies to gyros that also repeat rates without a defect: coarse gyros, and simulated
-gyros without noise. If such a gyro hangs at a rate that differs from the bias by less than this, it
-looks like a gyro whose bias has changed."""
 
+# A gyro certainly hangs if it repeats less of its samples at rest, and the chance of this series is
+# below.
 MAX_REPEATING, MIN_CHANCE = 0.6, 1e-6
-"""A gyro that repeats one rate certainly hangs if both of these conditions hold. At rest, it
-usually repeats less than the fraction `MAX_REPEATING` of its samples. The probability of the
-present series of repetitions is below `MIN_CHANCE`."""
 
+# Fraction of a jump that remains in the next sample: friction ends a push within some hundredths of
+# a second, but nothing is left of a wrong sample.
 CONFIRMED_FRACTION = 0.5
-"""Fraction of a jump of the rate that must remain in the next sample. After a push, friction slows
-the robot down within some hundredths of a second. After a wrong sample, nothing of the jump
-remains."""
 
+# Time at rest with one exact rate, until the gyro hangs: noise or a hand changes the last digits.
+# Less than `NEW_BIAS_TIME_S`, so the rate is not the bias first. A turntable looks like this, too.
 FROZEN_S = 0.8
-"""Time at rest after which a gyro that repeats one rate exactly is assumed to hang, s. The noise of
-a gyro, and a hand that turns the robot, change the last digits of the rate within a few samples.
-The time is shorter than `NEW_BIAS_TIME_S`, so that the rate of a gyro that hangs does not become
-the bias first. A coarse gyro that rotates evenly with a robot at rest, for example on a turntable,
-looks like a gyro that hangs."""
 
-TRUSTED_BLOCKS = 20.0
-"""Number of blocks of 0.1 s in which the robot must turn before the measured ratio of the gyro's
-turn to the wheels' turn is used."""
+TRUSTED_BLOCKS = 20.0  # of 0.1 s of turning, until the ratio of the turns is used
 
 STATUS_TEXTS: dict[GyroDoes, str] = {
     "off": "",
@@ -132,99 +96,74 @@ STATUS_TEXTS: dict[GyroDoes, str] = {
 
 
 class Turn(Struct, frozen=True, gc=False):
-    """Turn of the robot since the previous feedback line, measured by a gyro.
+    """The turn since the previous line by a gyro (or the wheels, with a correction), rad.
 
-    If earlier turns of the gyro were in doubt, the value may instead be the wheels' turn with a
-    correction of these earlier turns. `angle` is in rad, and `variance` is its variance, rad2. The
-    variance does not include the error of the gyro's scale, which does not average out
+    `variance`, rad2, is without the error of the gyro's scale, which does not average out
     (`uncertainty.py`).
     """
 
     angle: float
     variance: float
-    rate: float
-    """Turn rate, rad/s: that of the gyro's last sample, or of the wheels if `angle` is the wheels'
-    turn."""
+    rate: float  # rad/s, of the last sample or of the wheels
     rate_variance: float
+    # rad that wheels without a fault would report, by the learned ratio.
     wheels: float | None = None
-    """Turn that wheels without a fault would report, rad. It is `angle` divided by the learned
-    ratio of the gyro's turn to the wheels' turn."""
-    slips: bool = False
-    """Whether the turns according to wheels and gyro contradicted each other in the last `SLIP_S`
-    s."""
+    slips: bool = False  # the wheels contradicted the gyro within `SLIP_S`
 
 
 class Gyro:
     """Computes the turns of the robot from the samples of one gyro.
 
-    The caller passes samples to `add_samples`, and calls `turn` for each feedback line.
+    `add_samples` gets them, and `turn` is called for each line, which includes those up to
+    `SILENCE_TIMEOUT_NS` late, so no turn is lost. While they are later, the wheels provide it, and
+    a backlog (shown only by stamps) changes nothing. Missing samples make the turn uncertain. A
+    jump of the rate must be confirmed by the next sample. One exact rate at rest is a gyro that
+    hangs, and the wheels' turn replaces its since then. After a contradiction that ends with the
+    gyro unused, either may be right, so the difference is uncertainty.
     """
 
     def __init__(self) -> None:
         self._rest_s = self._since_rest_s = 0.0
+        # The wheels gave the last turn, as the gyro is on trial; the heading will be corrected.
         self.owes = False
-        """Whether the wheels provided the turn of the last line because the gyro is not proven. A
-        gyro is proven when it has agreed with the wheels in a turn. Then the heading is corrected
-        by the gyro's turn minus the wheels' turn."""
         self._does: GyroDoes = "silent"
-        self.events: list[Event] = []
-        """Log events of the last call of `turn`."""
-        self._doubt = 0.0
-        """Variance, rad2, that the next turn must add to the heading."""
+        self.events: list[Event] = []  # of the last `turn`
+        self._doubt = 0.0  # variance that the next turn must add, rad2
         self._begin()
 
     def _begin(self) -> None:
         self._bias, self._match, self._trial = Bias(), Match(), Trial()
+        # Not used yet, with their time (`_time_of`)
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
-        """Samples that `turn` has not used yet, each with its monotonic time, ns (`_time_of`)."""
         self._promptest = MinimumDelay()
+        # Arrival and delay of the first sample in such excess, ns.
         self._late_since: tuple[int, float] | None = None
-        """Arrival of the first sample with the present delay above `MAX_EXTRA_DELAY_NS`, and its
-        delay, both in ns. It is None if the delay is smaller."""
-        self._period_s = 0.0
-        """Mean time between two samples, s; 0 before the second sample."""
+        self._period_s = 0.0  # mean; 0 before the second sample
+        # Gyro's minus wheels' turn since the last used sample, whose rate is assumed to go on, rad.
         self._guessed = 0.0
-        """The gyro's turn minus the wheels' turn in the lines since the last sample that was used,
-        rad. In these lines, the robot is assumed to continue turning at the rate of this sample."""
+        # Gyro and wheels contradicted each other at the last used sample.
         self._slipped_before = False
-        """Whether gyro and wheels contradicted each other when the last used sample arrived."""
         self._last: GyroSample | None = None
-        self._told_ns: int | None = None
-        """Monotonic time of the last sample that was used, ns; None before the first sample."""
+        self._told_ns: Ns | None = None  # last used sample
         self._rate = 0.0
+        # Turn by all used samples, and that which `turn` has returned, rad.
         self._angle = self._given = 0.0
-        """`_angle` is the turn according to all samples that were used, rad. `_given` is the turn
-        that `turn` has returned so far, rad."""
-        self._variance = 0.0
-        """Variance of the part of `_angle` that `turn` has not returned yet, rad2."""
+        self._variance = 0.0  # of the rest of `_angle`, rad2
         self._slip_s = self._slipped_s = 0.0
-        self._reading: float | None = None
-        """Rate in the last sample that was used, rad/s, without a correction for the bias; None
-        before the first sample."""
+        self._reading: float | None = None  # rate of the last used sample, rad/s with the bias
+        # Exact repetition of `_reading`; and of it, at rest and not the bias.
         self._repeated_s = self._rested_s = 0.0
-        """`_repeated_s` is the time for which the gyro has repeated the rate `_reading` exactly, s.
-        `_rested_s` is the part of this time in which the robot was at rest and the rate was not the
-        bias, s."""
-        self._frozen = False
-        """Whether the gyro is assumed to hang, until its rate changes or becomes the bias."""
-        self._repeats = 0
-        """Number of successive samples that have repeated the rate of the sample before them."""
+        self._frozen = False  # the gyro hangs, until its rate changes or becomes the bias
+        self._repeats = 0  # successive repetitions
+        # Samples of the bias at rest, and repetitions among them, while the gyro does not hang.
         self._usual = self._usual_repeats = 0
-        """Numbers of samples that measured the bias at rest: all of them (`_usual`), and those that
-        repeated the rate of the sample before them (`_usual_repeats`). Samples of a gyro that hangs
-        do not count."""
+        # Rate that was repeated at rest and may be the new bias, rad/s.
         self._suspect: float | None = None
-        """A rate that the gyro repeated at rest and that may be its new bias, rad/s, or None."""
-        self._unsure = 0.0
-        """Additional variance of the bias, rad2/s2, because `_suspect` may be the new bias."""
-        self._noise = 0.0
-        """Variance of the present turn rate, rad2/s2."""
-        self._hole = False
-        """Whether samples are missing since the last feedback line, or the gyro was silent at that
-        line."""
+        self._unsure = 0.0  # variance of the bias by `_suspect`, rad2/s2
+        self._noise = 0.0  # variance of the present turn rate, rad2/s2
+        self._hole = False  # samples are missing since the last line, or it found the gyro silent
+        # Gyro's minus wheels' returned turn since the contradiction began, rad.
         self._contradicted = 0.0
-        """The gyro's turn minus the wheels' turn since their contradiction began, rad. The value
-        contains only turns that `turn` has returned, and it is 0 without a contradiction."""
         self._forget_owed()
         self._forget_repeated()
 
@@ -233,12 +172,9 @@ class Gyro:
         return GyroStatus(self._does, self._bias.value if self._bias.is_known else None)
 
     def add_samples(self, samples: tuple[GyroSample, ...]) -> None:
-        """Store the `samples` that arrived since the last control step, in the order of arrival.
+        """Store samples in the order of arrival; one with `anew` is another gyro's, and resets all.
 
-        A sample whose field `anew` is true is the first one of another gyro. The method then
-        forgets all values that were learned from the earlier gyro. If
-        the earlier gyro contradicted the wheels, the difference of their turns makes the heading
-        more uncertain.
+        A contradiction of the earlier one makes the heading more uncertain.
         """
         for sample in samples:
             if sample.anew:
@@ -248,18 +184,12 @@ class Gyro:
             self._hole |= len(self._heard) == self._heard.maxlen
             self._heard.append((self._time_of(sample), sample))
 
-    def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None:
-        """Return the turn of the robot since the previous feedback line, measured by the gyro.
+    def turn(self, at_ns: Ns, dt: float, wheels: float, still: bool) -> Turn | None:
+        """Return the gyro's turn since the previous line, `wheels` being the wheels', rad.
 
-        Return None if the wheels must provide the turn, for example because the gyro is silent or
-        not proven. If earlier turns of the gyro are in doubt, the result is instead the wheels'
-        turn, with a correction or an additional uncertainty for these earlier turns.
-
-        Args:
-            at_ns: Monotonic time of this line, ns.
-            dt: Time since the previous line, s. It is 0 after a gap, but the result covers the gap.
-            wheels: The turn in `dt` according to the wheels, rad.
-            still: Whether all wheels that are not ignored report zero speed.
+        Return None if the wheels must provide it. After doubtful turns, the result is the wheels'
+        turn with a correction. `dt` is 0 after a gap, which the result covers. `still` says that
+        all wheels in use report zero.
         """
         self.events, self.owes = [], False
         self._rest_s = self._rest_s + dt if still else 0.0
@@ -311,42 +241,26 @@ class Gyro:
         return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
 
     def drop_corrections(self) -> None:
-        """Drop the pending corrections of the heading, because a new pose was set.
-
-        This includes the uncertainty that the next turn would add to the heading.
-        """
+        """Drop pending corrections of the heading and its uncertainty: a new pose was set."""
         self._contradicted = self._doubt = self._guessed = 0.0
         self._forget_owed()
         self._forget_repeated()
 
     def _forget_owed(self) -> None:
+        # Pending correction, rad, for when the gyro is proven, and its variance, rad2.
         self._owed = self._owed_variance = 0.0
-        """`_owed` is the pending correction of the heading: the gyro's turn minus the wheels' turn
-        while the gyro was not proven, rad. It is added to the heading when the gyro is proven.
-        `_owed_variance` is its variance, rad2."""
 
     def _forget_repeated(self) -> None:
+        # Since the rate changed, over lines with the gyro's turn: gyro's minus wheels' turn and
+        # wheels' turn, rad; squared turns in gaps, rad2.
         self._repeated = self._repeated_wheels = self._repeated_gaps = 0.0
-        """Sums over the feedback lines since the rate of the gyro changed. The sums contain only
-        lines for which `turn` has returned the gyro's turn.
-
-        - `_repeated`: the gyro's turn minus the wheels' turn, rad.
-        - `_repeated_wheels`: the wheels' turn, rad.
-        - `_repeated_gaps`: the squares of the gyro's turns in gaps of the feedback, rad2.
-        """
 
     def undo_recomputation(self, turn: float) -> float:
-        """Return the angle that the caller must subtract from the heading, rad.
+        """Return the angle to subtract from the heading after a recomputation without a wheel.
 
-        Call this after the pose was recomputed over earlier feedback lines. `turn` is the change of
-        the robot's turn by this recomputation, rad. Only the lines in which the gyro was not proven
-        yet count (`owes`).
-
-        - If the gyro is proven now, the heading was already corrected to the gyro's turn. The
-          result is `turn`, so that the caller undoes the change.
-        - If the test of the gyro goes on, the result is 0, and the pending correction of the
-          heading changes by -`turn`.
-        - If the gyro was refuted, the result is 0, and no correction is pending.
+        `turn` is its change in lines with `owes`, rad. A proven gyro has corrected the heading
+        already, so the result is `turn`. On trial, the pending correction changes by -`turn`. A
+        refuted gyro has none.
         """
         verdict = self._trial.verdict
         if verdict == "none yet":
@@ -356,11 +270,8 @@ class Gyro:
     # Samples.
 
     def _time_of(self, sample: GyroSample) -> int:
-        """Return the monotonic time at which `sample` would have arrived without jitter, ns.
-
-        The samples of a backlog get the times at which they were measured. Even the last of them is
-        then old, so the wheels provide the present turn.
-        """
+        # Arrival without jitter; a backlog gets the times of measurement, so the wheels provide the
+        # present turn.
         last, self._last = self._last, sample
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
             return sample.at_ns
@@ -371,11 +282,8 @@ class Gyro:
             return sample.at_ns
         return sample.at_ns - max(0, int(late))
 
-    def _is_late_for_good(self, late: float, at_ns: int, last_at_ns: int) -> bool:
-        """Return whether the extra delay `late`, ns, is large and steady, because a clock was set.
-
-        `at_ns` and `last_at_ns` are the arrival times of this sample and of the one before it, ns.
-        """
+    def _is_late_for_good(self, late: float, at_ns: Ns, last_at_ns: Ns) -> bool:
+        # A clock was set: the excess `late` is large and steady.
         if late <= MAX_EXTRA_DELAY_NS:
             self._late_since = None
             return False
@@ -385,8 +293,8 @@ class Gyro:
         self._late_since = since_ns, first
         return at_ns - since_ns >= STEADY_DELAY_NS
 
-    def _take(self, until_ns: int, resting: bool) -> None:
-        """Process the samples until `until_ns`: learn the bias at rest, else add their turn."""
+    def _take(self, until_ns: Ns, resting: bool) -> None:
+        # Learn the bias at rest, otherwise add the turns.
         bias, samples = self._bias, self._heard
         while samples and samples[0][0] <= until_ns:
             jump = 0.0 if self._reading is None else samples[0][1].rate - self._reading
@@ -432,20 +340,13 @@ class Gyro:
 
     @property
     def _hangs(self) -> bool:
-        """Whether the gyro has repeated its rate for so long that it must have a defect.
-
-        If the gyro often repeats its rate without a defect, the repetitions prove nothing, and the
-        value is always False.
-        """
+        # False for a gyro that often repeats its rate without a defect.
         share = (self._usual_repeats + 1) / (self._usual + 1)
         return share < MAX_REPEATING and share**self._repeats < MIN_CHANCE
 
     def _end_repetition(self) -> None:
-        """Process the end of a repetition: the rate of the gyro has changed.
-
-        If the gyro seems to have hung, its turns during the repetition make the heading more
-        uncertain. If the repeated rate may be a new bias, the bias becomes more uncertain.
-        """
+        # The turns of a gyro that seems to have hung make the heading more uncertain, a possible
+        # new bias the bias.
         # The gyro may have hung while it contradicted the wheels. But a gyro without noise also
         # repeats its rate in an even turn with slipping wheels. Then the repetition begins with the
         # slip, and the wheels turn more than the robot.
@@ -465,20 +366,16 @@ class Gyro:
         self._forget_repeated()
 
     def _drop_waiting_correction(self) -> None:
-        """Drop a correction that waits for the next line, and add it to the heading's uncertainty.
-
-        A correction waits if the line that showed that the gyro hangs covers no known time.
-        """
+        # It waits if the line that showed the hanging gyro covers no known time; it becomes
+        # uncertainty.
         if self._frozen:
             self._doubt += self._repeated * self._repeated + self._repeated_gaps
 
     # Comparison with the wheels.
 
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
-        """Test a gyro that is not proven yet. Return whether the wheels must provide this turn.
-
-        While the wheels rest, the gyro provides the turn, because a person may turn the robot.
-        """
+        # True: the wheels must provide this turn. At rest the gyro does, because a person may turn
+        # the robot.
         trial, known = self._trial, self._bias.is_known
         if not trial.open or resting:
             return False
@@ -504,11 +401,8 @@ class Gyro:
         self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
 
     def _sum_up(self, angle: float, wheels: float, dt: float) -> None:
-        """Record the turns of a feedback line, which are needed if the gyro later proves wrong.
-
-        `angle` and `wheels` are the turns of the robot according to gyro and wheels, rad. `dt` is
-        the time of the line, s. It is 0 after a gap, in which only the gyro has measured the turn.
-        """
+        # This is for a gyro that later proves wrong. `dt` is 0 after a gap, which only the gyro has
+        # measured.
         off = angle - wheels
         self._repeated_gaps += 0.0 if dt > 0.0 else angle * angle
         self._repeated += off
@@ -517,30 +411,14 @@ class Gyro:
         self._contradicted = self._contradicted + off if self._slip_s > 0.0 else 0.0
 
     def _end_contradiction(self) -> None:
-        """Make the heading more uncertain by the difference between gyro and wheels.
-
-        This is the difference of their turns since they began to contradict each other. Call this
-        if the daemon can no longer find out whether the gyro or the wheels were right, for example
-        because the gyro has been silent for `LOST_NS`.
-        """
+        # The difference since the contradiction began is uncertainty, as nobody can tell who was
+        # right.
         self._doubt += self._contradicted * self._contradicted
         self._contradicted = 0.0
 
     def _doubted(self, wheels: float, dt: float, noise: float, lost: bool) -> Turn | None:
-        """Return the wheels' turn, corrected for doubtful earlier turns of the gyro.
-
-        Return None if no earlier turn is in doubt, or if `dt` is 0. Call this for a feedback line
-        in which the wheels provide the turn. If the gyro hangs, the result contains a correction
-        that replaces the gyro's earlier turns by the wheels' turns. In any case, the variance of
-        the result contains the uncertainty of the earlier turns.
-
-        Args:
-            wheels: the turn according to the wheels, rad.
-            dt: the time of the line, s; 0 after a gap.
-            noise: the variance of the turn rate in the result, rad2/s2.
-            lost: whether samples of the gyro are missing. A contradiction between gyro and wheels
-                then does not end with this line, so it is not added to the uncertainty yet.
-        """
+        # The wheels' turn with a correction for a gyro that hangs, and the uncertainty of earlier
+        # turns; None without doubt or `dt`. While samples are `lost`, a contradiction goes on.
         if dt <= 0.0:
             # This line gives no turn, so a correction for a gyro that hangs waits for the next one.
             if not lost and not self._frozen:

@@ -1,8 +1,8 @@
 """Compares a gyro with the wheels: learns the ratio of their turns, and finds contradictions.
 
-Let w be the turn rate according to the wheels and g that of the gyro, rad/s, as means over blocks
-of a tenth of a second. A least-squares fit finds the ratio a in g = a w. It forgets old data only
-while the robot turns. A delay of the gyro is the matter of its driver, and counts as 0 here.
+A least-squares fit of means over `BLOCK_S` finds a in g = a w, with the rates g of the gyro and w
+of the wheels, rad/s. It forgets only while the robot turns. A delay is the matter of the gyro's
+driver, and is 0 here.
 """
 
 from __future__ import annotations
@@ -10,39 +10,26 @@ from __future__ import annotations
 import math
 from collections import deque
 
-BLOCK_S = 0.1
-"""Duration of a block, over which the turn rates are averaged, s. A single feedback line has too
-few encoder counts for a precise rate."""
+BLOCK_S = 0.1  # of means: one line has too few counts for a precise rate
 
-MIN_TURN_RATE = 0.05
-"""Smallest turn rate according to the wheels, rad/s, at which the robot counts as turning."""
+MIN_TURN_RATE = 0.05  # rad/s by the wheels
 
-FORGETTING_FACTOR = 0.995
-"""Factor that reduces the weight of all earlier blocks (`BLOCK_S`) with each block in which the
-robot turns. The fit thus remembers 200 blocks (20 s of turning)."""
+FORGETTING_FACTOR = 0.995  # of earlier blocks with each block of turning: 200 blocks, or 20 s
 
+# Standard deviations of the ratio: before any data, and the least, because floor and turn rate
+# change it.
 INITIAL_RATIO_STD, MIN_RATIO_STD = 0.5, 0.1
-"""Standard deviations of the ratio of the gyro's turn to the wheels' turn. `INITIAL_RATIO_STD` is
-the value that is assumed before any data. `MIN_RATIO_STD` is the smallest value that is assumed,
-because floor and turn rate change the ratio."""
 
+# Standard deviation of a block's mean, rad/s, plus this share of it.
 BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
-"""The mean turn rate over a block (`BLOCK_S`) has a standard deviation of `BLOCK_NOISE` rad/s plus
-`BLOCK_SHARE` times the rate."""
 
-MAX_DELAY_S = 0.05
-"""Delay of a gyro that is no contradiction between gyro and wheels, s."""
+MAX_DELAY_S = 0.05  # of a gyro without a contradiction
 
-WINDOW_S = 0.2
-"""Time over which the turns of gyro and wheels are compared to find a contradiction, s."""
+WINDOW_S = 0.2  # for the comparison of turns
 
-WINDOW_STD = 0.015
-"""Standard deviation, rad, of the difference between the turns of gyro and wheels over `WINDOW_S`
-without slip. Encoder counts and vibration cause it."""
+WINDOW_STD = 0.015  # rad over `WINDOW_S` without slip, by encoder counts and vibration
 
-MAX_DEVIATIONS = 3.0
-"""Number of standard deviations by which the turns of gyro and wheels over `WINDOW_S` may differ.
-If they differ by more, gyro and wheels contradict each other."""
+MAX_DEVIATIONS = 3.0  # more over `WINDOW_S` is a contradiction
 
 
 class Match:
@@ -60,12 +47,7 @@ class Match:
         self._sums = [0.0, 0.0, 0.0]
 
     def add(self, wheels: float, gyro: float, dt: float, slips: bool) -> None:
-        """Add a feedback line. When a block is complete, learn from it.
-
-        `wheels` and `gyro` are the turns of the robot in the last `dt` s according to wheels and
-        gyro, rad. If `slips` is true in the last line of a block, the wheels slip, and nothing is
-        learned from this block.
-        """
+        """Add a line of `dt` s, rad by wheels and gyro; a block that slips teaches nothing."""
         self._slide(wheels, gyro, dt)
         self._wheels += wheels
         self._gyro += gyro
@@ -76,10 +58,7 @@ class Match:
             self._wheels = self._gyro = self._time = 0.0
 
     def contradiction(self, variance: float) -> bool:
-        """Return whether the turns of gyro and wheels in the last `WINDOW_S` s are contradictory.
-
-        `variance` is the variance of the gyro's turn over this time, rad2.
-        """
+        """Return whether the turns over `WINDOW_S` are contradictory (gyro's variance, rad2)."""
         wheels, gyro, time = self._sums
         if time < WINDOW_S * 0.95:
             return False

@@ -1,73 +1,56 @@
 """Tests in the first turn whether a gyro measures rad/s about an axis that points up.
 
-A gyro that is mounted upside down, reads degrees or is disconnected disagrees with the wheels in
-every turn. A good gyro disagrees with them only in a turn in which the wheels slip. So a gyro is
-used after it has agreed with the wheels in one turn. The limits for this agreement are wide,
-because skidding wheels roll further than the robot turns.
+One that is upside down, reads degrees or is disconnected disagrees in every turn, a good one only
+when the wheels slip. So it is used after it has agreed with the wheels in one turn, within wide
+limits, because skidding wheels roll further than the robot turns.
 """
 
 from __future__ import annotations
 
 from typing import Literal
 
+# Rad/s by the wheels, from which a turn to the other side begins (less may be one encoder count),
+# and a gyro can be dead (unequal tires report less while the robot drives straight).
 MIN_TURN_RATE = 0.1
-"""Turn rate according to the wheels, rad/s, with two uses. A feedback line in the opposite
-direction begins a new turn only from this rate on, because a lower rate may come from a single
-encoder count. A gyro that reads zero is called dead only from this rate on, because wheels with
-unequal tires report a lower rate while the robot drives straight."""
 
-MIN_MEAN_RATE, STRETCH_S = 0.05, 0.5
-"""`MIN_MEAN_RATE` is the smallest mean turn rate according to the wheels that counts as a turn,
-rad/s. `STRETCH_S` is the duration of the intervals over which the mean is taken, s."""
+MIN_MEAN_RATE, STRETCH_S = 0.05, 0.5  # rad/s by the wheels, mean over the s, that counts as a turn
 
-TURN_RATIO_RANGE = (0.25, 2.5)
-"""Range of the ratio of the robot's true turn to its turn according to the wheels. On any floor,
-the ratio is within this range."""
+TURN_RATIO_RANGE = (0.25, 2.5)  # of the true turn to the wheels', on any floor
 
+# Rad to one side by the wheels that can prove a gyro, or refute one, which may be late.
 MIN_PROVING_TURN, MIN_REFUTING_TURN = 0.1, 0.4
-"""Smallest turns to one side according to the wheels, rad. A turn of `MIN_PROVING_TURN` can prove
-that the gyro is good, and a turn of `MIN_REFUTING_TURN` can show that it is not. The second one is
-larger, because the gyro may be late."""
 
-MIN_REFUTING_TURN_S = 0.3
-"""Shortest time for which the robot must turn before the gyro can be refuted, s. No gyro has a
-delay as long as this."""
+MIN_REFUTING_TURN_S = 0.3  # of turning, until the gyro can be refuted; no delay is as long
 
+# Ratio of a gyro in degrees to the wheels: 57 without slip and errors.
 DEGREES_RATIO_RANGE = (15.0, 150.0)
-"""Range of the ratio of the gyro's turn to the wheels' turn if the gyro reads degrees. Without slip
-and errors, the ratio is 57."""
 
 Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not believed"]
 
 
 class Trial:
-    """Compares a gyro with the wheels until the gyro is proven.
+    """Compares a gyro with the wheels until it is proven.
 
-    `verdict` is the result so far. A gyro that was refuted can still be proven later, so a
-    refutation does not end the comparison.
+    A `verdict` that refutes it is not the last one.
     """
 
     def __init__(self) -> None:
         self.verdict: Verdict = "none yet"
         self._wheels = self._gyro = self._seconds = 0.0
+        # Sums of the present interval: wheels, rad; s; gyro, rad.
         self._stretch = self._stretch_s = self._stretch_gyro = 0.0
-        """Sums over the present interval of `STRETCH_S`: the turn according to the wheels, rad; the
-        duration, s; and the turn according to the gyro, rad."""
+        # rad by wheels and gyro, in intervals of `MIN_TURN_RATE`.
         self._fast = self._fast_gyro = 0.0
-        """Turns according to wheels and gyro, rad, over all intervals in which the mean turn rate
-        was at least `MIN_TURN_RATE`."""
 
     @property
     def open(self) -> bool:
-        """Whether the trial goes on. It ends when the gyro is proven."""
+        """Whether the gyro is not proven yet."""
         return self.verdict != "good"
 
     def add(self, wheels: float, gyro: float, dt: float, certain: bool = True) -> None:
-        """Compare the turns of gyro and wheels in a feedback line of `dt` s, and update `verdict`.
+        """Compare a line of `dt` s, rad by wheels and gyro, and update `verdict`.
 
-        `wheels` and `gyro` are the turns of the robot in this line according to wheels and gyro,
-        rad. `certain` is false if the bias of the gyro is unknown. The verdict can then only change
-        to "in degrees".
+        With an unknown bias (not `certain`), it can only become "in degrees".
         """
         self._stretch += wheels
         self._stretch_gyro += gyro
@@ -113,7 +96,7 @@ class Trial:
 
 
 def _named(ratio: float) -> Verdict:
-    """Return the verdict on a gyro whose turn is `ratio` times the wheels' turn."""
+    # `ratio` is the gyro's turn over the wheels' turn.
     least, most = TURN_RATIO_RANGE
     if DEGREES_RATIO_RANGE[0] <= abs(ratio) <= DEGREES_RATIO_RANGE[1]:
         return "in degrees"

@@ -1,9 +1,8 @@
 """Limits a requested twist: speed, wheel saturation, acceleration, deceleration and jerk.
 
-`Limiter.follow` moves towards a command and limits the linear and the angular axis separately.
-`Limiter.coast` brings the robot to rest without a command. It reduces both axes in the same
-proportion, because otherwise a wheel could speed up meanwhile (rule 2 of `acsard/README.md`). The
-jerk limit applies only to speeding up, because comfort must not delay braking.
+`follow` moves both axes separately towards a command. `coast` reduces them in proportion, or a
+wheel could speed up (rule 2 of `acsard/README.md`). Jerk is limited only for speeding up, because
+comfort must not delay braking.
 """
 
 from __future__ import annotations
@@ -36,19 +35,15 @@ class Limiter:
 
     def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
         self._kinematics = kinematics
+        # Allowed twist and accelerations. `Robot` resets it to that of the last line on the port.
         self.state = _State(REST, 0.0, 0.0)
-        """The allowed twist and the accelerations of the last step. If a line with wheel speeds
-        could not be written to the port, `Robot` resets `state` to its value at the last line that
-        was written."""
         self._cap = math.inf
         self.use(limits)
 
     def use(self, limits: LimitsConfig) -> None:
-        """Use these limits from now on.
+        """Use other limits; a faster robot slows down at the configured deceleration.
 
-        If the robot moves faster than the new speed limits allow, it slows down at the configured
-        deceleration. A lower wheel-speed limit, however, takes effect without a ramp, so the caller
-        may lower this limit only at rest.
+        A lower wheel speed takes effect without a ramp, so lower it only at rest.
         """
         self._linear = _Axis(
             limits.linear_speed,
@@ -65,32 +60,22 @@ class Limiter:
             limits.angular_jerk,
         )
         self._wheel_speed = limits.wheel_speed
-        self._wished = self._goal = REST
-        """`_wished` is the last requested twist. `_goal` is the same twist, scaled down to the
-        speed limits."""
-        self._arrived: _State | None = None
-        """The state in which the robot has reached `_goal` and keeps this speed; None before
-        that."""
+        self._wished = self._goal = REST  # requested, and within the speed limits
+        self._arrived: _State | None = None  # `_goal` is reached, and kept
 
     def cap(self, speed: float) -> None:
-        """Allow at most the linear speed `speed`, m/s, beside the configured limit.
-
-        A faster robot slows down at the configured deceleration.
-        """
+        """Allow at most this linear speed, too; a faster robot slows down as configured."""
         self._cap = speed
         self._wished = self._goal = REST
         self._arrived = None
 
     @property
     def twist(self) -> Twist:
-        """The twist that the limiter allowed in the last step, m/s and rad/s."""
+        """The allowed twist of the last step."""
         return self.state.twist
 
     def follow(self, wished: Twist, dt: float) -> Twist:
-        """Move the allowed twist towards `wished` for `dt` s, and return the new allowed twist.
-
-        `wished` is the requested twist, m/s and rad/s. It must be finite.
-        """
+        """Move the allowed twist towards a finite one for `dt` s, and return it."""
         if wished is not self._wished:  # most steps have the same command as the step before
             self._wished, self._arrived = wished, None
             self._goal = self._kinematics.saturate(self._within_speed(wished), self._wheel_speed)
@@ -110,10 +95,7 @@ class Limiter:
         return twist
 
     def _fitted(self, twist: Twist) -> Twist:
-        """Return the intended next twist `twist`, changed so that no wheel exceeds its speed limit.
-
-        On each axis, the result is between the present twist and `twist`.
-        """
+        # Each axis is between the present twist and `twist`, so that no wheel exceeds its limit.
         kinematics, most, now = self._kinematics, self._wheel_speed, self.twist
         if kinematics.fits(twist, most):
             return twist
@@ -136,11 +118,9 @@ class Limiter:
         return kinematics.saturate(fitted, most)
 
     def coast(self, dt: float, stop: bool = False) -> Twist:
-        """Slow down towards rest for `dt` s, and return the allowed twist.
+        """Slow down towards rest for `dt` s, both speeds in proportion; return the allowed twist.
 
-        Linear and angular speed fall in the same proportion. If `stop` is true, the limits
-        `*_stop_deceleration` apply, otherwise `*_deceleration`. A negative `dt` counts as 0, so
-        that it cannot speed up the robot.
+        `stop` uses `*_stop_deceleration`. A negative `dt` is 0, and cannot speed up the robot.
         """
         dt, twist = max(0.0, dt), self.twist
         seconds = max(
@@ -180,10 +160,7 @@ def _braking(axis: _Axis, stop: bool) -> float:
 def _approach(
     speed: float, goal: float, slope: float, dt: float, axis: _Axis
 ) -> tuple[float, float]:
-    """Return the speed of one axis after `dt` s on the way to `goal`, and its acceleration.
-
-    `slope` is the acceleration in the previous step.
-    """
+    # Speed of an axis on the way to `goal`, and its acceleration; `slope` is the previous one.
     if dt <= 0.0:
         return speed, slope
     # Split a change of direction at zero: slowing down is limited as deceleration, and speeding up
@@ -205,11 +182,8 @@ def _approach(
 
 
 def _flattenable(away: float, step: float, dt: float) -> float:
-    """Return the largest acceleration that can fall to zero before the speed passes its goal.
-
-    `away` is the difference between the goal and the speed. The jerk limit lets the acceleration
-    fall by `step` in each period of `dt` s.
-    """
+    # The largest acceleration that can fall to zero, by `step` in each `dt`, before the speed
+    # passes its goal, `away` from it.
     # If the acceleration starts at s and falls for n more periods, the speed changes by
     # dt ((n + 1) s - step n (n + 1) / 2).
     n = math.floor((math.sqrt(1.0 + 8.0 * away / (step * dt)) - 1.0) / 2.0)

@@ -1,15 +1,12 @@
 """Integrates wheel speeds into pose, twist and covariance of base_link in odom.
 
-The equations of one step of dt s, where left and right are the mean wheel speeds of the two sides
-(`kinematics.py`, equation 1), are
-
     (4)  d_left = r_l left dt            (5)  d_right = r_r right dt
     (6)  d = (d_right + d_left) / 2      (7)  dyaw = (d_right - d_left) / L
     (8)  x += d cos(yaw)                 (9)  y += d sin(yaw)
     (10) yaw += dyaw, wrapped            (11) v = d / dt, w = dyaw / dt
 
-Equations (8) and (9) step along a straight line; `path.py` integrates the exact arc instead. Line
-and arc agree in the limit dyaw -> 0.
+`left` and `right` are of `kinematics.py`, equation 1. Instead of (8) and (9), `path.py` integrates
+the exact arc, whose limit they are for dyaw -> 0.
 """
 
 from __future__ import annotations
@@ -49,34 +46,23 @@ from acsard.core.values import (
     WheelSpeeds,
 )
 
+# Fraction of a motion that the pose has missed with the probability 1/2: the board may have got the
+# command to rest in a gap or not, and a wheel that is contradicted may be right or not.
 MISSED_STD = math.sqrt(0.5)
-"""Standard deviation of a motion that the pose may have missed, as a fraction of this motion. The
-pose has missed the motion with the probability 1/2: the board may have received the command to rest
-in a gap or not, and a wheel that contradicts another one or its command may be right or not."""
 
-MAX_RECOMPUTED_LINES = 128
-"""Largest number of feedback lines that are recomputed when a wheel proves faulty."""
+MAX_RECOMPUTED_LINES = 128  # when a wheel proves faulty
 
 
 class Step(Struct, frozen=True, gc=False):
-    """One step of the pose: the motion that one feedback line added to it.
+    """The motion that one line added to the pose, kept for a recomputation without a wheel."""
 
-    The odometry keeps it to recompute the pose if a wheel proves faulty.
-    """
-
-    pose: Pose
-    """The pose before the feedback line."""
-    pieces: tuple[Motors, ...]
-    """Angles that the wheels rolled since the previous feedback line, rad, one item for each
-    arc."""
-    gyro: Turn | None
-    """The turn that a gyro measured; None if the wheels provided the turn."""
+    pose: Pose  # before the line
+    pieces: tuple[Motors, ...]  # rolled since the previous line, rad, one item for each arc
+    gyro: Turn | None  # None: the wheels provided the turn
     speeds: WheelSpeeds
-    turn: float
-    """Change of the heading that this line caused, rad."""
+    turn: float  # of the heading by this line, rad
+    # The wheels provided the turn, because the gyro has not agreed with them in a turn yet.
     on_trial: bool
-    """Whether the wheels provided the turn because the gyro was not proven. A gyro is proven when
-    it has agreed with the wheels in a turn."""
 
 
 class Odometry:
@@ -90,22 +76,17 @@ class Odometry:
         feedback: FeedbackConfig = FeedbackConfig(),  # noqa: B008
         quiet: float = math.inf,
     ) -> None:
-        """Start at the origin.
-
-        `encoder_counts` is the number of counts per revolution of a wheel; 0 if it is unknown.
-        `quiet` is the time without feedback after which the daemon commands rest, s.
-        """
+        # `encoder_counts` per revolution is 0 if unknown; after `quiet` s without feedback, the
+        # daemon commands rest.
         self._kinematics = kinematics
         self._positions = AT_REST
         self._rolling = Rolling(quiet)
         self._confirmation = Confirmation(feedback)
+        # Rolled at rest, rad; for the pose beyond two counts (`_unsettled`), or in a drive.
         self._held = AT_REST
-        """Angles that the wheels have rolled at rest, rad. The odometry adds these angles to the
-        pose when they exceed two encoder counts (`_unsettled`) or when the robot drives."""
+        # Quantization of each speed in the last line, and the largest known one, rad/s, or if none
+        # is known 0 and infinite.
         self._steps_of, self._coarsest, self._largest_step = AT_REST, 0.0, 0.0
-        """`_steps_of` contains the quantization step of each wheel's speed in the last line, rad/s.
-        `_coarsest` and `_largest_step` are the largest of these steps that is known, rad/s. If no
-        step is known, `_coarsest` is 0 and `_largest_step` is infinite."""
         self._path = Path()
         self._errors = ErrorModel(odometry, kinematics)
         self._uncertainty = PoseUncertainty(self._errors, encoder_counts)
@@ -113,41 +94,28 @@ class Odometry:
         self._gaps, self._rounding = Gaps(), Rounding()
         self.checks = ConsistencyChecks(odometry, kinematics, encoder_counts, feedback)
         self._steps: deque[Step] = deque(maxlen=MAX_RECOMPUTED_LINES)
+        # Two counts, rad: a wheel at rest rocks between the edges of one.
         self._unsettled = 2 * math.tau / (encoder_counts or ASSUMED_COUNTS)
-        """Angle of two encoder counts, rad. If a wheel at rest rocks between the edges of one
-        count, the reported angle is not larger than this."""
-        self._still = 0.0
-        """Time for which all wheel speeds have been zero, s, without filled gaps."""
-        self.twist = REST
-        """Twist in the last feedback line, m/s and rad/s."""
-        self.speeds = STILL
-        """Wheel speeds in the last feedback line, rad/s."""
+        self._still = 0.0  # s of zero speeds, without filled gaps
+        self.twist = REST  # in the last line
+        self.speeds = STILL  # in the last line
+        # Last commanded twist; highest commanded speeds since the last line, without sign.
         self._commanded = self._highest = REST
-        """`_commanded` is the twist that was commanded last. `_highest` contains the highest linear
-        and angular speed that was commanded since the last feedback line, both without sign."""
-        self._folded = False
-        """Whether a feedback line was used since the last command."""
+        self._folded = False  # a line was used since the last command
+        # Gaps in which the robot may have moved but the pose could not follow, their s, and s of
+        # filled gaps.
         self.gaps, self.unseen, self.bridged = 0, 0.0, 0.0
-        """Statistics of the gaps in the feedback. `gaps` and `unseen` are the number and the total
-        duration, s, of the gaps in which the robot may have moved but the pose could not follow.
-        `bridged` is the total duration of the gaps that were filled, s."""
-        self.travelled = 0.0
-        """Distance driven since the start of the daemon, forwards plus backwards, m."""
+        self.travelled = 0.0  # m since the daemon started, forwards plus backwards
 
     def use(self, odometry: OdometryConfig) -> None:
-        """Use the variances in `odometry` from now on.
-
-        The variances of the initial pose apply from the next call of `set_pose` on.
-        """
+        """Use other variances; those of the initial pose apply from the next `set_pose`."""
         self._errors.use(odometry)
 
     def set_pose(self, pose: Pose) -> None:
         """Set the pose of base_link in odom, with the uncertainty of an initial pose.
 
-        Some motion is not in the pose yet, for example the motion in feedback lines that are held
-        back or implausible. This motion is dropped, because it happened before this call. However,
-        a small motion at rest (`_held`) is still added to the angles of the wheels. If this call
-        comes in a silence of the board, the next line still adds the motion of the whole silence.
+        Motion that is not in the pose yet is dropped, because it was before this call; only `_held`
+        still turns the wheels. A silence that goes on is added by the next line as a whole.
         """
         self._positions = plus(self._positions, self._held)
         self._held = AT_REST
@@ -164,20 +132,14 @@ class Odometry:
         return self._path.pose
 
     def missed(self) -> dict[str, int]:
-        """Return counters of the gaps in the feedback by name, without counters that are 0.
-
-        `gaps` is the number of gaps in which the robot may have moved but the pose could not
-        follow, and `gap_ms` is their total duration, ms. `gaps_filled_ms` is the total duration of
-        filled gaps, ms.
-        """
+        """Return the counters `gaps`, `gap_ms` and `gaps_filled_ms` that are not 0."""
         ms = {"gap_ms": round(1e3 * self.unseen), "gaps_filled_ms": round(1e3 * self.bridged)}
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
 
     def command(self, twist: Twist) -> None:
-        """Record the twist, m/s and rad/s, that the motors are commanded from now on.
+        """Record the twist that the motors are commanded from now on.
 
-        The daemon calls this in each control step, after the feedback lines of this step. In a gap
-        of the feedback, the robot may have driven as fast as the recorded twists.
+        Call this in each step after its lines: in a gap, the robot may have driven as fast.
         """
         if self._folded or twist != self._commanded:
             # The robot may still follow the previous command, because the board reacts late.
@@ -189,19 +151,17 @@ class Odometry:
             self._commanded, self._folded = twist, False
 
     def skip(self, feedback: Feedback) -> None:
-        """Ignore the speeds of an implausible feedback line (see `sanity.py`).
+        """Ignore the speeds of an implausible line; the next plausible one adds both motions.
 
-        The next plausible line adds the motion of both lines to the pose. If `feedback` has encoder
-        counts, its motion comes from these counts.
+        With encoder counts, its motion comes from these.
         """
         self._rolling.skip(feedback)
 
     def confirmed(self, feedback: Feedback) -> tuple[list[Feedback], int]:
-        """Return the feedback lines to pass to `fold`, and the number of lines that were dropped.
+        """Return the lines for `fold`, in the order of time, and how many were dropped.
 
-        `feedback` is the next plausible line. It is held back for a later call if it covers a long
-        time and reports a speed that neither another wheel nor another line confirms yet. The
-        returned lines are in the order of time. The time of a dropped line counts as a gap.
+        The next plausible line is held back if it covers a long time with a speed that nothing
+        confirms yet. The time of a dropped line is a gap.
         """
         rolling, believed = self._rolling, self.checks.wheels.believed
         lines, dropped = self._confirmation.confirm(
@@ -212,16 +172,12 @@ class Odometry:
         return lines, len(dropped)
 
     def fold(self, feedback: Feedback) -> Estimate:
-        """Advance the pose by one feedback line, and return the new estimate.
+        """Advance the pose by one line, and return the new estimate.
 
-        - The angles that the wheels rolled come from the encoder counts of the line. Without
-          counts, each angle is the speed of the wheel times dt. After a gap that cannot be filled,
-          only the uncertainty grows.
-        - While the robot is at rest, a motion of up to two encoder counts does not change the pose
-          yet.
-        - If a gyro provides the turn since the previous line, the wheels provide only the distance.
-        - If a wheel proves faulty, the other wheel of its side replaces it, also in the earlier
-          lines in which the faulty wheel was wrong.
+        Angles come from encoder counts, or else speeds times dt; after a gap that cannot be filled,
+        only the uncertainty grows. At rest, up to two counts do not change the pose yet. With a
+        gyro's turn, the wheels provide only the distance. The other wheel of its side replaces a
+        faulty one, also in earlier lines.
         """
         speeds, dt, before, checks = feedback.speeds, feedback.dt, self.twist, self.checks
         rolled = self._rolling.take(feedback, self.speeds)
@@ -265,11 +221,7 @@ class Odometry:
         )
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
-        """Return the wheel angles to add to the pose now, rad, one item for each arc.
-
-        A small motion at rest is stored in `_held` and not returned yet, because a wheel at rest
-        may rock between the edges of one encoder count.
-        """
+        # A small motion at rest goes into `_held`: a wheel may rock between the edges of a count.
         turned = rolled.turned
         if self._held != AT_REST:
             turned = plus(self._held, turned)
@@ -284,10 +236,7 @@ class Odometry:
         return (turned, *rolled.pieces)
 
     def _take_back(self) -> None:
-        """Recompute the pose over the recent lines in which the newly faulty wheel was wrong.
-
-        If a gyro was proven meanwhile and has corrected the heading, the heading does not change.
-        """
+        # A gyro that was proven meanwhile has corrected the heading, which then does not change.
         was_faulty = self.checks.wheels.was_faulty
         wrong = list(takewhile(lambda step: was_faulty(step.speeds), reversed(self._steps)))
         if not wrong:
@@ -308,11 +257,7 @@ class Odometry:
             self._path.turn(-self.checks.undo_recomputation(on_trial))
 
     def _arcs(self, pieces: tuple[Motors, ...], gyro: Turn | None) -> list[tuple[float, float]]:
-        """Return the arcs that the robot drove, as pairs of distance (m) and turn (rad).
-
-        `pieces` contains the angles that the wheels rolled, rad, one item for each arc. If `gyro`
-        is not None, the result is a single arc with the gyro's turn.
-        """
+        # Distance, m, and turn, rad; a gyro's turn makes a single arc.
         believed, kinematics = self.checks.wheels.believed, self._kinematics
         arcs = []
         for piece in pieces:
@@ -329,7 +274,7 @@ class Odometry:
         speeds: WheelSpeeds,
         slips: bool,
     ) -> float:
-        """Advance the pose, and return its turn, rad. `turn` is the turn according to a gyro."""
+        # `turn` is by a gyro. Returns the turn of the pose, rad.
         path, turned = self._path, 0.0
         pose, variance = path.pose, None if turn is None else turn.variance
         for piece in pieces:
@@ -344,10 +289,7 @@ class Odometry:
         return turned
 
     def _go_on(self, rolled: Rolled, feedback: Feedback, before: Twist, twist: Twist) -> None:
-        """Add the uncertainty of a filled gap; without a gap, measure the robot's acceleration.
-
-        A gap that was not filled restarts the measurement.
-        """
+        # A gap that was not filled restarts the measurement of the acceleration.
         bridged = rolled.bridged
         if bridged > 0.0:
             self.bridged += bridged
@@ -362,10 +304,7 @@ class Odometry:
             self._gaps.follow(twist, feedback.dt)
 
     def _miss(self, cause: Missed, angles: Motors, gyro: Turn | None) -> None:
-        """Add the uncertainty because the wheels may have rolled `angles`, rad, in addition.
-
-        `gyro` is the turn that a gyro measured, or None.
-        """
+        # The wheels may have rolled `angles`, rad, in addition.
         distance, turn = self._kinematics.moved(angles)
         # A gyro does not miss a turn.
         turn = turn if gyro is None else 0.0
@@ -390,17 +329,13 @@ class Odometry:
         return variances
 
     def _rounded(self, seconds: float) -> tuple[float, float]:
-        """Return the variances that rounding to encoder counts causes in a gap of the feedback.
-
-        The gap takes `seconds` s. The result is the pair of the variances of the distance (m2) and
-        of the turn (rad2). The second one is 0 if a gyro provides the turn.
-        """
+        # Variances of distance, m2, and turn, rad2 (0 with a gyro), by counts in a gap.
         linear, angular = self._twist_uncertainty.rounding(self._rounding.square)
         square = seconds * seconds
         return linear * square, 0.0 if self.checks.turn is not None else angular * square
 
     def _add_unseen_motion(self, seconds: float, before: Twist, after: Twist) -> None:
-        """Add the uncertainty of `seconds` s of unknown motion, but do not move the pose."""
+        # Does not move the pose.
         if before != REST or after != REST or self._highest != REST:
             self.gaps += 1
             self.unseen += seconds
