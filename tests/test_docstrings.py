@@ -17,14 +17,6 @@ NOT_YET = (
     "cli",
     "core/config",
     "core/incoming",
-    "core/motion/consistency.py",
-    "core/motion/error_model.py",
-    "core/motion/gyro.py",
-    "core/motion/gyro_bias.py",
-    "core/motion/gyro_match.py",
-    "core/motion/gyro_trial.py",
-    "core/motion/limits.py",
-    "core/motion/odometry.py",
     "core/ros",
 )
 
