@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import tomllib
 from collections.abc import Sequence
-from pathlib import Path
 
 import msgspec
 
@@ -28,9 +27,8 @@ from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.ros.parameters import described
 from acsard.core.values import Plain
-from acsard.host.config_file import change, writable
-from acsard.host.errors import Exit, MendableError, UsageError
-from acsard.host.processes import is_daemon_here
+from acsard.host.errors import Exit, UsageError
+from acsard.machine.kept_settings import set_and_keep
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -64,15 +62,12 @@ def main(args: argparse.Namespace) -> int:
             return Exit.OK
         if many:
             return _set_all(robot, many, settings, as_json=args.json)
-        file = _file(robot, args.config, settings) if args.keep else None
-        reply = robot.set(settings)
-    text = _with_duration(reply).message
-    if reply.success and file is not None:
-        try:
-            change(file, settings)
-        except MendableError as error:
-            raise MendableError(f"{text}; not written: {error}") from None
-        text = f"{reply.message}; written to {file}"
+        if args.keep:
+            reply = set_and_keep(robot, args.config, settings)
+            text = reply.message
+        else:
+            reply = robot.set(settings)
+            text = _with_duration(reply).message
     print(json_line(encode(reply, "json").decode()) if args.json else lines(text))
     return Exit.OK if reply.success else Exit.FAILURE
 
@@ -128,23 +123,6 @@ def _set_all(
 
     replies = of_each(robot, ids, change_one)
     return print_each(replies, robot, ids, "NO ANSWER: {error}", as_json=as_json)
-
-
-def _file(robot: Client, path: str | None, settings: dict[str, Plain]) -> Path:
-    """Return the robot's configuration file. Raise an error if it cannot be changed here."""
-    if any(key.startswith("commands.sources.") for key in settings):
-        raise UsageError(
-            "--keep cannot change [[commands.sources]]: set the timeout without --keep, and "
-            "write it into the file yourself. If the file has no [[commands.sources]] yet, copy "
-            "all of these tables from the output of `acsard check` first, because the file's "
-            "tables replace all built-in ones"
-        )
-    if not is_daemon_here(robot.get("info").pid):
-        raise MendableError(
-            "no setting was changed: --keep writes the file on the robot, but the daemon runs on "
-            "another machine or in a container: type the command there, or leave out --keep"
-        )
-    return writable(path)
 
 
 def _print_settings(config: object, as_json: bool) -> None:

@@ -133,6 +133,7 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
         listen,
         tls,
         tokens.place(),
+        args.config,
         args.supervised,
     )
     log = Log(config.log)

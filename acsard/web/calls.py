@@ -18,9 +18,10 @@ from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.keys_and_roles import SERVICES
 from acsard.core.messages.permissions import SERVICE_ROLES
 from acsard.core.messages.schema import ServiceReply
-from acsard.host.errors import MendableError
+from acsard.host.errors import MendableError, UsageError
 from acsard.host.rate_limits import Places
 from acsard.host.threads import in_thread
+from acsard.machine.kept_settings import set_and_keep
 from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.robots import Robots
 from acsard.web.tasks import shared
@@ -42,8 +43,8 @@ Stop = Callable[[], Awaitable[ServiceReply]]
 class Calls:
     """Sends service calls and queries to the robot, within the limits of this module."""
 
-    def __init__(self, robots: Robots) -> None:
-        self._robots = robots
+    def __init__(self, robots: Robots, config: str | None = None) -> None:
+        self._robots, self._config = robots, config
         self._stops, self._merged = Stops(), StopMerger()
         self._asks = Places(MAX_CALLS, MAX_CALLS)
 
@@ -60,7 +61,14 @@ class Calls:
             return ServiceReply(False, self._robots.gone)
 
         def request() -> ServiceReply:
-            return _named(client, identity).request(verb, payload)
+            named = _named(client, identity)
+            if verb != "set" or "keep" not in payload:
+                return named.request(verb, payload)
+            arguments = dict(payload)
+            keep, settings = arguments.pop("keep"), arguments.get("settings")
+            if keep is True and isinstance(settings, dict):
+                return set_and_keep(named, self._config, settings)
+            return named.request(verb, arguments)
 
         async def stop() -> ServiceReply:
             return await self._stops.send_stop(request)
@@ -70,7 +78,7 @@ class Calls:
                 reply = await self._merged.send_stop(identity.token, stop)
             else:
                 reply = await self._run_call(request)
-        except (MendableError, DecodeError, TimeoutError) as error:
+        except (MendableError, UsageError, DecodeError, TimeoutError) as error:
             return ServiceReply(False, str(error) or "the robot did not answer in time: try again")
         if verb == "set" and reply.success:
             self._robots.refresh_about()

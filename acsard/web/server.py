@@ -54,6 +54,7 @@ class ServerOptions(Struct, frozen=True):
     listen: tuple[Listen, ...]
     tls: str  # directory of the robot's certificate, or ""
     state: Path  # directory of the token file
+    file: str | None = None  # the robot's configuration file; None for the usual places
     # started by the daemon: may use a later port, and ends when its standard input closes
     supervised: bool = False
 
@@ -80,7 +81,7 @@ async def serve(
     files = CertificateFiles(*files_in(options.tls))
     secure, names = _certified(options)
     robots = Robots(options.address, lambda: _connected(options.address), _about(options), counts)
-    parts = Parts(robots, counts)
+    parts = Parts(robots, counts, options.file)
     vault, acceptor = Vault(options.state, options.address.robot_id), Acceptor(counts)
     page = Page(parts, vault, names, acceptor, options.config.web)
     runner = web.AppRunner(

@@ -108,10 +108,10 @@ class ViewerCommands:
 class Parts:
     """What `Page` and all viewers share, such as the connection to the daemon."""
 
-    def __init__(self, robots: Robots, counts: Counts) -> None:
+    def __init__(self, robots: Robots, counts: Counts, config: str | None = None) -> None:
         self.robots, self.counts = robots, counts
         self.commands = ViewerCommands(lambda: robots.client, counts)
-        self.calls = Calls(robots)
+        self.calls = Calls(robots, config)
 
 
 class Viewer:

@@ -32,12 +32,15 @@ export class Settings {
     field.id = id;
     if (!row.choices) field.inputMode = typeof row.value === "number" ? "decimal" : "text";
     field.value = Array.isArray(row.value) ? row.value.join(",") : row.value;
-    const set = made("button", "", "Set");
-    set.setAttribute("aria-label", `Set ${row.key}`);
-    const send = () => this.#call({ settings: { [row.key]: read(field.value, row.value) } });
-    set.addEventListener("click", send);
-    field.addEventListener("keydown", (event) => event.key === "Enter" && send());
-    return made("div", "", label, field, set);
+    const send = (more) => this.#call({ settings: { [row.key]: read(field.value, row.value) }, ...more });
+    const buttons = [["Set", {}], ["Keep", { keep: true }]].map(([name, more]) => {
+      const button = made("button", "", name);
+      button.setAttribute("aria-label", `${name} ${row.key}`);
+      button.addEventListener("click", () => send(more));
+      return button;
+    });
+    field.addEventListener("keydown", (event) => event.key === "Enter" && send({}));
+    return made("div", "", label, field, ...buttons);
   }
 }
 

@@ -5,11 +5,16 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
+import tomllib
 from collections import Counter
 from itertools import pairwise
+from pathlib import Path
+from typing import Any, cast
 
-from acsard.core.messages.schema import ServiceReply
-from acsard.web.calls import MAX_STOPS, MIN_STOP_INTERVAL_S, StopMerger, Stops
+import pytest
+
+from acsard.core.messages.schema import Info, ServiceReply
+from acsard.web.calls import MAX_STOPS, MIN_STOP_INTERVAL_S, Calls, StopMerger, Stops
 
 PATIENCE_S = 20.0
 
@@ -103,3 +108,45 @@ async def test_a_stop_that_comes_as_the_pause_ends_is_sent_and_so_are_the_later_
         async with asyncio.timeout(PATIENCE_S):
             assert (await asyncio.create_task(merged.send_stop("viewer", stop))).success
     assert sent == 3
+
+
+class KeepingRobot:
+    """A daemon on this machine that sets everything, as the connection of the page."""
+
+    id, gone = "acsar", ""
+
+    def __init__(self) -> None:
+        self.client, self.asked = self, list[object]()
+
+    def get(self, key: str) -> Info:
+        return Info("acsar", "0", 1, "sim", True, 100.0, [], [])
+
+    def set(self, settings: object) -> ServiceReply:
+        return self.request("set", {"settings": settings})
+
+    def request(self, verb: str, fields: object) -> ServiceReply:
+        self.asked.append(fields)
+        return ServiceReply(True, "done")
+
+    def refresh_about(self) -> None: ...
+
+
+async def test_keep_writes_the_file_of_the_page_or_says_why_it_may_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot, file = KeepingRobot(), tmp_path / "robot.toml"
+    monkeypatch.setattr("acsard.web.calls._named", lambda *_: robot)
+    monkeypatch.setattr("acsard.web.calls.require", lambda *_: None)
+    monkeypatch.setattr("acsard.machine.kept_settings.is_daemon_here", lambda pid: True)
+    calls, wish = Calls(cast(Any, robot), str(file)), {"settings": {"rates.telemetry": 5}}
+    file.touch(0o444)
+    refused = await calls.call(cast(Any, None), "set", wish | {"keep": True})
+    assert "it is read-only" in refused.message
+    assert not refused.success
+    assert not robot.asked
+    file.chmod(0o644)
+    kept = await calls.call(cast(Any, None), "set", wish | {"keep": True})
+    assert kept == ServiceReply(True, f"done; written to {file}")
+    assert tomllib.loads(file.read_text()) == {"rates": {"telemetry": 5}}
+    assert (await calls.call(cast(Any, None), "set", wish | {"keep": False})).message == "done"
+    assert robot.asked == [wish, wish]
