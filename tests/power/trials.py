@@ -1,9 +1,9 @@
 """Runs tests on one changed module at a time, each in a forked process.
 
 The parent process imports all modules and collects the tests once, so that a fork starts quickly.
-A trial first runs the tests of its own module. For the other trials, all tests run once without a
-change, to measure which blocks of statements each test executes and how long it takes. A trial then
-runs only the tests that reach its change, the fastest first.
+All tests run once without a change, to measure which blocks of statements each test executes and
+how long it takes. A trial then runs only the tests that reach its change: the tests of its own
+module first, then the others, the fastest first.
 
 If the change is inside of functions, the fork replaces their code objects. If the change is in code
 that an import executes, the fork imports everything again, which takes some seconds longer. A test
@@ -55,7 +55,7 @@ MOST_BYTES = 6 << 30
 NOBODY, UNREACHED, IMPORT = "not noticed", "not reached", "import"
 """Verdicts beside the name of the test that noticed: no test failed, no test executes the change,
 or the change prevents the import of the tests."""
-UNDECIDED = "not by the first tests"
+UNDECIDED = "not by the first test"
 """The verdict before `measure`: the other tests remain to be tried."""
 
 
@@ -375,12 +375,12 @@ class Trials:
         return NOBODY if self._seconds else UNDECIDED
 
     def _chosen(self, trial: Trial, cold: bool) -> list[str]:
-        """Return the tests to run, in their order. Before `measure`, only these are known."""
+        """Return the tests to run, in their order. Before `measure`, only the first is known."""
         own = mirror(trial.path)
         first = [test for test in self.items if short(test) == trial.first]
         mine = [test for test in self.items if test.partition("::")[0] == own]
         if not self._seconds:
-            return first if trial.first else mine
+            return first
         name = trial.path.removesuffix(".py").replace("/", ".")
         blocks = {self._blocks[trial.path].get(line, 0) for line in trial.lines} - {0}
         places = {(trial.path, block) for block in blocks}
