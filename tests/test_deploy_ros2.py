@@ -24,8 +24,9 @@ from ruamel.yaml import YAML
 
 from acsard.core.config.settings import DIAGNOSTICS_HZ, BusConfig, Config, RosConfig
 from acsard.core.messages.diagnostics import diagnostics
+from acsard.core.motion.neutral import NEUTRAL_PAUSE_NS
 from acsard.core.ros.transports import ros_names
-from acsard.core.values import GyroStatus, Recording
+from acsard.core.values import NS_PER_S, GyroStatus, Recording
 from tests import promised
 from tests.each import each
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT
@@ -549,4 +550,4 @@ def test_drive_py_begins_and_ends_with_zeros() -> None:
     """
     text = (FILES / "drive.py").read_text()
     (zeros,) = re.findall(r"^ZEROS_S = ([\d.]+)$", text, re.M)
-    assert float(zeros) > CONFIG.commands.neutral_pause + min(TIMEOUTS)
+    assert float(zeros) > NEUTRAL_PAUSE_NS / NS_PER_S + min(TIMEOUTS)

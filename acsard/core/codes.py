@@ -51,7 +51,7 @@ FaultCode = Literal[
 ]  # fmt: skip
 
 StateCode = Literal[
-    StopCode, FaultCode, LinkCode, WaitCode, "switched_off", "not_activated", "shutting_down",
+    StopCode, FaultCode, LinkCode, WaitCode, "switched_off", "shutting_down",
     "emergency_stop_missing", "bumpers_missing", "commanded", "limits_zero", "no_command",
     "bumper_away", "bumper_blocks",
 ]  # fmt: skip
@@ -109,9 +109,6 @@ bumper_blocks
 
 shutting_down
     the daemon is shutting down
-not_activated
-    switched off;
-    -> call srv/activate
 switched_off
     switched off by {by}
 stopped

@@ -113,7 +113,7 @@ class Robot:
         self._limiter = Limiter(config.limits, self._kinematics)
         self._cap = SpeedCap(None)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
-        self._life = Lifecycle(config.control.auto_activate, latches)
+        self._life = Lifecycle(latches)
         self._first_event: Event | None = None
         if latches.in_force:
             kind, why = f"start -> {self._life.mode}", self._life.why

@@ -91,7 +91,7 @@ MAX_LAST_OUTPUT_S = 10.0
 # Bytes written to a terminal at once, and their limit in s: at 9600 baud they take 1.1 s.
 MAX_PART, PART_TIMEOUT_S = 1024, 1.5
 
-Form = Literal["console", "json", "logfmt", "journal"]
+Form = Literal["console", "json", "journal"]
 
 MAX_VALUE_LENGTH = 500  # characters: a value from another program may have any length
 
@@ -197,7 +197,7 @@ def output_in_threads(most: float | None = None) -> Iterator[None]:
 
 class Log:
     def __init__(self, settings: LogConfig, stream: TextIO = sys.stderr) -> None:
-        form: Form = settings.format if settings.format != "auto" else _fitting(stream)
+        form = _fitting(stream)
         if form == "journal":
             try:
                 stream = JournalStream()
@@ -277,5 +277,3 @@ def _renderer(form: Form, stream: TextIO) -> Any:
             return structlog.dev.ConsoleRenderer(14, colors=may_use_color(stream))
         case "json":
             return structlog.processors.JSONRenderer()
-        case "logfmt":
-            return structlog.processors.LogfmtRenderer(bool_as_flag=False)

@@ -139,7 +139,7 @@ def _deletion(names: list[str], disk: Disk, refused: bool) -> Event:
     elif refused:
         reason = "the disk accepted no more data; remove other files from the disk"
     else:
-        reason = "they exceeded record.megabytes or record.days"
+        reason = f"they exceeded record.megabytes or {MAX_AGE_DAYS} days"
     text = f"{many(len(names), 'recording')} deleted ({listed_names(names, MAX_NAMES)}): {reason}"
     return Event("recording", text, "warning" if disk.low or refused else "info")
 
@@ -164,6 +164,9 @@ class Run(Struct):
     events: list[Event] = field(default_factory=list)
 
 
+MAX_AGE_DAYS = 14  # of a recording without a stop, a fault, a lost link or a crash
+
+
 class RecordingDirectory:
     """The directory of recordings, locked until `close`: begins and ends files, makes room.
 
@@ -176,7 +179,7 @@ class RecordingDirectory:
         # Makes room, and finishes files that were cut off. `refused`: the disk refused the last
         # write although it reported free space.
         self._directory = Path(settings.directory)
-        self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
+        self._bytes = int(settings.megabytes * 1e6)
         self._run = run or Run()
         self._rounds = self.file_bytes = 0  # calls of `maintain`; size at which a file should end
         self.messages: list[str] = []  # for the log, about damaged or unfinished files
@@ -331,7 +334,7 @@ class RecordingDirectory:
         ended, disk = self._ended(), self._disk()
         oldest_s = -math.inf
         if now is not None and self._run.clock.trusted(now):
-            oldest_s = now.wall_ns / NS_PER_S - self._days * S_PER_DAY
+            oldest_s = now.wall_ns / NS_PER_S - MAX_AGE_DAYS * S_PER_DAY
         freed = self._run.freed if refused else None
         names = to_delete(ended, Bounds(self._bytes, oldest_s), disk, freed)
         deleted = list[str]()

@@ -78,7 +78,7 @@ def running(
     board: Board, where: Path, mcu: Mcu, port: Path | str = "", **tables: Mapping[str, object]
 ) -> Iterator[Rig]:
     """Run a daemon on the board's port and a client. The body runs when the link is up."""
-    config = {"mcu": mcu, "log": {"format": "json"}, **tables}
+    config = {"mcu": mcu, **tables}
     with Daemon(where, port or board.path, config) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
         yield Rig(board, daemon, bus)

@@ -8,7 +8,6 @@ from typing import get_args
 import msgspec
 import pytest
 
-from acsard.core.config.settings import CommandsConfig, Config
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query
 from tests.each import each, more
@@ -289,24 +288,22 @@ def test_a_zero_from_before_a_restart_of_the_board_arms_no_sender(stall: float) 
     assert world.state.reason.startswith("send a zero first")
 
 
-@each("pause", [0.5, 1.0])
 @each("way", ["plain", "bridge"])
 def test_a_stall_of_the_daemon_does_not_count_as_a_pause_after_another_sender_s_zero(
-    way: Way, pause: float
+    way: Way,
 ) -> None:
     """Two programs share a sender identity: one sends a zero, the other one speeds.
 
     The daemon stalls after the zero. Its next step begins before the bus delivers the waiting
     speeds. The robot stays at rest.
     """
-    config = Config(commands=CommandsConfig(neutral_pause=pause))
-    world = World(config)
+    world = World()
     world.run(1.0)
     first, other = Speaker(world, way), Speaker(world, way)
     other.hold(0.4, 1.0)
     first.send(0.0)
     world.run(0.02)
-    world.stall(pause)
+    world.stall(1.0)
     world.run(0.0005)
     other.hold(0.4, 2.0)
     assert world.state.mode == "ready"

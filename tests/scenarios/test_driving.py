@@ -11,7 +11,6 @@ import pytest
 from acsard.core.config.settings import (
     CommandsConfig,
     Config,
-    ControlConfig,
     DriveConfig,
     McuConfig,
     WheelMap,
@@ -155,17 +154,6 @@ def test_slip_is_undone_by_the_wheel_separation_multiplier() -> None:
     world.run(1.0)
     assert world.state.yaw == pytest.approx(math.remainder(3.0, math.tau), abs=0.03)
     assert world.mcu.vehicle.pose.yaw == pytest.approx(world.state.yaw, abs=0.03)
-
-
-def test_a_robot_that_is_not_activated_by_itself_waits_for_activate() -> None:
-    world = World(Config(control=ControlConfig(auto_activate=False)))
-    world.run(0.2)
-    world.drive(0.5, seconds=0.5)
-    assert world.state.mode == "inactive"
-    assert "activate" in world.state.reason
-    assert world.call("activate").success
-    world.drive(0.5, seconds=0.5)
-    assert world.state.mode == "driving"
 
 
 def test_neutral_first_can_be_switched_off() -> None:

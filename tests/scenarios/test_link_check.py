@@ -19,7 +19,6 @@ from msgspec.structs import replace
 from acsard.core.config.settings import (
     Config,
     ControlConfig,
-    FeedbackConfig,
     LimitsConfig,
     McuConfig,
     SimConfig,
@@ -708,12 +707,13 @@ def test_an_echo_that_begins_on_a_checked_link_during_a_drive_is_detected(
      (0.3, 1_000_000)],
 )  # fmt: skip
 def test_no_board_whose_motors_lag_by_2_ms_is_reported_as_an_echo(
-    lag: float, counts: int, period: float, speeds: int
+    lag: float, counts: int, period: float, speeds: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("acsard.core.motion.sanity.MAX_WHEEL_ACCELERATION", 1e6)
+    monkeypatch.setattr("acsard.core.motion.gap_filling.MAX_WHEEL_ACCELERATION", 1e6)
     plain = Config(
         sim=SimConfig(motor_time_constant=lag, encoder_counts=counts),
         mcu=McuConfig(reply_period=period),
-        feedback=FeedbackConfig(wheel_acceleration=1e6),
     )
     dice = random.Random(3)
     for acceleration in (1.0, 100.0):

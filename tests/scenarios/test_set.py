@@ -194,35 +194,6 @@ def test_a_sender_that_is_sending_is_not_forgotten_by_a_new_timeout(world: World
     assert "send a zero first" in world.state.reason
 
 
-def test_a_sender_s_clock_stays_known_when_the_neutral_pause_changes(world: World) -> None:
-    speaker = Speaker(world, "signed")
-    speaker.open()
-    world.run(1.5)
-    proved = world.state.counters["commands_of_new_senders"]
-    assert sets(world, commands__neutral_pause=2.0).success
-    speaker.hold(0.0, 0.1)
-    speaker.hold(0.4, 0.2)
-    assert world.state.mode == "driving"
-    assert world.state.counters["commands_of_new_senders"] == proved > 0
-    late = speaker.message(0.4)
-    world.run(0.4)
-    speaker.deliver(late)
-    world.run(0.1)
-    assert world.state.counters["command_stale"] == 1
-
-
-@pytest.mark.slow
-def test_a_new_neutral_pause_is_in_force_for_known_senders(world: World) -> None:
-    speaker = Speaker(world, "plain")
-    speaker.open()
-    world.run(1.5)
-    assert sets(world, commands__neutral_pause=2.0).success
-    for zeros, mode in ((1.5, "ready"), (2.2, "driving")):
-        speaker.hold(0.0, zeros)
-        speaker.hold(0.4, 0.3)
-        assert world.state.mode == mode, world.state.reason
-
-
 def test_a_rate_is_in_force_from_the_next_message_on(world: World) -> None:
     assert sets(world, rates__odom=10.0).success
     world.bus.wanted_keys.add("odom")

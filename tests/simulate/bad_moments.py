@@ -86,7 +86,6 @@ def _late_step(plan: Plan, dice: random.Random) -> None:
     The sender sends speeds, this one zero, and speeds again.
     """
     config, source = plan["config"], _best(plan)
-    config["control"].pop("auto_activate", None)
     config["commands"]["neutral_first"] = True
     safety = config.setdefault("safety", {})
     if "bumpers" not in safety and dice.random() < 0.5:
@@ -94,7 +93,7 @@ def _late_step(plan: Plan, dice: random.Random) -> None:
         plan["board"].append(["bumpers"])
     away, events = safety.get("bumper") == "away", []
     hz = 50.0 if source["timeout"] < 0.2 else 20.0
-    rests_s = config["commands"].get("neutral_pause", 1.0) + 0.3
+    rests_s = 1.0 + 0.3
     phases, at = [[0.0, 0.0, 0.0], [rests_s, *_speed(dice)]], rests_s + 4.0
     while at < plan["seconds"] - rests_s - 4.0:
         at = round(round(at * hz) / hz, 3)
@@ -151,7 +150,6 @@ def _alone(plan: Plan, dice: random.Random, phases: list[list[Any]]) -> dict[str
     Returns the sender.
     """
     source = _best(plan)
-    plan["config"]["control"].pop("auto_activate", None)
     hz = 50.0 if source["timeout"] < 0.2 else 20.0
     way = dice.choice(("client", "plain", "bridge"))
     driver = _driver(plan, source, way=way, hz=hz, phases=phases)
@@ -167,7 +165,7 @@ def _drives(
     Each rest takes `rests` seconds plus the configured pause. A phase is a start time, a linear and
     an angular speed.
     """
-    rests += plan["config"]["commands"].get("neutral_pause", 1.0)
+    rests += 1.0
     phases: list[list[Any]] = []
     at = 0.0
     while at < plan["seconds"]:
@@ -485,8 +483,8 @@ def _stall_behind_a_zero(plan: Plan, dice: random.Random) -> None:
     the bus delivers the waiting speeds.
     """
     commands, source = plan["config"]["commands"], _best(plan)
-    pause_s = dice.choice((0.5, 0.7, 1.0))
-    commands |= {"neutral_first": True, "neutral_pause": pause_s}
+    pause_s = 1.0
+    commands["neutral_first"] = True
     source["timeout"] = dice.choice((0.25, 0.5))
     first = _alone(plan, dice, [])
     hz = dice.choice((5.0, 10.0))
@@ -524,7 +522,7 @@ def _doubtful_holder(plan: Plan, dice: random.Random) -> None:
     lower = dice.choice(commands["sources"])
     second = _driver(plan, lower, way=dice.choice(("client", "plain", "signed")), hz=20.0)
     second |= {"name": "s1", "id": f"s1/{dice.getrandbits(64):016x}", "from": 3.0}
-    rests_s = 3.5 + commands.get("neutral_pause", 1.0)
+    rests_s = 3.5 + 1.0
     second["phases"] = [[3.0, 0.0, 0.0], [round(rests_s, 3), *_speed(dice)]]
     at = rests_s + 3.0
     while at < plan["seconds"] - 6.0:
@@ -569,7 +567,7 @@ def _coarse(plan: Plan, dice: random.Random) -> None:
     driver = _alone(plan, dice, [])
     at, phases = 0.0, []
     while at < plan["seconds"]:
-        rests_s = 1.5 + (config["commands"].get("neutral_pause", 1.0) if at == 0.0 else 0.0)
+        rests_s = 1.5 + (1.0 if at == 0.0 else 0.0)
         speed = dice.choice((-1, 1)) * round(dice.uniform(0.8, 1.0), 3)
         phases += [[round(at, 3), 0.0, 0.0], [round(at + rests_s, 3), speed, 0.0]]
         at += rests_s + dice.uniform(1.3, 2.5)
@@ -617,7 +615,7 @@ def _wheel_limit(plan: Plan, dice: random.Random) -> None:
     driver, at = _alone(plan, dice, []), 0.0
     while at < plan["seconds"]:
         driver["phases"].append([round(at, 3), 0.0, 0.0])
-        at += 1.0 + config["commands"].get("neutral_pause", 1.0)
+        at += 1.0 + 1.0
         for _ in range(6):
             v, w = dice.choice((-linear, 0.0, linear)), dice.choice((-angular, 0.0, angular))
             driver["phases"].append([round(at, 3), v, w])

@@ -297,7 +297,6 @@ def _config(
 def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any]) -> None:
     mcu, sim, limits = config["mcu"], config["sim"], config["limits"]
     config["control"]["rate"] = dice.choice((20.0, 50.0, 100.0, 100.0, 150.0))
-    config["control"]["auto_activate"] = dice.random() < 0.9
     config["drive"] = {
         "wheel_radius": round(dice.uniform(0.04, 0.15), 3),
         "wheel_separation": round(dice.uniform(0.2, 0.8), 3),
@@ -325,7 +324,6 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
             extras["board"] = [["free_running", 0.1]]
     commands = config["commands"]
     commands["neutral_first"] = dice.random() < 0.85
-    commands["neutral_pause"] = dice.choice((0.5, 1.0, 2.0))
     names = [*SOURCES, "twin"]
     commands["sources"] = [
         {
@@ -357,7 +355,6 @@ def _make_extreme(dice: random.Random, config: dict[str, Any]) -> None:
     names = dice.sample((*SOURCES, "twin", "sixth"), dice.randrange(1, 7))
     timeouts = [t for t in (0.05, 0.1, 0.25, 0.5, 2.0, 10.0) if t >= 2 * period]
     commands = config["commands"]
-    commands["neutral_pause"] = dice.choice((0.5, 1.0, 5.0))
     commands["sources"] = [
         {"name": name, "priority": dice.choice((0, 10, 50, 100)), "timeout": dice.choice(timeouts)}
         for name in names
@@ -373,7 +370,6 @@ def _make_other(dice: random.Random, config: dict[str, Any]) -> None:
     }
     config["feedback"] = {
         "wheel_speed": round(config["limits"]["wheel_speed"] * dice.uniform(1.5, 2.0), 2),
-        "wheel_acceleration": dice.choice((1000.0, 1500.0, 10000.0)),
         "response_time": dice.choice((0.2, 0.5, 1.0)),
         "fault_time": dice.choice((0.0, 0.3, 0.5, 2.0)),
     }
@@ -754,9 +750,6 @@ def _events(
     for at in add("typed latches", 30):
         typed = dice.choice((1, 1, 2, 3, 0))
         call(at, dice.choice(("clear", "clear", "activate")), named=True, typed=typed)
-    if not config["control"].get("auto_activate", True):
-        # Otherwise a robot that waits for its first `activate` would stand until the end.
-        call(round(dice.uniform(0.5, 5.0), 3), "activate", named=False)
     return events
 
 
@@ -771,6 +764,4 @@ def _settings(dice: random.Random, config: dict[str, Any]) -> dict[str, float]:
     if what != "limits":
         source = dice.choice(config["commands"]["sources"])["name"]
         settings[f"commands.sources.{source}.timeout"] = dice.choice((0.1, 0.25, 0.4, 1.0))
-        if dice.random() < 0.3:
-            settings["commands.neutral_pause"] = dice.choice((0.5, 1.0, 3.0))
     return settings

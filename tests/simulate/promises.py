@@ -132,7 +132,7 @@ class Witness:
         self.neutral_first = commands.get("neutral_first", True)
         self.priority = {s["name"]: s["priority"] for s in commands["sources"]}
         self.file_timeout = {s["name"]: int(s["timeout"] * NS) for s in commands["sources"]}
-        self.file_pause_ns = int(commands.get("neutral_pause", 1.0) * NS)
+        self.file_pause_ns = NS
         rate = config["control"].get("rate", 100.0)
         if rate == "auto":
             rate = 100.0  # at 115200 baud the longest line allows more
@@ -153,7 +153,6 @@ class Witness:
         """Calls that may have to release a latch, which is not certain since the daemon ended."""
         self.offs: list[int] = []
         """Arrivals of each `deactivate` that no `activate` has released."""
-        self.dormant_ns: int | None = None
         """Start of a daemon that waits for its first `activate`."""
         self.ending_ns: int | None = None
         """When the daemon got SIGTERM."""
@@ -246,8 +245,6 @@ class Witness:
         self._slopes = [Slope() for _ in range(4)]
         """Of the linear and then of the angular speed, forwards and backwards."""
         self.delivered = 0
-        if not self.config["control"].get("auto_activate", True):
-            self.dormant_ns = at_ns
         self.ending_ns = None
         self.mode = ""
 
@@ -357,10 +354,9 @@ class Witness:
     def activated(self, asked_ns: int, read_ns: int | None, name: str) -> None:
         """Note that the daemon has executed an `activate`."""
         self.perhaps_latched.discard("activate")
-        if self.dormant_ns is not None or self.offs:
+        if self.offs:
             self.arming(asked_ns)
         self._release(self.offs, "an activate undoes no later one", asked_ns, read_ns, name)
-        self.dormant_ns = None
 
     def _release(
         self, latched: list[int], promise: str, asked_ns: int, read_ns: int | None, name: str
@@ -390,10 +386,7 @@ class Witness:
                 )
                 continue
             before_ns = self.pause_ns, dict(self.timeout)
-            if parts[1] == "neutral_pause":
-                self.pause_ns = int(value * NS)
-            else:
-                self.timeout[parts[2]] = int(value * NS)
+            self.timeout[parts[2]] = int(value * NS)
             if before_ns != (self.pause_ns, self.timeout):
                 self.arming(asked_ns)
 
@@ -483,8 +476,6 @@ class Witness:
             causes.append((self.fault_ns, "a fault"))
         if self.offs:
             causes.append((self.offs[0], "being switched off"))
-        if self.dormant_ns is not None:
-            causes.append((self.dormant_ns, "being switched off"))
         if self.ending_ns is not None:
             causes.append((self.ending_ns, "SIGTERM"))
         return min(causes, default=None)
@@ -502,8 +493,6 @@ class Witness:
         if self.fault_ns is not None and self.fault_ns > cleared_ns:
             causes.append((self.fault_ns, "a fault"))
         causes += [(at_ns, "being switched off") for at_ns in self.offs if at_ns > active_ns]
-        if self.dormant_ns is not None and self.dormant_ns > active_ns:
-            causes.append((self.dormant_ns, "being switched off"))
         if self.ending_ns is not None:
             causes.append((self.ending_ns, "SIGTERM"))
         return min(causes, default=None)

@@ -67,9 +67,6 @@ PROMPT: dict[str, object] = {
 Each line then shows its command.
 """
 
-PROMPT_FEEDBACK: dict[str, object] = {"wheel_acceleration": 1e6}
-"""A feedback limit that accepts the reports of wheels that obey at once."""
-
 
 def gaps(lines: list[ReceivedLine]) -> list[float]:
     """Return the gaps between the lines in s.
@@ -269,7 +266,7 @@ def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
     results: list[Hole] = []
     with (
         FarPeer(where) as peer,
-        Daemon(where, peer.path, {"limits": PROMPT, "feedback": PROMPT_FEEDBACK}) as daemon,
+        Daemon(where, peer.path, {"limits": PROMPT}) as daemon,
         Bus(daemon.endpoint) as bus,
         Proxy(daemon.endpoint) as proxy,
         connect(proxy.endpoint) as client,
@@ -407,7 +404,7 @@ def flooded(where: Path, length: float) -> Flooded:
     ramp show no command's speed.
     """
     limits = PROMPT | {"linear_speed": 10.0, "wheel_speed": 99.0}
-    feedback = PROMPT_FEEDBACK | {"wheel_speed": 99.99}
+    feedback: dict[str, object] = {"wheel_speed": 99.99}
     with (
         FarPeer(where) as peer,
         Daemon(where, peer.path, {"limits": limits, "feedback": feedback}) as daemon,

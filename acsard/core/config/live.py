@@ -67,11 +67,6 @@ LIVE: dict[str, Live] = {
     "limits.linear_jerk": Live("always", "how fast the acceleration may grow"),
     "limits.angular_jerk": Live("always", "how fast the acceleration of a turn may grow"),
     "limits.wheel_speed": Live("rest", "highest speed of any wheel"),
-    "commands.neutral_pause": Live(
-        "rest",
-        "after its zero, a shared sender identity must send no speed for this time before it may "
-        "drive",
-    ),
     "commands.sources.*.timeout": Live(
         "rest", "time without a command after which the robot stops following the source"
     ),

@@ -11,6 +11,11 @@ _RATE = "remove the key; rates.telemetry is the highest rate of all messages but
 _SIM = "remove the key: the simulated robot has an ideal gyro, even wheels and a dry floor"
 
 REMOVED = {
+    "control.auto_activate": "remove the key: `acsard call deactivate` lasts over restarts",
+    "feedback.wheel_acceleration": "remove the key: the bound is 1500 rad/s2",
+    "commands.neutral_pause": "remove the key: the pause is 1 s",
+    "record.days": "remove the key: recordings are kept for 14 days, and record.megabytes counts",
+    "log.format": "remove the key: the format follows from the terminal, the journal or a pipe",
     "footprint": "remove this table, and give the URDF a fixed joint base_link -> base_footprint",
     "lidar.lidar_z_offset": _LIDAR,
     "lidar.lidar_roll": _LIDAR,

@@ -176,7 +176,6 @@ class McuConfig(Struct, frozen=True):
 
 class ControlConfig(Struct, frozen=True):
     rate: Annotated[float, Meta(ge=10.0, le=1000.0, extra={"unit": "Hz"})] | Literal["auto"] = 100.0
-    auto_activate: bool = True
     real_time: bool = True
     state_directory: Annotated[
         str,
@@ -208,7 +207,6 @@ class JointsConfig(Struct, frozen=True):
 
 class FeedbackConfig(Struct, frozen=True):
     wheel_speed: WheelSpeed = 80.0
-    wheel_acceleration: Annotated[float, Meta(ge=10.0, le=1e6, extra={"unit": "rad/s2"})] = 1500.0
     response_time: Annotated[float, Meta(ge=0.01, le=5.0, extra={"unit": "s"})] = 0.2
     fault_time: Annotated[float, Meta(ge=0.0, le=10.0, extra={"unit": "s (0 = off)"})] = 0.5
 
@@ -275,7 +273,6 @@ class Source(Struct, frozen=True):
 
 class CommandsConfig(Struct, frozen=True):
     neutral_first: bool = True
-    neutral_pause: Annotated[float, Meta(ge=0.5, le=60.0, extra={"unit": "s"})] = 1.0
     sources: tuple[Source, ...] = (
         Source("teleop", 100),
         Source("app", 50),
@@ -390,7 +387,6 @@ class RosConfig(Struct, frozen=True):
 
 class LogConfig(Struct, frozen=True):
     level: Literal["debug", "info", "warning", "error"] = "info"
-    format: Literal["auto", "console", "json", "logfmt", "journal"] = "auto"
 
 
 RECORD_VARIABLE = "ACSARD_RECORD"
@@ -400,7 +396,6 @@ RECORD_VARIABLE = "ACSARD_RECORD"
 class RecordConfig(Struct, frozen=True):
     directory: Directory = ""
     megabytes: Annotated[float, Meta(ge=10.0, le=1e6, extra={"unit": "MB"})] = 1000.0
-    days: Annotated[float, Meta(ge=0.01, le=3650.0, extra={"unit": "days"})] = 14.0
 
 
 class WebConfig(Struct, frozen=True):

@@ -18,7 +18,7 @@ from msgspec import Struct
 from acsard.core.config.settings import CommandsConfig, Source
 from acsard.core.motion.emergency_stop import CATCH_UP_NS, LATE_STEP_NS
 from acsard.core.motion.freshness import MAX_PROOF_NS, Freshness
-from acsard.core.motion.neutral import Sender, is_zero
+from acsard.core.motion.neutral import NEUTRAL_PAUSE_NS, Sender, is_zero
 from acsard.core.values import NS_PER_S, REST, Command, Ns, SourceStatus, Twist, Wait
 
 # Limit per source. A sender that may keep control (`Sender.holds`) is never replaced by a new one.
@@ -47,20 +47,19 @@ IDLE = Choice()
 
 
 class _Source:
-    def __init__(self, settings: Source, neutral_first: bool, pause: float) -> None:
+    def __init__(self, settings: Source, neutral_first: bool) -> None:
         self.name, self.priority = settings.name, settings.priority
         self.neutral_first = neutral_first
         self.senders: dict[str, Sender] = {}
-        self.use(settings, pause)
+        self.use(settings)
 
-    def use(self, settings: Source, pause: float) -> None:
-        self.pause_ns = int(pause * NS_PER_S)
+    def use(self, settings: Source) -> None:
         self.timeout_ns = int(settings.timeout * NS_PER_S)
         self.proof = Wait("proof", settings.name, min(self.timeout_ns, MAX_PROOF_NS) / NS_PER_S)
         self.late = Wait("late", settings.name, settings.timeout)
         self.stalled = Wait("stalled", settings.name)
         for sender in self.senders.values():
-            sender.use(self.timeout_ns, self.pause_ns)
+            sender.use(self.timeout_ns)
 
     def add(self, name: str, now_ns: Ns) -> Sender | None:
         """Return a new sender (it may replace the one of the lowest rank), or None."""
@@ -69,7 +68,7 @@ class _Source:
             if self._account(least, now_ns)[0]:
                 return None
             del self.senders[least]
-        added = self.senders[name] = Sender(self.timeout_ns, self.pause_ns, self.neutral_first)
+        added = self.senders[name] = Sender(self.timeout_ns, self.neutral_first)
         return added
 
     def _account(self, name: str, now_ns: Ns) -> tuple[bool, bool, int]:
@@ -81,7 +80,7 @@ class _Source:
     def cancel_zeros(self, at_ns: Ns) -> None:
         """Cancel the zeros of identities that several programs share: one may have sent a speed.
 
-        A zero whose `commands.neutral_pause` was over at `at_ns` stays.
+        A zero whose neutral pause was over at `at_ns` stays.
         """
         for sender in self.senders.values():
             sender.cancel_zero(at_ns)
@@ -127,8 +126,14 @@ class _Source:
 
     def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
         """Return the `Wait` for a zero; `lasts` is how long the sender has sent only speeds, s."""
-        pause = self.pause_ns / NS_PER_S
-        return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
+        return Wait(
+            "neutral",
+            self.name,
+            NEUTRAL_PAUSE_NS / NS_PER_S,
+            lasts=lasts,
+            ros=sender.ros,
+            shared=sender.shared,
+        )
 
     def doubt_wait(self, now_ns: Ns) -> Wait | None:
         """Return why the newest sender with doubtful stamps does not drive, or None without any."""
@@ -159,10 +164,7 @@ class Arbiter:
     """Stores the latest command of each sender, and chooses the command that the robot follows."""
 
     def __init__(self, commands: CommandsConfig) -> None:
-        self._sources = {
-            s.name: _Source(s, commands.neutral_first, commands.neutral_pause)
-            for s in commands.sources
-        }
+        self._sources = {s.name: _Source(s, commands.neutral_first) for s in commands.sources}
         self._ranking = sorted(self._sources.values(), key=lambda source: -source.priority)
         self._holder: _Source | None = None
         self._followed: Sender | None = None
@@ -171,9 +173,9 @@ class Arbiter:
         self._freshness = Freshness()
 
     def use(self, commands: CommandsConfig) -> None:
-        """Use other timeouts and `neutral_pause`. Armed senders stay armed."""
+        """Use other timeouts. Armed senders stay armed."""
         for settings in commands.sources:
-            self._sources[settings.name].use(settings, commands.neutral_pause)
+            self._sources[settings.name].use(settings)
 
     def require_neutral(self, since_ns: Ns = 0) -> None:
         """Forget all commands: each sender must send a zero that arrives from `since_ns` on.
@@ -191,7 +193,7 @@ class Arbiter:
         """Begin a control step, and return whether the daemon stood still before (True at first).
 
         After `LATE_STEP_NS`, the bus may not have delivered all commands, so senders stay in the
-        choice for a short time, and a running `neutral_pause` does not advance (`Sender.resume`).
+        choice for a short time, and a running neutral pause does not advance (`Sender.resume`).
         """
         before_ns, self._begun_ns = self._begun_ns, now_ns
         if now_ns - before_ns <= LATE_STEP_NS:

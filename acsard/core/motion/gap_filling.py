@@ -15,13 +15,12 @@ from operator import sub
 
 from msgspec import Struct
 
-from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.motion.error_model import PERIOD_GAIN
 from acsard.core.motion.gyro import REST_S
-from acsard.core.motion.sanity import SPEED_MARGIN
+from acsard.core.motion.sanity import MAX_WHEEL_ACCELERATION, SPEED_MARGIN
 from acsard.core.values import REST, Twist, WheelSpeeds
 
 # Consecutive implausible lines without counts, s and number: beyond both, their motion is
@@ -206,8 +205,7 @@ class Confirmation:
     time of a dropped line is a gap.
     """
 
-    def __init__(self, feedback: FeedbackConfig) -> None:
-        self._acceleration = feedback.wheel_acceleration
+    def __init__(self) -> None:
         self._period = 0.0  # s between two lines; 0 before the first
         self.forget()
 
@@ -237,7 +235,7 @@ class Confirmation:
         self._seconds = seconds = seconds + (self._seconds if pending else 0.0)
         # This change of one wheel's speed falsifies the motion of the whole time by as much as a
         # damaged line of the usual duration can.
-        most = (self._acceleration * period + SPEED_MARGIN) * period / seconds
+        most = (MAX_WHEEL_ACCELERATION * period + SPEED_MARGIN) * period / seconds
         used, now = believed(before.as_tuple()), believed(line.speeds.as_tuple())
         lines = good_lines = [*pending, line]
         three = [*[believed(sample.speeds.as_tuple()) for sample in pending], now]

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from acsard.core.codes import Reason, reason, sentence
+from acsard.core.codes import Reason, reason
 from acsard.core.formatting import utc
 from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError, mode_of, require_allowed
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches, Ns
@@ -38,11 +38,10 @@ NAMELESS = "request"  # in a text, a client that has no name
 class Lifecycle:
     """The latches and the mode of one robot. Requests that are not allowed raise `RefusedError`."""
 
-    def __init__(self, active: bool, latches: Latches = Latches()) -> None:  # noqa: B008
+    def __init__(self, latches: Latches = Latches()) -> None:  # noqa: B008
         self.latches = latches
         self.mode = Mode.WAITING
         self._shutting_down = self._linked = self._commanded = False
-        self._dormant = not active  # until the first `activate` (`control.auto_activate`)
         old_latches = (latches.stop, latches.fault, latches.inactive)
         self._number = max([latch.number for latch in old_latches if latch is not None], default=0)
         self._numbered = False  # this run has numbered a latch (`number_after_restart`)
@@ -193,16 +192,14 @@ class Lifecycle:
     def activate(self, number: int | None, asked_ns: Ns, now: Instant) -> bool:
         """Switch the robot on; return False if it was on.
 
-        `number` 0 says that the client has seen no latch: only `auto_activate` keeps the robot off.
-        Raises `RefusedError` like `clear`.
+        `number` is the latch that the client has seen, or None. Raises `RefusedError` like `clear`.
         """
         require_allowed(self.mode, "activate")
-        if not self._off:
-            return False
         latch = self.latches.inactive
-        if number is not None and number != (0 if latch is None else latch.number):
-            still = "switched off" if latch is None else latch.why
-            raise RefusedError(_not_in_force(number, still, "srv/activate"))
+        if latch is None:
+            return False
+        if number is not None and number != latch.number:
+            raise RefusedError(_not_in_force(number, latch.why, "srv/activate"))
         if latch is not None:
             if number is None:
                 self._require_latch_was_seen(
@@ -217,7 +214,6 @@ class Lifecycle:
                     f"{latch.why} at the same time as this call or after it: call srv/activate "
                     "again"
                 )
-        self._dormant = False
         self._latch(inactive=None)
         return True
 
@@ -247,16 +243,11 @@ class Lifecycle:
             twice = f" twice, {LATCH_REQUIRED_S:g} s apart" if fault and stop else ""
             text = f"{'; also '.join(parts)}; {before}call srv/clear{twice}"
             return Reason(latches.next.code, text)
-        if latches.inactive is not None:
-            latch = latches.inactive
-            return Reason(latch.code, f"{_latch_text(latch)}; call srv/activate")
-        return sentence("not_activated")
+        latch = latches.inactive
+        assert latch is not None
+        return Reason(latch.code, f"{_latch_text(latch)}; call srv/activate")
 
     # latches and mode
-
-    @property
-    def _off(self) -> bool:
-        return self._dormant or self.latches.inactive is not None
 
     def _new_latch(self, now: Instant, by: str, why: Reason) -> Latch:
         if self._numbered:
@@ -279,14 +270,14 @@ class Lifecycle:
             shutting_down=self._shutting_down,
             fault=self.latches.fault is not None,
             stopped=self.latches.stop is not None,
-            inactive=self._off,
+            inactive=self.latches.inactive is not None,
             linked=self._linked,
             commanded=self._commanded,
         )
 
     def _cleared_text(self) -> str:
         zero = "each sender must send a zero before it drives"
-        if self._off:
+        if self.latches.inactive is not None:
             return (
                 "cleared, but the robot is still switched off: call srv/activate to switch it on, "
                 f"then {zero}"

@@ -1,7 +1,7 @@
 """Applies the neutral-first rule to one sender: only an armed sender may drive the robot.
 
 Only a zero arms, silence does not, until `require_neutral`, `disarm` or `unlearn`. If several
-programs may share the identity, the zero arms it after `commands.neutral_pause`, unless a speed of
+programs may share the identity, the zero arms it after `NEUTRAL_PAUSE_NS`, unless a speed of
 any shared identity of the source cancels it. A live sender (its last accepted command is within the
 timeout) is present, so it may be chosen. After a stall or with doubtful stamps it stays present for
 `CANDIDATE_NS`; otherwise one that holds the robot with zeros would lose control to one that sends
@@ -14,12 +14,12 @@ from msgspec.structs import replace
 
 from acsard.core.motion.emergency_stop import CATCH_UP_NS
 from acsard.core.motion.freshness import MAX_JITTER_NS, MAX_PROOF_NS, Verdict
-from acsard.core.values import REST, Command, Ns
+from acsard.core.values import NS_PER_S, REST, Command, Ns
 
 # Programs without a sender id and without a GID may share an identity. These rules apply to them:
 #
 # - The zero of one program must not arm another program that never stopped. Therefore a zero arms a
-#   shared identity only after `commands.neutral_pause` without a speed. Further zeros and silence
+#   shared identity only after `NEUTRAL_PAUSE_NS` without a speed. Further zeros and silence
 #   do not restart this time.
 # - While the daemon stands still, it receives no speeds. Therefore the time of a stall does not
 #   count towards the pause.
@@ -32,12 +32,16 @@ from acsard.core.values import REST, Command, Ns
 # second half.
 CANDIDATE_NS = 2 * MAX_PROOF_NS
 
+# Time without a speed after the zero of a shared identity: longer than the pauses of a program that
+# sends its speeds irregularly.
+NEUTRAL_PAUSE_NS = NS_PER_S
+
 
 class Sender:
     """One sender of a command source: its last command, and whether it is armed."""
 
-    def __init__(self, timeout_ns: Ns, pause_ns: Ns, neutral_first: bool) -> None:
-        self.use(timeout_ns, pause_ns)
+    def __init__(self, timeout_ns: Ns, neutral_first: bool) -> None:
+        self.use(timeout_ns)
         self._neutral_first = neutral_first
         self._armed = self._proven_armed = not neutral_first
         self._zero_ns: Ns | None = None  # zero of a shared identity that will arm it
@@ -65,8 +69,8 @@ class Sender:
         # Last verdict on a command that its stamp made unacceptable.
         self.doubt: Verdict = "unproven"
 
-    def use(self, timeout_ns: Ns, pause_ns: Ns) -> None:
-        self._timeout_ns, self._pause_ns = timeout_ns, pause_ns
+    def use(self, timeout_ns: Ns) -> None:
+        self._timeout_ns = timeout_ns
 
     def is_live(self, now_ns: Ns) -> bool:
         """Return whether the last accepted command is within the timeout of its source."""
@@ -113,7 +117,7 @@ class Sender:
     def holds(self, now_ns: Ns) -> bool:
         """Return whether a sender in control may keep it: it is present, and armed or nearly so.
 
-        Nearly: `disarm` was at most `CANDIDATE_NS` ago, or its zero's `neutral_pause` is running.
+        Nearly: `disarm` was at most `CANDIDATE_NS` ago, or its zero's neutral pause is running.
         """
         just_set = self.disarmed_ns is not None and now_ns - self.disarmed_ns <= CANDIDATE_NS
         waits = just_set or self._zero_ns is not None
@@ -127,22 +131,22 @@ class Sender:
         """Continue after the daemon stood still from `before_ns` to `now_ns`.
 
         The bus may deliver the commands of that time later, so the sender stays present for one
-        timeout more, within `CANDIDATE_NS`. A running `neutral_pause` does not advance, and lasts
+        timeout more, within `CANDIDATE_NS`. A running neutral pause does not advance, and lasts
         for `CATCH_UP_NS` more at least.
         """
         if self.present(before_ns):
             self._present_ns = now_ns
         self._settle(before_ns)
         if not self._armed and self._zero_ns is not None:
-            rest_ns = max(self._zero_ns + self._pause_ns - before_ns, CATCH_UP_NS)
+            rest_ns = max(self._zero_ns + NEUTRAL_PAUSE_NS - before_ns, CATCH_UP_NS)
             proven = self._proven_zero_ns is not None
-            self._zero_ns = now_ns + rest_ns - self._pause_ns
+            self._zero_ns = now_ns + rest_ns - NEUTRAL_PAUSE_NS
             self._proven_zero_ns = self._zero_ns if proven else None
 
     def cancel_zero(self, at_ns: Ns) -> None:
         """Cancel the zero of a shared identity: another program may have sent a speed at `at_ns`.
 
-        If `neutral_pause` was over by then, the sender stays armed.
+        If neutral pause was over by then, the sender stays armed.
         """
         self._settle(at_ns)
         self._zero_ns = self._proven_zero_ns = None
@@ -172,7 +176,7 @@ class Sender:
 
         With "first" or "unproven" it does not drive, but a zero already arms (see `unlearn`).
         Before a speed of a shared identity, the caller calls `cancel_zero` of each sender of the
-        source. Zeros arm from `since_ns` on, and `neutral_pause` begins at `watched_ns`, the end of
+        source. Zeros arm from `since_ns` on, and neutral pause begins at `watched_ns`, the end of
         the last stall, at the earliest.
         """
         now_ns, zero = command.arrived_ns, is_zero(command)
@@ -246,8 +250,8 @@ class Sender:
         self._doubted_ns, self.doubt, self.ros = command.arrived_ns, why, command.ros
 
     def _settle(self, now_ns: Ns) -> None:
-        # Arm a shared identity when `neutral_pause` is over.
-        if self._zero_ns is not None and now_ns - self._zero_ns >= self._pause_ns:
+        # Arm a shared identity when neutral pause is over.
+        if self._zero_ns is not None and now_ns - self._zero_ns >= NEUTRAL_PAUSE_NS:
             self._armed = True
             if self._proven_zero_ns == self._zero_ns:
                 self._proven_armed = True

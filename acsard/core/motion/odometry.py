@@ -81,7 +81,7 @@ class Odometry:
         self._kinematics = kinematics
         self._positions = AT_REST
         self._rolling = Rolling(quiet)
-        self._confirmation = Confirmation(feedback)
+        self._confirmation = Confirmation()
         # Rolled at rest, rad; for the pose beyond two counts (`_unsettled`), or in a drive.
         self._held = AT_REST
         # Quantization of each speed in the last line, and the largest known one, rad/s, or if none

@@ -24,8 +24,11 @@ WINDOW_LINES = 1000  # 10 s at 100 Hz
 
 WARNING_FRACTION = 0.01  # of a window, above which one warning is logged
 
-# rad/s beyond `feedback.wheel_acceleration`, as coarse encoders and a robot at rest cause.
+# rad/s beyond `MAX_WHEEL_ACCELERATION`, as coarse encoders and a robot at rest cause.
 SPEED_MARGIN = 2.0
+
+# rad/s2: beyond the change of any real wheel.
+MAX_WHEEL_ACCELERATION = 1500.0
 
 COUNT_MARGIN = 2  # each of two reports may be wrong by one
 
@@ -129,7 +132,7 @@ class Sanity:
         # Each speed is a mean over the time that its line covers. Therefore the change may have
         # lasted from the middle of one such time to the middle of the next.
         mean = (since + longest) / 2
-        return self._settings.wheel_acceleration * (mean if mean > since else since) + SPEED_MARGIN
+        return MAX_WHEEL_ACCELERATION * (mean if mean > since else since) + SPEED_MARGIN
 
     def _agrees(self, line: Feedback, longest: float) -> bool:
         return any(
@@ -210,7 +213,7 @@ class Sanity:
         for name, now, then, step in rows:
             if abs(now - then) > most + COUNT_MARGIN * max(step, least):
                 leap = f"{name} jumps from {then:.2f} to {now:.2f} rad/s"
-                return f"{leap}, which is over feedback.wheel_acceleration"
+                return f"{leap}, which is over {MAX_WHEEL_ACCELERATION:g} rad/s2"
         return ""
 
 

@@ -1851,13 +1851,6 @@ def test_the_same_inputs_give_the_same_outputs(seed: int) -> None:
     assert len({outputs.mode for outputs in first}) > 2
 
 
-def test_without_auto_activate_a_robot_is_ready_in_the_step_of_the_activation() -> None:
-    bench = Bench(Config(control=ControlConfig(auto_activate=False))).linked()
-    assert bench.mode() == "inactive"
-    bench.step(ask="activate")
-    assert (bench.mode(), bench.link()) == ("ready", "up")
-
-
 # the latches that a robot starts with
 
 

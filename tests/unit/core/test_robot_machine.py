@@ -74,7 +74,7 @@ CONFIGS = [
     Config(commands=COMMANDS, limits=LimitsConfig(linear_jerk=5.0, angular_jerk=20.0)),
     Config(commands=COMMANDS, limits=LimitsConfig(wheel_speed=12.0, linear_deceleration=2.5)),
     Config(commands=COMMANDS, control=ControlConfig(rate=20.0)),
-    Config(commands=COMMANDS, control=ControlConfig(rate=250.0, auto_activate=False)),
+    Config(commands=COMMANDS, control=ControlConfig(rate=250.0)),
 ]
 
 STOP = Latch(5, 0, "ann", "stopped by ann", "stopped", kept=True)

@@ -304,7 +304,7 @@ def test_each_stop_that_no_step_served_is_latched_with_the_name_of_its_client() 
 
 def test_a_stop_that_no_step_served_keeps_the_causes_of_the_stop_before_it() -> None:
     keeper = Keeper()
-    life = Lifecycle(active=True)
+    life = Lifecycle()
     life.stop("ann", 1, NOW)
     life.press(reason("bumper", bumpers="a bumper is pressed"), NOW)
     Handover(life.latches, keeper).take_stops(life.latches, ["joe"], NOW)
@@ -316,7 +316,7 @@ def test_a_stop_that_no_step_served_keeps_the_causes_of_the_stop_before_it() -> 
 
 
 def test_every_cause_of_a_stop_is_in_the_file_with_at_most_500_characters() -> None:
-    life = Lifecycle(active=True)
+    life = Lifecycle()
     life.stop("a" * 600, 1, NOW)
     life.press(reason("bumper", bumpers="a bumper is pressed"), NOW)
     latches = decode("r", encode("r", life.latches))
@@ -346,7 +346,7 @@ def test_a_stop_that_no_step_served_is_newer_than_a_stop_that_was_released() -> 
     The number of the released stop is one above that of `INACTIVE`.
     """
     keeper, now = Keeper(), Instant(NOW.mono_ns, NOW.wall_ns - 9 * NS_PER_S)
-    life = Lifecycle(active=True, latches=Latches(inactive=INACTIVE))
+    life = Lifecycle(latches=Latches(inactive=INACTIVE))
     life.stop("joe", 1, Instant(1, now.wall_ns))
     assert life.latches.stop
     number = life.latches.stop.number

@@ -10,7 +10,7 @@ import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -167,7 +167,8 @@ def test_an_event_of_the_log_arrives_with_its_fields(
     journal: Journal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(JournalStream.__init__, "__defaults__", (journal.path,))
-    log = Log(LogConfig(format="journal"))
+    monkeypatch.setattr("acsard.host.logs._fitting", lambda stream: "journal")
+    log = Log(LogConfig())
     log.event(Event("link_up", "linked", "info"))
     entry = journal.entry()
     log.close()
@@ -180,7 +181,8 @@ def test_without_a_journal_the_log_is_written_as_json(
 ) -> None:
     monkeypatch.setattr(JournalStream.__init__, "__defaults__", (str(tmp_path / "nothing"),))
     with (tmp_path / "log").open("w+") as stream:
-        log = Log(LogConfig(format="journal"), stream)
+        monkeypatch.setattr("acsard.host.logs._fitting", lambda stream: "journal")
+        log = Log(LogConfig(), stream)
         log.event(Event("link_up", "linked", "info"))
         log.close()
         stream.seek(0)
@@ -191,7 +193,8 @@ def test_a_journal_that_disappears_raises_no_error(
     journal: Journal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(JournalStream.__init__, "__defaults__", (journal.path,))
-    log = Log(LogConfig(format="journal"))
+    monkeypatch.setattr("acsard.host.logs._fitting", lambda stream: "journal")
+    log = Log(LogConfig())
     journal.close()
     os.unlink(journal.path)
     for _ in range(10):
@@ -199,12 +202,10 @@ def test_a_journal_that_disappears_raises_no_error(
     log.close()
 
 
-def written(
-    path: Path, *events: Event, form: Literal["json", "console", "logfmt"] = "json"
-) -> list[str]:
-    """Write these events to a log of this format, and return its lines."""
+def written(path: Path, *events: Event) -> list[str]:
+    """Write these events to a log in a file, and return its lines."""
     with (path / "log").open("w+") as stream:
-        log = Log(LogConfig(format=form), stream)
+        log = Log(LogConfig(), stream)
         for event in events:
             log.event(event)
         log.close()
@@ -228,12 +229,13 @@ def test_sender_and_count_of_an_event_are_logged_only_if_present(
     assert (full["by"], full["count"], full["level"]) == ("joe (native)", 3, "warning")
 
 
-@pytest.mark.parametrize("form", ["json", "console", "logfmt"])
+@pytest.mark.parametrize("form", ["json", "console"])
 def test_control_characters_of_a_logged_text_are_replaced(
-    tmp_path: Path, form: Literal["json", "console", "logfmt"]
+    tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("acsard.host.logs._fitting", lambda stream: form)
     evil = "cmd/\x1b[2J\n\r\x00\u202eapp"
-    (line,) = written(tmp_path, Event("command_refused", evil, by=evil), form=form)
+    (line,) = written(tmp_path, Event("command_refused", evil, by=evil))
     text = line.replace("\x1b[0m", "").replace("\x1b[1m", "").replace("\x1b[2m", "")
     assert "cmd/\ufffd[2J  \ufffd\ufffdapp" in text.replace("\\ufffd", "\ufffd")
     assert "\x1b[2J" not in line
@@ -247,7 +249,7 @@ def test_a_long_value_is_truncated(tmp_path: Path) -> None:
 
 def test_an_event_below_the_level_is_not_written(tmp_path: Path) -> None:
     with (tmp_path / "log").open("w+") as stream:
-        log = Log(LogConfig(format="json", level="warning"), stream)
+        log = Log(LogConfig(level="warning"), stream)
         log.event(Event("link_up", "linked"))
         log.event(Event("link_down", "pulled", "warning"))
         log.close()
@@ -257,9 +259,9 @@ def test_an_event_below_the_level_is_not_written(tmp_path: Path) -> None:
 
 def test_a_changed_log_level_applies_to_the_next_events(tmp_path: Path) -> None:
     with (tmp_path / "log").open("w+") as stream:
-        log = Log(LogConfig(format="json", level="warning"), stream)
+        log = Log(LogConfig(level="warning"), stream)
         for level in ("warning", "info", "error", "info"):
-            log.use(LogConfig(format="json", level=level))
+            log.use(LogConfig(level=level))
             log.event(Event("mode", level))
         log.close()
         stream.seek(0)

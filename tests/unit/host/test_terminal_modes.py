@@ -57,15 +57,16 @@ def test_the_log_of_a_terminal_is_coloured_unless_no_color_is_set(
     if not wanted:
         monkeypatch.setenv("NO_COLOR", "1")
     ours, stream = terminal
-    logs = Log(LogConfig(format="console"), stream)
+    logs = Log(LogConfig(), stream)
     logs.event(Event("stop", "stopped"))
     logs.close()
     assert (b"\x1b[" in os.read(ours, 4096)) is wanted
 
 
-def test_the_console_s_log_in_a_file_has_no_colours() -> None:
+def test_the_console_s_log_in_a_file_has_no_colours(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("acsard.host.logs._fitting", lambda stream: "console")
     stream = io.StringIO()
-    logs = Log(LogConfig(format="console"), stream)
+    logs = Log(LogConfig(), stream)
     logs.event(Event("stop", "stopped"))
     logs.close()
     assert "stopped" in stream.getvalue()

@@ -40,8 +40,8 @@ def about(wall_ns: int = NOW_NS) -> About:
     return About("acsar", "0.1.0", "3.11.0", 5, wall_ns, "")
 
 
-def ring(where: Path, megabytes: float = 10.0, days: float = 14.0) -> RecordingDirectory:
-    return RecordingDirectory(RecordConfig(str(where), megabytes, days))
+def ring(where: Path, megabytes: float = 10.0) -> RecordingDirectory:
+    return RecordingDirectory(RecordConfig(str(where), megabytes))
 
 
 def record(store: RecordingDirectory, size: int = 10, kind: Kind = "plain", days: int = 0) -> Path:
@@ -192,12 +192,12 @@ def test_protected_files_count_for_the_limit_in_bytes(tmp_path: Path) -> None:
 def test_old_files_go_except_the_last_fifty_with_an_incident(
     tmp_path: Path,
 ) -> None:
-    store = ring(tmp_path, days=2.0)
-    incidents = [record(store, kind="kept", days=3) for _ in range(MAX_KEPT_FILES + 3)]
+    store = ring(tmp_path)
+    incidents = [record(store, kind="kept", days=15) for _ in range(MAX_KEPT_FILES + 3)]
     fresh = record(store, kind="kept", days=1)
-    old, new = record(store, days=3), record(store, days=1)
+    old, new = record(store, days=15), record(store, days=1)
     store.close()
-    later(ring(tmp_path, days=2.0))
+    later(ring(tmp_path))
     assert [path.exists() for path in incidents] == [False] * 4 + [True] * (MAX_KEPT_FILES - 1)
     assert [path.exists() for path in (fresh, old, new)] == [True, False, True]
 
@@ -205,11 +205,11 @@ def test_old_files_go_except_the_last_fifty_with_an_incident(
 def test_no_file_of_this_run_is_too_old_and_a_clock_that_was_just_set_is_not_trusted(
     tmp_path: Path,
 ) -> None:
-    before = ring(tmp_path, days=2.0)
-    old = record(before, days=3)
+    before = ring(tmp_path)
+    old = record(before, days=15)
     before.close()
-    store = ring(tmp_path, days=2.0)
-    mine = record(store, days=3)
+    store = ring(tmp_path)
+    mine = record(store, days=15)
     for mono_ns, jump_ns in ((0, 0), (STEADY_CLOCK_NS - 1, 0), (STEADY_CLOCK_NS, 400 * DAY_NS)):
         now = Instant(mono_ns, NOW_NS + mono_ns + jump_ns)
         store.maintain(now)
@@ -223,14 +223,14 @@ def test_no_file_of_this_run_is_too_old_and_a_clock_that_was_just_set_is_not_tru
 
 
 def test_a_jump_of_the_clock_does_not_make_earlier_files_older(tmp_path: Path) -> None:
-    store = ring(tmp_path, days=2.0)
+    store = ring(tmp_path)
     mine = record(store)
     ended_ns = mine.stat().st_mtime_ns
     store.maintain(Instant(0, NOW_NS))
     store.maintain(Instant(NS_PER_S, NOW_NS + NS_PER_S + 20 * DAY_NS))
     assert mine.stat().st_mtime_ns == ended_ns + 20 * DAY_NS
     store.close()
-    again = ring(tmp_path, days=2.0)
+    again = ring(tmp_path)
     for mono_ns in (0, STEADY_CLOCK_NS):
         now = Instant(mono_ns, NOW_NS + 21 * DAY_NS + mono_ns)
         again.maintain(now)
@@ -266,7 +266,7 @@ def test_if_other_programs_fill_the_disk_the_oldest_files_go_and_protected_ones_
 
 
 def test_the_current_file_and_files_of_other_programs_are_never_deleted(tmp_path: Path) -> None:
-    store = ring(tmp_path, days=0.01)
+    store = ring(tmp_path)
     (tmp_path / "notes.mcap").write_bytes(b"mine")
     (tmp_path / "notes-1.txt").write_bytes(b"mine")
     writing = store.begin(about(0))
@@ -443,7 +443,7 @@ def test_recordings_beyond_the_limits_are_deleted_with_an_event_that_is_not_a_wa
         record(store, MIN_FILE_BYTES)
     store.trim(None)
     (event,) = run.events
-    assert "exceeded record.megabytes or record.days" in event.text
+    assert "exceeded record.megabytes or 14 days" in event.text
     assert event.level == "info"
 
 

@@ -63,7 +63,7 @@ def test_every_live_setting_is_a_key_and_every_source_has_a_live_timeout() -> No
     "key",
     ["mcu.port", "drive.wheel_radius", "feedback.fault_time", "commands.neutral_first",
      "commands.sources.nav.priority", "bus.listen", "access.maintainers", "robot.id",
-     "odometry.gyro", "odometry.distance_scale_std", "log.format", "commands.sources.nav"],
+     "odometry.gyro", "odometry.distance_scale_std", "commands.sources.nav"],
 )  # fmt: skip
 def test_settings_of_wire_base_and_permissions_need_a_restart(key: str) -> None:
     assert find_live_setting(key) is None
@@ -211,7 +211,7 @@ def test_braking_can_be_made_harder_while_driving_but_softer_only_at_rest(key: s
 
 @each(
     ("key", "value"),
-    [("limits.wheel_speed", 39.0), ("limits.wheel_speed", 41.0), ("commands.neutral_pause", 2.0),
+    [("limits.wheel_speed", 39.0), ("limits.wheel_speed", 41.0),
      ("commands.sources.nav.timeout", 0.5)],
 )  # fmt: skip
 def test_settings_that_would_jump_or_reset_the_arbiter_are_refused_while_driving(

@@ -44,7 +44,6 @@ def test_the_defaults_are_those_of_the_original_robot() -> None:
     assert config.odometry.odom_frame == "odom"
     assert config.odometry.base_frame == "base_link"
     assert config.lidar.lidar_frame == "lidar_link"
-    assert config.control.auto_activate
     assert config.commands.neutral_first
 
 

@@ -26,9 +26,8 @@ class Bench:
         *sources: Source,
         neutral_first: bool = True,
         armed: bool = True,
-        pause: float = 1.0,
     ) -> None:
-        self.arbiter = Arbiter(CommandsConfig(neutral_first, pause, sources))
+        self.arbiter = Arbiter(CommandsConfig(neutral_first, sources))
         self.arbiter.require_neutral()
         self.now_ns = 10 * NS_PER_S
         self.offset_ns = 1_800_000_000 * NS_PER_S

@@ -378,13 +378,10 @@ def test_a_shared_sender_whose_clock_was_set_keeps_the_robot_through_its_pause(
     assert bench.choice().twist == REST
 
 
-@each("pause", [0.5, 3.0, 10.0])
-def test_a_shared_sender_whose_clock_was_set_waits_for_a_new_pause_and_keeps_the_robot(
-    pause: float,
-) -> None:
-    bench = Bench(LEFT, RIGHT, armed=False, pause=pause)
-    set_at, waits = 40 + int(20 * pause), []
-    for at in range(set_at + int(20 * (3.0 + pause))):
+def test_a_shared_sender_whose_clock_was_set_waits_for_a_new_pause_and_keeps_the_robot() -> None:
+    bench = Bench(LEFT, RIGHT, armed=False)
+    set_at, waits = 60, []
+    for at in range(set_at + 80):
         late_ms = 9000.0 * (at >= set_at)
         bench.wait(50).stamped(LEFT, late_ms, "clock", REST, "a", shared=True)
         if at > set_at - 10:
@@ -392,7 +389,7 @@ def test_a_shared_sender_whose_clock_was_set_waits_for_a_new_pause_and_keeps_the
         choice = bench.choice()
         waits.append(choice.wait.what)
         assert choice.source == "left" or at < 10
-    assert waits[set_at:].count("neutral") == 20 * pause
+    assert waits[set_at:].count("neutral") == 20
 
 
 def test_a_sender_that_must_send_a_zero_again_is_not_forgotten_for_a_new_one() -> None:
@@ -695,7 +692,7 @@ def test_a_new_timeout_applies_to_a_sender_that_drives() -> None:
     bench.send(HIGH)
     bench.wait(300)
     assert bench.driver() == ""
-    bench.arbiter.use(CommandsConfig(True, 1.0, (Source("high", 100, timeout=0.5),)))
+    bench.arbiter.use(CommandsConfig(True, (Source("high", 100, timeout=0.5),)))
     assert bench.driver() == "high"
 
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.gap_filling import (
@@ -262,7 +261,7 @@ class Doubtful:
     """A `Confirmation` that has received one line at 100 Hz, and a count of its lines."""
 
     def __init__(self, before: WheelSpeeds = FOUR) -> None:
-        self.confirmation, self.before, self.lines = Confirmation(FeedbackConfig()), before, 0
+        self.confirmation, self.before, self.lines = Confirmation(), before, 0
         self.receive(before, 0.01)
 
     def receive(self, speeds: WheelSpeeds, dt: float, **more: Any) -> tuple[list[int], list[int]]:
@@ -371,7 +370,7 @@ def test_a_slower_board_makes_the_usual_time_longer() -> None:
 
 def test_on_a_slow_link_the_usual_time_is_longer() -> None:
     slow = Doubtful()
-    slow.confirmation = Confirmation(FeedbackConfig())
+    slow.confirmation = Confirmation()
     for _ in range(3):
         assert slow.receive(FOUR, 0.1) == ([slow.lines], [])
     assert slow.receive(one_wheel_at(1, 70.0), 0.1) == ([5], [])

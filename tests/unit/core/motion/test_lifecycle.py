@@ -31,8 +31,8 @@ def ns(seconds: float) -> int:
     return int(seconds * NS_PER_S)
 
 
-def ready(active: bool = True) -> Lifecycle:
-    life = Lifecycle(active)
+def ready() -> Lifecycle:
+    life = Lifecycle()
     life.link(up=True)
     return life
 
@@ -78,11 +78,8 @@ def mode(life: Lifecycle) -> Mode:
 # the start
 
 
-def test_the_robot_starts_waiting_for_its_link_or_switched_off() -> None:
-    assert Lifecycle(active=True).mode is Mode.WAITING
-    off = Lifecycle(active=False)
-    assert (off.mode, off.why.text) == (Mode.INACTIVE, "switched off; call srv/activate")
-    assert off.latches == Latches()
+def test_the_robot_starts_waiting_for_its_link() -> None:
+    assert Lifecycle().mode is Mode.WAITING
 
 
 STOP = Latch(7, WALL_NS, "ann", "stopped by ann", "stopped", kept=True)
@@ -131,7 +128,7 @@ OFF = Latch(9, WALL_NS, "joe", "switched off by joe", "switched_off", kept=True)
     ],
 )
 def test_the_robot_starts_as_its_latches_say(latches: Latches, begins: Mode, why: str) -> None:
-    life = Lifecycle(active=True, latches=latches)
+    life = Lifecycle(latches=latches)
     life.link(up=True)
     life.command(fresh=True)
     assert (life.mode, life.why.text) == (begins, why)
@@ -167,7 +164,7 @@ def test_a_number_is_the_wall_time_in_ms_and_grows_even_if_the_clock_does_not() 
     early = ready()
     early.stop("ann", ns(1.0), Instant(ns(1.0), 0))
     assert number(early) == 1001  # 0 means that there is no stop
-    lifecycle = Lifecycle(active=True, latches=Latches(stop=STOP, inactive=OFF))
+    lifecycle = Lifecycle(latches=Latches(stop=STOP, inactive=OFF))
     lifecycle.stop("ann", ns(1.0), Instant(ns(1.0), 0))
     assert number(lifecycle) == OFF.number + 1001
 
@@ -183,13 +180,13 @@ def test_a_number_is_not_used_again_after_its_latch_is_released() -> None:
 
 def test_a_number_is_not_used_again_after_a_restart_with_a_wall_clock_that_went_back() -> None:
     """The latch file contains only latches in force, and no numbers of released latches."""
-    first = Lifecycle(active=True, latches=Latches(inactive=OFF))
+    first = Lifecycle(latches=Latches(inactive=OFF))
     numbers = []
     for seconds in (1.0, 1.5):
         first.stop("ann", ns(seconds), Instant(ns(seconds), 0))
         numbers.append(number(first))
         first.clear(numbers[-1], ns(seconds + 0.1), Instant(ns(seconds + 0.1), 0))
-    second = Lifecycle(active=True, latches=first.latches.after_restart())
+    second = Lifecycle(latches=first.latches.after_restart())
     second.stop("joe", ns(3.0), Instant(ns(3.0), 0))
     assert number(second) > max(numbers)
     with pytest.raises(RefusedError, match=f"latch {numbers[0]} is not the latch"):
@@ -306,13 +303,13 @@ def test_every_cause_survives_restarts() -> None:
     stop(life, 1.0)
     press(life, 2.0)
     for _ in range(3):
-        life = Lifecycle(active=True, latches=life.latches.after_restart())
+        life = Lifecycle(latches=life.latches.after_restart())
         assert life.why.text == (
             f"{PRESSED} (latched at {AT}:02 UTC, before the restart); also was stopped by "
             f"ann at {AT}:01 UTC, before the restart; call srv/clear"
         )
     press(life, 5.0, SILENT_REASON)
-    life = Lifecycle(active=True, latches=life.latches.after_restart())
+    life = Lifecycle(latches=life.latches.after_restart())
     press(life, 6.0)
     life.refuse_clear(None, ns(7.0))
     assert life.why.text == (
@@ -430,7 +427,7 @@ def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
     be wrong by years.
     """
     stop_at_start = Latch(7, WALL_NS, "ann", "stopped by ann", "stopped", kept=saved)
-    life = Lifecycle(active=True, latches=Latches(stop=stop_at_start))
+    life = Lifecycle(latches=Latches(stop=stop_at_start))
     for step_s in (10.0, 10.01, 11.5):
         life.begin(Instant(ns(step_s), WALL_NS + ns(wall_s)))
     for asked_s, age in ((9.9, "0.1"), (11.5, "1.5")):
@@ -453,7 +450,7 @@ def test_a_stop_in_the_first_step_is_not_older_than_the_start() -> None:
 
 
 def test_a_named_clear_releases_a_stop_from_the_start_immediately() -> None:
-    life = Lifecycle(active=True, latches=Latches(stop=STOP))
+    life = Lifecycle(latches=Latches(stop=STOP))
     life.begin(at(10.0))
     assert life.clear(STOP.number, ns(9.9), at(10.0))
 
@@ -578,7 +575,7 @@ def test_a_clear_without_a_number_is_refused_while_the_newest_of_fault_and_stop_
 def test_a_fault_from_before_a_restart_needs_a_number_in_the_first_two_seconds() -> None:
     before = ready()
     before.fault(cause("a wheel is dead"), at(1.0))
-    life = Lifecycle(True, before.latches)
+    life = Lifecycle(before.latches)
     life.begin(at(10.0))
     life.link(up=True)
     with pytest.raises(RefusedError, match="and the robot is still in fault"):
@@ -711,15 +708,6 @@ def test_an_activate_of_an_active_robot_changes_nothing_whatever_number_is_named
     assert life.latches is before
 
 
-def test_a_robot_that_starts_switched_off_has_the_number_0() -> None:
-    life = ready(active=False)
-    with pytest.raises(
-        RefusedError, match="latch 7 is not the latch that srv/activate would release now; the"
-    ):
-        activate(life, 1.0, 7)
-    assert activate(life, 1.0, 0)
-
-
 @each("latched", ["stop", "fault"])
 def test_a_clear_of_a_robot_that_is_switched_off_says_so_and_names_activate(latched: str) -> None:
     life = off()
@@ -768,7 +756,6 @@ class State(NamedTuple):
     inactive: bool
     linked: bool
     commanded: bool
-    dormant: bool
     pressed: bool
 
 
@@ -828,7 +815,6 @@ def state_of(life: Lifecycle) -> State:
         latches.inactive is not None,
         life._linked,
         life._commanded,
-        life._dormant,
         bool(life._held),
     )
 
@@ -851,7 +837,7 @@ def explore() -> list[Edge]:
     """
     edges: list[Edge] = []
     visited: set[tuple[State, tuple[bool, ...]]] = set()
-    queue = deque((Lifecycle(active), 10.0) for active in (True, False))
+    queue = deque([(Lifecycle(), 10.0)])
     while queue:
         life, now = queue.popleft()
         # A latch older than two seconds is a separate state, because a plain clear is accepted
@@ -880,17 +866,17 @@ def explore() -> list[Edge]:
 def test_every_combination_of_facts_and_latches_is_reached() -> None:
     states = {edge.before for edge in explore()}
     # A pressed emergency stop is always latched.
-    assert len(states) == 2**6 * 3
+    assert len(states) == 2**5 * 3
     tried = {(edge.before, edge.trigger, edge.pause_s) for edge in explore()}
-    assert len(tried) == 2**6 * 3 * len(TRIGGERS) * 2
+    assert len(tried) == 2**5 * 3 * len(TRIGGERS) * 2
 
 
 def test_the_mode_always_follows_from_the_facts_and_the_latches() -> None:
     for edge in explore():
-        *flags, inactive, linked, commanded, dormant, _ = edge.after
+        *flags, inactive, linked, commanded, _ = edge.after
         shutting_down, fault, stopped = flags
         assert edge.mode is mode_of(
-            shutting_down=shutting_down, fault=fault, stopped=stopped, inactive=inactive or dormant,
+            shutting_down=shutting_down, fault=fault, stopped=stopped, inactive=inactive,
             linked=linked, commanded=commanded,
         )  # fmt: skip
 
@@ -967,11 +953,7 @@ def test_a_plain_clear_is_refused_until_two_seconds_after_a_stop() -> None:
 
 
 def test_nothing_but_activate_ends_inactive() -> None:
-    ends = {
-        edge.trigger
-        for edge in explore()
-        if edge.before.inactive > edge.after.inactive or edge.before.dormant > edge.after.dormant
-    }
+    ends = {edge.trigger for edge in explore() if edge.before.inactive > edge.after.inactive}
     assert ends == {"activate by number", "activate without a number"}
 
 
@@ -1037,4 +1019,4 @@ def test_switching_on_by_number_is_refused_exactly_while_a_latch_holds_or_the_da
         if edge.trigger == "activate by number" or late:
             before = edge.before
             assert edge.refused == (before.shutting_down or before.fault or before.stopped)
-            assert edge.refused or not (edge.after.inactive or edge.after.dormant)
+            assert edge.refused or not edge.after.inactive

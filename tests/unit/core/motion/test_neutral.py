@@ -21,7 +21,7 @@ from tests.unit.core.motion.commanders import GO, HIGH, HOUR_NS, LEFT, LOW, MS, 
 
 
 def sender() -> Sender:
-    return Sender(250 * MS, 1000 * MS, neutral_first=True)
+    return Sender(250 * MS, neutral_first=True)
 
 
 def command_at(twist: Twist, at_ms: float, shared: bool = False) -> Command:
@@ -189,7 +189,7 @@ def test_a_shared_zero_that_armed_is_not_forgotten_when_a_later_speed_proves_wro
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_a_speed_before_an_unproven_zero_is_not_followed_once_the_zero_arms(shared: bool) -> None:
-    peer = Sender(5000 * MS, 1000 * MS, neutral_first=True)
+    peer = Sender(5000 * MS, neutral_first=True)
     peer.take(command_at(GO, 0, shared), 0)
     peer.take(command_at(REST, 10, shared), 0, "unproven")
     assert peer.armed(1010 * MS if shared else 10 * MS)
@@ -380,7 +380,7 @@ def test_requiring_a_zero_again_forgets_the_zeros_that_wait() -> None:
 
 
 def test_without_neutral_first_every_sender_is_armed() -> None:
-    peer = Sender(250 * MS, 1000 * MS, neutral_first=False)
+    peer = Sender(250 * MS, neutral_first=False)
     assert peer.armed(0)
     peer.require_neutral()
     assert peer.armed(0)

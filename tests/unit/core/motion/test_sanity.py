@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import msgspec
 import pytest
@@ -29,6 +30,20 @@ def only(wheel: int, speed: float, others: float = 0.0) -> WheelSpeeds:
     return WheelSpeeds(*(speed if i == wheel else others for i in range(4)))
 
 
+Bounded = Callable[[float], Sanity]
+
+
+@pytest.fixture
+def bounded(monkeypatch: pytest.MonkeyPatch) -> Bounded:
+    """Return a function that makes a `Sanity` with another bound of the acceleration, rad/s2."""
+
+    def make(acceleration: float) -> Sanity:
+        monkeypatch.setattr("acsard.core.motion.sanity.MAX_WHEEL_ACCELERATION", acceleration)
+        return Sanity(FeedbackConfig())
+
+    return make
+
+
 # impossible lines
 
 
@@ -40,31 +55,37 @@ def test_a_speed_no_wheel_reaches_is_impossible_and_names_the_wheel(wheel: int) 
 
 
 @pytest.mark.parametrize("wheel", range(4))
-def test_a_change_no_wheel_makes_is_impossible_and_names_the_wheel(wheel: int) -> None:
-    sanity = Sanity(FeedbackConfig(wheel_acceleration=100.0))
+def test_a_change_no_wheel_makes_is_impossible_and_names_the_wheel(
+    wheel: int, bounded: Bounded
+) -> None:
+    sanity = bounded(100.0)
     assert sanity.impossible(line(STILL)) == ""
     assert WHEELS[wheel] in sanity.impossible(line(only(wheel, 3.5)))
     assert sanity.impossible(line(only(wheel, 2.9))) == ""
 
 
-def test_the_most_a_wheel_can_do_is_possible() -> None:
+def test_the_most_a_wheel_can_do_is_possible(bounded: Bounded) -> None:
     # The limit is 100 rad/s2 x 10 ms and 2 rad/s of slack.
-    sanity = Sanity(FeedbackConfig(wheel_acceleration=100.0))
+    sanity = bounded(100.0)
     assert sanity.impossible(line(STILL)) == ""
     assert sanity.impossible(line(only(0, 3.0))) == ""
     assert sanity.impossible(line(only(0, 0.0))) == ""
     assert "front_right" in sanity.impossible(line(only(0, -3.01)))
 
 
-def test_a_real_step_is_believed_as_soon_as_it_could_have_happened() -> None:
-    sanity = Sanity(FeedbackConfig(wheel_acceleration=400.0))
+def test_a_real_step_is_believed_as_soon_as_it_could_have_happened(
+    bounded: Bounded,
+) -> None:
+    sanity = bounded(400.0)
     sanity.impossible(line(STILL))
     verdicts = [sanity.impossible(line(TEN)) == "" for _ in range(3)]
     assert verdicts == [False, True, True]
 
 
-def test_after_a_pause_a_larger_change_is_possible_for_as_long_as_the_pause_lasted() -> None:
-    sanity = Sanity(FeedbackConfig(wheel_acceleration=100.0))
+def test_after_a_pause_a_larger_change_is_possible_for_as_long_as_the_pause_lasted(
+    bounded: Bounded,
+) -> None:
+    sanity = bounded(100.0)
     for seconds in (0.01, 0.25, 0.01, 0.01):  # the board repeats the mean of the pause
         assert sanity.impossible(line(TEN, dt=seconds)) == ""
     assert sanity.impossible(line(STILL)) == ""
@@ -73,8 +94,10 @@ def test_after_a_pause_a_larger_change_is_possible_for_as_long_as_the_pause_last
     assert sanity.impossible(line(TEN))
 
 
-def test_the_first_line_and_the_first_after_a_gap_have_no_slew() -> None:
-    sanity = Sanity(FeedbackConfig(wheel_acceleration=10.0))
+def test_the_first_line_and_the_first_after_a_gap_have_no_slew(
+    bounded: Bounded,
+) -> None:
+    sanity = bounded(10.0)
     assert sanity.impossible(line(TEN, dt=0.0)) == ""
     assert sanity.impossible(line(STILL, dt=0.0, gap=0.5)) == ""
 
@@ -93,8 +116,8 @@ def test_three_impossible_lines_in_a_row_are_doubtful_and_two_are_not() -> None:
     assert flags == [False, False, False, False, True]
 
 
-def test_forgetting_starts_over() -> None:
-    sanity = Sanity(FeedbackConfig(wheel_acceleration=10.0))
+def test_forgetting_starts_over(bounded: Bounded) -> None:
+    sanity = bounded(10.0)
     sanity.impossible(line(STILL))
     for _ in range(3):
         sanity.impossible(line(TEN))
@@ -206,9 +229,11 @@ def stepping(speeds: WheelSpeeds, step: float, proven: bool = False) -> Feedback
     return Feedback(AT, speeds, DT, steps=(step,) * 4, counted=counted)
 
 
-def test_a_count_more_or_less_at_each_end_is_no_change_of_speed() -> None:
+def test_a_count_more_or_less_at_each_end_is_no_change_of_speed(
+    bounded: Bounded,
+) -> None:
     # The limit is 100 rad/s2 x 10 ms, 2 rad/s of slack and twice 31.4 rad/s.
-    sanity = Sanity(FeedbackConfig(wheel_acceleration=100.0))
+    sanity = bounded(100.0)
     assert sanity.impossible(stepping(STILL, 31.4)) == ""
     assert sanity.impossible(stepping(only(0, 65.7), 31.4)) == ""
     assert "front_right" in sanity.impossible(stepping(only(0, -0.2), 31.4))
@@ -413,9 +438,11 @@ def test_an_unknown_encoder_makes_any_change_possible_but_no_speed_above_the_lim
 # the limits themselves
 
 
-def test_a_change_of_the_limit_and_two_counts_is_possible() -> None:
+def test_a_change_of_the_limit_and_two_counts_is_possible(
+    bounded: Bounded,
+) -> None:
     # 100 rad/s2 x 10 ms, 2 rad/s of slack and twice 0.5 rad/s
-    sanity = Sanity(FeedbackConfig(wheel_acceleration=100.0))
+    sanity = bounded(100.0)
     assert sanity.impossible(stepping(STILL, 0.5)) == ""
     assert sanity.impossible(stepping(only(0, 4.0), 0.5)) == ""
 
