@@ -1,10 +1,8 @@
 """The command line of acsard: one module for each subcommand.
 
-The docstring of such a module is the text of the subcommand's `--help`. The function `add_options`
-of the module declares the options, and `main` runs the subcommand. If a subcommand has actions,
-such as `acsard tls init`, each action has its own main function. Only the module of the typed
-subcommand is imported. At its top, a module imports everything that it needs, except libraries that
-may be missing.
+A module's docstring is the text of `--help`, `add_options` declares the options, and `main` (or a
+main function for each action, as of `acsard tls init`) runs it. Only the module of the typed
+subcommand is imported. It imports at its top everything but libraries that may be missing.
 """
 
 from __future__ import annotations
@@ -29,6 +27,7 @@ from acsard.core.values import AcsardError
 from acsard.host.errors import Exit, MendableError
 from acsard.host.version import version
 
+# Subcommands in the order of `acsard --help`; the name is the module's too.
 VERBS = {
     "run": "run the daemon (the default)",
     "sim": "simulate a microcontroller on a pty, for a separate `acsard run --port …`",
@@ -52,26 +51,19 @@ VERBS = {
     "router": "run a fleet's Zenoh router and restart it when a client blocks it",
     "service": "install acsard as a system service, remove it, or show its status",
 }
-"""Maps each subcommand to its description in `acsard --help`, in the order in which they appear.
 
-The name of a subcommand is also the name of its module in this package.
-"""
+UNLISTED = ("gateway",)  # started only by systemd and `acsard run`
 
-UNLISTED = ("gateway",)
-"""Programs that only systemd and `acsard run` start, so `acsard --help` does not list them."""
-
+# Their exit code says whether something was done or judged, so they fail if the reader of their
+# output ends early. An action such as `recording replay` sets `must_finish` instead.
 MUST_FINISH = {
     "call", "set", "doctor", "mcu", "calibrate", "tls", "service",
 }  # fmt: skip
-"""Subcommands whose exit code says whether something was done or judged. If the reader of their
-output ends early, they have failed. An action of another subcommand, such as `recording replay`,
-sets `must_finish` instead."""
 
-MAX_ARGUMENT_LENGTH = 4096
-"""Largest length of an argument, characters. Zenoh fails on keys above 65,535 bytes."""
+MAX_ARGUMENT_LENGTH = 4096  # characters; Zenoh fails on keys above 65,535 bytes
 
+# Paths that the daemon uses, besides ACSARD_...
 PATH_VARIABLES = ("HOME", "STATE_DIRECTORY", "XDG_STATE_HOME")
-"""Environment variables with paths that the daemon uses, besides those that begin with ACSARD_."""
 
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 wrong usage, 65 part of the recording was left out, 66 no such
@@ -86,9 +78,8 @@ try:  acsard run                (start the robot on the built-in simulator)
 
 
 class _Parser(argparse.ArgumentParser):
+    # `parse_known_intermixed_args` is running, which may call `parse_known_args`: do not recurse.
     _intermixed = False
-    """Whether `parse_known_intermixed_args` is running. That method may call `parse_known_args`,
-    which must then not call `parse_known_intermixed_args` again."""
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
@@ -119,10 +110,9 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
-    """Return the parser for the command line of `acsard`.
+    """Return the parser, with the options of the subcommands in `called` only.
 
-    The parser accepts the names of all subcommands. It has the options of the subcommands in
-    `called` only, because the modules of other subcommands are not imported.
+    The modules of others are not imported.
     """
     whole = _Parser(
         prog="acsard",
@@ -186,16 +176,13 @@ _EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}")
 
 
 def _decimal(word: str) -> str:
-    """Write a number like `-1e-3`, which argparse would mistake for an option, as `-0.001`."""
+    # argparse would mistake `-1e-3` for an option.
     return f"{Decimal(word):f}" if _EXPONENT.fullmatch(word) else word
 
 
 def _unusable(words: Sequence[str]) -> str:
-    """Return why acsard cannot use these arguments or its environment, or "" if it can.
-
-    Paths and names must be UTF-8, because they appear in messages. The environment and the current
-    directory are checked only for the daemon, because `acsard call stop` must work everywhere.
-    """
+    # Paths and names must be UTF-8, because they appear in messages. Environment and directory
+    # matter only to the daemon, because `acsard call stop` must work everywhere.
     for word in words:
         if len(word) > MAX_ARGUMENT_LENGTH:
             return (
@@ -214,7 +201,6 @@ def _unusable(words: Sequence[str]) -> str:
 
 
 def _not_utf_8(texts: Mapping[str, str]) -> str:
-    """Return the problem of the first text that is not valid UTF-8, or ""."""
     for what, text in texts.items():
         try:
             text.encode()
@@ -224,7 +210,7 @@ def _not_utf_8(texts: Mapping[str, str]) -> str:
 
 
 def entry() -> NoReturn:
-    """Run `main`, flush the output, and end the process. This is the entry point of `acsard`."""
+    """Run `main`, flush the output, and end the process: the entry point of `acsard`."""
     # The process ends with `os._exit`, because Zenoh's threads may still call into Python. During a
     # normal shutdown of the interpreter, such a call would abort the process.
     _fill_closed_streams()

@@ -61,8 +61,8 @@ from acsard.host.terminal_modes import single_key_mode
 from acsard.terminal.output import MAX_TEXT_WIDTH, show
 from acsard.terminal.prompt import NobodyError, Prompt, TerminalPrompt, ended_by_signals
 
+# Options of a guided drive, not with `--log`.
 DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes")
-"""Names of the options for a guided drive. They cannot be used together with `--log`."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

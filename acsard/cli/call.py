@@ -20,8 +20,8 @@ from acsard.core.messages.schema import MESSAGES
 from acsard.core.values import Verb
 from acsard.host.errors import UsageError
 
+# The service `set` is `acsard set`.
 CALLABLE_SERVICES = tuple(service for service in SERVICES if service != "set")
-"""Names of the services that `acsard call` can call. `acsard set` calls the service `set`."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -77,9 +77,7 @@ def one_robot_only_text(
 ) -> str:
     """Return the error text for a service that can be called on only one robot at a time.
 
-    The text contains the command to type for each robot in `ids`. `values` are the numbers that the
-    operator typed after the name of the service, and `options` are the typed options that reach
-    the robot, such as " --connect ADDRESS".
+    It has the command for each robot, with the typed numbers and the options that reach it.
     """
     typed = " ".join(["acsard call", service, *(f"{value:g}" for value in values), "--id"])
     each = [robot_id for robot_id in ids if robot_id != "*"] or ["robot1"]

@@ -30,10 +30,7 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 
 
 def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
-    """Add the options --json and --write to the subcommand of `parser`.
-
-    `result` names the values that --write stores, such as "the result", for the help text.
-    """
+    """Add --json and --write, which stores `result` in the words of the help."""
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument(
         "--write",
@@ -44,7 +41,7 @@ def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
 
 
 def count(text: str) -> int:
-    """Parse a whole number from 1 to 999999999. This function is an argparse type."""
+    """Parse a whole number from 1 to 999999999, as an argparse type."""
     if not text.isascii() or not text.isdecimal() or len(text) > 9 or int(text) < 1:
         words = f"{text[:40]} is not a whole number from 1 to 999999999"
         raise argparse.ArgumentTypeError(words)
@@ -52,10 +49,7 @@ def count(text: str) -> int:
 
 
 def between(least: float, most: float, units: str) -> Callable[[str], float]:
-    """Return an argparse type: a function that parses a number from `least` to `most`.
-
-    `units` is the unit for the error message, such as "seconds".
-    """
+    """Return an argparse type for a number from `least` to `most`, in `units`."""
 
     def number(text: str) -> float:
         try:
@@ -71,10 +65,7 @@ def between(least: float, most: float, units: str) -> Callable[[str], float]:
 
 
 def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
-    """Return an argparse type: a function that parses a whole number from 1 to `most`.
-
-    `units` is the unit for the error message, such as "days". `hint` is appended to that message.
-    """
+    """Return an argparse type for a whole number from 1 to `most`; `hint` ends the error."""
 
     def number(text: str) -> int:
         if not text.isascii() or not text.isdecimal() or not 0 < int(text) <= most:
@@ -86,19 +77,15 @@ def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
 
 
 def options_text(options: Iterable[tuple[str, str | None]]) -> str:
-    """Return options as text for a command line, such as " --id robot2".
-
-    Each option is a pair of its name and its value. An option without a value is left out.
-    """
+    """Return options as text for a command line, such as " --id robot2", if they have a value."""
     return "".join([f" {name} {shlex.quote(value)}" for name, value in options if value])
 
 
 def overrides(options: Mapping[str, object]) -> dict[str, dict[str, object]]:
-    """Return the configuration values that options and the environment set, by table and key.
+    """Return the configuration values of options and environment, by table and key.
 
-    `options` maps dotted keys, such as "mcu.port", to values. A key with the value None is ignored.
-    The only environment variable is `ACSARD_TLS`, which sets `bus.tls` unless an option does. A
-    systemd unit sets this variable to the directory of its credentials.
+    `ACSARD_TLS`, which a systemd unit sets to its credentials, is `bus.tls` unless an option is.
+    None is ignored.
     """
     values: dict[str, object] = {}
     if "ACSARD_TLS" in os.environ:
@@ -111,6 +98,7 @@ def overrides(options: Mapping[str, object]) -> dict[str, dict[str, object]]:
     return result
 
 
+# Options by dotted key.
 OPTIONS = {
     "mcu.port": "--port",
     "mcu.baud_rate": "--baud-rate",
@@ -121,19 +109,13 @@ OPTIONS = {
     "bus.connect": "--connect",
     "bus.tls": "--tls",
 }
-"""Maps dotted keys of the configuration to the command-line option that sets the key."""
 
 
 def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple[str, Config]:
-    """Load the configuration, and return a pair: the path of its file, and the configuration.
+    """Load the configuration, and return the path of its file, too.
 
-    If the configuration has problems, print each problem after the name of the file or option that
-    causes it, and raise `ExitError`.
-
-    Args:
-        path: the value of --config, or None to search for the file.
-        options: maps dotted keys of `OPTIONS` to values, which replace those of the file. A key
-            with the value None is ignored.
+    Print each problem with its file or option, and raise `ExitError`. `options`, by keys of
+    `OPTIONS`, win unless they are None.
     """
     where, text = find(path)
     options = options or {}
@@ -153,10 +135,9 @@ def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple
 
 
 def with_record_directory(config: Config) -> Config:
-    """Return a copy of `config` with an absolute path of the recording directory.
+    """Return `config` with an absolute path of the recording directory.
 
-    If no directory is configured, the path comes from the environment variable ACSARD_RECORD, which
-    the systemd units set. Without this variable, the path is "".
+    Otherwise it is ACSARD_RECORD, which the systemd units set, or "".
     """
     # The path is absolute because a client that receives it over the bus may run in another working
     # directory.

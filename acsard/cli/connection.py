@@ -1,8 +1,4 @@
-"""Shared code of the subcommands that use the bus.
-
-It consists of their options, their connection to robots, checks of the typed key, and explanations
-why no message arrives.
-"""
+"""Shared code of the subcommands that use the bus: options, connections, keys and explanations."""
 
 from __future__ import annotations
 
@@ -31,10 +27,7 @@ SEVERAL_IDS = "; several ids separated by commas, or '*' for all robots"
 
 
 def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
-    """Add the options that select a robot and the address of its daemon.
-
-    `more` is appended to the help text of `--id`.
-    """
+    """Add the options that select a robot and its daemon's address; `more` help for `--id`."""
     add_config(parser)
     parser.add_argument(
         "--connect", metavar="ENDPOINT", help="address of the daemon, e.g. tcp/127.0.0.1:7448"
@@ -50,29 +43,21 @@ def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
 
 @contextmanager
 def connected(args: argparse.Namespace, source: str = "app") -> Iterator[Client]:
-    """Connect to the one robot that the options name, and yield a client of this robot.
-
-    The client sends commands as the command source `source`. Raises `UsageError` if `--id` names
-    several robots.
-    """
+    """Yield a client of the one robot that the options name. Raises `UsageError` for several."""
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, source=source, tls=tls) as robot:
         yield robot
 
 
 def robot_address(args: argparse.Namespace) -> Address:
-    """Return the address of the robot that the options name.
-
-    Without these options, return the address of the configured robot. Raises `UsageError` if
-    `--id` names several robots.
-    """
+    """Return the address of the robot that the options name. Raises `UsageError` for several."""
     require_one(args)
     _, config = load(args.config)
     return address_of(config, args.connect, args.id, args.tls)
 
 
 def several_ids(args: argparse.Namespace) -> tuple[str, ...]:
-    """Return the ids in `--id` if it names several robots, ("*",) for all robots, otherwise ()."""
+    """Return the ids in `--id` if it names several robots, ("*",) for all, otherwise ()."""
     return parse_ids(args.id or "")
 
 
@@ -87,12 +72,9 @@ def require_one(args: argparse.Namespace) -> None:
 
 @contextmanager
 def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[str, ...]]]:
-    """Connect to the bus, and yield a pair: a client, and the ids of the robots to use.
+    """Yield a client, and the ids of the robots to use by `Client.sibling`.
 
-    If `--id` names one robot, the client is for this robot, and the tuple of ids is empty. Without
-    `--id`, the client is for the configured robot. If `--id` names several robots, the tuple
-    contains their ids, or only "*" for `--id '*'`. Then use `Client.sibling` to get a client of
-    one of these robots.
+    These are () for one robot, which is the client's, and only "*" for `--id '*'`.
     """
     many = several_ids(args)
     _, config = load(args.config)
@@ -102,10 +84,9 @@ def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[
 
 
 def require_followed(key: str) -> None:
-    """Raise `UsageError` if `key` is a known key on which no messages are published.
+    """Raise `UsageError`, with the right command, if nothing is published on a known key.
 
-    The text of the error contains the command to type instead. If `key` is unknown, print a
-    warning, because a misspelt key would otherwise look like a robot that sends nothing.
+    Print a warning for an unknown one: a misspelt key would look like a silent robot.
     """
     if unknown(key):
         words = f"{key} is not in the topic table ({key_hint(key)}); waiting for messages anyway"
@@ -129,9 +110,8 @@ def require_followed(key: str) -> None:
 def require_asked(key: str) -> None:
     """Raise `UsageError` if `acsard get` cannot query this key.
 
-    `get` refuses a key that does not answer queries, and a key with a wildcard, because it prints
-    only one answer. It also refuses the key of a service, because a query on this key would call
-    the service.
+    It must answer, not have a wildcard (only one answer is printed), and not be a service, which a
+    query would call.
     """
     if set(key.partition("?")[0]) & set("*$"):
         raise UsageError(
@@ -161,20 +141,11 @@ def explained(
     after_s: float = FIRST_STATE_TIMEOUT_S,
     timeout_s: float = math.inf,
 ) -> Iterator[Callable[[], None]]:
-    """Print the reason if the `with` block receives no messages.
+    """Yield a function to be called for each message, and print the reason if none arrives.
 
-    Yield a function, which the block must call for each message. A separate thread finds the reason
-    and prints it on standard error, so the block can go on receiving.
-
-    Args:
-        look: function that returns why no message has arrived yet, or "" to print nothing. It is
-            called once if no message arrives in the first `after_s` s.
-        ceased: function for a later silence. It returns why no further message arrives, or "" to
-            print nothing. It is called each `after_s` s of the silence, until it has returned a
-            reason. If `ceased` is None, no reason for a later silence is printed.
-        after_s: time without a message after which a reason is printed, s.
-        timeout_s: time without a message after which the block ends by itself, s. If no message
-            has arrived by then, the reason is printed before the block is left.
+    A thread does this on standard error. `look` is asked once after `after_s`, and `ceased` every
+    `after_s` of a later silence until it has a reason; "" prints nothing. The block ends by itself
+    after `timeout_s` without a message, and the reason is printed before if there was none.
     """
     come, end, looked = Event(), Event(), Event()
     began_s = time.monotonic()
@@ -209,12 +180,9 @@ def explained(
 def silence_explained(
     robot: Client, key: str, timeout_s: float | None = None
 ) -> AbstractContextManager[Callable[[], None]]:
-    """Return a context that prints why no message arrives on a key, or that the connection is lost.
+    """Return `explained` for a key, or if it is "", only for a lost connection.
 
-    The context yields a function, which the caller must call for each message. Texts go to standard
-    error. If `key` is "", only a lost connection is reported. If no message arrives for `timeout_s`
-    s, the caller leaves the context; None means no time limit. If no message has arrived at all by
-    then, the reason is printed before the context ends.
+    The caller leaves the context after `timeout_s` without a message.
     """
     return explained(
         lambda: _none_yet(robot, key) if key else "",
@@ -244,9 +212,6 @@ def _ceased(robot: Client) -> str:
 
 
 def _of_link(where: Address) -> str:
-    """Return the fault of a TLS connection, such as an expired certificate.
-
-    Return "" if no fault is found, or if the connection does not use TLS.
-    """
+    # "": no fault is found, or no TLS is used.
     secured = where.tls and where.endpoint.startswith(TLS_PREFIX)
     return trouble(where.endpoint, where.tls) if secured else ""

@@ -43,8 +43,7 @@ from acsard.core.messages.short_texts import SHORT_TEXTS, short
 from acsard.host import clock
 from acsard.host.errors import Exit, NoAnswerError, UsageError
 
-RATE_SPAN_S = 10.0
-"""Largest age of the messages that a line of `--rate` describes, s."""
+RATE_SPAN_S = 10.0  # of the messages that a line of `--rate` describes
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -123,15 +122,11 @@ class Quota:
     """Counts the printed messages of each robot, and limits their number."""
 
     def __init__(self, most: int | None, robots: Collection[str]) -> None:
-        """Allow `most` messages of each robot, or any number if `most` is None.
-
-        `used_up` is true when each robot in `robots` has reached this number. If `robots` is empty,
-        only the robots with printed messages must have reached it.
-        """
+        # `used_up` is true when each of these robots, or each that has printed, has `most`.
         self._most, self._robots, self._counts = most, robots, dict[str, int]()
 
     def take(self, robot: str) -> bool:
-        """Return whether one more message of this robot may be printed. If so, count it."""
+        """Return whether one more message of this robot may be printed, and count it."""
         count = self._counts.get(robot, 0)
         if count == self._most:
             return False
@@ -153,7 +148,7 @@ def _print(
     timeout: float | None,
     on_message: Callable[[], None],
 ) -> int:
-    """Print the messages until Ctrl-C, until the `quota` is used up, or until messages cease."""
+    # Until Ctrl-C, the `quota`, or a silence.
     printed_s = time.monotonic()
     try:
         for sample in samples:
@@ -196,7 +191,7 @@ def _print_rates(
 
 
 def rate_text(times: list[float]) -> str:
-    """Return the rate of messages with these times of arrival, s, and the gaps between them."""
+    """Return the rate of messages with these arrivals, s, and the gaps between them."""
     if len(times) < 2 or times[-1] <= times[0]:
         return "no messages yet" if not times else f"{len(times)} messages, no rate yet"
     gaps_ms = np.diff(times) * 1e3
@@ -271,7 +266,7 @@ def _report_left_out(full_key: str, key: str, error: Exception) -> None:
 
 
 def _expected(robot: Client, ids: tuple[str, ...]) -> Collection[str]:
-    """Return the ids of the expected robots, and print which of the robots are present."""
+    # Also prints which robots are present.
     # Without the printed text, the operator could not distinguish a silent robot from an absent
     # robot.
     there: list[str] = []

@@ -16,8 +16,7 @@ from acsard.host.child import end_signals
 from acsard.host.errors import Exit, UsageError
 from acsard.host.extras import missing
 
-DEFAULT_ADDRESS = "127.0.0.1:8765"
-"""Address and port to which Foxglove and Lichtblick connect by default."""
+DEFAULT_ADDRESS = "127.0.0.1:8765"  # Foxglove and Lichtblick connect there by default
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -50,10 +49,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def loopback(text: str) -> tuple[str, int]:
-    """Return the host and the port in the text HOST:PORT.
-
-    Raises `UsageError` if the host is not a loopback address, or if the text has another form.
-    """
+    """Return host and port of HOST:PORT. Raises `UsageError` if it is no loopback address."""
     host, _, digits = text.rpartition(":")
     try:
         address = ipaddress.IPv4Address("127.0.0.1" if host == "localhost" else host)

@@ -85,11 +85,7 @@ def main(args: argparse.Namespace) -> int:
 def _checked(
     args: argparse.Namespace, config: Config, configured: Config, where: str, prompt: Prompt
 ) -> int:
-    """Check the board with the configuration `config`, and return the exit code.
-
-    Suggest changes to the configuration file `where`. `configured` contains the values of this
-    file, without the values of options.
-    """
+    # Suggests changes to the file `where`, whose values are `configured`, without options.
     port, simulated = config.mcu.port, config.mcu.simulated
     findings: list[Finding] = []
 
@@ -132,10 +128,7 @@ def _checked(
 
 
 def _prompt(args: argparse.Namespace, port: str) -> Prompt:
-    """Return the prompt that the options choose.
-
-    Raises `UsageError` if the wheels of a board at `port` could turn without a person's consent.
-    """
+    # Raises `UsageError` if wheels could turn without a person's consent.
     if port == SIMULATOR and args.port != SIMULATOR:
         raise UsageError(
             "no port is configured, so there is no board to check (mcu.port is the simulator, "

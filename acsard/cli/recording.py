@@ -59,11 +59,9 @@ from acsard.recording.timeline import TimelineEntry, TimelineWriter
 from acsard.report.page import make_report
 from acsard.terminal.output import show, table
 
-MAX_NAMES = 10
-"""Largest number of recordings, and of gaps between recordings, that a search prints."""
+MAX_NAMES = 10  # recordings, and gaps, that a search prints
 
-SERVICE_DIRECTORY = Path("/var/lib/acsard/record")
-"""The directory in which the systemd service stores its recordings."""
+SERVICE_DIRECTORY = Path("/var/lib/acsard/record")  # of the systemd service
 
 
 EXPORT_DESCRIPTION = """\
@@ -80,6 +78,7 @@ damage is left out and named; the exit code stays 0.
 """
 
 
+# Advice by output format and suffix of the typed file name.
 _MISNAMED = {
     ("mcap", ".csv"): "add --csv to write a table, or let the name end in .mcap",
     ("csv", ".mcap"): "leave out --csv to write MCAP, or let the name end in .csv",
@@ -92,10 +91,6 @@ _MISNAMED = {
     ("html", ".mcap"): "let the name end in .html; `acsard recording export` writes MCAP",
     ("html", ".txt"): "let the name end in .html; `acsard recording show` prints text",
 }
-"""Advice for an operator who typed a file name that does not fit the output format.
-
-The key is a pair: the output format, and the suffix of the typed file name.
-"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -292,10 +287,7 @@ def main_show(args: argparse.Namespace) -> int:
 
 
 def _is_being_recorded(recording: Recording) -> bool:
-    """Return whether a daemon is still writing to this recording.
-
-    The caller must read all steps of the recording first. Before that, its ending is not known.
-    """
+    # Read all steps before: the ending is not known until then.
     if recording.ending != UNFINISHED:
         return False
     # The daemon may have renamed or removed the file in the meantime.
@@ -305,7 +297,7 @@ def _is_being_recorded(recording: Recording) -> bool:
 
 
 def _show(recording: Recording, part: Span, as_json: bool) -> bool:
-    """Print the events in the time span `part`, and return whether `part` contains steps."""
+    # False: `part` has no steps.
     story = TimelineWriter(_config_of(recording))
     has_steps, over = False, False
     for step in steps(recording):
@@ -352,8 +344,7 @@ def _print_entry(entry: TimelineEntry, as_json: bool) -> None:
 def main_replay(args: argparse.Namespace) -> int:
     """Replay a recording, print how the results differ, and return the exit code.
 
-    The exit code is 1 if results differ and --config was not given. Otherwise it is 65 if a part of
-    the recording was not compared, and 0 if every part was compared.
+    It is 1 if they differ without --config, otherwise 65 if a part was not compared.
     """
     _require_one(args, "replay")
     recording = _recording(args)
@@ -475,7 +466,7 @@ def _parts(args: argparse.Namespace) -> list[tuple[Recording, Span]]:
 
 
 def _range(args: argparse.Namespace) -> tuple[float, float]:
-    """Return the times of --from and --to, s since 1970; -inf and inf without these options."""
+    # s since 1970; -inf and inf without these options.
     if any(isinstance(when, Offset) for when in (args.begin, args.end)):
         raise UsageError(
             "--from and --to in seconds count from the beginning of one recording, but "
@@ -556,10 +547,7 @@ def _when(text: str) -> When:
 
 @contextmanager
 def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
-    """Yield a function that shows on a terminal how much of a recording has been read.
-
-    The function takes the time of the last step that was read, ns since 1970.
-    """
+    # Shows on a terminal the time of the last step that was read.
     began_ns = recording.about.wall_ns
     last = read_end(recording.paths[-1]) if sys.stderr.isatty() else None
     whole = f" of {(last.last_ns - began_ns) / 1e9:.0f}" if last else ""
@@ -571,17 +559,14 @@ def _progress(recording: Recording) -> Iterator[Callable[[int], None]]:
 
 @contextmanager
 def _search_progress(count: int) -> Iterator[Callable[[int], None]]:
-    """Yield a function that shows on a terminal how many of `count` files have been searched."""
+    # Shows on a terminal the files that have been searched.
     with _overwritten_line() as show_line:
         yield lambda searched: show_line(f"searched {searched} of {many(count, 'recording')}")
 
 
 @contextmanager
 def _overwritten_line() -> Iterator[Callable[[str], None]]:
-    """Yield a function that shows a line on a terminal in the place of its last line.
-
-    The line is cleared at the end. Without a terminal, the function does nothing.
-    """
+    # In the place of the terminal's last line, which is cleared at the end.
     if not sys.stderr.isatty():
         yield lambda text: None
         return

@@ -19,21 +19,13 @@ from acsard.host.errors import Exit
 
 
 def of_robot(whose: str, line: str) -> str:
-    """Return a line of JSON that contains a message and the id of its robot.
-
-    The line has the form `{"robot": "robot1", "message": ...}`. `whose` is the id, and `line` is
-    the message as JSON.
-    """
+    """Return the JSON line `{"robot": "robot1", "message": ...}`."""
     record = {"robot": whose, "message": msgspec.Raw(line.encode())}
     return formatting.json_line(msgspec.json.encode(record).decode())
 
 
 def json_line(encoding: str, payload: bytes) -> str:
-    """Return the payload of a message as a line of JSON.
-
-    `encoding` is the Zenoh encoding of the message. If the payload cannot be decoded, or if it is
-    CDR, return `{"undecodable": ...}` with the payload as text.
-    """
+    """Return a payload as a line of JSON, or `{"undecodable": ...}` for CDR and damage."""
     try:
         form = detect(encoding, payload)
         if form == "cdr":
@@ -44,16 +36,12 @@ def json_line(encoding: str, payload: bytes) -> str:
         return msgspec.json.encode({"undecodable": repr(payload)}).decode()
 
 
+# Replies by robot id; an error says why there is no reply.
 Replies = Mapping[str, ServiceReply | AcsardError]
-"""Maps the id of each robot to its reply, or to the error that explains why a reply is missing."""
 
 
 def present_ids(robot: Client, ids: Sequence[str]) -> Sequence[str]:
-    """Return `ids`, or the ids of all robots that are present if `ids` contains "*".
-
-    `robot` is a client of any robot on the bus. Raises `NoAnswerError` if `ids` contains "*" and no
-    robot is present.
-    """
+    """Return `ids`, or for "*" all present robots. Raises `NoAnswerError` if there are none."""
     if ALL_ROBOTS in ids:
         return running_robots(robot.session, ids, robot.where.endpoint)
     return ids
@@ -62,11 +50,7 @@ def present_ids(robot: Client, ids: Sequence[str]) -> Sequence[str]:
 def of_each(
     robot: Client, ids: Sequence[str], call: Callable[[Client], ServiceReply]
 ) -> dict[str, ServiceReply | AcsardError]:
-    """Call a service of several robots at the same time, and return the replies by robot id.
-
-    `robot` and `ids` are those of `present_ids`. `call` gets a client of one robot, and calls the
-    service of this robot. If a robot does not reply, its entry is the error.
-    """
+    """Call a service of several robots at once, and return replies or errors by robot id."""
     wanted = present_ids(robot, ids)
 
     def called(robot_id: str) -> ServiceReply | AcsardError:
@@ -82,13 +66,10 @@ def of_each(
 def print_each(
     replies: Replies, robot: Client, ids: Sequence[str], silence: str, *, as_json: bool
 ) -> int:
-    """Print one line for the reply of each robot, and return the exit code.
+    """Print a line for each reply, and return the exit code.
 
-    The exit code is `OK` if all robots did as asked. It is `UNREACHABLE` if any robot did not
-    answer, and otherwise `FAILURE` if any robot refused.
-
-    `ids` are the ids that the operator typed. If they contain "*", the number of robots is printed.
-    `silence` is the text for a robot that did not answer. `{error}` in it stands for the reason.
+    It is `UNREACHABLE` if a robot did not answer, otherwise `FAILURE` if one refused. `silence` is
+    the text for a robot without an answer, for the reason `{error}`.
     """
     for robot_id, reply in replies.items():
         if isinstance(reply, AcsardError):

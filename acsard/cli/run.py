@@ -69,10 +69,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def options(args: argparse.Namespace) -> dict[str, object]:
-    """Return the values of the options, by dotted configuration key such as "mcu.port".
-
-    The value of an option that was not typed is None.
-    """
+    """Return the options by dotted key; None if they were not typed."""
     return {
         "mcu.port": args.port,
         "mcu.baud_rate": args.baud_rate,
@@ -141,11 +138,9 @@ def main(args: argparse.Namespace) -> int:
 
 
 def page(config: Config, where: str) -> list[str] | None:
-    """Return the arguments of `acsard` that serve the robot's web page, or None to serve no page.
+    """Return the arguments that serve the robot's page, or None.
 
-    The page is served if `web.page` is true, standard output is a terminal, the daemon is not a
-    systemd service, and the libraries of the page are installed. `where` is the path of the
-    configuration file.
+    It is served with `web.page`, at a terminal, not as a systemd service, and with its libraries.
     """
     looked_at = sys.stdout is not None and sys.stdout.isatty() and "INVOCATION_ID" not in os.environ
     there = all(map(find_spec, ("aiohttp", "prometheus_client", "segno")))
@@ -170,10 +165,7 @@ def _bus(config: Config) -> str:
 
 
 def reach(args: argparse.Namespace) -> str:
-    """Return the options that another tool needs to connect to this daemon.
-
-    The result is text for a command line, such as " --id robot2", or "" if no option is needed.
-    """
+    """Return the options with which a tool connects to this daemon, such as " --id robot2"."""
     listens = args.listen and reachable(args.listen)
     pairs = (("--config", args.config), ("--connect", listens), ("--id", args.id))
     return options_text(pairs)
@@ -188,12 +180,7 @@ def banner(
     *,
     served: bool = False,
 ) -> str:
-    """Return the banner that the daemon prints at its start.
-
-    `where` is the path of the configuration file. `trouble` is the reason why the serial device
-    cannot be opened yet, or "" if it is open. `reach` is the result of the function `reach`.
-    `served` says whether the robot's web page is served.
-    """
+    """Return the banner of the start; `trouble` says why the device is not open yet."""
     port = f"{device} at {config.mcu.baud_rate} baud"
     if trouble:
         port = f"none yet: {trouble}"

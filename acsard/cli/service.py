@@ -84,10 +84,7 @@ def main_uninstall(args: argparse.Namespace) -> int:
 
 
 def main_status(args: argparse.Namespace) -> int:
-    """Print the state of the service's files and units, and return the exit code.
-
-    The exit code is 0 if the systemd unit of the daemon is active, else 1.
-    """
+    """Print the state of files and units; return 0 if the daemon's unit is active, else 1."""
     show(table((file.condition(), str(file.path)) for file in service.files()))
     state = service.state(service.UNIT)
     print(state or "systemd does not answer: check that this machine runs systemd")

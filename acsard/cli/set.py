@@ -73,10 +73,9 @@ def main(args: argparse.Namespace) -> int:
 
 
 def pairs(words: Sequence[str]) -> dict[str, Plain]:
-    """Return the settings in the words that the operator typed: KEY VALUE KEY VALUE ...
+    """Return the settings in KEY VALUE KEY VALUE ..., as TOML or else strings.
 
-    A value is read as TOML. If it is not valid TOML, it is a string. Raises `UsageError` if the
-    last value is missing, or if a value contains NaN or infinity.
+    Raises `UsageError` without the last value, and for NaN and infinity.
     """
     if len(words) % 2:
         raise UsageError("give pairs of KEY VALUE, for example acsard set limits.linear_speed 0.8")

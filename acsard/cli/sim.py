@@ -27,6 +27,7 @@ from acsard.daemon.serial.simulator_pty import SimPty
 from acsard.host import clock
 from acsard.host.errors import UsageError
 
+# Arguments of faults, for the help.
 NUMBERS = {
     "bias": "MOTOR:FACTOR",
     "wrong_baud": "RATE",
@@ -36,7 +37,6 @@ NUMBERS = {
     "bumper_pressed": "BUMPER:START:SECONDS",
     "battery": "PERCENT:MINUTES",
 }
-"""Maps each fault with numbers as arguments to the names of the arguments, for the help text."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -68,7 +68,7 @@ def _with_names() -> list[str]:
 
 
 def fault(text: str) -> NamedFault:
-    """Parse a fault with its arguments, such as `bias=a:0.9`. This function is an argparse type."""
+    """Parse a fault such as `bias=a:0.9`, as an argparse type."""
     try:
         return named(text)
     except ValueError as error:

@@ -230,7 +230,7 @@ def _certified(names: list[str]) -> str:
 
 
 def _admit_service(directory: Path) -> None:
-    """Let the TLS gateway of an installed service use the certificates in `directory`."""
+    # The TLS gateway of an installed service may then use them.
     step = service.admitting(directory)
     if step is None:
         return

@@ -34,10 +34,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def ros_table(config: Config) -> Topics:
-    """Return the ROS topics and services that the configuration enables, as a table.
-
-    The note of a topic names the Zenoh key that has the same messages.
-    """
+    """Return the enabled ROS topics and services; a topic's note names its Zenoh key."""
     ros = config.ros
     known = source_keys(source.name for source in config.commands.sources)
     rows = []
