@@ -78,7 +78,7 @@ class Host:
         self.config = replace(
             Config(mcu=McuConfig(port="/dev/ttyACM0", link_check="auto", encoder_counts=3200)),
             record=RecordConfig(str(where), 100.0),
-            battery=BatteryConfig("percent", return_below=30.0, stop_below=10.0, hysteresis=5.0),
+            battery=BatteryConfig("percent", return_below=30.0, stop_below=10.0),
         )
         self.incidents: list[Incident] = []
 

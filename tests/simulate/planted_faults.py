@@ -963,7 +963,7 @@ FAULTS = (
         "battery level",
         "the level of the battery rises as soon as the motors stop",
         BATTERY,
-        "            rise = self._config.hysteresis if",
+        "            rise = HYSTERESIS if",
         "            rise = 0.0 if",
     ),
 )

@@ -528,7 +528,7 @@ def test_a_fault_of_a_motor_driver_needs_a_line_that_reports_it() -> None:
 
 def test_a_battery_stops_the_robot_by_its_mean_and_not_by_a_motor_start() -> None:
     bench = Bench()
-    config = {"measure": "volts", "stop_below": 22.0, "hysteresis": 0.5}
+    config = {"measure": "volts", "stop_below": 22.0}
     bench.witness.config = bench.witness.config | {"battery": config}
     bench.inputs = Inputs(bench.witness, True)
 

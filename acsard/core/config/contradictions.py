@@ -14,7 +14,7 @@ from itertools import pairwise
 
 from acsard.core.config import motion_rules, named_faults
 from acsard.core.config.partial import Rule, mistakes
-from acsard.core.config.settings import SIMULATOR, Config, McuConfig, is_tls
+from acsard.core.config.settings import HYSTERESIS, SIMULATOR, Config, McuConfig, is_tls
 from acsard.core.config.validation import show
 from acsard.core.config.wire_time import (
     COMFORTABLE_USE,
@@ -245,10 +245,10 @@ def _battery_problems(config: Config) -> list[str]:
             )
     most = 100.0 if battery.measure == "percent" else MAX_VOLTS
     for name, below in rows:
-        if below + battery.hysteresis > most:
+        if below + HYSTERESIS > most:
             errors.append(
-                f"{name} = {below:g}: with battery.hysteresis = {battery.hysteresis:g} the level "
-                f"would end only above {most:g}, which no board reports; lower either value"
+                f"{name} = {below:g}: the level ends only {HYSTERESIS:g} above this value, and "
+                f"no board reports more than {most:g}; lower the value"
             )
     return errors
 

@@ -227,6 +227,8 @@ class SafetyConfig(Struct, frozen=True):
         return bool(self.bumpers) and self.bumper != "off"
 
 
+HYSTERESIS = 0.5  # V or %, by which the mean must exceed the threshold of a level that ends
+
 Threshold = Annotated[float, Meta(ge=0.0, le=100.0, extra={"unit": "V or % (0 = off)"})]
 
 
@@ -235,7 +237,6 @@ class BatteryConfig(Struct, frozen=True):
     warning_below: Threshold = 0.0
     return_below: Threshold = 0.0
     stop_below: Threshold = 0.0
-    hysteresis: Annotated[float, Meta(ge=0.1, le=50.0, extra={"unit": "V or %"})] = 0.5
 
     @property
     def bounds(self) -> dict[BatteryLevel, float]:
@@ -287,7 +288,6 @@ class OdometryConfig(Struct, frozen=True):
     base_frame: Frame = "base_link"
     publish_tf: bool = True
     gyro: bool = False
-    gyro_scale_std: Deviation = 0.004
     distance_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_radian: ErrorRate = 1e-2

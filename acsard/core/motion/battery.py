@@ -2,7 +2,7 @@
 
 The thresholds of `[battery]` apply to a running mean, because starting motors make the voltage drop
 for some tenths of a second. An empty battery latches a stop, which `clear` releases only above the
-threshold by `battery.hysteresis`. If the board stops reporting, the level is "unknown" and the
+threshold by `HYSTERESIS`. If the board stops reporting, the level is "unknown" and the
 robot does not stop: one that blocks the way is the greater danger, and the voltage falls slowly.
 """
 
@@ -14,7 +14,7 @@ from typing import get_args
 from msgspec.structs import replace
 
 from acsard.core.codes import Reason, reason
-from acsard.core.config.settings import BatteryConfig
+from acsard.core.config.settings import HYSTERESIS, BatteryConfig
 from acsard.core.link.board_status import BoardStatus
 from acsard.core.values import NS_PER_S, BatteryLevel, BatteryStatus, Event, Ns
 
@@ -99,7 +99,7 @@ class Battery:
     def why(self) -> Reason:
         """Reason of a stop by an empty battery, without measured values."""
         config = self._config
-        charged = _with_unit(config, config.stop_below + config.hysteresis)
+        charged = _with_unit(config, config.stop_below + HYSTERESIS)
         return reason("battery_empty", threshold=_threshold(config, "stop"), charged=charged)
 
     @property
@@ -186,7 +186,7 @@ class Battery:
         reached = LEVELS_BY_URGENCY.index(self._known)
         new_level: BatteryLevel = "ok"
         for level, below in self._bounds.items():
-            rise = self._config.hysteresis if reached >= LEVELS_BY_URGENCY.index(level) else 0.0
+            rise = HYSTERESIS if reached >= LEVELS_BY_URGENCY.index(level) else 0.0
             if self._mean < below + rise:
                 new_level = level
         self.stopped_now = new_level == "stop" != self._known

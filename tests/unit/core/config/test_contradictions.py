@@ -324,13 +324,13 @@ def test_motion_away_from_a_bumper_needs_its_place() -> None:
         ),
         (
             BatteryConfig("percent", warning_below=99.8),
-            "battery.warning_below = 99.8: with battery.hysteresis = 0.5 the level would end "
-            "only above 100, which no board reports; lower either value",
+            "battery.warning_below = 99.8: the level ends only 0.5 above this value, and no "
+            "board reports more than 100; lower the value",
         ),
         (
-            BatteryConfig(stop_below=60.0, hysteresis=40.0),
-            "battery.stop_below = 60: with battery.hysteresis = 40 the level would end only above "
-            "99.99, which no board reports; lower either value",
+            BatteryConfig(stop_below=99.7),
+            "battery.stop_below = 99.7: the level ends only 0.5 above this value, and no "
+            "board reports more than 99.99; lower the value",
         ),
     ],
 )

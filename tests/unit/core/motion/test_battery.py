@@ -22,7 +22,7 @@ from tests.each import each
 
 MS = 1_000_000
 
-CONFIG = BatteryConfig(warning_below=22.0, return_below=21.5, stop_below=21.0, hysteresis=0.4)
+CONFIG = BatteryConfig(warning_below=22.0, return_below=21.5, stop_below=21.0)
 
 ORDER = ("ok", "warning", "return", "stop")
 
@@ -110,7 +110,7 @@ def test_a_level_ends_above_its_threshold_by_the_hysteresis() -> None:
     pack = Pack()
     levels = [
         pack.at(volts, 60.0)
-        for volts in (21.9, 22.39, 22.41, 21.4, 21.89, 21.91, 20.9, 21.39, 21.41, 21.8, 22.5)
+        for volts in (21.9, 22.49, 22.51, 21.4, 21.99, 22.01, 20.9, 21.49, 21.51, 21.9, 22.6)
     ]
     assert levels == [
         "warning", "warning", "ok", "return", "return", "warning", "stop", "stop", "return",
@@ -151,7 +151,7 @@ def test_the_stop_is_reported_once_and_held_until_the_hysteresis() -> None:
     pack.at(20.9, 5.0)
     assert (pack.stops, pack.battery.refuses_clear) == (1, True)
     assert pack.battery.why.text == "battery below battery.stop_below = 21 V"
-    assert pack.battery.refusal.advice == "charge the battery to 21.4 V"
+    assert pack.battery.refusal.advice == "charge the battery to 21.5 V"
     pack.at(21.3, 60.0)
     assert pack.battery.refuses_clear
     pack.at(24.0, 10.0)
@@ -163,7 +163,7 @@ def test_the_stop_is_reported_once_and_held_until_the_hysteresis() -> None:
     assert first == (
         "battery_stop",
         "20.90 V; the mean of the last seconds is below battery.stop_below = 21 V; charge the "
-        "battery to 21.4 V, then call srv/clear",
+        "battery to 21.5 V, then call srv/clear",
     )
     assert [text for _, text in pack.events if text.endswith("until srv/clear is called")] == [
         "24.00 V; the mean of the last seconds is below battery.return_below = 21.5 V; the robot "
