@@ -215,9 +215,8 @@ class Client:
         self._secret = new_secret()
         whole = sender_id(f"{platform.node()[:32]}/{os.getpid()}")
         self._sender = CommandSigner(whole)
-        self.sender = public_name(
-            whole, self.certificate
-        )  # `state.sender` while this client drives
+        # `state.sender` while this client drives.
+        self.sender = public_name(whole, self.certificate)
         # Compute stamps from the steady clock. If the stamps came from the wall clock, and a
         # program set this clock during a drive, the daemon would mistake the jump for a delay.
         self._wall_offset_ns = clock.now().wall_ns - clock.steady_ns()
