@@ -292,7 +292,7 @@ BODIES = {
 
 
 @pytest.mark.parametrize("what", BODIES)
-def test_a_malformed_body_gets_a_json_error_and_a_stop_with_it_stops_the_robot(
+def test_a_malformed_body_gets_a_json_error_but_a_stop_with_it_succeeds(
     page: Page, bus: Bus, what: str
 ) -> None:
     port = int(page.here.rpartition(":")[2])
@@ -315,8 +315,8 @@ def test_a_malformed_body_gets_a_json_error_and_a_stop_with_it_stops_the_robot(
         status, value, refused = answered(line, "Content-Type: application/json")
         assert (status, list(value), refused) == (400, ["error"], 1), line
     assert bus.state()["mode"] == "ready"
-    status, value, refused = answered("POST /api/srv/stop")
-    assert (status, list(value), refused) == (400, ["error"], 1)
+    status, value, refused = answered("POST /api/srv/stop")  # the server does not read the body
+    assert (status, value["success"], refused) == (200, True, 0)
     assert bus.state()["mode"] == "stopped"
     assert "Traceback" not in page.stderr
 
