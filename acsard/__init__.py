@@ -37,7 +37,7 @@ Where to look: each package may import only the packages below it in this list.
     bus/             Zenoh for every process: addresses, sessions, access rules, certificates,
                      subscriptions, discovery of robots
     terminal/        prints tables and output of all tools with the library rich; asks the person
-                     near the robot questions, at a terminal or through a program that uses JSON
+                     near the robot questions
     host/            the parts that every process uses: clock, timers, threads and the mailboxes
                      between them, child processes, files, rate limits, systemd, logs, errors
     checkup/         `acsard mcu check`: one module for each check of the board

@@ -1,4 +1,4 @@
-"""Starts child processes, limits them, watches their signs of life, and ends them.
+"""Starts child processes, watches their signs of life, and ends them.
 
 Each child has its own session, so a Ctrl-C at the terminal reaches only the parent, which then ends
 its children. A child does not outlive its parent: a socket (`Child` and `Parent`), which is the
@@ -49,7 +49,7 @@ class Silence:
         return self._ns > self._timeout_ns
 
 
-# The parent's side: start, limit and end
+# The parent's side: start and end
 
 
 def acsard(*words: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""The parent starts a child, limits it and ends it. The child never outlives its parent."""
+"""The parent starts a child and ends it. The child never outlives its parent."""
 
 from __future__ import annotations
 
