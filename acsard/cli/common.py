@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import re
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from msgspec.structs import replace
 
@@ -123,15 +122,23 @@ def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple
     try:
         return where, configuration.parse(text, overrides(options))
     except ConfigError as error:
-        places = [typed.get(re.split(r"[ :\[]", message)[0], where) for message in error.problems]
+        own, added = _problems_of_file(text), ", ".join(typed.values())
+        places = [where if problem in own else added for problem in error.problems]
         for place, problem in zip(places, error.problems, strict=True):
-            others = [f"{key} is from {name}" for key, name in typed.items() if key in problem]
-            note = f" ({', '.join(others)})" if others and place == where else ""
-            print(f"{place}: {problem}{note}", file=sys.stderr)
+            print(f"{place}: {problem}", file=sys.stderr)
         count = many(len(error.problems), "problem")
         raise ExitError(
             Exit.BAD_CONFIG, f"{count} in {' and '.join(dict.fromkeys(places))}"
         ) from None
+
+
+def _problems_of_file(text: bytes) -> Sequence[str]:
+    # The options cause all other problems.
+    try:
+        configuration.parse(text, {})
+    except ConfigError as error:
+        return error.problems
+    return ()
 
 
 def with_record_directory(config: Config) -> Config:

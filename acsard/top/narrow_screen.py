@@ -100,15 +100,16 @@ def link(data: ScreenData, state: RobotState, width: int) -> list[Text]:
         figures.append(Text(f"commands of new senders {count(met)}"))
     lines += flow([figure for figure in figures if figure], width, 0)
     if state.gyro != "off":
-        lines += folded(f"gyro {clean(state.gyro)}", width, 2)
+        lines += folded(f"gyro {clean(state.gyro)}", width, 2, labelled=True)
     if inputs := board(state):
-        lines += folded(f"board {inputs}", width, 2)
+        lines += folded(f"board {inputs}", width, 2, labelled=True)
     kinds = refused(state, before)
     for kind, parts in kinds:
         lines += flow([Text(f"rejected {kind}"), *parts], width, 2)
     if not kinds:
         lines.append(Text("rejected nothing"))
-    return [*lines, *folded(f"last one {clean(state.refused) or '-'}", width, 2)]
+    last = f"last one {clean(state.refused) or '-'}"
+    return [*lines, *folded(last, width, 2, labelled=True)]
 
 
 def timing(state: RobotState, width: int) -> list[Text]:
@@ -123,9 +124,9 @@ def timing(state: RobotState, width: int) -> list[Text]:
     return lines
 
 
-def folded(text: str, width: int, inset: int) -> list[Text]:
+def folded(text: str, width: int, inset: int, *, labelled: bool = False) -> list[Text]:
     """Wrap a text, with lines indented by `inset` cells, except a first line with a label."""
-    first = "" if text.startswith(("gyro ", "track ", "board ", "last one ")) else " " * inset
+    first = "" if labelled else " " * inset
     wide = max((cell_len(piece) for piece in text), default=1)  # a character may be two cells wide
     room, rest = max(inset + 1, width // max(1, wide)), " " * inset
     return [Text(piece) for piece in wrap(text, room, initial_indent=first, subsequent_indent=rest)]

@@ -215,7 +215,7 @@ def test_a_plain_activate_is_refused_for_two_seconds_after_a_deactivate(
     reply = call(world, "activate", "ann", via=via)
     assert (reply.success, world.state.mode) == (False, "inactive")
     assert f"was switched off by {JOE} (native) 1.0 s ago: look at the robot" in reply.message
-    service = "srv/activate" if via == "native" else "/acsard/activate"
+    service = "srv/activate"
     assert f"then call {service} again when 2 s have passed since then" in reply.message
     world.run(1.0)
     assert call(world, "activate", "ann", via=via).success

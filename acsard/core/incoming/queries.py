@@ -57,7 +57,7 @@ from acsard.core.ros.parameters import (
     requested_values,
 )
 from acsard.core.ros.shapes import Trigger
-from acsard.core.ros.transports import PARAMETERS_PREFIX, in_ros_words, left_out
+from acsard.core.ros.transports import PARAMETERS_PREFIX, left_out
 from acsard.core.values import ROLES, Answer, Outputs, Request, Verb
 
 Current = Callable[[str], Message | None]
@@ -112,7 +112,6 @@ class _Waiting(Struct, frozen=True):
     asked: Attachment | None
     """Attachment of a call over rmw_zenoh, from which the attachment of the reply is made. None for
     other calls."""
-    ros: bool = False
     wish: bytes = b""
     """Payload of a ROS request to set parameters, from which the reply is built. b"" for other
     calls."""
@@ -172,8 +171,6 @@ class Queries:
         if waiting is None:
             return None
         key, form, message, name = waiting.key, waiting.form, answer.message, "ServiceReply"
-        if waiting.ros:
-            message = in_ros_words(message, self._config.ros)
         if waiting.wish:
             service, name = key.removeprefix(PARAMETERS_PREFIX), ""
             payload = outcome(service, waiting.wish, answer.success, message)
@@ -187,7 +184,7 @@ class Queries:
         by = caller_name(query.via, query.attachment)
         verb = VERBS.get(query.topic)
         if verb is not None:
-            self._waiting[query.ticket] = _Waiting(query.topic, "cdr", asked, True)
+            self._waiting[query.ticket] = _Waiting(query.topic, "cdr", asked)
             return Request(verb, query.ticket, asked_ns=query.arrived_ns, by=by)
         if len(query.payload) > MAX_REQUEST_BYTES:
             raise DecodeError("too_big", f"the request has over {MAX_REQUEST_BYTES} bytes")
@@ -195,9 +192,7 @@ class Queries:
             service = query.topic.removeprefix(PARAMETERS_PREFIX)
             if service in SETTING_SERVICES:
                 wish = requested_values(query.payload)
-                self._waiting[query.ticket] = _Waiting(
-                    query.topic, "cdr", asked, True, query.payload
-                )
+                self._waiting[query.ticket] = _Waiting(query.topic, "cdr", asked, query.payload)
                 ticket, at_ns = query.ticket, query.arrived_ns
                 return Request("set", ticket, asked_ns=at_ns, by=by, settings=wish)
             payload = self._parameters.answer(service, query.payload)

@@ -7,7 +7,6 @@ the same messages. The two transports are zenoh-bridge-ros2dds ("bridge") and rm
 
 from __future__ import annotations
 
-import re
 from collections.abc import Container, Iterator
 from typing import Literal
 
@@ -82,7 +81,6 @@ class Endpoint(Struct, frozen=True):
 
 KINDS: dict[Direction, Kind] = {"out": "MP", "in": "MS", "query": "SS", "service": "SS"}
 
-_NAMED = re.compile(rf"\bsrv/({'|'.join(PLAIN_SERVICES)})\b")
 
 PARAMETER_SERVICES = {
     "describe_parameters": "rcl_interfaces/srv/DescribeParameters",
@@ -170,14 +168,6 @@ def ros_names(silent: Container[str] = ()) -> tuple[RosName, ...]:
             for name, type_name in PARAMETER_SERVICES.items()
         ),
     )
-
-
-def in_ros_words(text: str, ros: RosConfig) -> str:
-    """Replace the native keys of services in `text` by their ROS names.
-
-    For example, `srv/clear` becomes `/acsard/clear`.
-    """
-    return _NAMED.sub(lambda match: full_name(ros.namespace, f"{NODE}/{match[1]}"), text)
 
 
 def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[Endpoint, ...]:

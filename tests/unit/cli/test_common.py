@@ -170,8 +170,7 @@ def test_problems_of_the_file_and_of_an_option_are_distinguished(
     places.here.write_text("[control]\nrate = 100\n")
     assert main(["run", "--baud-rate", "9600"]) == Exit.BAD_CONFIG
     output = capsys.readouterr().err
-    assert "acsard.toml: control.rate = 100: " in output
-    assert " (mcu.baud_rate is from --baud-rate)" in output
+    assert output.startswith("--baud-rate: control.rate = 100: ")
 
 
 def test_every_key_that_run_can_set_has_the_name_of_its_option() -> None:

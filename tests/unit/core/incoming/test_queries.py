@@ -17,7 +17,6 @@ from acsard.core.config.settings import (
     LimitsConfig,
     OdometryConfig,
     RobotConfig,
-    RosConfig,
 )
 from acsard.core.incoming.queries import (
     BUSY,
@@ -619,34 +618,6 @@ def test_over_rmw_a_rejected_request_without_an_attachment_gets_no_reply() -> No
 
 
 @each("via", ["bridge", "rmw"])
-@each(
-    ("namespace", "clear", "activate"),
-    [
-        ("", "/acsard/clear", "/acsard/activate"),
-        ("robot1", "/robot1/acsard/clear", "/robot1/acsard/activate"),
-    ],
-)
-def test_replies_to_ros_callers_name_the_services_as_ros_does(
-    via: str, namespace: str, clear: str, activate: str
-) -> None:
-    made = queries(replace(CONFIG, ros=RosConfig(namespace=namespace)))
-    made.serve(ros_query("srv/stop", via), nothing, OUTPUTS)
-    words = "call srv/clear first; srv/activate switches it on, not srv/clearance"
-    reply = made.answered(Answer(7, True, words), WALL_NS)
-    assert reply is not None
-    message = Cdr(Trigger).decode(reply.payload).message
-    assert message == f"call {clear} first; {activate} switches it on, not srv/clearance"
-
-
-def test_replies_to_native_callers_name_the_services_by_their_keys() -> None:
-    made = queries()
-    made.serve(query("srv/stop"), nothing, OUTPUTS)
-    reply = made.answered(Answer(7, True, "call srv/clear first"), WALL_NS)
-    assert reply is not None
-    assert msgspec.json.decode(reply.payload)["message"] == "call srv/clear first"
-
-
-@each("via", ["bridge", "rmw"])
 @each("service", rcl.SETTING_SERVICES)
 def test_a_request_to_set_parameters_goes_to_the_robot_and_returns_its_answer(
     service: str, via: str
@@ -661,7 +632,7 @@ def test_a_request_to_set_parameters_goes_to_the_robot_and_returns_its_answer(
     assert (request.verb, request.id, request.settings) == ("set", 7, {"limits.linear_speed": 0.7})
     reply = made.answered(Answer(7, False, "call srv/clear first"), WALL_NS)
     assert reply is not None
-    no = rcl.SetParametersResult(False, "call /acsard/clear first")
+    no = rcl.SetParametersResult(False, "call srv/clear first")
     if service == "set_parameters":
         assert Cdr(rcl.SetReply).decode(reply.payload) == rcl.SetReply([no])
     else:
