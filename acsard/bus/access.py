@@ -28,7 +28,7 @@ from acsard.core.messages.permissions import COMMAND_ROLE, Use, has, keys_for, l
 from acsard.core.ros.transports import PARAMETERS_PREFIX, Endpoint, claims, endpoints, left_out
 from acsard.core.values import ROLES, ROOT_KEY, Role
 
-# What a daemon sends, except `put` (data), which has separate rules.
+# Messages that a daemon sends, except `put` (data), which has separate rules.
 DECLARATIONS = (
     "declare_subscriber",
     "declare_queryable",
@@ -115,9 +115,9 @@ class _Keys:
         self.subscribed = [full_key(robot, t.pattern) for t in topics if t.direction == "in"]
         self.subscribed += [e.key for e in ros if e.direction == "in"]
         """Key expressions to which the daemon subscribes."""
-        # For clients that connect without a certificate.
+        # Command keys for clients that connect without a certificate.
         self.commands = [full_key(robot, key) for key in source_keys(self._sources)]
-        # What every client may query.
+        # Queries that every client may send.
         self.viewer_queries = [
             full_key(robot, t.pattern)
             for t in topics

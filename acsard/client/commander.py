@@ -30,8 +30,8 @@ OPEN_TIMEOUT_S = 4.0
 # the state uses `FinalZeros`.
 ZEROS = 3
 
-# Commands may have no effect, or be missing, for so long before a drive ends: longer than 0.25 s
-# for a new sender, and than a short delay.
+# A drive ends after this time without an effect, or without a command of the program. It is longer
+# than the 0.25 s in which a new sender is checked, and than a short delay.
 GRACE_S = 0.5
 
 # Without input a held key counts as released. After 2 s the daemon forgets a new sender's zero.

@@ -31,7 +31,7 @@ from acsard.client.follower import MAX_STATE_AGE_S, SETTLED_S, Followed, Watch
 from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 
-# After a drive, the speed must fall below this share of its lowest so far, each time in so many s.
+# After a drive, the speed must fall below `SLOWER` times its lowest value, in each `SLOWS_S`.
 SLOWER, SLOWS_S = 0.97, 1.0
 
 

@@ -56,7 +56,7 @@ StateCode = Literal[
     "bumper_away", "bumper_blocks",
 ]  # fmt: skip
 
-# For which a message of a client is refused.
+# Reasons for which a message of a client is refused.
 RefusalCode = Literal[
     "unknown_source", "not_finite", "too_many_senders", "unproven", "stale", "malformed",
     "wrong_shape", "wrong_wheels", "unknown_encoding", "too_big", "not_a_put", "wildcard",

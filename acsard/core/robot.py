@@ -61,14 +61,15 @@ from acsard.core.values import (
     SpeedCap,
 )
 
-# For the limiter, s: after a longer stall the speed does not jump. At least 1.5 control periods.
+# Largest time step of the limiter, s, but at least 1.5 control periods. After a longer stall the
+# speed does not jump.
 MAX_DT = 0.05
 
-# Without a line for so long, the next acceleration starts from rest, because the board may have
-# stopped the motors: its clock may be slightly fast.
+# After this time without a line, the next acceleration starts from rest, because the board may have
+# stopped the motors. The margin is for a board whose clock is slightly fast.
 WRITE_PAUSE_S = WATCHDOG_S - 0.05
 
-# In "wait until the board has reported ...".
+# Words for "wait until the board has reported ...".
 INPUT_NAMES = {
     "estop": "its emergency stop",
     "bumpers": "its bumpers",

@@ -283,7 +283,7 @@ class RoutersStatus(Struct, frozen=True):
 
     connected: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
-    peers: tuple[str, ...] = ()  # connected ones that are no routers, and so forward nothing
+    peers: tuple[str, ...] = ()  # connected peers, which forward nothing
 
 
 class GyroSample(Struct, frozen=True, omit_defaults=True):
@@ -336,8 +336,8 @@ class BatteryStatus(Struct, frozen=True, gc=False):
 class Latch(Struct, frozen=True):
     """A stop, a fault or a deactivation of the robot, which lasts until a person releases it."""
 
-    # Set at this time, ms since 1970, or after the largest number so far: numbers always grow, over
-    # restarts too, and JavaScript represents them exactly.
+    # ms since 1970 when it was set, or more than the largest number before: numbers always grow,
+    # over restarts too. JavaScript represents them exactly.
     number: int
     at_ns: Ns  # wall clock
     by: str  # client, if one requested it
@@ -504,5 +504,5 @@ class Snapshot(Struct, frozen=True):
     recording: Recording = Recording()
     # Why the latches would not survive a restart; None without a file.
     latch_file: str | None = None
-    settings_differ: str = ""  # what `set` changed since the start
+    settings_differ: str = ""  # settings that `set` changed since the start
     speed_limit: str = ""  # one that lowers a setting

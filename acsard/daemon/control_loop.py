@@ -59,7 +59,8 @@ from acsard.recording.recorded_steps import StepRecorder, count_superseded
 
 FEEDBACK_TOPICS = ("odom", "tf", "wheel_states")  # with messages of the board's feedback lines
 
-# Limit of a step, and one slow query (`set`, ROS parameters) besides: a flood costs no period.
+# Queries that a step takes, beside one slow one (`set`, ROS parameters). More wait, so that a flood
+# costs no period.
 QUERIES_PER_STEP = 8
 
 # Least delay of a line; less is reported as 0, as the estimated sample times are less exact.

@@ -38,7 +38,8 @@ from acsard.host.systemd import START_EXTENSION_S, Systemd
 from acsard.host.version import version
 from acsard.recording.recorder import Recorder
 
-MAX_EXIT_RAMP_S = 0.6  # then STOP is sent even if the robot still moves
+# Longest ramp at the end. Then STOP is sent even if the robot still moves.
+MAX_EXIT_RAMP_S = 0.6
 
 
 class Departure:

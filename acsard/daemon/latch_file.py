@@ -41,7 +41,9 @@ from acsard.host.mailbox import Mailbox
 from acsard.host.threads import NoThreadError, in_thread
 from acsard.host.wait_timer import WaitTimer
 
-HANG_TIMEOUT_S = 2.0  # of a write or a sync; at the start, of the first read and write together
+# A write or a sync that takes longer is a disk that hangs. At the start, the first read and write
+# together may take this time.
+HANG_TIMEOUT_S = 2.0
 
 MIN_WRITE_PAUSE_S = 0.05  # each stop is a new latch: a flood of stops would wear out an SD card
 

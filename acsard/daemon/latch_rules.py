@@ -31,7 +31,8 @@ MAX_NUMBER = 1 << 52  # later latches get higher ones, and `clear` can name only
 
 MAX_TEXT_LENGTH = 500  # characters of a name or a reason
 
-# The answer to a stop waits no longer for the file, or a client believes that its stop was lost.
+# The answer to a stop waits for the file no longer than this, or the client would believe that the
+# robot did not receive its stop.
 MAX_ANSWER_DELAY_NS = NS_PER_S // 5
 
 DAEMON_NAME = "acsard"  # sender of a stop that the daemon itself sets
@@ -173,7 +174,7 @@ class Handover:
     """
 
     def __init__(self, latches: Latches, keeper: LatchKeeper | None) -> None:
-        # `latches` are stored already. Without `keeper` none is.
+        # `latches` are stored already. Without a `keeper`, no latches are stored.
         self.latches = latches
         self._keeper = keeper
 

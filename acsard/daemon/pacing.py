@@ -22,7 +22,8 @@ class Period(Struct, frozen=True):
 NO_PERIOD = Period(0, 0)
 
 
-REPLY_TIME_NS = 1_000_000  # after a line, in which the board can reply before an early one
+# Least time from the end of a line to an early one, in which the board can reply.
+REPLY_TIME_NS = 1_000_000
 
 # Steps in a period whose input brings no new command or mode. Further input waits for the next
 # period, so a flood takes little processor time.

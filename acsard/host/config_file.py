@@ -84,7 +84,7 @@ Keys = Mapping[str, object]  # values by dotted key, such as "mcu.port"
 
 
 def _target(file: Path, new: bool = False) -> Path:
-    # Without symbolic links; `new` may be missing. Raises `OSError`.
+    # The result has no symbolic links. A `new` file may be missing. Raises `OSError`.
     # `Path.resolve` of Python 3.11 raises RuntimeError for a loop.
     try:
         return Path(os.path.realpath(file, strict=True))

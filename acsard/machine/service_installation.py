@@ -184,7 +184,7 @@ class Remove(Struct, frozen=True):
         return self.path.is_dir() and not self.path.is_symlink()
 
     def do(self) -> None:
-        # Also acsard's own directories that become empty.
+        # acsard's own directories are deleted when they become empty.
         if self._is_directory:
             shutil.rmtree(self.path)
         else:

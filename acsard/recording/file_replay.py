@@ -92,7 +92,7 @@ def steps(recording: Recording) -> Iterator[RecordedStep]:
 def _steps_and_states(
     recording: Recording, copies: EventCopies | None = None
 ) -> Iterator[tuple[RecordedStep, Checkpoint | None]]:
-    # With the last robot state before each.
+    # Each step comes with the last robot state before it.
     saved: Checkpoint | None = None
     for topic, _, data in recording.messages():
         if topic == "events" and copies is not None:
@@ -194,7 +194,7 @@ class RecordedRun(_Source):
         self.on_skipped: Callable[[RecordedStep], None] = lambda step: None
         # Next step, and the state of the robot, or None.
         self._next, self._state = _first_state(recording)
-        # With the memory of its guard.
+        # The robot, with the memory of its guard.
         self.robot, self.memory = self._state or (Robot(config), Memory())
         if self._state is not None:
             with self.state_errors():

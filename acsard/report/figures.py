@@ -142,7 +142,8 @@ def _keys(styles: list[BandStyle]) -> list[Key]:
     ]
 
 
-HEADING_ARROWS = 12  # about so many along the path
+# Approximate number of arrows along the path.
+HEADING_ARROWS = 12
 
 # Marks by event: symbol in the legend, plotly's name, color.
 EVENT_MARKS = {

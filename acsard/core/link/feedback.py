@@ -31,7 +31,7 @@ FULL_READ_BYTES = 1024  # after a full read, the kernel may hold more data
 # evaluate; scheduling alone causes less.
 EVALUATION_START = 1.5
 
-# The same difference, summed over the evaluated reads, at which it decides.
+# Least difference of reply periods and commands, summed over evaluated reads, for a decision.
 DECISION_DIFFERENCE = 2.5
 
 MAX_READ_PERIODS = 100.0  # a read after more reply periods than this is not evaluated

@@ -101,7 +101,7 @@ class Lateness:
 
 
 class Heard(Struct):
-    """What the daemon received in an interval without a link."""
+    """The bytes and lines that the daemon received in an interval without a link."""
 
     size: int = 0  # bytes, without status lines
     lines: int = 0  # good and bad, without status lines

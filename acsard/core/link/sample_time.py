@@ -66,13 +66,14 @@ LATE_ALONE, LATE_BATCHED = 0.6, 1.3
 # or its board is slow and varies by more: there is no clock.
 MAX_ADAPTER_DELAY_NS = 25_000_000
 
-# A read this many periods after its slot confirms a clock, and more than one in so many must,
-# beside the earliest. Fewer are answers to commands between periods, and the clock is too early.
+# A read at most this many periods after its slot confirms a clock. Beside the earliest one, more
+# than one in `READS_PER_CONFIRMATION` must. Otherwise they answer commands between periods.
 MAX_CONFIRMING_LATENESS, READS_PER_CONFIRMATION = 0.55, 12
 
 COMPLETE_PERIODS = 1.4  # between two reads of one line: below it, no line is missing
 
-# An adapter delays only up to a limit. A line later by one period and this margin shows a loss.
+# An adapter delays lines only up to a limit. A line that is later by a period and this margin shows
+# a loss.
 LATENESS_MARGIN = 0.15
 
 # A line that comes more periods before its slot shows a wrong clock.

@@ -47,8 +47,8 @@ NAMES: dict[LinkState, EventName] = {
 # session begins, and every sender must send a zero before it can drive.
 LONG_GAP_NS = 1 * NS_PER_S
 
-# Time with the link up and no late step. A board reports each field at least once a second. Until
-# then a pressed emergency stop stays latched over a replugged cable.
+# Time with the link up and without late steps, in which a board reports each field at least once.
+# Until then, a pressed emergency stop stays latched while its cable is plugged in again.
 FORGET_NS = 3 * NS_PER_S
 
 IDENTITY = b"!acsard-mcu "  # acsard's firmware, after booting

@@ -100,7 +100,7 @@ class _Source:
         return layout.unpack_from(self.data, start)
 
     def count(self, least: int) -> int:
-        """Read the number of items, of at least so many bytes each. Raises `CdrError`."""
+        """Read the number of items, of at least `least` bytes each. Raises `CdrError`."""
         (count,) = self.take("I")
         if count * least > len(self.data) - self.at:
             raise CdrError(

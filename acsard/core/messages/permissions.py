@@ -16,7 +16,7 @@ Use = Literal["publish", "subscribe", "query"]  # a call of a service is a query
 
 USES: tuple[Use, ...] = get_args(Use)
 
-# What a role may do, for error messages.
+# The permissions of a role in words, for error messages.
 ROLE_TEXTS: dict[Role, str] = {
     "viewer": "this role may read data and stop the robot, but not drive it",
     "operator": "this role may stop the robot, clear a stop or a fault, and drive as a source that "

@@ -33,7 +33,7 @@ BATTERY = {
 }
 
 
-# Words by code.
+# Words by the code of the certificates.
 CERTIFICATE = {
     "expires": "certificate expires in {days:.0f} days",
     "expired": "certificate expired {days:.0f} days ago",

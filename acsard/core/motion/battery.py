@@ -28,8 +28,8 @@ SETTLE_S = 3.0
 
 SILENCE_TIMEOUT_S = 5.0  # at one report a second, four in a row may be lost
 
-# Longest time that one report stands for, that of a motor start, or it weighs too much after a gap.
-# At one report a second, the mean has a third of its speed.
+# Longest time for which one report counts, that of a motor start: after a gap, such a report would
+# weigh too much. At one report a second, the mean has a third of its speed.
 MAX_WEIGHT_NS = 300_000_000
 
 LEVELS_BY_URGENCY: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]  # without "unknown"

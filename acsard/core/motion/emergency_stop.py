@@ -34,9 +34,10 @@ TRANSITIONS: dict[tuple[EstopState, Sign], EstopState] = {
 
 SILENCE_TIMEOUT_S = 0.5  # five status lines at 10 Hz
 
-LATE_STEP_NS = 150_000_000  # between two control steps; the longest control period is 100 ms
+# A step this long after the previous one is late. The longest control period is 100 ms.
+LATE_STEP_NS = 150_000_000
 
-# After a late step, until what arrived meanwhile is read, the board is not silent.
+# For this time after a late step the board is not silent: its lines of that time are still read.
 CATCH_UP_NS = 100_000_000
 
 PRESSED_REASON = reason("emergency_stop")

@@ -30,7 +30,8 @@ LATERAL_VARIANCE = 1e-3  # m2/s2 sideways, which wheels do not measure, while th
 
 MIN_TWIST_VARIANCE = 1e-8  # filters that use the published twist treat less as an error
 
-ASSUMED_PERIOD_S = 0.01  # of the feedback lines, before it is measured
+# Period of the feedback lines before it is measured.
+ASSUMED_PERIOD_S = 0.01
 
 PERIOD_GAIN = 0.05  # small, because several lines may be read at the same time
 

@@ -37,7 +37,8 @@ from acsard.core.values import NS_PER_S, Command, Ns
 # Times of arrival are measured by the monotonic clock, because the daemon's own wall clock may be
 # set.
 
-SECONDS_PER_DRIFT = 5000  # for two clocks to drift apart by 1 s; a bad crystal takes twice as long
+# Two clocks drift apart by 1 s in this time. A bad crystal takes twice as long.
+SECONDS_PER_DRIFT = 5000
 
 # Pause after which a clock is new, because it may have drifted by 50 ms. If the stamps do not show
 # the pause, the network held commands back, and the clock stays known.
@@ -45,10 +46,12 @@ FORGET_NS = 250 * NS_PER_S
 
 MEMORY_NS = 3600 * NS_PER_S  # silence after which a clock is forgotten to save memory
 
-# Decrease of the delay; a larger one is the end of a backlog, or a clock that was set.
+# Largest decrease of the delay that is jitter. A larger one is the end of a backlog, or a clock
+# that was set.
 MAX_JITTER_NS = NS_PER_S // 20
 
-# Increase of the delay; a larger one is a network that has held commands back.
+# Largest increase of the delay that is jitter. After a larger one, the network has held commands
+# back.
 MAX_RISE_NS = NS_PER_S
 
 # The least delays of the halves of a proof may differ by its duration over this: 10 ms per second,
@@ -68,20 +71,21 @@ JUMP_PROOF_NS = 3 * NS_PER_S // 2
 # foreign clock (one that may be adjusted) may have been set by any amount in it.
 MAX_PAUSE_NS = 2 * NS_PER_S
 
-# Commands more than `SEPARATE_NS` apart with less between their stamps: the clock was set back.
+# If commands more than `SEPARATE_NS` apart have stamps closer than this, the clock was set back.
 # Zenoh's clock never goes back, but then advances by a fraction of a microsecond per message.
 MAX_STOPPED_STAMP_NS = 10_000
 
 SEPARATE_NS = NS_PER_S // 500  # commands this close may have been sent together
 
-# From one queue, whose last command has the least delay: no sender may exceed 1000 Hz.
+# Commands this close come from one queue, because no sender may exceed 1000 Hz. A proof waits for
+# the last one, which has the least delay.
 SAME_QUEUE_NS = NS_PER_S // 2000
 
 # Budget of trusted increases without a visible adjustment, for foreign clocks: refilled by 1 s in
 # 60 s, and above this while commands are late, so that no sender is refused forever.
 FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
 
-# To make the daemon forget a sender at 20 Hz, a client would need so many names within 0.05 s.
+# To make the daemon forget a sender at 20 Hz, a client would need this number of names in 0.05 s.
 MAX_CLOCKS = 1024
 
 State = Literal["new", "known"]

@@ -72,7 +72,7 @@ class Rolling:
     """
 
     def __init__(self, quiet: float = math.inf) -> None:
-        # `quiet`: after so long without feedback, a running daemon commands rest, s.
+        # After `quiet` s without feedback, a running daemon commands rest.
         self._quiet = quiet
         self.forget()
 

@@ -20,60 +20,65 @@ from acsard.core.motion.gyro_match import WINDOW_S, Match
 from acsard.core.motion.gyro_trial import TURN_RATIO_RANGE, Trial
 from acsard.core.values import NS_PER_S, Event, GyroDoes, GyroSample, GyroStatus, Level, Ns
 
-REST_S = 0.2  # of zero speeds of all wheels, until the robot stands still
+# The robot stands still after all wheels have reported zero speed for this time.
+REST_S = 0.2
 
 # Age of the last sample at which the gyro is silent; until then, the robot goes on turning at its
 # rate.
 SILENCE_TIMEOUT_NS = NS_PER_S // 5
 
-# Excess over the least delay. A larger one shows a network that held the sample back, or a sender's
-# clock that was set.
+# Largest normal excess of a delay over the least one. A larger excess shows a network that held the
+# sample back, or a sender's clock that was set.
 MAX_EXTRA_DELAY_NS = NS_PER_S // 4
 
-# Delays in such excess for this time that do not fall by this much show a clock that was set; a
-# backlog falls.
+# Delays above `MAX_EXTRA_DELAY_NS` for the first time that fall by less than the second one show a
+# clock that was set. The delays of a backlog fall.
 STEADY_DELAY_NS, MAX_DELAY_FALL_NS = NS_PER_S, NS_PER_S // 50
 
-# Step back of a stamp that shows that the sender's clock was set. Less is a driver that swaps
-# samples, or jitter.
+# A stamp that is earlier than the previous one by more than this shows a clock that was set back. A
+# smaller step is a driver that swaps samples, or jitter.
 MIN_SET_BACK_NS = NS_PER_S // 50
 
-# Sample periods without a sample after which some are missing; gain of the period, about 50
-# samples.
+# Samples are missing after this number of sample periods without one. `PERIOD_GAIN` is the weight
+# of a new sample in the mean period, so about fifty samples count.
 HOLE_PERIODS, PERIOD_GAIN = 1.5, 0.02
 
-# Time of new samples over that of the line that shows a backlog after a silence. The gyro stays
-# silent until its last sample is younger than `HOLE_PERIODS`.
+# If new samples cover more time than their feedback line, by this ratio, they are a backlog after a
+# silence. The gyro stays silent until its last sample is younger than `HOLE_PERIODS`.
 CATCH_UP_SPEED = 1.5
 
-SLIP_S = 0.5  # for which the wheels slip after a contradiction
+# The wheels count as slipping for this time after they contradicted the gyro.
+SLIP_S = 0.5
 
 MAX_SLIP_S = 5.0  # longer than this, the gyro is not used until gyro and wheels agree again
 
-# Rad/s to the next sample, which must confirm more. At 100 Hz 200 rad/s2 are a defect on the wire
-# or a push; at 10 Hz 20 rad/s2 are more than usual motors cause.
+# A larger change of the rate, rad/s, must be confirmed by the next sample. At 100 Hz it is 200
+# rad/s2, a defect or a push; at 10 Hz it is 20 rad/s2, more than usual motors cause.
 MAX_JUMP = 2.0
 
-# Age of the last sample from which nobody can tell any more who was right in a contradiction.
+# Age of the last sample from which the daemon cannot find out any more whether gyro or wheels were
+# right in a contradiction.
 LOST_NS = NS_PER_S
 
-# Change of the bias, rad/s, learned from one exact rate: coarse gyros and simulated ones without
-# noise repeat theirs. One that hangs closer to the bias looks like a changed bias.
+# Largest change of the bias, rad/s, that is learned from one exact rate at rest. Coarse gyros and
+# simulated ones without noise repeat rates. A gyro that hangs this close to the bias is not
+# noticed.
 MAX_BIAS_STEP = 0.06
 
-# A gyro certainly hangs if it repeats less of its samples at rest, and the chance of this series is
-# below.
+# A gyro that repeats one rate certainly hangs if at rest it usually repeats less than the first
+# fraction of its samples, and if such a series has a probability below the second.
 MAX_REPEATING, MIN_CHANCE = 0.6, 1e-6
 
-# Fraction of a jump that remains in the next sample: friction ends a push within some hundredths of
-# a second, but nothing is left of a wrong sample.
+# Fraction of a jump that must remain in the next sample. Friction ends a push within some
+# hundredths of a second, but nothing remains of a wrong sample.
 CONFIRMED_FRACTION = 0.5
 
-# Time at rest with one exact rate, until the gyro hangs: noise or a hand changes the last digits.
-# Less than `NEW_BIAS_TIME_S`, so the rate is not the bias first. A turntable looks like this, too.
+# A gyro that repeats one exact rate at rest for this time hangs: noise or a hand changes the last
+# digits. It is less than `NEW_BIAS_TIME_S`, or the rate would become the bias first.
 FROZEN_S = 0.8
 
-TRUSTED_BLOCKS = 20.0  # of 0.1 s of turning, until the ratio of the turns is used
+# The ratio of the turns is used after this number of blocks of 0.1 s with a turn.
+TRUSTED_BLOCKS = 20.0
 
 STATUS_TEXTS: dict[GyroDoes, str] = {
     "off": "",

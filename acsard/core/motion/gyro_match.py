@@ -23,7 +23,8 @@ INITIAL_RATIO_STD, MIN_RATIO_STD = 0.5, 0.1
 # Standard deviation of a block's mean, rad/s, plus this share of it.
 BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
 
-MAX_DELAY_S = 0.05  # of a gyro without a contradiction
+# A gyro with this delay does not contradict the wheels.
+MAX_DELAY_S = 0.05
 
 WINDOW_S = 0.2  # for the comparison of turns
 

@@ -9,18 +9,22 @@ from __future__ import annotations
 
 from typing import Literal
 
-# Rad/s by the wheels, from which a turn to the other side begins (less may be one encoder count),
-# and a gyro can be dead (unequal tires report less while the robot drives straight).
+# From this rate on, rad/s by the wheels, a line begins a turn to the other side (less may be one
+# encoder count), and a gyro that reads zero is dead (unequal tires report less).
 MIN_TURN_RATE = 0.1
 
-MIN_MEAN_RATE, STRETCH_S = 0.05, 0.5  # rad/s by the wheels, mean over the s, that counts as a turn
+# Mean rate by the wheels, rad/s, over intervals of `STRETCH_S`, from which the robot turns.
+MIN_MEAN_RATE, STRETCH_S = 0.05, 0.5
 
-TURN_RATIO_RANGE = (0.25, 2.5)  # of the true turn to the wheels', on any floor
+# Range of the true turn divided by the turn of the wheels, on any floor.
+TURN_RATIO_RANGE = (0.25, 2.5)
 
-# Rad to one side by the wheels that can prove a gyro, or refute one, which may be late.
+# Least turns to one side by the wheels, rad, that can prove a gyro, and that can refute one. The
+# second is larger, because the gyro may be late.
 MIN_PROVING_TURN, MIN_REFUTING_TURN = 0.1, 0.4
 
-MIN_REFUTING_TURN_S = 0.3  # of turning, until the gyro can be refuted; no delay is as long
+# Least time of turning before a gyro can be refuted. No gyro has such a delay.
+MIN_REFUTING_TURN_S = 0.3
 
 # Ratio of a gyro in degrees to the wheels: 57 without slip and errors.
 DEGREES_RATIO_RANGE = (15.0, 150.0)

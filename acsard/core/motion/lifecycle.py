@@ -1,11 +1,11 @@
 """Keeps the latches and the other facts that determine the mode, and derives the mode from them.
 
-Only `clear` releases a stop or a fault, one at a time, and only `activate` a `deactivate`. Neither
-releases a latch that its sender has not seen: it names the latch's number, or less recent events
-than `LATCH_REQUIRED_S` let it name none; and it must arrive after the latch was set. Inputs of the
-board and an empty battery latch a stop, a motor driver a fault, and `clear` releases nothing while
-such a cause lasts. A new cause gives its latch a new number and keeps the earlier causes, so the
-operator reads all.
+Only `clear` releases a stop or a fault, one at a time, and only `activate` releases a `deactivate`.
+Neither releases a latch that its sender has not seen: the request names the number of the latch, or
+nothing happened in the last `LATCH_REQUIRED_S`; and it arrived after the latch was set. `clear`
+releases nothing while its cause lasts: a pressed input of the board, an empty battery, or a fault
+of a motor driver. A new cause gives its latch a new number and keeps the earlier causes, so that
+the operator reads all of them.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from acsard.core.formatting import utc
 from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError, mode_of, require_allowed
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches, Ns
 
-# After a stop, a fault, its `clear`, a `deactivate`, the start and a stall of the daemon: an
-# earlier call may still arrive, as the network seldom delays a packet for longer.
+# For this time after a stop, a fault, its `clear`, a `deactivate`, the start or a stall of the
+# daemon, a call must name its latch: an earlier call may still arrive, as the network seldom delays
+# a packet for longer.
 LATCH_REQUIRED_S = 2.0
 
 # The first clients among the causes of a stop: a flood of stops must neither fill the reason
@@ -30,7 +31,8 @@ MAX_CLIENTS = 4
 
 MAX_FAULTS = 32  # the daemon knows fewer different ones
 
-LONG_AGO_NS = -(2**62)  # "never"
+# A time that stands for "never".
+LONG_AGO_NS = -(2**62)
 
 NAMELESS = "request"  # in a text, a client that has no name
 

@@ -55,7 +55,7 @@ def mode_of(
 
 SHUTDOWN_REASON = reason("shutting_down")
 
-# For the client.
+# Reasons for the client, by the mode and the refused request.
 REFUSALS: dict[tuple[Mode, Verb], str] = {
     (Mode.SHUTDOWN, "clear"): SHUTDOWN_REASON.text,
     (Mode.SHUTDOWN, "activate"): SHUTDOWN_REASON.text,

@@ -36,13 +36,15 @@ COUNT_MARGIN = 2  # each of two reports may be wrong by one
 # excuses a speed over `feedback.wheel_speed`.
 COARSEST_COUNT = math.tau / 16
 
-MIN_COUNT_S = 0.005  # for one such count: firmware rarely counts for a shorter time
+# Least time in which a wheel makes one such count: firmware rarely counts for a shorter time.
+MIN_COUNT_S = 0.005
 
 # 78.5 rad/s, below the default of `feedback.wheel_speed` (80): above it, only counts excuse a
 # speed.
 MAX_STEP = COARSEST_COUNT / MIN_COUNT_S
 
-MAX_REPORTS = 2  # of one count: firmware that is asked again very soon repeats its speeds once
+# Lines that report the same count: firmware that is asked again very soon repeats its speeds once.
+MAX_REPORTS = 2
 
 # Least time between two lines. While this computer catches up after a stall, one count would look
 # fast.

@@ -28,8 +28,8 @@ from acsard.core.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 # rad of one count that is learned if the number of counts is not configured.
 MAX_COUNT_ANGLE, MIN_COUNT_ANGLE = math.tau / 16, math.tau / 2000
 
-# The count is the third smallest angle that a front wheel rolled in so many lines; the smallest may
-# come from a damaged line.
+# The angle of a count is the third smallest angle that a front wheel rolled in the last lines. The
+# smallest alone may come from a damaged line.
 RECURRENCES, LEARNING_LINES = 3, 1000
 
 MIN_COMMANDED_SPEED = 0.005  # rad/s: a line to the board shows a lower one as 0.00

@@ -162,7 +162,7 @@ class ZenohBus(Bus):
             self._declare_json(session, topic)
 
     def _declare_json(self, session: zenoh.Session, topic: Topic) -> None:
-        # For clients without msgpack.
+        # The JSON key is for clients without msgpack.
         below = json_key(topic.key)
         key = full_key(self._id, below)
         # The publisher is not latched: a latched publisher encodes every message even without

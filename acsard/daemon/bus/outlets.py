@@ -33,7 +33,7 @@ PUBLISHER_OPTIONS: dict[str, Any] = {
 # thread for less.
 SLOT_MESSAGES = 16
 
-# The bus is blocked if messages wait so long; usually the thread needs 0.1 ms.
+# The bus is blocked if messages wait for this time. Usually the thread needs 0.1 ms.
 BLOCKED_AFTER_NS = NS_PER_S // 4
 
 # Heartbeat of latched ROS topics, as in rmw_zenoh.
