@@ -319,7 +319,7 @@ EstopState = Literal["", "released", "pressed", "silent"]
 
 
 # Level by the thresholds in `[battery]`; unknown: not reported, or for only a few seconds so far.
-BatteryLevel = Literal["ok", "warning", "return", "stop", "unknown"]
+BatteryLevel = Literal["ok", "warning", "stop", "unknown"]
 
 
 class BatteryStatus(Struct, frozen=True, gc=False):

@@ -9,7 +9,7 @@ from acsard.core.messages.schema import Battery, RobotState
 from tests.scenarios.taped import Tape, replayed
 from tests.scenarios.world import World
 
-LEVELS = BatteryConfig("percent", warning_below=50.0, return_below=30.0, stop_below=10.0)
+LEVELS = BatteryConfig("percent", warning_below=50.0, stop_below=10.0)
 DRAINED = Config(battery=LEVELS, sim=SimConfig(faults=("battery=60:2",)))
 """A robot with a small battery: at rest, a full one lasts two minutes."""
 
@@ -34,7 +34,6 @@ def test_a_drained_battery_warns_and_then_stops_the_robot_until_it_is_charged() 
         ("unknown", "driving"),
         ("ok", "driving"),
         ("warning", "driving"),
-        ("return", "driving"),
         ("stop", "stopped"),
     ]
     assert world.state.reason.startswith("battery below battery.stop_below = 10 % (latched at ")

@@ -78,7 +78,7 @@ class Host:
         self.config = replace(
             Config(mcu=McuConfig(port="/dev/ttyACM0", link_check="auto", encoder_counts=3200)),
             record=RecordConfig(str(where), 100.0),
-            battery=BatteryConfig("percent", return_below=30.0, stop_below=10.0),
+            battery=BatteryConfig("percent", warning_below=30.0, stop_below=10.0),
         )
         self.incidents: list[Incident] = []
 
@@ -314,10 +314,10 @@ def first_run(host: Host) -> None:
 
     host.drive()
     with host.world.mcu.battery(50.0, 0.6):
-        host.drive_until("return")
+        host.drive_until("warning")
         host.note(
             "low battery",
-            "^battery: return: .*the mean of the last seconds is below battery.return_below = 30",
+            "^battery: warning: .*the mean of the last seconds is below battery.warning_below = 30",
         )
         host.drive_until("stop")
     host.note(

@@ -208,10 +208,10 @@ def _driver(plan: Plan, dice: random.Random) -> None:
 def _battery(plan: Plan, dice: random.Random) -> None:
     """Add a battery that is nearly full, and becomes nearly empty for some time."""
     battery: dict[str, Any] = {"measure": "percent"}
-    bounds: tuple[float, ...] = (60.0, 45.0, 30.0)
+    bounds: tuple[float, ...] = (60.0, 30.0)
     if dice.random() < 0.7:
-        battery, bounds = {"measure": "volts"}, (23.4, 23.0, 22.6)
-    for name, below in zip(("warning", "return", "stop"), bounds, strict=True):
+        battery, bounds = {"measure": "volts"}, (23.4, 22.6)
+    for name, below in zip(("warning", "stop"), bounds, strict=True):
         battery[f"{name}_below"] = below
     plan["config"]["battery"] = battery
     plan["board"].append(["battery", 90, 600])
@@ -282,7 +282,7 @@ class _Mean:
 
         The battery then counts as empty until its mean rises.
         """
-        names = [name for name in ("warning", "return", "stop") if config.get(f"{name}_below")]
+        names = [name for name in ("warning", "stop") if config.get(f"{name}_below")]
         self.bounds = {name: config[f"{name}_below"] for name in names}
         self._room = 0.05 if config.get("measure", "volts") == "volts" else 0.5
         self._rise = 0.5

@@ -13,6 +13,7 @@ _SIM = "remove the key: the simulated robot has an ideal gyro, even wheels and a
 REMOVED = {
     "control.auto_activate": "remove the key: `acsard call deactivate` lasts over restarts",
     "feedback.wheel_acceleration": "remove the key: the bound is 1500 rad/s2",
+    "battery.return_below": "remove the key: use battery.warning_below",
     "battery.hysteresis": "remove the key: a level ends 0.5 V or % above its threshold",
     "odometry.gyro_scale_std": "remove the key: the standard deviation is 0.004",
     "commands.neutral_pause": "remove the key: the pause is 1 s",

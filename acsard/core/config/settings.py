@@ -235,7 +235,6 @@ Threshold = Annotated[float, Meta(ge=0.0, le=100.0, extra={"unit": "V or % (0 = 
 class BatteryConfig(Struct, frozen=True):
     measure: Literal["volts", "percent"] = "volts"
     warning_below: Threshold = 0.0
-    return_below: Threshold = 0.0
     stop_below: Threshold = 0.0
 
     @property
@@ -246,7 +245,6 @@ class BatteryConfig(Struct, frozen=True):
         """
         thresholds: dict[BatteryLevel, float] = {
             "warning": self.warning_below,
-            "return": self.return_below,
             "stop": self.stop_below,
         }
         return {level: below for level, below in thresholds.items() if below}

@@ -51,7 +51,7 @@ BOARD = {
     "silent": (ERROR, SILENT_REASON.text),
 }
 
-BATTERY_LEVELS = {"ok": OK, "warning": WARN, "return": WARN, "stop": ERROR, "unknown": WARN}
+BATTERY_LEVELS = {"ok": OK, "warning": WARN, "stop": ERROR, "unknown": WARN}
 
 SHOW_REFUSAL_S = 2.0  # two messages at the default 1 Hz
 

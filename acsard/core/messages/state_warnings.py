@@ -27,7 +27,6 @@ ESTOP = {"pressed": "emergency stop pressed", "silent": "emergency stop not repo
 # Words by level.
 BATTERY = {
     "warning": "battery low",
-    "return": "battery low, return",
     "stop": "battery empty",
     "unknown": "battery level unknown",
 }

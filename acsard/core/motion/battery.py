@@ -32,7 +32,7 @@ SILENCE_TIMEOUT_S = 5.0  # at one report a second, four in a row may be lost
 # weigh too much. At one report a second, the mean has a third of its speed.
 MAX_WEIGHT_NS = 300_000_000
 
-LEVELS_BY_URGENCY: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:4]  # without "unknown"
+LEVELS_BY_URGENCY: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:3]  # without "unknown"
 
 MISSING_REASON = (
     "the board has not reported its battery, but the configuration has thresholds in [battery]"

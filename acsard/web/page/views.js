@@ -6,7 +6,6 @@ import { RELEASE, age, ago, clock, person, reason, signed } from "./words.js";
 const DOUBTFUL = "STOP may not reach the robot from here: use its own switch.";
 const BATTERY = {
   warning: "The battery is low.",
-  return: "The battery is low: drive back.",
   stop: "The battery is empty.",
   unknown: "The level of the battery is unknown.",
 };

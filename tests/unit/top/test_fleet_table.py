@@ -52,7 +52,6 @@ FULL = "the disk is full: nothing is recorded"
         ({"settings_differ": DIFFER}, "settings differ"),
         ({"emergency_stop": "silent"}, "emergency stop not reported"),
         ({"bumpers": [False, True, True]}, "bumpers 2 and 3 pressed"),
-        ({"battery": BatterySummary(22.0, 21.4, None, "return")}, "battery low, return (21 %)"),
         ({"battery": BatterySummary(20.0, None, None, "stop")}, "battery empty (20.0 V)"),
         ({"battery": BatterySummary(None, None, None, "unknown")}, "battery level unknown"),
     ],

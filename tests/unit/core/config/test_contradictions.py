@@ -313,9 +313,9 @@ def test_motion_away_from_a_bumper_needs_its_place() -> None:
     ("battery", "problem"),
     [
         (
-            BatteryConfig(warning_below=22.0, return_below=22.0),
-            "battery.return_below = 22: not lower than battery.warning_below = 22; write a lower "
-            "battery.return_below",
+            BatteryConfig(warning_below=22.0, stop_below=22.0),
+            "battery.stop_below = 22: not lower than battery.warning_below = 22; write a lower "
+            "battery.stop_below",
         ),
         (
             BatteryConfig(warning_below=22.0, stop_below=23.0),
@@ -341,7 +341,7 @@ def test_contradicting_battery_thresholds_are_refused(battery: BatteryConfig, pr
 def test_battery_thresholds_in_order_are_accepted() -> None:
     for battery in (
         BatteryConfig(),
-        BatteryConfig(warning_below=22.0, return_below=21.5, stop_below=21.0),
+        BatteryConfig(warning_below=22.0, stop_below=21.0),
         BatteryConfig("percent", warning_below=99.5, stop_below=10.0),
     ):
         assert contradictions(Config(battery=battery)) == []

@@ -22,9 +22,9 @@ from tests.each import each
 
 MS = 1_000_000
 
-CONFIG = BatteryConfig(warning_below=22.0, return_below=21.5, stop_below=21.0)
+CONFIG = BatteryConfig(warning_below=21.5, stop_below=21.0)
 
-ORDER = ("ok", "warning", "return", "stop")
+ORDER = ("ok", "warning", "stop")
 
 
 class Pack:
@@ -79,8 +79,8 @@ def test_a_battery_without_thresholds_is_ok_from_the_first_report() -> None:
 @each(
     ("volts", "level"),
     [
-        (25.0, "ok"), (22.0, "ok"), (21.99, "warning"), (21.5, "warning"), (21.49, "return"),
-        (21.0, "return"), (20.99, "stop"), (0.0, "stop"),
+        (25.0, "ok"), (21.5, "ok"), (21.49, "warning"),
+        (21.0, "warning"), (20.99, "stop"), (0.0, "stop"),
     ],
 )  # fmt: skip
 def test_a_steady_voltage_has_its_level_after_three_seconds(
@@ -96,10 +96,10 @@ def test_a_steady_voltage_has_its_level_after_three_seconds(
 
 @each(
     ("charge", "level"),
-    [(0.3, "ok"), (0.29, "warning"), (0.2, "warning"), (0.19, "return"), (0.0, "return")],
+    [(0.3, "ok"), (0.29, "warning"), (0.0, "warning")],
 )
 def test_thresholds_in_per_cent_compare_the_charge(charge: float, level: BatteryLevel) -> None:
-    pack = Pack(BatteryConfig("percent", warning_below=30.0, return_below=20.0))
+    pack = Pack(BatteryConfig("percent", warning_below=30.0))
     for _ in range(100):
         pack.step(BoardStatus(charge=charge))
     assert pack.status.level == level
@@ -109,12 +109,10 @@ def test_thresholds_in_per_cent_compare_the_charge(charge: float, level: Battery
 def test_a_level_ends_above_its_threshold_by_the_hysteresis() -> None:
     pack = Pack()
     levels = [
-        pack.at(volts, 60.0)
-        for volts in (21.9, 22.49, 22.51, 21.4, 21.99, 22.01, 20.9, 21.49, 21.51, 21.9, 22.6)
+        pack.at(volts, 60.0) for volts in (21.4, 21.99, 22.01, 20.9, 21.49, 21.51, 21.9, 22.1)
     ]
     assert levels == [
-        "warning", "warning", "ok", "return", "return", "warning", "stop", "stop", "return",
-        "return", "ok",
+        "warning", "warning", "ok", "stop", "stop", "warning", "warning", "ok",
     ]  # fmt: skip
     assert pack.stops == 1
 
@@ -124,7 +122,7 @@ def test_noise_around_a_threshold_changes_the_level_once(noise: list[float]) -> 
     pack = Pack()
     pack.at(21.2, 10.0)
     levels = [pack.at(volts, 0.5) for volts in noise]
-    assert sum(a != b for a, b in pairwise(["return", *levels])) <= 1
+    assert sum(a != b for a, b in pairwise(["warning", *levels])) <= 1
 
 
 @given(st.lists(st.floats(15.0, 30.0), min_size=40, max_size=120))
@@ -166,7 +164,7 @@ def test_the_stop_is_reported_once_and_held_until_the_hysteresis() -> None:
         "battery to 21.5 V, then call srv/clear",
     )
     assert [text for _, text in pack.events if text.endswith("until srv/clear is called")] == [
-        "24.00 V; the mean of the last seconds is below battery.return_below = 21.5 V; the robot "
+        "24.00 V; the mean of the last seconds is below battery.warning_below = 21.5 V; the robot "
         "stays stopped until srv/clear is called"
     ]
     assert last[0] == "battery_stop"
@@ -193,11 +191,11 @@ def test_a_motor_start_does_not_change_the_level(start_ms: int, ms: int) -> None
     """
     pack = Pack()
     pack.at(21.1, 30.0, ms=ms)
-    assert pack.status.level == "return"
+    assert pack.status.level == "warning"
     for at_ms in range(0, 5000, ms):
         sags = start_ms <= at_ms < start_ms + 300
         pack.step(BoardStatus(volts=19.1 if sags else 21.1), ms=ms)
-        assert pack.status.level == "return"
+        assert pack.status.level == "warning"
         assert pack.status.mean is not None
         # A board that reports every 250 ms may show the drop for 0.5 s.
         assert pack.status.mean > 21.1 - (0.1 if ms == 250 else 0.07)
@@ -217,7 +215,7 @@ def test_a_motor_start_in_the_first_reports_does_not_change_the_level(
     pack.at(19.3, ms / 1000, ms=ms)
     pack.quiet(lost_s)
     pack.at(21.3, 30.0, ms=ms)
-    assert (pack.stops, pack.status.level) == (0, "return")
+    assert (pack.stops, pack.status.level) == (0, "warning")
 
 
 @each("ms", [500, 1000])
@@ -225,7 +223,7 @@ def test_a_motor_start_does_not_change_the_level_of_a_board_that_reports_seldom(
     pack = Pack()
     pack.at(21.1, 60.0, ms=ms)
     pack.at(19.1, ms / 1000, ms=ms)
-    assert pack.status.level == "return"
+    assert pack.status.level == "warning"
     assert pack.status.mean == pytest.approx(21.04)
 
 
@@ -235,7 +233,7 @@ def test_motors_that_start_every_two_seconds_count_by_their_mean() -> None:
     for _ in range(30):
         pack.at(19.6, 0.3)
         pack.at(21.6, 1.7)
-    assert pack.status.level == "return"
+    assert pack.status.level == "warning"
     assert pack.status.mean == pytest.approx(21.6 - 0.3, abs=0.06)
     assert pack.stops == 0
 
@@ -245,7 +243,7 @@ def test_a_lasting_drop_counts_after_a_time_constant() -> None:
     pack.at(24.0, 30.0)
     pack.at(20.0, TIME_CONSTANT_S)
     assert pack.status.mean == pytest.approx(20.0 + 4.0 / 2.718, abs=0.02)
-    assert pack.status.level == "return"
+    assert pack.status.level == "warning"
     assert pack.at(20.0, TIME_CONSTANT_S) == "stop"
 
 
