@@ -21,7 +21,6 @@ from acsard.core.config.settings import Config
 from acsard.core.formatting import lasting, many, printable_bytes
 from acsard.core.link.session import IDENTITY
 from acsard.core.motion.arbiter_text import MAX_SENDER_LENGTH
-from acsard.core.ros.shapes import how_often
 from acsard.core.values import NS_PER_S, Command, Event, Instant, Ns, WallNs
 from acsard.recording.recorded_steps import US_PER_S, RecordedStep
 
@@ -68,9 +67,8 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
 
     @property
     def sentence(self) -> str:
-        """The text, the client and the number of events, as in a line of the log."""
-        by = f" (by {self.by})" if self.by else ""
-        return f"{self.text}{by}{how_often(self.text, self.count)}"
+        """The text and the client, as in a line of the log."""
+        return f"{self.text} (by {self.by})" if self.by else self.text
 
 
 def entry_of(event: Event, wall_ns: WallNs) -> TimelineEntry:

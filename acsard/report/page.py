@@ -256,7 +256,7 @@ def _events(data: ReportData, clock: Clock) -> str:
         (
             _cell(time_of(mark), "time"),
             _cell(mark.name.replace("_", " "), f"name {mark.level}"),
-            _cell(mark.text_with_count),
+            _cell(mark.text),
             _cell(mark.by),
         )
         for mark in marks

@@ -92,7 +92,7 @@ def sentence(mark: Mark) -> str:
     """Return the escaped text that an event shows at the pointer."""
     head = f"<b>{label(mark.name.replace('_', ' '))}</b>"
     by = [label(f"by {mark.by}")] if mark.by else []
-    return "<br>".join([head, label(mark.text_with_count), *by])
+    return "<br>".join([head, label(mark.text), *by])
 
 
 def layout() -> dict[str, Any]:

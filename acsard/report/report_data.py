@@ -16,7 +16,6 @@ from msgspec import Struct
 from acsard.core.config.settings import Config
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.robot import Robot
-from acsard.core.ros.shapes import how_often
 from acsard.core.thinning import Band, Curve, Place, Point, Track
 from acsard.core.values import NS_PER_S, Ns, Outputs, Twist
 from acsard.recording.recorded_steps import US_PER_S, RecordedStep
@@ -47,11 +46,6 @@ class Mark(Struct, frozen=True):
     count: int  # equal events in the log's line
     place: Place | None  # by odometry
     seconds: float  # since 1970, whatever the clock does later
-
-    @property
-    def text_with_count(self) -> str:
-        """The text, and the number of equal events, if there are several."""
-        return f"{self.text}{how_often(self.text, self.count)}"
 
 
 class Marks:

@@ -6,7 +6,6 @@ loose contact floods the log.
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from typing import get_args
 
@@ -38,12 +37,15 @@ class _Held:
 
     def line(self) -> Event:
         last, what = self.last, _numbered(self._kinds)
+        if self.count > 1 and not what:
+            what = f"{self.count} times"
         if self.count > last.count and last.text:
-            what = f"{what or f'{self.count} times'}; the last"
+            what = f"{what}; the last"
         text = ": ".join(part for part in (what, last.text) if part)
         level, by = LEVELS[self._level], ", ".join(self._by)
+        kind = what if self.count > 1 else ""
         return replace(
-            last, text=text, level=level, by=by, kind="", count=self.count, news=self.news
+            last, text=text, level=level, by=by, kind=kind, count=self.count, news=self.news
         )
 
 
@@ -87,20 +89,17 @@ class EventThrottle:
         return True
 
 
-# Begin of the text of a line for several events.
-COMBINED_TEXT = re.compile(r"\A\d+ (?:x [^:;]*|times)(?:; the last)?: ")
-
-
 def merge(before: Event, line: Event) -> Event:
     """Return one line for two of the same name: all events, the higher level, the later text."""
-    count, last = before.count + line.count, COMBINED_TEXT.sub("", line.text, count=1)
+    count = before.count + line.count
+    last = line.text.removeprefix(f"{line.kind}: ")
     level = max(before.level, line.level, key=LEVELS.index)
     names = dict.fromkeys(filter(None, [*before.by.split(", "), *line.by.split(", ")]))
     by = [name for name in names if name != "others"]
     more = ["others"] if len(by) > MAX_LISTED or "others" in names else []
-    text = f"{count} times; the last: {last}"
-    by_text = ", ".join(by[:MAX_LISTED] + more)
-    return replace(line, text=text, level=level, by=by_text, count=count, news=False)
+    kind = f"{count} times; the last"
+    text, by_text = f"{kind}: {last}", ", ".join(by[:MAX_LISTED] + more)
+    return replace(line, text=text, level=level, by=by_text, kind=kind, count=count, news=False)
 
 
 def _count(counts: Counter[str], what: str, times: int) -> None:

@@ -5,7 +5,6 @@ CDR cannot encode maps, so the counters of `state` become a list. Null becomes N
 
 from __future__ import annotations
 
-import re
 from typing import Annotated, Any
 
 from msgspec import Meta, Struct
@@ -39,9 +38,6 @@ class Log(Struct, frozen=True):
     line: Natural = 0
 
 
-COUNT_PREFIX = re.compile(r"\d+ (x|times)\b")
-"""Pattern of a count at the beginning of an event's text, such as "3 x" or "3 times"."""
-
 LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
 """Maps each log level of acsard to its number in ROS."""
 
@@ -49,17 +45,7 @@ LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
 def log(event: Event | LogEvent, stamp: Time) -> Log:
     """Convert an event to a log message with the time `stamp`."""
     by = f" (by {event.by})" if event.by else ""
-    text = f"{event.text}{by}{how_often(event.text, event.count)}"
-    return Log(stamp, LEVELS.get(event.level, 20), event.name, text)
-
-
-def how_often(text: str, count: int) -> str:
-    """Return a suffix for the text of an event that occurred `count` times, like " (3 times)".
-
-    `text` is the text of the event. The suffix is "" if `count` is 1, or if `text` already begins
-    with a count.
-    """
-    return "" if count == 1 or COUNT_PREFIX.match(text) else f" ({count} times)"
+    return Log(stamp, LEVELS.get(event.level, 20), event.name, f"{event.text}{by}")
 
 
 def command_message(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:

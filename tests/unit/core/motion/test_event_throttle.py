@@ -125,8 +125,10 @@ def test_a_line_is_news_only_if_its_event_is_news() -> None:
 
 
 def test_two_joined_lines_have_the_total_count_and_the_last_text() -> None:
-    first = Event("command_refused", "12 x stale; the last: late", "info", "joe, ann", count=12)
-    other = Event("command_refused", "3 x wildcard: a star", "warning", "ann, eve", count=3)
+    kind = "12 x stale; the last"
+    first = Event("command_refused", f"{kind}: late", "info", "joe, ann", kind, 12)
+    kind = "3 x wildcard"
+    other = Event("command_refused", f"{kind}: a star", "warning", "ann, eve", kind, 3)
     line = merge(first, other)
     assert (line.text, line.count) == ("15 times; the last: a star", 15)
     assert (line.by, line.level) == ("joe, ann, eve", "warning")
