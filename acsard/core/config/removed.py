@@ -15,7 +15,6 @@ REMOVED = {
     "feedback.wheel_acceleration": "remove the key: the bound is 1500 rad/s2",
     "battery.return_below": "remove the key: use battery.warning_below",
     "battery.hysteresis": "remove the key: a level ends 0.5 V or % above its threshold",
-    "odometry.gyro_scale_std": "remove the key: the standard deviation is 0.004",
     "commands.neutral_pause": "remove the key: the pause is 1 s",
     "record.days": "remove the key: recordings are kept for 14 days, and record.megabytes counts",
     "log.format": "remove the key: the format follows from the terminal, the journal or a pipe",

@@ -286,6 +286,7 @@ class OdometryConfig(Struct, frozen=True):
     base_frame: Frame = "base_link"
     publish_tf: bool = True
     gyro: bool = False
+    gyro_scale_std: Deviation = 0.004
     distance_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_radian: ErrorRate = 1e-2

@@ -32,8 +32,6 @@ ASSUMED_COUNTS = 400  # per revolution; few encoders have fewer
 
 START_VARIANCE = 1e-6  # of x, y (m2) and yaw (rad2) at the start and after the pose was set
 
-GYRO_SCALE_STD = 0.004  # of a calibrated gyro: the relative error of each turn
-
 UNKNOWN_POSE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
 # Cause of a motion that the pose may have missed: a gap, or doubtful wheels of a side.
@@ -106,7 +104,7 @@ class PoseUncertainty:
             along, yaw, both = SLIP_FACTOR * along, SLIP_FACTOR * yaw, SLIP_FACTOR * both
         if variance is not None:
             yaw, both = variance, 0.0
-        scale = None if variance is None else GYRO_SCALE_STD
+        scale = None if variance is None else self._model.settings.gyro_scale_std
         self._p = stepped(self._p, dx, dy, along, yaw, both, c, s)
         if scale and self._of_gyro < 0:
             self._of_gyro = self._widen()

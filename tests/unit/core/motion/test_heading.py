@@ -17,13 +17,14 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.odometry import Odometry
-from acsard.core.motion.uncertainty import GYRO_SCALE_STD
 from acsard.core.values import NS_PER_S, GyroSample, Instant, Twist, WheelSpeeds
 from tests.unit.core.motion.liars import fold
 
 KINEMATICS = Kinematics(DriveConfig())
 
 PERIOD_NS = NS_PER_S // 100
+
+GYRO_SCALE_STD = OdometryConfig().gyro_scale_std
 
 
 class Listening(Gyro):
@@ -221,14 +222,16 @@ def test_the_heading_of_a_gyro_that_hangs_is_taken_back_or_in_the_covariance(
         assert math.sqrt(bench.yaw_variance) < 0.7
 
 
+@pytest.mark.parametrize("std", [GYRO_SCALE_STD, 0.02])
 @pytest.mark.parametrize("turns", [2, pytest.param(20, marks=pytest.mark.slow)])
-def test_the_error_of_a_gyros_scale_grows_with_the_turns(turns: int) -> None:
-    bench = proved(1 + GYRO_SCALE_STD)
+def test_the_error_of_a_gyros_scale_grows_with_the_turns(turns: int, std: float) -> None:
+    bench = proved(1 + std)
+    bench.robot.use(OdometryConfig(gyro_scale_std=std))
     off, variance = bench.off, bench.yaw_variance
     bench.run(turns * math.tau / 2.0, Twist(0.0, 2.0))
     bench.run(1.0, Twist())
     off, variance = bench.off - off, bench.yaw_variance - variance
-    assert off == pytest.approx(GYRO_SCALE_STD * turns * math.tau, rel=0.05)
+    assert off == pytest.approx(std * turns * math.tau, rel=0.05)
     assert off**2 / variance == pytest.approx(1.0, rel=0.25)
 
 

@@ -17,7 +17,7 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.motion.error_model import ErrorModel
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.odometry import Odometry
-from acsard.core.motion.uncertainty import GYRO_SCALE_STD, PoseUncertainty
+from acsard.core.motion.uncertainty import PoseUncertainty
 from acsard.core.values import STILL, WheelSpeeds
 from tests.unit.core.link.counted import RADIUS, TRACK
 from tests.unit.core.motion.nees import (
@@ -294,7 +294,9 @@ def test_the_yaw_errors_of_the_gyro_and_of_gaps_are_separate_whichever_came_firs
     of_skidding = 0.4 * DEFAULT.skid
     for model in (gaps_first, gyro_first):
         grown = model.covariance.yawyaw - before
-        assert grown == pytest.approx((20.0 * GYRO_SCALE_STD) ** 2 + of_skidding, rel=0.01)
+        assert grown == pytest.approx(
+            (20.0 * OdometryConfig().gyro_scale_std) ** 2 + of_skidding, rel=0.01
+        )
 
 
 def test_a_turn_that_the_wheels_give_has_no_error_of_the_gyro_scale() -> None:
