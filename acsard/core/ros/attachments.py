@@ -1,7 +1,7 @@
 """Encodes and decodes the attachment that rmw_zenoh_cpp adds to every sample and request.
 
-The attachment contains a sequence number, a time and a GID in 33 bytes. Both rmw_zenoh_cpp and
-acsard drop samples and requests without it.
+It has a sequence number, a time and a GID, in 33 bytes. Both rmw_zenoh_cpp and acsard drop samples
+and requests without it.
 """
 
 from __future__ import annotations
@@ -11,27 +11,25 @@ from struct import Struct as Layout
 from msgspec import Struct
 
 from acsard.core.messages.encodings import DecodeError
+from acsard.core.values import WallNs
 
 GID_BYTES = 16
 _LAYOUT = Layout(f"<qqB{GID_BYTES}s")
 
 
 class Attachment(Struct, frozen=True):
-    """Attachment of a sample or a request that rmw_zenoh_cpp has sent."""
+    """Attachment of rmw_zenoh_cpp."""
 
-    sequence: int
-    """Number of the sample or request. Each publisher and each service client counts from 1."""
-    stamp_ns: int
-    """Time of sending by the wall clock, ns since 1970."""
-    gid: bytes
-    """GID of the publisher or the service client, 16 bytes."""
+    sequence: int  # from 1, for each publisher and each client
+    stamp_ns: WallNs  # of sending
+    gid: bytes  # of the publisher or client, 16 bytes
 
     def pack(self) -> bytes:
         return _LAYOUT.pack(self.sequence, self.stamp_ns, GID_BYTES, self.gid)
 
 
 def unpack(data: bytes) -> Attachment:
-    """Decode an attachment of rmw_zenoh_cpp. Raises `DecodeError` if it is empty or not valid."""
+    """Decode an attachment of rmw_zenoh_cpp. Raises `DecodeError`."""
     if not data:
         raise DecodeError(
             "no_attachment",

@@ -1,13 +1,8 @@
 """The table of topics in MCAP files and live viewers: name, ROS type and message definition.
 
-Each topic is encoded as CDR and comes with its message definition (`ros2msg` of MCAP), so Foxglove,
-Lichtblick and PlotJuggler can read it. No topic may have another encoding, because `ros2 bag play`
-refuses a file that contains such a topic.
-
-ROS does not define a type for `state`, so this topic has a type of the package `acsard`
-(`shapes.py`). `ros2 bag play` reports that it skips this topic, but the viewers show it. The names
-and types of the topics in ROS come from `transports.py`. The definitions are those of ROS 2 Jazzy
-and later.
+All are CDR with their `ros2msg` definitions (ROS 2 Jazzy and later), for Foxglove, Lichtblick and
+PlotJuggler; `ros2 bag play` refuses a file with another encoding. `state` has a type of the package
+`acsard` (`shapes.py`), which it skips and viewers show. Names and types come from `transports.py`.
 """
 
 from __future__ import annotations
@@ -24,12 +19,12 @@ from acsard.core.ros.names import Qos, full_name
 from acsard.core.ros.shapes import Log, State, state
 from acsard.core.ros.transports import PUBLISHED
 
-ACSARD_PREFIX = "acsard/msg/"
-"""Prefix of the message types that ROS does not have."""
+ACSARD_PREFIX = "acsard/msg/"  # of types that ROS does not have
 
-Field = tuple[str, str]
-"""A pair: the type and the name of a field of a message."""
+Field = tuple[str, str]  # type and name
 
+# A line is a type, a colon, and its constants (`type NAME=value`) and fields (`type name`, `type
+# name default`). `[]` is a sequence, `[n]` an array.
 _TEXT = """
 builtin_interfaces/msg/Time: int32 sec, uint32 nanosec
 std_msgs/msg/Header: builtin_interfaces/msg/Time stamp, string frame_id
@@ -94,9 +89,6 @@ acsard/msg/RobotState: \
     string emergency_stop, bool[] bumpers, \
     string recording_error, string certificate_expiry, acsard/msg/Counter[] counters
 """
-"""Message definitions. Each line defines one type: its name, a colon, and its constants and fields,
-separated by commas. A constant is written as `type NAME=value`, and a field as `type name` or `type
-name default`. `[]` after a type marks a sequence, and `[n]` an array of n items."""
 
 
 def _parsed(text: str) -> dict[str, tuple[tuple[str, str], ...]]:
@@ -108,28 +100,26 @@ def _parsed(text: str) -> dict[str, tuple[tuple[str, str], ...]]:
     return table
 
 
-_DECLARED = _parsed(_TEXT)
-"""The constants and fields of each message type, in order. Each constant or field is a pair: its
-type and the rest of its definition, such as ("float64", "x 0")."""
+_DECLARED = _parsed(_TEXT)  # by type, pairs such as ("float64", "x 0")
 
+# Fields by type, without constants.
 DEFINITIONS: dict[str, tuple[Field, ...]] = {
     name: tuple((kind, rest.split()[0]) for kind, rest in declared if "=" not in rest)
     for name, declared in _DECLARED.items()
 }
-"""The fields of each message type, in order, without the constants."""
 
 SEPARATOR_LINE = "=" * 80
 
 
 def schema_text(name: str) -> str:
-    """Return the definitions of a type and of its nested types in MCAP's `ros2msg` format."""
+    """Return a type with its nested types in MCAP's `ros2msg` format."""
     parts = [_fields(name)]
     parts += [f"{SEPARATOR_LINE}\nMSG: {_short(other)}\n{_fields(other)}" for other in nested(name)]
     return "".join(parts)
 
 
 def nested(name: str) -> tuple[str, ...]:
-    """Return all types nested in the type `name`, at any depth, in the order of first use."""
+    """Return all nested types, at any depth, in the order of first use."""
     return tuple(dict.fromkeys(_nested(name)))
 
 
@@ -149,44 +139,31 @@ def _short(kind: str) -> str:
     return kind.replace("/msg/", "/")
 
 
-ENCODING, SCHEMA_ENCODING = "cdr", "ros2msg"
-"""Names of the message encoding and the schema encoding in MCAP and in Foxglove's live protocol."""
+ENCODING, SCHEMA_ENCODING = "cdr", "ros2msg"  # in MCAP and in Foxglove's protocol
 
 SOURCE_PLACEHOLDER = "<source>"
 
 
 class Channel(Struct, frozen=True):
-    """A topic in MCAP files and live viewers.
+    """A topic in MCAP files and live viewers; `<source>` stands for a command source."""
 
-    `<source>` in the name stands for the name of a command source.
-    """
-
-    name: str
-    """Topic name relative to the namespace."""
-    native: str
-    """Native Zenoh key of the same messages, without the prefix `acsard/<robot.id>/`."""
-    schema_name: str
-    """ROS type as `pkg/msg/Name`."""
-    message: type[Struct]
-    """Struct type of the messages as CDR encodes them. For the key `state`, it is `State` in
-    `shapes.py`."""
+    name: str  # relative to the namespace
+    native: str  # native key, without `acsard/<robot.id>/`
+    schema_name: str  # `pkg/msg/Name`
+    message: type[Struct]  # as CDR encodes it; for `state`, that of `shapes.py`
     qos: Qos = Qos()
 
     def topic(self, namespace: str, source: str = "") -> str:
-        """Return the fully qualified name of the topic, with its leading slash.
-
-        `namespace` is the ROS namespace of the robot. `source` is the name of the command source
-        that replaces `<source>`.
-        """
+        """Return the full name, with its leading slash; `source` replaces `<source>`."""
         return full_name(namespace, self.name.replace(SOURCE_PLACEHOLDER, source))
 
     @property
     def schema(self) -> str:
-        """The definitions of the message type and its nested types, in MCAP's `ros2msg` format."""
+        """The type with its nested types, in MCAP's `ros2msg` format."""
         return schema_text(self.schema_name)
 
     def encode(self, message: Any) -> bytes:
-        """Encode a message as CDR. A `RobotState` is first converted to `State` of `shapes.py`."""
+        """Encode a message as CDR; a `RobotState` becomes `State` of `shapes.py`."""
         return encode(state(message) if isinstance(message, RobotState) else message, "cdr")
 
 
@@ -203,28 +180,23 @@ def _published() -> dict[str, Channel]:
 
 STATE_CHANNEL = Channel("state", "state", ACSARD_PREFIX + "RobotState", State)
 
+# Each event is one log message.
 LOG_CHANNEL = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))
-"""The topic of the daemon's events. Each event is one log message."""
 
+# One for each command source; the stamp is the arrival.
 CMD_VEL_IN = Channel(
     f"cmd_vel_in/{SOURCE_PLACEHOLDER}",
     f"cmd/{SOURCE_PLACEHOLDER}",
     "geometry_msgs/msg/TwistStamped",
     TwistStamped,
 )
-"""The topics of the received commands, one topic for each command source. The stamp of a message
-is the time at which the command arrived."""
 
+# Channels by key, for all messages that `Report` builds.
 BY_KEY: dict[str, Channel] = {**_published(), STATE_CHANNEL.native: STATE_CHANNEL}
-"""Maps each native Zenoh key to its channel, for all messages that `Report` (`messages/report.py`)
-builds."""
 
 CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG_CHANNEL)
 
 
 def published_channels(silent: Container[str]) -> tuple[Channel, ...]:
-    """Return all channels except those whose native key is in `silent`.
-
-    `silent` contains the native keys that the robot does not use, as `left_out` returns them.
-    """
+    """Return all channels but those whose native key is in `silent` (`left_out`)."""
     return tuple(channel for channel in CHANNELS if channel.native not in silent)

@@ -1,13 +1,9 @@
 """Makes the Zenoh keys and liveliness tokens of ROS 2 topics and services.
 
-zenoh-bridge-ros2dds uses the name of a topic as its Zenoh key. The key of rmw_zenoh_cpp also
-contains the domain, the type and the hash of the type, so no message arrives if the hash is wrong.
-The robot's own topics are in `core/ros/transports.py`.
-
-A liveliness token announces an endpoint to ROS: a publisher, a subscription or a service server.
-Without the token, messages arrive, but `ros2 topic list` and `wait_for_service` do not find the
-endpoint. The formats of tokens, QoS strings and GIDs are those of rmw_zenoh_cpp (Jazzy 0.2.4 and
-later) and zenoh-plugin-ros2dds 1.10.
+The bridge's key is the name. That of rmw_zenoh_cpp also has the domain, the type and its hash, and
+a wrong hash means no message. A token announces an endpoint: without it messages arrive, but `ros2
+topic list` and `wait_for_service` do not find it. The formats are those of rmw_zenoh_cpp (Jazzy
+0.2.4 and later) and zenoh-plugin-ros2dds 1.10.
 """
 
 from __future__ import annotations
@@ -18,6 +14,7 @@ import xxhash
 from msgspec import Struct
 
 # fmt: off
+# RIHS01, for Jazzy, Kilted and Lyrical: a part of the wire format. A test recomputes them.
 TYPE_HASHES: dict[str, str] = {
     "geometry_msgs/msg/Twist":
         "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a",
@@ -55,71 +52,50 @@ TYPE_HASHES: dict[str, str] = {
         "RIHS01_0e192ef259c07fc3c07a13191d27002222e65e00ccec653ca05e856f79285fcd",
 }
 # fmt: on
-"""RIHS01 hashes of the ROS types in use, for Jazzy, Kilted and Lyrical. They are literals because
-the hashes are part of the wire format. A test recomputes them from the message definitions."""
 
 
-NODE = "acsard"
-"""Name of the robot's ROS node, which is also the prefix of its services."""
+NODE = "acsard"  # of the robot's ROS node, and prefix of its services
 
 
 def full_name(namespace: str, name: str) -> str:
-    """Return the fully qualified name of a topic or service, with its leading slash."""
+    """Return the full name of a topic or service, with its leading slash."""
     return f"/{namespace}/{name}" if namespace else f"/{name}"
 
 
 def bridge_key(name: str) -> str:
-    """Return the Zenoh key that zenoh-bridge-ros2dds uses for a topic or service.
-
-    `name` is the fully qualified name, with its leading slash.
-    """
+    """Return the bridge's Zenoh key of a full name."""
     return name.removeprefix("/")
 
 
 def rmw_key(domain: int, name: str, type_name: str) -> str:
-    """Return the Zenoh key that rmw_zenoh_cpp uses for a topic or service.
-
-    Args:
-        domain: the ROS domain id.
-        name: the fully qualified name, with its leading slash.
-        type_name: the type in the form `pkg/msg/Name`.
-    """
+    """Return the Zenoh key of rmw_zenoh_cpp for a full name and a type `pkg/msg/Name`."""
     return f"{domain}/{name.removeprefix('/')}/{dds_type(type_name)}/{TYPE_HASHES[type_name]}"
 
 
 def dds_type(type_name: str) -> str:
-    """Return the DDS form of a type name, such as `pkg::msg::dds_::Name_` for `pkg/msg/Name`."""
+    """Return `pkg::msg::dds_::Name_` for `pkg/msg/Name`."""
     package, kind, name = type_name.split("/")
     return f"{package}::{kind}::dds_::{name}_"
 
 
-Kind = Literal["MP", "MS", "SS"]
-"""Kind of a ROS endpoint: publisher (MP), subscription (MS) or service server (SS)."""
+Kind = Literal["MP", "MS", "SS"]  # publisher, subscription, service server
 
 RMW_DEFAULT_DEPTH = 42
 
 
 class Qos(Struct, frozen=True):
-    """QoS profile of a publisher or a subscription in ROS."""
-
-    depth: int = 10
-    """Number of samples that the publisher or the subscription keeps."""
-    transient: bool = False
-    """Durability. True means transient local: a subscriber that joins later also receives the
-    samples that the publisher keeps. False means volatile."""
+    depth: int = 10  # samples that are kept
+    transient: bool = False  # transient local: later subscribers get the kept samples, too
+    # Such a subscription accepts every publisher, a reliable one only reliable ones.
     best_effort: bool = False
-    """Reliability. True means best effort, and False means reliable. A best-effort subscription
-    accepts every publisher. A reliable subscription accepts only reliable publishers."""
 
 
 class Node(Struct, frozen=True):
     """A ROS node in a Zenoh session."""
 
     domain: int
-    zid: str
-    """Id of the Zenoh session."""
-    namespace: str
-    """Namespace without slashes at its ends. "" is the root namespace."""
+    zid: str  # of the session
+    namespace: str  # without slashes at its ends; "" is the root
     name: str
 
     @property
@@ -128,15 +104,7 @@ class Node(Struct, frozen=True):
         return f"{self._head}/0/NN/%/{_mangled('/' + self.namespace)}/{self.name}"
 
     def endpoint_token(self, number: int, kind: Kind, name: str, type_name: str, qos: Qos) -> str:
-        """Return the liveliness token of an endpoint of this node.
-
-        Args:
-            number: the number of the endpoint in its Zenoh session, from 1 on.
-            kind: the kind of the endpoint.
-            name: the fully qualified name of the topic or service.
-            type_name: the type in the form `pkg/msg/Name`.
-            qos: the QoS profile of the endpoint.
-        """
+        """Return the liveliness token of an endpoint, numbered from 1 in its session."""
         return (
             f"{self._head}/{number}/{kind}/%/{_mangled('/' + self.namespace)}/{self.name}"
             f"/{_mangled(name)}/{dds_type(type_name)}/{TYPE_HASHES[type_name]}/{rmw_qos(qos)}"
@@ -148,31 +116,24 @@ class Node(Struct, frozen=True):
 
 
 def rmw_qos(qos: Qos) -> str:
-    """Return a QoS profile in the form of the tokens of rmw_zenoh_cpp.
-
-    This form leaves out the values that are the defaults of rmw_zenoh_cpp.
-    """
+    """Return a QoS profile as in tokens of rmw_zenoh_cpp, without its defaults."""
     depth = "" if qos.depth == RMW_DEFAULT_DEPTH else qos.depth
     reliability = "2" if qos.best_effort else ""
     return f"{reliability}:{'1' if qos.transient else ''}:,{depth}:,:,:,,"
 
 
 def gid(token: str) -> bytes:
-    """Return the GID of an endpoint: the XXH3-128 hash of its token as 16 bytes, little endian."""
+    """Return the GID of an endpoint: XXH3-128 of its token, 16 bytes, little endian."""
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
 
 
 def bridge_presence(zid: str) -> str:
-    """Return the liveliness token with which a ros2dds bridge announces itself."""
+    """Return the liveliness token of a ros2dds bridge."""
     return f"@/{zid}/@ros2_lv"
 
 
 def bridge_token(zid: str, kind: Kind, name: str, type_name: str, qos: Qos) -> str:
-    """Return the liveliness token with which a ros2dds bridge announces an endpoint.
-
-    `zid` is the id of the Zenoh session. `name` is the fully qualified name of the topic or
-    service, and `type_name` is its type in the form `pkg/msg/Name`.
-    """
+    """Return the liveliness token of an endpoint of a ros2dds bridge."""
     head = f"{bridge_presence(zid)}/{kind}/{_in_one_chunk(bridge_key(name))}"
     head += f"/{_in_one_chunk(type_name)}"
     if kind == "SS":

@@ -1,10 +1,8 @@
 """Offers the configuration as ROS parameters, for `ros2 param` and `rqt_reconfigure`.
 
-A parameter has the name of its key in `acsard.toml`, with a dot between table and key. Its
-description and range come from the types in `core/config/settings.py`. Only the settings in
-`core/config/live.py` can be set while the daemon runs. This module decodes a request to set
-parameters, and `core/robot.py` accepts or refuses it. The structs of this module are types of
-rcl_interfaces.
+A parameter has the dotted key in `acsard.toml`, and description and range of
+`core/config/settings.py`. Those of `core/config/live.py` can be set; requests are decoded here, and
+`core/robot.py` accepts or refuses them. The structs are types of rcl_interfaces.
 """
 
 from __future__ import annotations
@@ -58,10 +56,7 @@ class ParameterDescriptor(Struct, frozen=True):
 
 
 def described(name: str, type_of: int) -> ParameterDescriptor:
-    """Return the descriptor of the parameter `name`, as `ros2 param describe` shows it.
-
-    `type_of` is the ROS type of the parameter, or 0 if the parameter does not exist.
-    """
+    """Return the descriptor of a parameter; `type_of` is its ROS type, or 0 if it is missing."""
     if not type_of:
         return ParameterDescriptor(name, type_of)
     return _described(name, type_of)
@@ -93,10 +88,9 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
 
 
 def kind_of(name: str) -> inspect.Type:
-    """Return the declared type of an existing setting. `name` is the dotted key of the setting.
+    """Return the declared type of a setting by its dotted key. Raises `KeyError` for a table.
 
-    For a setting of a command source, the key contains the name of the source, as in
-    `commands.sources.app.timeout`. Raises `KeyError` if `name` is the key of a table.
+    The key of a command source has its name, as in `commands.sources.app.timeout`.
     """
     cls: type[Struct] = Config
     parts = iter(name.split("."))
@@ -117,15 +111,11 @@ def kind_of(name: str) -> inspect.Type:
 
 
 T = TypeVar("T")
+# Parameters of a request to set: decoding more would take too much of a control step.
 ParameterList = Annotated[list[T], Meta(max_length=128)]
-"""List with at most 128 items, for the parameters that a request sets. A longer request is refused,
-because its decoding would take too much of the time of a control step."""
-NameList = Annotated[list[T], Meta(max_length=256)]
-"""List with at most 256 items, for names of parameters. It may be longer than a list of parameters
-to set, because a name is decoded faster than a parameter with its value."""
+NameList = Annotated[list[T], Meta(max_length=256)]  # of names, which are decoded faster
 
-MAX_REQUEST_BYTES = 16384
-"""Largest size of a request, bytes. A request with the names of all parameters is smaller."""
+MAX_REQUEST_BYTES = 16384  # with the names of all parameters, it is smaller
 
 NOT_SET, BOOL, INTEGER, DOUBLE, STRING = range(5)
 STRING_ARRAY = 9
@@ -136,7 +126,7 @@ Q = TypeVar("Q")
 
 
 class ParameterValue(Struct, frozen=True):
-    """Value of a parameter. `type` says which of the other fields contains the value."""
+    """Value of a parameter, in the field that `type` says."""
 
     type: Unsigned8 = NOT_SET
     bool_value: bool = False
@@ -165,30 +155,19 @@ class SetParametersResult(Struct, frozen=True):
 
 
 class ListRequest(Struct, frozen=True):
-    """Request of the service `list_parameters`."""
-
-    prefixes: NameList[str]
-    """Prefixes of the names to list. If the list is empty, all names are listed."""
-    depth: Unsigned64
-    """Largest number of parts, separated by dots, that a listed name may have after its prefix. 0
-    means any number."""
+    prefixes: NameList[str]  # all names without any
+    depth: Unsigned64  # parts after the prefix; 0 is any number
 
 
 class ListReply(Struct, frozen=True):
-    """Reply of the service `list_parameters`.
-
-    `prefixes` contains, for each name with a dot, the part before the last dot.
-    """
+    """Reply of `list_parameters`; `prefixes` are the parts before a last dot."""
 
     names: list[str]
     prefixes: list[str]
 
 
 class Names(Struct, frozen=True):
-    """Request that contains names of parameters.
-
-    The reply contains the values, the types or the descriptors of these parameters.
-    """
+    """Request with names of parameters."""
 
     names: NameList[str]
 
@@ -229,20 +208,14 @@ class SetAtomicallyReply(Struct, frozen=True):
     result: SetParametersResult
 
 
+# Not answered by `Parameters.answer`.
 SETTING_SERVICES = ("set_parameters", "set_parameters_atomically")
-"""The services that set parameters. `Parameters.answer` does not answer them."""
 
 
 def failure(service: str, why: str, request: bytes) -> bytes:
-    """Return the reply to a refused request of a parameter service, in CDR.
+    """Return the reply to a refused request, in CDR: without one, the client would wait forever.
 
-    Without a reply, the client would wait forever.
-
-    Args:
-        service: the name of the service.
-        why: the reason of the refusal. Only the replies of the services in `SETTING_SERVICES`
-            contain it. All other replies are empty, as in rclcpp.
-        request: the refused request, in CDR.
+    Only `SETTING_SERVICES` have the reason; other replies are empty, as in rclcpp.
     """
     if service in SETTING_SERVICES:
         with suppress(CdrError):
@@ -260,10 +233,7 @@ def failure(service: str, why: str, request: bytes) -> bytes:
 
 
 class Parameters:
-    """Answers requests of the ROS services that only read parameters.
-
-    `tables` is the configuration in the form that `core.config.parsing.effective()` returns.
-    """
+    """Answers the services that only read parameters, by the `effective()` tables."""
 
     def __init__(self, tables: Mapping[str, object]) -> None:
         self._values = {name: _value(value) for name, value in flat(tables)}
@@ -275,10 +245,7 @@ class Parameters:
         }
 
     def answer(self, service: str, payload: bytes) -> bytes:
-        """Return the reply to a request of `service`. `payload` and the reply are CDR.
-
-        Raises `CdrError` if the request is not valid.
-        """
+        """Return the reply to a request, both in CDR. Raises `CdrError`."""
         return self._services[service](payload)
 
     def _list(self, asked: ListRequest) -> ListReply:
@@ -306,11 +273,7 @@ class Parameters:
 
 
 def requested_values(payload: bytes) -> dict[str, Plain]:
-    """Decode a request to set parameters, and return the new values by parameter name.
-
-    `payload` is the request in CDR. Raises `CdrError` if the request is not valid, or if it
-    contains a parameter twice.
-    """
+    """Return the new values in a request to set. Raises `CdrError`, also for a repetition."""
     asked = Cdr(SetRequest).decode(payload)
     wishes: dict[str, Plain] = {}
     for parameter in asked.parameters:
@@ -321,16 +284,9 @@ def requested_values(payload: bytes) -> dict[str, Plain]:
 
 
 def outcome(service: str, payload: bytes, successful: bool, reason: str) -> bytes:
-    """Return the reply to a request to set parameters, in CDR.
+    """Return the reply to a request to set, in CDR: all get the same result.
 
-    All parameters of the request get the same result, because the robot sets all of them or none.
-    Raises `CdrError` if a request of `set_parameters` is not valid.
-
-    Args:
-        service: the name of the service, one of `SETTING_SERVICES`.
-        payload: the request, in CDR.
-        successful: True if the robot has set the parameters.
-        reason: the text for the client, such as the reason of a refusal.
+    Raises `CdrError` for an invalid `set_parameters`.
     """
     result = SetParametersResult(successful, reason)
     if service == "set_parameters_atomically":

@@ -1,6 +1,6 @@
 """Converts events, commands and the native message `state` to ROS messages.
 
-CDR cannot encode maps, so the counters of `state` become a list. Null becomes NaN (`cdr_types.py`).
+CDR has no maps, so the counters of `state` are a list, and null is NaN (`cdr_types.py`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Natural = Annotated[int, Meta(extra={"cdr": "I"})]
 
 
 class Log(Struct, frozen=True):
-    """The ROS message rcl_interfaces/msg/Log for one event. `name` is the name of the event."""
+    """The message rcl_interfaces/msg/Log for one event."""
 
     stamp: Time
     level: Byte
@@ -38,38 +38,31 @@ class Log(Struct, frozen=True):
     line: Natural = 0
 
 
-LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
-"""Maps each log level of acsard to its number in ROS."""
+LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}  # in ROS
 
 
 def log(event: Event | LogEvent, stamp: Time) -> Log:
-    """Convert an event to a log message with the time `stamp`."""
+    """Convert an event to a log message."""
     by = f" (by {event.by})" if event.by else ""
     return Log(stamp, LEVELS.get(event.level, 20), event.name, f"{event.text}{by}")
 
 
 def command_message(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
-    """Convert a received command to a message of the topic `cmd_vel_in/<source>`.
-
-    Args:
-        twist: the command.
-        arrived: the time at which the command arrived, for the header.
-        frame: the frame id for the header.
-    """
+    """Convert a received command to a message of `cmd_vel_in/<source>`."""
     return TwistStamped(
         Header(arrived, frame), Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))
     )
 
 
 class Trigger(Struct, frozen=True):
-    """The response of the ROS service type std_srvs/srv/Trigger."""
+    """The response of std_srvs/srv/Trigger."""
 
     success: bool
     message: str
 
 
 class Counter(Struct, frozen=True):
-    """The name of a counter and its value since the start of the daemon."""
+    """A counter since the start of the daemon."""
 
     name: str
     count: Whole
@@ -86,7 +79,7 @@ class Source(Struct, frozen=True):
 
 
 class State(Struct, frozen=True):
-    """A message of the ROS type acsard/msg/RobotState. It has most fields of `RobotState`."""
+    """The type acsard/msg/RobotState, with most fields of `RobotState`."""
 
     header: Header
     mode: str
@@ -114,7 +107,7 @@ class State(Struct, frozen=True):
 
 
 def state(message: RobotState) -> State:
-    """Convert a native `RobotState` to a message of the ROS type acsard/msg/RobotState."""
+    """Convert a native `RobotState` to acsard/msg/RobotState."""
     converted: dict[str, Any] = {
         "header": Header(message.stamp),
         "sources": [

@@ -1,8 +1,7 @@
-"""The table of the robot's ROS topics and services, with the native key of each topic and service.
+"""The table of the robot's ROS topics and services, with the native key of each.
 
-A native key is acsard's own Zenoh key. A ROS key is the Zenoh key that a ROS transport uses for
-the same messages. The two transports are zenoh-bridge-ros2dds ("bridge") and rmw_zenoh_cpp
-("rmw"). The bus declares its ROS endpoints from this table.
+A native key is acsard's own. A ROS key is that of a transport, zenoh-bridge-ros2dds ("bridge") or
+rmw_zenoh_cpp ("rmw"). The bus declares its ROS endpoints from this table.
 """
 
 from __future__ import annotations
@@ -38,42 +37,32 @@ Transport = Literal["bridge", "rmw"]
 
 
 class RosName(Struct, frozen=True):
-    """A ROS topic or service, with acsard's own Zenoh key (native key) for the same messages."""
+    """A ROS topic or service, with the native key for the same messages."""
 
-    name: str
-    """ROS name relative to the robot's namespace."""
-    native: str
-    """Native key without the prefix `acsard/<robot.id>/`."""
-    direction: Direction
-    """Direction of the native key. In ROS, both "query" and "service" are services."""
+    name: str  # relative to the robot's namespace
+    native: str  # without `acsard/<robot.id>/`
+    direction: Direction  # of the native key; "query" and "service" are services
     type: str
     qos: Qos = Qos()
 
 
 class Endpoint(Struct, frozen=True):
-    """A ROS topic or service that the daemon declares on the bus for one ROS transport."""
+    """A ROS topic or service that the daemon declares for one ROS transport."""
 
     transport: Transport
-    native: str
-    """Native key for the same messages, without the prefix `acsard/<robot.id>/`."""
+    native: str  # without `acsard/<robot.id>/`
     direction: Direction
     key: str
-    token: str
-    """Liveliness token that announces the endpoint, or "" if the endpoint is not announced.
-    rmw_zenoh identifies the endpoint by its GID, which is a hash of this token."""
-    latched: bool
-    """True if a new subscriber immediately receives the last message."""
-    type: str
-    """ROS type of the messages. If the endpoint accepts two types, which only the bridge allows,
-    this is the first type."""
+    token: str  # liveliness, if it is announced; the GID is a hash of it
+    latched: bool  # a new subscriber gets the last message
+    type: str  # the first one of two, which only the bridge allows
 
     @property
     def encoding(self) -> str:
-        """Zenoh Encoding to assume for an incoming sample, because samples from ROS have none.
+        """Zenoh Encoding to assume, because samples from ROS have none.
 
-        For rmw, it contains the ROS type. For the bridge, it does not, because an endpoint may
-        accept two types. The length of a sample then shows whether it is a Twist or a
-        TwistStamped.
+        For rmw it has the type. For the bridge, the length of a sample shows whether it is a Twist
+        or a TwistStamped.
         """
         cdr = encoding_name("cdr")
         return f"{cdr};{self.type}" if self.transport == "rmw" else cdr
@@ -91,9 +80,8 @@ PARAMETER_SERVICES = {
     "set_parameters_atomically": "rcl_interfaces/srv/SetParametersAtomically",
 }
 
+# Prefix of `RosName.native` for ROS parameter services; native clients use the key `config`.
 PARAMETERS_PREFIX = "parameters/"
-"""Prefix of `RosName.native` for the ROS services that read and set parameters. No native key on
-the bus begins like this, because native clients read the same settings with the key `config`."""
 
 PUBLISHED = (
     RosName("odom", "odom", "out", "nav_msgs/msg/Odometry"),
@@ -107,28 +95,23 @@ PUBLISHED = (
 
 TWISTS = ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped")
 
+# Command sources by the ROS topic that commands the robot.
 SOURCES = {
     "cmd_vel": "nav",
     "cmd_vel_dock": "dock",
     "cmd_vel_teleop": "teleop",
     "joint_commands": "ros2_control",
 }
-"""Maps each ROS topic that commands the robot to the name of its command source."""
 
+# The topic of Nav2's speed filter.
 SPEED_LIMIT_TOPIC = RosName(SPEED_LIMIT, SPEED_LIMIT, "in", "nav2_msgs/msg/SpeedLimit")
-"""Subscription to the speed limits of Nav2's speed filter."""
 
+# Best effort also receives from drivers with SensorDataQoS.
 GYRO_TOPIC = RosName("imu/data", IMU, "in", "sensor_msgs/msg/Imu", Qos(best_effort=True))
-"""Subscription to the samples of a gyro. It is best effort, so that it also receives from gyro
-drivers that publish with SensorDataQoS."""
 
 
 def left_out(config: Config) -> frozenset[str]:
-    """Return the native keys that a daemon with the configuration `config` does not use.
-
-    The daemon does not announce them to ROS, so that ROS tools do not show topics without
-    messages.
-    """
+    """Return the native keys that are not used, and so not announced to ROS."""
     silent = set() if config.odometry.publish_tf else {"tf"}
     # The simulated robot has its own gyro, so the daemon does not subscribe to another one.
     if not config.odometry.gyro or config.mcu.simulated:
@@ -139,10 +122,9 @@ def left_out(config: Config) -> frozenset[str]:
 
 
 def ros_names(silent: Container[str] = ()) -> tuple[RosName, ...]:
-    """Return the ROS topics and services of a robot, without its namespace.
+    """Return the ROS names, without namespace and native keys in `silent` (`left_out`).
 
-    A topic that accepts Twist and TwistStamped appears twice, once for each type. `silent` has the
-    native keys to leave out, as `left_out` returns them.
+    One for Twist and TwistStamped appears twice.
     """
     return (
         *(row for row in PUBLISHED if row.native not in silent),
@@ -171,13 +153,7 @@ def ros_names(silent: Container[str] = ()) -> tuple[RosName, ...]:
 
 
 def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[Endpoint, ...]:
-    """Return the endpoints of all ROS transports that the configuration switches on.
-
-    Args:
-        ros: the table `[ros]` of the configuration.
-        zid: the id of the Zenoh session.
-        silent: the native keys to leave out, as `left_out` returns them.
-    """
+    """Return the endpoints of all ROS transports that are switched on, without `silent` keys."""
     names = ros_names(silent)
     ros_endpoints: list[Endpoint] = []
     if ros.bridge:
@@ -188,11 +164,7 @@ def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[En
 
 
 def node_tokens(ros: RosConfig, zid: str) -> tuple[str, ...]:
-    """Return the liveliness tokens that announce the daemon itself to ROS.
-
-    There is one token for the bridge and one for rmw, if `ros` switches them on. `zid` is the id
-    of the daemon's Zenoh session.
-    """
+    """Return the liveliness tokens that announce the daemon itself to ROS, one per transport."""
     tokens = []
     if ros.bridge:
         tokens.append(bridge_presence(zid))
@@ -207,11 +179,10 @@ def command_keys(ros: RosConfig) -> tuple[str, ...]:
 
 
 def claims(ros: RosConfig) -> tuple[str, ...]:
-    """Return the tokens with which this daemon claims the ROS topic `cmd_vel` for itself.
+    """Return the tokens with which this daemon claims the ROS topic `cmd_vel`.
 
-    Two daemons with the same token would follow the same `cmd_vel`, so the second daemon does not
-    start. The tokens begin with `acsard/@ros/`. The tokens that announce endpoints to ROS cannot
-    serve as claims, because other ROS nodes may use the same names.
+    Two daemons with the same one would follow the same `cmd_vel`, so the second does not start.
+    Tokens that announce endpoints are no claims, because other nodes may use the names.
     """
     name = full_name(ros.namespace, "cmd_vel")
     trees = (("bridge", ros.bridge), (f"rmw/{ros.domain}", ros.rmw))
@@ -223,10 +194,7 @@ def _node(ros: RosConfig, zid: str) -> Node:
 
 
 def _bridge(ros: RosConfig, zid: str, names: tuple[RosName, ...]) -> Iterator[Endpoint]:
-    """Yield an endpoint for each name.
-
-    A name with two types is not announced to ROS, because a DDS reader has only one type.
-    """
+    # One with two types is not announced: a DDS reader has only one type.
     for row in names:
         twins = [other for other in names if other.name == row.name]
         if row is not twins[0]:
