@@ -20,30 +20,24 @@ class BusInput(Struct, frozen=True):
 
     arrivals: tuple[Arrival, ...] = ()
     queries: tuple[Query, ...] = ()
-    overrun: int = 0
-    """Number of samples that were dropped because the control loop did not fetch them in time."""
-    overrun_sources: tuple[str, ...] = ()
-    """Names of the command sources of the samples that `overrun` counts."""
-    dropped: int = 0
-    """Number of published messages that were dropped because the bus did not send them in time."""
-    stuck: bool = False
-    """True if a send on the bus has begun to block since the previous call of `Bus.take`."""
-    routers: RoutersStatus | None = None
-    """State of the connections to the endpoints in `bus.connect`; None if the state has not
-    changed."""
+    overrun: int = 0  # samples that the control loop did not fetch in time
+    overrun_sources: tuple[str, ...] = ()  # their command sources
+    dropped: int = 0  # published messages that the bus did not send in time
+    stuck: bool = False  # a send has begun to block since the previous `take`
+    routers: RoutersStatus | None = None  # None: not changed
 
 
 NO_INPUT = BusInput()
 
 
 class Waker(Protocol):
-    """Wakes the control loop. The bus may call these methods from any thread."""
+    """Wakes the control loop, from any thread."""
 
     def command(self) -> None:
-        """Wake the control loop because a sample has arrived that may be a command."""
+        """Report a sample that may be a command."""
 
     def stop(self) -> None:
-        """Wake the control loop because a stop has arrived."""
+        """Report a stop."""
 
 
 class Bus(Protocol):
@@ -51,27 +45,26 @@ class Bus(Protocol):
 
     @property
     def wanted_keys(self) -> AbstractSet[str]:
-        """The keys, such as "odom", of the topics that are latched or have a subscriber now."""
+        """The keys, such as "odom", that are latched or have a subscriber."""
 
     def take(self, queries: int) -> BusInput:
-        """Return the input from the bus since the last call.
+        """Return the input since the last call, with at most `queries` queries.
 
-        The result contains at most `queries` queries, in this order: service calls, one slow query
-        (ROS parameters or a `set`), other queries. If service calls alone reach the limit, the slow
-        query is returned in addition. The remaining queries wait for the next call.
+        Their order is: service calls, one slow one (ROS parameters, `set`), which comes even beyond
+        the limit, and others. The rest waits.
         """
 
     def publish(self, key: str, message: Message) -> None:
-        """Queue a message for the subscribers of `key`. The next call of `flush` sends it."""
+        """Queue a message for the subscribers of `key`, which the next `flush` sends."""
 
     def flush(self) -> None:
-        """Start to send the queued messages. Do not wait until they are sent."""
+        """Start to send the queued messages, without waiting."""
 
     def reply(self, reply: Reply) -> None:
-        """Send a reply to the query with the number `reply.ticket`."""
+        """Send a reply to the query of `reply.ticket`."""
 
     def retire(self, ticket: int) -> None:
-        """End the query with the number `ticket`. No more replies to this query are possible."""
+        """End a query: no more replies to it are possible."""
 
 
 GATEWAY_KEY = "gateway"
@@ -82,20 +75,17 @@ _decoder = Decoder(GatewayState)
 class GatewayFollower:
     """Counts the starts of the TLS gateway, and how often all its connections were in use.
 
-    The gateway checks its connections four times a second, and reports in how many checks since its
-    start all connections were in use. A gateway that already runs when the daemon starts counts as
-    one start, and its earlier checks are counted too.
+    The gateway checks four times a second and reports the sum since its start. One that runs when
+    the daemon starts is one start, with its earlier checks.
     """
 
     def __init__(self) -> None:
         self._last = GatewayState(0, 0, 0)
 
     def receive(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
-        """Decode a report of the TLS gateway, and update the two gateway counters in `counters`.
+        """Decode a report, update its two counters, and return when the first certificate expires.
 
-        `arrival` is the sample with the report. Return the time at which the first of the TLS
-        certificates expires, wall-clock ns since 1970. Return None if this time is unknown, or if
-        the report is invalid. An invalid report is ignored.
+        Return None if this is unknown. An invalid report is ignored.
         """
         try:
             report = _decoder.decode(arrival.encoding, arrival.payload)
@@ -127,11 +117,9 @@ class RouterFollower:
     def receive(
         self, status: RoutersStatus, counters: MutableMapping[str, int], events: list[Event]
     ) -> None:
-        """Store the present status, and compare it with the previous status.
+        """Compare the status with the previous one; count losses, and append events.
 
-        Append up to three events to `events`: for the connections that were lost, for those that
-        were made, and for the connected endpoints that are not routers. Also count the lost
-        connections in `counters`.
+        They are for lost connections, new ones, and those to endpoints that are not routers.
         """
         before, self.status = self.status, status
         lost = [endpoint for endpoint in status.missing if endpoint not in before.missing]

@@ -1,9 +1,8 @@
 """Decodes samples and service queries from the bus into a `Command` or a `Request`.
 
-A sample is refused if it is a DELETE, if its key contains a wildcard, or if its payload is too big
-or cannot be decoded. It is also refused if a field that the daemon reads is NaN or infinity, or if
-the sender id belongs to another certificate. A refused command does not refresh the timeout of its
-source.
+Refused are a DELETE, a key with a wildcard, a payload that is too big or cannot be decoded, NaN or
+infinity in a field that is read, and a sender id of another certificate. A refused command does not
+refresh the timeout of its source.
 """
 
 from __future__ import annotations
@@ -35,44 +34,32 @@ from acsard.core.messages.signature import public_name
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.ros.attachments import GID_BYTES, unpack
 from acsard.core.ros.transports import Transport
-from acsard.core.values import NS_PER_S, REST, Command, Pose, Request, Verb, WheelSpeeds
+from acsard.core.values import NS_PER_S, REST, Command, Ns, Pose, Request, Verb, WallNs, WheelSpeeds
 from acsard.core.values import Twist as BodyTwist
 
+# Without a command for this time, a sender id may come with another certificate: a program with a
+# fixed id may move from the robot to a laptop.
 BINDING_NS = 60 * NS_PER_S
-"""Time without a command after which a sender id may be used with another certificate, ns. For
-example, a program with a fixed id may move from the robot to a laptop."""
 
-MAX_BINDINGS = 1024
-"""Largest number of sender ids for which the daemon remembers the certificate. If there are more,
-the daemon forgets the sender that has sent no command for the longest time."""
+MAX_BINDINGS = 1024  # the sender that has been silent longest is forgotten
 
 
 class Bindings:
-    """The certificates to which the sender ids are bound.
+    """The certificates to which the sender ids are bound: each to the first one.
 
-    A sender id is bound to the certificate with which the daemon first received it. If an id
-    arrives with a second certificate, a user copied the id by mistake, or somebody stole its
-    secret. The daemon then refuses the commands with the second certificate. It accepts them only
-    when no command with the first certificate has arrived for `BINDING_NS`.
-
-    Senders on ROS keys are not bound, because ROS keys do not contain the name of a certificate. A
-    sender on a ROS key cannot pretend to be a bound sender, because the public names of the two
-    kinds differ.
+    With a second certificate, the id was copied by mistake or stolen, so its commands are refused
+    until the first has been silent for `BINDING_NS`. Senders on ROS keys are not bound, because
+    these keys have no certificate; their public names differ, so they cannot pretend to be bound.
     """
 
     def __init__(self) -> None:
+        # Certificate ("": on the robot itself) and last command by public name, the oldest first.
         self._seen: dict[str, tuple[str, int]] = {}
-        """Maps the public name of each sender id to a pair: the certificate name of the sender, and
-        the monotonic time of its last command, ns. The certificate name is "" for a program on the
-        robot itself. The oldest command is first."""
 
-    def bind(self, sender: str, certificate: str, now_ns: int) -> str | None:
-        """Bind a sender id to a certificate, and return None.
+    def bind(self, sender: str, certificate: str, now_ns: Ns) -> str | None:
+        """Bind a sender (by public name) to a certificate, "" on the robot itself.
 
-        If the id is still bound to another certificate, change nothing and return the name of the
-        other certificate. `sender` is the public name of the id. `certificate` is the common name
-        of the certificate, or "" for a program on the robot itself. `now_ns` is the present
-        monotonic time, ns.
+        If it is still bound to another one, change nothing and return that one's name.
         """
         bound, seen_ns = self._seen.get(sender, (certificate, now_ns))
         if bound != certificate and now_ns - seen_ns <= BINDING_NS:
@@ -84,58 +71,41 @@ class Bindings:
         return None
 
 
-MAX_COMMAND_BYTES = 4096
-"""Largest payload of a command or a service query, bytes. A TwistStamped in JSON is shorter than
-300 bytes."""
+MAX_COMMAND_BYTES = 4096  # a TwistStamped in JSON is shorter than 300
 
+# Largest lead of a timestamp over the daemon's clock; Zenoh replaces one that is further ahead.
 MAX_TIMESTAMP_LEAD_NS = NS_PER_S // 2
-"""Largest time by which a timestamp may be ahead of the daemon's clock, ns. Zenoh replaces a
-timestamp that is further ahead."""
 
-Via = Literal["native"] | Transport
-"""The kind of key on which a sample or query arrived: "native" for acsard's own keys, otherwise the
-name of the ROS transport."""
+Via = Literal["native"] | Transport  # acsard's own keys, or the ROS transport
 
 
 class Arrival(Struct, frozen=True):
     """A sample as Zenoh delivered it to the daemon."""
 
-    key: str
-    """The key below `acsard/<id>/`. For a sample on a ROS key, it is acsard's own key for the same
-    data."""
-    put: bool
-    """True for a PUT, false for a DELETE."""
+    key: str  # below `acsard/<id>/`, for a ROS key that of the same data
+    put: bool  # False: a DELETE
     payload: bytes
     encoding: str
-    arrived_ns: int
-    """Monotonic time of arrival, ns."""
-    stamp_ns: int | None
-    """Zenoh's timestamp, wall-clock ns since 1970. None if neither the sender nor a router set
-    it."""
+    arrived_ns: Ns
+    stamp_ns: WallNs | None  # Zenoh's timestamp, if the sender or a router set it
+    # Zenoh session of the timestamp (maybe a router's or a bridge's), unless it is the daemon's.
     sender: str
-    """Id of the Zenoh session that set the sample's timestamp. This may be the session of the
-    sender, of a router or of a bridge. The id is "" if the sample arrived without a timestamp, or
-    if the daemon's own session replaced the timestamp."""
     via: Via = "native"
     attachment: bytes = b""
-    received_ns: int | None = None
-    """Timestamp that the daemon's own Zenoh session set, wall-clock ns since 1970; otherwise None.
-    The session sets a timestamp if the sample arrives without a timestamp, or with a timestamp that
-    is too far ahead of the daemon's clock."""
+    # Timestamp of the daemon's own session: there was none, or one too far ahead.
+    received_ns: WallNs | None = None
 
 
 class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
-    """A Twist, with `linear` and `angular`, or a TwistStamped, with `header` and `twist`."""
-
+    # A Twist (`linear`, `angular`), or a TwistStamped (`header`, `twist`).
     linear: Vector3 | UnsetType = UNSET
     angular: Vector3 | UnsetType = UNSET
     header: Header | UnsetType = UNSET
     twist: Twist | UnsetType = UNSET
 
 
+# Sizes by which the type is inferred if the Encoding does not name it: exact, and least size.
 TWIST_CDR_BYTES, STAMPED_CDR_BYTES = 52, 68
-"""Exact size of a Twist in CDR, and smallest size of a TwistStamped in CDR, bytes. If the Zenoh
-Encoding does not name the type, the daemon infers the type from the size of the payload."""
 
 TWISTS = ("geometry_msgs/msg/Twist", "acsard.Twist.v1")
 STAMPED_TWISTS = ("geometry_msgs/msg/TwistStamped", "acsard.TwistStamped.v1")
@@ -158,10 +128,7 @@ class Receiver:
         self._bindings = Bindings()
 
     def command(self, arrival: Arrival) -> Command:
-        """Return the command in a sample on `cmd/…` or `wheel_cmd/…`.
-
-        Raises `DecodeError` if the sample is not a valid command.
-        """
+        """Return the command in a sample on `cmd/…` or `wheel_cmd/…`. Raises `DecodeError`."""
         kind, source, certificate = parts(arrival.key)
         if "*" in arrival.key or "/" in certificate:
             raise DecodeError(
@@ -257,13 +224,11 @@ class Receiver:
 
     @staticmethod
     def request(
-        verb: Verb, ticket: int, encoding: str, payload: bytes, asked_ns: int | None = None
+        verb: Verb, ticket: int, encoding: str, payload: bytes, asked_ns: Ns | None = None
     ) -> Request:
-        """Return the request in a service query. Raise `DecodeError` if the payload is not valid.
+        """Return the request in a service query. Raises `DecodeError`.
 
-        `verb` is the called service. `ticket` is the number of the query, which the reply repeats.
-        `encoding` is the Zenoh Encoding of `payload`. `asked_ns` is the monotonic time at which the
-        query arrived, ns.
+        The reply repeats `ticket`, and `asked_ns` is the arrival.
         """
         request = Request(verb, ticket, asked_ns=asked_ns)
         if verb not in _payloads or (SERVICES[verb].optional and not payload):
@@ -284,64 +249,41 @@ class Receiver:
 
 
 def require_size(verb: Verb, payload: bytes) -> None:
-    """Raise `DecodeError` if this payload is too large for a call of the service `verb`.
-
-    A service that needs no payload ignores a payload of any size.
-    """
+    """Raise `DecodeError` if the payload is too large; a service without one ignores any."""
     if verb in _payloads and len(payload) > MAX_COMMAND_BYTES:
         raise DecodeError("too_big", f"the payload has over {MAX_COMMAND_BYTES} bytes")
 
 
 class Identity(Struct, frozen=True):
-    """The sender of a sample, with the stamp and the sequence number of the sample if known."""
+    """The sender of a sample, with its stamp and its sequence number."""
 
-    sender: str
-    """The public name of the sender. The secret id is not kept."""
-    stamp_ns: int | None = None
-    """Time of sending by the wall clock, ns since 1970; None if unknown. It is the stamp in the
-    attachment, or else the timestamp of Zenoh."""
+    sender: str  # public name; the secret id is not kept
+    stamp_ns: WallNs | None = None  # in the attachment, or else of Zenoh
     sequence: int | None = None
-    shared: bool = False
-    """Whether several programs may share this identity."""
-    steady: bool = False
-    """Whether the sender states that the clock of its stamps is never adjusted."""
-    signed: str = ""
-    """The public name of the sender id, without the name of the TLS certificate. It is "" if the
-    sample has no sender id, if it is not a command, or if it arrived on a ROS key."""
+    shared: bool = False  # several programs may share it
+    steady: bool = False  # the clock of the stamps is never adjusted
+    signed: str = ""  # public name of the sender id of a native command, without the certificate
 
 
 # The results are cached, because each command needs the parts of its key twice, and commands arrive
 # on only a few different keys.
 @lru_cache(64)
 def parts(key: str) -> tuple[str, str, str]:
-    """Return the kind, the source and the certificate name in a command key.
-
-    For `cmd/app` they are "cmd", "app" and "". For `cmd/app/laptop` they are "cmd", "app" and
-    "laptop".
-    """
+    """Return kind, source and certificate of a key such as `cmd/app/laptop`."""
     kind, _, rest = key.partition("/")
     source, _, certificate = rest.partition("/")
     return kind, source, certificate
 
 
 def identify(arrival: Arrival) -> Identity:
-    """Return the identity of a sample's sender.
+    """Return the identity of a sample's sender. Raises `DecodeError` (rmw without attachment).
 
-    The identity depends on the key of the sample:
+    - native key: the sender id in the attachment, else the session of the stamp, else the key.
+    - key of rmw_zenoh: the GID.
+    - key of a bridge: the session of the stamp, else the key.
 
-    - a native key (one of acsard's own keys): the sender id in the attachment. If there is none,
-      the identity is the session that stamped the sample, or else the key.
-    - a key of rmw_zenoh: the GID.
-    - a key of a bridge: the session that stamped the sample, or else the key.
-
-    A sender id or a GID belongs to one program. Several programs may share a session or a key: a
-    router or a bridge stamps the samples of all programs that connect through it. The daemon cannot
-    tell the session of a router from the session of a program.
-
-    A GID does not prove the identity. ROS discovery publishes the GIDs, so a program that may put
-    on a key of rmw_zenoh can claim any GID.
-
-    Raises `DecodeError` if a sample on a key of rmw_zenoh has no valid attachment.
+    An id or a GID belongs to one program, but a router or a bridge stamps the samples of all its
+    programs, so a session or a key may be shared. A GID proves nothing: ROS discovery publishes it.
     """
     if arrival.via == "rmw":
         rmw = unpack(arrival.attachment)
@@ -367,10 +309,7 @@ def identify(arrival: Arrival) -> Identity:
 
 
 def _by_gid(gid: bytes) -> str:
-    """Return the public name of a ROS publisher.
-
-    No sender on acsard's own keys has the same public name.
-    """
+    # No sender on acsard's own keys has such a public name.
     return f"gid {public_name(gid.hex())}"
 
 
@@ -379,11 +318,9 @@ def _by_key(arrival: Arrival) -> str:
 
 
 def claimed_identity(arrival: Arrival) -> Identity:
-    """Return the identity of a sample's sender, even if the attachment of the sample is not valid.
+    """Return `identify`, even if the attachment is not valid; this raises no error.
 
-    The result equals that of `identify`, except for a sample on a key of rmw_zenoh. For such a
-    sample, only the field `sender` is set. It is "" if the attachment is too short for a GID. The
-    function never raises an error.
+    On a key of rmw_zenoh only `sender` is set, and is "" if the attachment is too short for a GID.
     """
     if arrival.via == "rmw":
         gid = arrival.attachment[-GID_BYTES:]
@@ -412,17 +349,11 @@ def _twist_payload(arrival: Arrival) -> _TwistPayload:
 
 
 def caller_name(via: Via, attachment: bytes, stamped_by: str = "") -> str:
-    """Return the name that the log shows for a program that called a service or sent a stop.
+    """Return the name in the log of a program that called a service or sent a stop.
 
-    The name has a suffix in brackets, which begins with the transport `via`:
-
-    - native: the public name of the sender id in `attachment`. Without a sender id the name is
-      "unnamed". The brackets then also contain the public name of `stamped_by`, the Zenoh session
-      that stamped the sample, if `stamped_by` is not "".
-    - rmw: "unnamed". The brackets also contain the GID of the client.
-    - bridge: "unnamed".
-
-    The name is only a claim of the program: Zenoh does not say on which connection a query arrived.
+    It is the public name of the sender id or "unnamed", with brackets that begin with the
+    transport. Without an id they also have the session of the stamp (native) or the GID (rmw). It
+    is only a claim: Zenoh does not say on which connection a query arrived.
     """
     if via == "rmw":
         return f"unnamed (rmw {attachment[-GID_BYTES:].hex()})"

@@ -1,11 +1,8 @@
 """Decodes samples on the key `imu` into turn rates about the z axis of base_link, or refuses them.
 
-A sample is a sensor_msgs/Imu in any encoding. In JSON and msgpack only `angular_velocity` is
-required. The z axis points up, so a turn to the left is positive.
-
-The daemon uses the samples of only one gyro. If this gyro is silent, the daemon may use another
-gyro. The first sample of the new gyro is marked (`GyroSample.anew`). The odometry then forgets the
-bias of the old gyro, because two gyros have different biases.
+A sample is a sensor_msgs/Imu, of which JSON and msgpack need only `angular_velocity`. z points up,
+so left is positive. Only one gyro is used. After its silence another one may be, whose first sample
+is marked (`GyroSample.anew`), so that the bias of the old one is forgotten.
 """
 
 from __future__ import annotations
@@ -20,22 +17,17 @@ from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, claimed_id
 from acsard.core.messages.encodings import DecodeError, Decoder, decode_cdr, detect
 from acsard.core.messages.schema import Covariance3, Header, Imu, Quaternion, Vector3
 from acsard.core.messages.signature import public_name
-from acsard.core.values import NS_PER_S, Event, GyroSample
+from acsard.core.values import NS_PER_S, Event, GyroSample, Ns
 
-MAX_RATE = 50.0
-"""Largest turn rate that is accepted, rad/s. No robot turns that fast."""
+MAX_RATE = 50.0  # rad/s; no robot turns that fast
 
-SILENCE_TIMEOUT_NS = NS_PER_S // 2
-"""Time without a sample of the gyro in use after which the daemon may use another gyro, ns."""
+SILENCE_TIMEOUT_NS = NS_PER_S // 2  # of the gyro in use, after which another one may be used
 
-SIMULATOR_SENDER = "gyro of the simulator/own"
-"""Sender id that the built-in simulator puts on the samples of its simulated gyro."""
+SIMULATOR_SENDER = "gyro of the simulator/own"  # of the built-in simulator's gyro
 
-MAX_NAME_LENGTH = 64
-"""Number of characters after which a sender's name is cut off in an error message."""
+MAX_NAME_LENGTH = 64  # characters of a sender's name in a text
 
-UNKNOWN_COVARIANCE = [0.0] * 9
-"""Covariance to use if a sample contains none. In sensor_msgs/Imu, zeros mean "unknown"."""
+UNKNOWN_COVARIANCE = [0.0] * 9  # zeros mean "unknown" in sensor_msgs/Imu
 
 
 class _Reading(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -52,16 +44,10 @@ _readings = Decoder(_Reading)
 
 
 class GyroFollower:
-    """Decoder for the samples of one gyro on the bus.
-
-    While this gyro sends, the samples of all other gyros are refused.
-    """
+    """Decodes the samples of one gyro; while it sends, those of others are refused."""
 
     def __init__(self, own: bool = False) -> None:
-        """Start without a gyro in use.
-
-        If `own` is true, accept only the simulated gyro of the built-in simulator of this daemon.
-        """
+        # `own`: accept only the gyro of this daemon's simulator.
         self._own = own
         self._followed = public_name(SIMULATOR_SENDER) if own else None
         self._heard_ns = -SILENCE_TIMEOUT_NS
@@ -69,10 +55,7 @@ class GyroFollower:
     def receive(
         self, arrival: Arrival, counters: MutableMapping[str, int], events: list[Event]
     ) -> GyroSample | None:
-        """Return the turn rate in a sample, or None if the sample is refused.
-
-        A refusal is counted in `counters` and reported in `events`.
-        """
+        """Return the turn rate in a sample, or None if it is refused, which is counted."""
         try:
             sample = reading(arrival)
             changed = self._follow(claimed_identity(arrival).sender, arrival.arrived_ns)
@@ -82,11 +65,8 @@ class GyroFollower:
             return None
         return replace(sample, anew=True) if changed else sample
 
-    def _follow(self, sender: str, now_ns: int) -> bool:
-        """Use the gyro of the sender `sender`. Return True if another gyro was used before.
-
-        Raises `DecodeError` while another gyro sends, or if only the simulated gyro is allowed.
-        """
+    def _follow(self, sender: str, now_ns: Ns) -> bool:
+        # True: another gyro was used before. Raises `DecodeError` while another gyro sends.
         other = sender != self._followed
         if other and (self._own or now_ns - self._heard_ns < SILENCE_TIMEOUT_NS):
             raise DecodeError(
@@ -104,7 +84,7 @@ def _named(sender: str | None) -> str:
 
 
 def reading(arrival: Arrival) -> GyroSample:
-    """Return the turn rate in a sample. Raises `DecodeError` if the sample is not valid."""
+    """Return the turn rate in a sample. Raises `DecodeError`."""
     if not arrival.put:
         raise DecodeError("not_a_put", "a DELETE is not a sample: send a PUT")
     if len(arrival.payload) > MAX_COMMAND_BYTES:

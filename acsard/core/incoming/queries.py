@@ -1,7 +1,7 @@
 """Answers queries from the bus, or turns them into a `Request` to the robot if they call a service.
 
-A query calls a service only if it names exactly the key of the service: a get on `<id>/**` must
-never stop the robot or clear a latch. All other keys may also be queried with a wildcard.
+Only a query for exactly its key calls a service: a get on `<id>/**` must never stop the robot or
+clear a latch. Other keys may be queried with a wildcard.
 """
 
 from __future__ import annotations
@@ -58,13 +58,11 @@ from acsard.core.ros.parameters import (
 )
 from acsard.core.ros.shapes import Trigger
 from acsard.core.ros.transports import PARAMETERS_PREFIX, left_out
-from acsard.core.values import ROLES, Answer, Outputs, Request, Verb
+from acsard.core.values import ROLES, Answer, Ns, Outputs, Request, Verb, WallNs
 
 Current = Callable[[str], Message | None]
 
-MAX_WILDCARD_LENGTH = 512
-"""Largest number of characters of a key expression with a wildcard. No key is that long, and a
-longer expression would delay the control loop."""
+MAX_WILDCARD_LENGTH = 512  # of a wildcard: no key is longer, and it would delay the control loop
 
 BUSY = "busy: too many queries at once; ask again"
 
@@ -72,21 +70,13 @@ BUSY = "busy: too many queries at once; ask again"
 class Query(Struct, frozen=True):
     """A query as Zenoh delivered it."""
 
-    ticket: int
-    """Number of the query. Each reply to the query has the same number."""
-    topic: str
-    """The daemon's key that the query matches, such as "state" or "srv/stop". For all JSON schemas,
-    it is "schema/<Type>"."""
-    asked: str
-    """The key expression of the query. If it begins with exactly `acsard/<id>/`, this prefix is
-    removed."""
-    fmt: str
-    """The parameter `fmt` of the query, which names the encoding of the reply; "" if it is
-    absent."""
+    ticket: int  # number, which each reply has
+    topic: str  # the daemon's key that matches, or "schema/<Type>"
+    asked: str  # key expression, without exactly `acsard/<id>/`
+    fmt: str  # parameter for the encoding of the reply
     payload: bytes
     encoding: str
-    arrived_ns: int | None = None
-    """Monotonic time of arrival, ns."""
+    arrived_ns: Ns | None = None  # arrival
     via: Via = "native"
     attachment: bytes = b""
 
@@ -98,28 +88,20 @@ class Reply(Struct, frozen=True):
     key: str
     payload: bytes
     encoding: str
-    ok: bool = True
-    """False for an error reply of Zenoh."""
+    ok: bool = True  # False: an error reply of Zenoh
     attachment: bytes = b""
 
 
 class _Waiting(Struct, frozen=True):
-    """A service call that waits for the answer of the robot."""
-
+    # A service call that waits for the answer of the robot.
     key: str
-    form: Format
-    """Encoding of the reply."""
-    asked: Attachment | None
-    """Attachment of a call over rmw_zenoh, from which the attachment of the reply is made. None for
-    other calls."""
-    wish: bytes = b""
-    """Payload of a ROS request to set parameters, from which the reply is built. b"" for other
-    calls."""
+    form: Format  # of the reply
+    asked: Attachment | None  # of rmw_zenoh, for the reply's attachment
+    wish: bytes = b""  # ROS request to set parameters, for the reply
 
 
 class Queries:
-    """Answers queries with constants or with the newest messages, and turns service calls into
-    requests."""
+    """Answers queries by constants or the newest messages; makes requests of service calls."""
 
     def __init__(self, config: Config, info: Info) -> None:
         self._config = config
@@ -132,7 +114,7 @@ class Queries:
         self._waiting: dict[int, _Waiting] = {}
 
     def use(self, config: Config) -> None:
-        """Answer queries with the configuration `config` from now on."""
+        """Answer queries with other settings from now on."""
         self._config = config
         self._fixed["config"] = effective(config)
         self._parameters = Parameters(effective(config))
@@ -140,12 +122,9 @@ class Queries:
     def serve(
         self, query: Query, current: Current, outputs: Outputs | None
     ) -> list[Reply] | Request:
-        """Return the replies to a query, or a `Request` to the robot if the query calls a service.
+        """Return the replies to a query (maybe none), or the `Request` of a service call.
 
-        The list of replies is empty if the daemon has no value for the query. `current` is a
-        function that returns the present message of a published key. `outputs` are the outputs of
-        the robot's last step, or None before the first step. Raises `DecodeError` for a ROS request
-        that cannot be served. The caller then sends the reply that `refused` builds.
+        Raises `DecodeError` for a ROS request, which the caller answers with `refused`.
         """
         if query.via != "native":
             return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
@@ -161,12 +140,8 @@ class Queries:
             words = str(error).encode()
             return [Reply(query.ticket, query.topic, words, "text/plain", ok=False)]
 
-    def answered(self, answer: Answer, wall_ns: int) -> Reply | None:
-        """Return the reply that contains the robot's answer to a service call.
-
-        The result is None if no service call waits for this answer. `wall_ns` is the time of the
-        reply by the wall clock, ns since 1970.
-        """
+    def answered(self, answer: Answer, wall_ns: WallNs) -> Reply | None:
+        """Return the reply with the robot's answer to a service call, or None if none waits."""
         waiting = self._waiting.pop(answer.id, None)
         if waiting is None:
             return None
@@ -179,7 +154,7 @@ class Queries:
         attachment = _echo(waiting.asked, wall_ns)
         return Reply(answer.id, key, payload, encoding_name(form, name), attachment=attachment)
 
-    def _ros(self, query: Query, wall_ns: int) -> list[Reply] | Request:
+    def _ros(self, query: Query, wall_ns: WallNs) -> list[Reply] | Request:
         asked = unpack(query.attachment) if query.via == "rmw" else None
         by = caller_name(query.via, query.attachment)
         verb = VERBS.get(query.topic)
@@ -239,7 +214,7 @@ class Queries:
         return [] if value is None else [(topic, type(value).__name__, value)]
 
     def _matches(self, query: Query, key: str) -> bool:
-        """Return whether a query asks for `key`, which lacks the prefix `acsard/<id>/`."""
+        # `key` is without `acsard/<id>/`.
         if "*" not in query.asked:
             return query.asked == key
         if len(query.asked) > MAX_WILDCARD_LENGTH:
@@ -249,9 +224,9 @@ class Queries:
 
 
 def includes(expression: str, key: str) -> bool:
-    """Return whether a Zenoh key expression matches a key.
+    """Return whether a Zenoh key expression matches a key, without backtracking.
 
-    The function does not backtrack, so no expression takes a long time.
+    So no expression takes a long time.
     """
     chunks = key.split("/")
     reached = {0}
@@ -266,11 +241,7 @@ def includes(expression: str, key: str) -> bool:
 
 
 def _fits(pattern: str, chunk: str) -> bool:
-    """Return whether `pattern` matches `chunk`.
-
-    `chunk` is a part of a key between two slashes. `pattern` is a part of a key expression between
-    two slashes, in which `$*` stands for any text.
-    """
+    # Both are between two slashes; `$*` stands for any text.
     if pattern == "*":
         return True
     first, *middle = pattern.split("$*")
@@ -288,12 +259,11 @@ def _fits(pattern: str, chunk: str) -> bool:
     return chunk.endswith(last) and at <= len(chunk) - len(last)
 
 
-def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
-    """Return the reply that refuses a query, or None if the client could not read any reply.
+def refused(query: Query, why: str, wall_ns: WallNs) -> Reply | None:
+    """Return the reply that refuses a query, or None if the client could not read any.
 
-    `why` is the reason, in words. `wall_ns` is the time of the reply by the wall clock, ns since
-    1970. A ROS client does not receive error replies of Zenoh. Therefore it gets a normal response,
-    which says that the call failed.
+    A ROS client receives no error replies of Zenoh, so it gets a response that says that the call
+    failed.
     """
     if query.via == "native":
         return Reply(query.ticket, query.topic, why.encode(), "text/plain", ok=False)
@@ -310,7 +280,7 @@ def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
 
 
 def invalid_call(verb: Verb, error: DecodeError) -> ServiceReply:
-    """Return the reply to a call of the service `verb` whose payload is not valid."""
+    """Return the reply to a service call whose payload is not valid."""
     return ServiceReply(False, f"{error}; send {SERVICES[verb].example}")
 
 
@@ -325,12 +295,12 @@ def _data(answer: Answer) -> ReplyData:
 
 
 def most_bytes(topic: str) -> int:
-    """Return the largest allowed payload of a query for the key `topic`, in bytes."""
+    """Return the largest payload of a query for a key, bytes."""
     return MAX_REQUEST_BYTES if topic.startswith(PARAMETERS_PREFIX) else MAX_COMMAND_BYTES
 
 
-def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
-    """Return the attachment by which rmw_zenoh matches a reply with its request."""
+def _echo(asked: Attachment | None, wall_ns: WallNs) -> bytes:
+    # rmw_zenoh matches a reply with its request by this.
     return b"" if asked is None else Attachment(asked.sequence, wall_ns, asked.gid).pack()
 
 
@@ -351,10 +321,7 @@ def _format(query: Query) -> Format:
 
 
 def topic_table(config: Config) -> Topics:
-    """Return the list of the daemon's keys with this configuration, as full keys on the bus.
-
-    The list leaves out the published keys on which this daemon never sends a message.
-    """
+    """Return the daemon's keys, as full keys, without those on which it never sends."""
     robot, silent = config.robot.id, left_out(config)
     return Topics(
         [
@@ -366,10 +333,7 @@ def topic_table(config: Config) -> Topics:
 
 
 def interfaces(config: Config, outputs: Outputs | None) -> Interfaces:
-    """Return the command and state interfaces of the joints, named as in ros2_control.
-
-    `outputs` are the outputs of the robot's last step, or None before the first step.
-    """
+    """Return the command and state interfaces of the joints, named as in ros2_control."""
     linked = outputs is not None and outputs.linked
     claimed = outputs is not None and outputs.mode == "driving"
     joints = config.joints.as_tuple()

@@ -12,8 +12,7 @@ from acsard.core.messages.keys_and_roles import SPEED_LIMIT
 from acsard.core.messages.schema import Header, SpeedLimit
 from acsard.core.values import SpeedCap
 
-NO_LIMIT_VALUE = 0.0
-"""Value of nav2_msgs/SpeedLimit that means "no limit", in m/s and in %."""
+NO_LIMIT_VALUE = 0.0  # of nav2_msgs/SpeedLimit, in m/s and in %
 
 
 class _Payload(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -26,10 +25,7 @@ _decoder = Decoder(_Payload)
 
 
 def decode_limit(arrival: Arrival, configured: float) -> SpeedCap:
-    """Return the speed limit in a sample. Raise `DecodeError` if the sample is not valid.
-
-    `configured` is the configured `limits.linear_speed`, m/s. A limit in % is a share of it.
-    """
+    """Return the speed limit in a sample; % are of `configured`, m/s. Raises `DecodeError`."""
     if not arrival.put:
         raise DecodeError("not_a_put", "a DELETE is not a speed limit: send a PUT")
     if len(arrival.payload) > MAX_COMMAND_BYTES:
