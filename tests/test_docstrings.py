@@ -13,9 +13,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[1] / "acsard"
 
 # A room leaves this list when it follows the rules. No room is added.
-NOT_YET = (
-    "core/config",
-)
+NOT_YET = ("core/config",)
 
 TYPES_OF_USERS = ("core/config/settings.py", "core/messages/schema.py", "web/socket_messages.py")
 
