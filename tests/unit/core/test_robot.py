@@ -6,14 +6,12 @@ They cover the link, modes, commands, lines, answers and counters.
 from __future__ import annotations
 
 import math
-import random
 from collections import Counter
 from itertools import pairwise
 
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.codes import reason
 from acsard.core.config.settings import (
     BatteryConfig,
     CommandsConfig,
@@ -48,6 +46,7 @@ from acsard.core.values import (
     Received,
     Refusal,
     Request,
+    SpeedCap,
     Twist,
     Verb,
     WheelSpeeds,
@@ -224,7 +223,7 @@ def test_a_press_sends_a_zero_line_and_latches_a_stop_in_the_same_step() -> None
     bench.driving()
     out = bench.status(PRESSED_LINE).step(GO)
     assert (out.mode, out.line, out.speeds) == ("stopped", ZERO_LINE, STILL)
-    assert out.reason.startswith("emergency stop pressed at the robot (latched at ")
+    assert out.code == "emergency_stop"
     assert {"emergency_stop", "mode"} <= set(names(out))
     assert bench.counters()["emergency_stops"] == 1
     assert bench.robot.snapshot(bench.now_ns).estop == "pressed"
@@ -273,11 +272,7 @@ def test_a_press_that_was_released_in_the_same_read_stays_a_stop() -> None:
 def test_clear_is_refused_while_pressed_and_a_sender_needs_a_zero_after_it() -> None:
     bench = Button(PRESSED_LINE)
     bench.linked()
-    answer = bench.answer("clear")
-    assert not answer.success
-    assert answer.message == (
-        "emergency stop pressed at the robot: release it at the robot, then call srv/clear again"
-    )
+    assert not bench.answer("clear").success
     assert bench.mode() == "stopped"
     bench.status(OK_LINE).step(GO)
     assert bench.mode() == "stopped"
@@ -296,35 +291,6 @@ def test_a_clear_in_the_step_of_the_press_does_not_release_the_stop() -> None:
     assert bench.mode() == "stopped"
 
 
-@each("before", ["stopped", "fault", "inactive", "waiting", "shutdown", "ready"])
-def test_a_press_is_latched_in_every_mode(before: str) -> None:
-    bench = Button()
-    bench.linked()
-    match before:
-        case "stopped":
-            bench.step(ask="stop")
-        case "fault":
-            bench.step(guard_trip="guard_line_damaged")
-        case "inactive":
-            bench.step(ask="deactivate")
-        case "waiting":
-            bench.reply = OK_LINE
-            for _ in range(12):
-                bench.step()
-        case "shutdown":
-            bench.shutting_down = True
-            bench.step()
-    assert bench.mode() == before
-    stop_latch = bench.out.latches.stop
-    bench.reply = PRESSED_LINE if before == "waiting" else bench.status(PRESSED_LINE).reply
-    out = bench.step()
-    assert out.mode == (before if before in ("fault", "shutdown") else "stopped")
-    assert out.latches.stop is not None
-    assert out.latches.stop.why == "emergency stop pressed at the robot"
-    assert stop_latch is None or out.latches.stop.number > stop_latch.number
-    assert out.line in (None, ZERO_LINE)
-
-
 def test_an_unreported_emergency_stop_counts_as_pressed_even_without_a_port() -> None:
     bench = Button()
     bench.linked()
@@ -340,25 +306,10 @@ def test_a_required_input_that_is_not_reported_keeps_the_robot_from_ready() -> N
     bench.linked()
     out = bench.step(GO)
     assert (out.mode, out.link, out.line) == ("waiting", "up", ZERO_LINE)
-    assert out.reason == (
-        'safety.estop = "required", but the microcontroller has not reported an emergency-stop '
-        "input: does its firmware send status lines with `estop=`?"
-    )
+    assert out.code == "emergency_stop_missing"
     assert bench.status(OK_LINE).step().mode == "ready"
     bench.step(REST)
     assert bench.step(GO).mode == "driving"
-
-
-def test_a_restarted_daemon_starts_with_the_latch_of_the_press() -> None:
-    bench = Button(PRESSED_LINE)
-    latches = bench.linked().out.latches.after_restart()
-    after = Bench(latches=latches).linked()
-    assert after.mode() == "stopped"
-    assert after.out.reason.startswith("emergency stop pressed at the robot (latched at ")
-    assert after.out.reason.endswith(
-        "before the restart); wait until the board has reported its emergency stop, "
-        "then call srv/clear"
-    )
 
 
 def test_wheels_that_roll_without_power_cause_no_fault() -> None:
@@ -400,10 +351,7 @@ def test_a_board_that_sends_only_status_lines_is_diagnosed() -> None:
     bench.reply = OK_LINE
     for _ in range(400):
         bench.step()
-    assert bench.out.reason == (
-        "no link to the microcontroller: only status lines were received; is TX of this computer "
-        "connected to RX of the board? `acsard mcu check` finds out more"
-    )
+    assert bench.out.code == "received_statuses"
 
 
 def test_a_checked_link_takes_no_status_line_without_a_checksum() -> None:
@@ -428,16 +376,14 @@ def test_a_bumper_stops_the_robot_immediately_until_a_clear_after_the_release() 
     bench.driving()
     out = bench.status(FRONT).step(GO)
     assert (out.mode, out.line, out.speeds) == ("stopped", ZERO_LINE, STILL)
-    assert out.reason.startswith("bumper 1 pressed (latched at ")
-    assert out.reason.endswith("; release it at the robot, then call srv/clear")
+    assert out.code == "bumper"
     assert {"bumper_pressed", "mode"} <= set(names(out))
     assert bench.counters()["bumper_presses"] == 1
     snapshot = bench.robot.snapshot(bench.now_ns)
     assert snapshot.bumpers == (True, False)
     assert snapshot.bumper is not None
     assert snapshot.bumper.code == "bumper"
-    answer = bench.answer("clear")
-    assert answer.message == "bumper 1 pressed: release it at the robot, then call srv/clear again"
+    assert not bench.answer("clear").success
     bench.status(FREE).step(GO)
     assert bench.mode() == "stopped"
     assert bench.answer("clear").success
@@ -451,9 +397,7 @@ def test_a_bumper_that_limits_stops_the_robot_and_each_sender_must_send_a_zero()
     bench.driving()
     out = bench.status(FRONT).step(GO)
     assert (out.mode, out.line, out.latches.in_force) == ("ready", ZERO_LINE, None)
-    assert out.reason.startswith(
-        "front bumper pressed: the robot drives only straight backwards, at most 0.1 m/s; "
-    )
+    assert out.code == "bumper_away"
     for _ in range(50):
         assert bench.step(BACK).line == ZERO_LINE
     bench.step(REST)
@@ -462,10 +406,7 @@ def test_a_bumper_that_limits_stops_the_robot_and_each_sender_must_send_a_zero()
         assert -0.1 <= out.applied.linear < 0.0
         assert out.applied.angular == 0.0
     assert (out.mode, out.applied.linear) == ("driving", -0.1)
-    assert out.reason == (
-        "commanded by app; front bumper pressed: the robot drives only straight "
-        "backwards, at most 0.1 m/s"
-    )
+    assert out.code == "bumper_away"
 
 
 def test_a_tap_in_one_read_stops_a_robot_that_a_bumper_only_limits_and_latches_nothing() -> None:
@@ -486,7 +427,7 @@ def test_a_command_against_a_pressed_bumper_makes_its_sender_unarmed(wrong: Twis
     for _ in range(20):
         out = bench.step(wrong)
         assert (out.mode, out.line) == ("ready", ZERO_LINE)
-    assert out.reason.partition("; ")[2].startswith("send a zero first")
+    assert bench.robot.snapshot(bench.now_ns).sources[1].waits_for.what == "neutral"
     # The release lets nobody drive who pushed against the obstacle.
     bench.status(FREE)
     for _ in range(20):
@@ -504,7 +445,7 @@ def test_a_retreat_goes_on_after_the_release_without_its_limits() -> None:
     for _ in range(100):
         out = bench.step(BACK)
     assert (out.mode, out.applied) == ("driving", BACK)
-    assert out.reason == "commanded by app"
+    assert out.code == "commanded"
 
 
 def test_a_press_of_the_bumper_in_the_direction_of_the_retreat_ends_the_retreat() -> None:
@@ -552,7 +493,7 @@ def test_silent_bumpers_latch_a_stop_also_if_a_press_would_only_limit() -> None:
     for _ in range(51):
         out = bench.step(GO)
     assert out.mode == "stopped"
-    assert out.reason.startswith("the board has not reported its bumpers for 0.5 s, so they")
+    assert out.code == "bumpers_silent"
     assert bench.robot.snapshot(bench.now_ns).bumpers == (True, True)
 
 
@@ -561,21 +502,9 @@ def test_bumpers_with_places_that_are_not_reported_keep_the_robot_from_ready() -
     bench = Button(b"", config)
     out = bench.linked().step(GO)
     assert (out.mode, out.link, out.line) == ("waiting", "up", ZERO_LINE)
-    assert out.reason.startswith('safety.estop = "required"')
-    bench.status(OK_LINE).step()
-    assert bench.out.reason == (
-        "safety.bumpers has 2 places, but the microcontroller has not reported 2 bumpers: does its "
-        "firmware send status lines with `bumpers=..`?"
-    )
+    assert out.code == "emergency_stop_missing"
+    assert bench.status(OK_LINE).step().code == "bumpers_missing"
     assert bench.status(OK_LINE + FREE).step().mode == "ready"
-
-
-def test_the_emergency_stop_is_named_before_a_bumper() -> None:
-    bench = Button(PRESSED_LINE + FRONT)
-    bench.linked()
-    assert bench.answer("clear").message.startswith("emergency stop pressed at the robot: ")
-    bench.status(OK_LINE + FRONT).step()
-    assert bench.answer("clear").message.startswith("bumper 1 pressed: ")
 
 
 # the motor drivers
@@ -587,11 +516,7 @@ def test_a_motor_drivers_fault_is_latched_until_a_clear_after_its_end() -> None:
     bench = Button(DRIVER_OK)
     bench.driving()
     out = bench.status(DRIVER_FAULT).step(GO)
-    assert out.mode == "fault"
-    assert out.reason.startswith("the board reports a fault of a motor driver, latched at ")
-    assert out.reason.endswith(
-        "; repair the driver, or switch the robot off and on, then call srv/clear"
-    )
+    assert (out.mode, out.code) == ("fault", "driver_fault")
     assert not bench.answer("clear").success
     bench.status(DRIVER_OK).step(GO)
     assert bench.mode() == "fault"
@@ -616,14 +541,6 @@ def test_a_clear_in_the_step_of_a_repeated_guard_trip_does_not_release_the_fault
     (answer,) = bench.step(guard_trip="guard_line_damaged", ask="clear").answers
     assert not answer.success
     assert bench.mode() == "fault"
-    assert bench.answer("clear").success
-
-
-def test_a_motor_driver_without_power_after_a_press_causes_no_fault() -> None:
-    bench = Button(PRESSED_LINE + DRIVER_FAULT)
-    bench.linked()
-    assert bench.mode() == "stopped"
-    bench.status(OK_LINE + DRIVER_OK).step()
     assert bench.answer("clear").success
 
 
@@ -669,9 +586,7 @@ def test_drivers_without_power_after_a_press_block_the_clear_until_they_recover(
         bench.linked()
     bench.status(OK_LINE + DRIVER_OK).step()
     assert bench.status(OK_LINE + DRIVER_FAULT).step().mode == "stopped"
-    refused = bench.answer("clear")
-    assert not refused.success
-    assert "motor driver" in refused.message
+    assert not bench.answer("clear").success
     bench.status(OK_LINE + DRIVER_OK).step()
     assert bench.answer("clear").success
     assert bench.status(OK_LINE + DRIVER_FAULT).step().mode == "fault"
@@ -789,9 +704,9 @@ def test_each_board_must_report_a_required_input_before_the_robot_is_ready() -> 
     assert bench.mode() == "ready"
     replugged(bench, b"", closed_steps=3)
     out = bench.step()
-    assert (out.mode, out.link, out.reason[:14]) == ("waiting", "up", "safety.estop =")
+    assert (out.mode, out.link, out.code) == ("waiting", "up", "emergency_stop_missing")
     out = bench.status(OK_LINE).step()
-    assert (out.mode, out.link, out.reason[:14]) == ("waiting", "up", "safety.bumpers")
+    assert (out.mode, out.link, out.code) == ("waiting", "up", "bumpers_missing")
     # A board with another number of bumpers is refused, also behind a board with the right one.
     for _ in range(400):
         assert bench.status(b"!status estop=ok bumpers=..\r\n").step().mode != "ready"
@@ -860,8 +775,7 @@ def test_an_empty_battery_ramps_to_rest_and_is_latched() -> None:
     assert before - speeds[0] == pytest.approx(drop)
     assert all(a - b <= drop + 1e-9 for a, b in pairwise(speeds))
     assert speeds[-1] == 0.0
-    assert bench.out.reason.startswith("battery below battery.stop_below = 21 V (latched at ")
-    assert bench.out.reason.endswith("; charge the battery to 21.5 V, then call srv/clear")
+    assert bench.out.code == "battery_empty"
 
 
 def test_each_new_level_is_an_event_and_a_change_of_the_status() -> None:
@@ -886,12 +800,7 @@ def test_clear_is_refused_while_the_battery_is_low_and_works_above_the_hysteresi
     for _ in range(400):
         bench.step()
     assert bench.mode() == "stopped"
-    answer = bench.answer("clear")
-    assert (answer.success, answer.message) == (
-        False,
-        "battery below battery.stop_below = 21 V: charge the battery to 21.5 V, then call "
-        "srv/clear again",
-    )
+    assert not bench.answer("clear").success
     bench.status(FULL_LINE)
     for _ in range(1000):
         bench.step(GO)
@@ -903,60 +812,22 @@ def test_clear_is_refused_while_the_battery_is_low_and_works_above_the_hysteresi
     assert bench.step(GO).mode == "driving"
 
 
-def test_a_pressed_button_is_named_before_an_empty_battery() -> None:
-    bench = Button(b"!status estop=pressed volts=19.00\r\n", GUARDED)
-    for _ in range(400):
-        bench.step()
-    assert bench.answer("clear").message.startswith("emergency stop pressed at the robot: ")
-    bench.status(b"!status estop=ok volts=19.00\r\n").step()
-    assert bench.answer("clear").message.startswith("battery below battery.stop_below = 21 V: ")
-
-
-def test_a_silent_battery_does_not_stop_a_driving_robot() -> None:
-    bench = Button(FULL_LINE, GUARDED)
-    bench.driving(steps=500)
-    bench.status(b"")
-    for _ in range(700):
-        assert bench.step(GO).mode == "driving"
-    battery = bench.robot.snapshot(bench.now_ns).battery
-    assert battery == BatteryStatus("unknown")
-
-
-def test_a_restarted_daemon_keeps_the_stop_until_the_battery_report_or_its_timeout() -> None:
-    bench = Button(EMPTY_LINE, GUARDED)
+@each("line", [PRESSED_LINE, OK_LINE + DRIVER_FAULT, b"!status bumpers=.X\r\n", EMPTY_LINE])
+def test_a_restarted_daemon_refuses_clear_until_the_board_has_reported_the_cause(
+    line: bytes,
+) -> None:
+    bench = Button(line, GUARDED).linked()
     for _ in range(400):
         bench.step()
     latches = bench.out.latches.after_restart()
-    after = Bench(GUARDED, latches=latches).linked()
-    assert after.mode() == "stopped"
-    assert after.out.reason.startswith("battery below battery.stop_below = 21 V (latched at ")
-    assert "wait until the board has reported its battery" in after.answer("clear").message
-    # Without a report for 3 s, `clear` is allowed.
-    for _ in range(310):
-        after.step()
-    assert after.answer("clear").success
-
-
-@each(
-    ("line", "words"),
-    [
-        (PRESSED_LINE, "its emergency stop"),
-        (OK_LINE + DRIVER_FAULT, "its motor drivers"),
-        (b"!status bumpers=.X\r\n", "its bumpers"),
-    ],
-)
-def test_a_restarted_daemon_refuses_clear_until_the_board_has_reported_the_cause(
-    line: bytes, words: str
-) -> None:
-    bench = Button(line)
-    latches = bench.linked().out.latches.after_restart()
-    after = Button(b"", latches=latches)
+    assert latches.next is not None
+    after = Button(b"", GUARDED, latches)
     after.linked()
-    refused = after.answer("clear")
-    assert not refused.success
-    assert f"wait until the board has reported {words}" in refused.message
-    after.status(b"!status estop=ok driver=ok bumpers=..\r\n")
-    for _ in range(3):  # a new number of bumpers counts from its second line on
+    assert (after.out.latches, after.out.code) == (latches, latches.next.code)
+    assert not after.answer("clear").success
+    after.status(b"!status estop=ok driver=ok bumpers=.. volts=24.00\r\n")
+    # A new number of bumpers counts from its second line on, a voltage after 3 s.
+    for _ in range(310 if line == EMPTY_LINE else 3):
         after.step()
     assert after.answer("clear").success
 
@@ -974,7 +845,7 @@ def test_a_restarted_daemon_allows_clear_after_3_s_without_a_report() -> None:
 def test_without_a_port_the_robot_waits_and_reports_the_reason() -> None:
     out = Bench().out
     assert (out.mode, out.link, out.linked) == ("waiting", "down", False)
-    assert out.reason == "the serial port is closed; it is being reopened"
+    assert out.code == "port_closed"
 
 
 def test_after_the_port_opens_three_good_lines_make_the_robot_ready() -> None:
@@ -985,34 +856,6 @@ def test_after_the_port_opens_three_good_lines_make_the_robot_ready() -> None:
         states.append((out.mode, out.link, out.linked))
     booting = ("waiting", "booting", False)
     assert states == [booting, booting, ("ready", "up", True), ("ready", "up", True)]
-
-
-def test_each_change_of_the_link_is_one_event() -> None:
-    def levels(outputs: Outputs) -> dict[str, str]:
-        return {event.name: event.level for event in outputs.events}
-
-    bench = Bench()
-    assert levels(bench.step()) == {"link_booting": "info"}
-    assert levels(bench.step()) == {}
-    assert levels(bench.step()) == {"link_up": "info", "mode": "info"}
-    bench.reply = None
-    for _ in range(10):
-        bench.step()
-    assert levels(bench.step()) == {"link_stale": "warning", "mode": "info"}
-    assert levels(bench.unplug().step()) == {"link_down": "warning"}
-    assert levels(bench.step()) == {}
-
-
-def test_every_feedback_line_is_an_estimate_with_its_own_stamp() -> None:
-    bench = Bench().linked()
-    bench.reply = bench.codec.encode(ROLLING) * 2
-    first, second = bench.step(tick=False).estimates
-    wire_ns = 33 * 10 * NS_PER_S // 115200
-    assert (first.heard_ns, second.heard_ns) == (bench.now_ns - wire_ns, bench.now_ns)
-    assert second.at.mono_ns == bench.now_ns - wire_ns
-    # Their period is not known yet, so they share the time since the line before.
-    assert first.at.mono_ns == second.at.mono_ns - 5_000_000
-    assert first.speeds == second.speeds == ROLLING
 
 
 def test_a_step_without_a_tick_uses_feedback_and_sends_no_line() -> None:
@@ -1056,8 +899,7 @@ def test_a_commander_that_never_sent_a_zero_does_not_drive() -> None:
     for _ in range(100):
         assert bench.step(GO).applied == REST
     assert bench.mode() == "ready"
-    assert bench.out.reason.startswith("send a zero first: app must send a zero")
-    assert bench.out.source == "app"
+    assert (bench.out.code, bench.out.source) == ("neutral", "app")
 
 
 @pytest.mark.parametrize("angular", [0.0, 1.0])
@@ -1067,31 +909,16 @@ def test_the_reason_says_that_a_robot_with_the_limits_0_cannot_move(angular: flo
     bench.step(REST)
     out = bench.step(GO)
     assert (out.mode, out.applied.linear) == ("driving", 0.0)
-    assert ("limits.linear_speed and limits.angular_speed are 0" in out.reason) == (not angular)
+    assert out.code == ("commanded" if angular else "limits_zero")
 
 
 def test_after_a_zero_a_command_drives() -> None:
     bench = Bench().linked()
     bench.step(REST)
     out = bench.step(GO)
-    assert (out.mode, out.reason) == ("driving", "commanded by app")
+    assert (out.mode, out.code) == ("driving", "commanded")
     assert (out.source, out.command_ns) == ("app", bench.now_ns)
     assert out.applied.linear == pytest.approx(0.01)
-
-
-def test_without_neutral_first_the_first_command_drives() -> None:
-    bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).linked()
-    bench.step(GO)
-    assert bench.mode() == "driving"
-
-
-def test_the_speed_grows_by_the_acceleration_up_to_the_command() -> None:
-    bench = Bench().linked()
-    bench.step(REST)
-    for step in range(1, 61):
-        out = bench.step(GO)
-        assert out.applied.linear == pytest.approx(min(0.01 * step, 0.5))
-    assert out.applied == GO
 
 
 def test_the_line_has_the_wheel_speeds_of_the_applied_twist() -> None:
@@ -1100,11 +927,6 @@ def test_the_line_has_the_wheel_speeds_of_the_applied_twist() -> None:
     assert bench.out.line == b"ap09.00,bp03.00,cp03.00,dp09.00\r\n"
     assert bench.out.applied == Twist(0.3, 1.0)
     assert bench.out.speeds.as_tuple() == pytest.approx((9.0, 3.0, 3.0, 9.0))
-
-
-def test_the_line_is_written_in_the_configured_dialect() -> None:
-    bench = Bench(Config(mcu=McuConfig(trailing_comma=True))).driving()
-    assert bench.out.line == b"ap10.00,bp10.00,cp10.00,dp10.00,\r\n"
 
 
 def test_a_silent_commander_is_followed_until_its_timeout_and_then_ramped_to_zero() -> None:
@@ -1117,15 +939,7 @@ def test_a_silent_commander_is_followed_until_its_timeout_and_then_ramped_to_zer
         assert out.mode == "ready"
     assert out.applied == REST
     assert out.line == ZERO_LINE
-    assert out.reason.startswith("waiting for a command")
-
-
-def test_a_commander_that_returns_after_its_timeout_accelerates_from_the_present_speed() -> None:
-    bench = Bench().driving()
-    for _ in range(35):
-        bench.step()
-    left = bench.out.applied.linear
-    assert bench.step(GO).applied.linear == pytest.approx(left + 0.01)
+    assert out.code == "no_command"
 
 
 def test_commands_are_counted_and_refusals_are_counted_by_reason() -> None:
@@ -1140,17 +954,6 @@ def test_commands_are_counted_and_refusals_are_counted_by_reason() -> None:
     assert counters["command_unknown_source"] == 1
     assert counters["command_malformed"] == 2
     assert counters["command_wildcard"] == 1
-
-
-def test_the_last_refusal_is_shown_as_text() -> None:
-    bench = Bench().linked()
-    assert bench.robot.snapshot(bench.now_ns).refused == ""
-    bench.step(refusals=(Refusal("wildcard", "cmd/**: no wildcards"),))
-    assert bench.robot.snapshot(bench.now_ns).refused == "cmd/**: no wildcards"
-    bench.step(REST, source="stranger")
-    bench.step(REST)
-    refused = bench.robot.snapshot(bench.now_ns).refused
-    assert refused == "source stranger: this source is not in commands.sources"
 
 
 def test_lines_and_rejects_by_reason_are_counted_and_zero_counters_are_left_out() -> None:
@@ -1171,16 +974,6 @@ def test_commands_are_accepted_in_a_step_without_a_tick() -> None:
     assert bench.mode() == "driving"
 
 
-def test_the_higher_source_drives_and_the_snapshot_names_it_to_the_lower_source() -> None:
-    bench = Bench().driving()
-    bench.step(REST, source="teleop")
-    assert bench.step(GO).source == "teleop"
-    snapshot = bench.robot.snapshot(bench.now_ns)
-    waits = {source.name: source.waits_for.what for source in snapshot.sources}
-    assert waits["app"] == "higher"
-    assert waits["teleop"] == "nothing"
-
-
 # a lost link
 
 
@@ -1198,15 +991,6 @@ def test_a_lost_port_clears_every_command() -> None:
     assert {source.age_s for source in sources} == {None}
 
 
-def test_a_source_that_commands_while_the_port_is_closed_is_shown() -> None:
-    bench = Bench().linked().unplug()
-    bench.step()
-    bench.step(GO)
-    bench.step(ms=100)
-    ages = {s.name: s.age_s for s in bench.robot.snapshot(bench.now_ns).sources}
-    assert ages["app"] == 0.1
-
-
 def test_without_neutral_first_no_source_waits_for_a_zero_before_the_port_opens() -> None:
     bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).unplug()
     bench.opened = 0  # the port was never open
@@ -1222,7 +1006,7 @@ def test_a_silent_mcu_makes_the_link_stale_and_the_speed_zero() -> None:
         assert bench.step(GO).applied == GO
     out = bench.step(GO)
     assert (out.applied, out.link, out.mode) == (REST, "stale", "waiting")
-    assert out.reason.startswith("the built-in simulator is silent because of a fault")
+    assert out.code == "simulator_fault"
 
 
 def test_without_feedback_only_zero_lines_go_out_ten_times_a_second() -> None:
@@ -1268,7 +1052,7 @@ def test_after_a_long_gap_each_source_must_be_neutral_again() -> None:
     bench.reply = reply
     for _ in range(20):
         assert bench.step(GO).applied == REST
-    assert bench.out.reason.startswith("send a zero first")
+    assert bench.out.code == "neutral"
     bench.let_go()
     assert bench.step(GO).mode == "driving"
 
@@ -1297,12 +1081,11 @@ def test_a_stop_brakes_by_its_own_deceleration_and_is_latched() -> None:
     answer = bench.answer("stop")
     stop = bench.robot.latches.stop
     assert stop is not None
-    assert answer == Answer(7, True, "stopped and latched; srv/clear releases it", stop.number)
+    assert (answer.success, answer.latch) == (True, stop.number)
     # 3 m/s2 is 0.03 m/s per step; 0.5 m/s take 17 steps.
     path = [bench.out.applied.linear, *(bench.step(GO).applied.linear for _ in range(17))]
     assert path == pytest.approx([max(0.5 - 0.03 * step, 0.0) for step in range(1, 19)], abs=1e-12)
-    assert bench.mode() == "stopped"
-    assert bench.out.reason == "stopped by request at 2027-01-15 08:00:50 UTC; call srv/clear"
+    assert (bench.mode(), bench.out.code) == ("stopped", "stopped")
 
 
 def test_a_stop_of_a_stopped_robot_is_an_event_because_a_clear_must_name_its_latch() -> None:
@@ -1315,38 +1098,23 @@ def test_a_stop_of_a_stopped_robot_is_an_event_because_a_clear_must_name_its_lat
 def test_a_refused_request_is_no_event() -> None:
     bench = Bench().driving()
     bench.step(ask="stop")
-    assert bench.answer("activate") == Answer(
-        7, False, "the robot is stopped: call srv/clear first"
-    )
+    assert not bench.answer("activate").success
     assert names(bench.out) == []
 
 
 def test_a_clear_without_a_latch_succeeds_and_changes_nothing() -> None:
     bench = Bench().driving()
     mode, twist = bench.mode(), bench.out.applied
-    assert bench.step(GO, ask="clear").answers == (
-        Answer(7, True, "nothing to clear: the robot is neither stopped nor in fault"),
-    )
+    (answer,) = bench.step(GO, ask="clear").answers
+    assert (answer.success, answer.latch) == (True, 0)
     assert (bench.mode(), bench.out.applied != REST, twist != REST) == (mode, True, True)
-
-
-def test_a_stop_stays_latched_after_a_lost_link() -> None:
-    bench = Bench().driving()
-    bench.step(ask="stop")
-    bench.unplug().step()
-    bench.replug()
-    for _ in range(10):
-        bench.step(REST)
-        bench.step(GO)
-    assert (bench.mode(), bench.out.applied) == ("stopped", REST)
 
 
 def test_after_clear_the_robot_is_ready_and_each_source_must_be_neutral() -> None:
     bench = Bench().driving()
     bench.step(ask="stop")
     answer = bench.answer("clear")
-    text = "cleared; each sender must send a zero before it drives"
-    assert answer == Answer(7, True, text, answer.latch)
+    assert answer.success
     assert answer.latch
     assert bench.mode() == "ready"
     for _ in range(20):
@@ -1361,14 +1129,12 @@ def test_deactivating_ramps_to_zero_by_the_normal_deceleration() -> None:
     answer = bench.answer("deactivate")
     off = bench.robot.latches.inactive
     assert off is not None
-    text = "inactive: the robot brakes to rest; call srv/activate to switch it on again"
-    assert answer == Answer(7, True, text, off.number)
+    assert (answer.success, answer.latch) == (True, off.number)
     assert bench.out.applied.linear == pytest.approx(0.49)
     for _ in range(50):
         bench.step(GO)
     assert (bench.mode(), bench.out.applied) == ("inactive", REST)
-    why = "switched off by request at 2027-01-15 08:00:50 UTC; call srv/activate"
-    assert bench.out.reason == why
+    assert bench.out.code == "switched_off"
 
 
 def test_after_an_activation_each_source_must_be_neutral() -> None:
@@ -1376,20 +1142,14 @@ def test_after_an_activation_each_source_must_be_neutral() -> None:
     bench.step(ask="deactivate")
     off = bench.robot.latches.inactive
     assert off is not None
-    assert bench.answer("activate") == Answer(7, True, "active", off.number)
+    answer = bench.answer("activate")
+    assert (answer.success, answer.latch) == (True, off.number)
     for _ in range(20):
         bench.step(GO)
     assert bench.mode() == "ready"
     bench.let_go()
     bench.step(GO)
     assert bench.mode() == "driving"
-
-
-def test_activating_an_active_robot_changes_nothing() -> None:
-    bench = Bench().driving()
-    bench.step(GO, ask="activate")
-    assert bench.mode() == "driving"
-    assert bench.step(GO).applied == GO
 
 
 def test_each_change_of_mode_by_request_is_an_event_even_in_quick_succession() -> None:
@@ -1402,24 +1162,13 @@ def test_each_change_of_mode_by_request_is_an_event_even_in_quick_succession() -
 # the pose
 
 
-def test_set_pose_sets_the_pose_of_the_next_estimate() -> None:
-    bench = Bench().linked()
-    answer = bench.answer("set_pose", Pose(1.0, 2.0, 0.5))
-    assert answer == Answer(7, True, "pose is x 1, y 2, yaw 0.5")
-    assert bench.step().estimates[-1].pose == Pose(1.0, 2.0, 0.5)
-
-
-def test_reset_odometry_sets_the_pose_to_zero() -> None:
-    bench = Bench().linked()
-    bench.step(ask="set_pose", pose=Pose(1.0, 2.0, 0.5))
-    assert bench.answer("reset_odometry") == Answer(7, True, "pose is x 0, y 0, yaw 0")
-    assert bench.step().estimates[-1].pose == Pose()
-
-
-def test_the_pose_may_be_set_while_driving_and_changes_no_motion() -> None:
+def test_set_pose_and_reset_odometry_set_the_pose_of_the_next_estimate() -> None:
     bench = Bench().driving()
-    out = bench.step(GO, ask="set_pose", pose=Pose(5.0, 5.0, 3.0))
-    assert (out.mode, out.applied) == ("driving", GO)
+    assert bench.answer("set_pose", Pose(1.0, 2.0, 0.5)).success
+    out = bench.step(GO)
+    assert (out.estimates[-1].pose, out.mode, out.applied) == (Pose(1.0, 2.0, 0.5), "driving", GO)
+    assert bench.answer("reset_odometry").success
+    assert bench.step().estimates[-1].pose == Pose()
 
 
 def test_several_requests_of_one_step_are_answered_in_order() -> None:
@@ -1443,21 +1192,6 @@ def test_a_clear_in_the_same_step_as_a_stop_does_not_release_the_stop(
     bench.now_ns += 10 * MS
     requests = tuple(Request(verb) for verb in order)
     assert bench.robot.step(Inputs(bench.now, True, True, 1, requests=requests)).mode == "stopped"
-
-
-def test_a_clear_requested_before_the_stop_was_applied_does_not_release_the_stop() -> None:
-    bench = Bench().linked()
-    asked_ns = bench.now_ns + 5 * MS
-    bench.step(ask="stop")
-    bench.now_ns += 10 * MS
-    latch = bench.robot_latch
-    late = (Request("clear", 7, asked_ns=asked_ns, latch=latch),)
-    out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=late))
-    assert (out.mode, out.answers[0].success) == ("stopped", False)
-    assert "call srv/clear again" in out.answers[0].message
-    bench.now_ns += 10 * MS
-    again = (Request("clear", 8, asked_ns=bench.now_ns, latch=latch),)
-    assert bench.robot.step(Inputs(bench.now, True, True, 1, requests=again)).answers[0].success
 
 
 def test_a_service_that_is_called_continuously_causes_one_event_per_second() -> None:
@@ -1489,26 +1223,47 @@ def test_a_stop_that_arrives_before_its_query_and_with_it_is_one_event() -> None
 def test_a_refused_command_is_reported_with_its_reason_and_its_sender() -> None:
     (event,) = Bench().linked().step(REST, source="nobody").events
     assert (event.name, event.level) == ("command_refused", "warning")
-    assert event.text == "unknown_source: source nobody: this source is not in commands.sources"
+    assert event.code == "unknown_source"
     refusal = Refusal("malformed", "cmd/app: no map", "app", "a" * 1000)
     bench = Bench().linked()
     events = [event for _ in range(150) for event in bench.step(refusals=(refusal,)).events]
     first, second = events
-    assert first.text.startswith("malformed: cmd/app")
-    assert (first.by, first.count) == ("a" * MAX_SENDER_LENGTH, 1)
-    assert second.text.startswith("100 x malformed; the last: ")
+    assert (first.code, first.by, first.count) == ("malformed", "a" * MAX_SENDER_LENGTH, 1)
+    assert (second.code, second.count) == ("malformed", 100)
 
 
 def test_missed_periods_are_reported_with_their_number() -> None:
     bench = Bench().linked()
     bench.now_ns += 50 * MS
     out = bench.robot.step(Inputs(bench.now, True, True, 1, missed=4))
-    (event,) = (event for event in out.events if event.name == "missed_periods")
-    assert (event.text, event.count) == (
-        "4 x missed: late by 0.04 s: no control step ran in 4 successive control periods",
-        4,
-    )
+    assert [(event.name, event.count) for event in out.events] == [("missed_periods", 4)]
     assert bench.counters()["missed_periods"] == 4
+
+
+def test_a_speed_limit_applies_until_it_ends_and_each_change_is_an_event() -> None:
+    bench = Bench().driving()
+
+    def cap(speed: float | None) -> list[str]:
+        bench.now_ns += 10 * MS
+        bench.out = bench.robot.step(
+            Inputs(
+                bench.now, True, True, 1, received=(Received(bench.now, bench.codec.stop),),
+                commands=(Command("app", GO, bench.now_ns),), speed_cap=SpeedCap(speed, "joe"),
+            )
+        )  # fmt: skip
+        return [event.by for event in bench.out.events if event.name == "speed_limit"]
+
+    assert cap(0.3) == ["joe"]
+    assert cap(0.3) == []
+    for _ in range(110):  # an event that comes again within a second is held back
+        assert bench.step(GO).applied.linear >= 0.3 - 1e-9
+    assert bench.out.applied.linear == pytest.approx(0.3)
+    assert "0.3 m/s" in bench.robot.snapshot(bench.now_ns).speed_limit
+    assert cap(None) == ["joe"]
+    for _ in range(60):
+        bench.step(GO)
+    assert bench.out.applied == GO
+    assert bench.robot.snapshot(bench.now_ns).speed_limit == ""
 
 
 def test_events_from_outside_the_robot_come_first_and_are_throttled() -> None:
@@ -1533,12 +1288,6 @@ def test_more_than_one_implausible_line_in_a_hundred_is_an_event() -> None:
     assert bench.out.mode == "ready"
 
 
-def test_implausible_lines_are_reported_as_rejected() -> None:
-    bench = Bench().linked()
-    bench.reply = bench.codec.encode(WheelSpeeds(99.0, 99.0, 99.0, 99.0))
-    assert names(bench.step())[0] == "lines_rejected"
-
-
 def silence(bench: Bench, speed: float) -> Bench:
     """Let the board be silent for 0.3 s. It then reports this speed for one wheel."""
     reply, bench.reply = bench.reply, None
@@ -1553,8 +1302,7 @@ def silence(bench: Bench, speed: float) -> Bench:
 def test_after_a_silence_a_line_that_the_next_one_refutes_is_rejected() -> None:
     bench = silence(Bench().linked(), 40.0)
     assert list(bench.out.estimates) == []
-    (event,) = [event for event in bench.step().events if event.name == "lines_rejected"]
-    assert event.text == "implausible: later lines contradict the speeds of this line"
+    assert names(bench.step()) == ["lines_rejected"]
     (estimate,) = bench.out.estimates
     assert (estimate.pose, estimate.speeds) == (Pose(), STILL)
     assert bench.counters()["line_implausible"] == 1
@@ -1576,10 +1324,7 @@ def test_after_a_silence_a_line_that_the_next_one_confirms_is_used_with_it() -> 
 def test_a_guard_trip_is_a_latched_fault_and_an_error_event() -> None:
     bench = Bench().driving()
     out = bench.step(GO, guard_trip="guard_too_fast")
-    assert out.mode == "fault"
-    at = "latched at 2027-01-15 08:00:50 UTC"
-    trip = reason("guard_too_fast").text
-    assert (out.code, out.reason) == ("guard_too_fast", f"{trip}, {at}; call srv/clear")
+    assert (out.mode, out.code) == ("fault", "guard_too_fast")
     event, mode = out.events
     assert (event.name, event.level) == ("fault", "error")
     assert (event.code, mode.code) == ("guard_too_fast", "guard_too_fast")
@@ -1625,10 +1370,7 @@ def test_a_third_impossible_line_is_a_fault_that_brakes_by_the_stop_deceleration
     bench = impossible(Bench().driving(), 2)
     assert (bench.mode(), bench.out.applied) == ("driving", GO)
     impossible(bench, 1)
-    assert bench.mode() == "fault"
-    assert bench.out.reason.startswith(
-        "the board reports impossible speeds (front_right at 99.00 rad/s"
-    )
+    assert (bench.mode(), bench.out.code) == ("fault", "impossible_speeds")
     # Each step removes 3 m/s2 x 10 ms.
     assert bench.out.applied.linear == pytest.approx(0.47)
     assert bench.step(GO).applied.linear == pytest.approx(0.44)
@@ -1674,16 +1416,14 @@ def test_shutting_down_ramps_to_zero_by_the_stop_deceleration_and_stays_there() 
     path = [bench.step(GO).applied.linear for _ in range(20)]
     assert path[:3] == pytest.approx([0.47, 0.44, 0.41])
     assert path[17:] == [0.0, 0.0, 0.0]
-    assert (bench.mode(), bench.out.reason) == ("shutdown", "the daemon is shutting down")
+    assert (bench.mode(), bench.out.code) == ("shutdown", "shutting_down")
 
 
 def test_shutting_down_is_one_event() -> None:
     bench = Bench().driving()
     bench.shutting_down = True
     (event,) = bench.step().events
-    assert event == Event(
-        "mode", "driving -> shutdown: the daemon is shutting down", code="shutting_down"
-    )
+    assert (event.name, event.code) == ("mode", "shutting_down")
     assert names(bench.step()) == []
 
 
@@ -1809,46 +1549,7 @@ def test_the_status_changes_with_mode_reason_link_and_source_and_not_otherwise()
     assert bench.step(ask="stop").status_changed
 
 
-def test_the_outputs_carry_the_time_of_the_step() -> None:
-    bench = Bench()
-    assert bench.step().now == bench.now
-
-
 # determinism
-
-
-def random_walk(seed: int) -> list[Outputs]:
-    """Run two hundred steps with random events."""
-    rng = random.Random(seed)
-    bench = Bench(
-        Config(commands=CommandsConfig(sources=(Source("app", 50), Source("teleop", 100))))
-    )
-    outputs = []
-    for _ in range(200):
-        bench.reply = rng.choice((bench.codec.stop, bench.codec.encode(ROLLING), b"hello\n", None))
-        if rng.random() < 0.02:
-            bench.unplug()
-        elif rng.random() < 0.2 and not bench.port_open:
-            bench.replug()
-        verbs: tuple[Verb, ...] = ("stop", "clear", "clear", "activate", "deactivate", "set_pose")
-        outputs.append(
-            bench.step(
-                *rng.choices((REST, GO, Twist(-1.0, 3.0)), k=rng.randrange(3)),
-                source=rng.choice(("app", "teleop", "stranger")),
-                ask=rng.choice(verbs) if rng.random() < 0.1 else None,
-                ms=rng.choice((3.0, 10.0, 10.0, 10.0, 25.0)),
-                tick=rng.random() < 0.8,
-                superseded=rng.random() < 0.1,
-            )
-        )
-    return outputs
-
-
-@each("seed", range(5))
-def test_the_same_inputs_give_the_same_outputs(seed: int) -> None:
-    first = random_walk(seed)
-    assert first == random_walk(seed)
-    assert len({outputs.mode for outputs in first}) > 2
 
 
 # the latches that a robot starts with
@@ -1859,29 +1560,22 @@ FAULTED = Latches(fault=Latch(8, WALL_NS, "", "a wheel is dead", "wheel_dead", k
 OFF = Latches(inactive=Latch(9, WALL_NS, "joe", "switched off by joe", "switched_off", kept=True))
 
 
-@pytest.mark.parametrize(
-    ("latches", "mode", "why"),
+@each(
+    ("latches", "mode", "code"),
     [
-        (STOPPED, "stopped", "was stopped by ann at 2027-01-15 08:00:00 UTC, before the restart"),
-        (
-            FAULTED,
-            "fault",
-            "a wheel is dead, latched at 2027-01-15 08:00:00 UTC, before the restart",
-        ),
-        (OFF, "inactive", "was switched off by joe at 2027-01-15 08:00:00 UTC, before the restart"),
+        (STOPPED, "stopped", "stopped"),
+        (FAULTED, "fault", "wheel_dead"),
+        (OFF, "inactive", "switched_off"),
     ],
 )
 def test_a_robot_starts_in_the_mode_of_its_latches_with_one_event(
-    latches: Latches, mode: str, why: str
+    latches: Latches, mode: str, code: str
 ) -> None:
     bench = Bench(latches=latches)
-    release = "srv/activate" if mode == "inactive" else "srv/clear"
-    assert (bench.out.mode, bench.out.reason) == (mode, f"{why}; call {release}")
+    assert (bench.out.mode, bench.out.code) == (mode, code)
     assert bench.out.latches is latches
     (event,) = bench.out.events
-    assert event == Event(
-        "mode", f"start -> {mode}: {why}; call {release}", "warning", code=bench.out.code
-    )
+    assert (event.name, event.level, event.code) == ("mode", "warning", code)
     bench.linked().step(REST)
     for _ in range(100):
         assert bench.step(GO).applied == REST
@@ -1890,16 +1584,6 @@ def test_a_robot_starts_in_the_mode_of_its_latches_with_one_event(
     assert bench.out.latches == Latches()
     bench.let_go()
     assert bench.step(GO).mode == "driving"
-
-
-def test_at_a_slow_rate_a_commanded_zero_brakes_by_the_whole_deceleration() -> None:
-    slow = Config(
-        control=ControlConfig(rate=10.0),
-        commands=CommandsConfig(sources=(Source("app", 50, 1.0),)),
-    )
-    bench = Bench(slow).driving(Twist(1.0), steps=30)
-    speeds = [bench.step(REST).applied.linear for _ in range(3)]
-    assert speeds == pytest.approx([0.9, 0.8, 0.7])
 
 
 def test_a_flood_of_bytes_faster_than_the_wire_raises_no_error() -> None:
@@ -2039,13 +1723,6 @@ def test_adjustments_for_the_clocks_of_senders_are_counted_in_ms() -> None:
     for number in range(300):
         bench.step(REST, late_ms=min(max(0.0, 10.0 * (number - 100)), 300.0), ms=50)
     assert "clock_adjustments_ms" in bench.counters()
-
-
-def test_the_latches_of_the_robot_are_those_of_its_last_step() -> None:
-    bench = Bench().linked()
-    bench.answer("stop")
-    assert bench.robot.latches is bench.out.latches
-    assert bench.robot.latches.stop
 
 
 def test_lines_that_are_not_answered_are_reported() -> None:

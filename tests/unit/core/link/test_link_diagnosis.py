@@ -52,14 +52,12 @@ HEARD: dict[str, tuple[bytes, ReceivedClass, str]] = {
 
 def test_a_board_that_only_prints_noise_is_reported_with_its_noise() -> None:
     bench = Bench().open()
-    texts = []
+    codes = []
     for tick in range(500):
         bench.wait(10, *([b"\x00\xff~" + GOOD] if tick % 2 else []))
-        texts += [event.text for event in bench.session.events if event.name == "link_booting"]
-    reports = [text for text in texts if "none good" in text]
-    assert len(reports) == 1
-    assert "150 lines received, none good, the last one is `" in reports[0]
-    assert bench.session.describe_link().text == reports[0]
+        codes += [event.code for event in bench.session.events if event.name == "link_booting"]
+    assert codes.count("received_foreign") == 1
+    assert bench.session.describe_link().code == "received_foreign"
     bench.wait(10, GOOD * 3)
     assert bench.session.describe_link().code == "link_up"
 
@@ -75,24 +73,21 @@ def test_a_silent_link_is_reported_first_and_the_received_data_later() -> None:
 
 
 @pytest.mark.parametrize(
-    ("apart", "longest", "advice", "code"),
+    ("apart", "longest", "code"),
     [
-        (20, 0.25, "set mcu.reply_period = 0.20", "reply_period"),
-        (20, 0.15, "at least every 0.15 s", "lines_too_rare"),
-        (74, 0.25, "at least every 0.25 s", "lines_too_rare"),
-        (136, 0.25, "at least every 0.25 s", "lines_too_rare"),
+        (20, 0.25, "reply_period"),
+        (20, 0.15, "lines_too_rare"),
+        (74, 0.25, "lines_too_rare"),
+        (136, 0.25, "lines_too_rare"),
     ],
 )
 def test_lines_too_far_apart_are_reported_with_a_setting_only_if_it_is_valid(
-    apart: int, longest: float, advice: str, code: str
+    apart: int, longest: float, code: str
 ) -> None:
     bench = Bench(McuConfig(port="/dev/board"), longest_reply=longest).open()
     for tick in range(600):
         bench.wait(10, *([] if tick % apart else [GOOD]))
-    why = bench.session.describe_link()
-    assert why.code == code
-    assert f" {apart / 100:.2f} s" in why.text
-    assert advice in why.text
+    assert bench.session.describe_link().code == code
 
 
 def test_a_single_silence_does_not_suggest_a_reply_period() -> None:
@@ -136,9 +131,8 @@ def test_silence_during_punctual_steps_is_blamed_on_the_board() -> None:
 
 def test_a_host_stall_is_reported_with_its_length() -> None:
     for steps in ((800,), (10, 800, 10), (60, 800)):
-        why = after(*steps).describe("stale")
-        assert why.code == "host_late"
-        assert "0.80 s, so the daemon received nothing from the microcontroller: " in why.text
+        assert after(*steps).describe("stale").code == "host_late"
+        assert after(*steps).late_s == 0.8
 
 
 def test_a_good_line_ends_the_host_stall() -> None:
@@ -224,9 +218,7 @@ def test_a_stall_within_the_time_of_the_sparse_lines_explains_them() -> None:
     bench = Bench(McuConfig(port="/dev/board")).open()
     bench.wait(10)
     bench.wait(800)
-    why = sparse(bench).diagnosis
-    assert why.code == "host_late"
-    assert "0.80 s, so the daemon received too few lines for a link: " in why.text
+    assert sparse(bench).diagnosis.code == "host_late"
 
 
 def test_lines_that_came_while_the_output_was_blocked_are_not_counted_afterwards() -> None:
@@ -249,7 +241,6 @@ def events_of(every: int, windows: int = 3, period: float = 0.0, linked: bool = 
 def test_a_loss_of_a_fifth_of_the_lines_is_reported_once_with_its_figures() -> None:
     (text,) = events_of(5)
     assert f"answered only {WINDOW_LINES * 4 // 5} of {WINDOW_LINES} lines" in text
-    assert "`acsard mcu check`" in text
 
 
 def test_the_few_losses_of_a_sound_link_are_not_reported() -> None:

@@ -71,15 +71,6 @@ def code(why: Reason | None) -> str:
     return "" if why is None else why.code
 
 
-def test_each_state_that_counts_as_pressed_has_words_and_a_remedy() -> None:
-    pin = Input()
-    pin.step(True)
-    assert pin.estop.why == PRESSED_REASON
-    pin.step(False)
-    pin.quiet(510)
-    assert pin.estop.why == SILENT_REASON
-
-
 def test_an_input_that_is_never_reported_is_never_pressed() -> None:
     pin = Input()
     assert pin.quiet(2000) == pin.step(None) == ""

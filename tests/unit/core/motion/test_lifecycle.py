@@ -1,8 +1,7 @@
-"""Tests of latches and modes: chosen sequences of events, and a check of all reachable states."""
+"""Tests of latches and modes: one example of each rule, and a check of all reachable states."""
 
 from __future__ import annotations
 
-import re
 from collections import deque
 from collections.abc import Callable
 from copy import copy
@@ -19,7 +18,6 @@ from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 from tests.each import each
 
 WALL_NS = 1_800_000_000 * NS_PER_S
-AT = "2027-01-15 08:00"
 
 
 def at(seconds: float) -> Instant:
@@ -49,7 +47,8 @@ def activate(life: Lifecycle, seconds: float, number: int | None = None) -> bool
     return life.activate(number, ns(seconds), at(seconds))
 
 
-PRESSED, SILENT = PRESSED_REASON.text, SILENT_REASON.text
+def deactivate(life: Lifecycle, seconds: float, by: str = "ann") -> str:
+    return life.deactivate(by, at(seconds))
 
 
 def press(life: Lifecycle, seconds: float, why: Reason = PRESSED_REASON) -> None:
@@ -75,11 +74,17 @@ def mode(life: Lifecycle) -> Mode:
     return life.mode
 
 
+def causes(life: Lifecycle) -> list[str]:
+    """Return who or what caused the stop, the newest cause first."""
+    assert life.latches.stop is not None
+    return [cause.by or cause.code for cause in life.latches.stop.causes]
+
+
 # the start
 
 
 def test_the_robot_starts_waiting_for_its_link() -> None:
-    assert Lifecycle().mode is Mode.WAITING
+    assert (Lifecycle().mode, Lifecycle().latches) == (Mode.WAITING, Latches())
 
 
 STOP = Latch(7, WALL_NS, "ann", "stopped by ann", "stopped", kept=True)
@@ -88,50 +93,19 @@ OFF = Latch(9, WALL_NS, "joe", "switched off by joe", "switched_off", kept=True)
 
 
 @each(
-    ("latches", "begins", "why"),
+    ("latches", "begins", "code"),
     [
-        (
-            Latches(stop=STOP),
-            Mode.STOPPED,
-            f"was stopped by ann at {AT}:00 UTC, before the restart; call srv/clear",
-        ),
-        (
-            Latches(fault=FAULT),
-            Mode.FAULT,
-            f"a wheel is dead, latched at {AT}:00 UTC, before the restart; call srv/clear",
-        ),
-        (
-            Latches(inactive=OFF),
-            Mode.INACTIVE,
-            f"was switched off by joe at {AT}:00 UTC, before the restart; call srv/activate",
-        ),
-        (
-            Latches(STOP, FAULT, OFF),
-            Mode.FAULT,
-            f"a wheel is dead, latched at {AT}:00 UTC, before the restart; also was stopped by ann "
-            f"at {AT}:00 UTC, before the restart; call srv/clear twice, 2 s apart",
-        ),
-        (
-            Latches(
-                stop=Latch(
-                    7,
-                    WALL_NS,
-                    "acsard",
-                    "stopped at the start",
-                    "stopped_at_start",
-                    kept=True,
-                )
-            ),
-            Mode.STOPPED,
-            f"stopped at the start (latched at {AT}:00 UTC, before the restart); call srv/clear",
-        ),
+        (Latches(stop=STOP), Mode.STOPPED, "stopped"),
+        (Latches(fault=FAULT), Mode.FAULT, "wheel_dead"),
+        (Latches(inactive=OFF), Mode.INACTIVE, "switched_off"),
+        (Latches(STOP, FAULT, OFF), Mode.FAULT, "wheel_dead"),
     ],
 )
-def test_the_robot_starts_as_its_latches_say(latches: Latches, begins: Mode, why: str) -> None:
+def test_the_robot_starts_as_its_latches_say(latches: Latches, begins: Mode, code: str) -> None:
     life = Lifecycle(latches=latches)
     life.link(up=True)
     life.command(fresh=True)
-    assert (life.mode, life.why.text) == (begins, why)
+    assert (life.mode, life.why.code) == (begins, code)
     assert life.latches is latches
 
 
@@ -141,17 +115,14 @@ def test_after_restart_marks_every_latch_as_kept_and_changes_nothing_else() -> N
     assert Latches().after_restart() == Latches()
 
 
-# one stop
+def test_the_latch_in_force_is_the_fault_then_the_stop_then_the_switch() -> None:
+    assert Latches(STOP, FAULT, OFF).in_force is FAULT
+    assert Latches(STOP, None, OFF).in_force is STOP
+    assert Latches(None, None, OFF).in_force is OFF
+    assert Latches().in_force is None
 
 
-def test_a_stop_latches_until_a_later_clear() -> None:
-    life = ready()
-    assert stop(life, 1.0) == "stopped and latched; srv/clear releases it"
-    assert mode(life) is Mode.STOPPED
-    assert life.why.text == f"stopped by ann at {AT}:01 UTC; call srv/clear"
-    done = clear(life, 1.5, number(life))
-    assert done == "cleared; each sender must send a zero before it drives"
-    assert (life.mode, life.latches) == (Mode.READY, Latches())
+# numbers
 
 
 def test_a_number_is_the_wall_time_in_ms_and_grows_even_if_the_clock_does_not() -> None:
@@ -161,21 +132,15 @@ def test_a_number_is_the_wall_time_in_ms_and_grows_even_if_the_clock_does_not() 
     first = number(life)
     life.stop("ann", ns(2.0), Instant(ns(2.0), 0))
     assert number(life) == first + 1
+    clear(life, 2.5, first + 1)
+    life.stop("ann", ns(3.0), Instant(ns(3.0), 0))
+    assert number(life) == first + 2
     early = ready()
     early.stop("ann", ns(1.0), Instant(ns(1.0), 0))
     assert number(early) == 1001  # 0 means that there is no stop
     lifecycle = Lifecycle(latches=Latches(stop=STOP, inactive=OFF))
     lifecycle.stop("ann", ns(1.0), Instant(ns(1.0), 0))
     assert number(lifecycle) == OFF.number + 1001
-
-
-def test_a_number_is_not_used_again_after_its_latch_is_released() -> None:
-    life = ready()
-    stop(life, 1.0)
-    first = number(life)
-    clear(life, 1.5, first)
-    life.stop("ann", ns(2.0), Instant(ns(2.0), 0))
-    assert number(life) == first + 1
 
 
 def test_a_number_is_not_used_again_after_a_restart_with_a_wall_clock_that_went_back() -> None:
@@ -189,7 +154,7 @@ def test_a_number_is_not_used_again_after_a_restart_with_a_wall_clock_that_went_
     second = Lifecycle(latches=first.latches.after_restart())
     second.stop("joe", ns(3.0), Instant(ns(3.0), 0))
     assert number(second) > max(numbers)
-    with pytest.raises(RefusedError, match=f"latch {numbers[0]} is not the latch"):
+    with pytest.raises(RefusedError):
         second.clear(numbers[0], ns(3.1), Instant(ns(3.1), 0))
 
 
@@ -201,8 +166,7 @@ def test_the_same_stop_arriving_twice_has_one_number() -> None:
     life.stop("ann", ns(1.0), at(1.102))
     life.stop("joe", ns(1.1), at(1.103))
     assert life.latches is latched
-    assert latched.stop is not None
-    assert latched.stop.by == "joe"
+    assert causes(life) == ["joe", "ann"]
 
 
 def test_a_stop_after_a_clear_counts_even_if_it_arrived_before_the_last_stop() -> None:
@@ -216,32 +180,6 @@ def test_a_stop_after_a_clear_counts_even_if_it_arrived_before_the_last_stop() -
 # several causes of one stop
 
 
-def test_a_press_keeps_the_name_of_the_client_that_stopped_the_robot() -> None:
-    life = ready()
-    stop(life, 1.0)
-    latch = number(life)
-    press(life, 2.0)
-    life.refuse_clear(None, ns(3.0))
-    both = f"{PRESSED} (latched at {AT}:02 UTC); also stopped by ann at {AT}:01 UTC"
-    assert life.why.text == f"{both}; call srv/clear"
-    with pytest.raises(RefusedError) as caught:
-        clear(life, 9.0, latch)
-    assert f"still stopped ({PRESSED}) and stopped by ann: look at" in str(caught.value)
-    assert clear(life, 9.0, number(life)).startswith("cleared; ")
-    assert mode(life) is Mode.READY
-    press(life, 10.0)
-    assert "ann" not in life.why.text
-
-
-def test_each_client_that_stopped_the_robot_is_named_and_the_last_one_first() -> None:
-    life = ready()
-    for seconds, name in ((1.0, "ann"), (2.0, "joe"), (3.0, "ann")):
-        stop(life, seconds, name)
-    assert life.why.text == (
-        f"stopped by ann at {AT}:03 UTC; also stopped by joe at {AT}:02 UTC; call srv/clear"
-    )
-
-
 def test_a_cause_that_comes_many_times_is_named_once_under_the_newest_number() -> None:
     life = ready()
     numbers = []
@@ -250,52 +188,33 @@ def test_a_cause_that_comes_many_times_is_named_once_under_the_newest_number() -
         press(life, seconds + 0.5)
         numbers.append(number(life))
     assert numbers == sorted(set(numbers))
+    assert causes(life) == ["emergency_stop", "ann"]
     life.refuse_clear(None, ns(60.0))
-    assert life.why.text == (
-        f"{PRESSED} (latched at {AT}:49 UTC); also stopped by ann at {AT}:49 UTC; call srv/clear"
-    )
+    assert clear(life, 60.1, number(life))
+    press(life, 61.0)
+    assert causes(life) == ["emergency_stop"]
 
 
-def test_the_reason_after_many_stops_names_the_first_clients_the_last_and_each_press() -> None:
+def test_the_causes_after_many_stops_are_the_first_clients_the_last_and_each_press() -> None:
     life = ready()
     press(life, 0.5)
-    life.refuse_clear(None, ns(0.6))
     for client in range(1000):
         stop(life, 1.0 + client / 100, f"client {client}")
     press(life, 20.0, SILENT_REASON)
-    life.refuse_clear(None, ns(21.0))
     stop(life, 30.0, "joe")
-    why = life.why.text.replace(SILENT, "silent")
-    assert re.findall(r"(client \d+|joe|silent|pressed) ", why) == [
-        "joe", "silent", "client 3", "client 2", "client 1", "client 0", "pressed",
+    assert causes(life) == [
+        "joe", "emergency_stop_silent", "client 3", "client 2", "client 1", "client 0",
+        "emergency_stop",
     ]  # fmt: skip
 
 
-def test_a_stop_in_the_step_of_a_press_is_named_although_it_arrived_before_the_press() -> None:
+def test_a_stop_in_the_step_of_a_press_is_a_cause_although_it_arrived_before_the_press() -> None:
     life = ready()
     press(life, 1.0)
     pressed = number(life)
     life.stop("ann", ns(0.999), at(1.0))
-    assert life.why.text.startswith(f"stopped by ann at {AT}:01 UTC; also {PRESSED} (latched at ")
-    latched = life.latches
+    assert causes(life) == ["ann", "emergency_stop"]
     assert number(life) > pressed
-    press(life, 1.1, SILENT_REASON)
-    pressed = number(life)
-    life.stop("ann", ns(0.999), at(1.2))  # the same request again, with its reply
-    assert number(life) == pressed
-    assert life.latches is not latched
-
-
-def test_two_stops_are_named_in_whichever_order_a_step_takes_them() -> None:
-    life = ready()
-    life.stop("ann", ns(1.1), at(1.2))
-    life.stop("joe", ns(1.0), at(1.2))
-    latched = life.latches
-    assert "stopped by ann" in life.why.text
-    assert "stopped by joe" in life.why.text
-    life.stop("ann", ns(1.1), at(1.3))
-    life.stop("joe", ns(1.0), at(1.3))
-    assert life.latches is latched
 
 
 def test_every_cause_survives_restarts() -> None:
@@ -304,165 +223,103 @@ def test_every_cause_survives_restarts() -> None:
     press(life, 2.0)
     for _ in range(3):
         life = Lifecycle(latches=life.latches.after_restart())
-        assert life.why.text == (
-            f"{PRESSED} (latched at {AT}:02 UTC, before the restart); also was stopped by "
-            f"ann at {AT}:01 UTC, before the restart; call srv/clear"
-        )
-    press(life, 5.0, SILENT_REASON)
-    life = Lifecycle(latches=life.latches.after_restart())
-    press(life, 6.0)
-    life.refuse_clear(None, ns(7.0))
-    assert life.why.text == (
-        f"{PRESSED} (latched at {AT}:06 UTC); also {SILENT} (latched at {AT}:05 UTC, "
-        f"before the restart); also was stopped by ann at {AT}:01 UTC, before the restart; call "
-        "srv/clear"
-    )
+        assert causes(life) == ["emergency_stop", "ann"]
+        assert life.latches.stop is not None
+        assert all(cause.kept for cause in life.latches.stop.causes)
 
 
-# clear
+# clear and activate
 
 
 class LatchCase(NamedTuple):
-    """How one client stops or deactivates a robot, and how another client releases it."""
+    """How one client stops or deactivates a robot, and how a client releases it."""
 
-    said: str
     mode: Mode
-    hold: Callable[[Lifecycle, float, str], object]
+    hold: Callable[[Lifecycle, float], object]
     verb: str
-    before: str
-    """Words for an earlier cause of the same latch."""
 
 
 HELD = each(
     "held",
-    [
-        LatchCase("stopped", Mode.STOPPED, stop, "clear", " and stopped by ann"),
-        LatchCase("switched off", Mode.INACTIVE, lambda life, s, by: life.deactivate(by, at(s)),
-             "activate", ""),
-    ],
-)  # fmt: skip
+    [LatchCase(Mode.STOPPED, stop, "clear"), LatchCase(Mode.INACTIVE, deactivate, "activate")],
+)
 
 
 @HELD
-@pytest.mark.parametrize("asked_s", [0.5, 1.0])
+@pytest.mark.parametrize(("asked_s", "now_s"), [(0.5, 9.0), (1.0, 9.0), (1.001, 1.0)])
 @pytest.mark.parametrize("named", [True, False])
-def test_a_release_that_arrived_before_the_latch_is_refused(
-    held: LatchCase, asked_s: float, named: bool
+def test_a_release_that_came_before_the_latch_or_in_its_step_is_refused(
+    held: LatchCase, asked_s: float, now_s: float, named: bool
 ) -> None:
     life = ready()
-    held.hold(life, 1.0, "ann")
+    held.hold(life, 1.0)
     with pytest.raises(RefusedError):
-        getattr(life, held.verb)(number(life) if named else None, ns(asked_s), at(9.0))
+        getattr(life, held.verb)(number(life) if named else None, ns(asked_s), at(now_s))
     assert mode(life) is held.mode
 
 
 @HELD
-def test_a_release_of_the_same_step_as_the_latch_is_refused(held: LatchCase) -> None:
-    life = ready()
-    held.hold(life, 1.0, "ann")
-    with pytest.raises(RefusedError, match="at the same time as this call or after it"):
-        getattr(life, held.verb)(number(life), ns(1.001), at(1.0))
-
-
-@HELD
-@pytest.mark.parametrize(("since_s", "age"), [(0.1, "0.1"), (0.4, "0.4"), (1.999, "1.9")])
-def test_a_release_without_a_number_is_refused_until_two_seconds_after_the_latch(
-    held: LatchCase, since_s: float, age: str
+@pytest.mark.parametrize("since_s", [0.1, 1.999])
+def test_a_release_without_a_number_is_refused_until_two_seconds_after_the_last_latch(
+    held: LatchCase, since_s: float
 ) -> None:
     life = ready()
-    held.hold(life, 1.0, "ann")
+    stop(life, 0.1)
+    clear(life, 0.2, number(life))
+    held.hold(life, 1.0)
     release = {"clear": clear, "activate": activate}[held.verb]
-    with pytest.raises(RefusedError) as caught:
+    with pytest.raises(RefusedError):
         release(life, 1.0 + since_s)
-    assert str(caught.value) == (
-        f"the robot was {held.said} by ann {age} s ago: look at the robot, then call "
-        f"srv/{held.verb} again when 2 s have passed since then, or name the number of the latch "
-        "that you have seen"
-    )
     assert mode(life) is held.mode
+    with pytest.raises(RefusedError):  # a step of the wall clock
+        getattr(life, held.verb)(None, ns(1.5), Instant(ns(1.5), WALL_NS + ns(3600.0)))
     assert release(life, 1.0 + LATCH_REQUIRED_S)
     assert (mode(life), life.latches) == (Mode.READY, Latches())
-
-
-@HELD
-@pytest.mark.parametrize("none", [False, True])
-def test_a_release_that_names_another_latch_is_refused(held: LatchCase, none: bool) -> None:
-    life = ready()
-    held.hold(life, 1.0, "ann")
-    latch = 0 if none else number(life)
-    held.hold(life, 10.0, "joe")
-    with pytest.raises(RefusedError) as caught:
-        {"clear": clear, "activate": activate}[held.verb](life, 20.0, latch)
-    assert str(caught.value) == (
-        f"latch {latch} is not the latch that srv/{held.verb} would release now; the robot "
-        f"is still {held.said} by joe{held.before}: look at the robot, then call srv/{held.verb} "
-        "again with the present `latch` in `state`"
-    )
-    assert mode(life) is held.mode
 
 
 def test_the_two_seconds_count_from_the_last_stop() -> None:
     life = ready()
     stop(life, 1.0)
     stop(life, 4.0, "joe")
-    with pytest.raises(RefusedError, match=r"stopped by joe 0\.5 s ago"):
+    with pytest.raises(RefusedError):
         clear(life, 4.5)
 
 
-def test_a_step_of_the_wall_clock_does_not_end_the_two_seconds() -> None:
-    life = ready()
-    stop(life, 1.0)
-    with pytest.raises(RefusedError, match=r"stopped by ann 0\.5 s ago"):
-        life.clear(None, ns(1.5), Instant(ns(1.5), WALL_NS + ns(3600.0)))
-
-
+@each("latches", [Latches(stop=STOP), Latches(fault=FAULT)])
 @each("wall_s", [-3e8, 0.0, 1.5, 3e8])
-@each("saved", [True, False])
-def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
-    saved: bool, wall_s: float
+def test_the_two_seconds_of_a_latch_from_the_start_count_from_the_first_step(
+    wall_s: float, latches: Latches
 ) -> None:
-    """A `clear` without a number releases a latch only after two seconds.
-
-    For a latch from the file they begin with the first step, because a booting computer's clock may
-    be wrong by years.
-    """
-    stop_at_start = Latch(7, WALL_NS, "ann", "stopped by ann", "stopped", kept=saved)
-    life = Lifecycle(latches=Latches(stop=stop_at_start))
+    """A booting computer's clock may be wrong by years."""
+    life = Lifecycle(latches=latches)
     for step_s in (10.0, 10.01, 11.5):
         life.begin(Instant(ns(step_s), WALL_NS + ns(wall_s)))
-    for asked_s, age in ((9.9, "0.1"), (11.5, "1.5")):
-        with pytest.raises(RefusedError) as caught:
+    for asked_s in (9.9, 11.5):
+        with pytest.raises(RefusedError):
             life.clear(None, ns(asked_s), Instant(ns(11.5), WALL_NS + ns(wall_s)))
-        assert str(caught.value) == (
-            f"the daemon started or resumed {age} s ago and the robot is still stopped by ann: "
-            "look at the robot, then call srv/clear again when 2 s have passed since then, or name "
-            "the number of the latch that you have seen"
-        )
+    assert copy(life).clear(number(life), ns(9.9), at(11.5))
     assert life.clear(None, ns(12.0), Instant(ns(12.0), WALL_NS + ns(wall_s)))
 
 
-def test_a_stop_in_the_first_step_is_not_older_than_the_start() -> None:
+def test_after_a_stall_a_release_must_name_its_latch_for_two_seconds() -> None:
     life = ready()
-    life.begin(at(10.0))
-    stop(life, 10.0)
-    with pytest.raises(RefusedError, match=r"stopped by ann 1\.0 s ago"):
-        clear(life, 11.0)
+    life.begin(at(1.0))
+    stop(life, 1.0)
+    life.begin(at(10.0), stalled=True)
+    with pytest.raises(RefusedError):
+        clear(life, 11.9)
+    assert clear(life, 10.0 + LATCH_REQUIRED_S)
 
 
-def test_a_named_clear_releases_a_stop_from_the_start_immediately() -> None:
-    life = Lifecycle(latches=Latches(stop=STOP))
-    life.begin(at(10.0))
-    assert life.clear(STOP.number, ns(9.9), at(10.0))
+def test_an_activate_of_an_active_robot_changes_nothing_whatever_number_is_named() -> None:
+    life = ready()
+    before = life.latches
+    assert not activate(life, 1.0)
+    assert not activate(life, 1.0, 7)
+    assert life.latches is before
 
 
 # a fault and a stop
-
-
-def both() -> Lifecycle:
-    life = ready()
-    stop(life, 1.0)
-    assert life.fault(cause("a wheel is dead"), at(2.0))
-    return life
 
 
 def test_each_cause_of_a_fault_is_latched_once_with_a_new_number() -> None:
@@ -475,15 +332,10 @@ def test_each_cause_of_a_fault_is_latched_once_with_a_new_number() -> None:
     assert life.fault(cause("the driver failed"), at(3.0))
     assert not life.fault(cause("the left wheel is slow (5 %)"), at(4.0))
     assert mode(life) is Mode.FAULT
-    assert life.why.text == (
-        f"the driver failed, latched at {AT}:03 UTC; also the left wheel is slow (3 %), latched at "
-        f"{AT}:01 UTC; call srv/clear"
-    )
     assert first is not None
-    with pytest.raises(RefusedError, match="the driver failed; also the left wheel is slow"):
-        life.clear(first.number, 5 * NS_PER_S, at(5.0))
-    assert life.latches.fault is not None
-    life.clear(life.latches.fault.number, 5 * NS_PER_S, at(5.0))
+    with pytest.raises(RefusedError):
+        clear(life, 5.0, first.number)
+    clear(life, 5.0, number(life))
     assert mode(life) is Mode.READY
 
 
@@ -496,59 +348,32 @@ def test_the_number_of_causes_of_a_fault_is_limited() -> None:
 
 
 def test_a_fault_keeps_the_stop_and_each_is_cleared_separately() -> None:
-    life = both()
-    assert mode(life) is Mode.FAULT
-    assert life.why.text == (
-        f"a wheel is dead, latched at {AT}:02 UTC; also stopped by ann at {AT}:01 UTC; "
-        "call srv/clear twice, 2 s apart"
-    )
-    assert (
-        clear(life, 5.0)
-        == "fault cleared, but the robot is still stopped by ann: call srv/clear again in 2 s"
-    )
-    assert mode(life) is Mode.STOPPED
-    with pytest.raises(RefusedError, match="a latch was cleared less than 2 s ago"):
-        clear(life, 6.9)  # the same clear request, delivered twice by the network
-    assert (
-        clear(life, 5.0 + LATCH_REQUIRED_S)
-        == "cleared; each sender must send a zero before it drives"
-    )
-    assert mode(life) is Mode.READY
-
-
-def test_a_stop_keeps_the_fault() -> None:
     life = ready()
-    life.fault(cause("a wheel is dead"), at(1.0))
-    message = stop(life, 2.0)
-    assert message == (
-        "stopped and latched; call srv/clear twice, 2 s apart: the first call releases the fault, "
-        "the second call releases the stop"
-    )
+    stop(life, 1.0)
+    assert life.fault(cause("a wheel is dead"), at(2.0))
+    stop(life, 2.5)
     assert mode(life) is Mode.FAULT
     clear(life, 5.0)
     assert mode(life) is Mode.STOPPED
-
-
-def test_a_clear_named_for_a_stop_is_refused_when_a_fault_has_come() -> None:
-    life = ready()
-    stop(life, 1.0)
-    latch = number(life)
-    life.fault(cause("a wheel is dead"), at(2.0))
-    with pytest.raises(RefusedError, match=r"still in fault \(a wheel is dead\)"):
-        clear(life, 9.0, latch)
-    assert life.latches.stop is not None
-
-
-def test_a_clear_without_a_number_releases_a_fault_only_when_the_client_may_have_seen_it() -> None:
-    life = ready()
-    life.fault(cause("a wheel is dead"), at(3.0))
-    with pytest.raises(RefusedError, match=r"went into fault \(a wheel is dead\) 1\.5 s ago"):
-        clear(life, 4.5)
-    life.fault(cause("the driver failed"), at(5.0))
-    with pytest.raises(RefusedError, match=r"went into fault \(the driver failed\) 1\.9 s ago"):
-        clear(life, 4.9 + LATCH_REQUIRED_S)
+    with pytest.raises(RefusedError):
+        clear(life, 6.9)  # the same clear request, delivered twice by the network
     clear(life, 5.0 + LATCH_REQUIRED_S)
     assert mode(life) is Mode.READY
+
+
+def test_a_clear_without_a_number_needs_two_seconds_after_the_newest_of_fault_and_stop() -> None:
+    life = ready()
+    life.fault(cause("a wheel is dead"), at(3.0))
+    with pytest.raises(RefusedError):
+        clear(life, 4.5)
+    life.fault(cause("the driver failed"), at(5.0))
+    with pytest.raises(RefusedError):
+        clear(life, 4.9 + LATCH_REQUIRED_S)
+    stop(life, 8.0)
+    with pytest.raises(RefusedError):
+        clear(life, 9.0)
+    clear(life, 8.0 + LATCH_REQUIRED_S)
+    assert mode(life) is Mode.STOPPED
 
 
 def test_the_second_delivery_of_a_clear_does_not_release_a_fault_that_came_between() -> None:
@@ -556,177 +381,65 @@ def test_the_second_delivery_of_a_clear_does_not_release_a_fault_that_came_betwe
     life.fault(cause("a wheel is dead"), at(1.0))
     clear(life, 5.0)
     life.fault(cause("a wheel is dead"), at(5.05))
-    with pytest.raises(RefusedError, match=r"went into fault \(a wheel is dead\) 0\.1 s ago"):
+    with pytest.raises(RefusedError):
         clear(life, 5.16)
     clear(life, 5.2, number(life))
     assert mode(life) is Mode.READY
 
 
-def test_a_clear_without_a_number_is_refused_while_the_newest_of_fault_and_stop_is_young() -> None:
-    life = both()
-    with pytest.raises(RefusedError, match="went into fault"):
-        clear(life, 3.0)
-    stop(life, 5.0, "bob")
-    with pytest.raises(RefusedError, match=r"was stopped by bob 1\.0 s ago"):
-        clear(life, 6.0)
-    assert "fault cleared" in clear(life, 5.0 + LATCH_REQUIRED_S)
+# inputs of the board
 
 
-def test_a_fault_from_before_a_restart_needs_a_number_in_the_first_two_seconds() -> None:
-    before = ready()
-    before.fault(cause("a wheel is dead"), at(1.0))
-    life = Lifecycle(before.latches)
-    life.begin(at(10.0))
-    life.link(up=True)
-    with pytest.raises(RefusedError, match="and the robot is still in fault"):
-        clear(life, 11.0)
-    clear(life, 10.0 + LATCH_REQUIRED_S)
-    assert mode(life) is Mode.READY
-
-
-# the emergency stop
-
-
-def test_a_pressed_emergency_stop_is_latched_and_says_what_to_do() -> None:
-    life = ready()
-    press(life, 1.0)
-    assert mode(life) is Mode.STOPPED
-    latched = f"{PRESSED} (latched at {AT}:01 UTC)"
-    assert life.why.text == f"{latched}; release it at the robot, then call srv/clear"
-    with pytest.raises(RefusedError) as caught:
-        clear(life, 9.0, number(life))
-    assert str(caught.value) == f"{PRESSED}: release it at the robot, then call srv/clear again"
-    life.refuse_clear(None, ns(9.2))
-    with pytest.raises(RefusedError, match="before the cause of the stop or fault had ended"):
-        life.clear(number(life), ns(9.2), at(9.3))
-    assert (mode(life), life.why.text) == (Mode.STOPPED, f"{latched}; call srv/clear")
-    assert clear(life, 9.5, number(life)).startswith("cleared; ")
-    assert mode(life) is Mode.READY
-
-
-def test_a_silent_input_names_the_board_and_its_cable() -> None:
-    life = ready()
-    press(life, 1.0, SILENT_REASON)
-    assert life.why.text == (
-        f"{SILENT} (latched at {AT}:01 UTC); check the board and its cable, then call srv/clear"
-    )
-
-
-def test_a_stop_and_a_fault_beside_a_pressed_emergency_stop_are_named_with_it() -> None:
-    life = ready()
-    press(life, 1.0)
-    stop(life, 2.0, "joe")
-    stopped = f"stopped by joe at {AT}:02 UTC; also {PRESSED} (latched at {AT}:01 UTC)"
-    assert life.why.text == f"{stopped}; release it at the robot, then call srv/clear"
-    life.fault(cause("a wheel is dead"), at(3.0))
-    assert life.why.text == (
-        f"a wheel is dead, latched at {AT}:03 UTC; also {stopped}; release it at the robot, then "
-        "call srv/clear twice, 2 s apart"
-    )
-    life.refuse_clear(None, ns(8.0))
-    assert clear(life, 9.0) == (
-        "fault cleared, but the robot is still stopped by joe and "
-        f"stopped ({PRESSED}): call srv/clear again in 2 s"
-    )
-    assert life.why.text == f"{stopped}; call srv/clear"
-
-
-def test_a_fault_that_the_board_still_reports_is_not_cleared() -> None:
-    life = ready()
-    life.fault(cause("a motor driver is hot"), at(1.0))
-    life.refuse_clear(cause("a motor driver is hot", "let it cool"), ns(1.0))
-    fault = f"a motor driver is hot, latched at {AT}:01 UTC"
-    assert life.why.text == f"{fault}; let it cool, then call srv/clear"
-    with pytest.raises(RefusedError) as caught:
-        clear(life, 9.0, number(life))
-    assert str(caught.value) == "a motor driver is hot: let it cool, then call srv/clear again"
-    stop(life, 10.0, "joe")
-    assert life.why.text == (
-        f"{fault}; also stopped by joe at {AT}:10 UTC; let it cool, then call srv/clear twice, "
-        "2 s apart"
-    )
-
-
-def test_a_fault_beside_one_that_the_board_reports_names_both() -> None:
-    life = ready()
-    life.fault(cause("a wheel is dead"), at(1.0))
-    life.refuse_clear(cause("a motor driver is hot", "let it cool"), ns(1.0))
-    assert life.why.text == (
-        f"a wheel is dead, latched at {AT}:01 UTC; also a motor driver is hot; let it cool, then "
-        "call srv/clear"
-    )
-
-
-def test_a_press_after_a_release_is_a_new_latch() -> None:
+def test_a_clear_counts_only_after_the_end_of_the_cause() -> None:
     life = ready()
     press(life, 1.0)
     latch = number(life)
-    life.refuse_clear(None, ns(8.0))
-    press(life, 5.0)
-    life.refuse_clear(None, ns(8.0))
-    with pytest.raises(RefusedError) as caught:
+    with pytest.raises(RefusedError):
         clear(life, 9.0, latch)
-    assert str(caught.value) == (
-        f"latch {latch} is not the latch that srv/clear would release now; the robot is "
-        f"still stopped ({PRESSED}): look at the robot, then call srv/clear again with the "
-        "present `latch` in `state`"
-    )
+    life.refuse_clear(None, ns(9.2))
+    with pytest.raises(RefusedError):
+        life.clear(latch, ns(9.2), at(9.3))
+    life.caused_again(ns(9.5))
+    with pytest.raises(RefusedError):
+        life.clear(latch, ns(9.5), at(9.6))
+    assert clear(life, 9.7, latch)
+    assert mode(life) is Mode.READY
 
 
-def test_a_plain_clear_is_refused_right_after_a_press() -> None:
-    life = ready()
+# words
+
+
+def test_the_reason_names_each_cause_with_its_time_and_what_the_operator_can_do() -> None:
+    life = Lifecycle(latches=Latches(stop=STOP))
+    life.begin(at(0.5))
     press(life, 1.0)
-    life.refuse_clear(None, ns(1.2))
-    with pytest.raises(RefusedError) as caught:
-        clear(life, 1.5)
-    assert str(caught.value).startswith(f"the robot was stopped ({PRESSED}) 0.5 s ago: look at")
-    assert clear(life, 3.0)
-
-
-# switched off
-
-
-def off(seconds: float = 1.0, by: str = "joe") -> Lifecycle:
-    life = ready()
-    life.deactivate(by, at(seconds))
-    return life
-
-
-def test_each_deactivate_has_a_new_number_and_the_last_is_the_one_that_is_reported() -> None:
-    life = off()
-    first = number(life)
-    life.deactivate("ann", at(2.0))
-    assert number(life) > first
-    assert life.why.text == f"switched off by ann at {AT}:02 UTC; call srv/activate"
-
-
-def test_an_activate_of_an_active_robot_changes_nothing_whatever_number_is_named() -> None:
-    life = ready()
-    before = life.latches
-    assert not activate(life, 1.0)
-    assert not activate(life, 1.0, 7)
-    assert life.latches is before
-
-
-@each("latched", ["stop", "fault"])
-def test_a_clear_of_a_robot_that_is_switched_off_says_so_and_names_activate(latched: str) -> None:
-    life = off()
-    if latched == "stop":
-        stop(life, 2.0)
-    else:
-        life.fault(cause("a wheel is dead"), at(2.0))
-    assert clear(life, 5.0) == (
-        "cleared, but the robot is still switched off: call srv/activate to switch it on, then "
-        "each sender must send a zero before it drives"
+    life.fault(cause("a wheel is dead"), at(2.0))
+    life.refuse_clear(cause("a motor driver is hot", "let it cool"), ns(2.0))
+    assert life.why.code == "driver_fault"
+    assert life.why.text == (
+        "a wheel is dead, latched at 2027-01-15 08:00:02 UTC; also a motor driver is hot; also "
+        "emergency stop pressed at the robot (latched at 2027-01-15 08:00:01 UTC); also was "
+        "stopped by ann at 2027-01-15 08:00:00 UTC, before the restart; let it cool, then call "
+        "srv/clear twice, 2 s apart"
     )
-    assert mode(life) is Mode.INACTIVE
 
 
-def test_the_latch_in_force_is_the_fault_then_the_stop_then_the_switch() -> None:
-    assert Latches(STOP, FAULT, OFF).in_force is FAULT
-    assert Latches(STOP, None, OFF).in_force is STOP
-    assert Latches(None, None, OFF).in_force is OFF
-    assert Latches().in_force is None
+def test_the_reason_says_how_a_robot_that_was_switched_off_is_switched_on() -> None:
+    life = ready()
+    deactivate(life, 1.0, "joe")
+    deactivate(life, 2.0)
+    assert life.why.text == "switched off by ann at 2027-01-15 08:00:02 UTC; call srv/activate"
+
+
+def test_a_refusal_names_what_holds_the_robot() -> None:
+    life = ready()
+    stop(life, 1.0)
+    press(life, 1.5)
+    life.refuse_clear(None, ns(1.6))
+    for latch, words in ((None, "the robot was stopped (em"), (3, "latch 3 is not the latch that")):
+        with pytest.raises(RefusedError, match="stopped by ann" if latch else "0.4 s ago") as said:
+            clear(life, 1.9, latch)
+        assert str(said.value).startswith(words)
 
 
 # shutdown
@@ -735,12 +448,12 @@ def test_the_latch_in_force_is_the_fault_then_the_stop_then_the_switch() -> None
 def test_a_stop_and_a_fault_during_the_shutdown_are_latched_for_the_next_start() -> None:
     life = ready()
     life.leave()
-    assert stop(life, 1.0) == "stopped and latched; the daemon is shutting down"
+    stop(life, 1.0)
     assert life.fault(cause("a wheel is dead"), at(2.0))
     assert mode(life) is Mode.SHUTDOWN
     assert life.latches.stop is not None
     assert life.latches.fault is not None
-    with pytest.raises(RefusedError, match="shutting down"):
+    with pytest.raises(RefusedError):
         clear(life, 9.0, number(life))
 
 
