@@ -44,11 +44,6 @@ class Run(NamedTuple):
     def failed(self) -> list[str]:
         return re.findall(r"^(?:FAILED|ERROR) .*$", self.said, re.M)
 
-    @property
-    def again(self) -> list[str]:
-        """Return the output lines of tests that failed on a busy machine and were repeated."""
-        return re.findall(r"^RERUN .*$", self.said, re.M)
-
 
 @contextmanager
 def loops(count: int) -> Iterator[None]:
@@ -124,7 +119,7 @@ def main() -> int:
         *_, last = result.said.strip().splitlines() or ["said nothing"]
         ended = "out of time" if result.code is None else f"exit {result.code}"
         print(f"run {number}: {result.seconds:.0f} s, {ended}: {last.strip('= ')}", flush=True)
-        for line in result.again + result.failed:
+        for line in result.failed:
             print(f"    {line}", flush=True)
         if result.code != 0:
             log = Path(tempfile.gettempdir(), f"acsard-loaded-{number}.log")

@@ -238,9 +238,7 @@ COMMANDS: dict[str, How] = {
         "tests/test_shape.py", "test_the_import_contracts_are_kept"
     ),
     ".venv/bin/pytest tests/unit tests/scenarios tests/test_*.py": PYTEST,
-    ".venv/bin/pre-commit install": Elsewhere(
-        "tests/test_pre_commit.py", "test_a_commit_of_code_or_of_the_contract_runs_every_check"
-    ),
+    ".venv/bin/pre-commit install": UntestedCommand("changes the hooks of this clone"),
     # tests/README.md
     ".venv/bin/pytest": PYTEST,
     ".venv/bin/pytest "
@@ -281,7 +279,6 @@ COMMANDS: dict[str, How] = {
         "tests/simulate/test_planted.py",
         "test_a_row_whose_seed_finds_nothing_any_more_is_listed",
     ),
-    ".venv/bin/python -m tests.firmware.unchanged HEAD~1": UntestedCommand("needs the history"),
     ".venv/bin/python -m tests.power compare": Elsewhere(
         "tests/power/test_compare.py", "test_a_test_that_is_deleted_is_a_loss"
     ),

@@ -285,11 +285,7 @@ def test_no_status_line_takes_the_place_of_a_reply(board: Board, host: Host) -> 
 
 
 def test_a_board_without_inputs_sends_no_status_line(runner: Path, firmware: Path) -> None:
-    """A firmware that is built without inputs sends only replies.
-
-    `python -m tests.firmware.unchanged COMMIT` compares its machine code with that of an older
-    commit.
-    """
+    """A firmware that is built without inputs sends only replies."""
     with Board(runner, firmware) as board, Host(board.path) as host:
         before = board.status().from_board.bytes
         host.ask(STOP)

@@ -1,4 +1,4 @@
-"""Fixtures of the system tests, and the repetition of tests that fail on a busy machine."""
+"""Fixtures of the system tests."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from acsard.machine.authority import Authority
-from tests.system import cores
 from tests.system.browser import NAME, Page
 from tests.system.builds import ros2dds_bridge
 from tests.system.bystander import standing_by
@@ -19,28 +18,6 @@ from tests.system.hosts import Hosts, two_hosts
 
 if TYPE_CHECKING:
     from tests.system.dds import DdsDomain, NewDomain
-
-_before = cores.idle()
-"""When the current test began."""
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Repeat a failed test, at most twice, if other programs used all cores during it.
-
-    The summary lists such tests. Any other failure counts.
-    """
-    again = pytest.mark.flaky(
-        reruns=2, condition=lambda: cores.cores_were_busy(_before, cores.idle())
-    )
-    for item in items:
-        if item.path.is_relative_to(Path(__file__).parent) and not item.get_closest_marker("soak"):
-            item.add_marker(again)
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    global _before
-    _before = cores.idle()
 
 
 @pytest.fixture(scope="session", autouse=True)
