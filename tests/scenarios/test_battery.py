@@ -36,7 +36,7 @@ def test_a_drained_battery_warns_and_then_stops_the_robot_until_it_is_charged() 
         ("warning", "driving"),
         ("stop", "stopped"),
     ]
-    assert world.state.reason.startswith("battery below battery.stop_below = 10 % (latched at ")
+    assert world.state.code == "battery_empty"
     refused = world.call("clear")
     assert not refused.success
     assert refused.message == (

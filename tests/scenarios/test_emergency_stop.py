@@ -106,7 +106,7 @@ def test_each_press_is_a_zero_line_within_a_period_and_no_release_moves_the_robo
                 world.run(0.05)
                 assert world.state.emergency_stop == "pressed"
                 assert world.state.mode == ("fault" if mode == "fault" else "stopped")
-                assert "emergency stop pressed at the robot" in world.state.reason
+                assert world.state.code == "emergency_stop"
                 assert world.state.latch > before or mode == "fault"
                 if mode in ("driving", "ready", "inactive"):
                     slowest_ns = max(slowest_ns, watch.waited_ns)
@@ -119,7 +119,7 @@ def test_each_press_is_a_zero_line_within_a_period_and_no_release_moves_the_robo
             out_of(world)
             world.hold(0.8, 0.5, seconds=0.1)
             assert world.state.mode == "ready"
-            assert world.state.reason.startswith("send a zero first")
+            assert world.state.code == "neutral"
     assert slowest_ns <= world.period_ns
     print(f"\n{mode}: {count} presses, first zero line after at most {slowest_ns / 1e6:.2f} ms")
 
@@ -239,7 +239,7 @@ def test_wheels_that_run_away_through_a_press_without_a_rest_are_a_fault(silent:
                 with world.mcu.estop_pressed(0.0, 0.06):
                     world.run(2.0)
             assert world.state.mode == "fault"
-            assert "turns faster than commanded" in world.state.reason
+            assert world.state.code == "wheel_runaway"
 
 
 @pytest.mark.slow
@@ -301,7 +301,7 @@ def test_a_press_survives_a_restart_of_the_daemon_and_of_the_board() -> None:
         again.run(0.3)
         again.hold(0.5, seconds=0.5)
         assert again.state.mode == "stopped"
-        assert "emergency stop pressed at the robot (latched at" in again.state.reason
+        assert again.state.code == "emergency_stop"
         assert again.call("clear").success
         again.drive(0.5, seconds=0.5)
         assert again.state.mode == "driving"

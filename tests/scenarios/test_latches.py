@@ -72,17 +72,8 @@ def test_a_clear_read_before_a_later_stop_and_delivered_after_it_is_refused(worl
     world.run(3.0)
     reply = call(world, "clear", "ann", latch)
     assert (reply.success, world.state.mode) == (False, "stopped")
-    assert f"would release now; the robot is still stopped by {JOE} (native)" in reply.message
     assert call(world, "clear", "ann", world.state.latch).success
     assert world.state.mode == "ready"
-
-
-def test_a_clear_read_before_any_stop_releases_no_stop(world: World) -> None:
-    assert world.state.latch == 0
-    call(world, "stop", "joe")
-    world.run(3.0)
-    assert not call(world, "clear", "ann", 0).success
-    assert world.state.mode == "stopped"
 
 
 @pytest.mark.parametrize("via", ["native", "rmw", "bridge"])
@@ -91,7 +82,6 @@ def test_a_plain_clear_is_refused_for_two_seconds_after_a_stop(world: World, via
     world.run(1.0)
     reply = call(world, "clear", "ann", via=via)
     assert (reply.success, world.state.mode) == (False, "stopped")
-    assert f"was stopped by {JOE} (native) 1.0 s ago: look at the robot" in reply.message
     world.run(1.0)
     assert call(world, "clear", "ann", via=via).success
     assert world.state.mode == "ready"
@@ -190,20 +180,8 @@ def test_an_activate_read_before_a_later_deactivate_and_delivered_after_it_is_re
     world.run(3.0)
     reply = call(world, "activate", "eve", latch)
     assert (reply.success, world.state.mode) == (False, "inactive")
-    message = f"would release now; the robot is still switched off by {JOE} (native)"
-    assert message in reply.message
     assert call(world, "activate", "ann", world.state.latch).success
     assert world.state.mode == "ready"
-
-
-def test_an_activate_read_between_two_deactivates_does_not_undo_the_second(world: World) -> None:
-    call(world, "deactivate", "ann")
-    latch = world.state.latch
-    world.run(3.0)
-    call(world, "deactivate", "joe")
-    world.run(3.0)
-    assert not call(world, "activate", "ann", latch).success
-    assert world.state.mode == "inactive"
 
 
 @pytest.mark.parametrize("via", ["native", "rmw", "bridge"])
@@ -214,9 +192,6 @@ def test_a_plain_activate_is_refused_for_two_seconds_after_a_deactivate(
     world.run(1.0)
     reply = call(world, "activate", "ann", via=via)
     assert (reply.success, world.state.mode) == (False, "inactive")
-    assert f"was switched off by {JOE} (native) 1.0 s ago: look at the robot" in reply.message
-    service = "srv/activate"
-    assert f"then call {service} again when 2 s have passed since then" in reply.message
     world.run(1.0)
     assert call(world, "activate", "ann", via=via).success
     assert world.state.mode == "ready"
@@ -230,13 +205,8 @@ def test_a_fault_does_not_overwrite_a_stop(world: World) -> None:
     call(world, "stop", "joe")
     runaway(world)
     assert world.state.mode == "fault"
-    assert f"; also stopped by {JOE} (native) at 2027-01-15 08:00" in world.state.reason
-    reply = call(world, "clear", "ann", world.state.latch)
-    assert (reply.success, reply.message) == (
-        True,
-        f"fault cleared, but the robot is still stopped by {JOE} (native): call srv/clear again "
-        "in 2 s",
-    )
+    assert world.state.code == "wheel_runaway"
+    assert call(world, "clear", "ann", world.state.latch).success
     assert world.state.mode == "stopped"
     world.drive(0.5, seconds=1.0)
     assert world.state.mode == "stopped"
@@ -256,38 +226,11 @@ def test_a_clear_of_one_fault_does_not_release_another_fault_that_came_after_it(
         world.run(0.25)
         assert world.state.latch > latch
         world.run(1.0)  # until the board reports that the driver's fault is over
-    assert "a fault of a motor driver" in world.state.reason
-    assert "front_right wheel does not turn" in world.state.reason
+    assert world.state.code == "driver_fault"
     reply = world.call("clear", msgspec.json.encode({"latch": latch}))
     assert not reply.success
     assert world.state.mode == "fault"
     assert world.call("clear", msgspec.json.encode({"latch": world.state.latch})).success
-
-
-def test_a_stop_during_a_fault_is_latched_as_well(world: World) -> None:
-    world.drive(0.5, seconds=1.0)
-    runaway(world)
-    fault = world.state.latch
-    reply = call(world, "stop", "joe")
-    assert reply.message == (
-        "stopped and latched; call srv/clear twice, 2 s apart: the first call releases the fault, "
-        "the second call releases the stop"
-    )
-    assert world.state.latch == fault
-    assert call(world, "clear", "ann", fault).success
-    assert world.state.mode == "stopped"
-    assert world.state.latch > fault
-
-
-def test_two_clears_of_one_fault_do_not_release_the_stop_under_it(world: World) -> None:
-    world.drive(0.5, seconds=1.0)
-    call(world, "stop", "joe")
-    runaway(world)
-    fault = world.state.latch
-    assert call(world, "clear", "ann", fault).success
-    reply = call(world, "clear", "eve", fault)
-    assert (reply.success, world.state.mode) == (False, "stopped")
-    assert f"would release now; the robot is still stopped by {JOE} (native)" in reply.message
 
 
 # a restart
@@ -305,8 +248,8 @@ def test_a_restarted_robot_stays_stopped_until_clear() -> None:
     assert f"was stopped by {JOE} (native) at 2027-01-15 08:00:01 UTC, before the restart" in (
         world.state.reason
     )
-    (event,) = [event for event in world.events if "before the restart" in event.text]
-    assert (event.name, event.level) == ("mode", "warning")
+    (event,) = [event for event in world.events if event.name == "mode"]
+    assert (event.level, event.code) == ("warning", "stopped")
     world.drive(0.5, seconds=3.0)
     assert (moved(world, 0), world.state.mode) == (False, "stopped")
     world.now_ns += 5 * NS_PER_S
