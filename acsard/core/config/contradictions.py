@@ -1,8 +1,7 @@
 """Checks combinations of settings in a configuration.
 
-`contradictions` returns errors: settings that cannot be used together. `warnings` returns settings
-that are allowed but have an effect that a user may not expect. The rules about motion are in
-`motion_rules.py`, and the rules about simulated faults in `named_faults.py`.
+`contradictions` are errors, `warnings` an effect that a user may not expect. `motion_rules.py` has
+the rules about motion, `named_faults.py` those about simulated faults.
 """
 
 from __future__ import annotations
@@ -28,24 +27,18 @@ from acsard.core.config.wire_time import (
 )
 from acsard.core.values import ROOT_KEY, WHEELS
 
+# Control periods in which a wheel may change its count by half of its range: more looks like the
+# other direction. 2 allows for a lost line.
 MIN_WRAP_PERIODS = 2
-"""Shortest allowed time for a wheel at full speed to change its encoder count by half of the
-count's range, in control periods. If the count changes by more than that between two lines, the
-wheel seems to turn in the other direction. The value 2 allows for one lost line."""
 
+# Below these counts and above this rate, a board without counts repeats speeds that look new. The
+# simulated robot with 16 to 96 counts was up to 20 % too short at 200 Hz, and 29 % too long at 300
+# Hz.
 FEW_COUNTS, FASTEST_HZ = 200, 100.0
-"""Limits for a warning about coarse encoders: encoder counts per wheel turn, and the control rate
-in Hz. The warning appears if there are fewer counts, the control rate is higher, and the board
-reports speeds but no counts. Such a board repeats its last speeds if it is asked again too soon,
-and the daemon cannot always tell repeated speeds from new ones. The
-simulated robot with 16 to 96 counts measured wrong distances: up to 20 % too short at 200 Hz, and
-up to 29 % too long at 300 Hz."""
 
-MIN_RATE_HZ = 0.1
-"""Lowest publishing rate that is not 0, Hz."""
+MIN_RATE_HZ = 0.1  # publishing, if not 0
 
-MAX_VOLTS = 99.99
-"""Highest voltage that a status line can express, V."""
+MAX_VOLTS = 99.99  # in a status line
 
 
 def warnings(config: Config) -> list[str]:
@@ -152,7 +145,7 @@ def _port_warnings(mcu: McuConfig) -> list[str]:
 
 
 def contradictions(config: Config) -> list[str]:
-    """Return one error line for each contradiction between settings in `config`."""
+    """Return one error line for each contradiction between settings."""
     return mistakes(RULES, config)
 
 
@@ -183,11 +176,7 @@ def _shorter_lines(mcu: McuConfig, rate: float) -> str:
 
 
 def _count_problems(config: Config) -> list[str]:
-    """Return an error if a large `mcu.encoder_counts` makes the direction of motion ambiguous.
-
-    The board sends each count modulo 65536. If a count may change by more than half of this range
-    within `MIN_WRAP_PERIODS` control periods, forward motion could look like backward motion.
-    """
+    # Counts are modulo 65536, so beyond half of it forward motion could look backward.
     counts, fastest = config.mcu.encoder_counts, config.feedback.wheel_speed / math.tau
     lasts = MIN_WRAP_PERIODS / config.rate_hz
     if fastest * counts * lasts <= FIELD_VALUES / 2:
@@ -256,11 +245,7 @@ def _battery_problems(config: Config) -> list[str]:
 def _repeated(
     noun: str, names: dict[str, str], part: Callable[[str], str] = lambda name: name
 ) -> list[str]:
-    """Return an error line for each value that repeats an earlier value.
-
-    `names` maps dotted keys to their values, and `noun` describes a value in the error line. `part`
-    returns the part of a value to compare, such as the host and port of an endpoint.
-    """
+    # An error for each value that repeats an earlier one of `names`, compared by `part`.
     first: dict[str, str] = {}
     errors = []
     for key, name in names.items():
@@ -347,10 +332,7 @@ def _listen_twice_problems(config: Config) -> list[str]:
 
 
 def _page_problems(config: Config) -> list[str]:
-    """Return an error for each address of the robot's web page that cannot be used.
-
-    `acsard/web/listen.py` applies the same rules when the page starts.
-    """
+    # `acsard/web/listen.py` applies the same rules when the page starts.
     addresses, errors = config.web.address, []
     for address in addresses:
         where = f"web.address = {show(address)}"
@@ -417,6 +399,8 @@ def _is_loopback(host: str) -> bool:
     return (mapped or address).is_loopback
 
 
+# A rule that reads an invalid key finds nothing at all, so each checks one thing and reads few
+# keys.
 RULES: tuple[Rule, ...] = (
     _rate_problems,
     _wire_problems,
@@ -438,5 +422,3 @@ RULES: tuple[Rule, ...] = (
     _ros_problems,
     *named_faults.RULES,
 )
-"""All rules about combinations of keys. A rule that reads an invalid key is skipped, and then finds
-nothing at all. Therefore each rule checks one thing and reads only a few keys."""

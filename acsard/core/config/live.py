@@ -1,7 +1,7 @@
 """Lists the settings that may change while the daemon runs, and checks such a change.
 
-A change must satisfy the same rules as the file, and is applied completely or not at all. A setting
-that is not in the table `LIVE` takes effect only at the next start of the daemon.
+It must satisfy the rules of the file, and is applied completely or not at all. A setting that is
+not in `LIVE` takes effect at the next start.
 """
 
 from __future__ import annotations
@@ -22,33 +22,23 @@ from acsard.core.values import Plain
 
 When = Literal["always", "raised", "rest"]
 
+# raised: a lower deceleration makes the stopping distance longer. rest: the change would disturb a
+# moving robot, as `limits.wheel_speed` has no ramp, and `commands` makes senders send a zero.
 WHEN_TEXTS: dict[When, str] = {
     "always": "at any time",
     "raised": "may be raised at any time, but lowered only while the robot stands",
     "rest": "only while the robot stands",
 }
-"""Texts for users that say when a setting may change, by the value of `Live.when`.
-
-- "always": The change is safe at any time.
-- "raised": The setting is a deceleration. A lower deceleration makes the stopping distance longer,
-  so it must not be lowered while the robot drives.
-- "rest": The change would disturb a moving robot. A lower `limits.wheel_speed` reduces the speed
-  without a ramp. After a change in `commands`, no sender drives the robot until it has sent a
-  zero.
-"""
 
 
 class Live(Struct, frozen=True):
-    """A setting that may change while the daemon runs.
-
-    `when` says at which moments it may change, and `WHEN_TEXTS` explains the values of `when`.
-    `what` describes the setting for users.
-    """
+    """A setting that may change while the daemon runs, at the moments `when`."""
 
     when: When
     what: str
 
 
+# Settings by dotted key; "*" is the name of a command source.
 LIVE: dict[str, Live] = {
     "limits.linear_speed": Live("always", "highest speed, forwards and backwards"),
     "limits.angular_speed": Live("always", "highest turn rate"),
@@ -83,17 +73,10 @@ LIVE: dict[str, Live] = {
     "rates.telemetry": Live("always", "how often the other messages are published at most"),
     "log.level": Live("always", "lowest level of the events that are logged"),
 }
-"""The settings that may change while the daemon runs, by their dotted keys in `acsard.toml`. In the
-key of a command source, "*" stands for the name of the source, as in `commands.sources.*.timeout`.
-"""
 
 
 def find_live_setting(key: str) -> Live | None:
-    """Return the entry of a setting in `LIVE`, the table of settings that may change at run time.
-
-    `key` is the dotted key of the setting. The result is None if the setting takes effect only at
-    the next start of the daemon.
-    """
+    """Return the entry of a dotted key in `LIVE`, or None."""
     parts = key.split(".")
     if parts[:2] == ["commands", "sources"] and len(parts) == 4:
         parts[2] = "*"
@@ -101,11 +84,9 @@ def find_live_setting(key: str) -> Live | None:
 
 
 def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
-    """Yield the dotted key and the value of each setting in nested tables.
+    """Yield the dotted key and the value of each setting; a table in a list has its name.
 
-    `name` is the dotted key of `value`, or "" for the whole configuration. A table in a list, such
-    as a command source, appears in a dotted key with its own `name` instead of its index. For
-    example, the key of the timeout of the source "app" is `commands.sources.app.timeout`.
+    So the timeout of the source "app" is `commands.sources.app.timeout`.
     """
     if isinstance(value, Mapping):
         for key, inner in value.items():
@@ -119,18 +100,13 @@ def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
 
 
 class Difference(Struct, frozen=True):
-    """The two values of a setting that differs between the daemon and the configuration file."""
+    """The two values of a setting that differs between the daemon and its file."""
 
-    its: object
-    """Value in force in the daemon; None if the setting does not exist there."""
-    ours: object
-    """Value in the configuration file; None if the setting does not exist there."""
+    its: object  # in force, or None
+    ours: object  # in the file, or None
 
     def describe(self, key: str) -> str:
-        """Return a text with both values, such as `log.level = "info", not "debug"`.
-
-        The value in force comes first. `key` is the dotted key of the setting.
-        """
+        """Return a text such as `log.level = "info", not "debug"`, the value in force first."""
         # A command source may be in only one of the two configurations. Its keys have no value in
         # the other one.
         its, ours = ("absent" if value is None else show(value) for value in (self.its, self.ours))
@@ -138,10 +114,7 @@ class Difference(Struct, frozen=True):
 
 
 def differences(runs: Config, file: Config) -> dict[str, Difference]:
-    """Return the settings whose values differ between two configurations, by dotted key.
-
-    `runs` is the configuration in force. `file` is the configuration in the file.
-    """
+    """Return the settings that differ between the configuration in force and the file."""
     its, ours = dict(flat(effective(runs))), dict(flat(effective(file)))
     return {
         key: Difference(its.get(key), ours.get(key))
@@ -150,30 +123,20 @@ def differences(runs: Config, file: Config) -> dict[str, Difference]:
     }
 
 
-Changes = dict[str, tuple[Plain, Plain]]
-"""Old and new value of each changed setting, by dotted key."""
+Changes = dict[str, tuple[Plain, Plain]]  # old and new value by dotted key
 
 
 def describe_changes(changes: Changes) -> str:
-    """Return a text that lists the changes, such as "log.level = debug (was info)"."""
+    """Return a text such as "log.level = debug (was info)"."""
     return ", ".join(
         f"{key} = {show(new)} (was {show(old)})" for key, (old, new) in changes.items()
     )
 
 
 def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tuple[Config, Changes]:
-    """Return a pair: `config` with new values of settings, and the changes.
+    """Return `config` with new values, and the changes; all or nothing. Raises `ConfigError`.
 
-    The change is applied completely or not at all. A value that is already in force is ignored. It
-    causes no error, even if its setting cannot be changed.
-
-    Args:
-        config: the configuration in force.
-        wishes: the requested values, by dotted key.
-        at_rest: True if the robot stands still. Some settings may change only then.
-
-    Raises:
-        ConfigError: the change is not allowed. The error says why.
+    A value that is in force is ignored, even if its setting cannot change.
     """
     tables: dict[str, Any] = effective(config)
     before = dict(flat(tables))

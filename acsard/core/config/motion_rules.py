@@ -1,7 +1,6 @@
 """Finds contradictions between the settings that concern motion.
 
-The robot must be able to stop soon enough, and motion that the limits allow must not look like a
-fault. The rules about other settings are in `contradictions.py`.
+The robot must stop soon enough, and motion that the limits allow must not look like a fault.
 """
 
 from __future__ import annotations
@@ -13,37 +12,26 @@ from msgspec import Struct
 from acsard.core.config.partial import Rule
 from acsard.core.config.settings import MAX_REPLY_PERIOD_S, Config
 
-MIN_JERK = 0.01
-"""Smallest allowed jerk limit, m/s3 or rad/s3. With a lower limit, the robot would need more than
-10 s to reach walking pace."""
+MIN_JERK = 0.01  # m/s3 or rad/s3: with less, walking pace takes more than 10 s
 
-MAX_STOP_S = 2.0
-"""Longest allowed time to brake from full speed to rest after a stop, s. No person should have to
-wait longer."""
+MAX_STOP_S = 2.0  # from full speed after a stop: no person should have to wait longer
 
-MAX_RAMP_S = 5.0
-"""Longest allowed time to brake from full speed to rest after the last command, s. During this
-ramp, no sender controls the robot."""
+MAX_RAMP_S = 5.0  # from full speed after the last command, while no sender controls the robot
 
+# Speed that a sound wheel reaches for a moment, over its command.
 OVERSPEED_FACTOR = 1.1
-"""Highest speed that a sound wheel reaches for a moment, divided by its commanded speed."""
 
-MAX_WHEEL_SPEED = 99.99
-"""Highest wheel speed that a line to the board can express, rad/s."""
+MAX_WHEEL_SPEED = 99.99  # rad/s in a line to the board
 
+# Lines that must show a wheel fault before it is reported.
 MIN_EVIDENCE_LINES = 2
-"""Number of feedback lines that must show a wheel fault before the fault is reported."""
 
 
 class _Reach(Struct, frozen=True):
-    """The highest speeds that the settings in `[limits]` allow."""
-
-    linear: float
-    """Linear speed, m/s."""
-    angular: float
-    """Turn rate, rad/s."""
-    wheel: float
-    """Speed of any wheel, rad/s."""
+    # The highest speeds that `[limits]` allow.
+    linear: float  # m/s
+    angular: float  # rad/s
+    wheel: float  # rad/s
 
 
 def _reach(config: Config) -> _Reach:
@@ -119,22 +107,16 @@ def _reply_problems(config: Config) -> list[str]:
 
 
 def longest_reply(fault_s: float) -> float:
-    """Return the longest allowed interval between two feedback lines (`mcu.reply_period`), s.
+    """Return the longest `mcu.reply_period`, with `MIN_EVIDENCE_LINES` in `fault_s`, s.
 
-    `fault_s` is `feedback.fault_time`, s. Within this time, the board must send
-    `MIN_EVIDENCE_LINES` lines. If `fault_s` is 0, the daemon does not check for wheel faults, and
-    the result is `MAX_REPLY_PERIOD_S`.
+    Without checks (0) it is `MAX_REPLY_PERIOD_S`.
     """
     share = math.floor(round(fault_s / MIN_EVIDENCE_LINES * 1000, 6)) / 1000
     return min(MAX_REPLY_PERIOD_S, share) if fault_s else MAX_REPLY_PERIOD_S
 
 
 def _rounded_up(value: float) -> float:
-    """Round up to three decimals.
-
-    An error line recommends the result as the value of a setting. If it were rounded down, the
-    setting would still be too low.
-    """
+    # An error recommends the result, with three decimals: rounded down, it would be too low.
     return math.ceil(round(value * 1000, 6)) / 1000
 
 

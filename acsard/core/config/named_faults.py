@@ -1,7 +1,6 @@
 """Parses the names of simulated faults, such as `mute`, `stuck_encoder=b` or `stalls=5:0.15`.
 
-The methods that produce the faults have the same names. They are in `core/simulator/faults.py` and
-`core/simulator/fake_mcu.py`.
+They are methods in `core/simulator/faults.py` and `core/simulator/fake_mcu.py`.
 """
 
 from __future__ import annotations
@@ -16,14 +15,15 @@ from acsard.core.config.partial import Rule
 from acsard.core.config.settings import Baud, Config
 from acsard.core.config.validation import show
 
+# Faults without arguments.
 FAULTS = (
     "mute", "noise", "partial_line", "slow_reply", "sparse_replies", "spaces", "unpadded",
     "trailing_comma", "comma_latched", "no_check", "plain_only", "no_sample", "no_watchdog",
     "late_watchdog", "watchdog_fed_by_bad_lines", "lost_replies", "lost_commands", "bit_errors",
     "free_running", "ftdi", "estop", "bumpers",
 )  # fmt: skip
-"""Names of the simulator's faults without arguments."""
 
+# Faults with a letter for each argument: `n` is a number, `m` a motor, a to d, stored as 0 to 3.
 ARGUMENTS = {
     "stuck_encoder": "m", "frozen_encoder": "m", "dead_motor": "m", "reversed_motor": "m",
     "reversed_encoder": "m",
@@ -33,37 +33,28 @@ ARGUMENTS = {
     "bumper_pressed": "nnn", "bumpers_silent": "nn", "driver_fault": "nn",
     "battery": "nn",
 }  # fmt: skip
-"""Maps the name of each fault with arguments to the kinds of its arguments. Each letter stands for
-one argument: `m` for a motor, `n` for a number. A user writes a motor as a to d, and `NamedFault`
-stores it as 0 to 3."""
 
+# Faults of the board's inputs, which end with a delay and a duration, s (0: without end).
 INPUT_FAULTS = ("estop_pressed", "estop_silent", "bumper_pressed", "bumpers_silent", "driver_fault")
-"""Names of the faults of the board's inputs. The last two arguments of each fault are a delay and
-a duration, s. The delay is the time from the start of the simulator to the beginning of the fault.
-A duration of 0 means that the fault never ends."""
 
+# Its argument is a period, s. It needs a timer, so only `acsard sim --fault` offers it.
 RESET_FAULT = "reset"
-"""Name of the fault that restarts the simulated board periodically. Its argument is the period, s.
-It needs a timer, so only `acsard sim --fault` offers it."""
 
 MOTORS = "abcd"
 
-MAX_ARGUMENT = 1e6
-"""Largest absolute value of a number that a fault takes as an argument. The limit prevents an
-overflow in the simulator."""
+MAX_ARGUMENT = 1e6  # prevents an overflow in the simulator
 
-MIN_STALL_S = 0.001
-"""Shortest duration of a stall in the fault `stalls`, s. A shorter stall has no visible effect."""
+MIN_STALL_S = 0.001  # a shorter one has no visible effect
 
 
 class NamedFault(Struct, frozen=True):
-    """A simulated fault and its arguments. A motor argument is a number from 0 to 3 (a to d)."""
+    """A simulated fault and its arguments; motors are 0 to 3 (a to d)."""
 
     name: str
     values: tuple[int | float, ...] = ()
 
     def __str__(self) -> str:
-        """Return the fault as a user writes it, such as "bias=a:0.9"."""
+        # As a user writes it, such as "bias=a:0.9".
         kinds = ARGUMENTS.get(self.name, "n" * len(self.values))
         words = [
             MOTORS[int(value)] if kind == "m" else str(value)
@@ -78,11 +69,7 @@ def forms() -> list[str]:
 
 
 def named(text: str) -> NamedFault:
-    """Parse the text of a simulated fault, such as "stalls=5:0.15".
-
-    Raises `ValueError` if the text is not valid. The error gives the mistake and the fix, but does
-    not repeat `text`.
-    """
+    """Parse a fault such as "stalls=5:0.15". Raises `ValueError` with mistake and fix."""
     name, _, arguments = text.partition("=")
     known = {RESET_FAULT: "n", **dict.fromkeys(FAULTS, ""), **ARGUMENTS}
     if name not in known:
@@ -124,10 +111,7 @@ def named(text: str) -> NamedFault:
 
 
 def warnings(config: Config) -> list[str]:
-    """Return a list with one warning if `sim.faults` has an effect, else an empty list.
-
-    Without the warning, a user could take a simulated fault for a real one.
-    """
+    """Return a warning if `sim.faults` has an effect: a user could take it for a real one."""
     faults = config.sim.faults
     if not faults or not config.mcu.simulated:
         return []

@@ -5,17 +5,15 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-MAX_COMPARED_LENGTH = 80
-"""Number of characters of a mistyped word that `nearest` compares. It ignores the rest, so that
-even a very long word takes only a short time."""
+MAX_COMPARED_LENGTH = 80  # characters of a mistyped word, so that a long one takes a short time
 
 
 def nearest(word: str, known: Iterable[str]) -> list[str]:
-    """Return a list with the known word most similar to `word`. It is empty if none is similar."""
+    """Return the known word that is most similar, in a list, or []."""
     return difflib.get_close_matches(word[:MAX_COMPARED_LENGTH], list(known), n=1, cutoff=0.6)
 
 
 def hint(word: str, known: Iterable[str], otherwise: str) -> str:
-    """Return "did you mean WORD?", or `otherwise` if no known word is similar to `word`."""
+    """Return "did you mean WORD?", or `otherwise` if no known word is similar."""
     near = nearest(word, known)
     return f"did you mean {near[0]}?" if near else otherwise

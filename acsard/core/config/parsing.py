@@ -13,13 +13,11 @@ from acsard.core.config.settings import Config
 from acsard.core.config.validation import build_partly
 from acsard.core.values import AcsardError
 
-MAX_BYTES = 65536
-"""Largest size of a configuration file, bytes. The `acsard.toml` in the repository has about a
-third of this size."""
+MAX_BYTES = 65536  # the `acsard.toml` in the repository has a third of this
 
 
 class ConfigError(AcsardError):
-    """Error for a configuration that cannot be used. `problems` lists each mistake with its fix."""
+    """A configuration that cannot be used. `problems` lists each mistake with its fix."""
 
     def __init__(self, problems: list[str]) -> None:
         super().__init__("\n".join(problems))
@@ -27,15 +25,9 @@ class ConfigError(AcsardError):
 
 
 def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) -> Config:
-    """Decode and check the text of an `acsard.toml`.
+    """Decode and check an `acsard.toml`; `overrides` win, by table and key.
 
-    Args:
-        text: the content of the file, TOML in UTF-8, with or without a byte-order mark.
-        overrides: values from the command line, by table and key. They replace the values in
-            `text`.
-
-    Raises:
-        ConfigError: the text is not a valid configuration. The error lists every mistake.
+    Raises `ConfigError`, which lists every mistake.
     """
     if len(text) > MAX_BYTES:
         raise ConfigError(

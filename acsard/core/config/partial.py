@@ -1,7 +1,6 @@
 """Runs the rules that relate several keys of `acsard.toml` to each other.
 
-A rule is skipped if it reads a key whose value is not valid. Another error line already reports
-this key.
+One that reads an invalid key is skipped, because another error reports the key.
 """
 
 from __future__ import annotations
@@ -12,27 +11,20 @@ from typing import Any, cast
 from acsard.core.config.settings import Config
 from acsard.core.values import AcsardError
 
-Rule = Callable[[Config], Iterable[str]]
-"""Function that checks a configuration and returns one error line for each mistake."""
+Rule = Callable[[Config], Iterable[str]]  # returns one error line for each mistake
 
 
 class InvalidKeyError(AcsardError):
-    """Error that occurs when a rule reads a key whose value is not valid."""
+    """A rule has read a key whose value is not valid."""
 
 
 def view_without(config: Config, invalid: Set[str]) -> Config:
-    """Return a view of `config` in which the keys in `invalid` cannot be read.
-
-    `invalid` contains dotted keys. Reading one of these keys raises `InvalidKeyError`.
-    """
+    """Return a view of `config` in which reading an `invalid` key raises `InvalidKeyError`."""
     return cast(Config, _View(config, "", invalid)) if invalid else config
 
 
 def mistakes(rules: Iterable[Rule], config: Config) -> list[str]:
-    """Return the error lines of all `rules` for `config`.
-
-    A rule is skipped if it reads a key whose value is not valid.
-    """
+    """Return the error lines of all rules that read only valid keys."""
     errors: list[str] = []
     for rule in rules:
         try:
@@ -43,11 +35,7 @@ def mistakes(rules: Iterable[Rule], config: Config) -> list[str]:
 
 
 class _View:
-    """A view of one table of the configuration. Reading an invalid key raises `InvalidKeyError`.
-
-    `path` is the dotted name of the table plus a dot, or "" for the whole document.
-    """
-
+    # One table of the configuration; `path` is its dotted name plus a dot, or "".
     def __init__(self, table: object, path: str, invalid: Set[str]) -> None:
         self._table, self._path, self._invalid = table, path, invalid
 

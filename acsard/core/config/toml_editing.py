@@ -13,15 +13,10 @@ from acsard.core.config.validation import write
 
 
 def edited(text: str, keys: Mapping[str, object]) -> str:
-    """Return `text`, the content of an `acsard.toml`, with new values for some settings.
+    """Return the content of an `acsard.toml` with new values, by dotted key.
 
-    Args:
-        text: the content of the file.
-        keys: the new values, by dotted key.
-
-    Raises:
-        ConfigError: the old or the new content is not a valid configuration.
-        ValueError: tables are written in a form that cannot be changed safely.
+    Raises `ConfigError` for an invalid old or new content, and `ValueError` for tables in a form
+    that cannot be changed safely.
     """
     from tomlkit.exceptions import TOMLKitError
 
@@ -61,11 +56,7 @@ def _changed(text: str, keys: Mapping[str, object]) -> str:
 
 
 def _adjusted(array: object, value: object) -> bool:
-    """Change the TOML list `array` to `value`, keep its comments, and return True.
-
-    Return False if this is not possible. The list may then be partly changed, so the caller must
-    replace it.
-    """
+    # Keeps its comments. False: it is partly changed at most, and the caller must replace it.
     from tomlkit.items import Array
 
     if not (isinstance(array, Array) and isinstance(value, list | tuple)):
@@ -81,12 +72,8 @@ def _adjusted(array: object, value: object) -> bool:
 
 
 def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:
-    """Insert new keys into the tables that `text` writes without a header, as dotted keys only.
-
-    A dotted key is a line such as `mcu.port = ...`, without a header `[mcu]`. A key that `text`
-    already contains is not inserted. Return the new text, and the entries of `keys` that the caller
-    must still put into the text.
-    """
+    # Insert new keys as lines `mcu.port = ...` into tables without a header `[mcu]`. Also returns
+    # the keys that are still to be put into the text.
     import tomlkit
 
     # tomlkit cannot insert such keys: it would put a table header between the dotted keys.

@@ -8,11 +8,7 @@ from acsard.core.config.validation import write
 
 
 def document(table: dict[str, object], path: str = "") -> list[str]:
-    """Return the lines of a TOML document with all keys and nested tables of `table`.
-
-    The nested tables come after the keys. `path` is the dotted name of `table`, or "" for the
-    whole document.
-    """
+    """Return the lines of a TOML document, nested tables last; `path` is the dotted name."""
     lines: list[str] = []
     tables: list[str] = []
     for key, value in table.items():
@@ -28,10 +24,7 @@ def document(table: dict[str, object], path: str = "") -> list[str]:
 
 
 def excerpt(keys: Mapping[str, object]) -> list[str]:
-    """Return the lines of a TOML document with some settings and the headers of their tables.
-
-    `keys` maps the dotted keys of the settings to their values.
-    """
+    """Return the lines of a TOML document with some settings, by dotted key, and headers."""
     lines: list[str] = []
     table = ""
     for key, value in sorted(keys.items(), key=lambda item: item[0].count(".")):

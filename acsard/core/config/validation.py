@@ -1,7 +1,4 @@
-"""Decodes a TOML table to a frozen struct, or to a list of mistakes.
-
-Each mistake is one line with the key, its value and the fix.
-"""
+"""Decodes a TOML table to a frozen struct, or to mistakes: a line with key, value and fix."""
 
 from __future__ import annotations
 
@@ -24,13 +21,9 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
 
 
 def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | None:
-    """Convert a TOML table to a struct of the type `cls`. Return None if the table has a mistake.
+    """Convert a TOML table to a struct, or return None and append its mistakes.
 
-    Args:
-        cls: the type of the struct.
-        table: the decoded TOML table.
-        path: the dotted name of the table, or "" for the whole document.
-        problems: list to which the function appends one line for each mistake.
+    `path` is the dotted name of the table, or "" for the whole document.
     """
     before = len(problems)
     made = build_partly(cls, table, path, problems, set())
@@ -40,18 +33,10 @@ def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | No
 def build_partly(
     cls: type[T], table: object, path: str, problems: list[str], invalid: set[str]
 ) -> T | None:
-    """Convert a TOML table to a struct, and use the default for each invalid value.
+    """Convert a TOML table to a struct, with the default for each invalid value.
 
-    Return None if `table` is not a table, or if a required key has no valid value.
-
-    Args:
-        cls: the type of the struct.
-        table: the decoded TOML table.
-        path: the dotted name of the table, or "" for the whole document.
-        problems: list to which the function appends one line for each mistake.
-        invalid: set to which the function adds the dotted key of each invalid value. For an
-            unknown key, it adds the most similar known key, because the user may have meant that
-            key.
+    Return None if `table` is not a table, or lacks a required key. `invalid` gets the dotted key of
+    each, and for an unknown key the most similar one, which the user may have meant.
     """
     if not isinstance(table, Mapping):
         header = f"[[{path.partition('[')[0]}]]" if path.endswith("]") else f"[{path}]"
@@ -119,7 +104,7 @@ def _unknown(key: str, value: object, path: str, near: list[str], known: list[st
 
 
 def expected(kind: inspect.Type) -> str:
-    """Return words for the valid values of a type, such as "a number from 0 to 10 m/s"."""
+    """Return words for the valid values, such as "a number from 0 to 10 m/s"."""
     unit = ""
     if isinstance(kind, inspect.Metadata):
         unit = str((kind.extra or {}).get("unit", ""))

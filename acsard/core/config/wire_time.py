@@ -2,69 +2,46 @@
 
 from __future__ import annotations
 
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Ns
 
-BITS_PER_BYTE = 10
-"""Bits per byte with 8N1: a start bit, eight data bits and a stop bit."""
+BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits and a stop bit
 
-PLAIN_BYTES = 33
-"""Length of the plain line `ap12.50,bn08.75,cp15.00,dn10.25` with CR LF, bytes. A trailing comma
-adds one byte."""
+PLAIN_BYTES = 33  # `ap12.50,bn08.75,cp15.00,dn10.25` with CR LF; a trailing comma is one more
 
-CHECK_BYTES = 8
-"""Length of the sequence number and the checksum of a command or a reply (`#07*585F`), bytes."""
+CHECK_BYTES = 8  # sequence number and checksum, `#07*585F`
 
-SAMPLE_BYTES = 21
-"""Length of `@` and the sample fields in a reply, bytes. The sample fields are the time of the
-board and four encoder counts. In a command, the request for the sample fields takes one letter."""
+SAMPLE_BYTES = 21  # `@`, the board's time and four counts in a reply; a command asks by one letter
 
-STATUS_BYTES = 28
-"""Length of `!status estop=pressed*F4BC`, a typical status line, with CR LF, bytes."""
+STATUS_BYTES = 28  # `!status estop=pressed*F4BC` with CR LF, a typical status line
 
-STATUS_HZ = 10
-"""Rate at which a board sends status lines, Hz."""
+STATUS_HZ = 10  # of status lines
 
-FIELD_VALUES = 65536
-"""Number of different values of a sample field, which has four hexadecimal digits. After FFFF, the
-field continues with 0."""
+FIELD_VALUES = 65536  # of a sample field with four hexadecimal digits
 
+# Share of the wire's capacity above which a slightly late line delays the next one. The rest
+# suffices for a space after each comma (36 bytes instead of 33).
 COMFORTABLE_USE = 0.8
-"""Largest advisable use of the serial wire, as a fraction of its capacity. If the lines use more,
-a line that is slightly late delays the next line. The remaining 20 % also suffice for a board that
-writes a space after each comma, so that its lines have 36 bytes instead of 33."""
 
 
-def wire_ns(count: int, baud_rate: int) -> int:
-    """Return the time in ns that the serial wire needs to transmit `count` bytes."""
+def wire_ns(count: int, baud_rate: int) -> Ns:
+    """Return how long `count` bytes take on the wire."""
     return count * BITS_PER_BYTE * NS_PER_S // baud_rate
 
 
 def line_bytes(trailing_comma: bool, check: bool = False, sample: bool = False) -> int:
-    """Return the length of a command line or of its reply, whichever is longer, bytes.
+    """Return the bytes of a command or its reply, whichever is longer.
 
-    Each direction has its own wire, so only the longer line limits the rate.
-
-    Args:
-        trailing_comma: True if a comma follows the last wheel speed.
-        check: True if lines have a sequence number and a checksum.
-        sample: True if replies have sample fields, which a command requests by one more letter.
+    Each direction has its own wire, so only the longer one limits the rate.
     """
     checked = PLAIN_BYTES + (CHECK_BYTES if check else 0)
     return max(checked + trailing_comma + sample, checked + (SAMPLE_BYTES if sample else 0))
 
 
 def wire_use(rate_hz: float, baud_rate: int, count: int) -> float:
-    """Return the fraction of the serial wire's capacity that lines of `count` bytes use.
-
-    `rate_hz` is the number of lines per second. If the result is above 1, the lines do not fit.
-    """
+    """Return the fraction of the wire's capacity; above 1, the lines do not fit."""
     return count * BITS_PER_BYTE * rate_hz / baud_rate
 
 
 def highest_rate(baud_rate: int, count: int, use: float = 1.0) -> int:
-    """Return the highest rate, Hz, at which lines of `count` bytes fit on the serial wire.
-
-    The result is rounded down to an integer. `use` is the fraction of the wire's capacity that the
-    lines may use, 0 to 1.
-    """
+    """Return the highest whole rate, Hz, of lines of `count` bytes within `use` of the wire."""
     return int(use * baud_rate / (count * BITS_PER_BYTE))
