@@ -12,9 +12,6 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "acsard"
 
-# A room leaves this list when it follows the rules. No room is added.
-NOT_YET = ("core/config",)
-
 TYPES_OF_USERS = ("core/config/settings.py", "core/messages/schema.py", "web/socket_messages.py")
 
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
@@ -54,14 +51,5 @@ def findings(module: str) -> Iterator[str]:
                     yield f"{module}:{item.lineno} a string below an assignment"
 
 
-def waits(module: str, rooms: tuple[str, ...] = NOT_YET) -> bool:
-    return any(module == room or module.startswith(f"{room}/") for room in rooms)
-
-
 def test_a_docstring_stands_only_where_it_says_more_than_the_name() -> None:
-    assert [text for module in TREES if not waits(module) for text in findings(module)] == []
-
-
-def test_a_room_that_follows_the_rules_has_left_the_list() -> None:
-    for room in NOT_YET:
-        assert any(any(findings(module)) for module in TREES if waits(module, (room,))), room
+    assert [text for module in TREES for text in findings(module)] == []
