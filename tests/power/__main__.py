@@ -104,7 +104,8 @@ class Run:
                     keep(item, verdict)
                     print(f"{self.minutes():.1f} min, {left} left", file=sys.stderr, flush=True)
 
-        if not any(results[item.scale].get(item.name) in (None, UNDECIDED) for item in items):
+        left = [i for i in items if results[i.scale].get(i.name) in (None, UNDECIDED)]
+        if not left or self.minutes() > self.asked.minutes:
             return
         # The copy may not change while its tests run.
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
