@@ -48,7 +48,7 @@ VERBS = {
     "calibrate": "measure wheel radii and effective track width, from a guided or a recorded drive",
     "recording": "list, show, replay, export and draw recordings",
     "tls": "make the certificates that other machines need to connect to the robot",
-    "router": "run a fleet's Zenoh router and restart it when a client blocks it",
+    "router": "run a fleet's Zenoh router with its configuration file",
     "service": "install acsard as a system service, remove it, or show its status",
 }
 

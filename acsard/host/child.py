@@ -16,7 +16,7 @@ import socket
 import stat
 import subprocess
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 
 from acsard.core.values import NS_PER_S, Ns
@@ -58,11 +58,9 @@ def acsard(*words: str) -> list[str]:
     return [sys.executable, "-P", "-m", "acsard", *words]
 
 
-def environment(hidden: Collection[str] = ()) -> dict[str, str]:
-    """Return this process's environment variables, without `hidden` and `SYSTEMD_VARIABLES`."""
-    return {
-        key: value for key, value in os.environ.items() if key not in (*SYSTEMD_VARIABLES, *hidden)
-    }
+def environment() -> dict[str, str]:
+    """Return this process's environment variables, without `SYSTEMD_VARIABLES`."""
+    return {key: value for key, value in os.environ.items() if key not in SYSTEMD_VARIABLES}
 
 
 def how_it_ended(code: int) -> str:

@@ -160,7 +160,7 @@ class Rig:
     def _start_program(self, stack: ExitStack, port: str) -> None:
         hidden = ("ACSARD_CONFIG", "ACSARD_TLS", "RUST_LOG", "STATE_DIRECTORY")
         words = [*self._command_line, "--config", str(self._file), "--port", port]
-        env = environment(hidden)
+        env = {name: value for name, value in environment().items() if name not in hidden}
         # The measured daemon must not leave files behind, so it writes its latches to the temporary
         # directory.
         env["XDG_STATE_HOME"] = str(self._log.parent)
