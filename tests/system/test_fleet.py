@@ -38,7 +38,6 @@ from acsard.core.messages.keys_and_roles import (
 )
 from acsard.core.values import ROLES
 from acsard.host.errors import Exit
-from tests.system.browser import Page, hands
 from tests.system.fleet_router import (
     ITS_NAME,
     ROBOT_FILE,
@@ -255,7 +254,7 @@ class Fleet:
         self._stack.close()
 
     def robot(self, robot_id: str, name: str = "", *, ready: bool = True) -> Daemon:
-        """Return a daemon with robot.toml and the certificate of its id, and with high rates.
+        """Return a daemon with robot.toml and the certificate of its id.
 
         robot2 is a Zenoh peer, as README.md describes for a robot that runs other programs.
         """
@@ -591,21 +590,6 @@ def test_the_tools_join_as_the_manual_says(fleet: Fleet) -> None:
     echo = finish(acsard("echo", "state", "-n", "1", *where), fleet.where)
     assert echo.code == 0, echo
     assert json.loads(echo.out)["mode"] == "ready"
-
-
-@pytest.mark.parametrize("name", ["viewer", "robot1"])
-async def test_a_page_over_tls_shows_its_own_robot_and_says_why_it_shows_no_other(
-    fleet: Fleet, name: str, tmp_path: Path
-) -> None:
-    by_tls = ["--connect", fleet.endpoint, "--tls", str(fleet.where / name), "--id", "robot1"]
-    with Page(fleet.daemons[0], tmp_path, *by_tls) as page:
-        async with hands(page) as ours:
-            await ours.say(subscribe="fleet")
-            message = await ours.find(lambda frame: frame.get("fleet"))
-            assert [(entry["robot"], entry["mode"]) for entry in message["fleet"]] == [
-                ("robot1", "ready")
-            ]
-            assert "over TLS this page looks only for its own robot" in message["note"]
 
 
 # the files
