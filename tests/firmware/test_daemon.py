@@ -112,7 +112,7 @@ def gives_way(bus: Bus, commander: Commander, linear: float = 0.5) -> None:
     A sender that is known only by its key must send zeros for a second before it is armed.
     """
     commander.wish = ZERO
-    until(lambda: "send a zero first" not in bus.state()["reason"], 5.0, "neutral")
+    until(lambda: bus.state()["code"] != "neutral", 5.0, "neutral")
     commander.wish = twist(linear)
 
 
@@ -420,7 +420,7 @@ def drives_in_the_end(board: Board, bus: Bus, commander: Commander) -> None:
         state = bus.state()
         if state["mode"] == "stopped":
             bus.get("srv/clear")
-        if "send a zero first" in state["reason"]:
+        if state["code"] == "neutral":
             gives_way(bus, commander)
         return turns(board, 0.5 / RADIUS)
 
@@ -448,7 +448,7 @@ def test_a_press_at_the_robot_stops_it_and_clear_is_refused_until_the_release(
         board.command(f"contact {ESTOP} open")
         state = until(lambda: s if (s := bus.state())["mode"] == "stopped" else None, 3.0, "a stop")
         assert state["emergency_stop"] == "pressed"
-        assert "emergency stop pressed at the robot" in state["reason"]
+        assert state["code"] == "emergency_stop"
         off = wait_until_still(board)
         assert "p00.00,bp00.00,cp00.00,dp00.00" in off.to_board.last
         refused = bus.get("srv/clear")

@@ -490,7 +490,7 @@ def test_no_line_waits_in_the_daemon_while_the_serial_line_is_full(
             state = bus.state()
             if state["mode"] == "fault":
                 bus.get("srv/clear")
-            driver.wish = ZERO if "send a zero first" in state["reason"] else twist(0.2)
+            driver.wish = ZERO if state["code"] == "neutral" else twist(0.2)
             return peer.lines[-1].line.startswith(text(0.2))
 
         # After a long silence the MCU has stopped, so the daemon starts over from zero.
@@ -669,7 +669,7 @@ def test_after_a_stall_of_seconds_a_commander_that_goes_on_must_be_neutral_first
             until(lambda: time.monotonic() > begun + 1.2, 5.0, "seconds")
             woken = time.monotonic()
         with Bus(daemon.endpoint) as bus:
-            until(lambda: "send a zero first" in bus.state()["reason"], 5.0, "what it waits for")
+            until(lambda: bus.state()["code"] == "neutral", 5.0, "what it waits for")
             until(lambda: len(peer.since(woken)) > 30, 5.0, "30 lines")
             assert no_burst(peer.since(woken)) >= 0.0
             assert {entry.line for entry in peer.since(woken)} == {ZERO_TEXT}

@@ -204,7 +204,7 @@ def test_a_viewer_can_stop_the_robot_and_do_nothing_else(viewer: Viewer, bus: Bu
     send(json.dumps({"linear": {"x": 0.3}, "angular": {}}).encode())
     looked.first(len(looked.came) + 20)
     assert bus.count("commands") == before
-    assert viewer.call("/acsard/stop", {})["message"].startswith("stopped and latched")
+    assert viewer.call("/acsard/stop", {})["success"]
     assert bus.state()["mode"] == "stopped"
     assert bus.get("srv/clear")["success"]
 

@@ -177,7 +177,7 @@ def test_a_simulator_that_the_file_makes_mute_never_links_and_the_log_says_why(
         Bus(daemon.endpoint) as bus,
         bus.follow("state") as states,
     ):
-        states.find(lambda state: "nothing was received" in state["reason"], 20.0, "no reply")
+        states.find(lambda state: state["code"] == "received_nothing", 20.0, "no reply")
         assert bus.get("sim/pose")["header"]["frame_id"] == "sim"
         assert "up" not in {sample.value["link"] for sample in list(states.seen)}
         events = daemon.events("configuration")

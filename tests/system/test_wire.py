@@ -77,7 +77,7 @@ def started(tmp_path_factory: pytest.TempPathFactory) -> Started:
         if state["mode"] == "fault":
             assert lost(begun) > 0.05, state
             bus.get("srv/clear")
-        waits = "send a zero first" in state["reason"]
+        waits = state["code"] == "neutral"
         sender.wish = ZERO if waits else twist(linear, angular)
         return steady(ZERO_LINE, *others)
 
@@ -293,7 +293,7 @@ def test_after_a_silence_of_a_second_the_commander_must_be_neutral_first(
             peer.reply = PLAIN
             back = states.find(lambda state: state["link"] == "up", 5.0, "up", after=stale.at).at
             waiting = states.find(
-                lambda state: "send a zero first" in state["reason"],
+                lambda state: state["code"] == "neutral",
                 5.0,
                 "why it waits",
                 after=back,
@@ -302,7 +302,7 @@ def test_after_a_silence_of_a_second_the_commander_must_be_neutral_first(
             peer.await_lines(50)
             assert _moving_since(peer, zeros_from) is None
             commander.wish = ZERO  # for a second, because the key alone identifies this sender
-            until(lambda: "send a zero first" not in bus.state()["reason"], 5.0, "neutral")
+            until(lambda: bus.state()["code"] != "neutral", 5.0, "neutral")
             commander.wish = twist(0.5)
             until(lambda: _moving_since(peer, zeros_from), 5.0, "driving after the zero")
 
