@@ -202,20 +202,18 @@ class Lifecycle:
             return False
         if number is not None and number != latch.number:
             raise RefusedError(_not_in_force(number, latch.why, "srv/activate"))
-        if latch is not None:
-            if number is None:
-                self._require_latch_was_seen(
-                    f"the robot was {_stopped(latch)}",
-                    _still(latch),
-                    self._off_ns,
-                    asked_ns,
-                    "srv/activate",
-                )
-            if asked_ns <= self._off_ns or now.mono_ns == self._off_ns:
-                raise RefusedError(
-                    f"{latch.why} at the same time as this call or after it: call srv/activate "
-                    "again"
-                )
+        if number is None:
+            self._require_latch_was_seen(
+                f"the robot was {_stopped(latch)}",
+                _still(latch),
+                self._off_ns,
+                asked_ns,
+                "srv/activate",
+            )
+        if asked_ns <= self._off_ns or now.mono_ns == self._off_ns:
+            raise RefusedError(
+                f"{latch.why} at the same time as this call or after it: call srv/activate again"
+            )
         self._latch(inactive=None)
         return True
 
@@ -262,9 +260,7 @@ class Lifecycle:
         return with_causes(self._new_latch(now, by, why), self.latches.stop)
 
     def _latch(self, **changes: Latch | None) -> None:
-        before = self.latches
-        if any(getattr(before, name) is not latch for name, latch in changes.items()):
-            self.latches = replace(before, **changes)
+        self.latches = replace(self.latches, **changes)
         self._derive()
 
     def _derive(self) -> None:

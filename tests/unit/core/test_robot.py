@@ -1152,6 +1152,14 @@ def test_after_an_activation_each_source_must_be_neutral() -> None:
     assert bench.mode() == "driving"
 
 
+def test_activating_an_active_robot_changes_nothing() -> None:
+    bench = Bench().driving()
+    bench.step(GO, ask="activate", gyro=0.0)
+    assert bench.mode() == "driving"
+    bench.set({"limits.linear_speed": 0.9})
+    assert bench.step(GO).applied == GO
+
+
 def test_each_change_of_mode_by_request_is_an_event_even_in_quick_succession() -> None:
     bench = Bench().linked()
     for _ in range(2):
