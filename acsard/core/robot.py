@@ -488,6 +488,8 @@ class Robot:
             events.append(Event(request.verb, message, by=request.by, news=news))
         self._asked = asked
         latch = _changed_latch(latches, self._life.latches)
+        if request.verb == "stop":
+            latch = _stop_of(request.by, self._life.latches)
         return Answer(request.id, True, message, latch, changes)
 
     def _execute(self, request: Request, now: Instant, changes: Changes) -> str:
@@ -651,6 +653,13 @@ class Robot:
                 return SHUTDOWN_REASON
             case _:
                 assert_never(self._life.mode)
+
+
+def _stop_of(by: str, latches: Latches) -> int:
+    # The number of a client's stop. It may be older than this step's call: the bus hands a call
+    # over as a stop first.
+    causes = () if latches.stop is None else latches.stop.causes
+    return next((one.number for one in causes if (one.code, one.by) == ("stopped", by)), 0)
 
 
 def _changed_latch(before: Latches, after: Latches) -> int:

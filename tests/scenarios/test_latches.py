@@ -114,6 +114,14 @@ def test_a_bumper_does_not_hide_the_client_that_stopped_the_robot(world: World) 
         assert world.state.mode == "ready"
 
 
+def test_the_answer_to_a_stop_has_the_number_of_the_stop_of_its_client(world: World) -> None:
+    first = world.call("stop").data.latch
+    assert first == world.state.latch
+    assert call(world, "stop", "joe").data.latch == world.state.latch != first
+    again = world.call("stop").data.latch
+    assert again == world.state.latch > first
+
+
 def test_a_stop_that_arrives_ahead_of_its_query_is_one_latch(world: World) -> None:
     world.put("stop", b"", attachment=msgspec.json.encode({"sender": "joe"}))
     arrived_ns, ahead = world.now_ns, world.state.latch
