@@ -80,8 +80,12 @@ def name_of(pid: int) -> str:
 
 
 def is_daemon_here(pid: int) -> bool:
-    """Return whether the daemon with the process id `pid` runs on this machine."""
-    return name_of(pid) == "acsard"
+    """Return whether the daemon with the process id `pid` runs on this machine.
+
+    A daemon in another container may have the process id of another subcommand here.
+    """
+    command = _text(PROC / str(pid) / "cmdline").split("\0")
+    return _executed(command) == "acsard" and "run" in command
 
 
 def waited_ns(pid: int) -> Ns:

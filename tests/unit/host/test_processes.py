@@ -139,6 +139,26 @@ def test_only_a_process_that_executes_acsard_has_its_name(
     assert name_of(77) == name
 
 
+@pytest.mark.parametrize(
+    ("command", "here"),
+    [
+        (("/opt/acsard/venv/bin/acsard", "run", "--config", "robot.toml"), True),
+        (tuple(acsard("run")), True),
+        (("python3", "bin/acsard", "web"), False),
+        (("python3", "-m", "other", "run"), False),
+        ((), False),
+    ],
+)
+def test_a_daemon_is_here_only_if_its_process_runs_one(
+    command: tuple[str, ...], here: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The page and the daemon in two containers may both have the process id 1."""
+    monkeypatch.setattr(processes, "PROC", tmp_path)
+    (tmp_path / "1").mkdir()
+    (tmp_path / "1" / "cmdline").write_bytes(b"".join(word.encode() + b"\0" for word in command))
+    assert processes.is_daemon_here(1) is here
+
+
 def test_another_program_with_the_word_acsard_keeps_its_own_name() -> None:
     with subprocess.Popen(["sh", "-c", "read line", "acsard"], stdin=subprocess.PIPE) as process:
         assert name_of(process.pid) != "acsard"
