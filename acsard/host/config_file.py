@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 from codecs import BOM_UTF8
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from acsard.core.config.parsing import MAX_BYTES, ConfigError, parse
@@ -130,11 +132,24 @@ def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = Fal
     `MendableError` and then leaves it unchanged.
     """
     try:
-        place, text, changes = _changed(file, keys, new)
-        replace(place, text.encode())
-        return changes
+        with _locked(_target(file, new).parent):
+            place, text, changes = _changed(file, keys, new)
+            replace(place, text.encode())
+            return changes
     except (OSError, ValueError, ConfigError) as error:
         raise _not_changed(file, error) from None
+
+
+@contextmanager
+def _locked(directory: Path) -> Iterator[None]:
+    # Two changes at once would lose one: the sync of a slow disk is between read and replacement.
+    handle = os.open(directory, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        with suppress(OSError):  # this file system has no locks
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
 
 
 def require_changeable(

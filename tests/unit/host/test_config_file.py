@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import threading
+import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +14,7 @@ from tomlkit.exceptions import NonExistentKey
 
 from acsard.bus.address import address_by_environment
 from acsard.core.config.parsing import ConfigError, parse
+from acsard.host import atomic_file, config_file
 from acsard.host.config_file import change, find, require_changeable
 from acsard.host.errors import MendableError, UsageError
 
@@ -167,3 +170,25 @@ def test_a_link_to_a_missing_file_creates_the_target(tmp_path: Path) -> None:
     change(link, KEYS, new=True)
     assert link.is_symlink()
     assert parse((tmp_path / "real.toml").read_bytes()).mcu.baud_rate == 57600
+
+
+def test_two_changes_at_once_lose_neither(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A slow disk keeps the first change waiting for its sync while the second one begins."""
+    file, syncs = tmp_path / "robot.toml", threading.Event()
+    file.touch()
+    real = atomic_file.replace
+
+    def slow(place: Path, content: bytes) -> None:
+        syncs.set()
+        time.sleep(0.2)
+        real(place, content)
+
+    monkeypatch.setattr(config_file, "replace", slow)
+    first = threading.Thread(target=change, args=(file, {"limits.linear_speed": 0.5}))
+    first.start()
+    assert syncs.wait(10.0)
+    change(file, {"limits.angular_speed": 0.7})
+    first.join(10.0)
+    limits = parse(file.read_bytes()).limits
+    assert (limits.linear_speed, limits.angular_speed) == (0.5, 0.7)
+    assert os.listdir(tmp_path) == ["robot.toml"]
