@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from msgspec.structs import replace
+
 from acsard.client import Client
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import Plain
@@ -42,4 +44,4 @@ def set_and_keep(robot: Client, config: str | None, settings: Mapping[str, Plain
         change(file, settings)
     except MendableError as error:
         raise MendableError(f"{reply.message}; not written: {error}") from None
-    return ServiceReply(True, f"{reply.message}; written to {file}")
+    return replace(reply, message=f"{reply.message}; written to {file}")

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from msgspec.structs import replace
 
-from acsard.core.messages.schema import Info, ServiceReply
+from acsard.core.messages.schema import Change, Info, ReplyData, ServiceReply
 from acsard.web.calls import MAX_STOPS, MIN_STOP_INTERVAL_S, Calls, StopMerger, Stops
 
 PATIENCE_S = 20.0
@@ -126,7 +127,7 @@ class KeepingRobot:
 
     def request(self, verb: str, fields: object) -> ServiceReply:
         self.asked.append(fields)
-        return ServiceReply(True, "done")
+        return ServiceReply(True, "done", ReplyData(changes={"rates.telemetry": Change(10.0, 5.0)}))
 
     def refresh_about(self) -> None: ...
 
@@ -146,7 +147,8 @@ async def test_keep_writes_the_file_of_the_page_or_says_why_it_may_not(
     assert not robot.asked
     file.chmod(0o644)
     kept = await calls.call(cast(Any, None), "set", wish | {"keep": True})
-    assert kept == ServiceReply(True, f"done; written to {file}")
+    assert kept == replace(robot.request("", wish), message=f"done; written to {file}")
+    del robot.asked[-1]
     assert tomllib.loads(file.read_text()) == {"rates": {"telemetry": 5}}
     assert (await calls.call(cast(Any, None), "set", wish | {"keep": False})).message == "done"
     assert robot.asked == [wish, wish]
