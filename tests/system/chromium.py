@@ -296,13 +296,6 @@ class Browser:
         kind = "rawKeyDown" if kind == "Down" else "keyUp"
         self.ask("Input.dispatchKeyEvent", type=kind, code=code, key=key)
 
-    def type_key(self, key: str) -> None:
-        """Press and release Tab or Enter, with the effect that the browser gives this key."""
-        number, text = {"Tab": (9, ""), "Enter": (13, "\r")}[key]
-        how = {"code": key, "key": key, "windowsVirtualKeyCode": number}
-        self.ask("Input.dispatchKeyEvent", type="keyDown", text=text, **how)
-        self.ask("Input.dispatchKeyEvent", type="keyUp", **how)
-
     def picture(self, path: Path, *, whole: bool = False) -> None:
         """Write a PNG of the visible page, or of the `whole` page down to its end."""
         reply = self.ask(

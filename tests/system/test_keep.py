@@ -19,8 +19,6 @@ from tests.system.typed import typed
 
 PERIOD_S = 0.01
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7448"
-
 KEY, VALUE = "limits.linear_speed", "0.45"
 
 

@@ -25,9 +25,6 @@ MESSAGE, CALL, ANSWER = 1, 2, 3
 """Opcodes: data either way; a service's request, and its reply."""
 
 
-RULE = "=" * 80
-
-
 class Came(NamedTuple):
     """A message of a channel, its time of arrival, and its bytes."""
 

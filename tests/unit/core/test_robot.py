@@ -165,16 +165,6 @@ class Bench:
         assert answer.id == 7
         return answer
 
-    def sent_speeds(self) -> WheelSpeeds | None:
-        """Return the wheel speeds of the last sent line, or None if no line was sent."""
-        return None if self.out.line is None else self.codec.decode(self.out.line.rstrip(b",\r\n"))
-
-    @property
-    def robot_latch(self) -> int:
-        """Return the number of the latch that `clear` releases next."""
-        latch = self.robot.step(Inputs(self.now, False, True, self.opened)).latches.next
-        return 0 if latch is None else latch.number
-
     def set(self, settings: dict[str, Plain]) -> None:
         self.now_ns += 10 * MS
         requests = (Request("set", 7, settings=settings),)

@@ -35,8 +35,6 @@ from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 from tests.unit.recording.attacks import whole
 
-MEMORY = Memory(b"line", 5, None, 7, 8)
-
 
 def test_a_robot_is_read_back_unchanged() -> None:
     world = World()
