@@ -98,8 +98,8 @@ class Page:
         rules: WebConfig,
     ) -> None:
         self._parts, self._vault, self._acceptor = parts, vault, acceptor
-        self._robots, self._files = parts.robots, Files()
-        self._box = BlackBox(parts.robots)
+        self._robot, self._files = parts.robot, Files()
+        self._box = BlackBox(parts.robot)
         self._websocket_limits, self._camera = WebSocketLimits(), Camera(rules.camera)
         self._has_camera = bool(rules.camera)
         # Each page file, and when the disk was last checked for a change, on the event loop's
@@ -108,7 +108,7 @@ class Page:
         self._viewers: set[Viewer] = set()
         # The last read of the token file, which may take any time.
         self._token_read: asyncio.Future[frozenset[str]] | None = None
-        self._admission = Admission(parts.robots.id, names, vault, acceptor, parts.counts, rules)
+        self._admission = Admission(parts.robot.id, names, vault, acceptor, parts.counts, rules)
         self.app = self._admission.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:
@@ -178,7 +178,7 @@ class Page:
                 "plain", "over plain http, no token is needed: connect without one"
             )
         identity = await self._admission.owner(peer_of(request), [form.token])
-        cookie = cookie_name(self._robots.id, own_port(request))
+        cookie = cookie_name(self._robot.id, own_port(request))
         old_token = "" if form.replace else request.cookies.get(cookie, "")
         present = self._vault.find_owner(old_token)
         if present is not None and not identity.may(present.role):
@@ -232,9 +232,9 @@ class Page:
         return web.Response(body=OPENAPI_DOCUMENT, content_type=JSON)
 
     async def metrics(self, request: web.Request) -> web.StreamResponse:
-        robots, counts = self._robots, self._parts.counts
+        robot, counts = self._robot, self._parts.counts
         body = metrics.text(
-            robots.id, robots.about.version, robots.state, not robots.gone, len(self._viewers),
+            robot.id, robot.about.version, robot.state, not robot.gone, len(self._viewers),
             counts.all(), counts.refused(),
         )  # fmt: skip
         return web.Response(body=body, headers={"Content-Type": metrics.CONTENT_TYPE})

@@ -23,7 +23,7 @@ from acsard.host.rate_limits import Places
 from acsard.host.threads import in_thread
 from acsard.machine.kept_settings import set_and_keep
 from acsard.web.callers import AdmittedClient, RequestRefusedError
-from acsard.web.robots import Robots
+from acsard.web.followed_robot import FollowedRobot
 from acsard.web.tasks import shared
 
 # At the same time: queries and calls other than a stop, and stops.
@@ -43,8 +43,8 @@ Stop = Callable[[], Awaitable[ServiceReply]]
 class Calls:
     """Sends service calls and queries to the robot, within the limits of this module."""
 
-    def __init__(self, robots: Robots, config: str | None = None) -> None:
-        self._robots, self._config = robots, config
+    def __init__(self, robot: FollowedRobot, config: str | None = None) -> None:
+        self._robot, self._config = robot, config
         self._stops, self._merged = Stops(), StopMerger()
         self._asks = Places(MAX_CALLS, MAX_CALLS)
 
@@ -56,9 +56,9 @@ class Calls:
         Raises `RequestRefusedError` if the client may not do that.
         """
         require(identity, verb)
-        client = self._robots.client
+        client = self._robot.client
         if client is None:
-            return ServiceReply(False, self._robots.gone)
+            return ServiceReply(False, self._robot.gone)
 
         def request() -> ServiceReply:
             named = _named(client, identity)
@@ -81,7 +81,7 @@ class Calls:
         except (MendableError, UsageError, DecodeError, TimeoutError) as error:
             return ServiceReply(False, str(error) or "the robot did not answer in time: try again")
         if verb == "set" and reply.success:
-            self._robots.refresh_about()
+            self._robot.refresh_about()
         return reply
 
     async def get(self, name: str) -> tuple[str, bytes]:
@@ -90,9 +90,9 @@ class Calls:
         Raises `MendableError` without bus or answer or if too many calls run, and `TimeoutError` if
         the bus is stuck.
         """
-        client = self._robots.client
+        client = self._robot.client
         if client is None:
-            raise MendableError(self._robots.gone)
+            raise MendableError(self._robot.gone)
         return await self._run_call(lambda: client.reply(f"{name}?fmt=json"))
 
     async def _run_call(self, call: Callable[[], T]) -> T:

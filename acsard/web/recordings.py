@@ -18,7 +18,7 @@ from acsard.recording.directory import NAME_TIME_FORMAT, PART_SUFFIX, is_being_r
 from acsard.recording.end_record import ending_text, read_end
 from acsard.web.answers import READ_TIMEOUT_S, TroubleError
 from acsard.web.callers import RequestRefusedError, is_loopback
-from acsard.web.robots import Robots
+from acsard.web.followed_robot import FollowedRobot
 from acsard.web.tasks import shared
 
 MIN_LIST_INTERVAL_NS = NS_PER_S // 4
@@ -43,8 +43,8 @@ class BlackBox:
     elsewhere.
     """
 
-    def __init__(self, robots: Robots) -> None:
-        self._robots = robots
+    def __init__(self, robot: FollowedRobot) -> None:
+        self._robot = robot
         self._listing: asyncio.Task[list[Recording]] | None = None
         self._listed_ns = 0  # start of the task `_listing`
 
@@ -80,20 +80,20 @@ class BlackBox:
         return path
 
     def _place(self) -> Path:
-        host = self._robots.endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+        host = self._robot.endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
         if not (is_loopback(host) or host == "localhost"):
             raise TroubleError(
                 404,
                 "the recordings are on the robot, but this page's server runs on another machine: "
                 "open the page that the robot serves",
             )
-        if not self._robots.about.recordings:
+        if not self._robot.about.recordings:
             raise TroubleError(
                 404,
                 "the daemon records nothing, because record.directory is not set: set it and "
                 "restart the daemon",
             )
-        return Path(self._robots.about.recordings)
+        return Path(self._robot.about.recordings)
 
 
 def rows(directory: Path) -> list[Recording]:

@@ -29,9 +29,9 @@ from acsard.host.threads import NoThreadError, in_thread
 from acsard.web.acceptor import READ_BYTES, Acceptor, Reader
 from acsard.web.app import Page
 from acsard.web.callers import is_loopback
+from acsard.web.followed_robot import About, FollowedRobot
 from acsard.web.listen import Listen, open_sockets, own_name, require_certificate
 from acsard.web.metrics import Counts
-from acsard.web.robots import About, Robots
 from acsard.web.socket_messages import DEFAULT_SOURCE
 from acsard.web.tokens import Vault
 from acsard.web.viewer import Parts
@@ -80,8 +80,10 @@ async def serve(
     # that it notices every later change.
     files = CertificateFiles(*files_in(options.tls))
     secure, names = _certified(options)
-    robots = Robots(options.address, lambda: _connected(options.address), _about(options), counts)
-    parts = Parts(robots, counts, options.file)
+    robot = FollowedRobot(
+        options.address, lambda: _connected(options.address), _about(options), counts
+    )
+    parts = Parts(robot, counts, options.file)
     vault, acceptor = Vault(options.state, options.address.robot_id), Acceptor(counts)
     page = Page(parts, vault, names, acceptor, options.config.web)
     runner = web.AppRunner(
@@ -113,7 +115,7 @@ async def serve(
 async def _until(leaving: asyncio.Event, parts: Parts, page: Page, options: ServerOptions) -> None:
     work: list[asyncio.Future[Any]] = [
         asyncio.create_task(leaving.wait()),
-        asyncio.create_task(parts.robots.run()),
+        asyncio.create_task(parts.robot.run()),
         asyncio.create_task(_tidy(page)),
         asyncio.wrap_future(parts.commands.outbox.dead),
     ]

@@ -19,9 +19,9 @@ from acsard.host import clock
 from acsard.host.rate_limits import Buckets, Rate
 from acsard.web.answers import cut
 from acsard.web.callers import Reason
+from acsard.web.followed_robot import RETRY_DELAY_S, FollowedRobot
 from acsard.web.limits import MAX_UNREAD_BYTES
 from acsard.web.metrics import Counts
-from acsard.web.robots import RETRY_DELAY_S, Robots
 from acsard.web.socket_messages import Refused, Subscribe, Unsubscribe
 from acsard.web.streams import NOT_READY_ERRORS, VIEWER_KEYS, Stream
 
@@ -164,10 +164,10 @@ class Keys:
     def __init__(
         self,
         out: Outgoing,
-        robots: Robots,
+        robot: FollowedRobot,
         start: Callable[[Coroutine[Any, Any, None]], None],
     ) -> None:
-        self._out, self._robots, self._start = out, robots, start
+        self._out, self._robot, self._start = out, robot, start
 
     def subscribe(self, frame: Subscribe) -> None:
         """Subscribe to a key or change its rate, or report to the client why not."""
@@ -209,7 +209,7 @@ class Keys:
 
     def _leave(self, subscription: Following) -> None:
         if subscription.stream is not None:
-            self._robots.streams.leave(subscription.name)
+            self._robot.streams.leave(subscription.name)
 
     async def _join(self, subscription: Following) -> None:
         stream = None
@@ -218,18 +218,18 @@ class Keys:
         if stream is None:
             return
         if not self._is_followed(subscription):  # the viewer unsubscribed during the wait
-            self._robots.streams.leave(subscription.name)
+            self._robot.streams.leave(subscription.name)
             return
         subscription.stream = stream
         self._out.wake()
 
     async def _follow(self, subscription: Following) -> Stream | None:
-        client = self._robots.client
+        client = self._robot.client
         if client is None:
             await asyncio.sleep(0.2)
             return None
         try:
-            return await self._robots.streams.follow(client, subscription.name)
+            return await self._robot.streams.follow(client, subscription.name)
         except NOT_READY_ERRORS:
             self._out.refuse(
                 "subscribe", "stuck", "the Zenoh bus is stuck; the page tries again by itself"

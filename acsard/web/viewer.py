@@ -27,9 +27,9 @@ from acsard.host.rate_limits import Bucket, Buckets
 from acsard.web import socket_messages
 from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.calls import Calls
+from acsard.web.followed_robot import FollowedRobot
 from acsard.web.limits import COMMAND_RATE, MAX_OVERRUNS, MESSAGE_RATE
 from acsard.web.metrics import Counts
-from acsard.web.robots import Robots
 from acsard.web.routes import RECORDINGS_ROLE
 from acsard.web.socket_messages import (
     Call,
@@ -108,10 +108,10 @@ class ViewerCommands:
 class Parts:
     """What `Page` and all viewers share, such as the connection to the daemon."""
 
-    def __init__(self, robots: Robots, counts: Counts, config: str | None = None) -> None:
-        self.robots, self.counts = robots, counts
-        self.commands = ViewerCommands(lambda: robots.client, counts)
-        self.calls = Calls(robots, config)
+    def __init__(self, robot: FollowedRobot, counts: Counts, config: str | None = None) -> None:
+        self.robot, self.counts = robot, counts
+        self.commands = ViewerCommands(lambda: robot.client, counts)
+        self.calls = Calls(robot, config)
 
 
 class Viewer:
@@ -127,27 +127,27 @@ class Viewer:
         camera: bool,
     ) -> None:
         self.who, self._camera = who, camera
-        self._robots, self._commands, self._calls = parts.robots, parts.commands, parts.calls
+        self._robot, self._commands, self._calls = parts.robot, parts.commands, parts.calls
         self._counts = parts.counts
         whole = sender_id(who.name)
         self._sender, self._commanders = CommandSigner(whole), dict[str, Commander]()
         # Public name, in `state.sender` while the client drives; the sender id stays secret.
-        self.sender = public_name(whole, parts.robots.certificate)
+        self.sender = public_name(whole, parts.robot.certificate)
         self._socket = socket
         self._bucket = Bucket(MESSAGE_RATE)
         self._overruns = self._calling = 0
         self._out = Outgoing(socket, request, parts.counts, who.origin)
-        self._keys = Keys(self._out, parts.robots, self._start)
+        self._keys = Keys(self._out, parts.robot, self._start)
         self._tasks: set[asyncio.Task[None]] = set()
         self._stops: set[asyncio.Task[None]] = set()
         self._ended = False
         self._stamp_ns = -1  # of the last command
-        self._unreachable_reason, self._about = "", parts.robots.about
+        self._unreachable_reason, self._about = "", parts.robot.about
 
     async def run(self) -> None:
         self._greet()
-        self._out.enqueue(socket_messages.DrivenPath(**self._robots.paths()))
-        self._out.enqueue(socket_messages.LastMinute(self._robots.minute()))
+        self._out.enqueue(socket_messages.DrivenPath(**self._robot.paths()))
+        self._out.enqueue(socket_messages.LastMinute(self._robot.minute()))
         pump = asyncio.create_task(self._out.pump(self._look_around))
         try:
             async for message in self._socket:
@@ -237,8 +237,8 @@ class Viewer:
                 self._keys.unsubscribe(frame)
 
     def _command(self, frame: Command) -> None:
-        if frame.source not in self._robots.about.timeouts:
-            names = ", ".join(self._robots.about.timeouts)
+        if frame.source not in self._robot.about.timeouts:
+            names = ", ".join(self._robot.about.timeouts)
             text = f"{frame.source} is not one of the robot's sources: {names}"
             self._out.refuse("cmd", "malformed", text)
             return
@@ -262,7 +262,7 @@ class Viewer:
             self._out.refuse("cmd", "too_fast", text)
 
     def _release(self) -> None:
-        timeouts = self._robots.about.timeouts
+        timeouts = self._robot.about.timeouts
         for source, commander in self._commanders.items():
             self._commands.outbox.release(commander, timeouts.get(source, MAX_SOURCE_TIMEOUT_S))
 
@@ -298,9 +298,9 @@ class Viewer:
     # Outgoing messages.
 
     def _greet(self) -> None:
-        about = self._about = self._robots.about
+        about = self._about = self._robot.about
         greeting = socket_messages.Greeting(
-            self._robots.id,
+            self._robot.id,
             about.version,
             self.who.role,
             self.sender,
@@ -317,11 +317,11 @@ class Viewer:
         self._out.enqueue(socket_messages.Hello(greeting))
 
     def _look_around(self, now: float) -> float:
-        if self._robots.gone != self._unreachable_reason:
-            self._unreachable_reason = self._robots.gone
+        if self._robot.gone != self._unreachable_reason:
+            self._unreachable_reason = self._robot.gone
             if self._unreachable_reason:
                 self._out.enqueue(socket_messages.DaemonUnreachable(self._unreachable_reason))
-        if self._robots.about is not self._about:
+        if self._robot.about is not self._about:
             self._greet()
         return now + 0.25
 

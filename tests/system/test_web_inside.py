@@ -20,9 +20,9 @@ from acsard.core.messages.signature import MAX_INT64
 from acsard.host.errors import UnreachableError
 from acsard.web.acceptor import Acceptor
 from acsard.web.app import Page
+from acsard.web.followed_robot import About, FollowedRobot
 from acsard.web.limits import MAX_OVERRUNS, MAX_UNREAD_BYTES
 from acsard.web.metrics import Counts
-from acsard.web.robots import About, Robots
 from acsard.web.server import ServerOptions, _until
 from acsard.web.tokens import Vault
 from acsard.web.viewer import Parts
@@ -48,8 +48,10 @@ class Inside:
         def connect() -> Client:
             raise UnreachableError("nobody is there")
 
-        self.robots = Robots(Address("tcp/127.0.0.1:1", "acsar", ""), connect, ABOUT, self.counts)
-        self.parts = Parts(self.robots, self.counts)
+        self.robot = FollowedRobot(
+            Address("tcp/127.0.0.1:1", "acsar", ""), connect, ABOUT, self.counts
+        )
+        self.parts = Parts(self.robot, self.counts)
         self.page = Page(
             self.parts, Vault(where, "acsar"), frozenset(), Acceptor(self.counts), rules=rules
         )
@@ -106,7 +108,7 @@ async def test_a_client_that_stops_reading_later_gets_only_the_newest_message(
         return inside.counts.all().get("frames_left_out", 0)
 
     with Daemon(tmp_path) as daemon, client_session(daemon.endpoint, "") as session:
-        inside.robots.client = Client(session, "acsar", "teleop")
+        inside.robot.client = Client(session, "acsar", "teleop")
         async with inside.hands() as ours:
             await ours.say(subscribe="odom", rate=50)
             await ours.find(lambda frame: "key" in frame)
@@ -158,7 +160,7 @@ async def test_a_key_that_is_unsubscribed_and_immediately_subscribed_again_is_fo
     inside: Inside, tmp_path: Path
 ) -> None:
     with Daemon(tmp_path) as daemon, client_session(daemon.endpoint, "") as session:
-        inside.robots.client = Client(session, "acsar", "teleop")
+        inside.robot.client = Client(session, "acsar", "teleop")
         async with inside.hands() as ours:
             await ours.say(subscribe="state", rate=10)
             await ours.state(lambda state: state["mode"])
@@ -176,16 +178,16 @@ async def test_a_client_that_unsubscribes_and_disconnects_leaves_no_subscription
     inside: Inside, tmp_path: Path
 ) -> None:
     with Daemon(tmp_path) as daemon, client_session(daemon.endpoint, "") as session:
-        inside.robots.client = Client(session, "acsar", "teleop")
+        inside.robot.client = Client(session, "acsar", "teleop")
         async with inside.hands() as ours:
             await ours.say(subscribe="odom", rate=50)
             await ours.find(lambda frame: "key" in frame)
-            assert inside.robots.streams.followed("odom") is not None
+            assert inside.robot.streams.followed("odom") is not None
             # The server reads both messages at once.
             await ours.say(unsubscribe="odom")
             await ours.socket.close()
             await eventually(lambda: not inside.page._viewers)
-            assert inside.robots.streams.followed("odom") is None
+            assert inside.robot.streams.followed("odom") is None
 
 
 async def test_a_client_that_pings_without_reading_gets_one_answer_to_all_pings(
@@ -216,13 +218,13 @@ async def test_a_bus_that_is_gone_is_reported_and_the_key_comes_when_it_is_back(
     with Daemon(tmp_path) as daemon:
         closed = client_session(daemon.endpoint, "")
         closed.close()
-        inside.robots.client = Client(closed, "acsar", "teleop")
+        inside.robot.client = Client(closed, "acsar", "teleop")
         async with inside.hands() as ours:
             await ours.say(subscribe="state", rate=10)
             refused = await ours.find(lambda frame: frame.get("refused") == "subscribe")
             assert "again" in refused["reason"]
             with client_session(daemon.endpoint, "") as session:
-                inside.robots.client = Client(session, "acsar", "teleop")
+                inside.robot.client = Client(session, "acsar", "teleop")
                 await ours.state(lambda state: state["mode"])
 
 
@@ -233,9 +235,11 @@ async def test_a_robot_with_a_closed_session_is_reported_as_gone_and_the_server_
         closed = client_session(daemon.endpoint, "")
         closed.close()
         way = Client(closed, "acsar", "teleop")
-        robots = Robots(Address(daemon.endpoint, "acsar", ""), lambda: way, ABOUT, inside.counts)
-        running = asyncio.create_task(robots.run())
-        await eventually(lambda: "again" in robots.gone or running.done())
+        robot = FollowedRobot(
+            Address(daemon.endpoint, "acsar", ""), lambda: way, ABOUT, inside.counts
+        )
+        running = asyncio.create_task(robot.run())
+        await eventually(lambda: "again" in robot.gone or running.done())
         assert not running.done()
         running.cancel()
 

@@ -29,8 +29,8 @@ from acsard.web.admission import IDENTITY_KEY
 from acsard.web.app import Page, settings_in
 from acsard.web.callers import RequestRefusedError
 from acsard.web.camera import Camera
+from acsard.web.followed_robot import About, FollowedRobot
 from acsard.web.metrics import Counts
-from acsard.web.robots import About, Robots
 from acsard.web.tokens import FILE, Vault
 from acsard.web.viewer import Parts
 from tests.each import each
@@ -40,8 +40,8 @@ from tests.unit.web.test_callers import MAINTAINER
 ABOUT = About("1", True, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 
 
-def robots(client: Client | None) -> Robots:
-    result = Robots(Address("tcp/127.0.0.1:1", "acsar", ""), Mock(), ABOUT, Counts())
+def followed(client: Client | None) -> FollowedRobot:
+    result = FollowedRobot(Address("tcp/127.0.0.1:1", "acsar", ""), Mock(), ABOUT, Counts())
     result.client = client
     return result
 
@@ -64,7 +64,7 @@ class Phone:
 
 def page_with_phone(directory: Path, ends: list[str]) -> Page:
     counts = Counts()
-    parts = Parts(robots(None), counts)
+    parts = Parts(followed(None), counts)
     page = Page(parts, Vault(directory, "acsar"), frozenset(), Acceptor(counts), WebConfig())
     page._viewers.add(Phone(ends))  # type: ignore[arg-type]
     return page
@@ -111,7 +111,7 @@ async def test_the_age_of_a_picture_counts_a_suspend(
 ) -> None:
     """The age must include the suspend, in which the monotonic clock stands still."""
     counts, headers = Counts(), dict[str, str]()
-    parts = Parts(robots(None), counts)
+    parts = Parts(followed(None), counts)
     page = Page(parts, Vault(tmp_path, "acsar"), frozenset(), Acceptor(counts), WebConfig())
     page._camera = Camera("http://127.0.0.1:1/")
 
@@ -150,7 +150,7 @@ class Daemon:
 def page_with_daemon(directory: Path) -> tuple[Page, list[str]]:
     """Return a page, and the list of the calls that reach the robot."""
     counts, calls = Counts(), list[str]()
-    parts = Parts(robots(cast(Client, Daemon(calls))), counts)
+    parts = Parts(followed(cast(Client, Daemon(calls))), counts)
     vault = Vault(directory, "acsar")
     return Page(parts, vault, frozenset(), Acceptor(counts), WebConfig()), calls
 

@@ -45,8 +45,8 @@ async def test_many_requests_at_once_read_the_disk_once(
         return []
 
     monkeypatch.setattr(recordings, "rows", look)
-    robots: Any = None
-    box = BlackBox(robots)
+    robot: Any = None
+    box = BlackBox(robot)
     monkeypatch.setattr(box, "_place", lambda: tmp_path)
     assert await asyncio.gather(*(box.rows() for _ in range(40))) == [[]] * 40
     assert looked == [tmp_path]

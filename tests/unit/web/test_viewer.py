@@ -19,9 +19,9 @@ from acsard.core.messages.signature import unpack
 from acsard.core.values import NS_PER_S, Role, Twist
 from acsard.host import clock
 from acsard.web.callers import AdmittedClient
+from acsard.web.followed_robot import About, FollowedRobot
 from acsard.web.limits import COMMAND_RATE
 from acsard.web.metrics import Counts
-from acsard.web.robots import About, Robots
 from acsard.web.viewer import Parts, Viewer, ViewerCommands
 from tests.unit.web.test_socket_messages import INVALID_STOPS
 
@@ -105,9 +105,9 @@ async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
     counts = Counts()
     about = About("1", True, 1.0, 4.0, 10.0, "", {"slow": 10.0})
     fake: Any = Fake()
-    robots = Robots(Address("tcp/127.0.0.1:1", "acsar", ""), lambda: fake, about, counts)
-    robots.client = fake
-    parts = Parts(robots, counts)
+    robot = FollowedRobot(Address("tcp/127.0.0.1:1", "acsar", ""), lambda: fake, about, counts)
+    robot.client = fake
+    parts = Parts(robot, counts)
     request: Any = SimpleNamespace(transport=None)
     socket: Any = SimpleNamespace()
     viewer = Viewer(
@@ -139,8 +139,8 @@ class Page:
         self.stops: list[ServiceReply] = []
         counts = Counts()
         about = About("1", True, 1.0, 4.0, 10.0, "", {})
-        robots = Robots(Address("tcp/127.0.0.1:1", "r1", ""), Mock(), about, counts)
-        parts = Parts(robots, counts)
+        robot = FollowedRobot(Address("tcp/127.0.0.1:1", "r1", ""), Mock(), about, counts)
+        parts = Parts(robot, counts)
         parts.calls.call = self._call  # type: ignore[method-assign, assignment]
         who = AdmittedClient(role, "bob", "token", "1.2.3.4")
         socket, request = cast(Any, SimpleNamespace()), cast(Any, SimpleNamespace(transport=None))

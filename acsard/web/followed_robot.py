@@ -76,7 +76,7 @@ class _TaskQueries:
             await in_thread(lambda: self._client.start_query(name, take), None)
 
 
-class Robots:
+class FollowedRobot:
     """The connection to the daemon of the page's robot, and the data for a newly opened page.
 
     `about` comes from the local configuration until the daemon answers.

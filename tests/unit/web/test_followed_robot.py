@@ -27,9 +27,9 @@ from acsard.core.messages.schema import Time
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.threads import NoThreadError
-from acsard.web import robots
+from acsard.web import followed_robot
+from acsard.web.followed_robot import PROCESS_PERIOD_S, About, FollowedRobot, _TaskQueries
 from acsard.web.metrics import Counts
-from acsard.web.robots import PROCESS_PERIOD_S, About, Robots, _TaskQueries
 from tests.each import each
 from tests.unit.client.test_follower import UNREADABLE, Robot
 from tests.unit.top.screens import INFO, STATE, sample_of
@@ -46,14 +46,14 @@ class World:
         self.asked = 0
         monkeypatch.setattr(clock, "mono_ns", lambda: round((self.now - self.asleep) * NS_PER_S))
         monkeypatch.setattr(clock, "asleep_ns", lambda: round(self.asleep * NS_PER_S))
-        monkeypatch.setattr(robots, "PROCESS_PERIOD_S", 0.0)
+        monkeypatch.setattr(followed_robot, "PROCESS_PERIOD_S", 0.0)
 
         async def at_once(call: Callable[[], Any], timeout: float | None) -> Any:
             return call()
 
-        monkeypatch.setattr(robots, "in_thread", at_once)
+        monkeypatch.setattr(followed_robot, "in_thread", at_once)
         never: Any = None
-        self.robots = Robots(Address("tcp/x:1", "acsar", ""), never, ABOUT, Counts())
+        self.followed = FollowedRobot(Address("tcp/x:1", "acsar", ""), never, ABOUT, Counts())
         self.robot = Answering(self)
 
     def state(self) -> Any:
@@ -71,15 +71,15 @@ class World:
         async def story() -> None:
             client: Any = self.robot
             watch = Watch(_TaskQueries(client), self.now)
-            watching = asyncio.create_task(self.robots._follow(watch))
-            began, before = self.now, self.robots.gone
+            watching = asyncio.create_task(self.followed._follow(watch))
+            began, before = self.now, self.followed.gone
             while self.now - began < seconds:
                 if (sample := publishes(self.now - began)) is not None:
                     self.robot.queue.append(sample)
                 for _ in range(5):  # each task of the page has its turn
                     await asyncio.sleep(0)
-                if self.robots.gone != before:
-                    before = self.robots.gone
+                if self.followed.gone != before:
+                    before = self.followed.gone
                     changes.append((self.now - began, before))
                 self.now += PROCESS_PERIOD_S
             assert not watching.done()
@@ -188,9 +188,9 @@ async def test_the_page_says_why_it_cannot_follow_the_robot_yet(
             raise failure
         return call()
 
-    monkeypatch.setattr(robots, "in_thread", in_thread)
+    monkeypatch.setattr(followed_robot, "in_thread", in_thread)
     client: Any = AnsweringRobot()
-    page = Robots(Address("tcp/x:1", "acsar", ""), lambda: client, ABOUT, Counts())
+    page = FollowedRobot(Address("tcp/x:1", "acsar", ""), lambda: client, ABOUT, Counts())
     running = asyncio.create_task(page.run())
     for _ in range(10):
         await asyncio.sleep(0)
@@ -213,11 +213,11 @@ async def test_the_page_learns_about_its_robot_although_a_thread_could_not_start
             raise NoThreadError("this process cannot start another thread")
         return call()
 
-    monkeypatch.setattr(robots, "in_thread", in_thread)
-    monkeypatch.setattr(robots, "RETRY_DELAY_S", 0.0)
-    monkeypatch.setattr(robots, "ABOUT_RETRY_S", 0.0)
+    monkeypatch.setattr(followed_robot, "in_thread", in_thread)
+    monkeypatch.setattr(followed_robot, "RETRY_DELAY_S", 0.0)
+    monkeypatch.setattr(followed_robot, "ABOUT_RETRY_S", 0.0)
     client: Any = AnsweringRobot()
-    page = Robots(Address("tcp/x:1", "acsar", ""), lambda: client, ABOUT, Counts())
+    page = FollowedRobot(Address("tcp/x:1", "acsar", ""), lambda: client, ABOUT, Counts())
     running = asyncio.create_task(page.run())
     for _ in range(100):
         await asyncio.sleep(0)
