@@ -90,7 +90,7 @@ DIFFERENCE_REASONS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = 
         "warning",
         "these values were set while the daemon ran, or come from another file, or the file has "
         "changed since the daemon started",
-        "when the daemon starts again, it uses the file's values; `acsard set KEY VALUE --write` "
+        "when the daemon starts again, it uses the file's values; `acsard set KEY VALUE --keep` "
         "writes a value into the file",
     ),
 )

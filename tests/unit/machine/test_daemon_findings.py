@@ -105,7 +105,7 @@ def test_settings_changed_at_run_time_are_reported_separately_from_options() -> 
     assert "limits.linear_speed = 0.4, not 1.0" in finding.text
     assert f"commands.sources.{sources[0].name}.timeout = 0.4, not 0.25" in finding.text
     assert "set while the daemon ran" in finding.text
-    assert "acsard set KEY VALUE --write" in finding.mend
+    assert "acsard set KEY VALUE --keep" in finding.mend
     assert "options" not in finding.text + finding.mend
     both = replace(runs, mcu=McuConfig(port="/dev/pts/3"))
     by_option, by_set = compared(running(both), FILE)
