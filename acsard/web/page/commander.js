@@ -8,11 +8,11 @@
 
 import { person } from "./words.js";
 
-export const PERIOD = 50;
-export const OPENING = 20;
-export const PATIENCE = 2000; // longest wait until the robot follows after a press
-export const GRACE = 500; // longest time for which the robot may cease to follow during a hold
-export const HICCUP = 250; // after a longer gap between two calls of `look` the robot has braked, so zeros come first
+const PERIOD = 50;
+const OPENING = 20;
+const PATIENCE = 2000; // longest wait until the robot follows after a press
+const GRACE = 500; // longest time for which the robot may cease to follow during a hold
+const HICCUP = 250; // after a longer gap between two calls of `look` the robot has braked, so zeros come first
 export const FROZEN = 1000; // after a longer gap between two calls of `look` the finger may be gone, so the hold ends
 
 /** Maps a mode to the reason why the robot does not drive in it, with the remedy. */
