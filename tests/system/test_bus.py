@@ -50,6 +50,7 @@ FIELDS = {
         "gyro", "encoder_counts", "wheel_fault", "sender", "recording_error",
         "latch", "latch_file_error", "feedback_age", "emergency_stop", "bumpers", "battery",
         "speed_limit", "settings_differ", "certificate_days",
+        "code", "certificate",
     },
     "diagnostics": {"header", "status"},
     "battery": {

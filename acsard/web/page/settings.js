@@ -22,16 +22,15 @@ export class Settings {
 
   #row(row, id) {
     const range = row.low === undefined ? "" : ` (${row.low} to ${row.high})`;
-    const list = Array.isArray(row.value) ? "; separate the values by commas without a space, because Space is STOP" : "";
     // Allow a narrow screen to break a key at its dots and underscores.
     const name = row.key.split(/(?<=[._])/).flatMap((part) => [part, made("wbr")]);
-    const label = made("label", "", ...name, made("small", "", `${row.what}${range}; ${row.when}${list}`));
+    const label = made("label", "", ...name, made("small", "", `${row.what}${range}; ${row.when}`));
     label.htmlFor = id;
     const field = made(row.choices ? "select" : "input", "");
     for (const one of row.choices ?? []) field.append(new Option(one, one));
     field.id = id;
     if (!row.choices) field.inputMode = typeof row.value === "number" ? "decimal" : "text";
-    field.value = Array.isArray(row.value) ? row.value.join(",") : row.value;
+    field.value = row.value;
     const send = (more) => this.#call({ settings: { [row.key]: read(field.value, row.value) }, ...more });
     const buttons = [["Set", {}], ["Keep", { keep: true }]].map(([name, more]) => {
       const button = made("button", "", name);
@@ -47,11 +46,7 @@ export class Settings {
 /** Convert the typed text to the type of the present value `before`. A text that does not fit is returned unchanged,
  *  and the daemon rejects it. */
 export function read(typed, before) {
-  if (Array.isArray(before)) return typed.split(",").map(one);
-  return typeof before === "number" ? one(typed) : typed;
-}
-
-function one(typed) {
+  if (typeof before !== "number") return typed;
   const value = number(typed);
   return Number.isNaN(value) ? typed : value;
 }
