@@ -16,10 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from tests.scenarios.taped import ADDED, plain
 from tests.system.harness import ROOT, Bus, Daemon, acsard, finish, until
 
-ROS = ("odom", "tf", "joint_states", "cmd_vel_out", "diagnostics")
-
-MEASURED = {"acsard: control loop", "acsard: recording"}
-"""Diagnostic rows of the daemon's measurements of itself, which are in no recording."""
+ROS = ("odom", "tf", "joint_states", "cmd_vel_out")
 
 RECORDED = ROOT / "tests" / "recordings" / "quiet.mcap"
 
@@ -120,13 +117,6 @@ def assert_published(
     assert published <= indexes[-1] - indexes[0] <= published + displaced, topic
 
 
-def since_driving(live: Sequence[Any], reason: Callable[[Any], str]) -> Sequence[Any]:
-    """Return the messages from the first one whose reason is "driving"."""
-    first = next(n for n, message in enumerate(live) if reason(message).startswith("driving"))
-    assert len(live) - first > 50
-    return live[first:]
-
-
 pytestmark = pytest.mark.slow  # tests/scenarios/test_export.py has it in virtual time
 
 
@@ -158,7 +148,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return live, static, bag(where / "bag")
 
 
-@pytest.mark.parametrize("topic", ["odom", "tf", "joint_states", "cmd_vel_out"])
+@pytest.mark.parametrize("topic", ROS)
 def test_every_exported_message_has_the_bytes_that_a_ros_node_received(
     topic: str, both: Any
 ) -> None:
@@ -177,75 +167,6 @@ def test_the_exported_static_transforms_are_those_that_were_published(both: Any)
         assert transform["header"]["stamp"] == {"sec": stamp.sec, "nanosec": stamp.nanosec}
         assert transform["child_frame_id"] == other.child_frame_id
         assert transform["transform"]["translation"]["x"] == other.transform.translation.x
-
-
-def test_every_exported_diagnostics_message_has_the_rows_that_were_published(both: Any) -> None:
-    live, _, export = both
-
-    def rows(raw: bytes) -> Any:
-        message = export.decode("/diagnostics", raw)
-        stamp = message.header.stamp.sec, message.header.stamp.nanosec
-        return stamp, [
-            (row.level, row.name, row.message, [(v.key, v.value) for v in row.values])
-            for row in message.status
-            if row.name not in MEASURED
-        ]
-
-    def why(row: Any) -> str:
-        return str(row[1][0][2])
-
-    written = [rows(raw) for raw in export.data["/diagnostics"]]
-    live_rows = since_driving([rows(raw) for raw in live.data["diagnostics"]], why)
-    assert places(live_rows, written, "diagnostics")
-    numbered = [(number, rows(raw)) for number, raw in live.numbered["diagnostics"]]
-    numbered = list(since_driving(numbered, lambda item: why(item[1])))
-    assert_published(numbered, written, live.displaced, "diagnostics")
-
-
-ALIKE = (
-    "mode",
-    "reason",
-    "x",
-    "y",
-    "yaw",
-    "linear",
-    "angular",
-    "link",
-    "source",
-    "sender",
-    "wheel_fault",
-)
-
-
-def test_every_exported_state_has_the_values_that_were_published(both: Any) -> None:
-    live, _, export = both
-
-    def of_live(raw: bytes) -> Any:
-        record = msgspec.msgpack.decode(raw)
-        counters = {
-            name: n for name, n in record["counters"].items() if not name.startswith("bus_")
-        }
-        sources = [(s["name"], s["age"], s["waits_for"]) for s in record["sources"]]
-        plain = [record[name] for name in ALIKE]
-        return [tuple(record["stamp"].values()), plain, list(record["wheels"]), sources, counters]
-
-    def of_file(raw: bytes) -> Any:
-        record = export.decode("/state", raw)
-        counters = {c.name: c.count for c in record.counters if not c.name.startswith("bus_")}
-        sources = [(s.name, s.age if s.age == s.age else None, s.waits_for) for s in record.sources]
-        stamp = record.header.stamp.sec, record.header.stamp.nanosec
-        plain = [getattr(record, name) for name in ALIKE]
-        return [stamp, plain, list(record.wheels), sources, counters]
-
-    live_states = since_driving(
-        [of_live(raw) for raw in live.data["state"]], lambda record: record[1][1]
-    )
-    written = [of_file(raw) for raw in export.data["/state"]]
-    assert places(live_states, written, "state")
-    # The daemon does not number this message. It publishes one with each of the diagnostics, which
-    # it numbers, because both have the same rate.
-    rows = [export.decode("/diagnostics", raw).header.stamp for raw in export.data["/diagnostics"]]
-    assert [record[0] for record in written] == [(stamp.sec, stamp.nanosec) for stamp in rows]
 
 
 def test_every_published_event_is_in_the_exported_log(both: Any) -> None:
