@@ -1315,7 +1315,8 @@ def test_a_robot_that_may_only_turn_is_turned_slowly(page: Phone) -> None:
 
 
 READ = """import('/page/settings.js').then(({read}) => [
-    read('0,5', 0.2), read(' −1.5 ', 0.2), read('fast', 0.2), read('', 0.2), read('info', 'debug')])"""
+    read('0,5', 0.2), read(' −1.5 ', 0.2), read('fast', 0.2), read('', 0.2),
+    read('info', 'debug')])"""
 
 
 def test_a_typed_comma_is_a_decimal_separator(page: Phone) -> None:
