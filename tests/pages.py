@@ -283,7 +283,7 @@ COMMANDS: dict[str, How] = {
         "tests/power/test_compare.py", "test_a_test_that_is_deleted_is_a_loss"
     ),
     ".venv/bin/python -m tests.power baseline --anew": UntestedCommand("takes hours"),
-    ".venv/bin/python -m tests.power mutants": UntestedCommand("takes long"),
+    ".venv/bin/python -m tests.power mutants --sample 240": UntestedCommand("takes long"),
     ".venv/bin/python -m tests.power mutants --safety": UntestedCommand("takes long"),
     ".venv/bin/python -m tests.pictures pictures": Elsewhere(
         "tests/system/test_page.py",
