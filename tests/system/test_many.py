@@ -343,7 +343,8 @@ def test_set_changes_named_robots_and_prints_a_line_for_each(robots: Robots) -> 
             reply.startswith(f"rates.telemetry = {value} (was ") for reply in replies.values()
         )
         assert all(
-            reply.endswith("; in force until the daemon's next start") for reply in replies.values()
+            reply.endswith("; a set lasts until the daemon's next start")
+            for reply in replies.values()
         )
     ended = robots.tool("set", "rates.telemetry", "0.0", "--json")
     assert [json.loads(line)["robot"] for line in ended.out.splitlines()] == [ONE, TWO]
