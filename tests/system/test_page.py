@@ -206,7 +206,7 @@ def test_keys_drive_while_they_are_held(page: Phone) -> None:
     browser.key("Down", "ArrowLeft", "ArrowLeft")
     until(lambda: (bus.state()["angular"] or 0.0) > 0.15, 10.0, "and left")
     browser.key("Up", "KeyW", "w")
-    until(lambda: abs(bus.state()["linear"]) < 0.02, 10.0, "only left")
+    until(lambda: (speed := bus.state()["linear"]) is not None and abs(speed) < 0.02, 10.0, "left")
     browser.key("Up", "ArrowLeft", "ArrowLeft")
     bus.at_rest()
 
