@@ -247,8 +247,8 @@ FAULTS = (
         "neutral pause",
         "a zero of a shared identity arms it after half the pause",
         NEUTRAL,
-        "now_ns - self._zero_ns >= self._pause_ns",
-        "now_ns - self._zero_ns >= self._pause_ns // 2",
+        "now_ns - self._zero_ns >= NEUTRAL_PAUSE_NS",
+        "now_ns - self._zero_ns >= NEUTRAL_PAUSE_NS // 2",
     ),
     fault(
         "neutral again",
