@@ -51,11 +51,11 @@ CHILD = """
 import json, sys
 from tests.simulate.actors import collect_seldom, played
 from tests.simulate.board_inputs import kinds
-from tests.simulate.plan import made
+from tests.simulate.plan import make_plan
 collect_seldom()
 seed, left, kind = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
 while left > 0.0:
-    plan = made(seed)
+    plan = make_plan(seed)
     if not kind or kind in kinds(plan) | {plan.get("moment", "")}:
         result = played(plan)
         left -= result.cpu_s
@@ -97,7 +97,8 @@ def plant(fault: Fault, tree: Path) -> None:
     shutil.copytree(ROOT / "acsard", tree / "acsard", ignore=ignored)
     shutil.copytree(ROOT / "tests" / "simulate", tree / "tests" / "simulate", ignore=ignored)
     (tree / "tests" / "scenarios").mkdir()
-    for name in ("__init__.py", "scenarios/__init__.py", "scenarios/world.py"):
+    helpers = ("scenarios/world.py", "scenarios/imperfect_gyro.py", "noise.py")
+    for name in ("__init__.py", "scenarios/__init__.py", *helpers):
         shutil.copy(ROOT / "tests" / name, tree / "tests" / name)
     for module, text in edited(fault).items():
         (tree / "acsard" / module).write_text(text, encoding="utf-8")
