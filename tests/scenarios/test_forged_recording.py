@@ -68,15 +68,15 @@ def forge_row(
 
 
 def forge_status(messages: Messages, dice: random.Random, place: int) -> None:
-    """Forge the reason or the source of one row. `place` is its index in the row's `status`."""
+    """Forge one word of the status of one row. `place` is its index in the row's `status`."""
 
     def forge(rare: OccasionalFields) -> OccasionalFields | None:
         if rare.status is None:
             return None
         status = list(rare.status)
         status[place] = forged_word(status[place], dice)
-        mode, reason, link, source = status
-        return replace(rare, status=(mode, reason, link, source))
+        mode, reason, link, source, code = status
+        return replace(rare, status=(mode, reason, link, source, code))
 
     forge_row(messages, dice, forge)
 
@@ -112,6 +112,10 @@ def reason(messages: Messages, dice: random.Random) -> None:
 
 def source(messages: Messages, dice: random.Random) -> None:
     forge_status(messages, dice, 3)
+
+
+def code(messages: Messages, dice: random.Random) -> None:
+    forge_status(messages, dice, 4)
 
 
 def event_client(messages: Messages, dice: random.Random) -> None:
@@ -217,7 +221,7 @@ def forged_files(original: Path, path: Path, forge: Forge, count: int) -> Iterat
 @each(
     "forge",
     [
-        reason, source, event_client, event_text, event_name, removed_event, added_event,
+        reason, source, code, event_client, event_text, event_name, removed_event, added_event,
         input_name("requests", "by"), input_name("commands", "sender"),
         input_name("refusals", "source"), copy, removed_copy,
     ],
