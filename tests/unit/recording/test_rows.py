@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import random
 from functools import cache
+from typing import get_args
 
 import msgspec
 import pytest
@@ -16,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from acsard.core.codes import GUARD_CODES, RefusalCode
 from acsard.core.config.settings import Config
 from acsard.core.robot import Robot
 from acsard.core.values import (
@@ -78,8 +80,10 @@ PARTS: dict[str, st.SearchStrategy[object]] = {
     "gyro": st.lists(
         st.builds(GyroSample, st.integers(0, 1 << 60), st.none(), st.floats(-1, 1)), max_size=2
     ).map(tuple),
-    "refusals": st.lists(st.builds(Refusal, TEXT, TEXT), max_size=2).map(tuple),
-    "guard_trip": st.sampled_from(["", "a wheel grows"]),
+    "refusals": st.lists(
+        st.builds(Refusal, st.sampled_from(get_args(RefusalCode)), TEXT), max_size=2
+    ).map(tuple),
+    "guard_trip": st.sampled_from(["", *GUARD_CODES]),
     "superseded": st.booleans(),
     "missed": st.integers(0, 5),
     "events": st.lists(st.builds(Event, st.just("imu_refused"), TEXT), max_size=1).map(tuple),
