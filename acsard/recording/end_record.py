@@ -35,10 +35,10 @@ Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]  # fits in 64 bits
 
 # Texts by cause. After `bug` the failing daemon still finishes its file; otherwise recovery does.
 CUT_TEXTS = {
-    "bug": "cut: an internal error ended the daemon",
-    "crash": "cut: the daemon or the computer stopped suddenly",
-    "disk": "cut: the disk accepted no more data",
-    "late": "cut: the daemon was asked to end, and the disk was too slow to write the last steps",
+    "bug": "an internal error ended the daemon",
+    "crash": "the daemon or the computer stopped suddenly",
+    "disk": "the disk accepted no more data",
+    "late": "the daemon was asked to end, and the disk was too slow to write the last steps",
     "open": "cut off, or still being recorded, when `acsard recording recover` read it",
 }
 
@@ -62,11 +62,11 @@ CRASH_CUTS = frozenset({"bug", "crash"})  # a failure of the daemon or of its co
 def ending_text(cut: str, why: str = "") -> str:
     """Return how a recording was cut off, or "" for an ordinary end.
 
-    A cause of another version is only "cut" and `why`.
+    A cause of another version is only "cut off" and `why`.
     """
     if not cut:
         return ""
-    words = CUT_TEXTS.get(cut, "cut")
+    words = CUT_TEXTS.get(cut, "cut off")
     return f"{words}: {printable(why)}" if why else words
 
 

@@ -94,7 +94,7 @@ def test_a_sender_sends_the_same_without_the_other_senders() -> None:
 def test_some_plans_have_a_bound_of_the_feedback_below_one_encoder_count() -> None:
     """The bound is just above the limit of the wheels, and all these plans are legal."""
     below = 0
-    for seed in range(500):
+    for seed in range(1000):
         config = make_plan(seed, 20.0)["config"]
         bound = config.get("feedback", {}).get("wheel_speed", 80.0)
         if bound < 1.31 * config["limits"]["wheel_speed"]:

@@ -86,7 +86,7 @@ def test_a_kill_costs_little_and_the_next_start_makes_the_file_whole(tmp_path: P
     assert replayed(tmp_path, whole) == lines
     listed = finish(acsard("recording", "--directory", str(tmp_path / "record")), tmp_path)
     assert whole.name in listed.out.splitlines()[0]
-    assert "[cut: the daemon or the computer stopped suddenly]" in listed.out.splitlines()[0]
+    assert "[the daemon or the computer stopped suddenly]" in listed.out.splitlines()[0]
 
 
 BUG = """\

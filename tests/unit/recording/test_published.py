@@ -99,7 +99,7 @@ def test_the_lines_after_the_last_step_have_the_drive_and_the_ending() -> None:
     publisher = Publisher(robot, START.wall_ns)
     for step in tape.steps():
         list(publisher.step(step, replay_step(robot, step)))
-    drive, cut = [line.message for line in publisher.end("cut: the disk accepted no more data")]
+    drive, cut = [line.message for line in publisher.end("the disk accepted no more data")]
     assert (drive.name, drive.msg[:13]) == ("drive", "was driving, ")
-    assert (cut.name, cut.msg, cut.level) == ("cut", "cut: the disk accepted no more data", 30)
+    assert (cut.name, cut.msg, cut.level) == ("cut", "the disk accepted no more data", 30)
     assert drive.stamp == cut.stamp == Time.from_ns(tape.taken[-1].inputs.now.wall_ns)

@@ -423,7 +423,7 @@ def test_a_bug_of_the_daemon_is_recorded_with_the_inputs_of_the_failed_step(
     assert path.name.endswith(KEPT_SUFFIX)
     assert last is not None
     assert (last.cut, last.why) == ("bug", why)
-    assert ending_text(last.cut, last.why) == f"cut: an internal error ended the daemon: {why}"
+    assert ending_text(last.cut, last.why) == f"an internal error ended the daemon: {why}"
     recording = Recording(path)
     result = replay_file(recording)
     assert (result.comparison.same, result.comparison.steps, result.gaps) == (True, number, [])
@@ -450,7 +450,7 @@ def test_the_text_of_a_bug_is_shortened_and_printable(bench: Bench) -> None:
     last = read_end(path)
     assert last is not None
     text = ending_text(last.cut, last.why)
-    assert text.startswith("cut: an internal error ended the daemon: ValueError: ")
+    assert text.startswith("an internal error ended the daemon: ValueError: ")
     assert (text.isprintable(), len(text) < 300) == (True, True)
 
 

@@ -228,7 +228,7 @@ def test_a_recording_that_was_cut_ends_with_the_reason() -> None:
     tape, writer = driven(), TimelineWriter()
     for step in decode(encode(0, tape.taken)):
         list(writer.step(step))
-    (cut,) = writer.end("cut: the disk accepted no more data")
+    (cut,) = writer.end("the disk accepted no more data")
     assert (cut.name, cut.text) == ("cut", "the disk accepted no more data")
     assert cut.seconds == tape.taken[-1].inputs.now.wall_ns / 1e9
 

@@ -118,10 +118,10 @@ def test_events_of_one_time_keep_their_order() -> None:
 
 def test_the_last_marks_are_the_drive_that_goes_on_and_the_ending() -> None:
     _, steps = drive_of_two()
-    report = report_from(steps[: len(steps) // 3], ending="cut: the disk accepted no more data")
+    report = report_from(steps[: len(steps) // 3], ending="the disk accepted no more data")
     drive, cut = report.marks.all()[-2:]
     assert (drive.name, drive.text[:13]) == ("drive", "was driving, ")
-    assert (cut.name, cut.text) == ("cut", "cut: the disk accepted no more data")
+    assert (cut.name, cut.text) == ("cut", "the disk accepted no more data")
 
 
 def test_the_events_of_a_clock_that_was_set_have_the_time_of_the_clock() -> None:
