@@ -92,7 +92,7 @@ def test_with_a_gyro_a_long_rotation_in_one_direction_has_a_small_heading_error(
         drive.hold(0.0, 0.0, 1.0)
     print(f"turning on: gyro {with_gyro.error:.2%}, wheels {without.error:.0%}")
     assert with_gyro.error < 0.01
-    assert without.error > 0.6
+    assert without.error > 0.55  # the track is 1.6 times as wide as configured
 
 
 @pytest.mark.slow

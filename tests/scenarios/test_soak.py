@@ -383,7 +383,7 @@ def test_a_day_with_a_fault_every_minute_is_explained_and_leaks_no_memory(
         modes[outputs.mode] += 1
         if outputs.mode not in MODES or len(outputs.reason) < 6:
             unexplained.append(f"{outputs.mode}: {outputs.reason!r}")
-        if (outputs.mode == "driving") != outputs.reason.startswith("driving"):
+        if (outputs.mode == "driving") != (outputs.code == "commanded"):
             unexplained.append(f"{outputs.mode} says {outputs.reason!r}")
 
     world.watch = watch
