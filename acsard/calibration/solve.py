@@ -96,9 +96,10 @@ class Calibration(Struct, frozen=True):
     notes: tuple[str, ...]
     # New values by the name of the setting; noise only if `LogNoise.better`.
     odometry: dict[str, float]
-    # Of `plausibility.TRACK` and `plausibility.RATIO`.
+    # Names of the settings (`plausibility.TRACK`, `plausibility.RATIO`) that keep their values.
     stays_configured: tuple[str, ...] = ()
-    # The same; empty if the settings cause no false wheel fault, or if no better ones were found.
+    # New values of [feedback] by the name of the setting; empty if the present ones cause no false
+    # wheel fault, or if no better ones were found.
     feedback: dict[str, float] = {}
     # Noise of the odometry that this log shows; None if the log does not show it.
     noise: LogNoise | None = None

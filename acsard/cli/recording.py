@@ -297,7 +297,7 @@ def _is_being_recorded(recording: Recording) -> bool:
 
 
 def _show(recording: Recording, part: Span, as_json: bool) -> bool:
-    # False: `part` has no steps.
+    # Returns False if `part` has no steps.
     story = TimelineWriter(_config_of(recording))
     has_steps, over = False, False
     for step in steps(recording):

@@ -145,7 +145,7 @@ def _locked(directory: Path) -> Iterator[None]:
     # Two changes at once would lose one: the sync of a slow disk is between read and replacement.
     handle = os.open(directory, os.O_RDONLY | os.O_CLOEXEC)
     try:
-        with suppress(OSError):  # this file system has no locks
+        with suppress(OSError):  # a file system may have no locks
             fcntl.flock(handle, fcntl.LOCK_EX)
         yield
     finally:

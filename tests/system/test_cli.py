@@ -172,7 +172,7 @@ def test_check_json_is_the_configuration_in_force(shared: Daemon, bus: Bus) -> N
     assert json.loads(ended.out) == bus.get("config")
 
 
-# echo and hz
+# echo
 
 
 def test_echo_prints_n_messages_as_json_lines_and_ends(shared: Daemon, bus: Bus) -> None:
