@@ -21,12 +21,11 @@ from acsard.core.motion.freshness import MAX_PROOF_NS, Freshness
 from acsard.core.motion.neutral import NEUTRAL_PAUSE_NS, Sender, is_zero
 from acsard.core.values import NS_PER_S, REST, Command, Ns, SourceStatus, Twist, Wait
 
-# Limit per source. A sender that may keep control (`Sender.holds`) is never replaced by a new one.
-MAX_SENDERS = 16
+MAX_SENDERS = 16  # of a source; one that may keep control (`Sender.holds`) is never replaced
 
 Objection = Literal["unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
 
-# Durations of zeros only, or of speeds without being armed, to which `state` rounds down.
+# s of zeros only, or of speeds without being armed, to which `state` rounds down.
 REPORTED_DURATIONS_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
@@ -72,7 +71,6 @@ class _Source:
         return added
 
     def _account(self, name: str, now_ns: Ns) -> tuple[bool, bool, int]:
-        # The rank: senders that may keep control, then armed ones, then the newest message.
         sender = self.senders[name]
         holds = sender.holds(now_ns)
         return holds, holds or sender.armed(now_ns), sender.noticed_ns
@@ -86,15 +84,10 @@ class _Source:
             sender.cancel_zero(at_ns)
 
     def undo_zeros(self, command: Command, was_set: bool) -> None:
-        """Undo earlier zeros of the sender of `command`, whose clock is in doubt.
-
-        If the clock was set, all of them; if it is not proven yet, only those that were not
-        accepted.
-        """
+        """Undo the unaccepted zeros of a sender with a doubtful clock, or all if it was set."""
         sender = self.senders.get(command.sender)
-        # Behind a bridge, several programs with clocks of their own share one identity. Therefore a
-        # command to another source counts here only if the same clock stamped the last command of
-        # this sender to this source.
+        # Behind a bridge, programs with clocks of their own share one identity, so a command to
+        # another source counts only if the same clock stamped the last one to this source.
         if sender is None or (command.source != self.name and command.clock != sender.clock):
             return
         if was_set:
@@ -198,7 +191,6 @@ class Arbiter:
         before_ns, self._begun_ns = self._begun_ns, now_ns
         if now_ns - before_ns <= LATE_STEP_NS:
             return False
-        # The first step follows no stall, so no command has waited.
         self._watched_ns = now_ns if before_ns else now_ns - CATCH_UP_NS
         for source in self._ranking:
             for sender in source.senders.values():
@@ -269,8 +261,7 @@ class Arbiter:
                 and source.priority == first[0].priority
                 and previous.holds(now_ns)
             ):
-                # A sender that began to send before `previous` may have become armed just now. The
-                # robot still follows `previous`.
+                # `previous` began later, but `source` may have become armed just now.
                 first = source, previous
                 break
         if first is None:
@@ -294,8 +285,7 @@ class Arbiter:
         return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
 
     def _blocked_source(self, holder: _Source, now_ns: Ns) -> str:
-        # The source whose speeds have no effect because `holder` sends zeros; maybe another sender
-        # of it.
+        # The source, or another sender of it, whose speeds have no effect: `holder` sends zeros.
         for source in self._ranking:
             senders = (each for each in source.present(now_ns) if each is not self._followed)
             if any(sender.twist != REST for sender in senders):

@@ -28,8 +28,8 @@ SETTLE_S = 3.0
 
 SILENCE_TIMEOUT_S = 5.0  # at one report a second, four in a row may be lost
 
-# Longest time for which one report counts, that of a motor start: after a gap, such a report would
-# weigh too much. At one report a second, the mean has a third of its speed.
+# Longest time for which one report counts, that of a motor start. At one report a second, the mean
+# has a third of its speed.
 MAX_WEIGHT_NS = 300_000_000
 
 LEVELS_BY_URGENCY: tuple[BatteryLevel, ...] = get_args(BatteryLevel)[:3]  # without "unknown"
@@ -75,13 +75,10 @@ class Battery:
         # `stopped`: an empty battery had stopped the robot before this daemon started.
         self._config = config
         self._bounds = config.bounds
-        # None if the board has never reported voltage or charge.
-        self.status: BatteryStatus | None = None
+        self.status: BatteryStatus | None = None  # until voltage or charge is reported
         self.stopped_now = False  # in the last `process_reports`
-        # By "volts", "percent" and "amps", with the arrival.
-        self._values: dict[str, tuple[float, int]] = {}
-        # Until the board on the newly opened port reports what `battery.measure` names.
-        self._awaited = True
+        self._values: dict[str, tuple[float, int]] = {}  # "volts", "percent", "amps", with arrival
+        self._awaited = True  # until the board on the new port reports what `battery.measure` names
         # Last level but "unknown": silence must not end a stop.
         self._known: BatteryLevel = "stop" if stopped and "stop" in self._bounds else "ok"
         self._told: BatteryLevel | None = None  # in the last event
@@ -161,8 +158,7 @@ class Battery:
             self._mean, self._since_ns, self._mean_ns = value, at_ns, at_ns
             self._stood_ns = 0
         elif at_ns > self._mean_ns:
-            # Until the weights add up to `TIME_CONSTANT_S`, this is the weighted mean of all
-            # reports. After that, it is an exponential mean.
+            # A weighted mean of all reports until `TIME_CONSTANT_S`, then an exponential one.
             stood_ns = min(at_ns - self._mean_ns, MAX_WEIGHT_NS)
             self._stood_ns += stood_ns
             span_ns = min(TIME_CONSTANT_S * NS_PER_S, self._stood_ns)
@@ -170,7 +166,6 @@ class Battery:
             self._mean_ns = at_ns
 
     def _level(self, now_ns: Ns) -> BatteryLevel | None:
-        # None until the reports cover `SETTLE_S`. Sets `stopped_now`.
         measure, values = self._config.measure, self._values
         if measure not in values:
             self._mean = None

@@ -31,8 +31,7 @@ class ConsistencyChecks:
         self.gyro = Gyro() if odometry.gyro else None
         self._by_wheels = 0.0  # turn of the last line by the wheels, rad
         self.turn: Turn | None = None  # turn of the last line by the gyro; None: use the wheels
-        # The wheels gave the last turn, because the gyro has not agreed with them in a turn yet.
-        self.on_trial = False
+        self.on_trial = False  # the wheels gave the turn: the gyro has not agreed with them yet
         self.slips = False  # the wheels contradict each other or the gyro
         self.events: list[Event] = []  # of the last line
 

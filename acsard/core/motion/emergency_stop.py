@@ -58,8 +58,7 @@ class BoardInput(ABC):
         self.state: EstopState = ""  # "" if never reported
         self.pressed: tuple[bool, ...] | None = None  # None if never reported
         self._awaited = True  # until the board on the newly opened port reports the inputs
-        # The reason, if an input began to count as pressed in the last `process_reports`.
-        self.pressed_now: Reason | None = None
+        self.pressed_now: Reason | None = None  # by the last `process_reports`
         self._reported_ns = self._looked_ns = 0
         self._excused = False
 
@@ -105,8 +104,8 @@ class BoardInput(ABC):
                 events += self._take("pressed" if any(pressed) else "ok", pressed)
         late, self._looked_ns = now_ns - self._looked_ns > LATE_STEP_NS, now_ns
         if self.pressed is not None and now_ns - self._reported_ns > _SILENT_NS:
-            # Excuse a late step only once between two reports of the board. Otherwise a control
-            # loop that is always late would delay the stop forever.
+            # Excuse a late step once between two reports, or a loop that is always late would delay
+            # the stop forever.
             if late and not self._excused:
                 self._reported_ns, self._excused = now_ns - _SILENT_NS + CATCH_UP_NS, True
             else:
@@ -150,10 +149,9 @@ class EmergencyStop(BoardInput):
 
     def __init__(self, use: EstopUse, unpowered: bool = False) -> None:
         super().__init__(use)
-        # Reported in the last `process_reports`, while the drivers have power.
-        self.driver_fault = False
-        # The emergency stop cuts the power of the drivers, and one without power reports a fault.
-        # It may come back late, so no such fault counts until `clear` has released the stop.
+        self.driver_fault = False  # in the last `process_reports`, while the drivers have power
+        # The stop cuts the drivers' power, and one without power reports a fault. It may come back
+        # late, so no such fault counts until `clear`.
         self._unpowered = unpowered
 
     def process_reports(

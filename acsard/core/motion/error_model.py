@@ -30,8 +30,7 @@ LATERAL_VARIANCE = 1e-3  # m2/s2 sideways, which wheels do not measure, while th
 
 MIN_TWIST_VARIANCE = 1e-8  # filters that use the published twist treat less as an error
 
-# Period of the feedback lines before it is measured.
-ASSUMED_PERIOD_S = 0.01
+ASSUMED_PERIOD_S = 0.01  # of the feedback lines, before it is measured
 
 PERIOD_GAIN = 0.05  # small, because several lines may be read at the same time
 
@@ -45,10 +44,9 @@ class Noise:
     """
 
     def __init__(self, odometry: OdometryConfig, track: float) -> None:
-        # The settings can describe more errors than those of the two sides. If the sides were the
-        # only cause of errors, `distance_variance_per_metre` D would be k / 2, and
-        # `yaw_variance_per_metre` Y would be 2 k / L^2. Therefore the sides get k = min(2 D,
-        # Y L^2 / 2). The remaining part of D or Y is an error of the robot as a whole.
+        # If the sides were the only cause of errors, D = `distance_variance_per_metre` would be
+        # k / 2, and Y = `yaw_variance_per_metre` 2 k / L^2. So k = min(2 D, Y L^2 / 2), and the
+        # rest of D or Y is an error of the robot as a whole.
         wheels = min(
             2 * odometry.distance_variance_per_metre,
             odometry.yaw_variance_per_metre * track * track / 2,
@@ -114,11 +112,10 @@ def columns(odometry: OdometryConfig, kinematics: Kinematics) -> tuple[Column, .
         share = odometry.wheel_separation_multiplier_std / separation
         rows.append((0.0, 0.0, 0.0, -share))
     if odometry.wheel_radius_ratio_std:
-        # One radius is larger by half of the ratio's error, and the other is smaller by that half.
+        # One radius is larger by half of the ratio's error, the other smaller.
         share = odometry.wheel_radius_ratio_std
         rows.append((0.0, share * track / 4, share / track, 0.0))
-    # The scale multiplies radii and track alike, so it does not change turns. Permanent slip has
-    # the same effect on the distance.
+    # Scale and permanent slip change distances alone: radii and track scale alike.
     if scale := math.hypot(odometry.distance_scale_std, odometry.wheel_slip_std):
         rows.append((scale, 0.0, 0.0, 0.0))
     return tuple(rows)
@@ -138,7 +135,7 @@ class TwistUncertainty:
     def __init__(self, model: ErrorModel, counts: int) -> None:
         self._model = model
         self._count = math.tau / counts if counts else 0.0
-        # The errors of the four wheels are independent, and each side is the mean of two wheels.
+        # Four independent errors; each side is the mean of two wheels.
         self._to_linear = model.radius**2 / 4 / 12
         self._period = ASSUMED_PERIOD_S
         self._to_angular = model.radius**2 / model.track**2 / 12
@@ -146,7 +143,7 @@ class TwistUncertainty:
     def of(self, twist: Twist, dt: float, step: float = 0.0) -> TwistVariances:
         """Return the variances of a line's twist; `dt` and the speeds' step may be 0, unknown."""
         if dt > 0.0:
-            # A single late line, or a line after lost lines, does not mean a longer period.
+            # A late line, or one after lost lines, does not mean a longer period.
             self._period += PERIOD_GAIN * (min(dt, 2 * self._period) - self._period)
         model, period, linear, angular = self._model, self._period, twist.linear, twist.angular
         quantum = max(SPEED_RESOLUTION, self._count / period, step) ** 2
@@ -178,7 +175,6 @@ class TwistUncertainty:
         return self._to_linear * square, self._to_angular * square
 
     def slipping(self, variances: TwistVariances) -> TwistVariances:
-        """Return the variances times `SLIP_FACTOR`: wheels slip in any direction."""
         return TwistVariances(
             min(SLIP_FACTOR * variances.linear, MAX_TWIST_VARIANCE),
             min(SLIP_FACTOR * variances.lateral, MAX_TWIST_VARIANCE),

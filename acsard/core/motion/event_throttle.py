@@ -55,8 +55,7 @@ class EventThrottle:
     def __init__(self) -> None:
         self._held: dict[EventName, _Held] = {}
         self._number = 0  # of events of all names
-        # Next line at one per second; a burst moves it into the future.
-        self._free_ns: dict[EventName, int] = {}
+        self._free_ns: dict[EventName, int] = {}  # next line at one per second, after a burst
 
     def lines(self, events: list[Event], now_ns: Ns) -> tuple[Event, ...]:
         """Return the events to log now, which may stand for several of the same name."""
@@ -71,8 +70,7 @@ class EventThrottle:
             name for name, group in self._held.items() if self._may(name, group.news, now_ns)
         ]
         if "stop" in due_names or "clear" in due_names:
-            # The lines of a stop and of a `clear` must be in the order of these events, so that the
-            # end of the log shows whether the robot is stopped.
+            # A stop and a `clear` stay in order: the end of the log shows whether the robot stands.
             due_names += [
                 name for name in ("stop", "clear") if name in self._held and name not in due_names
             ]
@@ -80,8 +78,7 @@ class EventThrottle:
         return tuple([self._held.pop(name).line() for name in due_names])
 
     def _may(self, name: EventName, news: bool, now_ns: Ns) -> bool:
-        # `BURST` applies if an event does not only repeat an earlier one, and to each stop, whose
-        # time matters.
+        # `BURST` is for news, and for each stop, whose time matters.
         free_ns, at_once = self._free_ns.get(name, now_ns), news or name == "stop"
         if free_ns > now_ns + (BURST - 1 if at_once else 0) * NS_PER_S:
             return False

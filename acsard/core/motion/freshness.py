@@ -40,25 +40,23 @@ from acsard.core.values import NS_PER_S, Command, Ns
 # Two clocks drift apart by 1 s in this time. A bad crystal takes twice as long.
 SECONDS_PER_DRIFT = 5000
 
-# Pause after which a clock is new, because it may have drifted by 50 ms. If the stamps do not show
-# the pause, the network held commands back, and the clock stays known.
+# Pause in which a clock may have drifted by 50 ms, so that it is new. If the stamps do not show the
+# pause, the network held commands back, and the clock stays known.
 FORGET_NS = 250 * NS_PER_S
 
 MEMORY_NS = 3600 * NS_PER_S  # silence after which a clock is forgotten to save memory
 
-# Largest decrease of the delay that is jitter. A larger one is the end of a backlog, or a clock
-# that was set.
+# Largest decrease of the delay that is jitter; a larger one ends a backlog, or a clock was set.
 MAX_JITTER_NS = NS_PER_S // 20
 
-# Largest increase of the delay that is jitter. After a larger one, the network has held commands
-# back.
+# Largest increase that is jitter; after a larger one, the network has held commands back.
 MAX_RISE_NS = NS_PER_S
 
 # The least delays of the halves of a proof may differ by its duration over this: 10 ms per second,
 # or 100 ms if the delay creeps. NTP slews a clock by up to 83 ms per second.
 EVEN_DIVISOR, CREEP_DIVISOR = 200, 20
 
-# A delay creeps if it changes between two commands by at most their distance over `CREEP`, plus
+# A delay creeps if it changes by at most the distance of two commands over `CREEP`, plus
 # `JITTER_NS`. Otherwise it jumps.
 CREEP, JITTER_NS = 10, NS_PER_S // 200
 
@@ -77,15 +75,15 @@ MAX_STOPPED_STAMP_NS = 10_000
 
 SEPARATE_NS = NS_PER_S // 500  # commands this close may have been sent together
 
-# Commands this close come from one queue, because no sender may exceed 1000 Hz. A proof waits for
-# the last one, which has the least delay.
+# Commands this close come from one queue: no sender may exceed 1000 Hz. The last one has the least
+# delay, so a proof waits for it.
 SAME_QUEUE_NS = NS_PER_S // 2000
 
 # Budget of trusted increases without a visible adjustment, for foreign clocks: refilled by 1 s in
 # 60 s, and above this while commands are late, so that no sender is refused forever.
 FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
 
-# To make the daemon forget a sender at 20 Hz, a client would need this number of names in 0.05 s.
+# To push out a sender at 20 Hz, a client would need this number of names in 0.05 s.
 MAX_CLOCKS = 1024
 
 State = Literal["new", "known"]
@@ -95,8 +93,7 @@ Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
 
 
 class _Proof:
-    # A test whether the delays of a clock are constant. It compares the least delays of successive
-    # halves of its duration (`EVEN_DIVISOR`, `CREEP_DIVISOR`), and goes on until two agree.
+    # Tests whether the delays of a clock are constant: the least delays of successive halves agree.
     def __init__(
         self, delay: int, at_ns: Ns, timeout_ns: Ns, needed_ns: Ns, share: int, again: bool
     ) -> None:
@@ -107,7 +104,7 @@ class _Proof:
         self._halves: list[tuple[int, int]] = []  # start and least delay of the last halves
 
     def add(self, delay: int, at_ns: Ns, timeout_ns: Ns) -> Literal["proven", "open", "failed"]:
-        """Add a command, and return the state of the test: "failed" begins a new one with it."""
+        """Add a command, and return the state of the test; "failed" begins a new one with it."""
         if not -MAX_JITTER_NS <= delay - self._first <= MAX_RISE_NS:
             return "failed"
         proven = False
@@ -133,10 +130,8 @@ class _Proof:
                 if not even:
                     self.least = self._first = minima[1]
             return even
-        # The test of a new clock compares the last eight halves in four pairs. The minima of the
-        # pairs must agree within the same limit, or differ by at most `MAX_JITTER_NS` without a
-        # trend. A trend means that the minima only fall, as while a backlog arrives, or only rise,
-        # as while a queue grows.
+        # The minima of the last eight halves in four pairs must agree within the same limit, or
+        # differ by at most `MAX_JITTER_NS` without a trend: a backlog falls, a queue rises.
         if count < 8:
             return False
         del self._halves[0]
@@ -150,27 +145,22 @@ class _Clock:
     def __init__(self, at_ns: Ns) -> None:
         self.state: State = "new"
         self.at_ns = at_ns  # arrival of its last command that was no repetition
-        # Longest silence that is no pause: the longest timeout of its sources.
-        self.gap_ns = MAX_PAUSE_NS
+        self.gap_ns = MAX_PAUSE_NS  # longest silence that is no pause: its longest timeout
         self.forgiven_ns = 0  # last trusted increase, less visible adjustments
         self._stamp_ns = 0
         self._delay = 0
         self._number = -1  # of the last command; -1 without one
         self._least = 0  # minimum of the trusted delays; it rises by the largest drift
         self._early = 0  # recent decreases of `_least`; falls by 1 ns each 10 ns
-        # Lowest delay of a steady clock (never adjusted); it rises by the largest drift.
-        self._floor: int | None = None
-        # Delay before the first visible adjustment since the last command in time.
-        self._before: int | None = None
+        self._floor: int | None = None  # lowest delay of a steady clock; it rises by the drift
+        self._before: int | None = None  # delay before the first visible adjustment
         self._shown = 0  # sum of these adjustments
-        # An adjustment that the next command must confirm, because the network may swap or repeat
-        # commands: delay before it, its size, and the stamp before it.
+        # An adjustment that the next command must confirm: delay before it, size, stamp before it.
         self._doubted: tuple[int, int, int] | None = None
         self._paused = False  # since the last command in time, so the clock may have been set
         self._budget, self._budget_at_ns = FORGIVE_NS, at_ns
         self._proof: _Proof | None = None
-        # Stamp and number (-1: none) of the last accepted command.
-        self._accepted: tuple[int, int] | None = None
+        self._accepted: tuple[int, int] | None = None  # stamp, and number or -1
 
     @property
     def was_known(self) -> bool:
@@ -217,16 +207,14 @@ class _Clock:
         return stamp_ns <= self._stamp_ns or (accepted is not None and stamp_ns <= accepted[0])
 
     def _later_than_lowest(self, delay: int, silence: int) -> int:
-        # Also updates the lowest delay, of a steady clock.
         floor = delay if self._floor is None else self._floor + silence // SECONDS_PER_DRIFT
         self._floor = min(floor, delay)
         return delay - self._floor
 
     def _look_for_adjustment(self, stamp_ns: Ns, silence: int, number: int) -> None:
         # A stamp that is not later than the previous one is a clock set back, or swapped commands.
-        # So the next command must confirm it: not later than its predecessor either, or than the
-        # last stamp before. If commands were lost, no pause counts, as the network may be the
-        # cause.
+        # The next command must confirm it: not later than its predecessor either, or than the last
+        # stamp before. If commands were lost, no pause counts: the network may be the cause.
         lost = number - self._number - 1 if number >= 0 and self._number >= 0 else 0
         if lost < 0:  # the sender has restarted its numbers
             return
@@ -290,8 +278,7 @@ class _Clock:
         return "stale"
 
     def _forgive(self, proof: _Proof, at_ns: Ns) -> bool:
-        # A smaller delay always is plausible. A larger one is after a pause of the sender, or by
-        # visible adjustments and the budget (`FORGIVE_NS`).
+        # A larger delay is plausible after a pause, or by visible adjustments and the budget.
         self._accrue(at_ns, FORGET_NS)
         hidden = proof.least - self._least
         if self._before is not None:
@@ -321,12 +308,9 @@ class Freshness:
 
     def __init__(self) -> None:
         self._clocks: dict[str, _Clock] = {}
-        # Foreign ones without an accepted command, forgotten after a pause.
-        self._newcomers: dict[str, _Clock] = {}
-        # Steady ones, for `MEMORY_NS`, because their lowest delay is valid at once.
-        self._unproved: dict[str, _Clock] = {}
-        # Last number and arrival of senders without stamps.
-        self._numbers: dict[str, tuple[int, int]] = {}
+        self._newcomers: dict[str, _Clock] = {}  # foreign, without an accepted command
+        self._unproved: dict[str, _Clock] = {}  # steady: the lowest delay is valid at once
+        self._numbers: dict[str, tuple[int, int]] = {}  # number and arrival, without stamps
         self.forgiven_ns = 0  # total of trusted increases without a visible adjustment
 
     def judge(self, command: Command, timeout_ns: Ns) -> Verdict:
@@ -352,7 +336,6 @@ class Freshness:
         return verdict
 
     def _in_order(self, command: Command, gap_ns: Ns) -> Verdict:
-        # After a silence of `gap_ns` the numbers may start again.
         number, at_ns = command.sequence, command.arrived_ns
         if number is None:
             return "fresh"
@@ -366,8 +349,7 @@ class Freshness:
         return "fresh"
 
     def _forget(self, now_ns: Ns) -> None:
-        # The number of clocks is limited, because a recording begins with all clocks, and the
-        # control loop writes all of them in one step.
+        # A recording begins with all clocks, which the control loop writes in one step.
         limits = (
             (self._newcomers, MAX_PAUSE_NS),
             (self._unproved, MEMORY_NS),
@@ -385,5 +367,4 @@ class Freshness:
 
 
 def _oldest(clocks: dict[str, _Clock]) -> _Clock:
-    # Each command moves its clock to the end of the dictionary.
     return next(iter(clocks.values()))

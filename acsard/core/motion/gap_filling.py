@@ -23,8 +23,8 @@ from acsard.core.motion.gyro import REST_S
 from acsard.core.motion.sanity import MAX_WHEEL_ACCELERATION, SPEED_MARGIN
 from acsard.core.values import REST, Twist, WheelSpeeds
 
-# Consecutive implausible lines without counts, s and number: beyond both, their motion is
-# unknown. Otherwise the robot is assumed to have moved at the speed of the next plausible line.
+# Beyond both, the motion in consecutive implausible lines without counts is unknown. Otherwise they
+# have the speed of the next plausible line. s and number.
 MAX_LOST_S, MAX_LOST = 0.05, 1
 
 AT_REST = (0.0, 0.0, 0.0, 0.0)
@@ -35,16 +35,13 @@ ASSUMED_ACCELERATION = Twist(0.125, 0.5)
 
 ACCELERATION_SPAN_S = 0.2  # over which the deviation from constant acceleration is measured
 
-# Weight of `ASSUMED_ACCELERATION` in the mean of squares, in spans; and the largest weight, which
-# is a minute of driving.
+# Spans for which `ASSUMED_ACCELERATION` counts; and the most, which is a minute of driving.
 INITIAL_WEIGHT, MAX_WEIGHT = 4.0, 300.0
 
-# Time for which a command counts in a gap, s. Without feedback, rest is usually commanded much
-# earlier, and a board that receives nothing stops by its watchdog.
+# s for which a command counts in a gap. A board that receives nothing stops by its watchdog.
 MAX_COMMANDED_S = 1.0
 
-# Fraction of its speed at which a wheel counts as resting: a decay never reaches zero.
-MIN_DECAY = 0.02
+MIN_DECAY = 0.02  # fraction of its speed at which a wheel counts as resting
 
 STEP_DECAY = 0.05  # of the estimated quantization step, forgotten with each line
 
@@ -61,8 +58,7 @@ class Rolled(Struct, frozen=True, gc=False):
     bridged: float  # part of `seconds` without a line: its speeds are assumed
     unknown: float  # s in addition to `seconds` in which the motion is unknown
     known: float  # s of `pieces` and `turned`; 0 if a part is unknown
-    # In addition, if the MCU missed the command to rest until its watchdog stopped it.
-    missed: Motors = AT_REST
+    missed: Motors = AT_REST  # more, if the MCU missed the command to rest until its watchdog
 
 
 class Rolling:
@@ -72,15 +68,13 @@ class Rolling:
     """
 
     def __init__(self, quiet: float = math.inf) -> None:
-        # After `quiet` s without feedback, a running daemon commands rest.
-        self._quiet = quiet
+        self._quiet = quiet  # s without feedback, after which a running daemon commands rest
         self.forget()
 
     def forget(self) -> None:
         """Forget the implausible lines since the last plausible one, and their motion."""
-        # In s: implausible lines without counts (`_lost`; `_counted` with), the gaps before them
-        # that can (`_bridged`) or cannot (`_gap`) be filled, and `_bridged` until rest was
-        # commanded.
+        # s of implausible lines without counts (`_lost`), with counts, of the gaps before them that
+        # can (`_bridged`) or cannot (`_gap`) be filled, and of `_bridged` until rest was commanded.
         self._lost = self._gap = self._bridged = self._counted = self._driven = 0.0
         self._turned, self._skipped = AT_REST, 0
 
@@ -102,20 +96,18 @@ class Rolling:
             self._turned = plus(self._turned, line.turned)
 
     def _driven_in(self, line: Feedback) -> float:
-        # s of the gaps before `line` until rest was commanded
         return self._bridged + line.driven if line.bridged else self._driven
 
     def take(self, line: Feedback, before: WheelSpeeds) -> Rolled:
         """Return the angles since the last plausible line, which had the speeds `before`."""
         speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged + self._bridged
         if not (self._skipped or bridged or line.gap or line.turned is not None):
-            # Nearly every line takes this shortcut. The code below would give the same result.
+            # Nearly every line takes this shortcut, with the same result as below.
             angles = times(speeds, dt)
             moved = angles if line.counted is None else line.counted
             arcs = () if moved == AT_REST else (moved,)
             return Rolled(arcs, AT_REST, angles, dt, 0.0, 0.0, dt)
-        # For implausible lines without counts, assume the speed of this line, unless those lines
-        # last too long.
+        # Implausible lines without counts have the speed of this line, unless they last too long.
         guessed = self._lost <= MAX_LOST_S or self._skipped <= MAX_LOST
         lost, unknown = (self._lost, 0.0) if guessed else (0.0, self._lost)
         turned, filled, unknown = self._turned, self._bridged, unknown + self._gap
@@ -158,10 +150,8 @@ def _some(*pieces: Motors) -> tuple[Motors, ...]:
 
 def _until_rest(before: Motors, driven: float, after: Motors, bridged: float, own: float) -> Motors:
     # Rest was commanded `driven` s into a gap of `bridged` s; the line of the speeds `after` covers
-    # the `own` s behind it.
-    # A board that computes its speeds since its last reply reports the means over the whole time.
-    # These means are large enough for the motion until the command to rest. A smaller speed is the
-    # speed after the gap. A wheel that became faster until then has not slowed down yet.
+    # the `own` s behind it. A board that computes its speeds since its last reply reports the means
+    # over the whole time, which are large enough for the motion until the command to rest.
     angles, whole = [], bridged + own
     for old, new in zip(before, after, strict=True):
         if driven >= bridged and old * new > 0.0 and abs(new) > abs(old):
@@ -177,7 +167,6 @@ def _until_rest(before: Motors, driven: float, after: Motors, bridged: float, ow
 
 
 def _slowing(old: float, new: float) -> float:
-    # Mean speed of an exponential decay.
     ratio = new / old if old else 1.0
     if ratio >= 0.99:
         return new
@@ -196,11 +185,10 @@ def times(a: Motors, factor: float) -> Motors:
 class Confirmation:
     """Holds back a feedback line that follows a gap and reports a doubtful speed.
 
-    Damage changes one wheel alone, motion both wheels of a side alike, and one damaged line would
-    falsify a whole gap. Two lines agree if no wheel alone has changed by more than a limit, which a
-    longer gap lowers. A line with counts, or of the usual time, is used at once, and so is one that
-    agrees with the last used line. Any other is held: if the next line agrees with it, both are
-    used, as one wheel really changed alone; if the next agrees with the last used one, the held
+    Damage changes one wheel alone, motion both wheels of a side alike. Two lines agree if no wheel
+    alone has changed by more than a limit, which a longer gap lowers. A line with counts, of the
+    usual time, or that agrees with the last used line is used at once. Any other is held: if the
+    next line agrees with it, both are used; if the next agrees with the last used one, the held
     line is dropped; otherwise the third decides, and a line that differs much more is dropped. The
     time of a dropped line is a gap.
     """
@@ -210,7 +198,7 @@ class Confirmation:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the feedback lines that are held back."""
+        """Forget the lines that are held back."""
         self._held: list[Feedback] = []
         self._seconds = 0.0  # of the held lines with the gaps before them
 
@@ -227,14 +215,12 @@ class Confirmation:
         the last used one. `believed` replaces the speeds of faulty wheels.
         """
         period, pending, seconds = self._period, self._held, line.dt + line.gap + skipped
-        # A long time counts as two periods, so that a single gap changes the mean only a little.
-        # A board with a longer period still changes it in the long run.
+        # A long time counts as two periods, so that a gap changes the mean only a little.
         self._period += PERIOD_GAIN * (min(seconds, 2 * period) - period) if period else seconds
         if not pending and (seconds <= 2 * period or not period or line.turned is not None):
             return [line], []
         self._seconds = seconds = seconds + (self._seconds if pending else 0.0)
-        # This change of one wheel's speed falsifies the motion of the whole time by as much as a
-        # damaged line of the usual duration can.
+        # Such a change falsifies the whole time by as much as a damaged line of usual duration can.
         most = (MAX_WHEEL_ACCELERATION * period + SPEED_MARGIN) * period / seconds
         used, now = believed(before.as_tuple()), believed(line.speeds.as_tuple())
         lines = good_lines = [*pending, line]
@@ -255,9 +241,9 @@ class Confirmation:
 
 
 def _alone(a: Motors, b: Motors, steps: Motors) -> float:
-    # Rad/s by which one wheel of a side changed without the other, beyond one quantization step.
+    # Change of one wheel of a side without the other, beyond one quantization step, rad/s.
     changes, largest = tuple(map(sub, a, b)), 0.0
-    # The wheels i and 3 - i in `WHEELS` order are those of one side.
+    # i and 3 - i in `WHEELS` order are of one side.
     for own, other, step in zip(changes, reversed(changes), steps, strict=True):
         explained = step if step < math.inf else 0.0
         largest = max(largest, min(abs(own), abs(own - other)) - explained)
@@ -295,7 +281,7 @@ class Gaps:
         span = self._seconds - dt  # the time between the first and the last line of the span
         if span < ACCELERATION_SPAN_S:
             return
-        # Compare the motion in the span with the motion at the mean of the first and last speeds.
+        # Compare with the motion at the mean of the first and last speeds.
         first = self._first
         if self._distance or self._turn or linear or angular:
             off = self._distance - linear * dt - span * (first.linear + linear) / 2

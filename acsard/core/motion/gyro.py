@@ -20,35 +20,29 @@ from acsard.core.motion.gyro_match import WINDOW_S, Match
 from acsard.core.motion.gyro_trial import TURN_RATIO_RANGE, Trial
 from acsard.core.values import NS_PER_S, Event, GyroDoes, GyroSample, GyroStatus, Level, Ns
 
-# The robot stands still after all wheels have reported zero speed for this time.
-REST_S = 0.2
+REST_S = 0.2  # of zero speeds of all wheels, after which the robot counts as resting
 
-# Age of the last sample at which the gyro is silent; until then, the robot goes on turning at its
-# rate.
+# Age of the last sample of a silent gyro. Until then, the robot is assumed to turn at its rate.
 SILENCE_TIMEOUT_NS = NS_PER_S // 5
 
-# Largest normal excess of a delay over the least one. A larger excess shows a network that held the
-# sample back, or a sender's clock that was set.
+# A delay this far above the least one shows a slow network, or a sender's clock that was set.
 MAX_EXTRA_DELAY_NS = NS_PER_S // 4
 
-# Delays above `MAX_EXTRA_DELAY_NS` for the first time that fall by less than the second one show a
-# clock that was set. The delays of a backlog fall.
+# A clock was set if such delays last for the first one and fall by less than the second one. The
+# delays of a backlog fall.
 STEADY_DELAY_NS, MAX_DELAY_FALL_NS = NS_PER_S, NS_PER_S // 50
 
-# A stamp that is earlier than the previous one by more than this shows a clock that was set back. A
-# smaller step is a driver that swaps samples, or jitter.
+# A stamp this far before the previous one shows a clock that was set back, not swapped samples.
 MIN_SET_BACK_NS = NS_PER_S // 50
 
-# Samples are missing after this number of sample periods without one. `PERIOD_GAIN` is the weight
-# of a new sample in the mean period, so about fifty samples count.
+# Samples are missing after this number of periods without one. `PERIOD_GAIN`: weight of a new
+# sample in the mean period.
 HOLE_PERIODS, PERIOD_GAIN = 1.5, 0.02
 
-# If new samples cover more time than their feedback line, by this ratio, they are a backlog after a
-# silence. The gyro stays silent until its last sample is younger than `HOLE_PERIODS`.
+# New samples that cover more time than their line, by this ratio, are a backlog after a silence.
 CATCH_UP_SPEED = 1.5
 
-# The wheels count as slipping for this time after they contradicted the gyro.
-SLIP_S = 0.5
+SLIP_S = 0.5  # after they contradicted the gyro, the wheels count as slipping
 
 MAX_SLIP_S = 5.0  # longer than this, the gyro is not used until gyro and wheels agree again
 
@@ -56,29 +50,25 @@ MAX_SLIP_S = 5.0  # longer than this, the gyro is not used until gyro and wheels
 # rad/s2, a defect or a push; at 10 Hz it is 20 rad/s2, more than usual motors cause.
 MAX_JUMP = 2.0
 
-# Age of the last sample from which the daemon cannot find out any more whether gyro or wheels were
-# right in a contradiction.
+# With a last sample this old, nobody can tell whether gyro or wheels were right.
 LOST_NS = NS_PER_S
 
-# Largest change of the bias, rad/s, that is learned from one exact rate at rest. Coarse gyros and
-# simulated ones without noise repeat rates. A gyro that hangs this close to the bias is not
-# noticed.
+# Largest change of the bias, rad/s, that is learned from one exact rate at rest: coarse gyros and
+# simulated ones repeat rates. A gyro that hangs this close to the bias is not noticed.
 MAX_BIAS_STEP = 0.06
 
 # A gyro that repeats one rate certainly hangs if at rest it usually repeats less than the first
 # fraction of its samples, and if such a series has a probability below the second.
 MAX_REPEATING, MIN_CHANCE = 0.6, 1e-6
 
-# Fraction of a jump that must remain in the next sample. Friction ends a push within some
-# hundredths of a second, but nothing remains of a wrong sample.
+# Fraction of a jump that must remain in the next sample: a push lasts for hundredths of a second.
 CONFIRMED_FRACTION = 0.5
 
-# A gyro that repeats one exact rate at rest for this time hangs: noise or a hand changes the last
-# digits. It is less than `NEW_BIAS_TIME_S`, or the rate would become the bias first.
+# A gyro that repeats one exact rate at rest for this time hangs, as noise changes the last digits.
+# It is less than `NEW_BIAS_TIME_S`, or the rate would become the bias first.
 FROZEN_S = 0.8
 
-# The ratio of the turns is used after this number of blocks of 0.1 s with a turn.
-TRUSTED_BLOCKS = 20.0
+TRUSTED_BLOCKS = 20.0  # of 0.1 s with a turn, after which the ratio of the turns is used
 
 STATUS_TEXTS: dict[GyroDoes, str] = {
     "off": "",
@@ -111,26 +101,22 @@ class Turn(Struct, frozen=True, gc=False):
     variance: float
     rate: float  # rad/s, of the last sample or of the wheels
     rate_variance: float
-    # rad that wheels without a fault would report, by the learned ratio.
-    wheels: float | None = None
+    wheels: float | None = None  # rad of wheels without a fault, by the learned ratio
     slips: bool = False  # the wheels contradicted the gyro within `SLIP_S`
 
 
 class Gyro:
     """Computes the turns of the robot from the samples of one gyro.
 
-    `add_samples` gets them, and `turn` is called for each line, which includes those up to
-    `SILENCE_TIMEOUT_NS` late, so no turn is lost. While they are later, the wheels provide it, and
-    a backlog (shown only by stamps) changes nothing. Missing samples make the turn uncertain. A
-    jump of the rate must be confirmed by the next sample. One exact rate at rest is a gyro that
-    hangs, and the wheels' turn replaces its since then. After a contradiction that ends with the
-    gyro unused, either may be right, so the difference is uncertainty.
+    `turn` includes samples up to `SILENCE_TIMEOUT_NS` late, so no turn is lost. While they are
+    later, the wheels provide it, and a backlog (shown only by stamps) changes nothing. Missing
+    samples make the turn uncertain. If a gyro hangs, the wheels' turn replaces its since then.
+    After a contradiction that ends with the gyro unused, the difference is uncertainty.
     """
 
     def __init__(self) -> None:
         self._rest_s = self._since_rest_s = 0.0
-        # The wheels gave the last turn, as the gyro is on trial; the heading will be corrected.
-        self.owes = False
+        self.owes = False  # the wheels gave the last turn; the heading will be corrected
         self._does: GyroDoes = "silent"
         self.events: list[Event] = []  # of the last `turn`
         self._doubt = 0.0  # variance that the next turn must add, rad2
@@ -138,21 +124,17 @@ class Gyro:
 
     def _begin(self) -> None:
         self._bias, self._match, self._trial = Bias(), Match(), Trial()
-        # Not used yet, with their time (`_time_of`)
-        self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
+        self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)  # unused, with `_time_of`
         self._promptest = MinimumDelay()
-        # Arrival and delay of the first sample in such excess, ns.
-        self._late_since: tuple[int, float] | None = None
+        self._late_since: tuple[int, float] | None = None  # arrival and first delay, ns
         self._period_s = 0.0  # mean; 0 before the second sample
         # Gyro's minus wheels' turn since the last used sample, whose rate is assumed to go on, rad.
         self._guessed = 0.0
-        # Gyro and wheels contradicted each other at the last used sample.
-        self._slipped_before = False
+        self._slipped_before = False  # contradiction at the last used sample
         self._last: GyroSample | None = None
         self._told_ns: Ns | None = None  # last used sample
         self._rate = 0.0
-        # Turn by all used samples, and that which `turn` has returned, rad.
-        self._angle = self._given = 0.0
+        self._angle = self._given = 0.0  # rad by all used samples, and returned by `turn`
         self._variance = 0.0  # of the rest of `_angle`, rad2
         self._slip_s = self._slipped_s = 0.0
         self._reading: float | None = None  # rate of the last used sample, rad/s with the bias
@@ -167,8 +149,7 @@ class Gyro:
         self._unsure = 0.0  # variance of the bias by `_suspect`, rad2/s2
         self._noise = 0.0  # variance of the present turn rate, rad2/s2
         self._hole = False  # samples are missing since the last line, or it found the gyro silent
-        # Gyro's minus wheels' returned turn since the contradiction began, rad.
-        self._contradicted = 0.0
+        self._contradicted = 0.0  # gyro's minus wheels' turn since the contradiction began, rad
         self._forget_owed()
         self._forget_repeated()
 
@@ -177,10 +158,7 @@ class Gyro:
         return GyroStatus(self._does, self._bias.value if self._bias.is_known else None)
 
     def add_samples(self, samples: tuple[GyroSample, ...]) -> None:
-        """Store samples in the order of arrival; one with `anew` is another gyro's, and resets all.
-
-        A contradiction of the earlier one makes the heading more uncertain.
-        """
+        """Store samples in the order of arrival; one with `anew` (another gyro) resets all."""
         for sample in samples:
             if sample.anew:
                 self._end_contradiction()
@@ -206,8 +184,7 @@ class Gyro:
         ahead = SILENCE_TIMEOUT_NS if self._told_ns is None else at_ns - self._told_ns
         age_ns = ahead
         if self._heard and self._told_ns is not None:
-            # A sample that waits for the confirmation of its jump is not used yet, but the gyro is
-            # not silent.
+            # A sample that waits for the confirmation of its jump is not used, but not silent.
             age_ns = min(age_ns, at_ns - self._heard[0][0])
         # Samples that catch up after a silence have the rates of an earlier motion.
         passed_ns = 0 if told_ns is None or self._told_ns is None else self._told_ns - told_ns
@@ -217,8 +194,8 @@ class Gyro:
         prediction = 0.0 if resting or silent else self._rate * max(0, ahead) / NS_PER_S
         angle, variance = self._angle + prediction - self._given, self._variance
         self._given, self._variance = self._angle + prediction, 0.0
-        # During a silence of the gyro, the wheels provide the turn. The samples that end the
-        # silence cover the same turn again, so the wheels also provide the turn of the next line.
+        # The samples that end a silence cover the same turn again, so the wheels also provide the
+        # turn of the next line.
         lost, self._hole = silent or self._hole, silent
         self._since_rest_s = 0.0 if resting else self._since_rest_s + dt
         # The error of the bias is the same in each line, so it does not average out.
@@ -272,11 +249,8 @@ class Gyro:
             self._owed -= turn
         return turn if verdict == "good" else 0.0
 
-    # Samples.
-
     def _time_of(self, sample: GyroSample) -> int:
-        # Arrival without jitter; a backlog gets the times of measurement, so the wheels provide the
-        # present turn.
+        # A backlog gets the times of measurement, so the wheels provide the present turn.
         last, self._last = self._last, sample
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
             return sample.at_ns
@@ -288,7 +262,6 @@ class Gyro:
         return sample.at_ns - max(0, int(late))
 
     def _is_late_for_good(self, late: float, at_ns: Ns, last_at_ns: Ns) -> bool:
-        # A clock was set: the excess `late` is large and steady.
         if late <= MAX_EXTRA_DELAY_NS:
             self._late_since = None
             return False
@@ -299,7 +272,6 @@ class Gyro:
         return at_ns - since_ns >= STEADY_DELAY_NS
 
     def _take(self, until_ns: Ns, resting: bool) -> None:
-        # Learn the bias at rest, otherwise add the turns.
         bias, samples = self._bias, self._heard
         while samples and samples[0][0] <= until_ns:
             jump = 0.0 if self._reading is None else samples[0][1].rate - self._reading
@@ -345,16 +317,12 @@ class Gyro:
 
     @property
     def _hangs(self) -> bool:
-        # False for a gyro that often repeats its rate without a defect.
         share = (self._usual_repeats + 1) / (self._usual + 1)
         return share < MAX_REPEATING and share**self._repeats < MIN_CHANCE
 
     def _end_repetition(self) -> None:
-        # The turns of a gyro that seems to have hung make the heading more uncertain, a possible
-        # new bias the bias.
-        # The gyro may have hung while it contradicted the wheels. But a gyro without noise also
-        # repeats its rate in an even turn with slipping wheels. Then the repetition begins with the
-        # slip, and the wheels turn more than the robot.
+        # A gyro without noise also repeats its rate in an even turn with slipping wheels. Then the
+        # repetition begins with the slip, and the wheels turn more than the robot.
         gyro = self._repeated + self._repeated_wheels
         before = self._repeated_s >= self._slipped_s + SLIP_S
         hung = before or self._hangs or abs(gyro) > abs(self._repeated_wheels)
@@ -371,16 +339,12 @@ class Gyro:
         self._forget_repeated()
 
     def _drop_waiting_correction(self) -> None:
-        # It waits if the line that showed the hanging gyro covers no known time; it becomes
-        # uncertainty.
+        # It waits if the line that showed the hanging gyro covers no known time.
         if self._frozen:
             self._doubt += self._repeated * self._repeated + self._repeated_gaps
 
-    # Comparison with the wheels.
-
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
-        # True: the wheels must provide this turn. At rest the gyro does, because a person may turn
-        # the robot.
+        # At rest the gyro provides the turn, because a person may turn the robot.
         trial, known = self._trial, self._bias.is_known
         if not trial.open or resting:
             return False
@@ -406,8 +370,7 @@ class Gyro:
         self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
 
     def _sum_up(self, angle: float, wheels: float, dt: float) -> None:
-        # This is for a gyro that later proves wrong. `dt` is 0 after a gap, which only the gyro has
-        # measured.
+        # `dt` is 0 after a gap, which only the gyro has measured.
         off = angle - wheels
         self._repeated_gaps += 0.0 if dt > 0.0 else angle * angle
         self._repeated += off
@@ -416,14 +379,12 @@ class Gyro:
         self._contradicted = self._contradicted + off if self._slip_s > 0.0 else 0.0
 
     def _end_contradiction(self) -> None:
-        # The difference since the contradiction began is uncertainty, as nobody can tell who was
-        # right.
+        # Nobody can tell whether gyro or wheels were right.
         self._doubt += self._contradicted * self._contradicted
         self._contradicted = 0.0
 
     def _doubted(self, wheels: float, dt: float, noise: float, lost: bool) -> Turn | None:
-        # The wheels' turn with a correction for a gyro that hangs, and the uncertainty of earlier
-        # turns; None without doubt or `dt`. While samples are `lost`, a contradiction goes on.
+        # The wheels' turn with a correction, and the uncertainty of earlier turns.
         if dt <= 0.0:
             # This line gives no turn, so a correction for a gyro that hangs waits for the next one.
             if not lost and not self._frozen:
@@ -431,8 +392,7 @@ class Gyro:
             return None
         angle = 0.0
         if lost:
-            # Samples are missing, so the wheels also give the turn since the sample before them,
-            # unless they slipped already then.
+            # The wheels also give the turn since the sample before, unless they slipped then.
             self._doubt += self._guessed * self._guessed
             if not self._slipped_before:
                 angle, self._contradicted, self._slip_s = -self._guessed, 0.0, 0.0

@@ -20,9 +20,7 @@ DEVIATION_MARGIN = 0.01  # rad/s beyond `MAX_DEVIATIONS`, because a robot at res
 
 MIN_NOISE = 1e-5  # rad/s of a sample: a coarse gyro may repeat one value
 
-# Another reading at rest becomes the bias after it was constant for this time: the gyro restarted
-# or warmed up, or the robot turned while the first bias was learned.
-NEW_BIAS_TIME_S = 1.0
+NEW_BIAS_TIME_S = 1.0  # another constant reading at rest: the gyro restarted or warmed up
 
 NOISE_GAIN = 0.02  # of the noise, about fifty samples
 

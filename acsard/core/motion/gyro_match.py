@@ -23,8 +23,7 @@ INITIAL_RATIO_STD, MIN_RATIO_STD = 0.5, 0.1
 # Standard deviation of a block's mean, rad/s, plus this share of it.
 BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
 
-# A gyro with this delay does not contradict the wheels.
-MAX_DELAY_S = 0.05
+MAX_DELAY_S = 0.05  # a gyro with this delay does not contradict the wheels
 
 WINDOW_S = 0.2  # for the comparison of turns
 
@@ -37,8 +36,7 @@ class Match:
     """Learns the ratio of the gyro's turns to the wheels' turns."""
 
     def __init__(self) -> None:
-        # Sums of the least-squares fit. Their initial values stand for the ratio 1 with the
-        # standard deviation `INITIAL_RATIO_STD`.
+        # The sums begin as the ratio 1 with the standard deviation `INITIAL_RATIO_STD`.
         self._ww, self._wg = 1.0 / INITIAL_RATIO_STD**2, 1.0 / INITIAL_RATIO_STD**2
         self.ratio = 1.0  # the gyro's turn divided by the wheels' turn
         self.deviation = INITIAL_RATIO_STD  # assumed standard deviation of `ratio`

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-# From this rate on, rad/s by the wheels, a line begins a turn to the other side (less may be one
-# encoder count), and a gyro that reads zero is dead (unequal tires report less).
+# rad/s by the wheels: less may be one encoder count. A gyro that reads zero at it is dead.
 MIN_TURN_RATE = 0.1
 
 # Mean rate by the wheels, rad/s, over intervals of `STRETCH_S`, from which the robot turns.
@@ -23,11 +22,9 @@ TURN_RATIO_RANGE = (0.25, 2.5)
 # second is larger, because the gyro may be late.
 MIN_PROVING_TURN, MIN_REFUTING_TURN = 0.1, 0.4
 
-# Least time of turning before a gyro can be refuted. No gyro has such a delay.
-MIN_REFUTING_TURN_S = 0.3
+MIN_REFUTING_TURN_S = 0.3  # no gyro has such a delay
 
-# Ratio of a gyro in degrees to the wheels: 57 without slip and errors.
-DEGREES_RATIO_RANGE = (15.0, 150.0)
+DEGREES_RATIO_RANGE = (15.0, 150.0)  # in degrees; 57 without slip and errors
 
 Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not believed"]
 
@@ -100,7 +97,6 @@ class Trial:
 
 
 def _named(ratio: float) -> Verdict:
-    # `ratio` is the gyro's turn over the wheels' turn.
     least, most = TURN_RATIO_RANGE
     if DEGREES_RATIO_RANGE[0] <= abs(ratio) <= DEGREES_RATIO_RANGE[1]:
         return "in degrees"

@@ -25,14 +25,12 @@ from acsard.core.values import NS_PER_S, Instant, Latch, Latches, Ns
 # a packet for longer.
 LATCH_REQUIRED_S = 2.0
 
-# The first clients among the causes of a stop: a flood of stops must neither fill the reason
-# in `state` nor hide the first client. The board has only a few causes.
+# The first clients among the causes of a stop: a flood of stops must not hide the first client.
 MAX_CLIENTS = 4
 
 MAX_FAULTS = 32  # the daemon knows fewer different ones
 
-# A time that stands for "never".
-LONG_AGO_NS = -(2**62)
+LONG_AGO_NS = -(2**62)  # "never"
 
 NAMELESS = "request"  # in a text, a client that has no name
 
@@ -52,12 +50,9 @@ class Lifecycle:
         self._stop_asked_ns = LONG_AGO_NS  # latest arrival of a client's stop
         self._off_ns = LONG_AGO_NS  # last switched off
         self._held: Reason | None = None  # why `clear` is refused now
-        # Last step in which the cause of a latch ended or came again; no earlier `clear` counts.
-        self._freed_ns = LONG_AGO_NS
+        self._freed_ns = LONG_AGO_NS  # a cause last ended or came again; no earlier `clear` counts
         self._began_ns: Ns | None = None  # first step, or first after the last stall
         self._derive()
-
-    # facts
 
     def begin(self, now: Instant, *, stalled: bool = False) -> None:
         """Begin a step; `stalled` says that the daemon stood still before it.
@@ -92,11 +87,9 @@ class Lifecycle:
         self._held = why
 
     def caused_again(self, now_ns: Ns) -> None:
-        """Record that the cause of the fault came again; no earlier `clear` counts."""
         self._freed_ns = now_ns
 
     def leave(self) -> None:
-        """Record that the daemon is shutting down."""
         self._shutting_down = True
         self._derive()
 
@@ -110,8 +103,6 @@ class Lifecycle:
         self._faulted_ns = now.mono_ns
         self._latch(fault=with_causes(self._new_latch(now, "", why), latch))
         return True
-
-    # requests
 
     def stop(self, by: str, asked_ns: Ns, now: Instant) -> str:
         """Latch a stop with a new number, and return a text for the client.
@@ -149,8 +140,7 @@ class Lifecycle:
         if latch is None:
             return ""
         if asked_ns <= self._freed_ns:
-            # This call may have arrived before the button was released, because a press may be
-            # shorter than a step.
+            # A press may be shorter than a step, so this call may have come before the release.
             raise RefusedError(
                 "this call came before the cause of the stop or fault had ended: call srv/clear "
                 "again"
@@ -159,7 +149,6 @@ class Lifecycle:
             set_ns = max(self._stopped_ns, self._faulted_ns)
             last_ns = self._cleared_ns
             if set_ns <= last_ns and asked_ns - last_ns < LATCH_REQUIRED_S * NS_PER_S:
-                # The network may have delivered one call twice.
                 raise RefusedError(
                     f"a latch was cleared less than {LATCH_REQUIRED_S:g} s ago; the robot is still "
                     f"{_in_force(latches)}: look at the robot, then call srv/clear again"
@@ -218,7 +207,6 @@ class Lifecycle:
         return True
 
     def deactivate(self, by: str, now: Instant) -> str:
-        """Switch the robot off with a new latch, and return a text for the client."""
         require_allowed(self.mode, "deactivate")
         self._off_ns = now.mono_ns
         why = reason("switched_off", by=by or NAMELESS)
@@ -235,8 +223,7 @@ class Lifecycle:
             parts = [f"{cause.why}, latched {_when(cause)}" for cause in faults]
             causes = () if stop is None else stop.causes
             if held is not None and not _is_latched(held, (*faults, *causes)):
-                # The cause that lasts differs from all latched causes. For example, one of two
-                # pressed bumpers has been released.
+                # For example, one of two pressed bumpers has been released.
                 parts.append(held.text)
             parts += [_latch_text(cause) for cause in causes]
             before = "" if held is None else f"{held.advice}, then "
@@ -246,8 +233,6 @@ class Lifecycle:
         latch = latches.inactive
         assert latch is not None
         return Reason(latch.code, f"{_latch_text(latch)}; call srv/activate")
-
-    # latches and mode
 
     def _new_latch(self, now: Instant, by: str, why: Reason) -> Latch:
         if self._numbered:
@@ -285,8 +270,7 @@ class Lifecycle:
     def _require_latch_was_seen(
         self, was: str, still: str, set_ns: Ns, asked_ns: Ns, call: str
     ) -> None:
-        # `was` is the newest cause, `still` all, `set_ns` its time (`LONG_AGO_NS`: an earlier
-        # run's).
+        # `was` is the newest cause, `still` all, `set_ns` its time.
         began_ns = LONG_AGO_NS if self._began_ns is None else self._began_ns
         since = asked_ns - max(set_ns, began_ns)
         if since >= LATCH_REQUIRED_S * NS_PER_S:
@@ -294,9 +278,8 @@ class Lifecycle:
         age_s = max(0.1, math.floor(since / NS_PER_S * 10) / 10)
         age_text = f"{was} {age_s:.1f} s ago"
         if set_ns < began_ns:
-            # An earlier run set the latch, or the daemon stood still after it. The age in an
-            # earlier run is unknown, because the monotonic clock may have restarted and the wall
-            # clock may have been set since.
+            # The age in an earlier run is unknown: the monotonic clock may have restarted, and the
+            # wall clock may have been set.
             age_text = (
                 f"the daemon started or resumed {age_s:.1f} s ago and the robot is still {still}"
             )
@@ -318,7 +301,6 @@ def with_causes(latch: Latch, before: Latch | None) -> Latch:
 
 
 def latch_of(number: int, at_ns: int, by: str, why: Reason) -> Latch:
-    """Return a latch with the cause `why`."""
     return Latch(number, at_ns, by, why.text, why.code, why.part)
 
 
@@ -331,8 +313,8 @@ def number_after_restart(last_number: int, now: Instant) -> int:
 
     If the wall clock was set back, it is `last_number` + 1 + ms since the computer started.
     """
-    # `last_number` + 1 alone is not safe: an earlier latch, which is not in the file any more, may
-    # have had that number, and a late `clear` may still name it.
+    # An earlier latch that is not in the file may have had `last_number` + 1, and a late `clear`
+    # may still name it.
     number = now.wall_ns // 1_000_000
     return number if number > last_number else last_number + 1 + now.mono_ns // 1_000_000
 

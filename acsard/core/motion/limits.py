@@ -35,8 +35,7 @@ class Limiter:
 
     def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
         self._kinematics = kinematics
-        # Allowed twist and accelerations. `Robot` resets it to that of the last line on the port.
-        self.state = _State(REST, 0.0, 0.0)
+        self.state = _State(REST, 0.0, 0.0)  # `Robot` resets it to that of the last line
         self._cap = math.inf
         self.use(limits)
 
@@ -95,14 +94,12 @@ class Limiter:
         return twist
 
     def _fitted(self, twist: Twist) -> Twist:
-        # Each axis is between the present twist and `twist`, so that no wheel exceeds its limit.
         kinematics, most, now = self._kinematics, self._wheel_speed, self.twist
         if kinematics.fits(twist, most):
             return twist
-        # Each axis changes at its own rate. On the way to the goal, both axes together may need a
-        # faster wheel than at the start or at the goal. So one axis changes as far as it may, and
-        # the other one only as far as the wheels allow. An axis that slows down goes first, because
-        # braking must not wait for the other axis.
+        # On the way, both axes together may need a faster wheel than at the start or at the goal.
+        # So one axis changes as far as it may, and the other one as far as the wheels allow. An
+        # axis that slows down goes first, because braking must not wait.
         changes = [Twist(twist.linear - now.linear), Twist(angular=twist.angular - now.angular)]
         turns_slower = abs(twist.angular) < abs(now.angular)
         if turns_slower and abs(twist.linear) >= abs(now.linear):
@@ -114,7 +111,7 @@ class Limiter:
         fitted = now
         for change in changes:
             fitted = _sum(fitted, change, kinematics.room(fitted, change, most))
-        # Remove the error that rounding has added.
+        # Rounding has added an error.
         return kinematics.saturate(fitted, most)
 
     def coast(self, dt: float, stop: bool = False) -> Twist:
@@ -160,11 +157,10 @@ def _braking(axis: _Axis, stop: bool) -> float:
 def _approach(
     speed: float, goal: float, slope: float, dt: float, axis: _Axis
 ) -> tuple[float, float]:
-    # Speed of an axis on the way to `goal`, and its acceleration; `slope` is the previous one.
+    # `slope` is the previous acceleration.
     if dt <= 0.0:
         return speed, slope
-    # Split a change of direction at zero: slowing down is limited as deceleration, and speeding up
-    # again as acceleration.
+    # A change of direction is split at zero into deceleration and acceleration.
     target = 0.0 if speed * goal < 0 else goal
     most = axis.acceleration if abs(target) > abs(speed) else axis.deceleration
     wanted = (target - speed) / dt
@@ -173,8 +169,8 @@ def _approach(
         slope = slope if slope * wanted > 0 else 0.0
         step = axis.jerk * dt
         most = min(most, abs(slope) + step, _flattenable(abs(target - speed), step, dt))
-        # The slope may fall faster than the jerk limit allows only if the speed would pass the goal
-        # otherwise. The slope never exceeds the acceleration limit, which may have been lowered.
+        # The slope may fall faster than the jerk limit only if the speed would pass the goal
+        # otherwise. It never exceeds the acceleration limit, which may have been lowered.
         most = min(axis.acceleration, max(most, abs(slope) - step))
     used = max(-most, min(most, wanted))
     # Return the goal itself if it is reached: in floating point, speed + wanted * dt may miss it.
@@ -182,8 +178,7 @@ def _approach(
 
 
 def _flattenable(away: float, step: float, dt: float) -> float:
-    # The largest acceleration that can fall to zero, by `step` in each `dt`, before the speed
-    # passes its goal, `away` from it.
+    # The largest acceleration that can fall to zero by `step` in each `dt` before the goal.
     # If the acceleration starts at s and falls for n more periods, the speed changes by
     # dt ((n + 1) s - step n (n + 1) / 2).
     n = math.floor((math.sqrt(1.0 + 8.0 * away / (step * dt)) - 1.0) / 2.0)

@@ -68,7 +68,7 @@ REFUSALS: dict[tuple[Mode, Verb], str] = {
 
 
 def require_allowed(mode: Mode, verb: Verb) -> None:
-    """Raise `RefusedError` if the robot refuses the request `verb` in this mode."""
+    """Raise `RefusedError` if this mode refuses the request."""
     why = REFUSALS.get((mode, verb))
     if why is not None:
         raise RefusedError(why)

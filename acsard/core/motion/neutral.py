@@ -16,24 +16,19 @@ from acsard.core.motion.emergency_stop import CATCH_UP_NS
 from acsard.core.motion.freshness import MAX_JITTER_NS, MAX_PROOF_NS, Verdict
 from acsard.core.values import NS_PER_S, REST, Command, Ns
 
-# Programs without a sender id and without a GID may share an identity. These rules apply to them:
+# Programs without a sender id and without a GID may share an identity. For them:
 #
-# - The zero of one program must not arm another program that never stopped. Therefore a zero arms a
-#   shared identity only after `NEUTRAL_PAUSE_NS` without a speed. Further zeros and silence
-#   do not restart this time.
-# - While the daemon stands still, it receives no speeds. Therefore the time of a stall does not
-#   count towards the pause.
-# - One program without a sender id may have several shared identities in turn, because its identity
-#   depends on the Zenoh session that stamps its commands. Therefore a speed of one shared identity
-#   cancels the zeros of all shared identities of the source.
+# - The zero of one must not arm another one that never stopped, so it arms only after
+#   `NEUTRAL_PAUSE_NS` without a speed. Further zeros and silence do not restart this time.
+# - While the daemon stands still, it receives no speeds, so a stall does not count towards it.
+# - One program may have several shared identities in turn, by the Zenoh session that stamps its
+#   commands, so a speed of one cancels the zeros of all shared identities of the source.
 
-# Time for which a sender that is not live stays in the choice, and for which an unarmed one keeps
-# control after its clock was set. A proof ends within it, even a longest one that restarts with its
-# second half.
+# Time for which a sender that is not live stays in the choice, and an unarmed one keeps control
+# after its clock was set. Even a longest proof that restarts with its second half ends within it.
 CANDIDATE_NS = 2 * MAX_PROOF_NS
 
-# Time without a speed after the zero of a shared identity: longer than the pauses of a program that
-# sends its speeds irregularly.
+# Without a speed, after the zero of a shared identity: longer than the pauses of irregular senders.
 NEUTRAL_PAUSE_NS = NS_PER_S
 
 
@@ -49,15 +44,13 @@ class Sender:
         self.name = ""
         self._stamp_ns: Ns | None = None  # of the last accepted command
         self._number: int | None = None  # of the last accepted command
-        # The last zero, until a command that was sent after it arrives. A speed from before it must
-        # not move the robot again. An accepted zero has no stamp here.
+        # The last zero (accepted: without a stamp), until a command that was sent after it arrives.
+        # A speed from before it must not move the robot again.
         self._ended: Command | None = None
         self.clock = ""  # of the last command
         self.twist = REST
         self.arrived_ns: Ns | None = None  # last accepted command since `require_neutral`
-        # Last command that keeps it present, accepted or not; a stall of the daemon moves it to its
-        # end.
-        self._present_ns = 0
+        self._present_ns = 0  # last command, accepted or not; a stall moves it to its end
         self.came_ns = 0  # first accepted command after its last silence
         self.zeros_ns: Ns | None = None  # zeros only since then, without a silence
         self.speeds_ns: Ns | None = None  # speeds only since then, without a silence
@@ -66,8 +59,7 @@ class Sender:
         self.shared = False  # several programs may share its identity
         self.noticed_ns = 0  # last message, even a refused one
         self._doubted_ns: Ns | None = None
-        # Last verdict on a command that its stamp made unacceptable.
-        self.doubt: Verdict = "unproven"
+        self.doubt: Verdict = "unproven"  # of the last command with an unacceptable stamp
 
     def use(self, timeout_ns: Ns) -> None:
         self._timeout_ns = timeout_ns
@@ -130,9 +122,9 @@ class Sender:
     def resume(self, before_ns: Ns, now_ns: Ns) -> None:
         """Continue after the daemon stood still from `before_ns` to `now_ns`.
 
-        The bus may deliver the commands of that time later, so the sender stays present for one
-        timeout more, within `CANDIDATE_NS`. A running neutral pause does not advance, and lasts
-        for `CATCH_UP_NS` more at least.
+        Commands of that time may come later, so the sender stays present for one timeout more,
+        within `CANDIDATE_NS`. A running neutral pause does not advance, and lasts for `CATCH_UP_NS`
+        more at least.
         """
         if self.present(before_ns):
             self._present_ns = now_ns
@@ -165,7 +157,6 @@ class Sender:
         self.refuse(command, "stale")
 
     def refuse(self, command: Command, why: Verdict) -> None:
-        """Record a command that was refused because of its stamp."""
         self.noticed_ns = command.arrived_ns
         self._doubt(command, why)
 
@@ -190,7 +181,7 @@ class Sender:
                 self._zero_ns = max(now_ns, watched_ns)
         if verdict in ("first", "unproven"):
             if zero and unarmed:
-                # When this zero arms the sender, an earlier speed must not drive the robot.
+                # When the zero arms, an earlier speed must not drive the robot.
                 self.twist = REST
             self._doubt(command, verdict)
             return
@@ -209,23 +200,19 @@ class Sender:
             else:
                 self._ended = None
         if zero and self._ended is None:
-            # `Freshness` already compares the stamps of commands of one clock with each other, so
-            # leave out the stamp of this accepted zero.
+            # `Freshness` compares the stamps of accepted commands already.
             self._ended = replace(command, stamp_ns=None)
 
     def _update_times(self, zero: bool, now_ns: Ns, present: bool) -> None:
-        # `present` is false if this command ends a silence.
         since_ns = self.zeros_ns if zero else self.speeds_ns
         if since_ns is None or not present:
             since_ns = now_ns
         self.zeros_ns, self.speeds_ns = (since_ns, None) if zero else (None, since_ns)
 
     def _overtaken(self, command: Command, zero: Command) -> bool:
-        # Sent before `zero`, but arrived after it.
-        # The network delays an accepted command by at most about the timeout. Therefore the stamp
-        # of `zero` is wrong if it is later by more than the timeout. If a command with a lower
-        # number arrives more than the timeout after `zero`, the sender has restarted its numbers.
-        # In both cases, `zero` must not keep the robot at rest.
+        # Sent before `zero`, but arrived after it. A stamp or a number that says so for longer than
+        # the timeout is wrong: the network delays no accepted command by more, and the sender may
+        # have restarted its numbers. Then `zero` must not keep the robot at rest.
         if command.clock != zero.clock:
             # Stamps of two clocks cannot be compared, but a sender numbers all its commands.
             passed_ns = command.arrived_ns - zero.arrived_ns
@@ -250,7 +237,6 @@ class Sender:
         self._doubted_ns, self.doubt, self.ros = command.arrived_ns, why, command.ros
 
     def _settle(self, now_ns: Ns) -> None:
-        # Arm a shared identity when neutral pause is over.
         if self._zero_ns is not None and now_ns - self._zero_ns >= NEUTRAL_PAUSE_NS:
             self._armed = True
             if self._proven_zero_ns == self._zero_ns:

@@ -82,10 +82,9 @@ class Odometry:
         self._positions = AT_REST
         self._rolling = Rolling(quiet)
         self._confirmation = Confirmation()
-        # Rolled at rest, rad; for the pose beyond two counts (`_unsettled`), or in a drive.
-        self._held = AT_REST
-        # Quantization of each speed in the last line, and the largest known one, rad/s, or if none
-        # is known 0 and infinite.
+        self._held = AT_REST  # rad at rest; for the pose beyond two counts, or in a drive
+        # Quantization of each speed in the last line, and the largest known one, rad/s (0 and
+        # infinite if none is known).
         self._steps_of, self._coarsest, self._largest_step = AT_REST, 0.0, 0.0
         self._path = Path()
         self._errors = ErrorModel(odometry, kinematics)
@@ -99,11 +98,9 @@ class Odometry:
         self._still = 0.0  # s of zero speeds, without filled gaps
         self.twist = REST  # in the last line
         self.speeds = STILL  # in the last line
-        # Last commanded twist; highest commanded speeds since the last line, without sign.
-        self._commanded = self._highest = REST
+        self._commanded = self._highest = REST  # last twist; highest speeds since the last line
         self._folded = False  # a line was used since the last command
-        # Gaps in which the robot may have moved but the pose could not follow, their s, and s of
-        # filled gaps.
+        # Gaps in which the robot may have moved, their s, and s of filled gaps.
         self.gaps, self.unseen, self.bridged = 0, 0.0, 0.0
         self.travelled = 0.0  # m since the daemon started, forwards plus backwards
 
@@ -128,7 +125,7 @@ class Odometry:
 
     @property
     def pose(self) -> Pose:
-        """The present pose of base_link in odom."""
+        """Pose of base_link in odom."""
         return self._path.pose
 
     def missed(self) -> dict[str, int]:
@@ -142,7 +139,7 @@ class Odometry:
         Call this in each step after its lines: in a gap, the robot may have driven as fast.
         """
         if self._folded or twist != self._commanded:
-            # The robot may still follow the previous command, because the board reacts late.
+            # The robot may still follow the previous command.
             highest = self._commanded if self._folded else self._highest
             self._highest = Twist(
                 max(abs(highest.linear), abs(twist.linear)),
@@ -221,12 +218,11 @@ class Odometry:
         )
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
-        # A small motion at rest goes into `_held`: a wheel may rock between the edges of a count.
+        # A wheel may rock between the edges of a count.
         turned = rolled.turned
         if self._held != AT_REST:
             turned = plus(self._held, turned)
         if turned == AT_REST:
-            # The wheels have turned back by the held motion.
             self._held = AT_REST
             return rolled.pieces
         if at_rest and max(map(abs, turned)) <= self._unsettled:
@@ -236,7 +232,7 @@ class Odometry:
         return (turned, *rolled.pieces)
 
     def _take_back(self) -> None:
-        # A gyro that was proven meanwhile has corrected the heading, which then does not change.
+        # A gyro that was proven meanwhile has corrected the heading already.
         was_faulty = self.checks.wheels.was_faulty
         wrong = list(takewhile(lambda step: was_faulty(step.speeds), reversed(self._steps)))
         if not wrong:
@@ -257,7 +253,6 @@ class Odometry:
             self._path.turn(-self.checks.undo_recomputation(on_trial))
 
     def _arcs(self, pieces: tuple[Motors, ...], gyro: Turn | None) -> list[tuple[float, float]]:
-        # Distance, m, and turn, rad; a gyro's turn makes a single arc.
         believed, kinematics = self.checks.wheels.believed, self._kinematics
         arcs = []
         for piece in pieces:
@@ -274,7 +269,7 @@ class Odometry:
         speeds: WheelSpeeds,
         slips: bool,
     ) -> float:
-        # `turn` is by a gyro. Returns the turn of the pose, rad.
+        # Returns the turn of the pose, rad.
         path, turned = self._path, 0.0
         pose, variance = path.pose, None if turn is None else turn.variance
         for piece in pieces:
@@ -289,7 +284,6 @@ class Odometry:
         return turned
 
     def _go_on(self, rolled: Rolled, feedback: Feedback, before: Twist, twist: Twist) -> None:
-        # A gap that was not filled restarts the measurement of the acceleration.
         bridged = rolled.bridged
         if bridged > 0.0:
             self.bridged += bridged
@@ -304,10 +298,8 @@ class Odometry:
             self._gaps.follow(twist, feedback.dt)
 
     def _miss(self, cause: Missed, angles: Motors, gyro: Turn | None) -> None:
-        # The wheels may have rolled `angles`, rad, in addition.
         distance, turn = self._kinematics.moved(angles)
-        # A gyro does not miss a turn.
-        turn = turn if gyro is None else 0.0
+        turn = turn if gyro is None else 0.0  # a gyro misses none
         self._uncertainty.miss(cause, MISSED_STD * distance, MISSED_STD * turn)
         if cause == "gap":
             # The board may also have received the command in some gaps and not in others. Motions
@@ -329,13 +321,12 @@ class Odometry:
         return variances
 
     def _rounded(self, seconds: float) -> tuple[float, float]:
-        # Variances of distance, m2, and turn, rad2 (0 with a gyro), by counts in a gap.
+        # Variances of distance, m2, and turn, rad2 (0 with a gyro).
         linear, angular = self._twist_uncertainty.rounding(self._rounding.square)
         square = seconds * seconds
         return linear * square, 0.0 if self.checks.turn is not None else angular * square
 
     def _add_unseen_motion(self, seconds: float, before: Twist, after: Twist) -> None:
-        # Does not move the pose.
         if before != REST or after != REST or self._highest != REST:
             self.gaps += 1
             self.unseen += seconds

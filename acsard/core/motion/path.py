@@ -40,7 +40,6 @@ class Path:
         return dx, dy, heading
 
     def turn(self, turn: Rad) -> None:
-        """Add a turn in place."""
         self._turn(turn)
         self.pose = Pose(self._x, self._y, self._yaw)
 
@@ -57,7 +56,6 @@ def plus(a: float, b: float) -> tuple[float, float]:
 
 
 def arc(pose: Pose, distance: Metres, turn: Rad) -> Pose:
-    """Return the pose after an arc."""
     half, yaw = turn / 2, math.remainder(pose.yaw, math.tau)
     chord = distance * (math.sin(half) / half if half else 1.0)
     heading = yaw + half

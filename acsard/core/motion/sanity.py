@@ -24,30 +24,24 @@ WINDOW_LINES = 1000  # 10 s at 100 Hz
 
 WARNING_FRACTION = 0.01  # of a window, above which one warning is logged
 
-# rad/s beyond `MAX_WHEEL_ACCELERATION`, as coarse encoders and a robot at rest cause.
-SPEED_MARGIN = 2.0
+SPEED_MARGIN = 2.0  # rad/s beyond `MAX_WHEEL_ACCELERATION`, by coarse encoders
 
-# rad/s2: beyond the change of any real wheel.
-MAX_WHEEL_ACCELERATION = 1500.0
+MAX_WHEEL_ACCELERATION = 1500.0  # rad/s2, more than any real wheel's
 
 COUNT_MARGIN = 2  # each of two reports may be wrong by one
 
-# Angle of a count, rad, of the coarsest encoder that is expected. Until the steps are learned, it
-# excuses a speed over `feedback.wheel_speed`.
+# Of the coarsest expected encoder, rad. Until the steps are learned, it excuses a speed over
+# `feedback.wheel_speed`.
 COARSEST_COUNT = math.tau / 16
 
-# Least time in which a wheel makes one such count: firmware rarely counts for a shorter time.
-MIN_COUNT_S = 0.005
+MIN_COUNT_S = 0.005  # firmware rarely counts for a shorter time
 
-# 78.5 rad/s, below the default of `feedback.wheel_speed` (80): above it, only counts excuse a
-# speed.
+# 78.5 rad/s, below `feedback.wheel_speed` (80): above it, only counts excuse a speed.
 MAX_STEP = COARSEST_COUNT / MIN_COUNT_S
 
-# Lines that report the same count: firmware that is asked again very soon repeats its speeds once.
-MAX_REPORTS = 2
+MAX_REPORTS = 2  # of the same count: firmware that is asked again very soon repeats its speeds once
 
-# Least time between two lines. While this computer catches up after a stall, one count would look
-# fast.
+# Least time between two lines: while this computer catches up, one count would look fast.
 MIN_INTERVAL_S = 0.004
 
 
@@ -64,13 +58,11 @@ class Sanity:
     def __init__(self, feedback: FeedbackConfig) -> None:
         self._settings = feedback
         self._last: WheelSpeeds | None = None
-        # The wheels can change back to the line before `_last` by the next line.
-        self._trusted = False
+        self._trusted = False  # the wheels can change back to the line before by the next one
         # Newest impossible lines since `_last`, with the time since it, s; not too fast ones.
         self._rejected: list[tuple[WheelSpeeds, float]] = []
         self._since = 0.0
-        # Time that a recent line covers: its speeds are means; a line of t s is recent for t s.
-        self._longest = 0.0
+        self._longest = 0.0  # s that a recent line covers (recent for as long)
         self._impossible = 0
         self._fast = NOT_FAST  # successive lines of each wheel over `feedback.wheel_speed`
         # Sums of the speeds in these lines, rad/s. A speed far above the limit is damage, so each
@@ -108,7 +100,7 @@ class Sanity:
         most = self._most(self._since, longest)
         why = ""
         if max(map(abs, wheels)) > self._settings.wheel_speed or change > most:
-            # Only a few lines get here. The quantization steps matter only for these lines.
+            # Only few lines need the quantization steps.
             why = self._too_fast(feedback)
             if not why and last is not None:
                 why = self._jump(feedback, last, most)
@@ -131,8 +123,7 @@ class Sanity:
         return ""
 
     def _most(self, since: float, longest: float) -> float:
-        # Each speed is a mean over the time that its line covers. Therefore the change may have
-        # lasted from the middle of one such time to the middle of the next.
+        # Speeds are means: the change may have lasted from the middle of one to that of the next.
         mean = (since + longest) / 2
         return MAX_WHEEL_ACCELERATION * (mean if mean > since else since) + SPEED_MARGIN
 
@@ -143,7 +134,6 @@ class Sanity:
         )
 
     def _count(self, why: str) -> None:
-        # `why` is "" for a possible line.
         self._lines += 1
         self.warning = None
         if why:
@@ -154,7 +144,6 @@ class Sanity:
             self._lines = self._dropped = 0
 
     def _warning_text(self, why: str) -> str:
-        # Each reason ends with the name of the setting.
         setting = why.rpartition(" over ")[2]
         return (
             f"{self._dropped} of {self._lines} lines were dropped, because no wheel can do "
@@ -190,20 +179,19 @@ class Sanity:
             if not lines:
                 continue
             if line.count and turned is not None:
-                # If the line reports n counts, n - 1 of them certainly occurred in its time.
+                # Of n reported counts, n - 1 certainly occurred in the time of the line.
                 room = size * min(1.0, line.count / abs(angle)) if angle else size
             elif learned and size <= MAX_STEP:
-                # The sum of n reported speeds is wrong by at most one step, or by two steps if
-                # lines are repeated. Therefore a lasting speed is soon evident.
+                # A sum of speeds is wrong by one step, or two if lines are repeated, so a lasting
+                # speed is soon evident.
                 room = step
                 if total / lines > fastest + step * min(1.0, MAX_REPORTS / lines):
                     room = 0.0
             elif learned or size > count:
                 room = 0.0  # No encoder has so large a step, so the line is damaged.
             else:
-                # A board that is asked again very soon repeats the speeds of the line before. So n
-                # successive fast lines have at least n / 2 counts, and all but one of these counts
-                # certainly occurred.
+                # The board may repeat the speeds of the line before, so n successive fast lines
+                # have n / 2 counts at least, of which all but one certainly occurred.
                 room = size * min(1.0, MAX_REPORTS / lines)
             if size > fastest + room:
                 return f"{name} at {now:.2f} rad/s is over feedback.wheel_speed"
@@ -220,5 +208,4 @@ class Sanity:
 
 
 def _proven(line: Feedback) -> Motors | None:
-    # rad, from encoder counts
     return line.counted if line.turned is None else line.turned

@@ -22,8 +22,8 @@ from acsard.core.motion.se2 import (
 )
 from acsard.core.values import PoseCovariance
 
-# rad2, before and after a stretch. Beyond it the series does not converge, and could make the
-# covariance indefinite, so the stretch adds nothing.
+# rad2, before and after a stretch. Beyond it the series does not converge, so the stretch adds
+# nothing.
 MAX_HEADING_VARIANCE = 1.0
 
 NO_TERMS = PoseCovariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -51,10 +51,8 @@ class SecondOrder:
     """
 
     def __init__(self, columns: int) -> None:
-        # Covariance (xx, xy, yy), m2, of the sum of all [x, n] / 2 and M_i.
-        self._noise: Vector = ORIGIN
-        # For each parameter the covariance of M_i with x, rows x and y.
-        self._with_x: list[tuple[Vector, Vector]] = []
+        self._noise: Vector = ORIGIN  # (xx, xy, yy), m2, of the sum of [x, n] / 2 and M_i
+        self._with_x: list[tuple[Vector, Vector]] = []  # of each M_i with x, rows x and y
         self._bent: dict[tuple[int, int], Planar] = {}  # C_ik, m; the larger index comes first
         for _ in range(columns):
             self.add_parameter()
@@ -107,8 +105,7 @@ class SecondOrder:
         x, y = self._with_x[i]
         by_new_x, by_new_y = brackets(new, p, -0.5)
         by_noise_x, by_noise_y = brackets(column, q, 0.5)
-        # [x, W_i] / 2 also correlates with M_i before this stretch. The variance of their sum
-        # contains this covariance twice.
+        # [x, W_i] / 2 correlates with M_i before, which the variance of their sum contains twice.
         ax, ay = bracket(new, plus(plus(x, x), by_new_x))
         bx, by = bracket(new, plus(plus(y, y), by_new_y))
         cx, cy = bracket(column, by_noise_x)
@@ -121,8 +118,8 @@ class SecondOrder:
         )
 
     def _settle(self) -> None:
-        # For independent unit normals, E[p_i p_k p_l p_m] is 3 if all four indices are equal, 1 if
-        # they form two pairs, and 0 otherwise.
+        # For independent unit normals, E[p_i p_k p_l p_m] is 3 if all indices are equal, 1 if they
+        # form two pairs, and 0 otherwise.
         xx, xy, yy = self._noise
         mean_x = mean_y = 0.0
         for (i, k), (x, y) in self._bent.items():

@@ -29,15 +29,12 @@ MIN_COMMAND_CHANGE = 0.05  # rad/s, after which a healthy wheel must report a di
 # Fraction of the wheels' difference by which a reference must be nearer to one of them.
 MIN_DISTANCE_FRACTION = 1 / 3
 
-# For a stuck wheel without a command or a gyro: a person cannot turn a wheel so evenly by hand.
-STUCK_TIME_S = 0.3
+STUCK_TIME_S = 0.3  # without a command or a gyro: no person turns a wheel so evenly
 
-# Fractions of the other wheel's angle: at most the first is dead, the opposite within the second
-# is reversed.
+# Of the other wheel's angle: at most the first is dead, the opposite within the second reversed.
 DEAD_FRACTION, REVERSED_FRACTION = 0.1, 0.3
 
-# Fraction of the larger angle by which a side must differ: the even wheel may be right while the
-# other one slips.
+# Of the larger angle, by which a side must differ: the even wheel may be right, and the other slip.
 MIN_STUCK_FRACTION = 0.3
 
 WheelFault = Literal["dead", "reversed", "stuck"]
@@ -50,8 +47,7 @@ FAULT_TEXTS: dict[WheelFault, str] = {
 
 
 class _Ballot:
-    # Sums of angles, rad, that decide which of two wheels is wrong. `low` and `high` limit a
-    # healthy one's by the command or a gyro.
+    # Angles, rad, that decide which wheel is wrong. `low` and `high` limit a healthy one's.
     def __init__(self) -> None:
         self._own = self._other = self._low = self._high = 0.0
 
@@ -85,7 +81,6 @@ class Suspect:
         self.forget()
 
     def forget(self) -> None:
-        """Start a new test."""
         self.sign: WheelFault | None = None
         self._lines = 0
         self._seconds = self._apart = 0.0
@@ -130,13 +125,11 @@ class Suspect:
 
         `gyro` is the angle that this side rolled by a trusted gyro, rad.
         """
-        # The speed of a healthy wheel lies between its command and the speed that a wheel with
-        # `feedback.response_time` has reached by now.
+        # A healthy speed lies between the command and that of a wheel with `response_time`.
         slow, command = expected.speed, expected.commanded
         self._begun = abs(own) if self._begun is None else self._begun
-        # After a command to the other direction, a healthy wheel of a slow robot turns against the
-        # command for a while. Such a wheel obeys its command if it does not turn faster than in the
-        # first line of the test.
+        # A healthy wheel of a slow robot turns against a reversed command for a while, but not
+        # faster than in the first line of the test.
         obeys = not expected.settled and own * command < 0.0 and abs(own) <= self._begun + count
         if expected.clear and not obeys:
             self._command.add(own, other, min(slow, command) * dt, max(slow, command) * dt)
@@ -176,7 +169,6 @@ class Stuck:
         self._seconds = self._followed = self._other = 0.0
 
     def command_changed(self, command: float) -> bool:
-        """Return whether the command has changed since the wheel began to repeat its speed."""
         return abs(command - self._command) >= MIN_COMMAND_CHANGE
 
     def add(self, same: bool, apart: float, dt: float, count: float, expected: Expected) -> bool:
@@ -187,7 +179,6 @@ class Stuck:
         """
         slow, command = expected.speed, expected.commanded
         leaves = command - self._command
-        # In the first line, the NaN makes this condition true.
         if not (same and abs(leaves) >= MIN_COMMAND_CHANGE):
             self._begin(slow, command)
             return False

@@ -58,11 +58,10 @@ class PoseUncertainty:
         self._model = model
         self._parameters = self._effects = model.columns
         self._counted = counts > 0
-        # The angle within which a wheel's position is unknown.
         count, track = model.radius * math.tau / (counts or ASSUMED_COUNTS), model.track
         self._play = count / track
         self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / track**2, 0.0)
-        # Since the last update of second order, m: displacement in odom, and rolled.
+        # Displacement in odom and rolled since the last update of second order, m.
         self._dx = self._dy = self._rolled = 0.0
         self.set(0.0)
 
@@ -118,7 +117,7 @@ class PoseUncertainty:
         self._publish()
 
     def doubt(self, along: float, yaw: float) -> None:
-        """Add these variances of distance, m2, and turn, rad2: the last step filled a gap."""
+        """Add variances of distance, m2, and turn, rad2: the last step filled a gap."""
         if not self._lost:
             self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
             self._publish()
@@ -144,8 +143,7 @@ class PoseUncertainty:
             return
         self.miss("gap", distance, turn)
         c, s = self._cos, self._sin
-        # The unknown motion may be an arc to the left or to the right, so the position also becomes
-        # uncertain sideways.
+        # The motion may be an arc to either side, so the position is uncertain sideways too.
         aside = (distance**2 + along) * min(1.0, (turn**2 + yaw) / 4)
         way_along, way_yaw, both = self._model.noise.of(distance, turn, abs(turn))
         p = added(self._p, along + way_along, yaw + way_yaw, both, c, s)
@@ -165,11 +163,9 @@ class PoseUncertainty:
             self.covariance = UNKNOWN_POSE
 
     def _beyond_play(self, turn: float) -> float:
-        # On a straight drive, the encoder counts of both sides arrive at different times, so the
-        # heading turns back and forth by one count. The sum of |dyaw| over all feedback lines would
-        # count this as turning, and make the variance of yaw 2 to 4 times too large. The heading
-        # therefore has a dead band of one count, like the backlash of a gear: only turns beyond it
-        # add to the noise.
+        # On a straight drive, the counts of both sides arrive at different times, and the heading
+        # turns back and forth by one count. The sum of |dyaw| would count this as turning, and make
+        # the variance of yaw 2 to 4 times too large. Only turns beyond one count add to the noise.
         self._turned += turn
         off = self._turned - self._middle
         if abs(off) <= self._play:
@@ -184,7 +180,7 @@ class PoseUncertainty:
         # J <- F J + G_p; `scale` is None without a gyro.
         c, s, more = self._cos, self._sin, 0.0
         columns: list[Vector] = []
-        # With four columns at 100 Hz, unpacking into names is faster than indexing tuples.
+        # Unpacking into names is faster than indexing tuples.
         for (x, y, yaw), effect in zip(self._columns, self._effects, strict=True):
             of_distance, of_turn, turn_of_distance, turn_of_turn = effect
             along = of_distance * distance + of_turn * turn
@@ -192,8 +188,7 @@ class PoseUncertainty:
                 more = turn_of_distance * distance + turn_of_turn * turn
             else:
                 more = scale * turn if len(columns) == self._of_gyro else 0.0
-            # Half of the heading error of the step acts on its displacement, because the direction
-            # of the chord is the old heading plus half of the turn.
+            # The direction of the chord is the old heading plus half of the turn.
             lever = yaw + more / 2
             columns.append((x + c * along - dy * lever, y + s * along + dx * lever, yaw + more))
         self._columns = columns
@@ -237,7 +232,6 @@ class PoseUncertainty:
 
 
 def _capped(p: PoseCovariance) -> PoseCovariance:
-    # The correlations do not change.
     x, y, yaw = (
         min(1.0, math.sqrt(MAX_VARIANCE / max(v, MAX_VARIANCE))) for v in (p.xx, p.yy, p.yawyaw)
     )

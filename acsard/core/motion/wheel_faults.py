@@ -28,8 +28,8 @@ from acsard.core.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 # rad of one count that is learned if the number of counts is not configured.
 MAX_COUNT_ANGLE, MIN_COUNT_ANGLE = math.tau / 16, math.tau / 2000
 
-# The angle of a count is the third smallest angle that a front wheel rolled in the last lines. The
-# smallest alone may come from a damaged line.
+# The angle of a count is the third smallest one that a front wheel rolled in the last lines, as the
+# smallest may come from a damaged line.
 RECURRENCES, LEARNING_LINES = 3, 1000
 
 MIN_COMMANDED_SPEED = 0.005  # rad/s: a line to the board shows a lower one as 0.00
@@ -48,7 +48,7 @@ SideName = Literal["left", "right"]
 LATE_PERIODS = 1.5  # usual durations of a line, above which its speeds do not show a count
 
 # Counts that a side must miss before both encoders may be the cause. A loaded robot at a fifth of
-# its speed reports one in less time.
+# its speed reports one earlier.
 UNFOLLOWED_COUNTS = 6.0
 
 MAX_UNFOLLOWED_LINE_S = 0.1  # for which a side counts as not following
@@ -130,7 +130,6 @@ class _Side:
         return bad_front or bad_rear or self._out_s > 0.0
 
     def spread(self, front: float, rear: float) -> Motors:
-        """Return values of the four wheels, with 0 for the other side."""
         if self.wheels == LEFT:
             return 0.0, front, rear, 0.0
         return front, 0.0, 0.0, rear
@@ -163,7 +162,6 @@ class _Side:
         return None
 
     def agree(self, dt: float) -> None:
-        """Process a line of `dt` s in which the wheels agree."""
         if self.suspected:
             self.suspected = False
             for suspect in self._suspects:
@@ -210,12 +208,10 @@ class _Side:
         if self.out is not None and self.expected.clear:
             against = self.witnesses[self.out].speed * self.expected.commanded < 0.0
             if fault == "stuck":
-                # A wheel that reports another speed is not stuck.
                 self._out_s = self._out_s + dt if same[self.out] else 0.0
             elif fault == "reversed" and against:
                 self._out_s += dt
-        # On a slow robot, a wheel may be called reversed by mistake. In that case, go on with the
-        # test of the other wheel.
+        # A wheel of a slow robot may be called reversed by mistake, so the other one is tested too.
         if fault in ("dead", "stuck"):
             return False
         self.suspected = True
@@ -284,9 +280,7 @@ class WheelFaults:
         self._sides = self._left, self._right = _Side("left", LEFT), _Side("right", RIGHT)
         self._last = STILL
         self._busy = self._leaves_out = self._stands = False
-        # The wheels of a side contradicted each other within `SLIP_HOLD_S`, or the ignored one may
-        # be right.
-        self.slips = False
+        self.slips = False  # within `SLIP_HOLD_S`, or the ignored wheel may be right
         self._rolled, self._unreported = 0.0, REPEATED_S
         self.pushed = ""  # wheels turn without a command, by the last line
         self._late = False
@@ -389,8 +383,7 @@ class WheelFaults:
             abs(commanded.front_left) < MIN_COMMANDED_SPEED
             and abs(commanded.front_right) < MIN_COMMANDED_SPEED
         )
-        # If this computer did not run the daemon for a while, one line covers all of that time.
-        # This line alone must not prove a fault.
+        # After a stall of this computer, one line covers all of that time, and proves no fault.
         most, count = limit / MIN_EVIDENCE_LINES, self._count
         bad_left = left.watch(speeds, dt, most, count, still)
         bad_right = right.watch(speeds, dt, most, count, still)
@@ -482,8 +475,7 @@ class WheelFaults:
         return self._found is not None and self._found.was_faulty(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
-        # A wheel that turns reports at least one count, so the smallest angle that recurs is one.
-        # A line that covers more time has a mean of several counts, which says nothing about one.
+        # A wheel that turns reports at least one count. A late line has a mean of several counts.
         late = dt > LATE_PERIODS * self._period
         self._period += PERIOD_GAIN * (dt - self._period)
         if late:
@@ -499,7 +491,6 @@ class WheelFaults:
                 self._seeking = self._count > MIN_COUNT_ANGLE
 
     def _by_gyro(self, i: int, turned: Motors, turn: float) -> float:
-        # Rad of side `i` (0 left, 1 right) by the gyro and the other side, whose wheels agree.
         front_right, front_left, rear_left, rear_right = turned
         return self._kinematics.opposite(
             (front_left + rear_left) / 2, (front_right + rear_right) / 2, turn

@@ -12,12 +12,10 @@ from __future__ import annotations
 
 import math
 
-# Without slip, the angles of two wheels can differ by two counts. Therefore a slip by the fraction
-# s at v rad/s is certain only after 2 c / (s v) seconds. With 96 counts per revolution, a slip of a
-# tenth at 10 rad/s is certain after 0.13 s, or after 0.26 s if unequal tires may cause the
-# difference ALLOWED_FRACTION. With the limit ALLOWED_COUNTS, and with sums that forget old angles,
-# a slip of a tenth is found within 0.2 s at speeds above 22 rad/s, and is never found at speeds
-# below 11.5 rad/s.
+# Wheels without slip can differ by two counts, so a slip by the fraction s at v rad/s is certain
+# after 2 c / (s v) seconds: with 96 counts, a tenth at 10 rad/s after 0.13 s, or after 0.26 s if
+# unequal tires may cause ALLOWED_FRACTION. With ALLOWED_COUNTS and these sums, a slip of a tenth is
+# found within 0.2 s above 22 rad/s, and never below 11.5 rad/s.
 
 TIME_CONSTANT_S = 0.14  # after which an angle has the weight 1 / e
 
@@ -45,8 +43,7 @@ class Residual:
     def __init__(self) -> None:
         self.ratio = 0.0  # learned, by which the front wheel turns further
         self.learns = True
-        # More than a late motor can cause; valid if the last `add` returned False.
-        self.slips = False
+        self.slips = False  # more than a late motor can cause, if the last `add` returned False
         self._off = self._way = self._net = 0.0
 
     def add(self, front: float, rear: float, keep: float, dt: float, count: float) -> bool:
@@ -63,7 +60,7 @@ class Residual:
         self._net = keep * (self._net + mean)
         most = ALLOWED_FRACTION * way + ALLOWED_COUNTS * count + ALLOWED_ANGLE
         if abs(total) > most:
-            # While the speed changes, a motor that reacts later causes a further difference.
+            # A motor that reacts later causes a further difference.
             late = ALLOWED_DELAY_S * abs(mean / dt - self._net / TIME_CONSTANT_S)
             self.slips = abs(total) > most + late
             self._learn(math.copysign(LEARNING_STEP, off * mean) * dt / DOUBTED_S)

@@ -14,15 +14,13 @@ from typing import Literal
 
 from acsard.core.codes import FaultCode
 
-# rad/s; below it, coarse encoders and a robot at rest can look like any fault.
-MIN_FAULT_SPEED = 2.0
+MIN_FAULT_SPEED = 2.0  # rad/s; below it, coarse encoders can look like any fault
 
 MIN_COMMANDED_SPEED = 0.3  # rad/s, at which the command can show which of two wheels is right
 
 SLOW_RESPONSE_FACTOR = 3.0  # of `feedback.response_time`, in a slow robot
 
-# rad/s; the measured speed is smoothed over the time in which such a wheel turns by one count.
-SMOOTHING_SPEED = 1.0
+SMOOTHING_SPEED = 1.0  # rad/s: smoothed over the time of one count at it
 
 MIN_APPROACH = 1.0  # rad/s closer to the command: no evidence of a fault
 
@@ -75,7 +73,6 @@ class Expected:
         )
         self.commanded = commanded
         follows = speed * commanded > 0.0
-        # A healthy wheel must already turn clearly as commanded.
         self.clear = (
             follows and abs(speed) >= MIN_COMMANDED_SPEED and abs(commanded) >= MIN_COMMANDED_SPEED
         )
@@ -89,8 +86,7 @@ class Witness:
         self.driven = False  # from a command to any wheel until this one is at rest
         self.ratio = 1.0  # of the last `RATIO_DRIVE_S`: rolled over expected
         self.slow = False  # turns as commanded, but too slowly
-        # Expected magnitude of `speed`, smoothed like it: an encoder with few counts needs much
-        # smoothing, and a healthy wheel then seems to brake too late.
+        # Expected magnitude of `speed`, smoothed like it, or a healthy wheel seems to brake late.
         self._due = 0.0
         self._rested_s = 0.0  # since a speed above `MIN_FAULT_SPEED`
         self.forget()
@@ -102,11 +98,9 @@ class Witness:
         # s for which each fault was shown.
         self.evidence: dict[FaultKind, float] = dict.fromkeys(WITNESS_CODES, 0.0)
         self.suspected = False
-        # Because of the infinity, the first line counts as approaching the command. With 0, a wheel
-        # that was already too fast would never count as slowing down, and slow motors would latch
-        # "runaway".
-        # Deviation when it last approached its command, rad/s: the magnitude of its speed if it is
-        # too fast, otherwise the speed against the command.
+        # Deviation, rad/s, when it last approached its command: its magnitude if it is too fast,
+        # otherwise against the command. Infinity, so that the first line counts as approaching:
+        # slow motors would otherwise latch "runaway".
         self._nearest = math.inf
         self._wrong = False  # too fast, still or backward in the last line
         self._seconds = self._went = self._way = 0.0
@@ -119,9 +113,8 @@ class Witness:
         self.driven = self.driven and not self._is_surely_slow(raw_speed, dt, count)
 
     def _is_surely_slow(self, raw_speed: float, dt: float, count: float) -> bool:
-        # not faster than `MIN_FAULT_SPEED`
-        # An encoder with few counts often reports 0 although the wheel turns. Therefore the
-        # reported speed must stay low for the time of one count at the speed `MIN_FAULT_SPEED`.
+        # An encoder with few counts often reports 0 while the wheel turns, so the speed must stay
+        # low for the time of one count at `MIN_FAULT_SPEED`.
         self._rested_s = 0.0 if abs(raw_speed) > MIN_FAULT_SPEED else self._rested_s + dt
         return self._rested_s >= count / MIN_FAULT_SPEED and abs(raw_speed) <= MIN_FAULT_SPEED
 
@@ -153,8 +146,7 @@ class Witness:
         moving = size > MIN_FAULT_SPEED and expected.settled
         fast = driven and turns > 1.5 * due + MIN_FAULT_SPEED
         against = moving and speed * goal < 0.0 and turns > 0.3 * size
-        # A wheel that slows down sooner than according to `response_time` is not dead. Therefore
-        # compare its speed with the smaller of command and expected speed.
+        # A wheel that slows down sooner than `response_time` says is not dead.
         dead = moving and least > MIN_FAULT_SPEED and abs(raw_speed) < 0.1 * least
         wrong = fast or against or dead
         off = turns if fast else -math.copysign(1.0, command) * speed
