@@ -39,15 +39,13 @@ class Turned(Struct, frozen=True):
 
 class Encoders:
     def __init__(self, counts: int, wheel_speed: float, quiet_ns: Ns) -> None:
-        # A delay (arrival minus time by the board's clock) that is `quiet_ns` below the least one
-        # is a restart. `counts` per turn is 0 if unknown, `wheel_speed` the highest, rad/s.
+        # A delay `quiet_ns` below the least one is a restart. `counts` is per turn, 0 if unknown.
         self._angle = math.tau / counts if counts else 0.0
         self._fastest = wheel_speed / math.tau * counts / 1000
         self._early_ms = quiet_ns * 1000 / NS_PER_S
         self._last: tuple[Reading, int] | None = None
-        # A restart sets the board's clock to 0. The clock counts modulo 65536 ms, so it then seems
-        # to have jumped ahead, and the delay of the next reading seems too small.
-        # Excess of each reading's delay over the least, ms.
+        # A restart sets the board's clock, modulo 65536 ms, to 0. It then seems to have jumped
+        # ahead, and the delay of the next reading seems too small.
         self._promptest = MinimumDelay(most=MAX_DELAY_MS)
 
     def forget(self) -> None:

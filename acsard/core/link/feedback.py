@@ -27,17 +27,14 @@ DIFFERENCE_GAIN = 0.05  # of the mean difference between the two clocks of a lin
 
 FULL_READ_BYTES = 1024  # after a full read, the kernel may hold more data
 
-# Least difference of reply periods and commands in a read with which `ReplyStyle` begins to
-# evaluate; scheduling alone causes less.
+# Least difference of reply periods and commands in an evaluated read; scheduling causes less.
 EVALUATION_START = 1.5
 
-# Least difference of reply periods and commands, summed over evaluated reads, for a decision.
-DECISION_DIFFERENCE = 2.5
+DECISION_DIFFERENCE = 2.5  # the same, summed over evaluated reads, for a decision
 
 MAX_READ_PERIODS = 100.0  # a read after more reply periods than this is not evaluated
 
-# With n lines, p reply periods and c commands: ||p - n| - |c - n|| must reach this times |p - c|,
-# so that n is clearly nearer to p or to c.
+# With n lines, p reply periods and c commands: ||p - n| - |c - n|| must reach this times |p - c|.
 CLEAR_FRACTION = 0.5
 
 EXTRA_READS = 3  # evaluated after a read that reaches `EVALUATION_START`
@@ -59,12 +56,10 @@ class Feedback(Struct, frozen=True, gc=False):
     dt: float
     gap: float = 0.0
     turned: Motors | None = None
-    # Part of `dt` in which lines were lost, s. It comes first, and the odometry fills it with the
-    # speeds of the lines before and after it.
+    # s of `dt` in which lines were lost. It comes first, and the odometry fills it.
     bridged: float = 0.0
     asked_ns: Ns | None = None  # when the answered command was written
-    # s since the previous line, for plausibility: the board's clock or arrivals; 0 after a gap.
-    since: float = 0.0
+    since: float = 0.0  # s by the board's clock or arrivals, for plausibility; 0 after a gap
     heard_ns: Ns = 0  # the host had the complete line
     # Whole counts as angles, rad, without the time of `bridged` (`whole_counts.py`). None if the
     # counts per turn are unknown or the firmware does not report whole counts.
@@ -85,15 +80,13 @@ class ReplyStyle:
     """
 
     def __init__(self, free_running: bool) -> None:
-        # `free_running`: `mcu.reply_period` is set.
-        # True: by its own clock; False: answers each command; None: unknown.
+        # By its own clock, or by each command; None: unknown. `free_running`: `reply_period` > 0.
         self.speaks: bool | None = free_running or None
         self._known = free_running
         self._left = self._after = 0
         self._came = self._periods = self._asked = 0.0
 
     def written(self) -> None:
-        """Count a command that was written to the port."""
         self._left += 1
 
     def process_read(self, lines: int, periods: float) -> None:
@@ -147,10 +140,8 @@ class Timeline:
         self._rest_ns = 0  # the last command to move ended: zeros, or the board's watchdog
         self._last_placed = Placed("reads", 0)  # by the clock that was chosen
         self._spoilt = False  # a bad or ignored line came since the last good one
-        # Mean of the time by `PromptedTimes` minus that by `FreeRunningTimes`, ns.
-        self._later = 0.0
-        # Whether `_later` includes the last difference; if not, the next one replaces it.
-        self._compared = False
+        self._later = 0.0  # mean time by `PromptedTimes` minus that by `FreeRunningTimes`, ns
+        self._compared = False  # `_later` has the last difference; if not, the next replaces it
         self.leaps = 0  # lines with impossible counts, for which speed times time is used
         self.restarted = False  # by the board's clock in the last line
 
@@ -221,8 +212,7 @@ class Timeline:
         self._spoilt = False
         first = self._last is None
         turned, wheels = self._turned(reading, came_ns), None
-        # A board that answers lines sends nothing by itself, so no line is missing after a time in
-        # which the host sent nothing.
+        # A board that answers sends nothing by itself, so after a pause no line is missing.
         clocked = placed.clock != "reads" or self._prompts.lossy
         known = clocked or not silent or dt * NS_PER_S <= self._quiet_ns
         if turned is not None:
@@ -249,9 +239,8 @@ class Timeline:
             ours = asked_ns is not None or speaks is False or self._prompts.varies_delay
             if ours and answered is not None:
                 if asked_ns is None and answered.due_ns - came_ns > self._usual_ns / 2:
-                    # The usual delay is too long: it was measured on the first reply, which a stall
-                    # had delayed. The time of the previous line already includes that stall, so the
-                    # time of this line is its arrival.
+                    # The usual delay was measured on a first reply that a stall had delayed. The
+                    # previous line's time has that stall in it, so this one's is its arrival.
                     return Placed("prompts", came_ns, early=True)
                 return answered
         slot = self._slots.place(self._rest)
@@ -270,13 +259,11 @@ class Timeline:
         return Placed("reads", int(self._end_ns - self._share_ns * self._rest))
 
     def _since_last(self, placed: Placed) -> tuple[float, float]:
-        # s since the last good line, and the part of it in which lines were lost
         last = self._last_placed
         back = placed.due_ns < last.due_ns
         self._last_placed = replace(placed, due_ns=last.due_ns) if back else placed
-        # If the times of this line and of the last good line come from different clocks, their
-        # difference is corrected by the mean offset between the clocks. Without this correction,
-        # the errors of many changes from one clock to another would add up.
+        # Times of different clocks are corrected by the mean offset between the clocks. The errors
+        # of many changes would add up otherwise.
         by_clock = placed.dt if placed.clock == last.clock else None
         if by_clock is not None and not last.early:
             return by_clock, placed.bridged
@@ -285,9 +272,8 @@ class Timeline:
         if by_clock is not None:
             return dt, placed.bridged
         period = self._usual_ns / NS_PER_S
-        # A prompted board only answers commands, so a long time alone does not show that lines
-        # are missing. But if a reply was bad or ignored, the speeds for a part of this time are
-        # missing.
+        # A long time alone does not show that lines of a prompted board are missing. But after a
+        # bad or ignored reply, the speeds for a part of it are.
         missing = dt > 1.5 * period and (self._style.speaks is not False or self._spoilt)
         return dt, dt - period if missing else 0.0
 
@@ -302,7 +288,6 @@ class Timeline:
         self._later += DIFFERENCE_GAIN * (later_ns - self._later)
 
     def _late_ns(self, clock: str) -> float:
-        # Mean offset of a clock to `FreeRunningTimes`, to subtract times of different clocks.
         if clock == "reads":
             return self._slots.late_ns
         return self._later if clock == "prompts" else 0.0
@@ -312,7 +297,6 @@ class Timeline:
         return self._slots.usual or self._period_ns
 
     def _sampled(self, came_ns: Ns, placed: Placed, length: int) -> Instant:
-        # When the board began to send the line, which came at `came_ns`.
         mono_ns = min(came_ns, placed.due_ns) - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns

@@ -19,8 +19,7 @@ from acsard.core.link.link_state import State as LinkState
 from acsard.core.link.negotiation import TROUBLES, Negotiation
 from acsard.core.values import NS_PER_S, Event, Ns
 
-# Share of `Link.quiet_ns` between two steps that makes the second late. A silence that ends with a
-# late step is this computer's fault, which did not run the daemon.
+# Share of `Link.quiet_ns` between two steps that makes the second late.
 LATE_STEP_FRACTION = 0.5
 
 BUSY_ADVICE = CODES["host_late"].advice
@@ -73,8 +72,7 @@ class Lateness:
     def __init__(self, simulated: bool, quiet_ns: Ns) -> None:
         self._simulated, self._least_ns = simulated, LATE_STEP_FRACTION * quiet_ns
         self._looked_ns: Ns | None = None
-        # Longest time between two steps since the last good line, if one was late.
-        self.late_s = 0.0
+        self.late_s = 0.0  # longest time between two steps since the last good line, if late
         self.step_s = 0.0  # between the last two steps, if the last was late
 
     def record_step(self, now_ns: Ns, good: bool) -> bool:
@@ -181,7 +179,6 @@ class SilenceDiagnosis:
     def judge(self, now_ns: Ns, late_s: float = 0.0) -> bool:
         """Process a step without a link, and return whether the diagnosis is of a new class."""
         if self._since_ns is None:
-            # The interval begins with this step, so the time before it does not belong to it.
             self._since_ns = now_ns
         else:
             self.now.late_s = max(self.now.late_s, late_s)
@@ -201,7 +198,6 @@ class UnansweredLines:
     """
 
     def __init__(self, reply_period: float) -> None:
-        # With `reply_period` the board does not answer lines, so there is no warning.
         self._own_clock = reply_period > 0.0
         self._since: tuple[int, int] | None = None
         self._told = False

@@ -56,7 +56,7 @@ class Link:
         self._silences = 0
         self._good_in_row = self._bad_in_row = 0
         self._heard_ns: Ns | None = None
-        # Until then the board may answer late; whether `wait` was called since the last good line.
+        # The board may answer late until then; `wait` was called since the last good line.
         self._waits_until_ns, self._waited = 0, False
 
     def apply(self, trigger: Input) -> None:

@@ -15,7 +15,7 @@ class MinimumDelay:
     """The delay of the last event minus the least so far, in the caller's unit of time."""
 
     def __init__(self, drift: float = MAX_DRIFT, most: float = math.inf) -> None:
-        # An excess over the least delay of more than `most` raises the least delay.
+        # A larger excess than `most` raises the least delay.
         self._drift, self._most = drift, most
         self.late = 0.0
 

@@ -120,10 +120,8 @@ class Negotiation:
         longest = line_bytes(mcu.trailing_comma, check=True, sample=mcu.wants_samples)
         self._answer_ns = PROCESSING_NS + 4 * wire_ns(longest, mcu.baud_rate)
         self._sequence = 0
-        # Number and time of the last checked line, until `settle`.
-        self._made: tuple[int, int] | None = None
-        # Number and time of written checked lines without an answer.
-        self._pending: deque[tuple[int, int]] = deque(maxlen=MAX_OPEN_LINES)
+        self._made: tuple[int, int] | None = None  # number and time of a line, until `settle`
+        self._pending: deque[tuple[int, int]] = deque(maxlen=MAX_OPEN_LINES)  # without an answer
         self._knows = False
         self._without = 0
         self._echo = EchoDetector()
@@ -157,8 +155,7 @@ class Negotiation:
         self._made = None
         self._asked, self._just_asked = Throttle(), False
         self._unanswered, self._open = 0, False
-        # The port replaces the first line after an opening with a plain stop, so the first line is
-        # a plain stop here too.
+        # The port replaces the first line after an opening with a plain stop.
         self._plain_turn = 0 if fresh else 1
 
     def _apply(self, trigger: Input) -> None:
@@ -240,7 +237,7 @@ class Negotiation:
             self._pending.popleft()
         if reply.sequence not in [sequence for sequence, _ in self._pending]:
             raise FrameError("stale_sequence", reply.plain)
-        # The board answers lines in order, so the lines before this one get no more answers.
+        # The board answers in order, so earlier lines get no more answers.
         sequence, left_ns = self._pending.popleft()
         while sequence != reply.sequence:
             sequence, left_ns = self._pending.popleft()

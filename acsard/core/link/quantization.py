@@ -19,8 +19,7 @@ MIN_CHANGE = 0.0105  # rad/s; less may be rounding
 
 BLOCK_STEPS = 64  # steps: even rare counts and filtered speeds give three counts in a block
 
-# For the first value of `Steps.size`, which may still grow until the end of the block.
-FIRST_STEPS = 24
+FIRST_STEPS = 24  # for the first `Steps.size`, which may still grow until the end of the block
 
 STEP_RANK = 3  # the third largest, because one damaged line causes two large changes
 
@@ -66,7 +65,6 @@ class Steps:
         if self._count == FIRST_STEPS and self.size == math.inf:
             self.size = largest[0]
         if self._count == BLOCK_STEPS:
-            # A new block has too few steps at first, so it starts with the size of this block.
             self._before, self._count = largest[0], 0
             self.size, self._largest = self._before, [0.0] * STEP_RANK
 
@@ -90,7 +88,7 @@ class Coarseness:
         (older, before), self._rows = self._rows, (self._rows[1], speeds)
         if speeds == NO_STEPS == before or elapsed_s > MAX_INTERVAL_S:
             return False
-        # Only one wheel is examined per line, to keep every control step short.
+        # One wheel per line keeps every control step short.
         wheel = self._wheel = (self._wheel + 1) % 4
         mean, jump = self._jumps[wheel], abs(older[wheel] - 2 * before[wheel] + speeds[wheel])
         self._jumps[wheel] = mean = mean + JUMP_GAIN * (elapsed_s / 2 * jump - mean)
@@ -99,14 +97,12 @@ class Coarseness:
 
 class CountRecovery:
     def __init__(self, counts: int = 0) -> None:
-        # `counts` per wheel turn, 0 if unknown.
         self._configured, self._whole = counts, WholeCounts(counts)
-        # Lines with a coarse encoder, if the counts per turn are not configured.
-        self.coarse_lines = 0
+        self.coarse_lines = 0  # with a coarse encoder and no configured counts
         self.forget()
 
     def forget(self) -> None:
-        """Forget all earlier lines, because the board has restarted or was replaced."""
+        """Forget all earlier lines: the board has restarted or was replaced."""
         self._whole.forget()
         self._coarseness = Coarseness()
         self._wheels = tuple(Steps() for _ in NO_STEPS)

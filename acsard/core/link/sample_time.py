@@ -21,7 +21,7 @@ from acsard.core.values import NS_PER_S, Ns
 
 Read = tuple[int, int]  # when the last line of a read was complete, and its number of lines
 
-# The odometry fills only shorter gaps, because the board may have been reset meanwhile.
+# Only shorter gaps are filled: the board may have been reset in a longer one.
 MAX_FILLED_GAP_S = 1.0
 
 
@@ -33,8 +33,7 @@ class Placed(Struct, frozen=True, gc=False):
 
     clock: Literal["slots", "prompts", "reads"]
     due_ns: Ns
-    # s since the previous line by this clock; None for its first line and for reads.
-    dt: float | None = None
+    dt: float | None = None  # s since the previous line by this clock; None for a first one
     bridged: float = 0.0  # s of it in which lines were lost
     # It came before the clock expected it. `due_ns` is then its arrival, and the next `dt` of the
     # clock is wrong: the caller subtracts the two `due_ns`.
@@ -51,32 +50,29 @@ LOOP_GAIN = 0.2
 
 MAX_CLOCK_ERROR = 0.01  # relative; a ceramic resonator reaches half of it
 
-# Relative change by rounding a period to whole ms, for the error of a quartz and of the
-# measurement; a larger one is not rounded.
+# A period is rounded to whole ms only if this changes it less: a quartz and the measurement err so.
 MAX_ROUNDING = 0.001
 
 # Share of reads with a single line, from which on clocks for such reads are tried, too.
 SINGLE_READ_FRACTION = 0.7
 
-# Periods by which a line may come after its slot, read one by one or batched by an adapter.
-# `MAX_ADAPTER_DELAY_NS` limits both.
+# Periods by which a line may come after its slot, read one by one or batched by an adapter
+# (`MAX_ADAPTER_DELAY_NS` at most).
 LATE_ALONE, LATE_BATCHED = 0.6, 1.3
 
-# An FTDI chip holds a line for 16 ms. A later line probably answers a command between two periods,
-# or its board is slow and varies by more: there is no clock.
+# An FTDI chip holds a line for 16 ms. A later line answers a command, or its board has no clock.
 MAX_ADAPTER_DELAY_NS = 25_000_000
 
-# A read at most this many periods after its slot confirms a clock. Beside the earliest one, more
-# than one in `READS_PER_CONFIRMATION` must. Otherwise they answer commands between periods.
+# Only reads at most this many periods after their slot confirm a clock, more than one in
+# `READS_PER_CONFIRMATION` beside the earliest. Others answer commands between periods.
 MAX_CONFIRMING_LATENESS, READS_PER_CONFIRMATION = 0.55, 12
 
 COMPLETE_PERIODS = 1.4  # between two reads of one line: below it, no line is missing
 
-# An adapter delays lines only up to a limit. A line that is later by a period and this margin shows
-# a loss.
+# A line that is later than an adapter's limit by a period and this margin shows a loss.
 LATENESS_MARGIN = 0.15
 
-# A line that comes more periods before its slot shows a wrong clock.
+# A line this many periods before its slot shows a wrong clock.
 MAX_EARLY_PERIODS = 0.25
 
 # Mean share, over two windows, of reads that follow missing lines, above which the period is wrong.
@@ -105,15 +101,13 @@ class FreeRunningTimes:
     """
 
     def __init__(self, known: tuple[float, ...]) -> None:
-        # `known` are the values of T that the configuration suggests, s.
-        self._known = known
+        self._known = known  # values of T that the configuration suggests, s
         self.usual = 0.0  # last measured T, ns; 0 before a clock was found
         self._stretch = 1.0  # slots per line of the last read: more than 1 if lines are missing
         self._before = 0
         self._first, self._slot = 0.0, 0  # c in ns, and k of the last line
         self._given = 0  # slots counted as missing by recent reads, to be taken back if none was
-        # In slots: usual lateness of a read, and time between two. Then the gain, and the share of
-        # reads in the last window that follow missing lines.
+        # In slots: usual lateness of a read, and time between two. Gain. Lossy share of reads.
         self._lag = self._batch = self._gain = self._share = 0.0
         self._batched: bool = False
         self._alone: bool = False
@@ -123,8 +117,7 @@ class FreeRunningTimes:
 
     def forget(self) -> None:
         """Give up the clock: the lines contradict it or may come from another board."""
-        # Nominal s by which the firmware divides its counts; None without a clock.
-        self.period: float | None = None
+        self.period: float | None = None  # nominal s by which the firmware divides its counts
         self._reads: list[Read] = []
         self._last: float | None = None  # of the last line that this clock has placed
 
@@ -146,7 +139,7 @@ class FreeRunningTimes:
             self.forget()  # the lines come too early, or later and later: the clock is wrong
             return 0
         self._slot += lost
-        # If the missing lines cover more time than may be filled, place them all before the read.
+        # Missing lines over more time than may be filled are all placed before the read.
         self._stretch = (
             1.0 + lost / lines if lost * self.usual < MAX_FILLED_GAP_S * NS_PER_S else 1.0
         )
@@ -185,8 +178,7 @@ class FreeRunningTimes:
         return Placed("slots", due_ns, passed * period, missing * period)
 
     def _missing(self, ahead: float, since: float, lines: int, drained: bool) -> int:
-        # -1: the clock is wrong, or an earlier read counted one too many. `ahead` is x, `since` the
-        # time since the previous read in slots.
+        # -1: the clock is wrong, or one was counted too many. `ahead` is x; `since` is in slots.
         lag = self._lag if self._lag < 0.5 else 0.5
         if ahead < -0.5 + 0.6 * lag:
             return -1
@@ -231,28 +223,23 @@ class FreeRunningTimes:
     def _clocks(
         self, reads: list[Read], gaps: list[int]
     ) -> Iterator[tuple[list[int], float, float]]:
-        # The likelier ones first: the slot of each read's last line, the allowed lateness in slots,
-        # and the period in ns.
-        # The configured periods come before the measured period, because for jittery lines they are
-        # more reliable than half a second of data.
+        # The slot of each read's last line, the allowed lateness in slots, and the period in ns.
+        # The configured periods come first: jittery lines make half a second of data less reliable.
         plain, known = _slots(reads), [period * NS_PER_S for period in self._known]
         alone = [gap for gap, (_, lines) in zip(gaps, reads[1:], strict=True) if lines == 1]
         own = plain
-        # Bytes that come faster than the wire can carry them have equal times, so the median may be
-        # 0.
+        # Bytes faster than the wire have equal times, so the median may be 0.
         if len(alone) >= SINGLE_READ_FRACTION * len(gaps) and (usual := median(alone)) > 0:
             own = _slots(reads, usual)
             yield from ((own, LATE_ALONE, period) for period in known)
-        # Lines that are read one by one may also fill the packets of an adapter one by one, so the
-        # rules for an adapter that batches lines are tried in any case.
+        # Lines read one by one may also fill the packets of an adapter one by one.
         yield from ((plain, LATE_BATCHED, period) for period in known)
         slope = _slope(reads, own)
         if slope <= 0:
             return
         if own is not plain:
             yield own, LATE_ALONE, slope
-        # Half a second of batched lines cannot distinguish the measured period from a configured
-        # period that is within `MAX_CLOCK_ERROR` of it.
+        # Half a second of batched lines cannot distinguish it from a configured one this close.
         elif all(abs(slope / period - 1) > MAX_CLOCK_ERROR for period in known):
             yield own, LATE_BATCHED, slope
 
@@ -278,7 +265,6 @@ class FreeRunningTimes:
         self._gain = max(LOOP_GAIN, self._gain / (1 + self._gain))
         self._first += self._gain * least * self.usual
         usual = self.usual * (1 + self._gain**2 / 2 * least / slots)
-        # Keep the time of the present line unchanged.
         self._first -= (usual - self.usual) * self._slot
         self.usual = usual
         self.period = self._nominal()
@@ -295,8 +281,7 @@ class FreeRunningTimes:
 
 
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
-    # The slot of each read's last line, from 0. With a finite `period`, ns, missing lines have
-    # slots.
+    # From 0. With a finite `period`, ns, missing lines have slots.
     slots = [0]
     for (before, _), (at, lines) in pairwise(reads):
         slots.append(slots[-1] + max(lines, round((at - before) / period)))
@@ -304,7 +289,6 @@ def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
 
 
 def _slope(reads: list[Read], slots: list[int]) -> float:
-    # ns, by least squares
     origin = reads[0][0]
     times = [at - origin for at, _ in reads]
     middle, centre = fmean(slots), fmean(times)
@@ -314,8 +298,7 @@ def _slope(reads: list[Read], slots: list[int]) -> float:
 
 
 def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, list[float]]:
-    # The latest time of slot 0, ns, for which no read comes before its slot, and each lateness in
-    # slots.
+    # The latest time of slot 0, ns, with no read before its slot; and each lateness in slots.
     offsets = [at - slot * period for (at, _), slot in zip(reads, slots, strict=True)]
     first = min(offsets)
     return first, [(offset - first) / period for offset in offsets]
@@ -341,12 +324,12 @@ LEAST_DELAY_RISE, MAX_RISE_PERIODS = 0.05, 3
 # replies. 1 is too low: the delay may rise by almost an interval for good.
 LOST_REPLY_PERIODS = 1.25
 
-# Share of lost replies below which a late reply after a stall proves no loss: two commands are then
-# close together, and the first reply is late anyway.
+# Share of lost replies below which a late reply after a stall proves no loss: the first of two
+# close commands is late anyway.
 RARE_LOSS_FRACTION = 0.002
 
-# Support for the usual delay: +1 with each reply near it, -1 with each much later one. At the lower
-# bound, stalls no longer explain them: it was measured on an early reply.
+# +1 with each reply near the usual delay, -1 with each much later one. At the lower bound, the
+# usual delay was measured on an early reply.
 MAX_SUPPORT, MIN_SUPPORT = 200, -8
 
 MAX_USB_JITTER_NS = 350_000  # mean deviation of the delay that USB and the scheduler explain
@@ -358,18 +341,15 @@ DELAY_RISE_NS = 20_000  # per read of a batched link, so that an outdated least 
 
 LOSS_GAIN = 0.005  # with 1/20, two lost replies would be enough to reach `LOSSY_FRACTION`
 
-# Above this share of lost replies, the reply to any command on a batched link may be missing.
-LOSSY_FRACTION = 0.03
+LOSSY_FRACTION = 0.03  # of lost replies; above it, any reply on a batched link may be missing
 
-# Share of reads with several lines. Host stalls alone cause fewer, so an adapter batches.
-BATCH_READ_FRACTION = 0.15
+BATCH_READ_FRACTION = 0.15  # of reads with several lines: host stalls alone cause fewer
 
 # Share of reads with a varied delay, above which the board varies it. An adapter whose packets fill
 # line by line does so, too, but only for a quarter of a second.
 BOARD_JITTER_FRACTION = 0.6
 
-# Above this mean deviation, an adapter and not the board varies the delay.
-MIN_ADAPTER_JITTER_NS = 2_000_000
+MIN_ADAPTER_JITTER_NS = 2_000_000  # mean deviation, above which the adapter varies the delay
 
 
 class PromptedTimes:
@@ -382,13 +362,12 @@ class PromptedTimes:
     """
 
     def __init__(self, soonest_ns: Ns) -> None:
-        # `soonest_ns`: a command and its reply on the wire.
-        self._soonest = soonest_ns
+        self._soonest = soonest_ns  # a command and its reply on the wire
         self._left: deque[int] = deque(maxlen=MAX_OPEN_COMMANDS)
         self.forget()
 
     def forget(self) -> None:
-        """Forget all commands, because no more replies to them will come."""
+        """Forget all commands: no more replies to them will come."""
         self._left.clear()
         self.restart()
 
@@ -404,23 +383,19 @@ class PromptedTimes:
         self._soon = 0.0  # least delay of the last replies, ns
         self._support = 0  # of the usual delay (`MAX_SUPPORT`)
         self._sent: int | None = None
-        # Usual ns between two commands, and share of lost replies.
-        self._apart = self._missing = 0.0
+        self._apart = self._missing = 0.0  # usual ns between two commands, share of lost replies
         # Last answered command, with the estimate by which the board itself was late or early.
         self._last: int | None = None
-        # Times of commands: the last one that waits for no reply (answered, skipped or given up),
-        # and the last answered one.
+        # Last command that waits for no reply (answered, skipped or given up), and last answered.
         self._passed = self._line = 0
         self._lost = False  # the last read with one reply showed a loss
-        # Given up at the last read of a batched link; an adapter that stalled may still deliver.
-        self._given: list[int] = []
+        self._given: list[int] = []  # at the last read of a batched link; may still be delivered
         self._at, self._alone, self._since = 0, False, 0
         # Batched link: least delay, usual time between reads (both ns), share of lost replies.
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
         self._several = 0.0  # share of reads with several lines
         self._batched = False  # an adapter holds replies back
-        # Share of reads whose delay varied more than by USB, and less than by an adapter.
-        self._thinking = 0.0
+        self._thinking = 0.0  # reads whose delay varied more than by USB, less than by an adapter
 
     @property
     def varies_delay(self) -> bool:
@@ -440,7 +415,6 @@ class PromptedTimes:
         return self._sent + int(self._delay)
 
     def written(self, at_ns: Ns) -> None:
-        """Record a command."""
         if self._sent is not None:
             apart, usual = at_ns - self._sent, self._apart
             self._apart = usual + FAST_GAIN * (min(apart, 2 * usual) - usual) if usual else apart
@@ -522,9 +496,8 @@ class PromptedTimes:
         self._support = 0
 
     def _shorten(self, command: int) -> None:
-        # After a stall, the delay of the second reply is much shorter than the usual delay. Without
-        # the correction, the usual delay would fall by only 5 % of the difference per reply. Until
-        # then the delay would seem to vary much, which would hide lost replies.
+        # After a stall, the delay of the second reply is much shorter than the usual one, which
+        # would fall by only 5 % per reply, seem to vary much, and hide lost replies.
         own = self._at - command
         self._first = own < (self._delay or 0) - self._apart / 2
         if self._first and self._alone and not self._batched:

@@ -43,8 +43,7 @@ NAMES: dict[LinkState, EventName] = {
     "stale": "link_stale",
 }
 
-# Without a good line, or with no line accepted by the port, the MCU may have been reset: a new
-# session begins, and every sender must send a zero before it can drive.
+# Without a line from the board or to the port, the MCU may have been reset: a new session begins.
 LONG_GAP_NS = 1 * NS_PER_S
 
 # Time with the link up and without late steps, in which a board reports each field at least once.
@@ -69,14 +68,11 @@ class McuSession:
     ) -> None:
         # `longest_reply` is the highest value that `mcu.reply_period` may have, s.
         self.codec = Codec(mcu.wheels, mcu.trailing_comma)
-        # Begin of every line with speed zero for all wheels.
-        self._rest = self.codec.stop.rstrip(b",\r\n")
-        # A board that answers sends nothing while it receives no line.
-        self._answers = not mcu.reply_period
+        self._rest = self.codec.stop.rstrip(b",\r\n")  # begin of every line with speed zero
+        self._answers = not mcu.reply_period  # sends nothing while it receives no line
         self._lines = LineReader()
         self._needs_check = mcu.link_check == "require"
-        # Received by the last `update`, with their arrival.
-        self.statuses: list[tuple[int, BoardStatus]] = []
+        self.statuses: list[tuple[int, BoardStatus]] = []  # of the last `update`, with arrival
         self.status = BoardStatus()  # last value of each field, until the session forgets it
         self.status_ns: Ns | None = None  # arrival of the last status line
         # Both of these, since the last opening of the port.
@@ -106,8 +102,7 @@ class McuSession:
         self._announced = ("down", self.negotiation.in_force, False, False)
         self._opened = 0
         self._blind, self._just_blind = Throttle(), False
-        # Last result of `line()`, until it is known whether it was written.
-        self._made: tuple[bytes, int] | None = None
+        self._made: tuple[bytes, int] | None = None  # last result of `line()`, not yet written
         self._left_ns = 0  # the port last wrote a line or was opened
         self._held_up = False  # the port did not write the last line
         self.blocked = False  # the open port's driver has accepted no line for `WATCHDOG_NS`
@@ -149,9 +144,9 @@ class McuSession:
             if self.lateness.record_step(now.mono_ns, good=bool(feedback)):
                 self._link.reset_silences()
             if 0.0 < self.lateness.step_s < WATCHDOG_S and self._answers and not feedback:
-                # The board may have had nothing to answer, because this computer sent nothing. If
-                # its watchdog has not stopped the motors yet, a stop without a ramp would only
-                # shake the robot. `Robot` makes such a stop anyway after `WRITE_PAUSE_S`.
+                # The board may have had nothing to answer. Before its watchdog has stopped the
+                # motors, a stop without a ramp would only shake the robot. `Robot` makes such a
+                # stop anyway after `WRITE_PAUSE_S`.
                 self._link.wait(now.mono_ns)
             self._judge(now.mono_ns)
         if self._rejected:
@@ -242,8 +237,7 @@ class McuSession:
         self.negotiation.begin(fresh=True)
 
     def _restart(self, how: str) -> None:
-        # The MCU has restarted, and its motors stand still. `how` completes "the microcontroller
-        # ...".
+        # `how` completes "the microcontroller ...".
         if self.link == "up":
             self.events.append(Event("mcu_restarted", f"the microcontroller {how}", "warning"))
         self._link.apply("restarted")
@@ -261,8 +255,7 @@ class McuSession:
             self.blocked = True
         if self.blocked:
             link.apply("blocked")
-        # The link does not come up in the update that detected a restart, because the arbiter must
-        # see a lost link first.
+        # The arbiter must see a lost link first.
         link.judge(now_ns, may_rise=not self._starting_over)
         up = link.state == "up"
         if self._awaiting:
@@ -291,7 +284,7 @@ class McuSession:
         self._rejected[reason] = (before + more, line)
 
     def _announce_rejects(self) -> None:
-        # After noise on the cable, an event for each rejected line would take too much time.
+        # After noise on the cable, an event for each line would take too much time.
         for reason, (count, line) in self._rejected.items():
             text = f"{line[:60]!r}" if line else ""
             self.events.append(

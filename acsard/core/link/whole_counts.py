@@ -16,8 +16,7 @@ ROUNDING = 0.0052  # of a speed with two decimals (0.005 rad/s), with a small ma
 
 MAX_TRIES = 16  # of n for a line, because the time of a control step is bounded
 
-# Probability that random speeds look like whole counts; it grows with each try. Above it, they
-# prove nothing.
+# That random speeds look like whole counts; it grows with each try. Above it, they prove nothing.
 MAX_CHANCE = 0.05
 
 # Counts between the number computed by the host's estimate and a whole one, where the speeds alone
@@ -26,8 +25,7 @@ MAX_COUNT_ERROR = 0.3
 
 MAX_TIME_ERROR, MAX_TIME_ERROR_S = 0.6, 0.005  # of the host's estimate: relative, plus s
 
-# Share of an error that the next estimate carries. With 1, clocks that differ by 0.5 % would sum up
-# errors forever.
+# Share of an error that the next estimate carries. With 1, clocks that differ by 0.5 % add up.
 MAX_CARRIED_ERROR = 0.95
 
 # Time since the line before, as a share of the firmware's counting time. Firmware that is asked
@@ -69,8 +67,7 @@ class WholeCounts:
         self._before: Motors = (0.0, 0.0, 0.0, 0.0)
         self.covers_gap = False  # the last line includes the counts of the missing line before it
         self._cover = 0.0  # share of the lines after a missing one that do, 0 to 1, where it shows
-        # Share of lines that are not whole counts; error of the host's time in counts of the
-        # fastest wheel.
+        # Lines that are not whole counts; error of the host's time in counts of the fastest wheel.
         self._doubt = self._unsure = 0.0
 
     def pause(self) -> None:
@@ -135,12 +132,10 @@ class WholeCounts:
             off = abs(expected_s - period) * fastest / self.angle
             self._unsure += MEAN_GAIN * (off - self._unsure)
         if not number or (confirmed is None and self._unsure > MAX_MEAN_ERROR):
-            # Speed times time. The time includes the time carried from earlier lines.
             self.pause()
             self._period = expected_s
             return a * expected_s, b * expected_s, c * expected_s, d * expected_s
-        # After the first line, the error comes from two sample times in equal parts, so only half
-        # of it is carried. With each further line the share grows.
+        # After the first line, the error comes from two sample times, so half of it is carried.
         self._run += 1
         share = min(MAX_CARRIED_ERROR, self._run / (self._run + 1))
         self._period, self._apart = period, share * (expected_s - period)
@@ -170,8 +165,7 @@ class WholeCounts:
         shares -= {0.0, 1.0}
         if not shares:
             return number, None
-        # A wheel with the share s of the fastest speed makes s n counts. The computed s n is wrong
-        # by up to (1 + s) n times the relative rounding error of the fastest speed.
+        # With the share s of the fastest speed, s n is wrong by up to (1 + s) n rounding errors.
         error = ROUNDING / fastest
         step, chance = 1 if exact > number else -1, 0.0
         for _ in range(MAX_TRIES):
@@ -189,8 +183,7 @@ class WholeCounts:
                         fits = False
                         break
                 if chance > MAX_CHANCE:
-                    # The speeds prove nothing. If the firmware divides by a round period, then the
-                    # host's time alone agrees with the counts.
+                    # If the firmware divides by a round period, the host's time alone agrees.
                     return (number if fits and abs(number - exact) <= MAX_COUNT_ERROR else 0), None
                 if fits:
                     return number, True

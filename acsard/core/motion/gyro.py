@@ -249,6 +249,8 @@ class Gyro:
             self._owed -= turn
         return turn if verdict == "good" else 0.0
 
+    # Samples.
+
     def _time_of(self, sample: GyroSample) -> int:
         # A backlog gets the times of measurement, so the wheels provide the present turn.
         last, self._last = self._last, sample
@@ -342,6 +344,8 @@ class Gyro:
         # It waits if the line that showed the hanging gyro covers no known time.
         if self._frozen:
             self._doubt += self._repeated * self._repeated + self._repeated_gaps
+
+    # Comparison with the wheels.
 
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
         # At rest the gyro provides the turn, because a person may turn the robot.

@@ -54,6 +54,8 @@ class Lifecycle:
         self._began_ns: Ns | None = None  # first step, or first after the last stall
         self._derive()
 
+    # facts
+
     def begin(self, now: Instant, *, stalled: bool = False) -> None:
         """Begin a step; `stalled` says that the daemon stood still before it.
 
@@ -103,6 +105,8 @@ class Lifecycle:
         self._faulted_ns = now.mono_ns
         self._latch(fault=with_causes(self._new_latch(now, "", why), latch))
         return True
+
+    # requests
 
     def stop(self, by: str, asked_ns: Ns, now: Instant) -> str:
         """Latch a stop with a new number, and return a text for the client.
@@ -233,6 +237,8 @@ class Lifecycle:
         latch = latches.inactive
         assert latch is not None
         return Reason(latch.code, f"{_latch_text(latch)}; call srv/activate")
+
+    # latches and mode
 
     def _new_latch(self, now: Instant, by: str, why: Reason) -> Latch:
         if self._numbered:
