@@ -60,19 +60,26 @@ UNKNOWN_STATUS, CHARGING, DISCHARGING, NOT_CHARGING = range(4)  # `Battery.power
 BATTERY_HZ = 1.0
 
 
+NEVER_NS = -(1 << 62)
+
+
 class _Rate:
     # Messages of one key; 0 Hz is no limit.
-    def __init__(self, hz: float) -> None:
+    def __init__(self) -> None:
+        self._period_ns = 0
+        self._last_ns = NEVER_NS
+
+    def use(self, hz: float) -> None:
         self._period_ns = int(NS_PER_S / hz) if hz else 0
-        self._next_ns = -2 * self._period_ns
 
     def due(self, now_ns: Ns, at_once: bool = False) -> bool:
         # Allow a twentieth of the period as grace. Otherwise a step that is a microsecond early
         # would wait for the next period.
-        if not at_once and now_ns < self._next_ns - self._period_ns // 20:
+        next_ns = self._last_ns + self._period_ns
+        if not at_once and now_ns < next_ns - self._period_ns // 20:
             return False
-        behind = at_once or now_ns - self._next_ns > self._period_ns
-        self._next_ns = (now_ns if behind else self._next_ns) + self._period_ns
+        behind = at_once or now_ns - next_ns > self._period_ns
+        self._last_ns = now_ns if behind else next_ns
         return True
 
 
@@ -97,20 +104,21 @@ class Report:
             "diagnostics": self._diagnostics,
             "battery": self._battery,
         }
+        limited = ("odom", "wheel_states", "cmd_vel_out", *self._summaries)
+        self._rates = {key: _Rate() for key in limited}
         self.use(config)
 
     def use(self, config: Config) -> None:
         """Use other rates and frames from the next message on."""
         self._config = config
         rates = config.rates
-        self._rates = {
-            "odom": _Rate(rates.odom),
-            "wheel_states": _Rate(rates.telemetry),
-            "cmd_vel_out": _Rate(rates.telemetry),
-            "state": _Rate(rates.state_hz),
-            "diagnostics": _Rate(rates.at_most(DIAGNOSTICS_HZ)),
-            "battery": _Rate(rates.at_most(BATTERY_HZ)),
-        }
+        # A change must not make messages due, so each `_Rate` remembers its last message.
+        self._rates["odom"].use(rates.odom)
+        self._rates["wheel_states"].use(rates.telemetry)
+        self._rates["cmd_vel_out"].use(rates.telemetry)
+        self._rates["state"].use(rates.state_hz)
+        self._rates["diagnostics"].use(rates.at_most(DIAGNOSTICS_HZ))
+        self._rates["battery"].use(rates.at_most(BATTERY_HZ))
 
     def due(
         self, outputs: Outputs, wanted: Collection[str], get_snapshot: GetSnapshot

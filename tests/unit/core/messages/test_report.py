@@ -477,6 +477,27 @@ def test_state_has_10_hz_and_diagnostics_have_1_hz_by_default() -> None:
     assert abs(len(times_of("diagnostics", CONFIG)) - 10) <= 1
 
 
+@each(("key", "most"), [("odom", 20), ("wheel_states", 10), ("state", 10), ("battery", 1)])
+def test_a_change_of_a_setting_makes_no_message_due(key: str, most: int) -> None:
+    config = rates(odom=20.0, telemetry=10.0)
+    report, count = Report(config, START), 0
+    for step in range(1000):
+        report.use(config)
+        count += len(list(report.due(at(later(step / 100)), {key}, get_snapshot)))
+    assert abs(count - 10 * most) <= 1
+
+
+def test_a_new_rate_counts_from_the_last_message_on() -> None:
+    report, steps = Report(rates(odom=1.0), START), []
+    for step in range(200):
+        if step == 30:
+            report.use(rates(odom=2.0))
+        if list(report.due(at(later(step / 100)), {"odom"}, get_snapshot)):
+            steps.append(step)
+    assert steps[0] == 0
+    assert 48 <= steps[1] <= 50  # a message may come a twentieth of its period early
+
+
 @pytest.mark.parametrize("key", sorted(SUMMARIES))
 def test_a_change_of_the_status_is_published_immediately(key: str) -> None:
     report = Report(CONFIG, START)
