@@ -1,8 +1,8 @@
 """The robot as one pure object. `Robot.step(Inputs) -> Outputs` calls all its parts in order.
 
 A step updates the odometry, chooses one command, checks the mode, limits the command and converts
-it to wheel speeds. Only `step` changes the state, except that its caller may add to `counters`. The
-control loop reads and writes the port, and `core/guard.py` checks each line.
+it to wheel speeds. Only `step` changes the state, and only from its inputs. The control loop reads
+and writes the port, and `core/guard.py` checks each line.
 """
 
 from __future__ import annotations
@@ -135,9 +135,10 @@ class Robot:
         self._status: tuple[str, Code, str, str, str] = ("", "booting", "", "", "")
         self._battery_level = ""  # in the previous step
         # Since the start: `commands` (accepted), `command_<reason>` (refused),
-        # `commands_of_new_senders` (not proved yet), and events. The control loop adds those of the
-        # port and the bus.
+        # `commands_of_new_senders` (not proved yet), lines to the board, and events.
         self.counters: Counter[str] = Counter()
+        # Whether the last step's line was that of a period. None: it made no line.
+        self._period_line: bool | None = None
         self._refused = ""
         self._refused_ns: Ns | None = None
         self._sanity = Sanity(config.feedback)
@@ -231,6 +232,7 @@ class Robot:
         news = (self._choice.arrived_ns, self._life.mode) != self._made_of
         due = inputs.tick or (inputs.at_once and news)
         line = self._drive(inputs) if due else None
+        self._period_line = None if line is None else inputs.tick
         applied = self._limiter.twist
         self._odometry.command(applied)
         link = self.session.link
@@ -267,6 +269,12 @@ class Robot:
     # The outcome of the previous line.
 
     def _settle(self, inputs: Inputs) -> None:
+        if self._period_line is not None and not inputs.superseded:
+            self.counters["lines_sent"] += 1
+        elif self._period_line and inputs.port_open:
+            # Count the lines of periods only. If a line between two periods is superseded, the line
+            # of the period still follows.
+            self.counters["lines_superseded"] += 1
         # To the last line on the port: from zero if the guard replaced it, from the one before if
         # it was not written.
         if inputs.guard_trip:
@@ -553,6 +561,9 @@ class Robot:
     def _accept_commands(self, inputs: Inputs, events: list[Event]) -> None:
         now_ns = inputs.now.mono_ns
         messages: Sequence[Command | Refusal] = inputs.commands
+        senders = {(command.source, command.sender) for command in inputs.commands}
+        if superseded := len(inputs.commands) - len(senders):
+            self.counters["commands_superseded"] += superseded
         if inputs.refusals:
             # Process commands and refusals in the order of arrival. An unreadable message may have
             # commanded motion, so it cancels the zeros that arrived before it, and only those. The

@@ -6,7 +6,7 @@ All decisions about the motion are made there. The loop is synchronous, so that 
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 
 from msgspec.structs import replace
@@ -55,7 +55,7 @@ from acsard.core.values import (
 from acsard.daemon.latch_rules import MAX_ANSWER_DELAY_NS, Handover, LatchKeeper
 from acsard.daemon.latencies import Stopwatch
 from acsard.daemon.pacing import NO_PERIOD, Pace, Period
-from acsard.recording.recorded_steps import StepRecorder, count_superseded
+from acsard.recording.recorded_steps import StepRecorder
 
 FEEDBACK_TOPICS = ("odom", "tf", "wheel_states")  # with messages of the board's feedback lines
 
@@ -127,6 +127,8 @@ class ControlLoop:
         self._queries = Queries(config, info)
         self._gateway, self._imu = GatewayFollower(), GyroFollower(config.mcu.simulated)
         self._routers = RouterFollower()
+        # Of the bus, beside those of the robot.
+        self._counters: Counter[str] = Counter()
         self._turn_rates: list[GyroSample] = []  # since the last step
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
         self._superseded, self._late_ns = False, 0
@@ -147,8 +149,8 @@ class ControlLoop:
     def totals(self, now_ns: Ns) -> dict[str, float]:
         """Return the fields of the event `ended`: run time in s, distance in m, counters."""
         seconds, metres = (now_ns - self._start_ns) / NS_PER_S, self.robot.travelled
-        shot = self.robot.snapshot(now_ns)
-        return {"seconds": round(seconds, 1), "metres": round(metres, 2), **shot.counters}
+        counters = self._snapshot().counters
+        return {"seconds": round(seconds, 1), "metres": round(metres, 2), **counters}
 
     @property
     def retry_ns(self) -> Ns | None:
@@ -228,7 +230,7 @@ class ControlLoop:
             self._handover.take(outputs.latches)
             if self.robot.config is not self._config:
                 self._adopt(self.robot.config)
-            line = self._send(outputs, inputs.now, inputs.tick)
+            line = self._send(outputs, inputs.now)
         except Exception:
             if self._recorder is not None:
                 self._recorder.died(inputs)
@@ -271,12 +273,12 @@ class ControlLoop:
         self._note(batch)
         for arrival in batch.arrivals:
             if arrival.key == GATEWAY:
-                ends_ns = self._gateway.receive(arrival, self.robot.counters)
+                ends_ns = self._gateway.receive(arrival, self._counters)
                 if ends_ns:
                     self.report.certificate_ends[""] = ends_ns
                 continue
             if arrival.key == IMU:
-                sample = self._imu.receive(arrival, self.robot.counters, self._others)
+                sample = self._imu.receive(arrival, self._counters, self._others)
                 if sample is not None:
                     self._turn_rates.append(sample)
                 continue
@@ -307,8 +309,6 @@ class ControlLoop:
                         identity.shared,
                     )
                 )
-        if superseded := count_superseded(commands):
-            self.robot.counters["commands_superseded"] += superseded
         for source in batch.overrun_sources:
             text = f"source {source}: too many commands came at once, and the oldest were dropped"
             refusals.append(Refusal("displaced", text, source))
@@ -320,13 +320,13 @@ class ControlLoop:
 
     def _note(self, batch: BusInput) -> None:
         if batch.overrun:
-            self.robot.counters["bus_overrun"] += batch.overrun
+            self._counters["bus_overrun"] += batch.overrun
         if batch.dropped:
-            self.robot.counters["bus_dropped"] += batch.dropped
+            self._counters["bus_dropped"] += batch.dropped
         if batch.routers is not None:
-            self._routers.receive(batch.routers, self.robot.counters, self._others)
+            self._routers.receive(batch.routers, self._counters, self._others)
         if batch.stuck:
-            self.robot.counters["bus_stuck"] += 1
+            self._counters["bus_stuck"] += 1
             self._others.append(BUS_STUCK)
 
     def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
@@ -344,27 +344,21 @@ class ControlLoop:
         self._bus.retire(query.ticket)
         return None
 
-    def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
-        # None: not written. `tick` is false between two periods.
+    def _send(self, outputs: Outputs, now: Instant) -> bytes | None:
+        # None: not written.
         line, self._trip = self._guard.check(outputs)
         self._superseded, self._late_ns = False, 0
         if line is None:
             return None
         before_ns = self._port.sent_ns
-        offered = self._port.offer(line, now)
-        if offered == "sent":
+        if self._port.offer(line, now) == "sent":
             self._guard.record_written(line)
             sent_ns = self._port.sent_ns
             self._stopwatch.line(outputs, sent_ns, before_ns)
             late_ns = sent_ns - now.mono_ns
             self._late_ns = late_ns if late_ns >= MIN_WRITE_DELAY_NS else 0
-            self.robot.counters["lines_sent"] += 1
             return line
         self._superseded = True
-        if offered == "superseded" and tick:
-            # Count the lines of periods only. If a line between two periods is superseded, the line
-            # of the period still follows.
-            self.robot.counters["lines_superseded"] += 1
         return None
 
     def _publish(self, outputs: Outputs, answers: tuple[Answer, ...]) -> None:
@@ -402,8 +396,10 @@ class ControlLoop:
     def _snapshot(self) -> Snapshot:
         outputs = self.outputs
         now_ns = 0 if outputs is None else outputs.now.mono_ns
+        shot = self.robot.snapshot(now_ns)
         return replace(
-            self.robot.snapshot(now_ns),
+            shot,
+            counters=shot.counters | self._counters,
             figures=self._stopwatch.measured(now_ns),
             missed_last_minute=self._stopwatch.missed(now_ns),
             routers=self._routers.status,

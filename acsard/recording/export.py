@@ -32,7 +32,6 @@ from acsard.recording.file_replay import (
 )
 from acsard.recording.published import Published, Publisher
 from acsard.recording.recorded_steps import RecordedStep
-from acsard.recording.replay import replay_step
 from acsard.recording.time_span import WHOLE_SPAN, Span
 
 _RELIABLE, _BEST_EFFORT = 1, 2
@@ -352,7 +351,7 @@ def _write_steps(
         if number % PROGRESS_STEPS == 0:
             progress(step.inputs.now.wall_ns)
         with run.state_errors():
-            outputs = replay_step(run.robot, step)
+            outputs = run.robot.step(step.inputs)
         if is_inside(step):
             writer.step(step, outputs)
         elif not over:
@@ -381,7 +380,7 @@ def calibration_csv(recording: Recording) -> bytes:
                 # A calibration compares whole drives, and part of this drive is missing.
                 break
             last = step.number
-            lines += measured_csv_rows(step, replay_step(run.robot, step))
+            lines += measured_csv_rows(step, run.robot.step(step.inputs))
             has_gyro = has_gyro or bool(step.inputs.gyro)
     if not has_gyro:
         raise RecordingError(

@@ -19,7 +19,6 @@ from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.values import (
     AcsardError,
-    Command,
     Estimate,
     Event,
     Inputs,
@@ -159,11 +158,6 @@ def input_names(inputs: Inputs, before: int) -> int:
     ]
     # Most steps contain no names. The JSON encoding shows where each name ends.
     return zlib.crc32(msgspec.json.encode(names), before) if names else before
-
-
-def count_superseded(commands: Sequence[Command]) -> int:
-    """Return the number of commands of a step before a newer one of the same sender."""
-    return len(commands) - len({(command.source, command.sender) for command in commands})
 
 
 def status_of(outputs: Outputs) -> Status:

@@ -24,7 +24,6 @@ from acsard.recording.recorded_steps import (
     RecordedOutputs,
     RecordedStep,
     checksum,
-    count_superseded,
     input_names,
     micropose,
     status_of,
@@ -93,19 +92,6 @@ class Comparison(Struct):
         return not self.same and self.first_by_output.keys() <= TEXT_OUTPUTS
 
 
-def replay_step(robot: Robot, step: RecordedStep) -> Outputs:
-    """Run `robot.step` with recorded inputs; update counters that the control loop updates."""
-    recorded, inputs = step.recorded, step.inputs
-    if superseded := count_superseded(inputs.commands):
-        robot.counters["commands_superseded"] += superseded
-    outputs = robot.step(inputs)
-    if recorded.sent is not None:
-        robot.counters["lines_sent"] += 1
-    elif recorded.line is not None and inputs.tick and inputs.port_open:
-        robot.counters["lines_superseded"] += 1
-    return outputs
-
-
 class Replay:
     def __init__(self, robot: Robot, memory: Memory | None = None) -> None:
         self.outputs: Outputs | None = None  # of the last step
@@ -124,7 +110,7 @@ class Replay:
         """Replay the next step; return how it differs, or None."""
         if step.begins:
             self._checksum = self._names = 0
-        outputs = self.outputs = replay_step(self.robot, step)
+        outputs = self.outputs = self.robot.step(step.inputs)
         # A step that changes a setting gives the robot a new configuration.
         if self.robot.config is not self._config:
             self._config = self.robot.config

@@ -41,7 +41,6 @@ from acsard.recording.export import export
 from acsard.recording.file import Recording
 from acsard.recording.file_replay import RecordedRun
 from acsard.recording.published import MEASURED_ROWS, Publisher
-from acsard.recording.replay import replay_step
 from tests.each import each
 from tests.scenarios.taped import (
     ADDED,
@@ -86,7 +85,7 @@ def exported(recording: Recording) -> Said:
     run = RecordedRun(recording)
     publisher, messages = Publisher(run.robot, recording.about.started_ns), defaultdict(list)
     for step in run.steps():
-        for output in publisher.step(step, replay_step(run.robot, step)):
+        for output in publisher.step(step, run.robot.step(step.inputs)):
             messages[output.channel.native.replace("<source>", output.source)].append(
                 output.message
             )

@@ -8,7 +8,9 @@ from msgspec.structs import replace
 
 from acsard.core.config.named_faults import FAULTS
 from acsard.core.config.settings import Config
+from acsard.core.link.serial_output import Offered
 from acsard.core.robot import Robot
+from acsard.core.values import Instant
 from acsard.recording.replay import Replay
 from acsard.recording.state import adopt, thaw
 from tests.scenarios.taped import (
@@ -143,6 +145,29 @@ def test_a_recording_that_begins_in_a_drive_is_replayed_from_its_first_state(
     (first,) = tape.states
     assert tape.taken[first].outputs.mode == "driving"
     lives_again(tape, config, first)
+
+
+def test_a_replay_counts_lines_and_commands_as_the_daemon_did() -> None:
+    tape, world = recorded_world(PLAIN)
+    world.drive(0.3, seconds=0.5)
+    world.send_together([0.2, 0.3])
+    world.port.blocked = True
+    world.run(0.05)
+    world.port.blocked = False
+    world.run(0.2)
+    offer = world.port.offer
+
+    def unplug(line: bytes, now: Instant) -> Offered:
+        world.port.unplug()
+        return offer(line, now)
+
+    world.port.offer = unplug  # type: ignore[method-assign]
+    world.run(0.1)
+    counters = world.loop.robot.counters
+    assert counters["lines_sent"] > 50
+    assert counters["lines_superseded"] == 5
+    assert counters["commands_superseded"] == 1
+    assert replayed(tape, PLAIN).robot.counters == counters
 
 
 def test_a_line_that_differs_is_reported_with_the_inputs_of_both_sides() -> None:

@@ -49,7 +49,6 @@ from acsard.recording.export import (
     wheel_columns,
 )
 from acsard.recording.file import Recording, RecordingWriter, Topic
-from acsard.recording.replay import replay_step
 from acsard.recording.time_span import Span
 from tests.scenarios.taped import BATCH, Tape, chunks, recorded_world
 from tests.scenarios.world import START
@@ -446,7 +445,7 @@ def test_the_table_has_a_row_for_each_feedback_line_and_each_gyro_sample(tape: T
     robot = Robot(GYRO)
     lines: list[str] = []
     for step in tape.steps():
-        lines += csv_rows(step, replay_step(robot, step))
+        lines += csv_rows(step, robot.step(step.inputs))
     estimates = [e for t in tape.taken for e in t.outputs.estimates]
     reports = [sample for t in tape.taken for sample in t.inputs.gyro]
     cells = [line.split(",") for line in lines]
@@ -462,8 +461,8 @@ def test_calibration_reads_the_same_from_the_whole_table_and_from_the_measured_c
     robot, twin = Robot(GYRO), Robot(GYRO)
     whole, part = [CSV_HEADER], [MEASURED_CSV_HEADER]
     for step in tape.steps():
-        whole += csv_rows(step, replay_step(robot, step))
-        part += measured_csv_rows(step, replay_step(twin, step))
+        whole += csv_rows(step, robot.step(step.inputs))
+        part += measured_csv_rows(step, twin.step(step.inputs))
     tables = [read("\n".join(lines).encode()) for lines in (whole, part)]
     commands = ["applied_linear", "applied_angular"]
     assert list(tables[0].columns) == ["t", "fr", "fl", "rl", "rr", "yaw_rate", *commands]

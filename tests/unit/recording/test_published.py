@@ -12,7 +12,6 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.schema import Time
 from acsard.core.robot import Robot
 from acsard.recording.published import MEASURED_ROWS, Published, Publisher
-from acsard.recording.replay import replay_step
 from acsard.recording.timeline import TimelineWriter
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
@@ -21,7 +20,7 @@ from tests.scenarios.world import START, World
 def published_messages(tape: Tape, config: Config) -> list[Published]:
     robot = Robot(config)
     publisher = Publisher(robot, START.wall_ns)
-    return [m for step in tape.steps() for m in publisher.step(step, replay_step(robot, step))]
+    return [m for step in tape.steps() for m in publisher.step(step, robot.step(step.inputs))]
 
 
 def names(published: list[Published]) -> set[str]:
@@ -98,7 +97,7 @@ def test_the_lines_after_the_last_step_have_the_drive_and_the_ending() -> None:
     tape, robot = driven(), Robot(Config())
     publisher = Publisher(robot, START.wall_ns)
     for step in tape.steps():
-        list(publisher.step(step, replay_step(robot, step)))
+        list(publisher.step(step, robot.step(step.inputs)))
     drive, cut = [line.message for line in publisher.end("the disk accepted no more data")]
     assert (drive.name, drive.msg[:13]) == ("drive", "was driving, ")
     assert (cut.name, cut.msg, cut.level) == ("cut", "the disk accepted no more data", 30)
