@@ -19,25 +19,22 @@ from acsard.core.formatting import many
 from acsard.core.values import Metres, RadPerS
 from acsard.terminal.output import table
 
-# Names of the settings of `[drive]` that contain the multipliers, in the order of
-# `Multipliers.values`.
+# Settings of `[drive]`, in the order of `Multipliers.values`.
 NAMES = (
     "wheel_separation_multiplier", "left_wheel_radius_multiplier", "right_wheel_radius_multiplier",
 )  # fmt: skip
 
-# Number of digits of the settings that are written into `acsard.toml`.
-DIGITS = 5
+DIGITS = 5  # of the settings that are written into `acsard.toml`
 
 
-# A smaller change would appear as 0.0 %.
-MIN_GROWTH = 0.0005
+MIN_GROWTH = 0.0005  # a smaller change would appear as 0.0 %
 
 
 class CalibrationRefusal(Struct, frozen=True):
     """The object that `--json` prints if a log gives no calibration."""
 
     log: str
-    refused: str  # text that says why the log gives no calibration, and what the user must do
+    refused: str  # why the log gives no calibration, and what the user must do
     notes: Sequence[str] = ()
 
 

@@ -22,27 +22,23 @@ from acsard.core.config.settings import DriveConfig
 class Parameter(IntEnum):
     """Indices of the fitted parameters in an array of `PARAMETER_COUNT` numbers."""
 
-    LEFT = 0  # ratio of the left wheels' radius to the configured wheel radius
-    RIGHT = 1  # ratio of the right wheels' radius to the configured wheel radius
-    # Ratio of the configured wheel separation to the effective track.
-    INVERSE_TRACK = 2
+    LEFT = 0  # radius of the left wheels / configured wheel radius
+    RIGHT = 1  # radius of the right wheels / configured wheel radius
+    INVERSE_TRACK = 2  # configured wheel separation / effective track
     TRACK_GROWTH = 3  # fraction by which the effective track grows for each rad/s of turn rate
-    # Delay of the positions' recorded times relative to those of the wheels, s; later is positive.
-    DELAY = 4
-    SENSOR_X = 5  # distance by which the position sensor is ahead of the robot's middle, m
-    SENSOR_Y = 6  # distance by which the position sensor is to the left of the robot's middle, m
-    BIAS_ERROR = 7  # gyro bias that remains after the bias measured at rest is subtracted, rad/s
-    # Relative error of the gyro's scale: with 0.01, the gyro shows turns 1 % too large.
-    SCALE_ERROR = 8
+    DELAY = 4  # of the positions' recorded times after those of the wheels, s
+    SENSOR_X = 5  # position sensor ahead of the robot's middle, m
+    SENSOR_Y = 6  # position sensor to the left of the robot's middle, m
+    BIAS_ERROR = 7  # gyro bias that the measurement at rest leaves, rad/s
+    SCALE_ERROR = 8  # of the gyro, relative: with 0.01, it shows turns 1 % too large
 
 
 PARAMETER_COUNT = len(Parameter)
 RADII = [Parameter.LEFT, Parameter.RIGHT]
-# Indices of the parameters that describe the wheels: radii, inverse track and track growth.
+# Radii, inverse track and track growth.
 WHEEL_PARAMETERS = list(Parameter)[: Parameter.DELAY]
 
-# If a residual exceeds this number of standard deviations, its weight is less than 1 (Huber).
-HUBER_LIMIT = 2.0
+HUBER_LIMIT = 2.0  # standard deviations of a residual, above which its weight is less than 1
 
 
 class Base(Struct, frozen=True):
@@ -84,11 +80,8 @@ class Evidence(Struct, frozen=True):
     J and J^T W r by the noise variance of the sensor.
     """
 
-    # Left-hand sides J^T W J of the normal equations, shape (blocks, PARAMETER_COUNT,
-    # PARAMETER_COUNT).
-    normal: Floats
-    # Right-hand sides J^T W r of the normal equations, shape (blocks, PARAMETER_COUNT).
-    score: Floats
+    normal: Floats  # left-hand sides J^T W J, shape (blocks, PARAMETER_COUNT, PARAMETER_COUNT)
+    score: Floats  # right-hand sides J^T W r, shape (blocks, PARAMETER_COUNT)
     squares: Floats  # sum of weighted squared residuals per block
     counts: Floats  # number of independent residuals per block
 
@@ -131,8 +124,7 @@ def huber(residuals: Floats | Complexes, least: float) -> Floats:
     return np.asarray(np.minimum(1.0, HUBER_LIMIT * scale / np.maximum(size, 1e-300)))
 
 
-# Function that returns the `Evidence` of one sensor, computed with given parameters.
-Source = Callable[[Floats], Evidence]
+Source = Callable[[Floats], Evidence]  # the evidence of a sensor, for given parameters
 
 MAX_STEPS = 30
 # The fit ends after a step below `SMALL`, and has converged if its last step is below `SETTLED`. A
@@ -147,20 +139,16 @@ PRIOR_STD = {
     Parameter.SENSOR_Y: 0.5,
 }
 
-# Relative standard deviation of the scale of a MEMS gyro, which only positions can show.
-GYRO_SCALE_STD = 0.005
+GYRO_SCALE_STD = 0.005  # relative, of a MEMS gyro; only positions can show its scale
 
-# Weight of a constraint (`Held`) in the normal equations, large enough to enforce it.
-CONSTRAINT_WEIGHT = 1e9
+CONSTRAINT_WEIGHT = 1e9  # of a `Held` in the normal equations, large enough to enforce it
 
 # Constraint: weights of the parameters, shape (PARAMETER_COUNT,), and the value of their sum.
 Held = tuple[Floats, float]
 
-# Minimum number of blocks at which the jackknife also leaves out pairs of neighboring blocks.
-MIN_PAIR_BLOCKS = 16
+MIN_PAIR_BLOCKS = 16  # for a jackknife that also leaves out pairs of neighboring blocks
 
-# Least number of blocks in a log, and of runs at which the jackknife leaves out whole runs.
-MIN_BLOCKS = 5
+MIN_BLOCKS = 5  # in a log; and least runs for a jackknife that leaves out whole runs
 
 
 def student_factor(free: Floats | float) -> Floats:
@@ -176,11 +164,10 @@ class Fit(Struct, frozen=True):
     """The result of a fit: the fitted parameters, and the normal equations at these parameters."""
 
     parameters: Floats
-    # Left-hand sides of the normal equations, shape (blocks, PARAMETER_COUNT, PARAMETER_COUNT).
-    normal: Floats
-    score: Floats  # right-hand sides of the normal equations, shape (blocks, PARAMETER_COUNT)
-    # Matrix that the constraints and the prior information add to the left-hand side of the normal
-    # equations, shape (PARAMETER_COUNT, PARAMETER_COUNT).
+    normal: Floats  # left-hand sides, shape (blocks, PARAMETER_COUNT, PARAMETER_COUNT)
+    score: Floats  # right-hand sides, shape (blocks, PARAMETER_COUNT)
+    # Added to the left-hand side by constraints and priors, shape (PARAMETER_COUNT,
+    # PARAMETER_COUNT).
     prior_normal: Floats
     active: tuple[Parameter, ...]  # indices of the parameters that were fitted
     converged: bool
@@ -268,8 +255,8 @@ def fit(
         step = np.zeros(PARAMETER_COUNT)
         step[list(active)] = _solved(normal.sum(axis=0) + known, score.sum(axis=0) + prior, active)
         # Far from the solution, take only a part of the step, because the linearization holds only
-        # nearby. After a third of the steps, halve each step. Otherwise a residual could become an
-        # outlier in every second step, and the fit would not converge.
+        # nearby. Later, halve each step: otherwise a residual could become an outlier in every
+        # second step.
         size = float(np.max(np.abs(step[: Parameter.DELAY])))
         whole = 1.0 if at < MAX_STEPS // 3 else 0.5
         parameters = parameters + step * min(whole, 0.3 / size if size else 1.0)
@@ -289,15 +276,14 @@ def _sum(evidence: Sequence[Evidence]) -> tuple[Floats, Floats]:
 
 
 def _weight(part: Evidence) -> float:
-    # The noise comes from the differences between the right-hand sides of the blocks. Unlike the
-    # residuals, these differences become larger if the residuals are correlated.
+    # From the differences between blocks, which unlike residuals grow if residuals are correlated.
     total = part.normal.sum(axis=0)
     used = np.flatnonzero(np.diag(total) > 0.0)
     if not len(used):
         return 0.0
     inner = np.linalg.pinv(total[np.ix_(used, used)], rcond=1e-10, hermitian=True)
     rank = int(np.linalg.matrix_rank(inner, hermitian=True))
-    # Use the deviations from the mean, because the mean is not noise until the fit has converged.
+    # The mean is not noise until the fit has converged.
     apart = part.score[:, used] - part.score[:, used].mean(axis=0)
     noise = float(np.einsum("bi,ij,bj->", apart, inner, apart))
     white = float(part.squares.sum() / max(1.0, part.counts.sum()))

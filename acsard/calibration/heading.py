@@ -34,23 +34,19 @@ MAX_RATE_AT_REST = 0.05
 
 MIN_SAMPLES = 5  # minimum number of gyro samples in a standstill from which the bias is measured
 
-# A gyro sample this many median deviations from the median of a standstill is an outlier.
-OUTLIER_RATIO = 6.0
+OUTLIER_RATIO = 6.0  # median deviations of an outlier from the median of a standstill
 
-# Smallest random walk assumed for the gyro bias, rad/s per square root of a second.
+# Of the gyro bias, rad/s per square root of a second: the smallest, and the usual one if no run has
+# two standstills that could be compared.
 MIN_RANDOM_WALK = 5e-5
-
-# The same if no run has two standstills whose biases could be compared.
 ASSUMED_RANDOM_WALK = 2e-4
 
-# Approximate length of the intervals in which turns of wheels and sensor are compared.
-INTERVAL_S = 1.0
+INTERVAL_S = 1.0  # approximate length of the intervals of a comparison
 
 # Step of the search for the heading sensor's delay, and the largest delay that is tried.
 GRID_S, FURTHEST_S = 0.02, 2.0
 
-# If the yaw turns this much further than the wheels, it is in degrees.
-DEGREES_RATIO = 10.0
+DEGREES_RATIO = 10.0  # of the turns of yaw and wheels, above which the yaw is in degrees
 
 
 class Heading(Struct, frozen=True):
@@ -58,8 +54,7 @@ class Heading(Struct, frozen=True):
 
     t: Floats  # times of the sensor's samples, s
     angle: Floats  # heading at the times `t`, rad, without jumps by 2 pi
-    # Long intervals without a sample of the sensor, s: one row (begin, end) for each.
-    gaps: Floats
+    gaps: Floats  # long intervals without a sample, s: one row (begin, end) for each
 
 
 class Headings(Struct, frozen=True):
@@ -67,43 +62,34 @@ class Headings(Struct, frozen=True):
 
     source: str  # column of the log from which the headings come: "yaw_rate" or "yaw"
     per_run: tuple[Heading, ...]
-    # Delay of the sensor's recorded times relative to those of the wheels.
-    delay: Seconds
-    # Median of the gyro biases that were measured in standstills of the robot.
-    bias: RadPerS
-    # True if no standstill shows the gyro's bias, so that the wheels must show it.
-    bias_unknown: bool
-    # Standard deviation of the error of the measured gyro bias.
+    delay: Seconds  # of the sensor's recorded times after those of the wheels
+    bias: RadPerS  # median of the gyro biases in standstills
+    bias_unknown: bool  # no standstill shows the gyro's bias, so that the wheels must show it
     bias_std: RadPerS = 0.0
 
 
 STRAIGHT_RATE = 0.05  # turn rate up to which the robot is considered to drive straight, rad/s
 
-# Fraction of the total turned angle that the robot turned at rates below `Rates.fastest`.
-FASTEST_QUANTILE = 0.95
+FASTEST_QUANTILE = 0.95  # of the turned angle at rates below `Rates.fastest`
 
 
 class Rows(Struct, frozen=True):
     """The motion of the robot in intervals of about a second."""
 
-    # Index of the block (a few seconds of driving) to which each interval belongs.
-    block: npt.NDArray[np.int64]
-    # Turn in each interval according to the heading sensor, rad; 0 if there is no sensor.
-    turned: Floats
-    left: Floats  # angle by which the left wheels rolled in each interval, rad
+    block: npt.NDArray[np.int64]  # index of the block of each interval
+    turned: Floats  # by the heading sensor, rad; 0 if there is none
+    left: Floats  # rolled by the left wheels, rad
     right: Floats
-    # Integral of |w| w, rad2/s, with w the speed of right minus left wheels: `TRACK_GROWTH` scales
-    # it.
+    # Integral of |w| w, rad2/s, with w right minus left wheel speed: `TRACK_GROWTH` scales it.
     signed_square_integral: Floats
-    seconds: Floats  # length of each interval, s
+    seconds: Floats
 
 
 class Rates(Struct, frozen=True):
     """Statistics of the turn rates in a log."""
 
-    mean: RadPerS  # mean turn rate, weighted by the turned angle
-    # Turn rate, below which the robot turned 95 % (`FASTEST_QUANTILE`) of its total turned angle.
-    fastest: RadPerS
+    mean: RadPerS  # weighted by the turned angle
+    fastest: RadPerS  # below which the robot turned `FASTEST_QUANTILE` of its total angle
 
 
 def of_gyro(driven: Sequence[Run]) -> Headings | None:
@@ -169,9 +155,7 @@ def _in_degrees(run: Run, radius_per_separation: float) -> bool:
     )
 
 
-# The standstills of a run: their times (s), gyro biases (rad/s) and variances of these biases
-# (rad2/s2).
-Rests = tuple[Floats, Floats, Floats]
+Rests = tuple[Floats, Floats, Floats]  # standstills: times, s, biases, rad/s, variances, rad2/s2
 
 
 def _biases(run: Run) -> Rests:
@@ -190,9 +174,8 @@ def _mean(samples: Floats) -> tuple[float, float]:
     step = float(steps.min()) if len(steps) else 0.0
     inliers = samples[off <= max(OUTLIER_RATIO * float(np.median(off)), 1.01 * step)]
     inliers = inliers if len(inliers) >= MIN_SAMPLES else samples
-    # The variance comes from the means of five parts, so it is right for correlated noise as well.
-    # The result is not the median, because the median of a coarse gyro is always one of its few
-    # reported values.
+    # The variance of five means is right for correlated noise too. The median of a coarse gyro is
+    # always one of its few values.
     parts = [float(part.mean()) for part in np.array_split(inliers, MIN_SAMPLES)]
     few = step**2 / 12 if len(np.unique(inliers)) <= 2 else 0.0
     return float(inliers.mean()), float(np.var(parts, ddof=1)) / len(parts) + few
@@ -203,11 +186,10 @@ def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
     noise = sum(float(variance.sum()) for _, _, variance in rested) / max(1, count) ** 2
     walked = [np.column_stack((np.diff(v) ** 2 - n[1:] - n[:-1], np.diff(t))) for t, v, n in rested]
     changed, lasted = np.concatenate(walked).sum(axis=0)
-    # An estimate from few differences is uncertain, so increase it.
+    # An estimate from few differences is uncertain.
     few = 1 + 2 / max(1, count - len(rested))
     walk = max(MIN_RANDOM_WALK**2, few * changed / lasted) if lasted else ASSUMED_RANDOM_WALK**2
-    # Between two standstills, the bias error is a Brownian bridge. Before the first and after the
-    # last standstill, the bias error is a free random walk.
+    # Between two standstills, the bias error is a Brownian bridge, otherwise a free random walk.
     whole = sum(seconds)
     between = sum(float(np.sum(np.diff(t) ** 3)) for t, _, _ in rested) / 12
     outside = sum(
@@ -233,8 +215,7 @@ def offset(headings: Sequence[Heading], driven: Sequence[Run]) -> float:
         sensor = np.diff(np.interp(grid, heading.t, heading.angle))
         sensor[~inside(grid[:-1], grid[1:], heading.gaps)] = 0.0
         sensor -= sensor.mean()
-        # Try the sum of the angles as well as the difference, because the speeds of one side may
-        # have the wrong sign.
+        # Also try the sum of the angles: the speeds of one side may have the wrong sign.
         for at, series in enumerate((np.diff(right - left), np.diff(right + left))):
             centred = series - series.mean()
             scores[at] += _correlation(sensor, centred, reach)
@@ -314,8 +295,7 @@ def _signed_square_integral(run: Run) -> Floats:
     return integral(np.abs(apart) * apart, steps)
 
 
-# The turns of sensor and wheels usually differ by `NOISE` rad per second and by the fraction
-# `SHARE`, whose squares are added.
+# Usual difference of the turns of sensor and wheels: rad per second, and fraction, squares added.
 NOISE, SHARE = 0.01, 0.03
 
 

@@ -21,14 +21,11 @@ from acsard.calibration.positions import Segment, WheelSteps, path, segments, sp
 from acsard.calibration.runs import Block, Mask, Run, cumulative
 
 FOLDS = 5
-# With fewer runs, a fifth of the log is left out at a time.
-MIN_RUNS = 3
+MIN_RUNS = 3  # with fewer, a fifth of the log is left out at a time
 
-# Curvature of the path according to the wheels, rad/m, below which the path counts as straight.
-MAX_STRAIGHT_CURVATURE = 0.1
+MAX_STRAIGHT_CURVATURE = 0.1  # rad/m by the wheels, below which the path counts as straight
 
-# With less straight driving, the heading error per 10 m would be only noise.
-MIN_STRAIGHT_M = 1.0
+MIN_STRAIGHT_M = 1.0  # with less, the heading error per 10 m would be only noise
 
 
 class BeforeAfter(Struct, frozen=True):
@@ -40,19 +37,16 @@ class BeforeAfter(Struct, frozen=True):
 
 NOT_COMPARED = BeforeAfter(None, None)
 
-# Smallest ratio of a gain to its standard deviation at which the gain counts as sure (95 %).
-SURE_DEVIATIONS = 2.0
+SURE_DEVIATIONS = 2.0  # ratio of a gain to its standard deviation at which it is sure (95 %)
 
-# Half of an error. A larger gain is sure even if its deviation is large, because in a guided drive
-# one leg may show nearly all of the error.
+# Half of an error. A larger gain is sure: in a guided drive, one leg may show nearly all of it.
 SURE_GAIN = float(np.log(2.0))
 
 # Nearer than `NEAR` deviations, the configured multipliers stay. Beyond `FAR` (one log of thirty by
 # chance), a smaller gain is enough: half of it at twice `FAR`.
 NEAR, FAR = 2.0, 3.0
 
-# Constant, m2 or deg2, added to each sum of squared errors because 0 does not have a logarithm.
-MIN_SQUARE = 1e-9
+MIN_SQUARE = 1e-9  # m2 or deg2, added because 0 does not have a logarithm
 
 
 class Improvement(Struct, frozen=True):
@@ -60,16 +54,11 @@ class Improvement(Struct, frozen=True):
 
     turn: BeforeAfter  # heading error after a turn of 360 deg, deg
     straight: BeforeAfter  # heading error after 10 m straight ahead, deg
-    # RMS heading error over whole drives, deg.
-    heading: BeforeAfter
-    # RMS position error over whole drives, m.
-    place: BeforeAfter
-    # Size of the improvement, as a sum of logarithms; inf if it was not computed.
-    log_improvement: float = np.inf
-    # Standard deviation of `log_improvement`, from the differences between drives.
-    gain_std: float = 0.0
-    # Distance of the new multipliers from the configured multipliers, in standard deviations.
-    apart: float = FAR
+    heading: BeforeAfter  # RMS over whole drives, deg
+    place: BeforeAfter  # RMS over whole drives, m
+    log_improvement: float = np.inf  # a sum of logarithms; inf if it was not computed
+    gain_std: float = 0.0  # of `log_improvement`, from the differences between drives
+    apart: float = FAR  # new multipliers from the configured ones, in standard deviations
 
     @property
     def sure(self) -> bool:
@@ -85,9 +74,7 @@ class Fold(Struct, frozen=True):
     """One step of the cross-validation: a drive, and parameters fitted without this drive."""
 
     drive: Block
-    # Mask of the blocks (a few seconds each) that the fit leaves out, because they overlap the
-    # drive.
-    blocks: Mask
+    blocks: Mask  # that the fit leaves out, because they overlap the drive
     parameters: Floats
 
 

@@ -21,22 +21,20 @@ from acsard.core.values import NS_PER_S, AcsardError
 
 Floats = npt.NDArray[np.float64]
 
-# Columns of wheel speeds, rad/s: of each wheel, or the mean of each side.
+# Wheel speeds, rad/s: of each wheel, or the mean of each side.
 FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
 
-# Columns with the twist that the daemon commands to the wheels, in m/s and rad/s.
+# The twist that the daemon commands to the wheels, m/s and rad/s.
 APPLIED = "applied_linear", "applied_angular"
 
 BOUNDS = dict.fromkeys((*FOUR, *TWO), 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
-# Bound of the other columns. All bounds allow degrees and ns, so that later checks can name the
-# unit.
-DEFAULT_BOUND = 1e9
+DEFAULT_BOUND = 1e9  # allows degrees and ns, so that later checks can name the unit
 
-# Columns of wheel speeds and turn rates. Spikes are removed only from these columns.
+# Spikes are removed only from these columns.
 SPIKE_COLUMNS = frozenset((*FOUR, *TWO, "yaw_rate"))
 
-# A spike is `SPIKE` times its neighbors and the usual rate, which is the quantile 1 - `FEW_VALUES`
-# of the rates above `SLOW` rad/s.
+# A spike is `SPIKE` times its neighbors and the quantile 1 - `FEW_VALUES` of the rates above `SLOW`
+# rad/s.
 SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
 
 

@@ -18,7 +18,7 @@ from acsard.calibration.log_table import Floats, NoCalibrationError
 from acsard.core.config.settings import OdometryConfig
 from acsard.core.values import Metres
 
-# Indices into `Multipliers.values` and `Multipliers.covariance`.
+# Indices into `Multipliers`.
 SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
 
 
@@ -28,10 +28,9 @@ TOLERANCE = 1e-4  # difference between two multipliers that is too small to matt
 class Deviations(Struct, frozen=True):
     """Relative standard deviations of the robot's geometry: track and wheel radii."""
 
-    track: float  # relative standard deviation of the ratio of effective track to mean radius
-    ratio: float  # relative standard deviation of the ratio of the right to the left wheel radius
-    # Relative standard deviation of the mean radius, to which all distances are proportional.
-    scale: float
+    track: float  # of effective track / mean radius
+    ratio: float  # of right / left wheel radius
+    scale: float  # of the mean radius, to which all distances are proportional
 
     @classmethod
     def of(cls, odometry: OdometryConfig, base: Base) -> Deviations:
@@ -95,21 +94,17 @@ def multipliers(parameters: Floats, covariance: Floats, rate: Rates) -> Multipli
     return Multipliers(values, jacobian @ covariance @ jacobian.T)
 
 
-# Includes the error of choosing the point on the robot to measure.
-RUN_LENGTH_STD_M = 0.01
+RUN_LENGTH_STD_M = 0.01  # includes the choice of the point on the robot
 
 # Distances by tape and by positions contradict each other if they differ by this fraction and by
 # this number of standard deviations.
 CONTRADICTS, CONTRADICTS_STD = 0.02, 5.0
 
-# Standard deviation of the logarithm of the wheels' size if no measurement has shown the size.
-UNKNOWN_SIZE_STD = 1.0
+UNKNOWN_SIZE_STD = 1.0  # of the logarithm of the wheels' size before any measurement
 
-# Shortest distance between start and end of a run, that a person may measure by tape.
-MIN_TAPE_M = 0.5
+MIN_TAPE_M = 0.5  # between start and end of a run, to measure it by tape
 
-# Smallest `Extent.straight` of a run whose distance a person may measure by tape.
-MIN_STRAIGHTNESS = 0.8
+MIN_STRAIGHTNESS = 0.8  # `Extent.straight` of a run, to measure it by tape
 
 
 class Tape(Struct, frozen=True):
@@ -131,8 +126,7 @@ class Extent(Struct, frozen=True):
         return self.distance / self.length if self.distance > MIN_TAPE_M else 0.0
 
 
-# Function that returns the `Extent` of a run for given multipliers.
-Follow = Callable[[Floats, int], Extent]
+Follow = Callable[[Floats, int], Extent]  # the `Extent` of a run for given multipliers
 
 
 def scaled(
@@ -159,8 +153,7 @@ def scaled(
             f"path is {extent.length:.2f} m long, so it is too short or not straight enough: drive "
             "straight ahead for 2 m or more in a separate run, and measure from start to end"
         )
-    # Derivatives of the logarithm of the distance with respect to the logarithms of the
-    # multipliers.
+    # Of the logarithm of the distance by the logarithms of the multipliers.
     jacobian = np.zeros(3)
     for index in (SEPARATION, LEFT_RADIUS, RIGHT_RADIUS):
         longer = prior.values.copy()

@@ -28,46 +28,37 @@ from acsard.core.values import Metres
 
 
 class Source(IntEnum):
-    """Sources of random errors; the last three are those of the sensors."""
+    """Sources of random errors, by their variances; the last three are those of the sensors."""
 
-    DISTANCE = 0  # variance of the error of the distance, per metre driven, m2/m
-    # Variance of the error of the heading, per metre that the wheels roll (mean of both sides),
-    # rad2/m.
-    YAW = 1
-    SKID = 2  # variance of the error of the heading, per radian that the robot turns, rad2/rad
-    HEADING = 3  # variance of a measured heading, rad2
-    DRIFT = 4  # growth of the variance of the gyro's heading per second, rad2/s
-    PLACE = 5  # variance of a measured coordinate, m2
+    DISTANCE = 0  # of the distance, per metre driven, m2/m
+    YAW = 1  # of the heading, per metre that the wheels roll (mean of both sides), rad2/m
+    SKID = 2  # of the heading, per radian that the robot turns, rad2/rad
+    HEADING = 3  # of a measured heading, rad2
+    DRIFT = 4  # growth for the gyro's heading per second, rad2/s
+    PLACE = 5  # of a measured coordinate, m2
 
 
 SOURCE_COUNT = len(Source)
 SENSOR_SOURCES = np.arange(SOURCE_COUNT) >= Source.HEADING
-# Noise of each `Source` from which the search starts. The numbers only have to be positive.
-INITIAL_NOISE = np.array([1e-4, 1e-4, 1e-3, 1e-5, 1e-6, 1e-4])
+INITIAL_NOISE = np.array([1e-4, 1e-4, 1e-3, 1e-5, 1e-6, 1e-4])  # they only have to be positive
 
 # Length of a window, or of a shorter drive, and time between the residuals in it.
 WINDOW_S, APART_S = 32.0, 4.0
 
-# Minimum number of intervals between the residuals of a window.
-MIN_INTERVALS = 4
+MIN_INTERVALS = 4  # between the residuals of a window
 
-# Of more windows, only every n-th is used.
-MAX_WINDOWS = 80
+MAX_WINDOWS = 80  # of more, only every n-th is used
 
-# Errors are independent from step to step.
-STEP_S = 0.5
+STEP_S = 0.5  # errors are independent from step to step
 
-# Groups of drives that are left out in turn, which takes two searches each.
-MAX_FOLDS = 10
+MAX_FOLDS = 10  # groups of drives that are left out in turn, which takes two searches each
 
 # Fewer suffice for a search that starts from the noise of the whole log.
 STEPS, FEWER_STEPS = 150, 60
 
-# If the mean square of a window's normalized residuals exceeds this limit, the window weighs less.
-OUTLIER_LIMIT = 9.0
+OUTLIER_LIMIT = 9.0  # mean square of normalized residuals, above which a window weighs less
 
-# Variance added to each residual, so that even a perfect sensor's covariance can be inverted.
-MIN_VARIANCE = 1e-12
+MIN_VARIANCE = 1e-12  # of each residual, so that a perfect sensor's covariance can be inverted
 
 # The fit of a short log often finds 0, and the odometry would state that the pose is exact.
 MIN_NOISE_RATIO = 0.25
@@ -76,15 +67,13 @@ MIN_NOISE_RATIO = 0.25
 # larger gain is better even if its deviation is large.
 CERTAIN_GAIN = math.log(2.0) - 3 / 8
 
-# The largest value that the configuration accepts.
-MAX_SETTING = 1.0
+MAX_SETTING = 1.0  # that the configuration accepts
 
 # Each deviation above 0 costs the daemon a column of the covariance in each period. This is the
 # rounding of the multipliers; a perfect simulated robot gave 1e-5 to 1e-25.
 MIN_STD = 1e-5
 
-# Distance of driving, for which the report states the random errors of heading and distance.
-REPORT_DISTANCE_M = 10.0
+REPORT_DISTANCE_M = 10.0  # for which the report states the errors of heading and distance
 
 
 # The residuals of a window are modelled as normal with mean 0. Their covariance V is linear in the
@@ -105,11 +94,9 @@ class Windows(Struct, frozen=True):
 
     drive: npt.NDArray[np.int64]  # index of the drive of each window
     size: Floats  # number of residuals of each window, without the padding
-    residual: Floats  # residuals after the unknown start pose was projected out, shape (windows, n)
-    # Covariance that a noise of 1 of each source causes, shape (windows, SOURCE_COUNT, n, n).
-    effects: Floats
-    # Covariance due to the uncertain geometry and gyro bias, shape (windows, n, n).
-    known: Floats
+    residual: Floats  # without the unknown start pose, shape (windows, n)
+    effects: Floats  # covariance by a noise of 1, shape (windows, SOURCE_COUNT, n, n)
+    known: Floats  # covariance by the uncertain geometry and gyro bias, shape (windows, n, n)
 
     def of(self, chosen: Mask | npt.NDArray[np.int64]) -> Windows:
         return Windows(
@@ -162,12 +149,9 @@ class LogNoise(Struct, frozen=True):
 
     found: Floats  # the noise that the log shows, a number for each `Source`
     present: Floats  # the configured noise of the robot, a number for each `Source`
-    # Log likelihood per residual with the found noise, minus that with the configured noise.
-    log_likelihood_gain: float
-    # Standard deviation of `log_likelihood_gain`, from the differences between drives.
-    gain_std: float
-    # Whether the log has positions. Only positions show the noise of the distance.
-    places: bool
+    log_likelihood_gain: float  # per residual, of the found noise over the configured one
+    gain_std: float  # of `log_likelihood_gain`, from the differences between drives
+    places: bool  # the log has positions, which alone show the noise of the distance
     turning: float  # total turned angle per metre driven in this log, rad/m
 
     @property
@@ -229,8 +213,8 @@ class Reference(Struct, frozen=True):
     """The sensors of a log, and the parameters that were fitted to the whole log."""
 
     runs: Sequence[Run]
-    headings: Headings | None  # the headings that a sensor measured, or None if the log has none
-    places: bool  # whether the log has positions
+    headings: Headings | None  # None if the log has no heading sensor
+    places: bool  # the log has positions
     steps: Sequence[WheelSteps]
     base: Base
     # Fitted to the whole log; those from `Parameter.DELAY` on describe the sensors.
@@ -278,9 +262,9 @@ def noise(
 
 class _Motion(Struct, frozen=True):
     middle: Floats  # times in the middle of the steps, s
-    distance: Floats  # distance of each step, m
-    turn: Floats  # turn of each step, rad
-    track: Metres  # effective track
+    distance: Floats  # of each step, m
+    turn: Floats  # of each step, rad
+    track: Metres  # effective
 
     @property
     def metres(self) -> float:
@@ -302,17 +286,14 @@ class _Motion(Struct, frozen=True):
 
 class _Window(Struct, frozen=True):
     residual: Floats
-    # Derivatives of the residuals with respect to the start pose, shape (residuals, unknowns).
-    start: Floats
+    start: Floats  # derivatives by the start pose, shape (residuals, unknowns)
     motion: _Motion
-    # Change of each residual per m of error in a step's distance, shape (residuals, steps).
+    # Change of each residual by an error in a step's distance, m, or turn, rad, shape (residuals,
+    # steps).
     along: Floats
-    # Change of each residual per rad of error in a step's turn, shape (residuals, steps).
     yaw: Floats
-    # Maps each source of sensor noise to the covariance of the residuals if this noise is 1.
-    sensor: dict[Source, Floats]
-    # Covariance of the residuals due to the uncertain bias of the gyro; 0 without a gyro.
-    bias: Floats | float = 0.0
+    sensor: dict[Source, Floats]  # covariance by a sensor noise of 1
+    bias: Floats | float = 0.0  # covariance by the uncertain bias of the gyro; 0 without one
 
     def projected(self, known: Deviations) -> tuple[Floats, Floats, Floats]:
         """Return the residuals and their covariances after projecting out the unknown start pose.

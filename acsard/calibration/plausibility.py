@@ -18,34 +18,28 @@ from acsard.calibration.log_table import Floats, NoCalibrationError
 from acsard.calibration.positions import StartingPoint
 from acsard.calibration.runs import Block
 
-# Minimum total turn of the robot in a log, rad. Left turns and right turns are added.
-MIN_TOTAL_TURN = 2 * np.pi
+MIN_TOTAL_TURN = 2 * np.pi  # rad; left turns and right turns are added
 
-# Least sum, rad, of the mean angles of both sides, and of half of their differences.
-MIN_ROLL = 3.0
+MIN_ROLL = 3.0  # rad, sum of the mean angles of both sides, and of half of their differences
 
-# With a larger squared correlation of mean and difference, all motion is the same curve.
-MAX_CORRELATION = 0.98
+MAX_CORRELATION = 0.98  # squared, of mean and difference; above it, all motion is the same curve
 
 # Names of the two quantities that some logs do not determine accurately enough.
 TRACK, RATIO = "the effective track", "the ratio of the right to the left wheel radius"
 
-# Largest accepted relative standard deviation of each quantity.
+# Relative standard deviations.
 MAX_LOG_STDS = {TRACK: 0.2, RATIO: 0.03}
 
-# Largest condition number of the normal equations at which radii and track can be separated.
-MAX_CONDITION = 1e4
+MAX_CONDITION = 1e4  # of the normal equations at which radii and track can be separated
 
 DRIVE_ADVICE = (
     "record a drive of 60 s: stand for 3 s, drive 2 m straight ahead and back, make three full "
     "turns to the left and three to the right, some slow and some fast, then drive curves both ways"
 )
 
-# Largest fraction of a sensor's motion (sum of squares) that the wheels may leave unexplained.
-MAX_CONTRADICTION = 0.5
+MAX_CONTRADICTION = 0.5  # fraction of a sensor's motion (squares) that wheels may not explain
 
-# Largest credible ratio of a measured value to a configured one. Above it, a unit is wrong.
-WRONG_UNIT_RATIO = 8.0
+WRONG_UNIT_RATIO = 8.0  # of a measured value to a configured one, above which a unit is wrong
 
 # Skidding does not explain a smaller ratio of measured to predicted turn: speeds in rpm do.
 MIN_TURN_RATIO = 0.2
@@ -54,29 +48,20 @@ MIN_TURN_RATIO = 0.2
 # `WRONG_UNIT_RATIO`, that of the wheel speeds.
 WRONG_POSITION_UNIT_RATIO = 2e-3
 
-# Two turns in a second, rad/s. A larger value is probably in deg/s.
-MAX_TURN_RATE = 12.0
+MAX_TURN_RATE = 12.0  # rad/s: two turns in a second; a larger value is probably in deg/s
 
-# Smallest credible ratio of effective track to wheel separation. Skidding only makes it larger.
-MIN_TRACK_RATIO = 0.4
+MIN_TRACK_RATIO = 0.4  # of effective track to wheel separation; skidding only makes it larger
 
 LEAST_FACTOR, MOST_FACTOR = 0.1, 10.0  # range of multipliers that the configuration accepts
 
 NOTABLE_S, FAR_S = 0.005, 0.5
 
-LARGE_BIAS = 0.05  # gyro bias, rad/s, above which the bias is reported
-
-# Below this fraction of turns to the rarer side, a remark says so.
-ONE_SIDED_RATIO = 0.1
-
-# If measured and configured wheel radius differ by more than this factor, a remark says so.
-REPORTED_SIZE_RATIO = 1.25
-
-# If left and right wheel radius differ by more than this factor, a remark says so.
-REPORTED_RADIUS_RATIO = 1.1
-
-# Effective track / wheel separation. A remark states any other ratio.
-LEAST_TRACK, MOST_TRACK = 0.85, 3.0
+# Limits of the remarks.
+LARGE_BIAS = 0.05  # of the gyro, rad/s
+ONE_SIDED_RATIO = 0.1  # of turns to the rarer side
+REPORTED_SIZE_RATIO = 1.25  # measured / configured wheel radius
+REPORTED_RADIUS_RATIO = 1.1  # left / right wheel radius
+LEAST_TRACK, MOST_TRACK = 0.85, 3.0  # effective track / wheel separation
 
 
 def drives_enough(parts: Sequence[Block]) -> None:
@@ -212,7 +197,7 @@ def turns_the_right_way(
         )
     if by_heading:
         sensor = source or "the positions"
-        # If two sensors agree, the wheels are wrong. If there is only one sensor, it may be wrong.
+        # If two sensors agree, the wheels are wrong. A single one may be wrong itself.
         or_sensor = (
             ""
             if starting_point is not None and sides is not None

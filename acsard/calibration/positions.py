@@ -19,16 +19,13 @@ from acsard.calibration.fit import PARAMETER_COUNT, RADII, Base, Evidence, Param
 from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Block, Complexes, Run, cumulative
 
-# Least number of positions in a segment.
-MIN_POINTS = 5
+MIN_POINTS = 5  # positions in a segment
 
-# Time step for integrating the path. Finer steps cost time and add no accuracy.
-STEP_S = 0.02
+STEP_S = 0.02  # for integrating the path; finer steps add no accuracy
 
 JUMP, JUMP_M = 6.0, 0.05
 
-# Half of the interval from which the speed of the position sensor is computed.
-SPEED_HALF_INTERVAL_S = 0.05
+SPEED_HALF_INTERVAL_S = 0.05  # from which the speed of the position sensor is computed
 
 
 def extent(places: Complexes) -> float:
@@ -48,25 +45,22 @@ class Segment(Struct, frozen=True):
 class WheelSteps(Struct, frozen=True):
     """The angles by which the wheels rolled in a run, step by step."""
 
-    # Times at which the steps begin and end, s. There is one more time than there are steps.
-    t: Floats
+    t: Floats  # times at which the steps begin and end, s: one more than steps
     left: Floats  # angle that the left wheels roll in each step, rad
     right: Floats  # angle that the right wheels roll in each step, rad
-    # Integral of |w| w over each step, rad2/s, with w the speed of right minus left wheels.
-    signed_square_integral: Floats
+    signed_square_integral: Floats  # of |w| w, rad2/s, with w right minus left wheel speed
 
 
 class WheelPath(Struct, frozen=True):
     """The path of the robot in a run, computed from the wheels, linear between the times `t`."""
 
-    parameters: Floats  # parameters with which the path was computed, shape (PARAMETER_COUNT,)
+    parameters: Floats  # shape (PARAMETER_COUNT,)
     t: Floats  # times of the points of the path, s
     place: Complexes  # place x + iy of the robot at the times `t`, m
     heading: Floats  # heading of the robot at the times `t`, rad
-    # Derivatives of `place` with respect to the radii, the inverse track and the track growth.
-    derivatives: dict[Parameter, Complexes]
-    # Derivatives of `heading` with respect to the radii, the inverse track and the track growth.
-    heading_derivatives: dict[Parameter, Floats]
+    # With respect to the radii, the inverse track and the track growth.
+    derivatives: dict[Parameter, Complexes]  # of `place`
+    heading_derivatives: dict[Parameter, Floats]  # of `heading`
 
     def at(self, t: Floats) -> tuple[Complexes, Complexes]:
         """Return the places of the position sensor at recorded times `t`, and their derivatives.
@@ -186,18 +180,16 @@ def _directions(turns: Floats) -> tuple[Floats, Complexes]:
     return heading, np.exp(1j * (heading[:-1] + turns / 2)) * np.sinc(turns / (2 * np.pi))
 
 
-# Path of the robot according to the wheels in each run, by the index of the run.
-Paths = Sequence[WheelPath] | Mapping[int, WheelPath]
+Paths = Sequence[WheelPath] | Mapping[int, WheelPath]  # by the index of the run
 
 
 class Aligned(Struct, frozen=True):
     """The positions of a segment, compared with the path that fits them best."""
 
     block: int
-    # Position minus aligned path, m, times the square root of the position's weight.
-    residual: Complexes
-    # Derivatives of the aligned path, times the same root, shape (positions, PARAMETER_COUNT).
-    derivatives: Complexes
+    # Both times the square root of the position's weight.
+    residual: Complexes  # position minus aligned path, m
+    derivatives: Complexes  # of the aligned path, shape (positions, PARAMETER_COUNT)
 
 
 def aligned(segments: Sequence[Segment], paths: Paths) -> Iterator[Aligned]:
@@ -237,7 +229,7 @@ def evidence(segments: Sequence[Segment], paths: Paths, blocks: int) -> Evidence
         normal[part.block] += np.real(conj @ part.derivatives)
         score[part.block] += np.real(conj @ part.residual)
         squares[part.block] += float(np.sum(np.abs(part.residual) ** 2))
-        # Each position gives two numbers. The alignment uses up three: a shift and a rotation.
+        # The alignment uses up three of the numbers: a shift and a rotation.
         counts[part.block] += 2 * len(part.residual) - 3
     return Evidence(normal, score, squares, counts)
 
@@ -261,11 +253,10 @@ DELAYS_S = np.arange(-1.5, 1.55, 0.1)  # delays of the positions that `search` t
 # Segments of the largest extent that try and that refine starting points.
 MOST_SEGMENTS, REFINED_SEGMENTS = 60, 20
 
-# Largest number of positions of a segment that `search` uses. They are evenly spaced.
-MAX_POINTS = 80
+MAX_POINTS = 80  # of a segment that `search` uses, evenly spaced
 
-# No point is refined whose badness is `FAR_WORSE` times that of the best point. The badness is the
-# unexplained variance, increased for an unusual robot.
+# No point is refined whose badness (unexplained variance, more for an unusual robot) is `FAR_WORSE`
+# times the best one.
 MOST_REFINED, FAR_WORSE = 4, 20.0
 
 # Turn / turn predicted without multipliers. A robot that skids much is at the lower end.
@@ -274,14 +265,11 @@ USUAL_TURN_RANGE = 0.31, 1.25
 # Usual range of the turn that positions show, divided by the turn that a heading sensor shows.
 HEADING_TURN_RANGE = 0.8, 1.25
 
-# Factor of the badness if a side seems to roll backwards, or if all turns seem reversed.
-REVERSAL_PENALTY = 4.0
+REVERSAL_PENALTY = 4.0  # of the badness if a side or all turns seem reversed
 
-# Added to `unexplained`, because smaller differences are only noise of the positions.
-UNEXPLAINED_OFFSET = 1e-3
+UNEXPLAINED_OFFSET = 1e-3  # smaller differences are only noise of the positions
 
-# A refinement that changes the turn by more is discarded.
-MAX_REFINEMENT = 1.3
+MAX_REFINEMENT = 1.3  # of the turn; a larger change is discarded
 
 SEARCH_STEP_S = 0.1  # time step for integrating paths in `search`
 
@@ -290,8 +278,7 @@ class StartingPoint(Struct, frozen=True):
     """Parameters from which a fit to positions can start."""
 
     parameters: Floats
-    # Fraction of the positions' variance that the path from the wheels does not explain.
-    unexplained: float
+    unexplained: float  # fraction of the positions' variance
 
 
 # The search tries tracks from a tenth to thirty times the configured one. It also tries reversed
@@ -386,7 +373,7 @@ def _tried(
     for segment in subset:
         along = np.interp(segment.t - delay_s, steps[segment.run].t, paths[segment.run])
         centred, centred_path = segment.place - segment.place.mean(), along - along.mean()
-        # Each path is rotated so that it fits best, but all paths share one scale.
+        # Each path is rotated to fit best, but all paths share one scale.
         cross += abs(complex(np.vdot(centred_path, centred)))
         size += float(np.sum(np.abs(centred_path) ** 2))
         squares += float(np.sum(np.abs(centred) ** 2))

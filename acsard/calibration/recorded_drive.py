@@ -14,8 +14,7 @@ from acsard.recording.export import calibration_csv
 from acsard.recording.file import Recording
 from acsard.recording.mcap_records import MAGIC
 
-# Maximum size of a log, bytes. The file is read into memory.
-MAX_FILE_BYTES = 1 << 30
+MAX_FILE_BYTES = 1 << 30  # the file is read into memory
 
 
 def calibrated(log: Path, config: Config, tape: Tape | None) -> Calibration:

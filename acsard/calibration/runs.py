@@ -25,24 +25,21 @@ Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
 Number = TypeVar("Number", np.float64, np.complex128)
 
-# If the times in a log jump back by more than this time, the recording may have restarted.
-MIN_BACKWARD_STEP_S = 1.0
+MIN_BACKWARD_STEP_S = 1.0  # if the times jump back by more, the recording may have restarted
 
-# With more jumps back, the log is one recording whose rows are not sorted by time.
-MAX_RESTARTS = 100
+MAX_RESTARTS = 100  # with more jumps back, the rows of one recording are unsorted
 
-# With a longer median period of the wheels, the times are probably not in seconds.
-MAX_PERIOD_S = 0.7
+MAX_PERIOD_S = 0.7  # median of the wheels; with a longer one, the times are probably not in s
 
-MIN_ROWS = 20  # minimum number of wheel samples in a run
+MIN_ROWS = 20  # wheel samples in a run
 
-NEW_RUN_AFTER_S = 60.0  # time without a wheel sample, after which a new run begins
+NEW_RUN_AFTER_S = 60.0  # without a wheel sample
 
 # Times are rounded if they are `ROUNDED_S` apart and `REPEATED` rows have the same time on average.
 ROUNDED_S, REPEATED = 0.2, 4.0
 
-# The logger repeats values if, while the wheels roll at `ROLLING` rad/s (sum of both sides), this
-# fraction of the rows has the value of the row before. Such rows are removed.
+# Rows with the values of the row before are removed if they are this fraction of those in which the
+# wheels roll at `ROLLING` rad/s (sum of both sides).
 ROLLING, MAX_REPEATED_FRACTION = 0.2, 0.4
 
 WHEEL_STREAM = "left right"
@@ -50,37 +47,29 @@ COMMANDS = " ".join(APPLIED)
 # Names of the sensors, which are their columns. The commands count as a sensor.
 SENSOR_NAMES = (WHEEL_STREAM, "yaw_rate", "yaw", "x y", COMMANDS)
 
-# The times and the values of each sensor, by the name of the sensor in `SENSOR_NAMES`.
-Streams = dict[str, tuple[Floats, ...]]
+Streams = dict[str, tuple[Floats, ...]]  # times and values, by `SENSOR_NAMES`
 
-# Maximum number of different values in the column `run`. A log with more values is refused.
-MAX_RUNS = 1000
+MAX_RUNS = 1000  # values in the column `run`
 
-SUMMED_ROWS = 50  # number of rows over which wheel speeds are summed before two wheels are compared
+SUMMED_ROWS = 50  # over which wheel speeds are summed before two wheels are compared
 
-# Difference between front and rear wheel as a fraction of the distance: the first is reported, a
-# log with the second is refused.
+# Difference of front and rear wheel as a fraction of the distance: reported, refused.
 REPORTED_DIFFERENCE, MAX_DIFFERENCE = 0.15, 0.8
 
 # A gap is longer than `GAP_S` and than `GAP_PERIODS` median intervals.
 GAP_S, GAP_PERIODS = 0.3, 5.0
 
-STANDSTILL_SPEED = 0.02  # largest speed at which a wheel is considered to stand still, rad/s
+STANDSTILL_SPEED = 0.02  # rad/s, up to which a wheel stands still
 
-# Number of blocks into which a log is divided, unless the blocks would be too short or too long.
-BLOCK_COUNT = 16
+BLOCK_COUNT = 16  # of a log, unless the blocks would be too short or too long
 
-# Maximum length of a block, unless the caller of `blocks()` asks for longer blocks.
-MAX_BLOCK_S = 12.0
+MAX_BLOCK_S = 12.0  # unless the caller of `blocks()` asks for longer ones
 
-# Smooths the speeds of a coarse encoder, some of which are 0 and some far too large.
-SMOOTH_S = 0.3
+SMOOTH_S = 0.3  # for coarse encoders, of whose speeds some are 0 and some far too large
 
-# Blocks in which neither side rolls this angle, rad, are left out.
-MIN_BLOCK_ROLL = 0.2
+MIN_BLOCK_ROLL = 0.2  # rad, of at least one side
 
-# If the delay from stamp to arrival varies by more, the stamps are not used.
-MAX_JITTER_S = 5.0
+MAX_JITTER_S = 5.0  # of the delay from stamp to arrival; above it, the stamps are not used
 
 
 class Run(Struct, frozen=True, dict=True):
@@ -94,8 +83,7 @@ class Run(Struct, frozen=True, dict=True):
     gyro_t: Floats
     gyro: Floats  # yaw rate, rad/s
     yaw_t: Floats
-    # Yaw as recorded, rad. It may be wrapped.
-    yaw: Floats
+    yaw: Floats  # as recorded, rad; it may be wrapped
     place_t: Floats
     place: Complexes  # positions x + iy, m, relative to the first position
     commands_t: Floats
@@ -262,8 +250,7 @@ def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
 
 
 def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
-    # The times of rows without wheel speeds may jump back within a drive, because a file may list
-    # all rows of one sensor after all rows of another.
+    # A file may list all rows of one sensor after all rows of another.
     wheels = _wheel_rows(rows, columns)
     back = np.flatnonzero(np.diff(t[wheels]) < -MIN_BACKWARD_STEP_S) + 1
     if not 0 < len(back) <= MAX_RESTARTS:
@@ -301,7 +288,7 @@ def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floa
 
 
 def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
-    # Without this split, one row with a time of another day would make the drive many hours long.
+    # A row with a time of another day would make the drive many hours long.
     times = np.sort(t[_wheel_rows(rows, columns)])
     ends = np.flatnonzero(np.diff(times) > NEW_RUN_AFTER_S)
     if not len(ends):
@@ -347,8 +334,7 @@ def _remove_repeats(drives: Iterable[tuple[str, Streams]], notes: Notes) -> None
             rolling,
         )
         for streams, again, _ in repeats:
-            # Remove the repetitions at rest as well, because a repeated value may be older than the
-            # time of its row.
+            # At rest too: a repeated value may be older than the time of its row.
             streams[what] = tuple(column[~again] for column in streams[what])
 
 
@@ -390,8 +376,8 @@ class Block(Struct, frozen=True):
     """A few seconds of a run. To compute uncertainties, the fit leaves out one block at a time."""
 
     run: int
-    begin: float  # start of the block, s since the start of the run
-    end: float  # end of the block, s since the start of the run
+    begin: float  # s since the start of the run
+    end: float
 
 
 def gaps(t: Floats) -> Floats:

@@ -59,9 +59,8 @@ class DriveTotals(Struct, frozen=True):
     runs: int
     seconds: float
     metres: float
-    # Total turning of the robot to the left and to the right, as a number of turns of 360 deg.
-    turns: float
-    fastest: RadPerS  # turn rate below which the robot turned 95 % of its total turned angle
+    turns: float  # to the left and to the right, of 360 deg
+    fastest: RadPerS  # below which the robot turned 95 % of its total turned angle
 
     @classmethod
     def of(
@@ -80,29 +79,22 @@ class DriveTotals(Struct, frozen=True):
 class Calibration(Struct, frozen=True):
     """The result of a calibration. Each standard deviation has the unit of its quantity."""
 
-    # What the wheels were compared with, such as "yaw_rate and positions" or "a tape".
-    reference: str
+    reference: str  # what the wheels were compared with: "yaw_rate and positions", "a tape"
     drives: DriveTotals
     configured: Multipliers
-    multipliers: Multipliers  # new multipliers of the wheel separation and of the two wheel radii
-    # What shows the size of the wheels: "positions", "distance", "positions and distance" or "".
-    scale: str
+    multipliers: Multipliers
+    scale: str  # shown by "positions", "distance", "positions and distance" or ""
     growth: float  # fraction by which the effective track grows with each rad/s of turn rate
     growth_std: float
     improvement: Improvement
-    # Delay of each sensor's recorded times relative to those of the wheels, s, by sensor name.
-    delays: dict[str, float]
-    gyro_bias: RadPerS  # gyro bias; 0 without a gyro
+    delays: dict[str, float]  # of recorded times after those of the wheels, s, by sensor
+    gyro_bias: RadPerS  # 0 without a gyro
     notes: tuple[str, ...]
-    # New values by the name of the setting; noise only if `LogNoise.better`.
-    odometry: dict[str, float]
-    # Names of the settings (`plausibility.TRACK`, `plausibility.RATIO`) that keep their values.
-    stays_configured: tuple[str, ...] = ()
-    # New values of [feedback] by the name of the setting; empty if the present ones cause no false
-    # wheel fault, or if no better ones were found.
+    odometry: dict[str, float]  # new values by setting; noise only if `LogNoise.better`
+    stays_configured: tuple[str, ...] = ()  # `plausibility.TRACK`, `plausibility.RATIO`
+    # New values by setting; empty if the present ones cause no false wheel fault, or none is better.
     feedback: dict[str, float] = {}
-    # Noise of the odometry that this log shows; None if the log does not show it.
-    noise: LogNoise | None = None
+    noise: LogNoise | None = None  # that this log shows
 
 
 def calibrate(
@@ -128,16 +120,13 @@ class Prepared(Struct, frozen=True):
     """A log that was divided into blocks of one length, and all other inputs of the fit."""
 
     runs: Sequence[Run]
-    # Headings that a sensor measured, or None if the log has no heading sensor.
-    headings: Headings | None
+    headings: Headings | None  # None if the log has no heading sensor
     base: Base
-    parts: list[Block]  # blocks into which the runs were divided
-    # In intervals of about 1 s. A gyro is corrected for its bias, unless this is unknown.
-    rows: Rows
+    parts: list[Block]  # of all runs
+    rows: Rows  # a gyro is corrected for its bias, unless this is unknown
     segments: list[Segment]  # measured positions; empty if the log has no positions
-    steps: list[WheelSteps]  # rolling of the wheels in each run; empty if the log has no positions
-    # One function for each sensor, which returns the sensor's `Evidence` for given parameters.
-    sources: list[Source]
+    steps: list[WheelSteps]  # rolling in each run; empty if the log has no positions
+    sources: list[Source]  # one for each sensor
     start: Floats  # parameters from which the fit starts, shape (PARAMETER_COUNT,)
 
 
@@ -213,15 +202,13 @@ class Candidate(Struct, frozen=True):
 
     made: Prepared
     fitted: Fit
-    covariance: Floats  # covariance of the parameters, shape (PARAMETER_COUNT, PARAMETER_COUNT)
-    # The motion in intervals of about a second, with the gyro corrected for its bias and scale.
-    rows: Rows
+    covariance: Floats  # of the parameters, shape (PARAMETER_COUNT, PARAMETER_COUNT)
+    rows: Rows  # with the gyro corrected for its bias and scale
     rate: Rates
-    gyro_bias: RadPerS  # gyro bias; 0 without a gyro
+    gyro_bias: RadPerS  # 0 without a gyro
     result: Multipliers
     improvement: Improvement
-    # Relative deviation in this log of each quantity that stays as configured; inf if unknown.
-    stays_configured: dict[str, float]
+    stays_configured: dict[str, float]  # relative deviation of the quantity; inf if unknown
 
 
 def _calibrated(
@@ -367,8 +354,7 @@ def _calibration(
     delays = {headings.source: headings.delay} if headings is not None else {}
     if made.segments:
         delays["positions"] = float(fitted.parameters[Parameter.DELAY])
-    # Without an improvement, `stays_configured` has both quantities, and no sensor has measured the
-    # scale.
+    # Without an improvement, `stays_configured` has both quantities, and nothing shows the scale.
     measured = bool(made.segments) and len(best.stays_configured) < 2
     scale, notes = ["positions"] if measured else [], list(log.notes)
     if tape is not None:

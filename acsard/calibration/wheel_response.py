@@ -24,30 +24,25 @@ from acsard.core.motion.wheel_faults import MIN_COMMANDED_SPEED
 from acsard.core.motion.wheel_witness import MIN_FAULT_SPEED, Expected, Witness
 from acsard.core.values import RadPerS, Seconds, Twist
 
-# Response times that are tried. They cover the range of `feedback.response_time`.
-RESPONSE_TIMES_S = np.geomspace(0.01, 5.0, 60)
+RESPONSE_TIMES_S = np.geomspace(0.01, 5.0, 60)  # the range of `feedback.response_time`
 
-# Minimum and maximum number of wheel samples.
+# Numbers of wheel samples.
 LEAST_ROWS, MOST_ROWS = 200, 30_000
 
-# Largest fraction of the sum of squared wheel speeds that the model may leave unexplained.
-MAX_UNEXPLAINED = 0.5
+MAX_UNEXPLAINED = 0.5  # fraction of the sum of squared wheel speeds
 
-# Longest time for which a healthy wheel may look faulty with the proposed response time.
-MAX_FAULTY_FRACTION = 0.5
+MAX_FAULTY_FRACTION = 0.5  # of a fault time, in which a healthy wheel may look faulty
 
 # Limits that show that a wheel turns as fast as it can.
 STEADY_S, REACHED, CONSTANT = 1.0, 0.9, 0.03
 
-# If the fitted and the configured response time differ by at most this factor, they agree.
-AGREEMENT_FACTOR = 1.5
+AGREEMENT_FACTOR = 1.5  # up to which the fitted and the configured response time agree
 
 
 class Commanded(NamedTuple):
     """The wheel speeds of a run, with the commands that applied to them."""
 
-    # Interval before each sample of the wheel speeds, s.
-    steps: Floats
+    steps: Floats  # s before each sample of the wheel speeds
     wanted: Floats  # commanded speeds (left, right), rad/s, shape (samples, 2)
     actual: Floats  # measured speeds (left, right), rad/s, shape (samples, 2)
 
@@ -56,12 +51,10 @@ class WheelResponse(Struct, frozen=True):
     """The response of the wheels to their commands in a log."""
 
     seconds: Seconds  # response time that fits the log best
-    # Response time to configure; None if the tool proposes no change.
-    proposed: Seconds | None
-    present: Seconds  # configured response time
-    # Whether the daemon would report a fault in this log with the configured response time.
-    false_fault: bool
-    fastest: RadPerS  # highest speed that the wheels reach; infinity if the log shows no such limit
+    proposed: Seconds | None  # to configure; None if the tool proposes no change
+    present: Seconds  # configured
+    false_fault: bool  # the daemon would report one in this log with the configured time
+    fastest: RadPerS  # highest speed of the wheels; infinity if the log shows no such limit
 
     def settings(self) -> dict[str, float]:
         """Return the new values for settings of `[feedback]`; empty if none must change."""

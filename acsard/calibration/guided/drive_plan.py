@@ -67,17 +67,13 @@ class Slant(Struct, frozen=True):
     """The robot's turn, from the distances of two points of the robot to a line on the floor."""
 
     quantity: Literal["turned", "angle"]
-    # Answer: distance of the point that a turn to the left moves towards the line.
-    near: str
-    # Answer: distance of the point that a turn to the left moves away from the line.
-    far: str
-    # Answer before the first leg: distance between the two points.
-    apart: str
+    near: str  # answer: distance of the point that a turn to the left moves towards the line
+    far: str  # the same of the point that it moves away
+    apart: str  # answer before the first leg: distance between the two points
     # Earlier leg after which the start angle was measured; "" if the robot started parallel.
     since: str = ""
     plus: Rad = 0.0  # whole turns to add, because the distances to the line do not show them
-    # Legs whose total motion was measured; () means the leg just driven.
-    over: tuple[str, ...] = ()
+    over: tuple[str, ...] = ()  # legs whose total motion was measured; () is the last one
 
 
 Measure = Distance | Slant
@@ -87,12 +83,11 @@ class Leg(Struct, frozen=True):
     """A series of moves that a person starts with Enter and can stop at any time with any key."""
 
     name: str
-    words: str  # text that tells the person, before the leg, what to do and how the robot will move
+    words: str  # tells the person what to do and how the robot will move
     moves: tuple[Move, ...]
     asks: tuple[NumberQuestion, ...] = ()  # questions that the person answers after the moves
     measures: tuple[Measure, ...] = ()
-    # The person ends the last move with a key; its duration is a timeout.
-    by_key: bool = False
+    by_key: bool = False  # the person ends the last move; its duration is a timeout
 
     @property
     def seconds(self) -> float:
@@ -101,15 +96,11 @@ class Leg(Struct, frozen=True):
 
 FLOOR_M = 3.0  # side length of the square floor that must be free
 
-# Speed straight ahead in a guided drive, m/s, unless the robot's limits are lower.
-USUAL_SPEED = 0.3
+USUAL_SPEED = 0.3  # m/s straight ahead, unless the robot's limits are lower
 
-# Largest rolling speed of the wheels while the robot turns in a guided drive, m/s.
-MAX_ROLLING_SPEED = 0.5
+MAX_ROLLING_SPEED = 0.5  # of the wheels while the robot turns, m/s
 
-# Assumed distance from the robot's middle to its outermost point, as a multiple of the wheel
-# separation.
-REACH_RATIO = 0.75
+REACH_RATIO = 0.75  # assumed distance from middle to outermost point / wheel separation
 
 EDGE_MARGIN_M = 0.1  # distance to keep between the robot and the edge of the floor
 
@@ -120,8 +111,7 @@ LEAST_SPEED, LEAST_TURN = 0.05, 0.2
 
 STOP_DISTANCE_M = 0.1  # distance that the robot may still roll after a leg has ended
 
-# Ratio of effective track to wheel separation; the smallest is 1.
-MAX_TRACK_RATIO = 2.5
+MAX_TRACK_RATIO = 2.5  # of effective track to wheel separation; the smallest is 1
 
 
 class Setup(Struct, frozen=True):
@@ -201,8 +191,7 @@ class Method(Struct, frozen=True):
 
     legs: Legs
     asks: tuple[NumberQuestion, ...] = ()  # questions that the person answers before the first leg
-    # Whether a person measures the motion by tape; otherwise a sensor measures it.
-    by_tape: bool = False
+    by_tape: bool = False  # a person measures the motion; otherwise a sensor does
 
     def longest_s(self, setup: Setup) -> float:
         """Return the driving time of all legs for the least favorable of `TRACK_RATIOS`, s."""

@@ -20,21 +20,17 @@ from acsard.core.messages.schema import Info
 from acsard.host.errors import NoAnswerError, UsageError
 from acsard.terminal.prompt import Prompt
 
-# Key of the true pose, without the robot's id. Only the built-in simulator publishes it.
-TRUE_POSE = "sim/pose"
+TRUE_POSE = "sim/pose"  # only the built-in simulator publishes this key
 
 
 class DriveOptions(Struct, frozen=True):
     """The options of a guided drive. None means that the user chose nothing."""
 
-    method: str | None = None  # name of the method, as in `METHODS`
-    # Zenoh key of the robot's positions, with or without the robot's id.
-    positions: str | None = None
-    # Endpoint at which the positions are published; None means the daemon's endpoint.
-    positions_at: str | None = None
-    imu: str | None = None  # zenoh key of the gyro, with or without the robot's id
-    # Start every leg without a person. Only the built-in simulator permits this.
-    without_person: bool = False
+    method: str | None = None  # as in `METHODS`
+    positions: str | None = None  # key of the robot's positions, with or without its id
+    positions_at: str | None = None  # their endpoint; None means the daemon's
+    imu: str | None = None  # key of the gyro, with or without the robot's id
+    without_person: bool = False  # only the built-in simulator permits this
 
 
 def guided_drive(

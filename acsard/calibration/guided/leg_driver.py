@@ -25,21 +25,16 @@ STALL_REASON = (
     "on it"
 )
 
-# Time that the robot may take to follow a changed command, including the ramp. The path of the
-# wheels may lag behind the commanded path by this time.
-RESPONSE_TIMEOUT_S = 1.5
+RESPONSE_TIMEOUT_S = 1.5  # until the robot follows a changed command, including the ramp
 
-# Time for which the daemon may not follow the commands, or may report no wheel speeds, before the
-# leg is halted.
-DEVIATION_TIMEOUT_S = 1.0
+DEVIATION_TIMEOUT_S = 1.0  # until the leg is halted if the daemon does not follow or report
 
 PATH_OFF_M, PATH_OFF_RAD = 0.1, 0.15
 # The rolled path may differ from the commanded one by these, plus `SAME_SHARE` of the same motion
 # and `OTHER_SHARE` of the other one. With more, the robot could leave the free floor.
 SAME_SHARE, OTHER_SHARE = 0.05, 0.03
 
-# Longest time between two samples of the wheel speeds, over which the path is continued.
-MAX_SAMPLE_GAP_S = 2.0
+MAX_SAMPLE_GAP_S = 2.0  # between two samples of the wheel speeds, to continue the path
 
 # A leg is done when the wheels stand still for `STANDING_S`, and halted after `STANDS_S`.
 STANDING_S, STANDS_S = 0.5, 6.0
@@ -69,13 +64,11 @@ class CommandedPath:
         self._ramps = Limiter(limits, self._kinematics)
         self._lever = drive.wheel_separation * drive.wheel_separation_multiplier / 2.0
         self._stepped = now
-        # Stamp of the last sample, s, and its twist.
-        self._sampled: tuple[float, Twist] | None = None
-        # Commanded metres and radians, without their signs.
-        self._lengths = [0.0, 0.0]
+        self._sampled: tuple[float, Twist] | None = None  # stamp of the last sample, s, and twist
+        self._lengths = [0.0, 0.0]  # commanded metres and radians, without their signs
         # Commanded and rolled distance, m (forward is +), and turn, rad (left is +).
         self._commanded, self._rolled = (0.0, 0.0), (0.0, 0.0)
-        # The values of `_commanded` in the last `RESPONSE_TIMEOUT_S`, each with its time, s.
+        # With the time of each, s, in the last `RESPONSE_TIMEOUT_S`.
         self._recent: deque[tuple[float, tuple[float, float]]] = deque([(now, self._commanded)])
 
     def command(self, twist: Twist, now: float) -> None:
@@ -135,17 +128,13 @@ class LegDriver:
         self._leg, self._source, self._sender = leg, source, sender
         self._path = CommandedPath(config.drive, config.limits, now)
         self.phase = Phase.OPENING
-        self.halted = ""  # the reason why the leg ended early; "" if it did not end early
-        # The reason in `halted` is temporary, so the leg can be repeated.
-        self.disturbed = False
-        # No messages arrived from the daemon. If they do again, the leg can be repeated.
-        self.silent = False
+        self.halted = ""  # the reason why the leg ended early
+        self.disturbed = False  # the reason is temporary, so the leg can be repeated
+        self.silent = False  # no messages arrived; if they do again, the leg can be repeated
         self._begun = self._received = self._stepped = now
         self._number, self._ends = -1, now
         self._command = REST
-        # The reason why the daemon does not accept the commands yet; "" if it accepts them.
-        self._waits = "no message with the daemon's state has arrived"
-        # Reason to halt the leg if this computer is so busy that the daemon receives no commands.
+        self._waits = "no message with the daemon's state has arrived"  # "" if it accepts commands
         self._starved = f"the daemon has received no command of source {source} for {OPENING_S:g} s"
         self._still_since: float | None = None
         self._deviates_since: float | None = None
@@ -172,8 +161,8 @@ class LegDriver:
         if self.phase is Phase.OPENING and pressed in "\r\n":
             return
         if self.phase is Phase.MOVING and now - self._stepped > MAX_STATE_AGE_S / 2:
-            # This process was paused, and the robot stopped during the pause. The person may have
-            # pressed a key only because the robot stopped.
+            # The person may have pressed a key only because the robot stopped in a pause of this
+            # process.
             self._halt(STALL_REASON)
         last = self._number == len(self._leg.moves) - 1
         if self.phase is Phase.MOVING and self._leg.by_key and last:
@@ -217,10 +206,9 @@ class LegDriver:
         """Return the command to send now."""
         held_up, self._stepped = now - self._stepped, now
         self._path.command(self._command, now)
-        # If this process was paused, the robot has braked, and the time of the move may be over.
-        # The next move would then begin at the wrong place. The pause also hides whether the daemon
-        # was silent. If the pause came before the first move, the person who started the leg may
-        # have left in the meantime.
+        # If this process was paused, the robot has braked, and the next move would begin at the
+        # wrong place. The pause also hides whether the daemon was silent, and the person who
+        # started the leg may have left.
         if held_up > MAX_STATE_AGE_S / 2 and self.phase in (Phase.OPENING, Phase.MOVING):
             self._halt(STALL_REASON, disturbed=True)
         elif now - self._received > MAX_STATE_AGE_S:
@@ -258,8 +246,7 @@ class LegDriver:
             return
         move = self._leg.moves[self._number]
         self._command = Twist(move.linear, move.angular)
-        # Add the duration to the planned end of the previous move, not to `now`. A late step then
-        # does not lengthen the drive.
+        # Not to `now`: a late step then does not lengthen the drive.
         self._ends += move.seconds
 
     def _settle(self, now: float) -> None:
@@ -276,8 +263,7 @@ class LegDriver:
             )
 
     def _tolerate_briefly(self, why: str, now: float, *, disturbed: bool) -> None:
-        # A short deviation is harmless. If this computer is busy for a moment, it sends commands
-        # late, and the robot only slows down.
+        # If this computer is busy for a moment, the robot only slows down.
         if not why:
             self._deviates_since = None
         elif self._deviates_since is None:

@@ -17,20 +17,17 @@ from acsard.calibration.guided.drive_plan import (
 from acsard.calibration.multipliers import MIN_TAPE_M
 from acsard.terminal.prompt import NumberQuestion
 
-# Covers the errors at both ends of the tape.
-STRAIGHT_LEG_STD_M = 0.005
+STRAIGHT_LEG_STD_M = 0.005  # of both ends of the tape
 
 FIRST_TURN_RATE = 1.2  # turn rate of the first turn in place, rad/s, if the robot does not skid
 
-# Multiple of the time that the robot with the largest effective track needs.
-FIRST_TURN_TIMEOUT_FACTOR = 1.1
+FIRST_TURN_TIMEOUT_FACTOR = 1.1  # of the time of the robot with the largest effective track
 
 MAX_SPIN_S = 24.0  # longest total time of the full turns in place in one leg
 
 SETTLE = Move(1.0)  # pause between moves, in which the robot comes to rest and stops shaking
 
-# Name of the leg in which the robot turns once in place, until the person presses a key.
-ROUND_LEG = "once round"
+ROUND_LEG = "once round"  # one turn in place, until the person presses a key
 
 FROM_MARK = NumberQuestion(
     "How far is the marked wheel from its mark now, in a straight line?",
@@ -127,13 +124,12 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
 
 
 # The methods "gyro" and "positions". Each drive goes there and back, so the robot stays on the
-# floor although its effective track is unknown.
+# floor.
 
 # Turn rates of fast turns, slow turns and curves, rad/s, if the robot does not skid.
 FAST, SLOW, CURVE = 1.5, 0.75, 0.8
 
-# Duration of a turn in place in "gyro", longest length of a curve, and angle of a turn in place in
-# "positions" without skidding.
+# Of a turn in place in "gyro", of a curve, and of a turn in place in "positions", without skidding.
 SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
 
 # Turn rates of a turn in place, and of a curve there and back; 0 is straight.
@@ -142,8 +138,7 @@ POSITION_MOVES = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (
 # The first two are long enough to measure the bias of a gyro.
 STANDING, PAUSE, SHORT = Move(2.5), Move(1.4), Move(0.7)
 
-# Name of the leg straight ahead. In the method "gyro", a person may measure its length by tape.
-STRAIGHT_LEG = "straight"
+STRAIGHT_LEG = "straight"  # in the method "gyro", a person may measure its length by tape
 
 
 def _straight(setup: Setup, asks: tuple[NumberQuestion, ...] = ()) -> Leg:

@@ -34,19 +34,16 @@ from acsard.terminal.prompt import Prompt
 
 SOURCE = "app"
 
-# A key takes effect within this time.
-POLL_PERIOD_S = 0.005
+POLL_PERIOD_S = 0.005  # a key takes effect within this time
 
 DISPLAY_PERIOD_S = 0.2  # interval between updates of the progress display of a leg
 
-# If a silent daemon sends its state again within this time, the leg is repeated.
-RECONNECT_TIMEOUT_S = 3.0
+RECONNECT_TIMEOUT_S = 3.0  # if a silent daemon returns within this time, the leg is repeated
 
 # CDR does not name its type. A pose is too short to be decoded as `Odometry`.
 POSITION_TYPES = (Odometry, PoseStamped)
 
-# Function that processes a message. Its second argument is the time of arrival, s.
-Take = Callable[[Any, float], object]
+Take = Callable[[Any, float], object]  # processes a message and its time of arrival, s
 
 
 class Sensor:
@@ -99,7 +96,7 @@ class Sensor:
         )
 
 
-# Columns of a log that each kind of recorded message fills.
+# By the kind of recorded message.
 COLUMNS_BY_STREAM = {
     "wheels": FOUR, "gyro": ("yaw_rate",), "places": ("x", "y"), "commands": APPLIED,
 }  # fmt: skip
@@ -108,10 +105,9 @@ COLUMNS_BY_STREAM = {
 class Sample(Struct, frozen=True):
     """The values of one message, with its time of arrival and its stamp."""
 
-    arrival: Seconds  # time of arrival on this computer's clock
-    stamp: Seconds | None  # stamp of the sender's clock; None if the message has no stamp
-    # Values of the columns that `COLUMNS_BY_STREAM` lists for this kind of message.
-    values: tuple[float, ...]
+    arrival: Seconds  # on this computer's clock
+    stamp: Seconds | None  # by the sender's clock
+    values: tuple[float, ...]  # of the columns in `COLUMNS_BY_STREAM`
 
 
 class LegRecorder:

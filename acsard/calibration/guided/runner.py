@@ -28,10 +28,9 @@ from acsard.calibration.solve import Calibration, calibrate
 from acsard.calibration.wheel_response import response
 from acsard.terminal.prompt import NumberQuestion, Prompt
 
-MAX_REPEATS = 2  # maximum number of times that a disturbed leg is repeated on a real robot
+MAX_REPEATS = 2  # of a disturbed leg on a real robot
 
-# No person has to put the simulated robot back.
-MAX_SIMULATED_REPEATS = 20
+MAX_SIMULATED_REPEATS = 20  # no person has to put the simulated robot back
 
 
 def begins_again(legs: Sequence[Leg], number: int, *, sensor: bool) -> int:
@@ -70,8 +69,7 @@ def guide(
     rides: dict[str, Run] = {}
     answers: Answers = {}
     readings: dict[str, list[Reading]] = {}
-    # The legs are computed again after each leg, because a measurement may have changed `track`.
-    # The legs that depend on the effective track come after the measurement that shows it.
+    # The legs that depend on the track come after the measurement that shows it.
     track, number = 1.0, 0
     repeats: dict[str, int] = {}
     most = MAX_SIMULATED_REPEATS if simulated else MAX_REPEATS

@@ -51,23 +51,18 @@ from acsard.core.config.settings import DriveConfig, OdometryConfig
 # After 1 m, rad; it grows with the square root of the rolled distance.
 SKID_HEADING_STD = 0.015
 
-# Standard deviation of a distance due to skidding, as a fraction of the distance.
-SKID_LENGTH_STD = 0.002
+SKID_LENGTH_STD = 0.002  # of a distance, relative
 
-# Prior standard deviation of the mean wheel radius, as a fraction of the wheel radius.
-PRIOR_RADIUS_STD = 1.0
+PRIOR_RADIUS_STD = 1.0  # of the mean wheel radius, relative
 
-# Weight of the assumed noise against the noise that the scatter of the readings shows.
-PRIOR_DEGREES_OF_FREEDOM = 4.0
+PRIOR_DEGREES_OF_FREEDOM = 4.0  # weight of the assumed noise against the scatter of the readings
 
 MAX_STEPS = 50
-CONVERGED = 1e-9  # largest change of a parameter in the last step of a fit that has converged
+CONVERGED = 1e-9  # largest change of a parameter in the last step of a fit
 
-# Largest condition number of normal equations from which the parameters can be computed.
-MAX_CONDITION = 1e8
+MAX_CONDITION = 1e8  # of normal equations from which the parameters can be computed
 
-# For the `turned` reading from which the first estimate of the track is computed.
-MAX_STARTING_STD = 0.2
+MAX_STARTING_STD = 0.2  # of the `turned` reading that gives the first estimate of the track
 
 
 class Reading(Struct, frozen=True, dict=True):
@@ -92,9 +87,8 @@ class Predicted(Struct, frozen=True):
     """A prediction of a reading, computed from the angles by which the wheels rolled."""
 
     value: float
-    # Derivatives of `value` with respect to the parameters, shape (PARAMETER_COUNT,).
-    derivatives: Floats
-    variance: float  # variance of `value` due to skidding, rad2 or m2
+    derivatives: Floats  # of `value` by the parameters, shape (PARAMETER_COUNT,)
+    variance: float  # of `value` due to skidding, rad2 or m2
 
 
 class TapeFit(Struct, frozen=True):
@@ -102,9 +96,8 @@ class TapeFit(Struct, frozen=True):
 
     parameters: Floats
     covariance: Floats
-    residuals: Floats  # measured value minus predicted value of each reading, rad or m
-    # With parameters that were fitted to all other readings; NaN if that fit fails.
-    held_out: Floats
+    residuals: Floats  # measured minus predicted value of each reading, rad or m
+    held_out: Floats  # the same with a fit to all other readings; NaN if that fit fails
 
 
 def joined(rides: Sequence[Run]) -> WheelSteps:
@@ -146,8 +139,7 @@ def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
     in_range(np.array([1 / inverse, left, right]))
     compared = [(residual, weight) for _, residual, weight in _compared(readings, base, parameters)]
     residuals, weights = np.array(compared).T
-    # Combine the scatter of these readings with the assumed noise. If there are few readings, the
-    # scatter is uncertain itself, so widen the deviation to that of Student's t.
+    # The scatter of few readings is uncertain itself, so widen the deviation to Student's t.
     free = PRIOR_DEGREES_OF_FREEDOM + max(0.0, len(readings) - len(WHEEL_PARAMETERS) + 1.0)
     scale = (PRIOR_DEGREES_OF_FREEDOM + float(weights @ residuals**2)) / free
     covariance = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT))
@@ -230,8 +222,7 @@ def _held_out_residual(
     return residual
 
 
-# Includes the error of choosing the point on the robot to measure.
-LINE_DISTANCE_STD_M = 0.002
+LINE_DISTANCE_STD_M = 0.002  # includes the choice of the point on the robot
 
 TRACK_RATIO_RANGE = 0.85, 3.0  # range of credible ratios of effective track to wheel separation
 
@@ -253,8 +244,7 @@ def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answe
         return slant(answers[leg, measure.near], answers[leg, measure.far], apart)
 
     turned = angle(leg) - (angle(measure.since) if measure.since else 0.0)
-    # The turn is the difference of two angles, each from two distances. Four errors of
-    # `LINE_DISTANCE_STD_M` combine to twice `LINE_DISTANCE_STD_M`.
+    # The turn is the difference of two angles, each from two distances: four errors.
     return Reading(driven, measure.quantity, measure.plus + turned, 2 * LINE_DISTANCE_STD_M / apart)
 
 
@@ -263,7 +253,7 @@ def track_ratio(reading: Reading, drive: DriveConfig) -> float:
 
     `reading` is one full turn. Raises `GuideError` if the ratio is not credible.
     """
-    # Use the measured radius and separation without the configured multipliers.
+    # Without the configured multipliers.
     base = Base(drive.wheel_radius, drive.wheel_separation, 1.0, 1.0, 1.0)
     by_wheels = predicted(reading.steps, "turned", base, base.start()).value
     track = by_wheels / reading.value
@@ -294,7 +284,7 @@ def slant(near: float, far: float, apart: float) -> float:
     return math.asin(sine)
 
 
-# Largest accepted relative standard deviation of each quantity.
+# Relative standard deviations.
 MAX_TAPE_STDS = {TRACK: 0.1, RATIO: 0.02}
 
 # Above `TURNED` rad, a reading shows an error of turns; below `STRAIGHT`, of straight driving.
@@ -311,8 +301,7 @@ def calibrated(
     base = Base.of(drive)
     rides = list({id(ride): ride for reading in readings for ride in reading.rides}.values())
     fit = fit_readings(readings, base)
-    # The rows are not compared with a gyro, so the blocks only have to be short enough to show the
-    # turn rates.
+    # There is no gyro, so the blocks only have to be short enough to show the turn rates.
     rows = heading.rows(None, rides, blocks(rides, 4.0))
     by_wheels = heading.turned(rows, base, fit.parameters)
     rate = rates(rows, by_wheels)
