@@ -92,7 +92,7 @@ class Calibration(Struct, frozen=True):
     notes: tuple[str, ...]
     odometry: dict[str, float]  # new values by setting; noise only if `LogNoise.better`
     stays_configured: tuple[str, ...] = ()  # `plausibility.TRACK`, `plausibility.RATIO`
-    # New values by setting; empty if the present ones cause no false wheel fault, or none is better.
+    # New values by setting; empty if the present ones cause no false wheel fault or none is better.
     feedback: dict[str, float] = {}
     noise: LogNoise | None = None  # that this log shows
 
