@@ -56,8 +56,7 @@ def synced(stream: BinaryIO) -> None:
 
 
 def _replace(part: Path, new: Path) -> None:
-    # No system call replaces a directory that contains files. Therefore an existing directory `new`
-    # first gets another name. It is removed after `part` has been renamed.
+    # No system call replaces a directory with files, so `new` first gets another name.
     if not new.is_dir():
         os.replace(part, new)
         return
@@ -113,8 +112,7 @@ def _require_bag(directory: Path) -> None:
 
 
 def _recording(path: Path) -> Recording | None:
-    # `Recording` reads the complete file, and a ROS bag may be larger than the memory. So check the
-    # beginning of the file first.
+    # A ROS bag may be larger than the memory, so check the beginning of the file first.
     with path.open("rb") as stream:
         begin = stream.read(HEADER_BYTES)
     if not (begin.startswith(MAGIC) and PROFILE in begin):

@@ -44,15 +44,12 @@ from acsard.recording.retention import (
 
 DIRECTORY_MODE = 0o750
 
-# Every user may read the files, but only root can enter the parent directory `PRIVATE_STATE`. The
-# service of the robot's web page reads the files through a read-only mount. Group permissions
-# cannot give this service access: a dynamic group has no name, and systemd 257 makes the user
-# `nobody` the owner of state directories.
-# Modes for a service with a dynamic user: every user who can enter the parent directory may read.
+# Every user may read the files, but only root can enter `PRIVATE_STATE`. The page's service reads
+# them through a read-only mount: its dynamic group has no name to give permissions to, and systemd
+# 257 makes `nobody` the owner of state directories.
 OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
 
-# State of services with a dynamic user; only root can enter it.
-PRIVATE_STATE = Path("/var/lib/private")
+PRIVATE_STATE = Path("/var/lib/private")  # of services with a dynamic user; only root can enter it
 
 KEPT_SUFFIX = ".kept.mcap"
 NEAR_SUFFIX = ".near.mcap"
@@ -61,13 +58,10 @@ PART_SUFFIX = ".mcap.part"
 
 MARKER_SUFFIX = ".left"  # of a marker that the disk, and not a crash, cut off a `.part` file
 
-# The last suffix is the end of every name.
-# End of a finished file's name, by retention class.
+# Ends of the names of finished files, by retention class.
 SUFFIX_OF_KIND: dict[Kind, str] = {"kept": KEPT_SUFFIX, "near": NEAR_SUFFIX, "plain": MCAP_SUFFIX}
 
-# `RecordingDirectory.maintain` is called once a second, so there is a search every ten minutes.
-# More searches are not needed, because a single file may cover an hour.
-TRIM_ROUNDS = 600  # calls of `maintain` between two searches for files that are too old
+TRIM_ROUNDS = 600  # seconds, as calls of `maintain`, between two searches for too old files
 
 S_PER_DAY = 86400
 
@@ -115,8 +109,7 @@ def mark_cut(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
     Otherwise the next start would assume a crash. `kind` is its class when it is finished. Raises
     `OSError`.
     """
-    # The marker is empty and has `kind` and `cut` in its name, because even a full disk usually
-    # accepts a new name.
+    # Even a full disk usually accepts a new name, so the marker is empty.
     part.with_name(f".{part.name}.{kind}.{cut}{MARKER_SUFFIX}").touch()
 
 
@@ -155,13 +148,11 @@ class Run(Struct):
     """State of one run of the daemon, which outlives a `RecordingDirectory` after a disk error."""
 
     numbers: set[int] = field(default_factory=set)  # of files that ended in this run
-    # Class of each file that a disk error cut off in this run, by name. Others without a marker
-    # were cut off by a crash before it.
+    # Class of each file that a disk error cut off, by name. A crash before this run cut off others.
     cut: dict[str, Kind] = field(default_factory=dict)
     freed: int = 0  # bytes deleted for a full disk since the last successful write
     clock: ClockWatch = field(default_factory=ClockWatch)
-    # About deleted recordings; `StepWriter` takes them.
-    events: list[Event] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)  # about deleted files, for `StepWriter`
 
 
 MAX_AGE_DAYS = 14  # of a recording without a stop, a fault, a lost link or a crash
@@ -183,8 +174,7 @@ class RecordingDirectory:
         self._run = run or Run()
         self._rounds = self.file_bytes = 0  # calls of `maintain`; size at which a file should end
         self.messages: list[str] = []  # for the log, about damaged or unfinished files
-        # Wall-clock time of a crash that cut off an earlier run's newest file.
-        self.cut_ns: WallNs | None = None
+        self.cut_ns: WallNs | None = None  # crash that cut off an earlier run's newest file
         here = self._directory.resolve()
         as_service = os.environ.get(RECORD_VARIABLE) == settings.directory
         self._open_to_all = as_service and here.is_relative_to(PRIVATE_STATE)
@@ -192,8 +182,7 @@ class RecordingDirectory:
             self._directory.mkdir(parents=True)
             # The umask may have removed bits of the mode.
             self._directory.chmod(DIRECTORY_MODE)
-        # Other users may not open the lock file, because every process that can open the file can
-        # also lock it.
+        # A process that can open the lock file can lock it.
         self._lock = os.open(self._directory / ".lock", os.O_RDWR | os.O_CREAT, FILE_MODE)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -226,8 +215,7 @@ class RecordingDirectory:
             try:
                 status, marked, disk = part.stat(), _marked(part), self._disk()
             except FileNotFoundError:
-                # Another process has just removed the file.
-                continue
+                continue  # another process has just removed it
             ours = self._run.cut.get(part.name)
             kind, cut = (ours, "disk") if ours else marked or ("kept", "crash")
             whole = part.with_name(stem(part) + SUFFIX_OF_KIND[kind])
@@ -250,8 +238,8 @@ class RecordingDirectory:
             with suppress(FileNotFoundError):
                 before_ns = cut_ns - path.stat().st_mtime_ns
                 earlier = _number(path) < _number(part)
-                # A computer without a battery-backed clock starts with a time in the past. Then all
-                # older files seem to have ended long after the crash. They must not match.
+                # Without a battery-backed clock, older files seem to have ended long after the
+                # crash.
                 if earlier and abs(before_ns) < INCIDENT_MARGIN_NS:
                     self.retain(path)
 

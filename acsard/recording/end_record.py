@@ -51,8 +51,7 @@ class EndRecord(Struct, frozen=True):
     said: str  # `timeline.summary`
     cut: str = ""  # key of `CUT_TEXTS`; "" if the daemon ended normally
     why: str = ""  # of `bug`: the exception, and the number of a failed step
-    # Earliest of any message: before `wall_ns` if the clock was set back.
-    earliest_ns: Ns | None = None
+    earliest_ns: Ns | None = None  # before `wall_ns` if the clock was set back
     serious: bool = False  # `timeline.is_serious`
 
 
@@ -78,8 +77,7 @@ def as_metadata(last: EndRecord) -> dict[str, str]:
 
 def read_end(path: Path) -> EndRecord | None:
     """Return the end record of a file, or None; this reads only its first and last bytes."""
-    # Do not follow the MCAP index or unpack chunks, because a forged file may claim lengths of
-    # gigabytes.
+    # A forged file may claim lengths of gigabytes, so neither follow the index nor unpack chunks.
     try:
         with path.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:

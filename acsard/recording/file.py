@@ -92,7 +92,6 @@ CHANNEL_DESCRIPTIONS: dict[Topic, str] = {
     f"{', '.join(Unfinished.__struct_fields__)}",
 }
 
-# `Recording.ending` without an end record.
 UNFINISHED = "the file has no end: it was cut off, or is still being recorded"
 
 EVENTS_SCHEMA = 1  # MCAP schema of `events`
@@ -368,12 +367,10 @@ class Recording:
                 f"cannot read {path}: {error.strerror}; `acsard recording` lists the recordings"
             ) from None
         self.ended = False  # it has an end record
-        # Damaged places, mostly chunks; not the incomplete end of a file that was cut off.
-        self.damaged = 0
+        self.damaged = 0  # damaged places, without the incomplete end of a cut file
         self.cut = ""  # key of `CUT_TEXTS`; "" for an ordinary end, and without one
         self.why = ""  # of `bug`: the exception, and the number of a failed step
-        # Inputs of the step in which the daemon failed, encoded.
-        self.unfinished: bytes | None = None
+        self.unfinished: bytes | None = None  # inputs of the step in which the daemon failed
         self.about = self._about()
 
     @property
@@ -424,8 +421,7 @@ class Recording:
             # In a damaged chunk, all readable messages precede the damage.
             self.damaged += place.damaged
         if not self.ended and (end := end_in(self._data)) is not None:
-            # The file is finished, but damaged before its end. No complete chunk follows the
-            # damage, so `walk` took the damage for the end of a file that was cut off.
+            # No complete chunk follows the damage, so `walk` took it for the end of a cut file.
             self.ended, self.cut, self.why = True, end.cut, end.why
             self.damaged += 1
 

@@ -109,8 +109,7 @@ def _steps_and_states(
             yield step, saved
 
 
-# A genuine file stays below this limit. Without the limit, the replay of a forged file of 5 kB took
-# 4 s.
+# Without this limit, the replay of a forged file of 5 kB took 4 s.
 STATE_BYTES_PER_FILE_BYTE = 8  # decoded after gaps, plus `MAX_BYTES`
 
 
@@ -152,8 +151,7 @@ class _Source:
         number: int,
         tried: Callable[[Config], Config] | None = None,
     ) -> State | None:
-        # None if it is not usable or of another step. `tried` maps its configuration to the
-        # replay's.
+        # None if it is not usable or of another step.
         if saved is None or saved.number != number:
             return None
         self._state_bytes_left -= len(saved.data)
@@ -260,7 +258,6 @@ class RecordedRun(_Source):
 
 
 def _with_changes(other: Config, recorded: Config, present: Config) -> Config:
-    # `other` with what clients changed from `recorded` to `present`, if all of it is permitted.
     # A robot with the configuration `other` would have refused changes that are not permitted.
     before = dict(flat(effective(recorded)))
     changes = {k: v for k, v in flat(effective(present)) if before.get(k) != v}

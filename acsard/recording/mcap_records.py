@@ -62,8 +62,7 @@ _LONGEST_FRAME_HEAD = 18  # of a zstd frame
 
 _BLOCK_BYTES = 1 << 17  # of a zstd block
 
-# Bytes of work for each zstd block: even an empty one takes as long as 1 KiB.
-_BLOCK_EFFORT = 1 << 10
+_BLOCK_EFFORT = 1 << 10  # bytes of work for each zstd block: even an empty one takes as long
 
 _REPEATED = 1  # type of a zstd block that repeats one byte
 
@@ -187,7 +186,7 @@ def read_chunk(data: bytes, begin: int) -> ReadChunk | None:
                 waiting.clear()
                 whole = ReadChunk(begin, end, messages, last)
     except zstandard.ZstdError:
-        # A block is damaged. The next blocks refer to this block, so they cannot be read either.
+        # The next blocks refer to a damaged one, so they cannot be read either.
         effort += _BLOCK_BYTES
     return whole._replace(effort=effort)
 
@@ -203,8 +202,7 @@ def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
         block = int.from_bytes(data[begin : begin + 3], "little")
         last, kind, size = bool(block & 1), block >> 1 & 3, block >> 3
         end = begin + 3 + (1 if kind == _REPEATED else size)
-        # After a power cut, a file may end with zeros. They would be decoded as endless empty
-        # blocks.
+        # After a power cut, a file may end with zeros, which would be endless empty blocks.
         if not block or size > _BLOCK_BYTES or end > len(data):
             return
         yield end, stream.decompress(data[begin:end]), last
@@ -239,9 +237,8 @@ DAMAGE_ERRORS = (
 
 MAGIC = b"\x89MCAP0\r\n"
 
-# In the test recordings, each byte of a chunk unpacks to 5 to 13 bytes. The limit is larger,
-# because a damaged chunk is read up to three times, and a damaged block counts as 128 KiB.
-# Unpacked bytes of damaged chunks for each byte of the file, plus `MAX_CHUNK_BYTES`.
+# Unpacked bytes of damaged chunks for each byte of the file, plus `MAX_CHUNK_BYTES`. Recordings
+# have 5 to 13; damaged chunks are read up to three times, and a damaged block counts as 128 KiB.
 MAX_EFFORT = 256
 
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, and bytes that follow
@@ -340,10 +337,8 @@ def _is_intact(stream: io.BytesIO, at: int, end: int) -> bool:
 
 
 class _Chunks:
-    # The work for incomplete chunks is limited, because a forged file may have thousands.
-    # In a hostile file thousands of incomplete chunks may share the same blocks, and each chunk
-    # unpacks to megabytes. So the limit on the work is proportional to the file's size, and no part
-    # of the file is searched twice.
+    # In a forged file thousands of incomplete chunks may share the same blocks, each of megabytes.
+    # So the work is proportional to the file's size, and no part is searched twice.
 
     def __init__(self, data: bytes) -> None:
         self._data = data

@@ -90,8 +90,7 @@ class Publisher:
 
     def _line(self, entry: TimelineEntry) -> Published:
         wall_ns = round(entry.seconds * NS_PER_S)
-        # The time of an entry is rounded to a fraction of a us. Use the exact time of the step
-        # instead, so that the log agrees with the stamps of the other messages.
+        # The time of an entry is rounded. That of the step agrees with the other messages.
         if abs(wall_ns - self._now.wall_ns) < MAX_ROUNDING_NS:
             wall_ns = self._now.wall_ns
         line = Log(Time.from_ns(wall_ns), LEVELS[entry.level], entry.name, entry.sentence)

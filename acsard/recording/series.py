@@ -59,8 +59,7 @@ class Search(Struct):
 
     found: list[FoundRecording] = field(default_factory=list)  # the oldest first
     unreadable: list[str] = field(default_factory=list)  # a sentence for each such file
-    # Parts of the range over `MIN_GAP_S` without a recording, s since 1970.
-    gaps: list[tuple[float, float]] = field(default_factory=list)
+    gaps: list[tuple[float, float]] = field(default_factory=list)  # s since 1970, over `MIN_GAP_S`
 
 
 class NothingRecordedError(AcsardError):
@@ -123,7 +122,7 @@ def _gaps(pieces: Sequence[_CoveredRange], first: float, last: float) -> list[tu
 
 
 def _groups(files: Sequence[Path], chosen: dict[int, Contents]) -> list[list[int]]:
-    # Indices in `files` for each recording; `chosen` has files in the range.
+    # `chosen` has files in the range.
     groups: list[list[int]] = []
     for number, contents in sorted(chosen.items()):
         if groups and number - 1 in chosen and _continues(chosen[number - 1], contents):

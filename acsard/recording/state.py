@@ -41,9 +41,8 @@ PICKLE_PROTOCOL = 5  # read by `unpickling.py`
 
 MAX_ERROR_LENGTH = 200  # characters of an error's text
 
-# Without this table, Python 3.11 before 3.11.4, as in Debian 12, would encode a mode as a call of
-# `getattr`, which `unpickling.py` refuses.
-# A mode becomes a call of `Mode`.
+# Python before 3.11.4 would encode a mode as a call of `getattr`, which `unpickling.py` refuses.
+# Here it is a call of `Mode`.
 DISPATCH_TABLE = copyreg.dispatch_table | {
     Mode: lambda mode: (Mode, (mode.value,)),
 }
@@ -150,8 +149,7 @@ def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
 class _Walk:
     # Walks through the three robots of `adopt()` and changes each part of the first once.
     def __init__(self) -> None:
-        # By `id()`; the reference keeps it from being used again.
-        self._visited: dict[int, Any] = {}
+        self._visited: dict[int, Any] = {}  # by `id()`, which the reference keeps valid
 
     def into(self, now: Any, begun: Any, other: Any) -> None:
         if id(now) in self._visited:

@@ -27,16 +27,14 @@ from acsard.recording.recorded_steps import US_PER_S, RecordedStep
 MAX_TIME_S = 2**63 / 1e9  # 292 years, because a time in ns must fit in 64 bits
 
 
-# Least time between entries `reason`, `waits` or `board`: two sources that alternate would fill the
-# timeline.
+# Between entries `reason`, `waits` or `board`: sources that alternate would fill the timeline.
 MIN_REASON_NS = NS_PER_S
 
 MAX_POSE_WAIT_NS = NS_PER_S  # of `continues` for its first pose, which without a link does not come
 
 MIN_CLOCK_CHANGE_NS = 5 * NS_PER_S  # of the wall clock, for an entry `clock`
 
-# Least time for an entry `waits`: two senders may send while an operator changes between them.
-MIN_WAIT_NS = NS_PER_S
+MIN_WAIT_NS = NS_PER_S  # two senders may send while an operator changes between them
 
 MIN_SILENCE_NS = NS_PER_S  # of a waiting sender, after which its time restarts
 
@@ -181,8 +179,7 @@ class WaitingSenders:
     """Makes an entry `waits` when a sender sends speeds, but the robot follows another sender."""
 
     def __init__(self, priorities: Mapping[str, int]) -> None:
-        # of the sources
-        self._priorities = priorities
+        self._priorities = priorities  # of the sources
         self._commander = ""  # "source (sender)" of the last event
         self._waiting: dict[tuple[str, str], _Waiting] = {}  # by source and sender
         self._reported_ns = -MIN_REASON_NS  # last entry
@@ -262,8 +259,7 @@ class TimelineWriter:
         self._since = ""  # note of a drive that began before this recording
         self._now: Instant | None = None
         self._shutting_down = False
-        # First step of a recording that continues another, until the entry.
-        self._continued: RecordedStep | None = None
+        self._continued: RecordedStep | None = None  # first step of one that continues another
         self._losses = LinkLosses()
         self._board = BoardIdentity()
         self._reasons = ReasonChanges()
