@@ -107,7 +107,6 @@ def rolls_enough(rows: Rows, *, spins: bool = False) -> None:
 
 
 def turns_enough(turned: Floats) -> None:
-    """Raise `NoCalibrationError` if the robot hardly turns."""
     if (angle := float(np.abs(turned).sum())) < MIN_TOTAL_TURN:
         raise NoCalibrationError(
             f"the robot turned by {np.degrees(angle):.0f} deg in total, which is too little to "

@@ -63,7 +63,6 @@ class WheelResponse(Struct, frozen=True):
         return {"response_time": self.proposed}
 
     def sentences(self) -> list[str]:
-        """Return one or two sentences for the report."""
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
         if self.false_fault:
             then = (

@@ -50,7 +50,6 @@ def replacing(
 
 
 def synced(stream: BinaryIO) -> None:
-    """Flush a stream and sync its file to the disk."""
     stream.flush()
     os.fsync(stream.fileno())
 

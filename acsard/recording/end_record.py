@@ -70,7 +70,6 @@ def ending_text(cut: str, why: str = "") -> str:
 
 
 def as_metadata(last: EndRecord) -> dict[str, str]:
-    """Return the end record as MCAP metadata."""
     fields = msgspec.to_builtins(last).items()
     return {key: str(value) for key, value in fields if value is not None}
 

@@ -181,7 +181,6 @@ class Index:
             self._places.append(AttachmentIndex(at, length, *times, size, record.name, kind))
 
     def records(self) -> list[McapRecord]:
-        """Return the MCAP records of the summary section."""
         return [self._totals, *self._places]
 
 

@@ -120,7 +120,6 @@ class Unfinished(Struct, frozen=True):
     inputs: Inputs
 
     def encode(self) -> bytes:
-        """Return the message, in MessagePack."""
         # The encoding contains the field names, because a later version may add fields.
         return msgspec.msgpack.encode(self)
 

@@ -54,7 +54,6 @@ class Disk(NamedTuple):
 
     @property
     def low(self) -> bool:
-        """Whether less than `spare` is free."""
         return self.free < self.spare
 
 
@@ -167,7 +166,6 @@ class IncidentWindow(Generic[File]):
         self._happened_ns = -INCIDENT_MARGIN_NS  # last incident
 
     def begin(self, now_ns: Ns) -> None:
-        """Register the beginning of a new file."""
         self.kind = "near" if now_ns - self._happened_ns < INCIDENT_MARGIN_NS else "plain"
 
     def happened(self, now_ns: Ns) -> list[File]:

@@ -66,7 +66,6 @@ class Checkpoint(Struct, frozen=True, array_like=True):
     data: bytes  # `freeze`
 
     def encode(self) -> bytes:
-        """Return the message, in MessagePack."""
         return msgspec.msgpack.encode(self)
 
 

@@ -70,7 +70,6 @@ class TimelineEntry(Struct, frozen=True, omit_defaults=True):
 
 
 def entry_of(event: Event, wall_ns: WallNs) -> TimelineEntry:
-    """Return the entry for an event of the log."""
     late = event.name == "link_stale" and event.code in HOST_CODES
     name = "link_late" if late else event.name
     return TimelineEntry(wall_ns / 1e9, name, event.text, event.level, event.by, event.count)

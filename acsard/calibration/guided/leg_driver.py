@@ -203,7 +203,6 @@ class LegDriver:
             self._still_since = now
 
     def step(self, now: float) -> Twist:
-        """Return the command to send now."""
         held_up, self._stepped = now - self._stepped, now
         self._path.command(self._command, now)
         # If this process was paused, the robot has braked, and the next move would begin at the

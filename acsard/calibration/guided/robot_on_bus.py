@@ -66,7 +66,6 @@ class Sensor:
         return count
 
     def discard(self) -> int:
-        """Discard each message that has arrived, and return the number of messages."""
         return self.receive(lambda message, now: None, 0.0)
 
     def await_first(self, what: str) -> None:
@@ -143,7 +142,6 @@ class LegRecorder:
         self._add("places", message.header.stamp, arrival, (spot.x, spot.y))
 
     def command(self, message: TwistStamped, arrival: float) -> None:
-        """Add the twist that the daemon commands to the wheels."""
         values = message.twist.linear.x, message.twist.angular.z
         self._add("commands", message.header.stamp, arrival, values)
 

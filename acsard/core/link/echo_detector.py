@@ -63,7 +63,6 @@ class EchoDetector:
         self.forget()
 
     def forget(self) -> None:
-        """Forget everything, because the port has been opened."""
         # `COMPARED_LINES` lines, and the one before them, with which a series may end that the next
         # reply continues.
         self._sent: deque[bytes] = deque(maxlen=COMPARED_LINES + 1)
@@ -73,7 +72,6 @@ class EchoDetector:
         self._last: deque[_Wheels] = deque(maxlen=MAX_OTHER_REPORTS + 1)  # of the last replies
 
     def written(self, line: bytes) -> None:
-        """Record a line, with its end, that was written to the port."""
         self._sent.append(line.removesuffix(b"\r\n"))
         self._runs.append(None)
 

@@ -146,7 +146,6 @@ class Timeline:
         self.restarted = False  # by the board's clock in the last line
 
     def forget(self) -> None:
-        """Forget the previous line, because a new session begins."""
         self._encoders.forget()
         self._slots.forget()
         self._prompts.forget()

@@ -123,7 +123,6 @@ class Heard(Struct):
 
     @property
     def looks(self) -> ReceivedClass:
-        """The class of the received bytes."""
         if self.statuses and not self.lines:
             return "statuses"
         if not self.size:

@@ -38,5 +38,4 @@ class MinimumDelay:
         return self.late
 
     def believe(self) -> None:
-        """Update the least delay with the last measured event."""
         self.late = min(max(0.0, self.late), self._most)

@@ -215,7 +215,6 @@ class Negotiation:
 
     @property
     def echoes(self) -> bool:
-        """Whether an echo was detected."""
         return self.trouble == "echo"
 
     def check_reply_echo(self, line: bytes, speeds: WheelSpeeds) -> bool:

@@ -50,7 +50,6 @@ class Steps:
         self._count = 0
 
     def add(self, speed: float) -> None:
-        """Process the next reported speed, rad/s."""
         step = abs(speed - self._last)
         if step < MIN_CHANGE:
             return

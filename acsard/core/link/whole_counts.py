@@ -59,7 +59,6 @@ class WholeCounts:
         self.forget()
 
     def forget(self) -> None:
-        """Forget all earlier lines, because they may be those of another board."""
         # s added to the next estimate, positive if the last sample was taken earlier than
         # estimated; s over which the firmware last counted.
         self._apart = self._period = 0.0

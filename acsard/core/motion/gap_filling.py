@@ -198,7 +198,6 @@ class Confirmation:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the lines that are held back."""
         self._held: list[Feedback] = []
         self._seconds = 0.0  # of the held lines with the gaps before them
 

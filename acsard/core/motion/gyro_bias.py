@@ -41,7 +41,6 @@ class Bias:
         return self._rested_s >= LEARNING_TIME_S
 
     def drift(self, dt: float) -> None:
-        """Increase the variance of the bias by the drift in `dt` s."""
         self.variance += BIAS_RANDOM_WALK * BIAS_RANDOM_WALK * dt
 
     def update_at_rest(self, rate: float, variance: float, dt: float) -> bool:

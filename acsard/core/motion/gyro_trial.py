@@ -45,7 +45,6 @@ class Trial:
 
     @property
     def open(self) -> bool:
-        """Whether the gyro is not proven yet."""
         return self.verdict != "good"
 
     def add(self, wheels: float, gyro: float, dt: float, certain: bool = True) -> None:

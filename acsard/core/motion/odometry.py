@@ -125,7 +125,6 @@ class Odometry:
 
     @property
     def pose(self) -> Pose:
-        """Pose of base_link in odom."""
         return self._path.pose
 
     def missed(self) -> dict[str, int]:

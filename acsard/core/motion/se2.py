@@ -108,7 +108,6 @@ def stepped(
     c: float,
     s: float,
 ) -> PoseCovariance:
-    """Return `added(carried(p, dx, dy), along, yaw, both, c, s)`."""
     # This function runs for each feedback line, and is faster than the two calls.
     xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
     cc, cs = along * c, along * s

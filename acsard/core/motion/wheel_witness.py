@@ -40,7 +40,6 @@ WITNESS_CODES: dict[FaultKind, FaultCode] = {
 
 
 def faster(front: float, rear: float) -> float:
-    """Return the speed of the larger magnitude."""
     return front if abs(front) > abs(rear) else rear
 
 
