@@ -387,15 +387,14 @@ COMMANDS: dict[str, How] = {
     "acsard web --tls tls --address https://0.0.0.0:8443": INVITED,
     "acsard web --tokens": COOKIE,
     "acsard web --revoke phone": COOKIE,
-    "sudo /opt/acsard/venv/bin/acsard tls init": BY_THE_SERVICE,
+    "sudo acsard tls init": BY_THE_SERVICE,
     "sudo install -D -m 0644 -t /etc/systemd/system/acsard-web.service.d "
     "deploy/systemd/lan.conf": BY_THE_SERVICE,
     'sudo sh -c "systemctl daemon-reload && systemctl restart acsard-web"': BY_THE_SERVICE,
-    "sudo /opt/acsard/venv/bin/acsard web --config /etc/acsard/acsard.toml "
+    "sudo acsard web --config /etc/acsard/acsard.toml "
     "--invite operator --name phone": BY_THE_SERVICE,
-    "sudo /opt/acsard/venv/bin/acsard web --config /etc/acsard/acsard.toml "
-    "--revoke phone": BY_THE_SERVICE,
-    'sudo sh -c "/opt/acsard/venv/bin/acsard tls renew && '
+    "sudo acsard web --config /etc/acsard/acsard.toml --revoke phone": BY_THE_SERVICE,
+    'sudo sh -c "acsard tls renew && '
     'systemctl try-reload-or-restart acsard-web acsard-gateway"': Elsewhere(
         OPEN, "test_a_renewed_certificate_is_shown_after_the_reload_and_tokens_still_count"
     ),
@@ -448,42 +447,34 @@ COMMANDS: dict[str, How] = {
     "sudo apt install ros-$ROS_DISTRO-ros2-controllers "
     "ros-$ROS_DISTRO-joint-state-topic-hardware-interface": NO_ROS,
     # deploy/systemd
-    "sudo python3 -m venv /opt/acsard/venv": VENV,
-    "sudo /opt/acsard/venv/bin/pip install -r deploy/systemd/requirements.lock": VENV,
-    "sudo /opt/acsard/venv/bin/pip install --no-deps --no-build-isolation .": VENV,
-    "sudo /opt/acsard/venv/bin/acsard service install": INSTALLED,
+    "python3 -m venv .venv": VENV,
+    ".venv/bin/pip install -r deploy/systemd/requirements.lock": VENV,
+    ".venv/bin/pip install --no-deps --no-build-isolation .": VENV,
+    "sudo .venv/bin/acsard service install": INSTALLED,
     "git pull && .venv/bin/pip install '.[tools]'": UntestedCommand("needs a newer commit"),
     "python3 -m pip download -r deploy/systemd/requirements.lock -d wheels": DOWNLOADED,
-    "sudo /opt/acsard/venv/bin/pip install --no-index --find-links wheels -r "
+    ".venv/bin/pip install --no-index --find-links wheels -r "
     "deploy/systemd/requirements.lock": DOWNLOADED,
-    "sudo /opt/acsard/venv/bin/pip install --no-index --no-deps --no-build-isolation .": DOWNLOADED,
+    ".venv/bin/pip install --no-index --no-deps --no-build-isolation .": DOWNLOADED,
     "sudo systemctl restart acsard": OPENED,
-    "sudo /opt/acsard/venv/bin/acsard doctor --config /etc/acsard/acsard.toml": Elsewhere(
+    "sudo acsard doctor --config /etc/acsard/acsard.toml": Elsewhere(
         "tests/system/test_doctor.py",
         "test_the_text_output_has_a_line_for_each_finding_and_one_for_its_remedy",
     ),
-    'sudo sh -c "/opt/acsard/venv/bin/pip install -r deploy/systemd/requirements.lock && '
-    "/opt/acsard/venv/bin/pip install --no-deps --no-build-isolation . && "
-    "/opt/acsard/venv/bin/acsard service install "
-    '--force && systemctl restart acsard"': Elsewhere(
-        SERVICE,
-        "test_a_foreign_file_is_not_overwritten_or_removed_without_force",
-        "pip is not called again",
-    ),
-    "sudo /opt/acsard/venv/bin/acsard recording": Elsewhere(
+    "sudo acsard recording": Elsewhere(
         LOG, "test_the_list_has_a_line_for_each_recording_with_its_events"
     ),
-    "sudo /opt/acsard/venv/bin/acsard recording --from yesterday": Elsewhere(
+    "sudo acsard recording --from yesterday": Elsewhere(
         LOG, "test_the_list_can_be_restricted_to_a_range_of_time"
     ),
-    "sudo /opt/acsard/venv/bin/acsard recording show --from 14:05": Elsewhere(
+    "sudo acsard recording show --from 14:05": Elsewhere(
         "tests/unit/cli/test_recording_times.py",
         "test_a_time_of_day_is_looked_up_before_now_in_the_ring",
     ),
-    "sudo /opt/acsard/venv/bin/acsard recording replay": Elsewhere(
+    "sudo acsard recording replay": Elsewhere(
         LOG, "test_a_replay_without_differences_reports_equal_counts"
     ),
-    "sudo /opt/acsard/venv/bin/acsard recording export 12 drive.mcap": Elsewhere(
+    "sudo acsard recording export 12 drive.mcap": Elsewhere(
         "tests/unit/cli/test_recording_export.py",
         "test_export_takes_a_number_and_a_name_and_overwrites_no_file",
     ),
@@ -495,8 +486,8 @@ COMMANDS: dict[str, How] = {
     "journalctl -u acsard ACSARD_EVENT=link_down": Elsewhere(
         UNIT, "test_journal_entries_have_the_event_fields", "the event is chosen by the test"
     ),
-    "/opt/acsard/venv/bin/acsard service status": INSTALLED,
-    "sudo /opt/acsard/venv/bin/acsard tls init --write /etc/acsard/acsard.toml": OPENED,
+    "acsard service status": INSTALLED,
+    "sudo acsard tls init --write /etc/acsard/acsard.toml": OPENED,
     'sudo sh -c "systemctl daemon-reload && systemctl restart acsard"': OPENED,
     "acsard echo state --connect tls/robot.local:7449 --tls clients/viewer": OPENED._replace(
         but="it calls `stop` instead"

@@ -1,5 +1,5 @@
-"""Install the systemd units, the stop script, the udev rules and a first configuration, then enable
-and start the service; or remove the service; or show its status.
+"""Install acsard as a systemd service: a copy of the program, units, udev rules and a first
+configuration. Or remove the service, or show its status.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ from collections.abc import Iterable
 
 from acsard.host.errors import Exit, MendableError, NotPermittedError
 from acsard.machine import service_installation as service
-from acsard.machine.service_installation import Step, missing_prerequisite, unusable_location
+from acsard.machine import versions
+from acsard.machine.service_installation import Step, missing_prerequisite
 from acsard.terminal.output import show, table
 
 
@@ -46,19 +47,30 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def main_install(args: argparse.Namespace) -> int:
     _ready(args)
-    trouble = unusable_location() or missing_prerequisite()
+    used = versions.current()
+    trouble = missing_prerequisite()
+    if used and not versions.is_own(used):
+        trouble = (
+            f"the service runs version {used}; to change to this one, type `acsard service upgrade "
+            f"{sys.prefix}`, which can go back if the new one does not work"
+        )
     if trouble:
         print(f"acsard: {trouble}", file=sys.stderr)
         if not (args.dry_run or args.force):
             return Exit.FAILURE
+    python = versions.service_python()
+    if python != os.path.realpath(sys.executable):
+        print(f"the service runs with {python}, because it cannot run {sys.executable}")
     files = service.files()
     steps = service.installing(
         files, service.present(files), service.wrong_modes(files), force=args.force
     )
-    _do(steps, args.dry_run)
+    _do([*steps, *service.linking()], args.dry_run)
     if not args.dry_run:
         print("\nnow set [mcu] and [robot] in /etc/acsard/acsard.toml, then type:")
-        print("systemctl restart acsard && acsard doctor --config /etc/acsard/acsard.toml")
+        print(
+            "sudo systemctl restart acsard && sudo acsard doctor --config /etc/acsard/acsard.toml"
+        )
     return 0
 
 
@@ -72,19 +84,18 @@ def main_uninstall(args: argparse.Namespace) -> int:
         force=args.force or args.purge,
         purge=args.purge,
         stateful=[unit for unit, (where, _) in service.STATE_DIRECTORIES.items() if where.exists()],
+        programs=service.programs(),
     )
     _do(steps, args.dry_run)
-    # Give this advice only in a venv, because outside of it the directory is the system's Python.
-    if sys.prefix != sys.base_prefix:
-        print(
-            f"\nThe program itself is still in {sys.prefix}; to remove the program, delete that "
-            "directory"
-        )
     return 0
 
 
 def main_status(args: argparse.Namespace) -> int:
     """Print the state of files and units; return 0 if the daemon's unit is active, else 1."""
+    used = versions.current()
+    print(f"version in use: {used or 'none'}")
+    if newer := versions.unused():
+        print(f"version {newer} is installed, but not in use")
     show(table((file.condition(), str(file.path)) for file in service.files()))
     state = service.state(service.UNIT)
     print(state or "systemd does not answer: check that this machine runs systemd")

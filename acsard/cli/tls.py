@@ -22,8 +22,9 @@ from acsard.host.config_file import change, require_changeable, require_tomlkit
 from acsard.host.errors import UsageError
 from acsard.machine import certificates
 from acsard.machine import service_installation as service
+from acsard.machine.deploy_files import source
 from acsard.machine.router_file import router_file
-from acsard.machine.service_installation import TLS_DIRECTORY, source
+from acsard.machine.service_installation import TLS_DIRECTORY
 
 NAME = re.compile(r"(?!@)[A-Za-z0-9_ .:@+-]{1,64}")
 

@@ -5,6 +5,7 @@ This module uses only the standard library, because `deploy/build_hook.py` impor
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
 from pathlib import Path
 
@@ -20,8 +21,13 @@ HASH_DIGITS = 9
 @lru_cache(1)
 def version() -> str:
     """Return the version, such as `0.1.0+g1a2b3c4d5`, or `0.1.0` if the commit is not known."""
-    commit = _text(_PACKAGE / COMMIT_FILE) or commit_of(_PACKAGE.parent)
+    commit = source()
     return f"{__version__}+g{commit[:HASH_DIGITS]}" if commit else __version__
+
+
+def source() -> str:
+    """Return the commit of this program's source; "" if unknown."""
+    return _text(_PACKAGE / COMMIT_FILE) or commit_of(_PACKAGE.parent)
 
 
 def commit_of(clone: Path) -> str:
@@ -39,6 +45,22 @@ def commit_of(clone: Path) -> str:
     common = git / (_text(git / "commondir") or ".")
     packed = [line.partition(" ") for line in _text(common / "packed-refs").splitlines()]
     return _text(common / name) or next((commit for commit, _, ref in packed if ref == name), "")
+
+
+_NUMBER = re.compile(r"([0-9]{1,6})\.([0-9]{1,6})\.([0-9]{1,6})(?:(\.dev|rc)([0-9]{1,6}))?(?=\+|$)")
+_PHASES = (".dev", "rc", None)
+
+
+def order(version: str) -> tuple[int, ...]:
+    """Return a key that sorts versions from old to new; () if `version` is not a version.
+
+    The commits of one number have the same key, because hashes do not sort.
+    """
+    match = _NUMBER.match(version)
+    if match is None:
+        return ()
+    major, minor, patch, phase, step = match.groups()
+    return int(major), int(minor), int(patch), _PHASES.index(phase), int(step or 0)
 
 
 def _text(path: Path) -> str:

@@ -1,7 +1,7 @@
 """Installs acsard as a systemd service, or removes the service.
 
-The files come from `deploy/`, with the path of this installation. A file that a user has changed
-goes only with `force` or `purge`. Both are lists of steps, which the user can read before.
+The files come from `deploy/`. A file that a user has changed goes only with `force` or `purge`.
+Both are lists of steps, which the user can read before.
 """
 
 from __future__ import annotations
@@ -13,59 +13,21 @@ import shutil
 import stat
 import subprocess
 import sys
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping
 from pathlib import Path
 
 from msgspec import Struct
 
-import acsard
 from acsard.host.atomic_file import replace
 from acsard.host.child import how_it_ended
 from acsard.host.errors import MendableError, NotPermittedError
 from acsard.host.processes import run_command
-
-HOME = "/opt/acsard/venv"  # of the venv in `deploy/`, replaced by the one that runs this
+from acsard.host.version import version
+from acsard.machine import versions
+from acsard.machine.deploy_files import reference, source
 
 # Group of the service in its unit, and the program that runs `acsard-stop`.
 GROUP, SETPRIV = "dialout", "/usr/bin/setpriv"
-
-# systemd hides these from the service.
-HIDDEN_DIRECTORIES = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
-
-
-def unusable_location(
-    prefix: str = sys.prefix,
-    base: str = sys.base_prefix,
-    executable: str = sys.executable,
-    hidden: Sequence[str] = HIDDEN_DIRECTORIES,
-) -> str:
-    """Return why a service cannot run this installation, or ""."""
-    if prefix == base:
-        return (
-            f"acsard runs from {prefix}, which is not a venv, but a service needs a venv; install "
-            f"acsard in a venv at {HOME} (deploy/systemd/README.md)"
-        )
-    if _hidden(Path(prefix), hidden):
-        return (
-            f"a service cannot run from {prefix}, because services have no access to home "
-            f"directories and /tmp; install acsard in a venv at {HOME} (deploy/systemd/README.md)"
-        )
-    # In a venv, bin/python is a link to the Python from which the venv was made.
-    interpreter = Path(os.path.realpath(executable))
-    for path in (Path(base), interpreter):
-        if _hidden(path, hidden):
-            return (
-                f"the venv {prefix} uses the Python in {path}, which a service cannot see; "
-                f"{_remake_venv_advice(prefix)}"
-            )
-    for path in (Path(prefix), interpreter):
-        closed = _inaccessible_part(path)
-        if closed:
-            return (
-                f"the service's user has no permission to enter {closed}, but needs {path}; run "
-                f"`chmod o+rx {closed}`, or {_remake_venv_advice(prefix)}"
-            )
-    return ""
 
 
 def missing_prerequisite(group: str = GROUP, program: str = SETPRIV) -> str:
@@ -83,32 +45,6 @@ def missing_prerequisite(group: str = GROUP, program: str = SETPRIV) -> str:
             f"`groupadd --system {group}`, or see deploy/systemd/README.md for another group"
         )
     return ""
-
-
-def _remake_venv_advice(prefix: str) -> str:
-    return (
-        f"make the venv again with the system's Python: /usr/bin/python3 -m venv --clear {prefix}"
-    )
-
-
-def _hidden(path: Path, hidden: Sequence[str]) -> bool:
-    real = Path(os.path.realpath(path))
-    return any(real.is_relative_to(place) for place in hidden)
-
-
-def _inaccessible_part(path: Path) -> Path | None:
-    # Which the service's user may not enter.
-    for place in (*reversed(path.parents), path):
-        try:
-            mode = place.stat().st_mode
-        except PermissionError:
-            return place
-        except OSError:
-            # The path does not exist, so no permission is missing.
-            return None
-        if not mode & stat.S_IXOTH:
-            return place
-    return None
 
 
 class File(Struct, frozen=True):
@@ -230,7 +166,32 @@ class Run(Struct, frozen=True):
             raise MendableError(f"{' '.join(self.words)}: {failed}")
 
 
-Step = Write | Remove | Keep | Run
+class InstallCopy(Struct, frozen=True):
+    """Copies acsard from this environment to /opt/acsard, and makes the copy the version in use."""
+
+    def __str__(self) -> str:
+        return f"copy    acsard from {sys.prefix} to {versions.HOME}/{version()}"
+
+    def do(self) -> None:
+        versions.remove_unfinished()
+        versions.use(versions.copy())
+
+
+class Link(Struct, frozen=True):
+    """Makes a symbolic link."""
+
+    path: Path
+    target: Path
+
+    def __str__(self) -> str:
+        return f"link    {self.path} -> {self.target}"
+
+    def do(self) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.path.symlink_to(self.target)
+
+
+Step = Write | Remove | Keep | Run | InstallCopy | Link
 
 
 def _unreadable(path: Path, error: OSError) -> MendableError:
@@ -242,11 +203,14 @@ def _unreadable(path: Path, error: OSError) -> MendableError:
 UNIT, GATEWAY, PAGE = "acsard.service", "acsard-gateway.service", "acsard-web.service"
 ALL_UNITS = (UNIT, GATEWAY, PAGE)
 # Removed when they become empty.
-OWN_DIRECTORIES = ("bin", "acsard", *(f"{unit}.d" for unit in ALL_UNITS))
-STOP_PROGRAM = "acsard-stop"
+OWN_DIRECTORIES = ("acsard", *(f"{unit}.d" for unit in ALL_UNITS))
 UNIT_DIRECTORY = Path("/etc/systemd/system")
+RULES = Path("/etc/udev/rules.d/70-acsar.rules")
 CONFIG_DIRECTORY = Path("/etc/acsard")
 LAN_DROP_IN = "lan.conf"
+# `acsard` in the PATH of every user, also under sudo. The Debian package has the second link.
+COMMAND, PACKAGE_COMMAND = Path("/usr/local/bin/acsard"), Path("/usr/bin/acsard")
+PROGRAM = versions.HOME / versions.CURRENT / "bin" / "acsard"
 TLS_DIRECTORY = "/etc/acsard/tls"  # in the drop-in `lan.conf`
 # Directories by unit, with their content.
 STATE_DIRECTORIES = {
@@ -280,29 +244,26 @@ REMOVE_COMMANDS = (*RELOAD_COMMANDS, Run(("systemctl", "reset-failed", *ALL_UNIT
 
 def files() -> list[File]:
     """Return all files that the installation of the service writes."""
-    reference = _reference().read_text(encoding="utf-8")
+    defaults = reference(source()).read_text(encoding="utf-8")
     return [
-        *(_unit(name) for name in ALL_UNITS),
-        File(
-            Path("/opt/acsard/bin") / STOP_PROGRAM,
-            (source() / "systemd" / STOP_PROGRAM).read_bytes(),
-            0o755,
-        ),
-        File(
-            Path("/etc/udev/rules.d/70-acsar.rules"),
-            (source() / "udev" / "70-acsar.rules").read_bytes(),
-        ),
+        *system_files(source()),
         File(
             CONFIG_DIRECTORY / "acsard.toml",
-            reference.replace('port = "sim"', 'port = "/dev/acsar"').encode(),
+            defaults.replace('port = "sim"', 'port = "/dev/acsar"').encode(),
             kept=True,
         ),
     ]
 
 
-def _unit(name: str) -> File:
-    text = (source() / "systemd" / name).read_text(encoding="utf-8")
-    return File(UNIT_DIRECTORY / name, text.replace(HOME, sys.prefix).encode())
+def system_files(deploy: Path) -> list[File]:
+    """Return the files that belong to the version with this `deploy/`."""
+    return [
+        *(
+            File(UNIT_DIRECTORY / name, (deploy / "systemd" / name).read_bytes())
+            for name in ALL_UNITS
+        ),
+        File(RULES, (deploy / "udev" / RULES.name).read_bytes()),
+    ]
 
 
 def lan_drop_in(unit: str) -> File:
@@ -372,7 +333,13 @@ def installing(
             "these files differ from the files that this version of acsard installs: "
             f"{paths}; look at the differences, and replace the files with --force"
         )
-    return [*steps, *INSTALL_COMMANDS]
+    return [InstallCopy(), *steps, *INSTALL_COMMANDS]
+
+
+def linking() -> list[Step]:
+    """Return the step that puts `acsard` into the PATH, unless there is one."""
+    there = [path for path in (PACKAGE_COMMAND, COMMAND) if os.path.lexists(path)]
+    return [] if there else [Link(COMMAND, PROGRAM)]
 
 
 def config_directories() -> list[Path]:
@@ -395,6 +362,7 @@ def uninstalling(
     force: bool,
     purge: bool = False,
     stateful: Iterable[str] = (),
+    programs: Iterable[Path] = (),
 ) -> list[Step]:
     """Return the steps that remove the service, with a `Keep` for all that stays.
 
@@ -419,14 +387,6 @@ def uninstalling(
             why[file.path] = "it is your configuration; --purge removes it"
         elif not force:
             why[file.path] = "the file differs from what this version installs; --force removes it"
-    if any(path.name == UNIT for path in why):
-        # The daemon's unit stays, so the daemon may start again. The unit then needs `acsard-stop`,
-        # which sends zeros after the daemon's end.
-        why |= {
-            f.path: f"{UNIT} stays and needs this file"
-            for f in there
-            if f.path.name == STOP_PROGRAM
-        }
     steps: list[Step] = [
         Keep(file.path, why[file.path]) if file.path in why else Remove(file.path) for file in there
     ]
@@ -444,7 +404,26 @@ def uninstalling(
     units = [name for name in reversed(ALL_UNITS) if any(file.path.name == name for file in there)]
     leaving = [Run(("systemctl", "disable", "--now", *units))] if units else []
     back: list[Step] = [*map(Write, again), RELOAD_COMMANDS[0]] if again else []
-    return [*back, *leaving, *steps, *REMOVE_COMMANDS]
+    removed: list[Step] = []
+    for path in programs:
+        # If a unit stays, the daemon may start again, and needs its program and `acsard-stop`.
+        stays = [file.name for file in why if file.name in ALL_UNITS]
+        removed.append(
+            Keep(path, f"{stays[0]} stays and needs this directory") if stays else Remove(path)
+        )
+    return [*back, *leaving, *steps, *REMOVE_COMMANDS, *removed]
+
+
+def programs() -> list[Path]:
+    """Return the copies and links that an installation without the Debian package has made."""
+    if (versions.HOME / versions.PACKAGE).exists():
+        return []
+    links = (versions.CURRENT, versions.PREVIOUS)
+    return [
+        *([COMMAND] if COMMAND.is_symlink() and COMMAND.readlink() == PROGRAM else ()),
+        *(versions.HOME / name for name in links if (versions.HOME / name).is_symlink()),
+        *(versions.HOME / name for name in versions.installed()),
+    ]
 
 
 def state(unit: str) -> str:
@@ -455,24 +434,3 @@ def state(unit: str) -> str:
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return done.stdout.strip() or done.stderr.strip()
-
-
-def source() -> Path:
-    """Return `deploy/`, inside the package or beside it in a clone. Raises `MendableError`."""
-    package = Path(acsard.__file__).parent
-    inside = package / "deploy"
-    if inside.is_dir():
-        return inside
-    clone = package.parent / "deploy"
-    if not clone.is_dir():
-        raise MendableError(
-            f"the installation of acsard is incomplete: neither {inside} nor {clone} exists; "
-            "install acsard again"
-        )
-    return clone
-
-
-def _reference() -> Path:
-    # Inside `deploy/` of a package, or beside it in a clone.
-    inside = source() / "acsard.toml"
-    return inside if inside.is_file() else source().parent / "acsard.toml"

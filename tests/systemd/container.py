@@ -35,7 +35,10 @@ PACKAGES = "systemd,systemd-sysv,dbus,udev,umockdev,iproute2,python3-minimal,lib
 
 UNIT, GATEWAY, PAGE = "acsard.service", "acsard-gateway.service", "acsard-web.service"
 
-HOME = "/opt/acsard"
+HOME = "/srv/acsard"
+"""Directory of the clone, its packages and the venv from which the service is installed."""
+
+VERSIONS = "/opt/acsard"
 
 LENT = f"{HOME}/python"
 """Mount point of our own Python, if Debian's is another."""
@@ -261,9 +264,15 @@ class Container:
         self.install_unit()
 
     def install_unit(self) -> None:
-        """Install the files of `acsard service install`, without starting the service."""
+        """Install the files of `acsard service install`, without starting the service.
+
+        The version in use runs from the clone, because a copy takes long.
+        """
         deploy = ROOT / "deploy" / "systemd"
-        self.write(f"{HOME}/bin/acsard-stop", (deploy / "acsard-stop").read_text(), 0o755)
+        program = self.path(ACSARD).read_text()
+        self.write(f"{VERSIONS}/test/bin/acsard", program, 0o755)
+        self.write(f"{VERSIONS}/test/bin/acsard-stop", (deploy / "acsard-stop").read_text(), 0o755)
+        self.path(f"{VERSIONS}/current").symlink_to("test")
         for unit in (UNIT, GATEWAY, PAGE):
             self.write(f"{UNITS}/{unit}", (deploy / unit).read_text())
         self.run("systemctl", "daemon-reload")

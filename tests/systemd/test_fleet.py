@@ -6,13 +6,11 @@ import pytest
 
 from tests.pages import blocks
 from tests.system.harness import until
-from tests.systemd.container import Container
+from tests.systemd.container import ACSARD, HOME, Container
 
 pytestmark = pytest.mark.systemd
 
-ACSARD = "/opt/acsard/venv/bin/acsard"
-
-CLONE, THERE = "/opt/acsard/src", "/tmp/router"
+CLONE, THERE = f"{HOME}/src", "/tmp/router"
 
 BEFORE = (
     f"cp {CLONE}/deploy/zenoh/router.json5 .",

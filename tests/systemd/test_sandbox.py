@@ -12,15 +12,25 @@ from pathlib import Path
 import pytest
 
 from tests.system.harness import ROOT, until
-from tests.systemd.container import CONFIG, GATEWAY, PAGE, PORT, UNIT, USUAL, ZERO, Board, Container
+from tests.systemd.container import (
+    ACSARD,
+    CONFIG,
+    GATEWAY,
+    HOME,
+    PAGE,
+    PORT,
+    UNIT,
+    USUAL,
+    ZERO,
+    Board,
+    Container,
+)
 
 pytestmark = pytest.mark.systemd
 
 DEPLOY = ROOT / "deploy" / "systemd"
 
 EXPOSURE = 1.5
-
-ACSARD = "/opt/acsard/venv/bin/acsard"
 
 TLS = "/etc/acsard/tls"
 
@@ -56,7 +66,7 @@ def test_the_unit_of_a_fleet_s_router_runs_the_router(container: Container) -> N
         assert container.run("systemctl", "daemon-reload").code == 0
         assert container.start(unit).code == 0
         connect = f"import socket; socket.create_connection({place}, 1.0)"
-        words = ("/opt/acsard/venv/bin/python", "-c", connect)
+        words = (f"{HOME}/venv/bin/python", "-c", connect)
         until(lambda: container.run(*words).code == 0, 10.0, "the router listens")
         assert (container.show("ActiveState", unit), container.show("User", unit)) == (
             "active",

@@ -12,14 +12,23 @@ import pytest
 
 from acsard.machine.authority import Authority
 from tests.system.harness import ROOT, until
-from tests.systemd.container import GATEWAY, PAGE, UNIT, Container, UnavailableError, unavailable
+from tests.systemd.container import (
+    ACSARD,
+    GATEWAY,
+    HOME,
+    PAGE,
+    UNIT,
+    VERSIONS,
+    Container,
+    UnavailableError,
+    unavailable,
+)
 
 pytestmark = pytest.mark.systemd
 
-ACSARD = "/opt/acsard/venv/bin/acsard"
-PLACES = ("/etc", "/opt/acsard/bin")
+PLACES = ("/etc", "/opt", "/usr/local/bin")
 CONFIGURATION = "/etc/acsard/acsard.toml"
-STOP = "/opt/acsard/bin/acsard-stop"
+RULES = "/etc/udev/rules.d/70-acsar.rules"
 RECORDINGS = ROOT / "tests" / "recordings"
 
 
@@ -37,7 +46,7 @@ def alone(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Co
 @pytest.fixture
 def bare(alone: Container) -> Iterator[Container]:
     """Provide a systemd with the program but without the service, as `pip install` leaves it."""
-    clean = "rm -rf /etc/systemd/system/acsard* /opt/acsard/bin /etc/acsard"
+    clean = "rm -rf /etc/systemd/system/acsard* /opt/acsard /etc/acsard"
     alone.run("systemctl", "stop", PAGE, GATEWAY, UNIT)
     alone.run("sh", "-c", clean)
     alone.run("systemctl", "daemon-reload")
@@ -68,8 +77,7 @@ def test_a_dry_run_prints_every_file_and_command_and_touches_nothing(bare: Conta
         f"/etc/systemd/system/{UNIT}",
         f"/etc/systemd/system/{GATEWAY}",
         f"/etc/systemd/system/{PAGE}",
-        STOP,
-        "/etc/udev/rules.d/70-acsar.rules",
+        RULES,
         CONFIGURATION,
     ]
     assert f"run     systemctl enable --now {UNIT} {GATEWAY} {PAGE}" in done.out
@@ -83,13 +91,17 @@ def test_the_service_runs_after_install_and_leaves_no_file_after_uninstall(bare:
     until(lambda: "/dev/acsar" in bare.show("StatusText"), 5.0, "it waits for the board")
     assert bare.show("UnitFileState") == "enabled"
     status = bare.run(ACSARD, "service", "status")
-    assert (status.code, status.out.count("as installed")) == (0, 6)
-    assert bare.run("chmod", "644", STOP).code == 0
+    assert (status.code, status.out.count("as installed")) == (0, 5)
+    assert bare.run("chmod", "600", RULES).code == 0
     status = bare.run(ACSARD, "service", "status")
-    assert f"wrong mode or owner  {STOP}" in status.out, status.out
+    assert f"wrong mode or owner  {RULES}" in status.out, status.out
     assert bare.run(ACSARD, "service", "install").code == 0
-    assert bare.run("stat", "-c", "%a", STOP).out.strip() == "755"
-    result = bare.run(ACSARD, "service", "uninstall")
+    assert bare.run("stat", "-c", "%a", RULES).out.strip() == "644"
+    # The service uses neither the clone nor its venv.
+    maps = Path(f"/proc/{bare.main_pid()}/maps").read_text()
+    assert f"{VERSIONS}/" in maps
+    assert HOME not in maps
+    result = bare.run("acsard", "service", "uninstall")
     assert result.code == 0, result.out + result.err
     assert listing(bare) == before
     assert bare.show("LoadState") == "not-found"
@@ -232,9 +244,9 @@ def test_the_service_s_page_lists_serves_and_draws_recordings_and_cannot_change_
     assert drawn(bare) == {"report": "ready", "href": f"report/{FORMER}"}
     assert "Plotly" in asks(bare, f"/report/{FORMER}")
 
-    bare.write("/opt/acsard/probe.py", PROBE)
+    bare.write("/srv/probe.py", PROBE)
     words = f"{bare.show('MainPID')} /var/lib/acsard/record {FORMER}"
-    walls = f"ExecStartPre=/usr/bin/python3 /opt/acsard/probe.py {words}"
+    walls = f"ExecStartPre=/usr/bin/python3 /srv/probe.py {words}"
     bare.drop_in("probe.conf", f"[Service]\n{walls}\n", PAGE)
     bare.run("systemctl", "restart", PAGE)
     lines = [line for line in bare.messages(PAGE).splitlines() if line.startswith('{"read"')]

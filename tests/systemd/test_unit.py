@@ -11,7 +11,7 @@ from typing import NamedTuple
 import pytest
 
 from tests.system.harness import until
-from tests.systemd.container import CONFIG, PORT, UNIT, ZERO, Board, Container, Driver
+from tests.systemd.container import CONFIG, HOME, PORT, UNIT, ZERO, Board, Container, Driver
 
 pytestmark = pytest.mark.systemd
 
@@ -156,7 +156,7 @@ def test_a_stall_is_ended_by_the_watchdog_with_stacks_and_followed_by_zeros(
     took = faults(container, board, driver, signal.SIGSTOP, times)
     text = container.run("journalctl", "-o", "cat", f"_SYSTEMD_INVOCATION_ID={first}").out
     assert "Fatal Python error: Aborted" in text
-    assert 'File "/opt/acsard/src/acsard/' in text, "where it hung"
+    assert f'File "{HOME}/src/acsard/' in text, "where it hung"
     assert "Watchdog timeout" in container.messages()
     assert within(took, STALL_BOUND_S)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from acsard.host.errors import MendableError
+from acsard.machine.deploy_files import source
 from acsard.machine.service_installation import (
     GATEWAY,
     GROUP,
@@ -18,10 +19,10 @@ from acsard.machine.service_installation import (
     REMOVE_COMMANDS,
     SETPRIV,
     STATE_DIRECTORIES,
-    STOP_PROGRAM,
     UNIT,
     File,
     Found,
+    InstallCopy,
     Keep,
     Remove,
     Run,
@@ -32,63 +33,12 @@ from acsard.machine.service_installation import (
     installing,
     missing_prerequisite,
     present,
-    source,
     uninstalling,
-    unusable_location,
     wrong_modes,
 )
-from tests.each import each
 
 PROGRAM = "/usr/bin/env"
 """A program that every user may run."""
-
-
-@each(
-    ("prefix", "base", "good"),
-    [
-        ("/opt/acsard/venv", "/usr", True),
-        ("/usr", "/usr", False),
-        ("/home/anna/venv", "/usr", False),
-        ("/root/venv", "/usr", False),
-        ("/tmp/venv", "/usr", False),
-        ("/rooted/venv", "/usr", True),
-    ],
-)
-def test_a_service_is_refused_in_a_home_directory_and_outside_a_venv(
-    prefix: str, base: str, good: bool
-) -> None:
-    assert (unusable_location(prefix, base, PROGRAM) == "") is good
-
-
-def test_outside_a_venv_the_reason_of_the_refusal_is_not_a_hidden_directory() -> None:
-    reason = unusable_location("/usr", "/usr", PROGRAM)
-    assert "which is not a venv" in reason
-    assert "home directories" not in reason
-    assert "home directories" in unusable_location("/home/anna/venv", "/usr", PROGRAM)
-
-
-def test_a_service_is_refused_with_a_python_in_a_home_directory() -> None:
-    reason = unusable_location("/opt/acsard/venv", "/root/.pyenv/versions/3.11.7", PROGRAM)
-    assert "/root/.pyenv/versions/3.11.7" in reason
-    assert "/usr/bin/python3 -m venv --clear /opt/acsard/venv" in reason
-
-
-def test_a_link_to_a_python_in_a_home_is_followed(tmp_path: Path) -> None:
-    home = tmp_path / "home" / "anna"
-    home.mkdir(parents=True)
-    (home / "python3").symlink_to(PROGRAM)
-    (tmp_path / "python").symlink_to(home / "python3")
-    there = unusable_location("/opt/v", "/usr", str(tmp_path / "python"), hidden=("/usr/bin",))
-    assert "/usr/bin" in there
-
-
-def test_a_directory_that_other_users_cannot_enter_is_reported(tmp_path: Path) -> None:
-    venv = tmp_path / "venv"
-    venv.mkdir()
-    tmp_path.chmod(0o700)
-    reason = unusable_location(str(venv), "/usr", PROGRAM, hidden=())
-    assert "no permission to enter" in reason
-    assert "chmod o+rx" in reason
 
 
 def test_a_missing_group_or_program_of_the_units_is_reported_with_a_remedy() -> None:
@@ -104,7 +54,7 @@ def test_a_missing_group_or_program_of_the_units_is_reported_with_a_remedy() -> 
 
 ETC = Path("/etc/x")
 UNIT_FILE = File(ETC / UNIT, b"unit")
-STOP_FILE = File(ETC / STOP_PROGRAM, b"stop", 0o755)
+STOP_FILE = File(ETC / "stop", b"stop", 0o755)
 RULES = File(ETC / "rules", b"rules")
 OWN = File(ETC / "acsard.toml", b"first", kept=True)
 GATEWAY_FILE = File(ETC / GATEWAY, b"gateway")
@@ -130,7 +80,11 @@ NOTHING: Found = {file.path: None for file in ALL}
 
 
 def test_a_first_installation_writes_all_files_and_then_runs_the_commands() -> None:
-    assert installing(ALL, NOTHING, (), force=False) == [*map(Write, ALL), *INSTALL_COMMANDS]
+    assert installing(ALL, NOTHING, (), force=False) == [
+        InstallCopy(),
+        *map(Write, ALL),
+        *INSTALL_COMMANDS,
+    ]
 
 
 def test_the_daemon_starts_before_the_page_whose_unit_mounts_its_directory() -> None:
@@ -142,6 +96,7 @@ def test_the_daemon_starts_before_the_page_whose_unit_mounts_its_directory() -> 
 
 def test_unchanged_files_are_kept_and_the_commands_run_again() -> None:
     assert installing(ALL, installed_files(), (), force=False) == [
+        InstallCopy(),
         *(Keep(f.path) for f in ALL),
         *INSTALL_COMMANDS,
     ]
@@ -226,15 +181,18 @@ def test_a_changed_configuration_is_kept_even_if_forced() -> None:
     assert kept_paths(installed_files(own=b"mine"), force=True) == {OWN.path}
 
 
-def test_a_unit_that_is_kept_also_keeps_its_stop_script() -> None:
-    assert kept_paths(installed_files(unit=b"mine"), force=False) == {
-        UNIT_FILE.path,
-        STOP_FILE.path,
-    }
+def test_a_unit_that_is_kept_also_keeps_its_program() -> None:
+    program = Path("/opt/acsard/1.0.0")
+    for unit, stays in ((b"mine", True), (UNIT_FILE.content, False)):
+        state = installed_files(unit=unit)
+        steps = uninstalling(ALL, state, (), force=False, programs=[program])
+        assert (Remove(program) in steps) is not stays
+        why = [step.why for step in steps if isinstance(step, Keep) and step.path == program]
+        assert why == ([f"{UNIT} stays and needs this directory"] if stays else [])
 
 
 def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
-    unit, gateway, page, _, _, configuration = files()
+    unit, gateway, page, _, configuration = files()
     assert (unit.path.name, gateway.path.name, page.path.name) == (UNIT, GATEWAY, PAGE)
     assert b'port = "/dev/acsar"' in configuration.content
     assert set(present([unit])) == {unit.path}
@@ -246,7 +204,6 @@ def test_each_kept_path_is_reported_with_its_reason_and_how_to_remove_it() -> No
     steps = uninstalling(ALL, state, [tls, own], force=False)
     assert {step.path: step.why for step in steps if isinstance(step, Keep)} == {
         UNIT_FILE.path: "the file differs from what this version installs; --force removes it",
-        STOP_FILE.path: f"{UNIT} stays and needs this file",
         OWN.path: "it is your configuration; --purge removes it",
         tls: "certificates and their authority; --purge removes it",
         own: "not a file of the service; --purge removes it",
@@ -317,7 +274,7 @@ def test_networks_that_the_user_has_restricted_are_kept() -> None:
 
 def test_after_a_write_and_a_removal_the_directory_is_unchanged(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").write_text("untouched")
-    file = File(tmp_path / "acsard" / "bin" / "tool", b"new", 0o755)
+    file = File(tmp_path / "acsard" / "tool", b"new", 0o755)
     Write(file).do()
     assert file.current_content() == b"new"
     assert file.path.stat().st_mode & 0o777 == 0o755
