@@ -69,6 +69,10 @@ One worker runs all of them and `bench`, one after the other: they would disturb
 """
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--approve", action="store_true", help="write the transcripts anew")
+
+
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """Choose the number of test processes.
 

@@ -122,6 +122,9 @@ HERE = "tests/system/test_pages.py"
 FLEET, UNIT = "tests/system/test_fleet.py", "tests/systemd/test_unit.py"
 ROUTER = "tests/system/test_router.py"
 LOG = "tests/unit/cli/test_recording.py"
+TRANSCRIPT = Elsewhere(
+    "tests/unit/cli/test_transcripts.py", "test_each_command_prints_what_its_transcript_says"
+)
 SERVICE, OPEN = "tests/systemd/test_service.py", "tests/systemd/test_web.py"
 WEB = "tests/system/test_web_strangers.py"
 SIMULATED = "tests/system/test_simulated.py"
@@ -461,9 +464,7 @@ COMMANDS: dict[str, How] = {
         "tests/system/test_doctor.py",
         "test_the_text_output_has_a_line_for_each_finding_and_one_for_its_remedy",
     ),
-    "sudo acsard recording": Elsewhere(
-        LOG, "test_the_list_has_a_line_for_each_recording_with_its_events"
-    ),
+    "sudo acsard recording": TRANSCRIPT,
     "sudo acsard recording --from yesterday": Elsewhere(
         LOG, "test_the_list_can_be_restricted_to_a_range_of_time"
     ),
@@ -471,9 +472,7 @@ COMMANDS: dict[str, How] = {
         "tests/unit/cli/test_recording_times.py",
         "test_a_time_of_day_is_looked_up_before_now_in_the_ring",
     ),
-    "sudo acsard recording replay": Elsewhere(
-        LOG, "test_a_replay_without_differences_reports_equal_counts"
-    ),
+    "sudo acsard recording replay": TRANSCRIPT,
     "sudo acsard recording export 12 drive.mcap": Elsewhere(
         "tests/unit/cli/test_recording_export.py",
         "test_export_takes_a_number_and_a_name_and_overwrites_no_file",

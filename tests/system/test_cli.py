@@ -379,40 +379,12 @@ def test_a_robot_of_another_id_is_not_reached_and_that_is_reported(shared: Daemo
     assert "Robots here: acsar; use --id acsar" in ended.err
 
 
-@each("endpoint", ["tcp/127.0.0.1", "tls/robot.local", "tcp/[::1]"])
-def test_an_address_without_its_port_is_not_taken_for_a_missing_daemon(endpoint: str) -> None:
-    ended = typed("get", "odom", "--connect", endpoint)
-    assert (ended.code, ended.out) == (2, "")
-    assert f"{endpoint} is not an endpoint, because its port is missing" in ended.err
-
-
-@each("robot_id", ["a/b*", "", "**", "robot 1"])
-def test_an_invalid_robot_id_is_refused_with_2_before_any_query(
-    shared: Daemon, robot_id: str
-) -> None:
-    for words in (["call", "clear"], ["echo", "odom"]):
-        ended = tool(shared, *words, f"--id={robot_id}")
-        assert (ended.code, ended.out) == (2, "")
-        assert f"{robot_id!r} is not a robot's id" in ended.err
-
-
 def test_echo_for_many_waits_for_each_and_says_which_is_missing(shared: Daemon) -> None:
     ended = tool(shared, "echo", "odom", "-n", "2", "--id", "*")
     assert (ended.code, len(ended.out.splitlines())) == (0, 2)
     ended = tool(shared, "echo", "odom", "-n", "1", "--timeout", "0.5", "--id", "acsar,other")
     assert (ended.code, len(ended.out.splitlines())) == (1, 1)
     assert "following acsar; not present: other" in ended.err
-
-
-@each("verb", ["top", "drive", "calibrate"])
-@each("ids", ["*", "robot1,robot2"])
-def test_a_verb_for_one_robot_refuses_several_ids_and_names_the_verb_for_many(
-    shared: Daemon, verb: str, ids: str
-) -> None:
-    ended = tool(shared, verb, "--id", ids)
-    assert (ended.code, ended.out) == (2, "")
-    assert f"`acsard {verb}` takes one" in ended.err
-    assert "acsard fleet" in ended.err
 
 
 # names that do not exist

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,10 +13,9 @@ import pytest
 
 from acsard.cli import parser
 from acsard.core.config.parsing import parse
-from acsard.host.errors import Exit, MendableError, UnreachableError, UsageError
+from acsard.host.errors import Exit, MendableError, UnreachableError
 from tests.unit.calibration.bags import write_bag
 from tests.unit.calibration.cut import usual
-from tests.unit.calibration.robots import GUIDED
 
 GOOD = usual().csv(places=False)
 SCRIPT = Path(__file__).parents[3] / "deploy" / "calibration" / "bag_to_csv.py"
@@ -119,22 +117,6 @@ def test_a_refusal_ends_with_failure_and_an_object(
     assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
 
 
-def test_a_refusal_contains_the_notes_about_the_log(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rows = [f"{i / 100},1,1,0.1" for i in range(500)]
-    rows[100] = "1,1,1,900"
-    with pytest.raises(MendableError, match="\\nnote: 1 cell of yaw_rate left out"):
-        called(tmp_path, "t,left,right,yaw_rate\n" + "\n".join(rows), "--json")
-    assert "1 cell of yaw_rate" in json.loads(capsys.readouterr().out)["notes"][0]
-
-
-def test_a_missing_log_is_reported(tmp_path: Path) -> None:
-    args = parser(["calibrate"]).parse_args(["calibrate", "--log", str(tmp_path / "none.csv")])
-    with pytest.raises(MendableError, match="correct --log"):
-        args.main(args)
-
-
 # a bag of ROS
 
 
@@ -154,21 +136,6 @@ def test_a_script_converts_a_bag_to_a_log(
     assert result["wheel_separation_multiplier"] == pytest.approx(1.6 * 1.06, abs=0.05)
 
 
-def test_a_bag_is_refused_with_the_script_that_converts_it(tmp_path: Path) -> None:
-    write_bag(tmp_path / "bag", usual(plan=GUIDED[:2]))
-    (file,) = (tmp_path / "bag").glob("*.mcap")
-    for log in (tmp_path / "bag", file):
-        args = parser(["calibrate"]).parse_args(["calibrate", "--log", str(log)])
-        with pytest.raises(MendableError, match=r"whose first line names the columns.*bag_to_csv"):
-            args.main(args)
-
-
-@pytest.mark.parametrize("word", ["0", "nan", "a=b", "-3", "1e9"])
-def test_a_distance_is_a_length_in_metres(tmp_path: Path, word: str) -> None:
-    with pytest.raises(SystemExit):
-        called(tmp_path, GOOD, f"--distance={word}")
-
-
 # without a log
 
 
@@ -176,32 +143,6 @@ def driving(*words: str) -> int:
     """Return the exit code of a guided `acsard calibrate` with these arguments and no terminal."""
     args = parser(["calibrate"]).parse_args(["calibrate", *words])
     return int(args.main(args))
-
-
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        ([], "person at the terminal"),
-        (["--distance", "2.0"], "--distance needs --log"),
-        (["--method", "positions"], "--positions KEY"),
-        (["--method", "tape", "--positions", "sim/pose"], "leave one of them out"),
-        (["--positions-at", "tcp/127.0.0.1:7447"], "--positions KEY"),
-        (["--positions", "odom"], "odom cannot show the errors of the wheels"),
-        (["--positions", "acsard/acsar/odom"], "odom cannot show the errors of the wheels"),
-        (["--log", "drive.csv", "--method", "tape"], "--method is for a guided drive"),
-        (["--log", "drive.csv", "--imu", "imu"], "--imu is for a guided drive"),
-        (["--method", "tape", "--imu", "imu"], "--imu is for --method gyro, not for --method tape"),
-        (["--positions", "sim/pose", "--imu", "x/imu"], "not for --positions"),
-        (["--log", "drive.csv", "--yes"], "--yes is for a guided drive"),
-    ],
-)
-def test_contradictory_options_are_refused_before_a_connection_is_made(
-    words: list[str], why: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sys.stdin", open(os.devnull))  # noqa: SIM115
-    with pytest.raises(UsageError, match=re.escape(why)):
-        driving(*words)
 
 
 def test_without_a_daemon_the_verb_ends_as_unreachable(tmp_path: Path) -> None:

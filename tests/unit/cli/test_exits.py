@@ -65,16 +65,6 @@ def test_a_verb_may_end_with_any_code(code: Exit) -> None:
     assert ExitError(code, "so").code is code
 
 
-def test_an_unknown_option_names_the_help_that_lists_the_known_ones(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["recording", "show", "--stops"])
-    assert ended.value.code == Exit.USAGE
-    error = "unrecognized arguments: --stops; `acsard recording show --help` lists the options"
-    assert error in capsys.readouterr().err
-
-
 @each(
     ("between", "behind"),
     [
@@ -94,17 +84,6 @@ def test_an_unknown_option_names_the_help_that_lists_the_known_ones(
 def test_an_option_may_stand_between_two_arguments(between: str, behind: str) -> None:
     known = parser(between.split()[:1])
     assert known.parse_args(between.split()) == known.parse_args(behind.split())
-
-
-def test_an_unexpected_word_after_an_option_is_named_too(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["recording", "export", "1", "--csv", "a.csv", "b.csv"])
-    assert ended.value.code == Exit.USAGE
-    output = capsys.readouterr().err
-    assert "usage: acsard recording export " in output
-    assert "unrecognized arguments: b.csv; `acsard recording export --help` lists" in output
 
 
 @each("word", ["\udcff", "x" * 4097])

@@ -10,8 +10,6 @@ from msgspec.structs import replace
 
 from acsard.cli import main
 from acsard.core.config.settings import Config
-from acsard.host.errors import Exit
-from tests.each import each
 from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import World
 
@@ -54,27 +52,6 @@ def test_the_newest_recording_is_exported_to_a_named_file_in_the_working_directo
     assert output.err == ""  # without a terminal there is no progress line
     assert output.out.endswith(f" in {name}\n")
     assert [path.name for path in here.iterdir()] == [name]
-
-
-@each(
-    ("verb", "words", "mend"),
-    [
-        ("export", "7 drive.csv", "add --csv to write a table"),
-        ("export", "7 drive.mcap --csv", "leave out --csv to write MCAP"),
-        ("export", "7 drive.html --csv", "`acsard recording report` writes HTML"),
-        ("export", "7 drive.mcap --rosbag2", "leave out --rosbag2 to write one MCAP file"),
-        ("export", "7 drive.CSV --rosbag2", "write --csv in place of --rosbag2"),
-        ("report", "7 drive.csv", "let the name end in .html"),
-        ("report", "7 drive.mcap", "let the name end in .html"),
-        ("report", "7 drive.txt", "let the name end in .html"),
-    ],
-)
-def test_a_name_with_the_suffix_of_another_format_is_refused(
-    verb: str, words: str, mend: str, where: Path, here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["recording", verb, *words.split(), "--directory", str(where)]) == Exit.USAGE
-    assert mend in capsys.readouterr().err
-    assert not [*here.iterdir()]
 
 
 @pytest.mark.slow
@@ -120,19 +97,6 @@ def test_another_configuration_computes_the_odometry_again(where: Path, here: Pa
     assert further == pytest.approx(2 * far, rel=0.02)
 
 
-@pytest.mark.parametrize(
-    ("new", "words"),
-    [("nowhere/a.mcap", "No such file or directory"), ("/proc/a.mcap", "cannot write /proc/a")],
-)
-def test_an_unwritable_path_is_reported(
-    new: str, words: str, where: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert export(where, "7", new) in (1, 77)
-    error = capsys.readouterr().err
-    assert error.startswith(f"acsard: cannot write {new}: ")
-    assert words in error
-
-
 def test_a_truncated_recording_is_exported_up_to_its_end(
     where: Path, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -143,15 +107,6 @@ def test_a_truncated_recording_is_exported_up_to_its_end(
     with (here / "new.mcap").open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None
-
-
-def test_a_file_that_is_not_a_recording_is_refused(
-    where: Path, here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert export(where, "7", "new.mcap") == 0
-    assert export(where, "new.mcap", "again.mcap") == 1
-    assert "new.mcap is not a recording of acsard" in capsys.readouterr().err
-    assert not (here / "again.mcap").exists()
 
 
 # calibrate
@@ -186,10 +141,3 @@ def test_calibrate_takes_a_recording_of_a_robot_with_a_gyro_as_it_is(
     assert main(["calibrate", "--log", "drive.csv", "--json"]) == 0
     by_table = capsys.readouterr().out.replace("drive.csv", "drive.log")
     assert by_recording.partition('"notes"')[0] == by_table.partition('"notes"')[0]
-
-
-def test_calibrate_says_what_a_recording_lacks(
-    where: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["calibrate", "--log", str(where / RECORDED)]) == 1
-    assert "has no gyro samples" in capsys.readouterr().err

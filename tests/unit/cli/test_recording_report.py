@@ -71,29 +71,6 @@ def test_a_version_with_other_texts_says_that_only_texts_differ(
 
 
 @pytest.mark.slow
-def test_nothing_is_overwritten_without_force(tmp_path: Path) -> None:
-    new = tmp_path / "here.html"
-    new.write_text("mine")
-    code, _, err = report(QUIET, new)
-    assert code == 1
-    assert f"cannot write {new}: this path exists already; --force overwrites it" in err
-    assert new.read_text() == "mine"
-    assert report(QUIET, new, "--force")[0] == 0
-    assert new.stat().st_size > 1e6
-
-
-def test_a_report_never_overwrites_a_recording_even_with_force(tmp_path: Path) -> None:
-    new = tmp_path / "other"
-    shutil.copy(QUIET, new)
-    code, _, err = report(QUIET, new, "--force")
-    assert code == 1
-    assert (
-        f"cannot write {new}: this file is a recording of acsard, and would be overwritten" in err
-    )
-    assert new.read_bytes() == QUIET.read_bytes()
-
-
-@pytest.mark.slow
 def test_an_old_report_is_replaced_only_by_a_complete_new_one(tmp_path: Path) -> None:
     new = tmp_path / "here.html"
     new.write_text("mine")
@@ -133,12 +110,3 @@ def test_a_damaged_section_is_left_out_and_reported(tmp_path: Path) -> None:
     text = new.read_text(encoding="utf-8")
     assert "1 damaged place is left out" in text
     assert "steps are missing" in text
-
-
-@pytest.mark.slow
-def test_a_range_without_steps_makes_no_report(tmp_path: Path) -> None:
-    new = tmp_path / "none.html"
-    code, _, err = report(QUIET, new, "--from", "9999")
-    assert code == 1
-    assert "no step in that span of time" in err
-    assert not new.exists()

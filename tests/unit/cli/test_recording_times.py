@@ -9,10 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from acsard.cli import main
 from acsard.core.config.settings import Config
-from acsard.recording.time_span import TIME_EXAMPLES
-from tests.each import each
 from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import START, World
 from tests.system.typed import typed
@@ -86,26 +83,6 @@ def test_a_range_over_several_files_names_all_of_them(ring: Ring) -> None:
     assert (code, out.count("  stop: ")) == (0, 4)
     assert f"4 of 30 recordings in {where}: {', '.join(names[3:7])}" in err
     assert recording(where, "show", "all")[1].count("  stop: ") == FILES
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("verb", ["show", "export", "report"])
-def test_a_time_without_a_recording_is_refused_with_the_nearest_recordings(
-    verb: str, ring: Ring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    where, names, _ = ring
-    code, out, err = recording(where, verb, "--from", local(3600.0))
-    assert (code, out) == (1, "")
-    assert (
-        f"nothing was recorded from {local(3600.0)[:19]}; the last recording before that time is"
-        in err
-    )
-    assert f"is {names[-1]}, " in err
-    code, out, err = recording(where, verb, "--to", local(-3600.0))
-    assert (code, out) == (1, "")
-    assert f"the first recording after that time is {names[0]}, {local(0.0)[:19]} to " in err
-    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.slow
@@ -288,53 +265,3 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     code, out, err = recording(tmp_path, "show", "--from", local(0.0))
     assert (code, "start: " in out) == (0, True)
     assert "000002-20270115T080000Z.mcap is not a recording of acsard" in err
-
-
-def test_seconds_need_one_recording(ring: Ring) -> None:
-    where, names, _ = ring
-    code, _, err = recording(where, "show", "--from", "0.1")
-    assert code == 0
-    assert names[-1] in err
-    assert "the seconds of --from and --to count from the beginning of this recording" in err
-    assert "this is the newest of 30 recordings; `acsard recording` lists all" in err
-
-
-@each("words", ["--from 1", "--to 1", "--from 1 --to 14:05", "export all x.mcap --from 30 --to 60"])
-def test_seconds_are_refused_for_all_recordings_and_not_recommended(
-    words: str, tmp_path: Path
-) -> None:
-    code, _, err = recording(tmp_path, *words.split())
-    assert (code, "either name one recording, as in " in err) == (2, True)
-    assert err.endswith(f", or write a time, for example {TIME_EXAMPLES}")
-    assert "second" not in TIME_EXAMPLES
-
-
-@each("verb", ["replay", "recover"])
-def test_a_subcommand_for_one_recording_refuses_all_and_says_how_to_name_one(
-    verb: str, tmp_path: Path
-) -> None:
-    new = ["new.mcap"] if verb == "recover" else []
-    for words in (["--from", "14:05", verb, "1", *new], [verb, "all", *new]):
-        code, _, err = recording(tmp_path, *words)
-        assert code == 2
-        assert f"{verb} takes one whole recording" in err
-        assert f"`acsard recording {verb} 12" in err
-
-
-@each(
-    ("verb", "words"), [("", "-h"), ("show", "also a number of seconds"), ("export", "FILE `all`")]
-)
-def test_the_help_says_where_seconds_are_a_time(
-    verb: str, words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        main(["recording", *verb.split(), "--help"])
-    output = " ".join(capsys.readouterr().out.split())
-    assert words in output
-    assert ("number of seconds" in output) == bool(verb)
-
-
-def test_a_recording_without_a_step_in_the_range_is_reported(ring: Ring) -> None:
-    where, _, _ = ring
-    code, out, err = recording(where, "show", "3", "--from", "9999")
-    assert (code, out, "has no step in that span of time" in err) == (1, "", True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import pytest
 from acsard.cli import main
 from acsard.cli.set import pairs
 from acsard.core.messages.schema import Info, ServiceReply
-from acsard.host.errors import Exit, UsageError
 from tests.each import each
 
 
@@ -46,32 +44,6 @@ def test_several_settings_are_a_list_of_key_value_pairs() -> None:
         "log.level": "info",
     }
     assert pairs([]) == {}
-
-
-def test_a_key_without_a_value_is_refused_with_the_syntax() -> None:
-    with pytest.raises(UsageError, match=r"pairs of KEY VALUE"):
-        pairs(["limits.linear_speed"])
-
-
-@each("word", ["nan", "-inf", "1e400"])
-def test_a_number_that_is_not_finite_is_refused_with_its_key(word: str) -> None:
-    words = rf"^limits\.linear_speed = {re.escape(word)}: a number must be finite"
-    with pytest.raises(UsageError, match=words):
-        pairs(["rates.telemetry", "5", "limits.linear_speed", word])
-
-
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        ([], "name one robot in --id to list its settings"),
-        (["rates.telemetry", "5", "--keep"], "--keep changes only the file of the robot"),
-    ],
-)
-def test_several_robots_are_refused_for_a_list_and_for_the_local_file(
-    words: list[str], why: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["set", *words, "--id", "a,b"]) == Exit.USAGE
-    assert why in capsys.readouterr().err
 
 
 class Robot:
@@ -133,8 +105,3 @@ def test_keep_sets_nothing_if_it_cannot_write_the_file(
     assert main(["set", "rates.telemetry", "5", "--keep"]) == 1
     assert why in capsys.readouterr().err
     assert not robot.settings
-
-
-def test_keep_needs_a_setting(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["set", "--keep"]) == Exit.USAGE
-    assert "acsard set limits.linear_speed 0.8 --keep" in capsys.readouterr().err

@@ -1,0 +1,152 @@
+"""What commands print for people, as transcripts in `transcripts/`.
+
+In a transcript, `$` begins a command, `|` a printed line, `!` a line of standard error and `#` a
+comment. `exit` names an exit code other than 0. All commands of a transcript run in one temporary
+directory, without a daemon. A command that fails changes no file. To write the transcripts anew
+from their commands, run `pytest --approve tests/unit/cli/test_transcripts.py`, and then read
+`git diff`.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from acsard.core.config.settings import Config
+from acsard.host import config_file
+from acsard.machine.authority import Authority
+from tests.scenarios.taped import Tape, chunks
+from tests.scenarios.world import World
+from tests.system.typed import typed
+from tests.unit.calibration.bags import write_bag
+from tests.unit.calibration.cut import usual
+from tests.unit.calibration.robots import GUIDED
+
+PLACE = Path(__file__).with_name("transcripts")
+
+ADDRESS = "192.0.2.7"
+"""The only address of this machine that a certificate names."""
+
+VARYING = (
+    (r"! usage: acsard [^\n]*\n(?:! {2,}[^\n]*\n)*", "! usage: ...\n"),
+    (r"it expired on \S+;", "it expired on DATE;"),
+    (r"Unable to load PEM file[^\n]*", "Unable to load PEM file"),
+    (r" +[\d.]+ kB", "  12 kB"),
+)
+"""Patterns of texts that differ between runs and versions of libraries, and their replacements."""
+
+
+def recordings(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make two recordings, of which the second is cut, and one file that is no recording."""
+    (where / "ring").mkdir()
+    for number, seconds in ((1, 2.0), (2, 4.0)):
+        tape = Tape(every=200)
+        world = World(recorder=tape)
+        world.drive(0.5, seconds=seconds)
+        world.call("stop")
+        world.run(0.5)
+        tape.write(where / f"ring/00000{number}-20270115T080000Z.mcap", Config())
+    whole = where / "ring/000002-20270115T080000Z.mcap"
+    data = whole.read_bytes()
+    whole.write_bytes(data[: chunks(data)[2][1]])
+    whole.rename(f"{whole}.part")
+
+
+def logs(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make a log, a bag, and one part of a bag."""
+    (where / "drive.csv").write_text(usual().csv(places=False))
+    write_bag(where / "bag", usual(plan=GUIDED[:2]))
+
+
+def authorities(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make an authority of another robot and an expired one, and give this machine fixed names."""
+    Authority.make(where / "other", "other", 30, ["localhost"])
+    Authority.make(where / "expired", "expired", -1, ["localhost"])
+    monkeypatch.setattr("socket.gethostname", lambda: "robot")
+    monkeypatch.setattr("acsard.machine.certificates.own_addresses", lambda: [ADDRESS])
+
+
+SLOW = ("mcu", "recording")
+
+PREPARED: dict[str, Callable[[Path, pytest.MonkeyPatch], None]] = {
+    "recording": recordings,
+    "calibrate": logs,
+    "tls": authorities,
+}
+"""Makes the files of a transcript, by its name."""
+
+
+def marked(mark: str, printed: str) -> str:
+    return "".join(f"{mark} {line}".rstrip() + "\n" for line in printed.splitlines())
+
+
+def outcome(command: str) -> tuple[str, int]:
+    """Run a command, and return its printed lines and its exit code."""
+    program, *words = shlex.split(command)
+    if program != "acsard":
+        done = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=10.0)
+        return marked("|", done.stdout) + marked("!", done.stderr), done.returncode
+    ended = typed(*words)
+    printed = marked("|", ended.out) + marked("!", ended.err)
+    for pattern, word in VARYING:
+        printed = re.sub(pattern, word, printed)
+    return printed, ended.code
+
+
+def contents(where: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() if path.is_file() else b"" for path in where.rglob("*")}
+
+
+def replayed(transcript: str, where: Path) -> Iterator[str]:
+    """Run the commands of a transcript, and yield the lines that it should have."""
+    for line in transcript.splitlines(keepends=True):
+        if line.startswith("# ") or line == "\n":
+            yield line
+        elif line.startswith("$ "):
+            before = contents(where)
+            printed, code = outcome(line.removeprefix("$ "))
+            assert code == 0 or contents(where) == before, f"{line} failed and changed a file"
+            yield line + printed + (f"exit {code}\n" if code else "")
+
+
+@pytest.fixture
+def utc(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Print local times in UTC."""
+    with monkeypatch.context() as patch:
+        patch.setenv("TZ", "UTC")
+        time.tzset()
+        yield
+    time.tzset()
+
+
+@pytest.mark.usefixtures("utc")
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(path.stem, marks=[pytest.mark.slow] if path.stem in SLOW else [])
+        for path in sorted(PLACE.glob("*.txt"))
+    ],
+)
+def test_each_command_prints_what_its_transcript_says(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    for variable in ("ACSARD_CONFIG", "ACSARD_TLS", "ACSARD_RECORD"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    monkeypatch.setattr(config_file, "SEARCH_PATHS", (Path("acsard.toml"),))
+    monkeypatch.chdir(tmp_path)
+    if name in PREPARED:
+        PREPARED[name](tmp_path, monkeypatch)
+    path = PLACE / f"{name}.txt"
+    transcript = path.read_text(encoding="utf-8")
+    text = "".join(replayed(transcript, tmp_path)).replace(str(tmp_path), "HERE")
+    if request.config.getoption("approve"):
+        path.write_text(text, encoding="utf-8")
+    assert text == transcript
