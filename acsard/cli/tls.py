@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import ipaddress
+import os
 import re
 import socket
 from collections.abc import Mapping
@@ -140,7 +141,8 @@ def _add_common(action: argparse.ArgumentParser) -> None:
 
 
 def main_init(args: argparse.Namespace) -> int:
-    directory = args.directory.resolve()
+    # `Path.resolve` of Python 3.11 raises a RuntimeError for a loop of links. `init` explains it.
+    directory = Path(os.path.realpath(args.directory))
 
     configs: list[Config] = []
 

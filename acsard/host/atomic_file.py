@@ -1,4 +1,4 @@
-"""Replaces files atomically, and waits until the disk has stored a file or directory."""
+"""Replaces files atomically, waits until the disk has stored them, and follows links."""
 
 from __future__ import annotations
 
@@ -9,6 +9,17 @@ from contextlib import suppress
 from pathlib import Path
 
 NEW_MODE = 0o644  # other users may read it: the systemd service may run as another user
+
+
+def real_path(path: Path, new: bool = False) -> Path:
+    """Return the path without symbolic links; `new` permits a missing one. Raises `OSError`."""
+    # `Path.resolve` of Python 3.11 raises a RuntimeError for a loop of links.
+    try:
+        return Path(os.path.realpath(path, strict=True))
+    except FileNotFoundError:
+        if not new:
+            raise
+        return Path(os.path.realpath(path))
 
 
 def replace(

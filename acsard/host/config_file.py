@@ -13,7 +13,7 @@ from acsard.core.config.parsing import MAX_BYTES, ConfigError, parse
 from acsard.core.config.settings import Config
 from acsard.core.config.toml_editing import edited
 from acsard.core.values import AcsardError
-from acsard.host.atomic_file import replace
+from acsard.host.atomic_file import real_path, replace
 from acsard.host.errors import Exit, ExitError, MendableError
 from acsard.host.extras import install
 
@@ -85,17 +85,6 @@ def writable(path: str | None) -> Path:
 Keys = Mapping[str, object]  # values by dotted key, such as "mcu.port"
 
 
-def _target(file: Path, new: bool = False) -> Path:
-    # The result has no symbolic links. A `new` file may be missing. Raises `OSError`.
-    # `Path.resolve` of Python 3.11 raises RuntimeError for a loop.
-    try:
-        return Path(os.path.realpath(file, strict=True))
-    except FileNotFoundError:
-        if not new:
-            raise
-        return Path(os.path.realpath(file))
-
-
 def _require_writable(place: Path) -> None:
     # Raises `ValueError`.
     if not place.is_file():
@@ -132,7 +121,7 @@ def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = Fal
     `MendableError` and then leaves it unchanged.
     """
     try:
-        with _locked(_target(file, new).parent):
+        with _locked(real_path(file, new).parent):
             place, text, changes = _changed(file, keys, new)
             replace(place, text.encode())
             return changes
@@ -169,7 +158,7 @@ def require_changeable(
 def _changed(
     file: Path, keys: Keys | Callable[[Config], Keys], new: bool
 ) -> tuple[Path, str, Keys]:
-    place = _target(file, new)
+    place = real_path(file, new)
     # `read_text` would lose CRLF line ends.
     text = "" if new and not place.exists() else _decoded(read(place))
     changes = keys(parse(text.encode())) if callable(keys) else keys

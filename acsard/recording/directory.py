@@ -26,7 +26,7 @@ from acsard.core.config.settings import RECORD_VARIABLE, RecordConfig
 from acsard.core.formatting import listed as listed_names
 from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S, Event, Instant, Ns, WallNs
-from acsard.host.atomic_file import sync
+from acsard.host.atomic_file import real_path, sync
 from acsard.recording.end_record import CUT_TEXTS
 from acsard.recording.file import FILE_MODE, About, RecordingWriter
 from acsard.recording.recovery import recover
@@ -175,7 +175,7 @@ class RecordingDirectory:
         self._rounds = self.file_bytes = 0  # calls of `maintain`; size at which a file should end
         self.messages: list[str] = []  # for the log, about damaged or unfinished files
         self.cut_ns: WallNs | None = None  # crash that cut off an earlier run's newest file
-        here = self._directory.resolve()
+        here = real_path(self._directory, new=True)
         as_service = os.environ.get(RECORD_VARIABLE) == settings.directory
         self._open_to_all = as_service and here.is_relative_to(PRIVATE_STATE)
         if not self._directory.is_dir():

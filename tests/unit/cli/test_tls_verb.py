@@ -502,4 +502,10 @@ def test_the_printed_lines_are_those_that_write_writes(
         assert parse(Path("acsard.toml").read_bytes()).bus == printed
 
 
-# an authority that cannot sign
+def test_init_in_a_loop_of_symbolic_links_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a").symlink_to(tmp_path / "b")
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    assert tls("init", "--directory", str(tmp_path / "a" / "keys")) == Exit.FAILURE
+    assert f"{tmp_path}/a is not a directory" in capsys.readouterr().err

@@ -258,6 +258,23 @@ def test_a_disk_that_refuses_is_reported_and_tried_again_and_driving_goes_on(
     assert next(steps(Recording(path))).number > 100
 
 
+def test_a_loop_of_symbolic_links_is_reported_and_the_recorder_tries_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where, other = tmp_path / "record", tmp_path / "other"
+    where.symlink_to(other)
+    other.symlink_to(where)
+    bench = Bench(where, monkeypatch)
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(2.0)
+    assert bench.recorder.status.trouble == f"{where}: Too many levels of symbolic links"
+    other.unlink()
+    other.mkdir()
+    bench.drive(6.0)
+    assert bench.recorder.status.trouble == ""
+    assert len(bench.end()) == 1
+
+
 def happen_stop(world: World) -> None:
     world.call("stop")
 
