@@ -369,7 +369,7 @@ class Robot:
             self._fault(DRIVER_FAULT_REASON, now, events)
             self._life.caused_again(now.mono_ns)
         battery = self._battery
-        events += battery.process_reports(statuses, now.mono_ns)
+        events += battery.process_reports(statuses, now.mono_ns, self.session.link == "up")
         if battery.stopped_now:
             self._life.press(battery.why, now)
         if self.session.forgot:

@@ -720,6 +720,9 @@ class Inputs:
             self._doubtful = True
             witness.perhaps_latched.add("clear")
             return
+        if snapshot.decided_ns - (battery.at_ns or 0) > 4.8 * NS:
+            # A battery that is no longer reported does not refuse a clear.
+            battery.must["stop"] = False
         if battery.may["stop"] and snapshot.mode == "stopped" != self._mode and not witness.stops:
             witness.counts["battery empty"] += 1
             witness.stops.append(true_ns)

@@ -2,8 +2,9 @@
 
 The thresholds of `[battery]` apply to a running mean, because starting motors make the voltage drop
 for some tenths of a second. An empty battery latches a stop, which `clear` releases only above the
-threshold by `HYSTERESIS`. If the board stops reporting, the level is "unknown" and the
-robot does not stop: one that blocks the way is the greater danger, and the voltage falls slowly.
+threshold by `HYSTERESIS`. If the board stops reporting, the level is "unknown", the robot does not
+stop and `clear` is not refused: one that blocks the way is the greater danger, and the voltage
+falls slowly.
 """
 
 from __future__ import annotations
@@ -79,7 +80,9 @@ class Battery:
         self.stopped_now = False  # in the last `process_reports`
         self._values: dict[str, tuple[float, int]] = {}  # "volts", "percent", "amps", with arrival
         self._awaited = True  # until the board on the new port reports what `battery.measure` names
-        # Last level but "unknown": silence must not end a stop.
+        # Last report of what `battery.measure` names, or last step without a link.
+        self._reported_ns: Ns | None = None
+        # Last level but "unknown"; "stop" only while the board reports the battery.
         self._known: BatteryLevel = "stop" if stopped and "stop" in self._bounds else "ok"
         self._told: BatteryLevel | None = None  # in the last event
         self._mean: float | None = None
@@ -120,10 +123,15 @@ class Battery:
                 self.status = None
 
     def process_reports(
-        self, reports: Iterable[tuple[int, BoardStatus]], now_ns: Ns
+        self, reports: Iterable[tuple[int, BoardStatus]], now_ns: Ns, linked: bool
     ) -> list[Event]:
-        """Process status lines with their arrival; return an event if the level changed."""
+        """Process status lines with their arrival; return an event if the level changed.
+
+        Without a link the board cannot report, so a level "stop" stays.
+        """
         self.stopped_now = False
+        if self._reported_ns is None or not linked:
+            self._reported_ns = now_ns
         news = False
         for at_ns, line in reports:
             percent = None if line.charge is None else float(round(100 * line.charge))
@@ -132,6 +140,8 @@ class Battery:
                 if value is not None:
                     self._take(name, value, at_ns)
                     news = True
+        if self._known == "stop" and now_ns - self._reported_ns > SILENCE_TIMEOUT_S * NS_PER_S:
+            self._known = "ok"
         if self.status is None and not ("volts" in self._values or "percent" in self._values):
             return []
         for name, (_, at_ns) in [*self._values.items()]:
@@ -153,7 +163,7 @@ class Battery:
         if name != self._config.measure:
             self._since_ns = at_ns if first else self._since_ns
             return
-        self._awaited = False
+        self._awaited, self._reported_ns = False, at_ns
         if self._mean is None:
             self._mean, self._since_ns, self._mean_ns = value, at_ns, at_ns
             self._stood_ns = 0

@@ -802,6 +802,25 @@ def test_clear_is_refused_while_the_battery_is_low_and_works_above_the_hysteresi
     assert bench.step(GO).mode == "driving"
 
 
+@each("silence", [b"", b"!status driver=ok\r\n", b"!status charge=0.90\r\n"])
+def test_clear_works_5_s_after_the_last_report_of_a_low_battery(silence: bytes) -> None:
+    bench = Button(EMPTY_LINE, GUARDED)
+    for _ in range(400):
+        bench.step()
+    bench.status(silence)
+    allowed = []
+    for _ in range(600):
+        allowed.append(bench.answer("clear").success)
+    assert 490 < allowed.index(True) < 510
+    bench.step(REST)
+    assert bench.step(GO).mode == "driving"
+    bench.status(EMPTY_LINE)
+    for _ in range(400):
+        bench.step(GO)
+    assert bench.mode() == "stopped"
+    assert not bench.answer("clear").success
+
+
 @each("line", [PRESSED_LINE, OK_LINE + DRIVER_FAULT, b"!status bumpers=.X\r\n", EMPTY_LINE])
 def test_a_restarted_daemon_refuses_clear_until_the_board_has_reported_the_cause(
     line: bytes,

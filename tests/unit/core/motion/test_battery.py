@@ -33,6 +33,7 @@ class Pack:
     def __init__(self, config: BatteryConfig = CONFIG) -> None:
         self.battery = Battery(config)
         self.now_ms = 10_000
+        self.linked = True
         self.events: list[tuple[str, str]] = []
         self.stops = 0
 
@@ -40,7 +41,7 @@ class Pack:
         """Process these status lines `ms` after the last step, and return the level."""
         self.now_ms += ms
         reports = [(self.now_ms * MS, line) for line in lines]
-        events = self.battery.process_reports(reports, self.now_ms * MS)
+        events = self.battery.process_reports(reports, self.now_ms * MS, self.linked)
         self.events += [(event.name, event.text) for event in events]
         self.stops += self.battery.stopped_now
         return None if self.battery.status is None else self.battery.status.level
@@ -167,8 +168,9 @@ def test_the_stop_is_reported_once_and_held_until_the_hysteresis() -> None:
 def test_an_exchanged_battery_ends_the_stop_within_seconds() -> None:
     pack = Pack()
     pack.at(20.5, 30.0)
-    pack.quiet(SILENCE_TIMEOUT_S + 0.1)
+    pack.quiet(SILENCE_TIMEOUT_S - 0.1)
     assert pack.battery.refuses_clear
+    pack.quiet(0.2)
     assert pack.at(25.0, 3.2) == "ok"
     assert not pack.battery.refuses_clear
 
@@ -283,15 +285,30 @@ def test_lines_without_the_battery_do_not_count_as_its_reports() -> None:
     assert pack.status.level == "unknown"
 
 
-def test_a_silence_does_not_release_a_stop() -> None:
+def test_a_battery_that_is_no_longer_reported_does_not_refuse_clear() -> None:
     pack = Pack()
     pack.at(20.0, 10.0)
-    assert pack.quiet(600.0) == "unknown"
+    pack.quiet(SILENCE_TIMEOUT_S)
     assert pack.battery.refuses_clear
-    # A clear would be refused, so the event does not advise it.
+    assert pack.quiet(0.2) == "unknown"
+    assert not pack.battery.refuses_clear
     assert pack.events[-1] == ("battery", SILENT_REASON)
     assert pack.at(20.0, 10.0) == "stop"
-    assert pack.stops == 1
+    # A `clear` may have released the first stop.
+    assert (pack.stops, pack.battery.refuses_clear) == (2, True)
+
+
+def test_only_a_silence_with_a_link_ends_the_refusal_of_clear() -> None:
+    pack = Pack()
+    pack.at(20.0, 10.0)
+    pack.linked = False
+    pack.quiet(600.0)
+    assert pack.battery.refuses_clear
+    pack.linked = True
+    pack.quiet(SILENCE_TIMEOUT_S)
+    assert pack.battery.refuses_clear
+    pack.quiet(0.2)
+    assert not pack.battery.refuses_clear
 
 
 @each(
