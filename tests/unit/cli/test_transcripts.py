@@ -18,10 +18,12 @@ from pathlib import Path
 
 import pytest
 
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, McuConfig
+from acsard.core.messages.signature import Signature
+from acsard.core.values import NS_PER_S, Received
 from acsard.host import config_file
 from acsard.machine.authority import Authority
-from tests.scenarios.taped import Tape, chunks
+from tests.scenarios.taped import Tape, chunks, recorded_world
 from tests.scenarios.world import World
 from tests.system.typed import typed
 from tests.unit.calibration.bags import write_bag
@@ -72,12 +74,54 @@ def authorities(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("acsard.machine.certificates.own_addresses", lambda: [ADDRESS])
 
 
+def days(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Record a short day of a robot that meets many events, and its second half alone."""
+    config = Config(mcu=McuConfig(port="/dev/ttyACM0"))
+    tape, world = recorded_world(config, every=200)
+    world.drive(0.5, 0.2, seconds=1.0)
+    world.call("stop")
+    world.run(1.0)
+    world.call("clear")
+    world.run(0.3)
+    world.hold(0.5, seconds=2.5)  # without a zero
+    world.drive(0.5, seconds=1.0, source="nav")
+    world.send(0.0, source="teleop")
+    for _ in range(40):
+        world.send(0.5, source="teleop")
+        payload, sender = b'{"linear": {"x": 0.3}, "angular": {}}', Signature("eve").pack()
+        world.put("cmd/app", payload, attachment=sender)
+        world.run(0.05)
+    world.run(1.0)
+    world.wall_offset_ns += 36_000 * NS_PER_S
+    world.run(1.0)
+    world.wall_offset_ns -= 7_200 * NS_PER_S
+    world.drive(0.5, seconds=0.5)
+    world.stall(0.6)
+    world.run(1.0)
+    with world.mcu.mute():
+        world.run(0.05)
+        world.stall(0.2)
+        world.run(0.05)
+    world.run(1.0)
+    with world.mcu.mute():
+        world.run(0.5)
+        identity = b"!acsard-mcu 1 counts=3200 check=1 sample=1 lines=0 reset=brown-out\r\n"
+        world.port.feed(Received(world.instant, identity))
+        world.run(0.05)
+    world.drive(0.5, seconds=0.5)
+    world.loop.shutting_down = True
+    world.run(0.1)
+    tape.write(where / "day.mcap", config)
+    tape.write(where / "evening.mcap", config, first=2000)
+
+
 SLOW = ("mcu", "recording")
 
 PREPARED: dict[str, Callable[[Path, pytest.MonkeyPatch], None]] = {
     "recording": recordings,
     "calibrate": logs,
     "tls": authorities,
+    "timeline": days,
 }
 """Makes the files of a transcript, by its name."""
 
