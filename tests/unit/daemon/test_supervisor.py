@@ -31,7 +31,6 @@ def test_a_program_that_cannot_be_started_is_reported(monkeypatch: pytest.Monkey
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     event = asyncio.run(first_event())
     assert (event.name, event.level) == ("gateway_ended", "warning")
-    assert "could not be started" in event.text
 
 
 def test_a_thread_that_cannot_be_started_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,7 +38,7 @@ def test_a_thread_that_cannot_be_started_is_reported(monkeypatch: pytest.MonkeyP
         raise RuntimeError("can't start new thread")
 
     monkeypatch.setattr(threading.Thread, "start", full)
-    assert "can't start new thread" in asyncio.run(first_event()).text
+    assert asyncio.run(first_event()).name == "gateway_ended"
 
 
 def program(monkeypatch: pytest.MonkeyPatch, where: Path, text: str) -> None:
@@ -57,13 +56,13 @@ def test_a_program_that_falls_silent_is_killed(
     pid = tmp_path / "pid"
     stops = f"import os; os.write(0, b'.'); open({str(pid)!r}, 'w').write(str(os.getpid())); "
     program(monkeypatch, tmp_path, stops + "os.kill(os.getpid(), 19)")
-    assert "stopped or hung" in asyncio.run(first_event()).text
+    assert asyncio.run(first_event()).name == "gateway_ended"
     with pytest.raises(ProcessLookupError):
         os.kill(int(pid.read_text()), signal.SIGCONT)
 
 
 @pytest.mark.parametrize(("kind", "code"), [(PAGE, 2), (PAGE, 75), (PAGE, 77), (PAGE, 78)])
-def test_a_program_that_cannot_start_at_first_is_given_up_and_the_log_says_the_remedy(
+def test_a_program_that_cannot_start_at_first_is_given_up(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Kind, code: int
 ) -> None:
     program(monkeypatch, tmp_path, f"raise SystemExit({code})")
@@ -71,7 +70,6 @@ def test_a_program_that_cannot_start_at_first_is_given_up_and_the_log_says_the_r
     assert asyncio.run(keep_running(["any"], events.append, kind)) == code
     (event,) = events
     assert (event.name, event.level) == (kind.ended, "warning")
-    assert event.text.startswith(f"{kind.name} ended with exit code {code}; it is not restarted: ")
     assert kind.remedy in event.text
 
 
@@ -90,16 +88,14 @@ def test_a_program_that_once_ran_is_started_again_when_its_files_are_wrong(
         keeper = asyncio.create_task(keep_running(["any"], events.append, kind))
         while len(events) < 3 and not keeper.done():
             await asyncio.sleep(0.01)
+        assert not keeper.done()
         keeper.cancel()
 
     asyncio.run(asyncio.wait_for(runs(), 10.0))
-    texts = [event.text for event in events[:3]]
-    assert texts == [
-        f"{kind.name} ended with exit code {number}; it is restarted" for number in (1, code, code)
-    ]
+    assert {event.name for event in events} == {kind.ended}
 
 
-def test_a_page_that_a_person_ends_after_it_ran_stays_ended_and_the_log_says_the_remedy(
+def test_a_page_that_a_person_ends_after_it_ran_stays_ended(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     began = tmp_path / "began"
@@ -108,11 +104,7 @@ def test_a_page_that_a_person_ends_after_it_ran_stays_ended_and_the_log_says_the
     events: list[Event] = []
     page = replace(PAGE, restart_pause_s=0.01)
     assert asyncio.run(keep_running(["web"], events.append, page)) == 0
-    assert [event.text.partition(": ")[0] for event in events] == [
-        "the robot's page ended with exit code 1; it is restarted",
-        "the robot's page ended with exit code 0; it is not restarted",
-    ]
-    assert "`acsard web`" in events[1].text
+    assert [PAGE.remedy in event.text for event in events] == [False, True]
 
 
 def test_the_first_page_that_could_be_started_counts_as_the_first(
@@ -130,9 +122,7 @@ def test_the_first_page_that_could_be_started_counts_as_the_first(
         monkeypatch.setattr(sys, "executable", executable)
 
     assert asyncio.run(keep_running(["web"], log, PAGE)) == 78
-    refused, given_up = (event.text for event in events)
-    assert "could not be started" in refused
-    assert "it is not restarted" in given_up
+    assert [PAGE.remedy in event.text for event in events] == [False, True]
 
 
 @pytest.mark.parametrize(("kind", "code"), [(GATEWAY, 78), (PAGE, 1)])
@@ -141,7 +131,4 @@ def test_a_program_that_may_start_later_is_restarted(
 ) -> None:
     program(monkeypatch, tmp_path, f"raise SystemExit({code})")
     event = asyncio.run(first_event(kind))
-    assert (event.name, event.text.partition(";")[0]) == (
-        kind.ended,
-        f"{kind.name} ended with exit code {code}",
-    )
+    assert event.name == kind.ended

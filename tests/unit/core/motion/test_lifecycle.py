@@ -424,11 +424,12 @@ def test_the_reason_names_each_cause_with_its_time_and_what_the_operator_can_do(
     )
 
 
-def test_the_reason_says_how_a_robot_that_was_switched_off_is_switched_on() -> None:
+def test_the_newest_client_that_switched_the_robot_off_is_named() -> None:
     life = ready()
     deactivate(life, 1.0, "joe")
     deactivate(life, 2.0)
-    assert life.why.text == "switched off by ann at 2027-01-15 08:00:02 UTC; call srv/activate"
+    assert life.latches.inactive is not None
+    assert (life.why.code, life.latches.inactive.by) == ("switched_off", "ann")
 
 
 def test_a_refusal_names_what_holds_the_robot() -> None:
