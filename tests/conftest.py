@@ -11,6 +11,7 @@ import signal
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from zlib import crc32
 
@@ -70,7 +71,19 @@ One worker runs all of them and `bench`, one after the other: they would disturb
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--approve", action="store_true", help="write the transcripts anew")
+    parser.addoption("--approve", action="store_true", help="write the approved texts anew")
+
+
+@pytest.fixture
+def approved(request: pytest.FixtureRequest) -> Callable[[Path, str], None]:
+    """Return a function that compares a text with an approved file, or writes it (`--approve`)."""
+
+    def compare(path: Path, text: str) -> None:
+        if request.config.getoption("approve"):
+            path.write_text(text, encoding="utf-8")
+        assert text == path.read_text(encoding="utf-8")
+
+    return compare
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:

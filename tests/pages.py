@@ -257,9 +257,6 @@ COMMANDS: dict[str, How] = {
     ),
     ".venv/bin/pytest -m soak -s": PYTEST,
     "bash .ci/run": UntestedCommand("it is what runs everything here"),
-    ".venv/bin/python -m tests.screens": Elsewhere(
-        "tests/test_screens.py", "test_each_screen_fits_its_width_and_shows_the_whole_reason"
-    ),
     ".venv/bin/python -m tests.pythons python3.12 python3.13": UntestedCommand(
         "installs into venvs of other Pythons, for who has them"
     ),

@@ -178,7 +178,10 @@ def utc(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     ],
 )
 def test_each_command_prints_what_its_transcript_says(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    approved: Callable[[Path, str], None],
 ) -> None:
     for variable in ("ACSARD_CONFIG", "ACSARD_TLS", "ACSARD_RECORD"):
         monkeypatch.delenv(variable, raising=False)
@@ -191,6 +194,4 @@ def test_each_command_prints_what_its_transcript_says(
     path = PLACE / f"{name}.txt"
     transcript = path.read_text(encoding="utf-8")
     text = "".join(replayed(transcript, tmp_path)).replace(str(tmp_path), "HERE")
-    if request.config.getoption("approve"):
-        path.write_text(text, encoding="utf-8")
-    assert text == transcript
+    approved(path, text)

@@ -68,21 +68,6 @@ def test_help_stays_on_a_screen_of_few_lines() -> None:
     assert rows[-len(HELP) :] == list(HELP)
 
 
-def test_keys_that_do_not_drive_are_reported() -> None:
-    why = "app has the same priority and came first: wait until it is silent"
-    data = replace(SEEN, objection=why)
-    assert why in " ".join(" ".join(texts(data, 40)).split())
-    assert why in joined(report_lines(data, 40))
-
-
-def test_a_silence_is_reported_with_its_length() -> None:
-    silent = replace(SEEN, age=7.0, silent=True)
-    for data in (silent, replace(silent, state=None)):
-        assert "nothing received from the daemon for 7 s" in " ".join(texts(data, 80))
-        assert "nothing received from the daemon for 7 s" in joined(report_lines(data, 80))
-    assert "first state" in texts(replace(SEEN, state=None), 80)[1]
-
-
 @each("mode", list(Mode))
 def test_the_mode_is_shown_once_with_its_reason(mode: Mode) -> None:
     data = of(mode=mode.value, reason="because")
@@ -97,26 +82,6 @@ def test_without_a_screen_no_word_and_no_figure_is_broken_at_the_edge(width: int
     assert LONG in joined(rows)
     assert sum("x   +1.500 m" in line for line in rows) == 1
     assert sum("turn -0.60 rad/s" in line for line in rows) == 1
-
-
-def test_the_final_report_says_whether_the_robot_stands_and_where() -> None:
-    still = {"linear": 0.0, "angular": 0.0, "wheels": [0.0] * 4}
-    assert joined(last_report_lines(of(**still), 80)).startswith(
-        "drive ended: the robot stands still; driving: commanded"
-    )
-    for moving in (of(), of(**still | {"wheels": [0.0, 0.1, 0.0, 0.0]})):
-        assert joined(last_report_lines(moving, 80)).startswith(
-            "drive ended: the robot still moves; driving: "
-        )
-    unknown = of(**still | {"linear": None, "angular": None, "wheels": []})
-    assert joined(last_report_lines(unknown, 80)).startswith(
-        "drive ended: the robot reports no speed; driving: "
-    )
-    assert "forward - m/s" in joined(last_report_lines(unknown, 80))
-    assert "yaw +57.3°" in joined(last_report_lines(of(**still), 40))
-    assert joined(last_report_lines(replace(SEEN, age=7.0, silent=True), 80)).startswith(
-        "drive ended: nothing received from the daemon"
-    )
 
 
 @given(

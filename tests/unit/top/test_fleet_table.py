@@ -17,7 +17,7 @@ from acsard.bus.address import Address
 from acsard.client import fleet as fleets
 from acsard.client.fleet import Row
 from acsard.client.follower import FLEET_QUERY_PERIOD_S
-from acsard.core.messages.schema import BatterySummary, Info, Time
+from acsard.core.messages.schema import Info, Time
 from acsard.core.values import NS_PER_S
 from acsard.host import clock as clocks
 from acsard.top.fleet_table import COLUMN_HEADS, Roster, table
@@ -27,56 +27,9 @@ from tests.unit.top.screens import STATE, sample_of
 ROW = Row("robot1", True, replace(STATE, reason="commanded by app"), 0.1, "0.1.0")
 
 
-def test_a_line_has_every_column_of_a_robot() -> None:
-    head, line = table([ROW], 120)
-    assert head.split() == [column for column in COLUMN_HEADS if column != "BATTERY"]
-    assert line.split() == [
-        "robot1", "driving", "+0.50", "up", "+1.2", "-0.5", "+57°", "0.1.0", "0.1", "s",
-        "commanded", "by", "app",
-    ]  # fmt: skip
-
-
 READY = replace(STATE, mode="ready", reason="waiting for a command", linear=0.0)
 DIFFER = "limits.linear_speed = 0.8, not 1.0"
 FULL = "the disk is full: nothing is recorded"
-
-
-@each("width", [60, 80, 120])
-@each(
-    ("wrong", "brief"),
-    [
-        ({"recording_error": FULL}, "recording fails"),
-        ({"certificate": "expires", "certificate_days": 10.0}, "certificate expires in 10 days"),
-        ({"latch_file_error": "no room"}, "latch file fails"),
-        ({"wheel_fault": "rear left wheel is left out"}, "wheel fault"),
-        ({"settings_differ": DIFFER}, "settings differ"),
-        ({"emergency_stop": "silent"}, "emergency stop not reported"),
-        ({"bumpers": [False, True, True]}, "bumpers 2 and 3 pressed"),
-        ({"battery": BatterySummary(20.0, None, None, "stop")}, "battery empty (20.0 V)"),
-        ({"battery": BatterySummary(None, None, None, "unknown")}, "battery level unknown"),
-    ],
-)
-def test_a_robot_that_will_fail_later_does_not_look_ready(
-    wrong: dict[str, Any], brief: str, width: int
-) -> None:
-    bad, good = replace(READY, **wrong), replace(READY, certificate="valid")
-    rows = [Row("robot1", True, good, 0.1, "0.1.0"), Row("robot2", True, bad, 0.1, "0.1.0")]
-    _, first, second = table(rows, width)
-    assert first.startswith("robot2  ready")
-    assert f"WARNING: {brief}"[: width - first.index("WARNING") - 1] in first
-    assert second.startswith("robot1  ready")
-    assert second.endswith("waiting for a command")
-
-
-def test_the_column_of_the_battery_is_there_if_a_robot_has_one() -> None:
-    full = replace(READY, battery=BatterySummary(24.5, 87.2, -1.0, "ok"))
-    volts = replace(READY, battery=BatterySummary(24.56, None, None, "ok"))
-    states = {"robot1": full, "robot2": volts, "robot3": READY}
-    head, *lines = table([replace(ROW, robot_id=n, state=s) for n, s in states.items()], 80)
-    assert head.split() == ["ROBOT", "MODE", "M/S", "LINK", "BATTERY", "SEEN", "WHY"]
-    at = head.index("BATTERY")
-    assert [line[at : at + 7].strip() for line in lines] == ["87 %", "24.6 V", ""]
-    assert not any("WARNING" in line for line in lines)
 
 
 def test_the_details_of_each_warning_follow_the_list_of_warnings() -> None:
@@ -97,20 +50,6 @@ def test_the_details_of_each_warning_follow_the_list_of_warnings() -> None:
     )
 
 
-def test_the_reason_of_a_fault_comes_before_the_warnings() -> None:
-    state = replace(STATE, mode="fault", reason="a wheel is stuck", settings_differ=DIFFER)
-    (_, line) = table([replace(ROW, state=state)], 160)
-    assert "  a wheel is stuck; WARNING: settings differ; settings: limits" in line
-
-
-def test_a_warning_that_is_in_the_reason_is_not_repeated() -> None:
-    why = "emergency stop pressed at the robot; release it at the robot, then call srv/clear"
-    state = replace(STATE, mode="stopped", reason=why, emergency_stop="pressed")
-    state = replace(state, code="emergency_stop")
-    (_, line) = table([replace(ROW, state=state)], 200)
-    assert line.endswith(f"  {why}")
-
-
 def test_a_narrow_terminal_lacks_the_version_first() -> None:
     rows = [replace(ROW, state=replace(READY, recording_error=FULL))]
     heads = [column for column in COLUMN_HEADS if column != "BATTERY"]
@@ -120,41 +59,6 @@ def test_a_narrow_terminal_lacks_the_version_first() -> None:
         head, line = table(rows, width)
         assert head.split() == heads
         assert len(line) == width
-
-
-def test_the_speed_limit_that_slows_a_robot_is_shown() -> None:
-    (_, line) = table([replace(ROW, state=replace(STATE, speed_limit="0.3 m/s, set by x"))], 160)
-    assert line.endswith("; speed limit: 0.3 m/s, set by x")
-
-
-def test_without_feedback_no_speed_is_shown() -> None:
-    (_, line) = table([replace(ROW, state=replace(STATE, linear=None))], 120)
-    assert line.split()[2] == "-"
-
-
-def test_robots_are_in_the_order_of_their_names() -> None:
-    rows = [replace(ROW, robot_id=name) for name in ("c", "a", "b")]
-    assert [line[0] for line in table(rows, 80)[1:]] == ["a", "b", "c"]
-
-
-@each(
-    ("row", "words"),
-    [
-        (replace(ROW, here=False, age=90.0), "GONE, was: commanded by app"),
-        (replace(ROW, age=7.0, silent=True), "SILENT, was: commanded by app"),
-        (replace(ROW, state=None), "waiting for its state"),
-        (replace(ROW, state=None, here=False), "not there"),
-    ],
-)
-def test_a_robot_that_is_gone_or_silent_is_reported(row: Row, words: str) -> None:
-    assert table([row], 120)[1].endswith(words)
-
-
-def test_a_narrow_terminal_shows_the_most_important_columns() -> None:
-    head, line = table([ROW], 40)
-    assert head.split() == ["ROBOT", "MODE", "M/S", "SEEN", "WHY"]
-    assert len(line) <= 40
-    assert "driving" in line
 
 
 @each("width", [40, 80, 160])
@@ -202,12 +106,6 @@ def test_a_robot_that_needs_help_is_shown_first_if_the_fleet_exceeds_the_screen(
     lines = table([*rows, replace(IN_NEED[need], robot_id="robot99")], 120, 22)
     assert lines[1].startswith("robot99")
     assert [line.split()[0] for line in lines[2:-1]] == [row.robot_id for row in rows[:19]]
-
-
-def test_a_robot_in_fault_is_before_those_that_are_off() -> None:
-    rows = [replace(row, robot_id=str(9 - n)) for n, row in enumerate(IN_NEED.values())]
-    names = [line[0] for line in table([*rows, ROW], 120)[1:]]
-    assert names == ["9", "8", "5", "7", "6", "r"]
 
 
 def test_more_robots_than_lines_are_counted() -> None:

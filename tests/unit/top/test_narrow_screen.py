@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import re
-
 from rich.cells import cell_len
 
-from acsard.core.messages.schema import SourceState
 from tests.each import each
-from tests.unit.top.screens import SEEN, STATE, line_with, lines_of, of, painted
+from tests.unit.top.screens import STATE, lines_of, of, painted
 
 WIDTHS = (40, 60, 80, 160)
 
@@ -46,21 +43,11 @@ def test_every_figure_is_on_a_screen_of_any_width(width: int) -> None:
     assert not any(line.endswith("…") for line in lines[1:])
 
 
-def test_the_wheels_are_where_they_are_on_the_robot() -> None:
-    assert re.search(r"front ▲ \+12.00 .*▲  \+8.00", line_with("front", SEEN, 40))
-    assert re.search(r"rear  ▲ \+12.50 .*▼  -7.50", line_with("rear", SEEN, 40))
-
-
 def test_on_few_lines_the_figures_since_the_start_go_first() -> None:
     lines = lines_of(of(sources=STATE.sources[:1]), 40, 24)
     assert len(lines) == 24
     assert any("last minute" in line for line in lines)
     assert not any("since start" in line for line in lines)
-
-
-def test_sources_that_do_not_fit_are_counted() -> None:
-    many = [SourceState(f"source{n}", n, None, "a command", "command") for n in range(40)]
-    assert any("more: source" in line for line in lines_of(of(sources=many), 40, 24))
 
 
 def test_growing_counters_stand_out_on_a_narrow_screen() -> None:

@@ -11,7 +11,6 @@ from msgspec.structs import replace
 from rich.cells import cell_len
 
 from acsard.core.messages.schema import (
-    BatterySummary,
     Latency,
     RobotState,
     SourceState,
@@ -34,12 +33,6 @@ It clears the screen, sets the title, is markup, reverses direction, colours and
 # content of the screen
 
 
-def test_the_head_shows_robot_address_version_and_age() -> None:
-    head = lines_of(SEEN)[0]
-    for phrase in ("acsar", "tcp/127.0.0.1:7448", "0.1.0", "seen 0.1 s ago", "q quits"):
-        assert phrase in head
-
-
 @each("mode", list(Mode))
 def test_every_mode_has_a_badge_of_its_colour_and_its_reason(mode: Mode) -> None:
     data = of(mode=mode.value, reason="because")
@@ -54,10 +47,6 @@ def test_stopped_and_fault_share_a_style_that_no_other_mode_has() -> None:
     assert (
         len({MODE_STYLES[m] for m in ("driving", "ready", "waiting", "stopped", "inactive")}) == 5
     )
-
-
-def test_the_mode_is_shown_once_with_its_reason() -> None:
-    assert lines_of(SEEN)[1].strip() == "DRIVING   commanded by app"
 
 
 def test_a_long_reason_continues_below_and_moves_no_other_line() -> None:
@@ -76,23 +65,12 @@ def test_a_long_reason_continues_below_and_moves_no_other_line() -> None:
 # no state for some time
 
 
-def test_before_the_first_state_the_screen_says_what_it_waits_for() -> None:
-    assert lines_of(ScreenData("acsar", "tcp/x:1", None))[1] == (
-        "waiting for the first state message of the daemon"
-    )
-
-
 @pytest.mark.parametrize("state", [STATE, None])
 def test_a_silent_robot_is_shown_by_three_red_lines(state: RobotState | None) -> None:
     data = replace(SEEN, state=state, age=3.4, silent=True)
     assert "NOTHING RECEIVED FOR 3 s: is the daemon running?" in lines_of(data)[2]
     assert painted(data).count("41m") == 3  # three lines in red
     assert not any("DRIVING" in line for line in lines_of(data))
-
-
-def test_a_slow_state_is_not_silent_before_its_time() -> None:
-    assert "NOTHING RECEIVED" not in "".join(lines_of(replace(SEEN, age=9.0)))
-    assert "NOTHING RECEIVED FOR 30 s" in lines_of(replace(SEEN, age=30.0, silent=True))[2]
 
 
 def test_the_last_values_before_a_silence_stay_dimmed() -> None:
@@ -110,33 +88,6 @@ def test_without_a_link_no_old_speed_is_shown(width: int) -> None:
     assert not re.search(r"[+-]\d+\.\d+ (m/s|rad/s)", no_link)
     assert re.search(r"[+-]\d+\.\d+ m/s", there)
     assert "▲" not in no_link
-
-
-def test_undecodable_messages_are_distinguished_from_silence() -> None:
-    (row,) = [
-        line
-        for line in lines_of(replace(SEEN, age=3.0, undecodable=9, silent=True))
-        if "FOR 3 s" in line
-    ]
-    assert "a different version?" in row
-
-
-@each("width", [40, 80])
-def test_a_warning_is_shown_below_the_mode_with_its_text(width: int) -> None:
-    inputs = {"emergency_stop": "released", "bumpers": [False, False]}
-    battery = BatterySummary(24.5, 87.0, -1.25, "ok")
-    lines = lines_of(
-        of(mode="ready", recording_error="disk full", battery=battery, **inputs), width
-    )
-    at = next(n for n, line in enumerate(lines) if "READY" in line)
-    assert "WARNING: recording fails: disk full" in map(str.strip, lines[at : at + 4])
-    words = " ".join(" ".join(lines).split())
-    assert "board emergency stop released bumpers .. battery 24.50 V -1.25 A 87 %" in words
-
-
-def test_more_warnings_take_one_line_of_a_wide_screen() -> None:
-    lines = lines_of(of(recording_error="disk full", bumpers=[False, True]))
-    assert "WARNING: bumper 2 pressed, recording fails" in lines
 
 
 # any message from the bus
