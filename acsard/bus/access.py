@@ -21,7 +21,6 @@ from acsard.core.messages.keys_and_roles import (
     json_key,
     offered,
     published,
-    row_of,
     source_keys,
 )
 from acsard.core.messages.permissions import COMMAND_ROLE, Use, has, keys_for, least_role
@@ -152,12 +151,6 @@ class _Keys:
         # ROS command keys of all configured sources.
         if native.startswith(tuple(f"{kind}/" for kind in COMMANDS)):
             return COMMAND_ROLE if native.rpartition("/")[2] in self._sources else None
-        if row_of(native) is None:
-            # `least_role` would let every role use the ROS key.
-            raise LookupError(
-                f"the table of keys has no row for {native}, which the daemon uses for the ROS "
-                f"key {endpoint.key}"
-            )
         return least_role(native)
 
 

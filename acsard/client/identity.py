@@ -39,9 +39,13 @@ class ClientIdentity(Struct, frozen=True):
 
         If the role is unknown, return likely reasons for the silence, or "" without a certificate.
         """
-        least = least_role(key)
         if not self.role:
             return self.silence
+        try:
+            least = least_role(key)
+        except LookupError:
+            # The key is the reason, not the role.
+            return ""
         if has(self.role, least):
             return ""
         return f"{self.describe()}; {key} needs at least the role {least}"

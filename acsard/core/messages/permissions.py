@@ -57,13 +57,13 @@ def least_role(key: str) -> Role:
     """Return the lowest role that may put on a key, otherwise query it, otherwise subscribe.
 
     A `json/` is ignored, and a role's name at the end is the role. Without any permission the
-    result is "maintainer", and for an unknown key the placeholder "viewer".
+    result is "maintainer". Raises `LookupError` for an unknown key, which no role may use.
     """
     row = row_of(key.removeprefix(JSON_TREE))
-    if row is None:
-        return "viewer"
+    if row is None or (row.query == "<role>" and key.rpartition("/")[2] not in ROLES):
+        raise LookupError(f"the table of keys has no row for {key!r}")
     if row.query == "<role>":
-        return next((role for role in ROLES if key.endswith(f"/{role}")), ROLES[0])
+        return next(role for role in ROLES if key.endswith(f"/{role}"))
     return row.publish or row.query or row.subscribe or ROLES[-1]
 
 

@@ -52,6 +52,7 @@ def test_a_missing_permission_is_reported_with_the_role_that_it_needs() -> None:
     assert viewer.lacks("srv/stop") == viewer.lacks("state") == ""
     assert ClientIdentity("maintainer", "", "x").lacks("config") == ""
     assert ClientIdentity("", "", "x").lacks("config") == ""
+    assert viewer.lacks("json/no/such/key") == ""
 
 
 def test_a_silent_robot_leads_to_questions_first_about_the_id_and_to_no_claim() -> None:

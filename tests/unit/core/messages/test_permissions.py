@@ -58,8 +58,15 @@ def test_a_published_key_is_granted_together_with_its_json_key() -> None:
         ("imu", "maintainer"),
         ("config", "maintainer"),
         ("whoami/operator", "operator"),
-        ("no/such/key", "viewer"),
     ],
 )
 def test_a_key_has_the_expected_least_role(key: str, role: Role) -> None:
     assert least_role(key) == role
+
+
+@pytest.mark.parametrize(
+    "key", ["", "no/such/key", "cmd/", "cmd/a/b/c", "json/nonsense", "whoami/admin"]
+)
+def test_no_role_may_use_an_unknown_key(key: str) -> None:
+    with pytest.raises(LookupError, match="no row"):
+        least_role(key)
