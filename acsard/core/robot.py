@@ -565,17 +565,13 @@ class Robot:
         if superseded := len(inputs.commands) - len(senders):
             self.counters["commands_superseded"] += superseded
         if inputs.refusals:
-            # Process commands and refusals in the order of arrival. An unreadable message may have
-            # commanded motion, so it cancels the zeros that arrived before it, and only those. The
-            # refusal of a lost message has the arrival time 0, so it is processed first.
+            # Process commands and refusals in the order of arrival. A message that is unreadable or
+            # was lost may have commanded motion, so it cancels a zero that arrived before it.
             messages = sorted([*messages, *inputs.refusals], key=lambda message: message.arrived_ns)
         for message in messages:
             if isinstance(message, Refusal):
                 self._refuse(message, now_ns, events)
-                if message.source:
-                    self._arbiter.notice(
-                        message.source, message.sender, message.arrived_ns, message.shared
-                    )
+                self._arbiter.notice(message.source, message.sender, message.arrived_ns)
                 continue
             if message.stamp_replaced:
                 self.counters["stamps_replaced"] += 1

@@ -172,7 +172,6 @@ class Refusal(Struct, frozen=True):
     source: str = ""
     sender: str = ""
     arrived_ns: Ns = 0  # 0: unknown
-    shared: bool = False  # as `Command.shared`
 
 
 # Events in the log; `deploy/systemd/README.md` explains each.

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 
 from msgspec.structs import replace
 
+from acsard.core.codes import RefusalCode
 from acsard.core.config.live import differences
 from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_ns
@@ -24,7 +25,13 @@ from acsard.core.incoming.bus_interface import (
     GatewayFollower,
     RouterFollower,
 )
-from acsard.core.incoming.commands import Receiver, caller_name, claimed_identity, parts
+from acsard.core.incoming.commands import (
+    Arrival,
+    Receiver,
+    caller_name,
+    claimed_identity,
+    parts,
+)
 from acsard.core.incoming.imu import GyroFollower
 from acsard.core.incoming.queries import Queries, Query, refused
 from acsard.core.incoming.speed_limit import decode_limit
@@ -298,20 +305,11 @@ class ControlLoop:
             try:
                 commands.append(self._receiver.command(arrival))
             except DecodeError as error:
-                identity = claimed_identity(arrival)
-                refusals.append(
-                    Refusal(
-                        error.reason,
-                        f"{arrival.key}: {error}",
-                        parts(arrival.key)[1],
-                        identity.sender,
-                        arrival.arrived_ns,
-                        identity.shared,
-                    )
-                )
-        for source in batch.overrun_sources:
+                refusals.append(_refusal(arrival, error.reason, f"{arrival.key}: {error}"))
+        for arrival in batch.displaced:
+            source = parts(arrival.key)[1]
             text = f"source {source}: too many commands came at once, and the oldest were dropped"
-            refusals.append(Refusal("displaced", text, source))
+            refusals.append(_refusal(arrival, "displaced", text))
         for query in batch.queries:
             served = self._served(query, now, refusals)
             if served is not None:
@@ -407,6 +405,11 @@ class ControlLoop:
             recording=Recording() if self._recorder is None else self._recorder.status,
             settings_differ=self._changed_settings,
         )
+
+
+def _refusal(arrival: Arrival, code: RefusalCode, text: str) -> Refusal:
+    sender = claimed_identity(arrival).sender
+    return Refusal(code, text, parts(arrival.key)[1], sender, arrival.arrived_ns)
 
 
 def _stops(batch: BusInput) -> list[str]:

@@ -7,6 +7,7 @@ from typing import get_args
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query
@@ -177,6 +178,22 @@ def test_a_zero_of_a_shared_identity_arms_when_no_speed_has_followed_for_a_secon
         world.run(quiet_s)
         speaker.hold(0.4, 0.2)
         assert world.state.mode == mode
+
+
+@each("way", ["zenoh", "routed", "bridge"])
+def test_a_flood_of_unsigned_junk_on_a_key_keeps_no_other_sender_disarmed(way: Way) -> None:
+    world = quiet()
+    joystick = Speaker(world, way)
+    flood = [Arrival("cmd/app", True, b"junk", "", 0, None, "")] * 20
+    for speed in [0.0] * 24 + [0.4] * 4:
+        joystick.send(speed)
+        for _ in range(5):
+            junk = [replace(arrival, arrived_ns=world.now_ns) for arrival in flood]
+            world.bus.arrivals += junk[4:]
+            world.bus.displaced += junk[3:4]
+            world.run(0.01)
+    assert world.state.counters["command_displaced"] == 28 * 5
+    assert world.state.mode == "driving"
 
 
 @pytest.mark.slow

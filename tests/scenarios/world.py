@@ -115,7 +115,7 @@ class MemoryBus:
         self.replies: dict[int, list[Reply]] = {}
         self.finished: set[int] = set()
         self.arrivals: list[Arrival] = []
-        self.overrun_sources: set[str] = set()
+        self.displaced: list[Arrival] = []
         self.queries: list[Query] = []
 
     def take(self, queries: int) -> BusInput:
@@ -124,10 +124,10 @@ class MemoryBus:
         batch = BusInput(
             tuple(self.arrivals),
             tuple(self.queries[:queries]),
-            overrun_sources=tuple(sorted(self.overrun_sources)),
+            displaced=tuple(self.displaced),
         )
         self.arrivals.clear()
-        self.overrun_sources.clear()
+        self.displaced.clear()
         del self.queries[:queries]
         return batch
 

@@ -217,7 +217,7 @@ FAULTS = (
         "arbiter notice",
         "a zero arms a shared sender although unreadable speeds follow it",
         ARBITER,
-        "            known.cancel_zeros(arrived_ns)",
+        "            known_sender.cancel_zero(arrived_ns)",
         "            pass",
     ),
     fault(

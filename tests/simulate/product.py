@@ -295,7 +295,7 @@ class Product:
                 same = [waiting for waiting in arrivals if waiting.key == key]
                 if len(same) > HELD:
                     arrivals.remove(same[0])
-                    world.bus.overrun_sources.add(key.split("/")[1])
+                    world.bus.displaced.append(same[0])
                     self.dropped += 1
                     self.drops(key)
         if at_ns == world.now_ns and (world._listens or key == "stop"):

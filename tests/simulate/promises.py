@@ -93,8 +93,8 @@ INPUTS = {
 """Faults of the simulated board that report inputs. They give no trouble to lines and wheels."""
 
 MAYBE_SPEEDS = ("garbage", "not a number", "huge", "fields")
-"""Refused messages that may have been speeds of a program that shares its identity, so a zero
-before them arms nobody."""
+"""Refused messages that may have been speeds of a program that shares its identity, so a zero of
+this identity before them arms nobody."""
 
 
 class BrokenError(AssertionError):
@@ -235,6 +235,8 @@ class Witness:
         self._unread: list[tuple[str, Wish | None, tuple[Any, ...]]] = []
         """Messages that no step has read yet: the key, the command if it can be read, and the
         arguments for its age."""
+        self._undone: list[list[tuple[Sender, list[tuple[int, int]]]]] = []
+        """The zeros of other identities that each of them has cancelled."""
         self.last: tuple[float, ...] = ZERO
         self.last_ns = at_ns
         self.first = True
@@ -254,10 +256,13 @@ class Witness:
         """Record a command that reached the daemon. Return None if it is not readable."""
         self.delivered += 1
         self._unread.append((sample.key, None, ()))
+        self._undone.append([])
         source = sender["source"]
         if message.junk not in ("", "cancels"):
-            if sample.shared and message.junk in MAYBE_SPEEDS:
-                self._cancel_zeros(source, arrived_ns)
+            unsure = self.senders.get((source, sample.identity))
+            if unsure is not None and sample.shared and message.junk in MAYBE_SPEEDS:
+                self._arm(unsure, arrived_ns)
+                unsure.zeros.clear()
             return None
         if message.junk == "cancels":
             v, w = 0.0, 0.0
@@ -285,7 +290,7 @@ class Witness:
             known.zeros.append((ended_ns if stalled else arrived_ns, arrived_ns))
             del known.zeros[:-4000]
         elif sample.shared:
-            self._cancel_zeros(source, arrived_ns)
+            self._cancel_zeros(source, arrived_ns, known)
         wish.armed_ns = known.armed_ns
         self.wishes.append((source, wish))
         return wish
@@ -293,15 +298,19 @@ class Witness:
     def dropped(self, key: str) -> None:
         """Note that the inbox dropped its oldest message on this key, so no step will read it.
 
-        The robot does not follow this command, and does not learn its delay.
+        The robot does not follow this command, and does not learn its delay. It cancels zeros of
+        its own identity only, because the robot does not know whether it was a speed.
         """
         place = next(n for n, (other, *_) in enumerate(self._unread) if other == key)
         del self._unread[place]
+        for known, zeros in self._undone.pop(place):
+            known.zeros[:0] = zeros
 
     def read(self) -> None:
         """Judge the ages of all commands that a step has read."""
         self._judge_ages()
         self._unread.clear()
+        self._undone.clear()
 
     def _judge_ages(self) -> None:
         for place, (key, wish, arguments) in enumerate(self._unread):
@@ -309,13 +318,15 @@ class Witness:
                 wish.fresh = self.ages.fresh(*arguments)
                 self._unread[place] = key, None, ()
 
-    def _cancel_zeros(self, source: str, now_ns: int) -> None:
-        """Cancel the zeros of the source's shared identities, because a possible speed arrived.
+    def _cancel_zeros(self, source: str, now_ns: int, sender: Sender) -> None:
+        """Cancel the zeros of the source's shared identities, because one has sent a speed.
 
         Any program with that identity may have sent the speed.
         """
         for known in self._sharing.get(source, ()):
             self._arm(known, now_ns)
+            if known is not sender and known.zeros:
+                self._undone[-1].append((known, known.zeros.copy()))
             known.zeros.clear()
 
     def _arm(self, known: Sender, now_ns: int) -> None:

@@ -1012,6 +1012,27 @@ def test_a_speed_of_another_shared_identity_of_the_source_undoes_a_zero(
     assert (witness.wishes[-1][1].armed_ns == NS) is armed
 
 
+@pytest.mark.parametrize(("junk", "lost"), [("not a number", False), ("", True)])
+def test_an_unreadable_or_lost_message_of_another_shared_identity_undoes_no_zero(
+    junk: str, lost: bool
+) -> None:
+    witness = witnessed()
+    plain = make_plan(1)["senders"][0] | {"way": "plain", "source": "app", "churn": False}
+    other = plain | {"way": "bridge"}
+    for at_s, sender, v, kind in (
+        (0.5, other, 0.0, ""), (1.0, plain, 0.0, ""),
+        (1.5, other, 0.3, junk), (2.5, plain, 0.3, ""),
+    ):  # fmt: skip
+        message = Message(int(at_s * NS), int(at_s * NS), v, 0.0, NS, 0, kind)
+        put = sample(sender, message, PLAIN["config"], NS)
+        witness.command(sender, message, put, message.arrives_ns)
+        if lost and at_s == 1.5:
+            witness.dropped(put.key)
+        else:
+            witness.read()
+    assert witness.wishes[-1][1].armed_ns == NS
+
+
 def test_a_sender_behind_routers_has_the_identity_of_the_session_that_stamps() -> None:
     routers = [[0.0, "session of router 1"], [2.0, ""], [3.0, "session of router 2"]]
     sender = make_plan(1)["senders"][0] | {"way": "routed", "source": "app", "churn": False}

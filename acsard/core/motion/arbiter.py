@@ -206,7 +206,7 @@ class Arbiter:
         if command.shared and not is_zero(command):
             source.cancel_zeros(command.arrived_ns)
         if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
-            self.notice(command.source, command.sender, command.arrived_ns, command.shared)
+            self.notice(command.source, command.sender, command.arrived_ns)
             return "not_finite"
         verdict = self._freshness.judge(command, source.timeout_ns)
         if verdict == "stale":
@@ -228,20 +228,17 @@ class Arbiter:
         sender.take(command, self._since_ns, verdict, self._watched_ns)
         return "" if verdict in ("fresh", "set") else "unproven"
 
-    def notice(self, source: str, sender: str, arrived_ns: Ns, shared: bool = False) -> None:
-        """Record that a message to `source` was lost or unusable; it may have been a speed.
+    def notice(self, source: str, sender: str, arrived_ns: Ns) -> None:
+        """Record that a message of a sender was lost or unusable; it may have been a speed.
 
-        If any program that shares its identity may have sent it, the zeros of all shared identities
-        of the source are canceled (`cancel_zeros`). For a lost message, pass "" and 0.
+        It cancels the zero of its own identity only: a program that sends only such messages never
+        drives, so it must not keep the others that share the source from being armed.
         """
         known = self._sources.get(source)
-        if known is None:
-            return
-        known_sender = known.senders.get(sender)
+        known_sender = None if known is None else known.senders.get(sender)
         if known_sender is not None:
             known_sender.noticed_ns = arrived_ns
-        if shared or not sender:
-            known.cancel_zeros(arrived_ns)
+            known_sender.cancel_zero(arrived_ns)
 
     def choose(self, now_ns: Ns) -> Choice:
         """Return the command that the robot follows now, or the reason why it follows none."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import queue
 from collections import deque
+from contextlib import suppress
 from functools import partial
 from itertools import count
 
@@ -107,6 +108,8 @@ class Replies:
 # the limit of 1000 Hz puts 10 between two steps.
 COMMAND_BUFFER = 16
 
+MAX_DISPLACED = 16  # senders of displaced commands that `take` returns
+
 GYRO_BUFFER = 64  # samples: 400 Hz fill it if the control loop takes none for 160 ms
 
 # All unconfigured sources share a buffer, so that they cannot displace a configured command.
@@ -142,7 +145,7 @@ class Inbox:
         # The daemon's session stamps samples without a timestamp, so one with this id is not the
         # sender's.
         self.own_id: zenoh.TimestampId | None = None
-        self._prefix, self._replies = prefix, replies
+        self._prefix, self._replies, self._sources = prefix, replies, sources
         self._arrivals: dict[str, Mailbox[Arrival]] = {
             key: Mailbox(
                 max(COMMAND_BUFFER, round(COMMAND_BUFFER * 100.0 / rate_hz)), self._commanded
@@ -164,6 +167,8 @@ class Inbox:
         # ROS parameters and `set`: one takes as long as all others of a step.
         self._slow: deque[Query] = deque()
         self._lost = dict.fromkeys(self._arrivals, 0)  # displaced samples that `take` has reported
+        # The newest displaced command of each sender since the last `take`.
+        self._displaced: dict[tuple[str, Via, str, bool], Arrival] = {}
         self._any = False  # set after the item is in its buffer, so `take` overlooks none
         self._waker = waker
 
@@ -172,7 +177,7 @@ class Inbox:
         if not self._any:
             return NO_INPUT
         self._any = False
-        arrivals, overrun, sources = list[Arrival](), 0, set[str]()
+        arrivals, overrun = list[Arrival](), 0
         for key, box in self._arrivals.items():
             if not box.waiting:
                 continue
@@ -180,7 +185,7 @@ class Inbox:
             if box.lost != self._lost[key]:
                 overrun += box.lost - self._lost[key]
                 self._lost[key] = box.lost
-                sources.add(parts(key)[1])
+        displaced, self._displaced = self._displaced, {}
         arrivals.sort(key=lambda arrival: arrival.arrived_ns)
         arrivals = self._stops.take() + arrivals
         due_queries = _taken_of(self._services, queries) + _taken_of(self._slow, 1)
@@ -188,7 +193,7 @@ class Inbox:
         if self._services or self._slow or self._others:
             # The other queries wait for the next step.
             self._any = True
-        return BusInput(tuple(arrivals), tuple(due_queries), overrun, tuple(sorted(sources - {""})))
+        return BusInput(tuple(arrivals), tuple(due_queries), overrun, tuple(displaced.values()))
 
     # Zenoh's threads call the methods below.
 
@@ -229,7 +234,23 @@ class Inbox:
         if key == "stop" and put:
             self._stops.put(arrival)
         else:
-            self._buffer(key).put(arrival)
+            self._put(self._buffer(key), arrival)
+
+    def _put(self, box: Mailbox[Arrival], arrival: Arrival) -> None:
+        waiting = box.waiting
+        if len(waiting) == waiting.maxlen and parts(arrival.key)[1] in self._sources:
+            # With several writers this may miss one of two samples that are displaced at once. The
+            # deque is empty if the control loop has just taken all samples.
+            with suppress(IndexError):
+                self._note_displaced(waiting[0])
+        box.put(arrival)
+
+    def _note_displaced(self, lost: Arrival) -> None:
+        # Samples of one program and one key have the same of these values, except that programs
+        # with a sender id need no distinction: no other program shares their identity.
+        sender = lost.key, lost.via, lost.sender, bool(lost.attachment)
+        if sender in self._displaced or len(self._displaced) < MAX_DISPLACED:
+            self._displaced[sender] = lost
 
     def _buffer(self, key: str) -> Mailbox[Arrival]:
         buffer = self._arrivals.get(key)

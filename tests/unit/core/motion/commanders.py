@@ -75,9 +75,9 @@ class Bench:
         assert self.stamped(source, 0.0, clock, REST, sender) == ""
         return self
 
-    def unreadable(self, source: Source, sender: str = "", shared: bool = False) -> None:
+    def unreadable(self, source: Source, sender: str) -> None:
         """Record that an undecodable command arrived from this sender."""
-        self.arbiter.notice(source.name, sender, self.now_ns, shared)
+        self.arbiter.notice(source.name, sender, self.now_ns)
 
     def choice(self) -> Choice:
         return self.arbiter.choose(self.now_ns)

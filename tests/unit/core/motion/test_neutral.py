@@ -84,7 +84,7 @@ def test_a_pause_without_a_zero_does_not_arm_however_long(pause_ms: int) -> None
             assert not peer.armed(number * pause_ms * MS)
 
 
-@pytest.mark.parametrize("other", ["speed", "cancelled", "not finite", "unreadable", "stale"])
+@pytest.mark.parametrize("other", ["speed", "cancelled", "not finite", "stale"])
 @pytest.mark.parametrize("name", ["a", "b"])
 def test_a_possible_speed_of_a_shared_identity_ends_the_wait_of_each_shared_zero(
     name: str, other: str
@@ -99,9 +99,7 @@ def test_a_possible_speed_of_a_shared_identity_ends_the_wait_of_each_shared_zero
     for wait_ms, arms in ((999, False), (1000, True)):
         bench.wait(20).send(HIGH, REST, "a", shared=True)
         bench.wait(wait_ms)
-        if other == "unreadable":
-            bench.unreadable(HIGH, name, shared=True)
-        elif other == "stale":
+        if other == "stale":
             assert bench.stamped(HIGH, 5000.0, "b", GO, "b", shared=True) == "stale"
         else:
             twist = {"speed": GO, "not finite": Twist(math.nan, 0.0)}.get(other, REST)
@@ -129,26 +127,26 @@ def test_a_speed_on_another_source_does_not_end_the_wait_of_a_shared_zero() -> N
 
 
 @pytest.mark.parametrize(
-    ("name", "shared", "ends"),
-    [("", False, True), ("never seen", True, True), ("never seen", False, False)],
+    ("name", "ends"), [("a", True), ("b", False), ("never seen", False), ("", False)]
 )
-def test_an_unreadable_message_ends_a_shared_wait_unless_a_named_unshared_sender_sent_it(
-    name: str, shared: bool, ends: bool
+def test_an_unreadable_or_lost_message_ends_the_wait_of_its_own_identity_only(
+    name: str, ends: bool
 ) -> None:
     bench = Bench(HIGH, armed=False)
     bench.send(HIGH, REST, "a", shared=True)
-    bench.unreadable(HIGH, name, shared)
-    bench.wait(1001).send(HIGH, GO, "a", shared=True)
+    bench.send(HIGH, REST, "b", shared=True)
+    for _ in range(20):
+        bench.wait(50).unreadable(HIGH, name)
+    bench.wait(1).send(HIGH, GO, "a", shared=True)
     assert (bench.driver() == "") is ends
 
 
-def test_messages_that_were_lost_unread_end_the_wait_of_a_shared_zero() -> None:
+def test_a_lost_message_that_arrived_when_the_pause_was_over_ends_no_wait() -> None:
     bench = Bench(HIGH, armed=False)
     bench.send(HIGH, REST, "a", shared=True)
-    # The daemon reads of the loss only now, and does not know when it happened.
-    bench.wait(1001).arbiter.notice("high", "", 0)
+    bench.wait(1001).unreadable(HIGH, "a")
     bench.send(HIGH, GO, "a", shared=True)
-    assert bench.driver() == ""
+    assert bench.driver() == "high"
 
 
 @pytest.mark.parametrize("shared", [False, True])
@@ -599,7 +597,7 @@ def test_no_twist_of_a_sender_that_no_zero_has_armed_is_followed(
             assert bench.driver() == ""
             continue
         if kind == "unreadable":
-            bench.unreadable(HIGH, name, shared)
+            bench.unreadable(HIGH, name)
             refused = kind
         elif kind == "stamped":
             refused = bench.stamped(HIGH, late_ms, name, TWISTS[name], name, shared)
@@ -620,6 +618,8 @@ def test_no_twist_of_a_sender_that_no_zero_has_armed_is_followed(
             armed.add(name)
         elif zero:
             waiting.setdefault(name, now_ns)
+        elif kind == "unreadable":
+            waiting.pop(name, None)
         elif shared:
             waiting = {}
         followed = bench.choice().twist

@@ -9,9 +9,17 @@ from typing import Any
 import pytest
 import zenoh
 
+from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Reply
 from acsard.core.messages.keys_and_roles import IMU
-from acsard.daemon.bus.inbox import COMMAND_BUFFER, MAX_OPEN_QUERIES, Inbox, Replies
+from acsard.daemon.bus.inbox import (
+    COMMAND_BUFFER,
+    GYRO_BUFFER,
+    MAX_DISPLACED,
+    MAX_OPEN_QUERIES,
+    Inbox,
+    Replies,
+)
 
 
 class Loop:
@@ -84,10 +92,27 @@ def test_a_flood_on_a_key_displaces_only_samples_of_that_key_and_is_counted() ->
         "cmd/nav",
         *["cmd/app"] * COMMAND_BUFFER,
     ]
-    assert (batch.overrun, batch.overrun_sources) == (5, ("app",))
+    assert (batch.overrun, [lost.key for lost in batch.displaced]) == (5, ["cmd/app"])
     arrived(inbox, "cmd/app")
     batch = inbox.take(8)
-    assert (batch.overrun, batch.overrun_sources) == (0, ())
+    assert (batch.overrun, batch.displaced) == (0, ())
+
+
+def test_the_newest_displaced_command_of_each_sender_is_returned_for_16_senders() -> None:
+    inbox, _ = an_inbox()
+    senders = [f"session {number % 20}" for number in range(60)] + ["last"] * COMMAND_BUFFER
+    for at_ns, sender in enumerate(senders):
+        arrival = Arrival("cmd/app", True, b"", "", at_ns, None, sender)
+        inbox._put(inbox._buffer("cmd/app"), arrival)
+    lost = {arrival.sender: arrival.arrived_ns for arrival in inbox.take(8).displaced}
+    assert lost == {f"session {number}": 40 + number for number in range(MAX_DISPLACED)}
+
+
+def test_a_displaced_gyro_sample_or_command_of_no_source_is_only_counted() -> None:
+    inbox, _ = an_inbox()
+    arrived(inbox, *[IMU] * (GYRO_BUFFER + 1), *["cmd/unlisted"] * (COMMAND_BUFFER + 1))
+    batch = inbox.take(8)
+    assert (batch.overrun, batch.displaced) == (2, ())
 
 
 @pytest.mark.parametrize(("rate_hz", "room"), [(10.0, 160), (20.0, 80), (100.0, 16), (300.0, 16)])
