@@ -14,8 +14,8 @@ from pathlib import Path
 import shtab
 from argparse_manpage.manpage import Manpage
 
-from acsard import __version__
 from acsard.cli import parser
+from acsard.host.version import version
 
 FILES = {"bash": "acsard", "zsh": "_acsard", "fish": "acsard.fish"}
 """Maps each shell to the name under which it looks for the completion script."""
@@ -33,7 +33,7 @@ def actions(of: argparse.ArgumentParser) -> Iterator[argparse.Action]:
 
 def main(directory: Path) -> None:
     directory.mkdir(parents=True, exist_ok=True)
-    about = {"project_name": "acsard", "version": __version__, "manual_title": "ACSAR robot"}
+    about = {"project_name": "acsard", "version": version(), "manual_title": "ACSAR robot"}
     (directory / "acsard.1").write_text(f"{Manpage(parser(), about)}\n", encoding="utf-8")
     whole = parser()
     for action in actions(whole):

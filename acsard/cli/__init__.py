@@ -109,6 +109,13 @@ class _Parser(argparse.ArgumentParser):
             raise
 
 
+class _Version(argparse.Action):
+    # argparse's own action takes the text, for which a clone asks git, before it is needed.
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        print(f"acsard {version()}")
+        parser.exit()
+
+
 def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
     """Return the parser, with the options of the subcommands in `called` only.
 
@@ -122,7 +129,7 @@ def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    whole.add_argument("--version", action="version", version=f"acsard {version()}")
+    whole.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     verbs = whole.add_subparsers(title="subcommands", metavar="SUBCOMMAND", dest="verb")
     for name in (*VERBS, *UNLISTED):
         # argparse lists only subcommands that have a help.

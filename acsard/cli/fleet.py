@@ -1,7 +1,8 @@
 """Show a live table of every robot on the bus or router at --connect: mode, speed, link, place,
 version and reason. Press q or Ctrl-C to quit. Over TLS a role may use only exact keys, so name the
 robots: --id robot1,robot2. Into a pipe, or with --once, the tool prints one table. PLACE gives x
-and y in m and the heading. SEEN gives the age of the last report. WHY gives the warnings, then the
+and y in m and the heading. VERSION marks a number as older if another robot in the table has a
+higher one. SEEN gives the age of the last report. WHY gives the warnings, then the
 reason why the robot moves or does not move, then the details of the warnings. A robot that is ready
 can have warnings too: a certificate that expires soon, a recording or a latch file that fails, a
 wheel fault, settings that differ from the configuration file. On a narrow terminal some columns are

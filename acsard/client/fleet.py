@@ -1,4 +1,4 @@
-"""Follows many robots: whether each daemon is present, its newest state and its version.
+"""Follows many robots: whether each daemon is present, and its newest state.
 
 A daemon is present while Zenoh shows its liveliness token. Zenoh's threads store the newest states,
 and one thread decodes them with `Fleet.rows()` and calls `due()` and `send_queries()`, of which
@@ -21,7 +21,7 @@ from acsard.client.follower import FLEET_QUERY_PERIOD_S, Follower
 from acsard.client.synchronous import Client
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import full_key
-from acsard.core.messages.schema import Info, RobotState
+from acsard.core.messages.schema import RobotState
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
 
@@ -33,19 +33,17 @@ class Row(Struct, frozen=True):
     here: bool  # the daemon's liveliness token is present
     state: RobotState | None
     age: float  # of `state`, s; inf before the first that proves that the daemon runs
-    version: str
     silent: bool = False  # `Follower.silent`
 
 
 class _TrackedRobot:
     def __init__(self) -> None:
         self.here = False
-        self.version = ""
         self.newest = Mailbox[tuple[zenoh.Sample, float]](1)  # undecoded, with its arrival
         self.begin()
 
     def begin(self) -> None:
-        self.since = self.info_due = clock.steady_s()
+        self.since = clock.steady_s()
         self.follower = Follower(self.since, FLEET_QUERY_PERIOD_S)
         self.follower.due = self.since
 
@@ -60,7 +58,7 @@ class Fleet:
         self._lock = Lock()
         self.left_out = False  # a robot, because of `most`
         self._known = {robot_id: _TrackedRobot() for robot_id in ids if robot_id != ALL_ROBOTS}
-        self._states, self._infos = Decoder(RobotState), Decoder(Info)
+        self._states = Decoder(RobotState)
         self._declared: list[Any] = []
         session, liveliness = robot.session, robot.session.liveliness()
         try:
@@ -82,25 +80,20 @@ class Fleet:
                 self._take(robot)
             return [self._row(name, robot, now) for name, robot in self._known.items()]
 
-    def due(self) -> list[tuple[str, str]]:
-        """Return the queries (robot id and key) that are due, once, for `send_queries()`."""
+    def due(self) -> list[str]:
+        """Return the robots whose state must be queried, once, for `send_queries()`."""
         now, due = clock.steady_s(), []
         with self._lock:
             for name, robot in self._known.items():
                 self._take(robot)
                 if robot.follower.query_is_due(now):
-                    due.append((name, "state"))
-                if robot.here and not robot.version and now >= robot.info_due:
-                    robot.info_due = now + FLEET_QUERY_PERIOD_S
-                    due.append((name, "info"))
+                    due.append(name)
         return due
 
-    def send_queries(self, due: Sequence[tuple[str, str]]) -> None:
-        """Send queries of `due()`. This may wait for the bus. Raises `ZError`."""
-        for name, key in due:
-            self._robot.sibling(name).start_query(
-                key, self._answer if key == "state" else self._info
-            )
+    def send_queries(self, due: Sequence[str]) -> None:
+        """Query the states of `due()`. This may wait for the bus. Raises `ZError`."""
+        for name in due:
+            self._robot.sibling(name).start_query("state", self._answer)
 
     def end(self) -> None:
         """Unsubscribe from all robots. This may wait for the bus. Raises `ZError`."""
@@ -114,7 +107,7 @@ class Fleet:
             # A storage on a router may have sent this old state. Wait for the daemon's own answer.
             state = None
         age = follower.age(now) if follower.is_confirmed else math.inf
-        return Row(name, robot.here, state, age, robot.version, silent)
+        return Row(name, robot.here, state, age, silent)
 
     def _take(self, robot: _TrackedRobot) -> None:
         for sample, at in robot.newest.take():
@@ -147,8 +140,7 @@ class Fleet:
         if robot is not None:
             appeared, robot.here = not robot.here, sample.kind == zenoh.SampleKind.PUT
             if not robot.here:
-                # Query the version again later, because the daemon may restart with another one.
-                robot.since, robot.version = clock.steady_s(), ""
+                robot.since = clock.steady_s()
             elif appeared:
                 robot.begin()
 
@@ -168,12 +160,3 @@ class Fleet:
         with self._lock:
             self._take(robot)
             robot.follower.answered(state, clock.steady_s())
-
-    def _info(self, sample: zenoh.Sample) -> None:
-        robot = self._of(sample)
-        try:
-            version = self._infos.decode(*encoded(sample)).version
-        except DecodeError:
-            version = "?"
-        if robot is not None:
-            robot.version = version

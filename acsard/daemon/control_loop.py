@@ -112,7 +112,7 @@ class ControlLoop:
         # message of a key of another part, such as the simulator. `adopted` gets each new
         # configuration. `latches` are those at the start, which `keeper` stores over a restart.
         self.robot = Robot(config, latches)
-        self.report = Report(config, start, certificate_ends)
+        self.report = Report(config, start, certificate_ends, info.version)
         self.shutting_down = False  # the robot ramps to zero and stays at rest
         self.outputs: Outputs | None = None
         self._start_ns = start.mono_ns

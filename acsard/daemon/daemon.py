@@ -117,8 +117,6 @@ async def run(
         # Ask for real-time priority before the first thread starts. Only this thread then has it:
         # the threads of the bus do not inherit it.
         refused = real_time.request() if config.control.real_time else ""
-        if refused:
-            log.info("real_time", text=refused)
         totals: dict[str, object] = {}
         stack.callback(lambda: log.info("ended", **totals))  # runs after `totals` is filled
         events, start = list[Event](), clock.now()
@@ -129,6 +127,7 @@ async def run(
         after = stack.enter_context(ExitStack())
         bus, port = ZenohBus(config, wake), _port(config, path, wake, events.append)
         ends = _certificates(config, gateway is not None)
+        info = _info(config, path)  # takes a while in a clone: before the port is open
         # Open the bus before the port. If another program uses the robot's id or the address, the
         # daemon must end without touching the port.
         async with _patience(config, log, manager):
@@ -139,7 +138,7 @@ async def run(
         await stack.enter_async_context(port)
         control = ControlLoop(
             config,
-            _info(config, path),
+            info,
             port,
             bus,
             start,
@@ -159,6 +158,8 @@ async def run(
         after.callback(lambda: control.keep_last_stops(clock.now()))
         stack.callback(lambda: totals.update(control.totals(clock.mono_ns())))
         announce(path, port.trouble)
+        if refused:
+            log.info("real_time", text=refused)
         manager.ready()
         departure.started()
         served = ((gateway if config.bus.outside else None, GATEWAY), (page, PAGE))

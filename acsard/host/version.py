@@ -1,11 +1,16 @@
-"""Finds the version of this program and the commit of its source.
+"""Finds the version of this program, and says which of two versions is older.
 
-This module uses only the standard library, because `deploy/build_hook.py` imports it.
+The number stands in `acsard/__init__.py`. The commit of the source follows it, as in
+`0.2.0.dev0+g1a2b3c4d5`, and `.dirty` if files differ from that commit. A release, which is a number
+without `.dev` from an unchanged source, is the number alone.
+
+This module uses only the standard library, because the build reads it.
 """
 
 from __future__ import annotations
 
 import re
+import subprocess
 from functools import lru_cache
 from pathlib import Path
 
@@ -13,21 +18,41 @@ from acsard import __version__
 
 _PACKAGE = Path(__file__).parents[1]
 
-COMMIT_FILE = "commit"  # made by `deploy/build_hook.py`; it contains the git commit
+COMMIT_FILE = "commit"  # `deploy/build_hook.py` puts it into wheel and sdist
 
 HASH_DIGITS = 9
+
+DIRTY = ".dirty"
+
+GIT_TIMEOUT_S = 10.0  # the first look at a large clone on an SD card takes seconds
+
+_NUMBER = re.compile(r"([0-9]{1,6})\.([0-9]{1,6})\.([0-9]{1,6})(?:(\.dev|rc)([0-9]{1,6}))?(?=\+|$)")
+_PHASES = (".dev", "rc", None)
 
 
 @lru_cache(1)
 def version() -> str:
-    """Return the version, such as `0.1.0+g1a2b3c4d5`, or `0.1.0` if the commit is not known."""
-    commit = source()
-    return f"{__version__}+g{commit[:HASH_DIGITS]}" if commit else __version__
+    """Return the version, or the number alone if the commit is not known."""
+    return full_version(__version__, source())
+
+
+def full_version(number: str, commit: str) -> str:
+    """Return the version of a source that `source()` describes."""
+    if not commit or (".dev" not in number and not commit.endswith(DIRTY)):
+        return number
+    return f"{number}+g{commit[:HASH_DIGITS]}{DIRTY if commit.endswith(DIRTY) else ''}"
 
 
 def source() -> str:
-    """Return the commit of this program's source; "" if unknown."""
-    return _text(_PACKAGE / COMMIT_FILE) or commit_of(_PACKAGE.parent)
+    """Return the commit of this program's source, with `.dirty` if files differ; "" if unknown."""
+    built = _text(_PACKAGE / COMMIT_FILE)
+    return built or source_of(_PACKAGE.parent)
+
+
+def source_of(clone: Path) -> str:
+    """Return the commit that is checked out in `clone`, with `.dirty` if files differ from it."""
+    commit = commit_of(clone)
+    return commit and commit + (DIRTY if _is_changed(clone) else "")
 
 
 def commit_of(clone: Path) -> str:
@@ -47,10 +72,6 @@ def commit_of(clone: Path) -> str:
     return _text(common / name) or next((commit for commit, _, ref in packed if ref == name), "")
 
 
-_NUMBER = re.compile(r"([0-9]{1,6})\.([0-9]{1,6})\.([0-9]{1,6})(?:(\.dev|rc)([0-9]{1,6}))?(?=\+|$)")
-_PHASES = (".dev", "rc", None)
-
-
 def order(version: str) -> tuple[int, ...]:
     """Return a key that sorts versions from old to new; () if `version` is not a version.
 
@@ -61,6 +82,19 @@ def order(version: str) -> tuple[int, ...]:
         return ()
     major, minor, patch, phase, step = match.groups()
     return int(major), int(minor), int(patch), _PHASES.index(phase), int(step or 0)
+
+
+def _is_changed(clone: Path) -> bool:
+    # Without git, the source counts as unchanged. A clone of another user is read too.
+    git = ["git", "--no-optional-locks", "-c", "safe.directory=*", "-C", str(clone)]
+    try:
+        done = subprocess.run(
+            [*git, "status", "--porcelain"],
+            stdin=subprocess.DEVNULL, capture_output=True, timeout=GIT_TIMEOUT_S, check=False,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return False
+    return bool(done.stdout)
 
 
 def _text(path: Path) -> str:

@@ -15,12 +15,12 @@ import msgspec
 from mcap.writer import Writer
 from msgspec import Struct
 
-from acsard import __version__
 from acsard.core.config.settings import Config
 from acsard.core.ros.channels import ENCODING, SCHEMA_ENCODING, Channel
 from acsard.core.ros.names import TYPE_HASHES, Qos
 from acsard.core.values import NS_PER_S, Estimate, GyroSample, Instant, Ns, Outputs, WallNs
 from acsard.host.errors import RecordingError
+from acsard.host.version import version
 from acsard.recording.atomic_output import METADATA, replacing, synced
 from acsard.recording.file import About, Recording
 from acsard.recording.file_replay import (
@@ -205,7 +205,7 @@ class _MessageWriter(_Writer):
         self._publisher = Publisher(run.robot, about.started_ns or about.wall_ns)
         self._namespace = run.robot.config.ros.namespace
         self._writer = Writer(stream)
-        self._writer.start("ros2", f"acsard {__version__}")
+        self._writer.start("ros2", f"acsard {version()}")
         origin = {"robot": about.robot, "recording": name, "recorded_by": f"acsard {about.version}"}
         self._writer.add_metadata("acsard export", origin)
         self._schemas: dict[str, int] = {}

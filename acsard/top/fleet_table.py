@@ -11,11 +11,12 @@ from acsard.client.fleet import Fleet, Row
 from acsard.core.formatting import printable, rough, signed
 from acsard.core.messages.schema import RobotState
 from acsard.core.messages.state_warnings import SAME_AS_REASON, brief, charge, warnings
+from acsard.host.version import order
 
 COLUMN_HEADS = ("ROBOT", "MODE", "M/S", "LINK", "BATTERY", "PLACE", "VERSION", "SEEN", "WHY")
 
 # Maximum widths of all columns except the last, which gets the rest.
-COLUMN_WIDTHS = (32, 8, 6, 7, 7, 22, 21, 6)
+COLUMN_WIDTHS = (32, 8, 6, 7, 7, 22, 33, 6)
 
 # Minimum widths. On a narrow terminal, ROBOT shrinks to its minimum first.
 NAME, WHY = 12, 32
@@ -32,7 +33,8 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
 
     If some do not fit into `height` lines, the last line says how many.
     """
-    cells = [COLUMN_HEADS, *map(row_cells, sorted(rows, key=_order))]
+    newest = max((order(row.state.version) for row in rows if row.state), default=())
+    cells = [COLUMN_HEADS, *(row_cells(row, newest) for row in sorted(rows, key=_order))]
     widest = [max(len(row[n]) for row in cells) for n in range(len(COLUMN_HEADS))]
     rooms = [min(room, most) for room, most in zip(widest, (*COLUMN_WIDTHS, WHY), strict=True)]
     powered = any(row[BATTERY_COLUMN] for row in cells[1:])
@@ -73,12 +75,15 @@ def shortened(names: Sequence[str], room: int) -> list[str]:
     return max(map(cut, from_the_middle), key=lambda variant: len(set(variant)))
 
 
-def row_cells(row: Row) -> tuple[str, ...]:
-    """Return the texts of a robot's cells, in the order of `COLUMN_HEADS`."""
+def row_cells(row: Row, newest: tuple[int, ...]) -> tuple[str, ...]:
+    """Return the texts of a robot's cells, in the order of `COLUMN_HEADS`.
+
+    `newest` is the order of the newest version in the table.
+    """
     name = printable(row.robot_id)
     if row.state is None:
         why = "waiting for its state" if row.here else "not there"
-        return (name, "-", "-", "-", "", "-", printable(row.version) or "-", "never", why)
+        return (name, "-", "-", "-", "", "-", "-", "never", why)
     state, absence = row.state, _absence(row)
     return (
         name,
@@ -87,10 +92,15 @@ def row_cells(row: Row) -> tuple[str, ...]:
         printable(state.link),
         charge(state.battery),
         _place(state),
-        printable(row.version) or "-",
+        _version(state, newest),
         rough(row.age),
         f"{absence}, was: {_why(state)}" if absence else _why(state),
     )
+
+
+def _version(state: RobotState, newest: tuple[int, ...]) -> str:
+    text = printable(state.version) or "-"
+    return f"{text} older" if () < order(state.version) < newest else text
 
 
 def _why(state: RobotState) -> str:
@@ -151,9 +161,7 @@ class Roster(Fleet):
         with self._lock:
             known = list(self._known.values())
         named = ALL_ROBOTS not in self._ids
-        return named and all(
-            robot.here and robot.version and robot.follower.is_confirmed for robot in known
-        )
+        return named and all(robot.here and robot.follower.is_confirmed for robot in known)
 
     @property
     def presence_text(self) -> str:

@@ -50,7 +50,7 @@ FIELDS = {
         "gyro", "encoder_counts", "wheel_fault", "sender", "recording_error",
         "latch", "latch_file_error", "feedback_age", "emergency_stop", "bumpers", "battery",
         "speed_limit", "settings_differ", "certificate_days",
-        "code", "certificate",
+        "code", "certificate", "version",
     },
     "diagnostics": {"header", "status"},
     "battery": {

@@ -87,13 +87,17 @@ class Report:
     """Builds the messages that the daemon publishes, and knows when each is due."""
 
     def __init__(
-        self, config: Config, start: Instant, certificate_ends: Mapping[str, int] | None = None
+        self,
+        config: Config,
+        start: Instant,
+        certificate_ends: Mapping[str, int] | None = None,
+        version: str = "",
     ) -> None:
         # Expiry by owner, "" for the robot's own (maybe by the TLS gateway's report), ns since
         # 1970.
         self.certificate_ends = dict(certificate_ends or {})
         self._names = list(config.joints.as_tuple())
-        self._start = start
+        self._start, self._version = start, version
         self._estimate: Estimate | None = None
         self._outputs: Outputs | None = None
         self._happened = RecentEvents()
@@ -275,6 +279,7 @@ class Report:
             settings_differ=snapshot.settings_differ,
             speed_limit=snapshot.speed_limit,
             certificate_days=self._certificate_days(outputs.now),
+            version=self._version,
         )
 
     def _certificate_days(self, now: Instant) -> float | None:

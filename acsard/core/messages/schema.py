@@ -427,6 +427,8 @@ class RobotState(Message, frozen=True):
     """
     code: Annotated[str, one_of(get_args(StateCode))] = ""
     """Code of `reason`. If several latches are set, it is the code of `latch`."""
+    version: str = ""
+    """Version of the daemon, such as `0.2.0`, or `0.2.0.dev0+g1a2b3c4d5` if it is not a release."""
 
 
 class GatewayState(Message, frozen=True):

@@ -1,16 +1,15 @@
-"""The version contains the commit of the clone from which the code runs or was installed."""
+"""The version has the commit of the source, and sorts by its number."""
 
 from __future__ import annotations
 
 import subprocess
-import sys
-import zipfile
 from pathlib import Path
 
 import pytest
 
 from acsard import __version__
-from acsard.host.version import COMMIT_FILE, HASH_DIGITS, commit_of, version
+from acsard.host.version import commit_of, full_version, order, source_of, version
+from tests.each import each
 from tests.pages import ROOT
 
 
@@ -54,18 +53,44 @@ def test_without_a_readable_clone_the_commit_is_empty(tmp_path: Path) -> None:
     assert commit_of(tmp_path) == ""
 
 
-def test_the_version_of_a_clone_names_its_commit() -> None:
-    commit = commit_of(ROOT)
-    assert version() == (f"{__version__}+g{commit[:HASH_DIGITS]}" if commit else __version__)
+def test_a_changed_clone_is_dirty_and_an_ignored_file_changes_nothing(
+    clone: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commit = commit_of(clone)
+    (clone / ".git/info/exclude").write_text("ignored\n")
+    (clone / "ignored").touch()
+    assert source_of(clone) == commit
+    (clone / "new").touch()
+    assert source_of(clone) == f"{commit}.dirty"
+    monkeypatch.setenv("PATH", "")
+    assert source_of(clone) == commit, "without git, the commit is still known"
 
 
-@pytest.mark.slow
-def test_a_wheel_has_the_commit_of_its_source(tmp_path: Path) -> None:
-    pytest.importorskip("hatchling", reason="only the build needs it")
-    words = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
-    subprocess.run(words, cwd=ROOT, check=True, capture_output=True)
-    (wheel,) = tmp_path.glob("*.whl")
-    with zipfile.ZipFile(wheel) as files:
-        has = f"acsard/{COMMIT_FILE}" in files.namelist()
-        assert has == bool(commit_of(ROOT))
-        assert not has or files.read(f"acsard/{COMMIT_FILE}").decode().strip() == commit_of(ROOT)
+COMMIT = "1a2b3c4d5" + "0" * 31
+
+
+@each(
+    ("number", "commit", "full"),
+    [
+        ("0.2.0.dev0", COMMIT, "0.2.0.dev0+g1a2b3c4d5"),
+        ("0.2.0.dev0", f"{COMMIT}.dirty", "0.2.0.dev0+g1a2b3c4d5.dirty"),
+        ("0.2.0.dev0", "", "0.2.0.dev0"),
+        ("0.2.0rc1", COMMIT, "0.2.0rc1"),
+        ("0.2.0", COMMIT, "0.2.0"),
+        ("0.2.0", f"{COMMIT}.dirty", "0.2.0+g1a2b3c4d5.dirty"),
+    ],
+)
+def test_only_a_release_is_the_number_alone(number: str, commit: str, full: str) -> None:
+    assert full_version(number, commit) == full
+
+
+def test_versions_sort_as_their_numbers_and_the_commits_of_a_number_are_equal() -> None:
+    ages = ["0.2.0.dev0", "0.2.0.dev1", "0.2.0rc1", "0.2.0", "0.2.1.dev0", "0.10.0", "1.0.0"]
+    keys = [order(text) for text in ages]
+    assert keys == sorted(set(keys))
+    assert order("0.2.0.dev0+g1a2b3c4d5.dirty") == order("0.2.0.dev0+gfedcba987")
+    assert {order(text) for text in ("", "?", "0.2", "0.2.0a", "9" * 99 + ".0.0")} == {()}
+
+
+def test_this_program_has_the_version_of_its_clone() -> None:
+    assert version() == full_version(__version__, source_of(ROOT))

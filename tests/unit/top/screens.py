@@ -47,13 +47,14 @@ STATE = RobotState(
     refused="",
     counters={"lines": 1300, "lines_sent": 1301, "commands": 220, "missed_periods": 3},
     latencies=dict.fromkeys(NAMES, MEASURED),
+    version="0.2.0",
 )
 BEFORE = replace(
     STATE,
     stamp=Time(999, 0),
     counters={"lines": 1200, "lines_sent": 1201, "commands": 200, "missed_periods": 3},
 )
-INFO = Info("acsar", "0.1.0", 7, "/dev/acsar", False, 100.0, [], [])
+INFO = Info("acsar", "0.2.0", 7, "/dev/acsar", False, 100.0, [], [])
 SEEN = ScreenData(
     "acsar", "tcp/127.0.0.1:7448", STATE, BEFORE, 0.05, INFO, 0, "q quits", passed=1.05
 )

@@ -17,14 +17,24 @@ from acsard.bus.address import Address
 from acsard.client import fleet as fleets
 from acsard.client.fleet import Row
 from acsard.client.follower import FLEET_QUERY_PERIOD_S
-from acsard.core.messages.schema import Info, Time
+from acsard.core.messages.schema import Time
 from acsard.core.values import NS_PER_S
 from acsard.host import clock as clocks
 from acsard.top.fleet_table import COLUMN_HEADS, Roster, table
 from tests.each import each
 from tests.unit.top.screens import STATE, sample_of
 
-ROW = Row("robot1", True, replace(STATE, reason="commanded by app"), 0.1, "0.1.0")
+ROW = Row("robot1", True, replace(STATE, reason="commanded by app"), 0.1)
+
+
+def test_a_version_with_a_lower_number_than_the_newest_in_the_table_is_marked_as_older() -> None:
+    versions = {
+        "r1": "0.2.0.dev0+g1a2b3c4d5", "r2": "0.2.0", "r3": "0.10.0rc1", "r4": "0.10.0rc1+g1.dirty",
+        "r5": "unreadable", "r6": "",
+    }  # fmt: skip
+    rows = [Row(name, True, replace(STATE, version=text), 0.1) for name, text in versions.items()]
+    lines = table([*rows, Row("r7", True, None, 0.1)], 200)[1:]
+    assert {line[:2] for line in lines if " older " in line} == {"r1", "r2"}
 
 
 READY = replace(STATE, mode="ready", reason="waiting for a command", linear=0.0)
@@ -119,8 +129,8 @@ def test_more_robots_than_lines_are_counted() -> None:
 def test_any_text_and_number_fits_the_width_and_is_printable(
     text: str, number: float, age: float, width: int
 ) -> None:
-    state = replace(STATE, mode=text, reason=text, link=text, linear=number)
-    for line in table([Row(text, True, state, age, text)], width):
+    state = replace(STATE, mode=text, reason=text, link=text, linear=number, version=text)
+    for line in table([Row(text, True, state, age)], width):
         assert len(line) <= width
         assert line.isprintable()
 
@@ -173,13 +183,9 @@ def fleet_of(
 
     def answer(name: str, key: str, take: Callable[[Any], object]) -> None:
         if name in answering:
-            replies = {"state": replace(STATE, stamp=Time(next(stamps))), "info": INFO}
-            take(sample_of(replies[key], f"acsard/{name}/{key}"))
+            take(sample_of(replace(STATE, stamp=Time(next(stamps))), f"acsard/{name}/{key}"))
 
     return Roster(robot, ids, most=3)
-
-
-INFO = Info("robot1", "0.1", 1, "sim", simulated=True, rate=100.0, listen=[], connect=[])
 
 
 def test_robots_beyond_the_limit_are_reported_as_left_out(session: Session) -> None:
@@ -214,18 +220,6 @@ def test_a_robot_whose_liveliness_token_is_deleted_is_not_present(session: Sessi
     session.announce("robot1", zenoh.SampleKind.DELETE)
     assert [row.here for row in fleet.rows()] == [False]
     assert fleet.left_out_text == ""
-
-
-def test_the_version_of_a_robot_that_publishes_its_state_often_is_queried(
-    session: Session, clock: Clock
-) -> None:
-    fleet = fleet_of(session, ("robot1",), ("robot1",))
-    session.announce("robot1")
-    for _ in range(3):
-        fleet._state(sample_of(STATE, "acsard/robot1/state"))
-        version = fleet.rows()[0].version
-        clock.now += 0.1
-    assert version == "0.1"
 
 
 def test_a_state_from_before_a_suspend_is_old(

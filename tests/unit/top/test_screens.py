@@ -94,11 +94,11 @@ ROBOTS = {
     "no-battery": replace(READY, battery=BatterySummary(None, None, None, "unknown")),
 }  # fmt: skip
 FLEET = [
-    *(Row(name, True, state, 0.1, "0.1.0") for name, state in ROBOTS.items()),
-    Row("gone", False, STATE, 90.0, "0.1.0"),
-    Row("silent", True, STATE, 7.0, "0.1.0", silent=True),
-    Row("new", True, None, 0.1, ""),
-    Row("not-there", False, None, 0.1, ""),
+    *(Row(name, True, state, 0.1) for name, state in ROBOTS.items()),
+    Row("gone", False, replace(STATE, version="0.1.9"), 90.0),
+    Row("silent", True, STATE, 7.0, silent=True),
+    Row("new", True, None, 0.1),
+    Row("not-there", False, None, 0.1),
 ]
 
 
