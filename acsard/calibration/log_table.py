@@ -15,14 +15,14 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
+from acsard.calibration.log_rows import FOUR
 from acsard.core.formatting import many, printable
-from acsard.core.messages.schema import Imu, JointState, Message, PoseStamped
-from acsard.core.values import NS_PER_S, AcsardError
+from acsard.core.values import AcsardError
 
 Floats = npt.NDArray[np.float64]
 
-# Wheel speeds, rad/s: of each wheel, or the mean of each side.
-FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
+# The mean wheel speeds of the sides, rad/s.
+TWO = "left", "right"
 
 # The twist that the daemon commands to the wheels, m/s and rad/s.
 APPLIED = "applied_linear", "applied_angular"
@@ -178,28 +178,3 @@ def _used(header: Sequence[str]) -> list[str]:
     if len(set(used)) < len(used) or header.count("run") > 1:
         raise LogError(f"the first line names a column twice: {CSV_ADVICE}")
     return used
-
-
-HEADER = f"t,{','.join(FOUR)},yaw_rate,x,y,yaw"
-
-# Zenoh keys whose messages `row()` converts to rows of a log.
-KEYS = ("wheel_states", "imu", "sim/pose")
-
-
-def row(message: Message, arrived_ns: int) -> str:
-    """Return the CSV row of a message on one of `KEYS`. Raises `ValueError` for other messages.
-
-    The time is the stamp of the message, or `arrived_ns` (wall clock) if it has none.
-    """
-    if isinstance(message, JointState) and len(message.velocity) == len(FOUR):
-        cells = [*(f"{speed:.6g}" for speed in message.velocity), "", "", "", ""]
-    elif isinstance(message, Imu):
-        cells = ["", "", "", "", f"{message.angular_velocity.z:.6g}", "", "", ""]
-    elif isinstance(message, PoseStamped):
-        where, turn = message.pose.position, message.pose.orientation
-        yaw = 2 * math.atan2(turn.z, turn.w)
-        cells = ["", "", "", "", "", f"{where.x:.4f}", f"{where.y:.4f}", f"{yaw:.5f}"]
-    else:
-        raise ValueError(f"{type(message).__name__} cannot be in a log")
-    stamp_ns = message.header.stamp.to_ns() or arrived_ns
-    return ",".join([f"{stamp_ns // NS_PER_S}.{stamp_ns % NS_PER_S // 1000:06d}", *cells])

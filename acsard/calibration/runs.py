@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.log_table import APPLIED, FOUR, TWO, Floats, LogError, Table
+from acsard.calibration.log_rows import FOUR
+from acsard.calibration.log_table import APPLIED, TWO, Floats, LogError, Table
 from acsard.core.values import Seconds
 
 Complexes = npt.NDArray[np.complex128]

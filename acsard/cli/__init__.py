@@ -19,6 +19,7 @@ from contextlib import suppress
 from copy import copy
 from decimal import Decimal
 from importlib import import_module
+from types import ModuleType
 from typing import NoReturn
 
 from acsard.core.config.nearest import nearest
@@ -135,11 +136,23 @@ def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
         # argparse lists only subcommands that have a help.
         verb = verbs.add_parser(name, help=VERBS[name]) if name in VERBS else verbs.add_parser(name)
         if name in called:
-            module = import_module(f"acsard.cli.{name}")
+            module = _module(name)
             verb.description = module.__doc__
             verb.set_defaults(main=getattr(module, "main", None))
             module.add_options(verb)
     return whole
+
+
+def _module(name: str) -> ModuleType:
+    try:
+        return import_module(f"acsard.cli.{name}")
+    except ModuleNotFoundError as error:
+        if error.name != "numpy":
+            raise
+        # The Debian package leaves numpy to Debian. All other installations have it.
+        raise MendableError(
+            "this subcommand needs the library numpy: type `sudo apt install python3-numpy`"
+        ) from None
 
 
 def main(argv: list[str] | None = None) -> int:

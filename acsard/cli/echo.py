@@ -14,14 +14,15 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
+from itertools import pairwise
+from statistics import fmean, pstdev, quantiles
 from typing import Any
 
-import numpy as np
 import zenoh
 
 from acsard.bus.robot_discovery import ALL_ROBOTS, follow, robot_of, running_robots
 from acsard.bus.subscription import encoded
-from acsard.calibration.log_table import HEADER, KEYS, row
+from acsard.calibration.log_rows import HEADER, KEYS, row
 from acsard.cli.common import between, count
 from acsard.cli.connection import (
     SEVERAL_IDS,
@@ -194,11 +195,14 @@ def rate_text(times: list[float]) -> str:
     """Return the rate of messages with these arrivals, s, and the gaps between them."""
     if len(times) < 2 or times[-1] <= times[0]:
         return "no messages yet" if not times else f"{len(times)} messages, no rate yet"
-    gaps_ms = np.diff(times) * 1e3
-    least, p50, p99, most = np.percentile(gaps_ms, (0, 50, 99, 100))
+    gaps_ms = [1e3 * (after - before) for before, after in pairwise(times)]
+    # `quantiles` needs two values.
+    values = gaps_ms if len(gaps_ms) > 1 else gaps_ms * 2
+    percentiles = quantiles(values, n=100, method="inclusive")
     return (
-        f"{1e3 / gaps_ms.mean():8.2f} Hz   gaps ms: min {least:.2f}  p50 {p50:.2f}  p99 {p99:.2f}  "
-        f"max {most:.2f}  std {gaps_ms.std():.2f}   n {len(times)}"
+        f"{1e3 / fmean(gaps_ms):8.2f} Hz   gaps ms: min {min(gaps_ms):.2f}  "
+        f"p50 {percentiles[49]:.2f}  p99 {percentiles[98]:.2f}  "
+        f"max {max(gaps_ms):.2f}  std {pstdev(gaps_ms):.2f}   n {len(times)}"
     )
 
 

@@ -18,7 +18,8 @@ from msgspec import Struct
 from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.calibration.guided.drive_plan import DisturbedError, GuideError, Leg
 from acsard.calibration.guided.leg_driver import LegDriver
-from acsard.calibration.log_table import APPLIED, FOUR, Floats, Table
+from acsard.calibration.log_rows import FOUR
+from acsard.calibration.log_table import APPLIED, Floats, Table
 from acsard.calibration.runs import NEW_RUN_AFTER_S, Log, Run, on_arrival_clock, runs
 from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S
 from acsard.client.driving import repeat_zeros

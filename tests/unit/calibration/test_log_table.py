@@ -9,15 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.calibration.log_table import (
-    HEADER,
-    KEYS,
-    Floats,
-    LogError,
-    bounded,
-    read,
-    row,
-)
+from acsard.calibration.log_rows import HEADER, KEYS, row
+from acsard.calibration.log_table import Floats, LogError, bounded, read
 from acsard.core.messages.keys_and_roles import by_key
 from acsard.core.messages.schema import (
     Header,

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from acsard.calibration.log_table import HEADER
+from acsard.calibration.log_rows import HEADER
 from acsard.cli import echo, main
 from acsard.cli.echo import Quota, _message_text, _print, _record, rate_text
 from acsard.cli.replies import json_line
