@@ -212,6 +212,30 @@ def test_a_port_that_accepts_no_bytes_does_not_delay_the_stop_script(
     assert ended.seconds < 1.0
 
 
+@pytest.mark.parametrize(
+    ("result", "ended_by", "code"),
+    [
+        ("success", "exited", 0),
+        ("success", "killed", 1),  # systemd calls SIGHUP and SIGPIPE a success
+        ("signal", "killed", 1),
+        ("watchdog", "dumped", 1),
+        ("exit-code", "exited", 1),
+    ],
+)
+def test_a_port_that_accepts_no_bytes_is_always_logged_and_is_a_failure_if_the_daemon_died(
+    tmp_path: Path, wire: Wire, result: str, ended_by: str, code: int
+) -> None:
+    path = config(tmp_path, f'[mcu]\nport = "{wire.name}"\n')
+    tty.setraw(wire.slave)
+    for _ in range(10):
+        wire.fill()
+        ended = stop(path, SERVICE_RESULT=result, EXIT_CODE=ended_by)
+        if "does not take zeros" in ended.err:
+            break
+    assert ended.code == code
+    assert f"<4>acsard-stop: {wire.name} does not take zeros" in ended.err
+
+
 def test_a_device_that_is_not_a_port_is_reported(tmp_path: Path) -> None:
     ended = stop(config(tmp_path, '[mcu]\nport = "/dev/null"\n'))
     assert ended.code == 0

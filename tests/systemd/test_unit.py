@@ -82,6 +82,14 @@ def faults(
     return took
 
 
+def check_clean_stop(container: Container) -> None:
+    """Stop the unit, and check that it does not end as failed."""
+    stopped = container.run("systemctl", "stop", UNIT)
+    assert stopped.code == 0, stopped.err
+    names = ("Result", "ExecMainStatus", "ActiveState")
+    assert [container.show(name) for name in names] == ["success", "0", "inactive"]
+
+
 def undisturbed(took: list[Fault]) -> list[float]:
     """Return the delays until the first zero line, less the time that other work took, s.
 
@@ -144,6 +152,7 @@ def test_sigkill_is_followed_by_zeros_within_100_ms_and_a_restart(
 ) -> None:
     container.start()
     took = faults(container, board, driver, signal.SIGKILL, times)
+    check_clean_stop(container)
     assert within(took, KILL_BOUND_S)
 
 
@@ -154,6 +163,7 @@ def test_a_stall_is_ended_by_the_watchdog_with_stacks_and_followed_by_zeros(
     container.start()
     first = container.journal()[0]["_SYSTEMD_INVOCATION_ID"]
     took = faults(container, board, driver, signal.SIGSTOP, times)
+    check_clean_stop(container)
     text = container.run("journalctl", "-o", "cat", f"_SYSTEMD_INVOCATION_ID={first}").out
     assert "Fatal Python error: Aborted" in text
     assert f'File "{HOME}/src/acsard/' in text, "where it hung"
@@ -170,12 +180,8 @@ def test_stop_ramps_down_ends_with_stop_and_exits_0(
         container.start()
         driver.drives(board)
         began = time.monotonic()
-        stopped = container.run("systemctl", "stop", UNIT)
+        check_clean_stop(container)
         ends.append(time.monotonic() - began)
-        assert stopped.code == 0, stopped.err
-        assert container.show("Result") == "success"
-        assert container.show("ExecMainStatus") == "0"
-        assert container.show("ActiveState") == "inactive"
         lines = [entry for entry in board.since(began) if entry.line != b"-"]
         ramp = [float(entry.line[2:7]) for entry in lines]
         assert lines[-1].line == ZERO
@@ -186,6 +192,37 @@ def test_stop_ramps_down_ends_with_stop_and_exits_0(
     report("systemctl stop at 0.5 m/s -> first zero (end of the ramp)", zeros)
     report("systemctl stop at 0.5 m/s -> stopped", ends)
     assert max(ends) < 1.5
+
+
+_FILLER = """\
+import os, sys, time
+port = os.open(sys.argv[1], os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY)
+for _ in range(50):  # the kernel makes room a little later
+    for piece in (bytes(100), bytes(1)):
+        try:
+            while True:
+                os.write(port, piece)
+        except BlockingIOError:
+            pass
+    time.sleep(0.005)
+"""
+
+
+def test_a_clean_stop_of_a_unit_whose_board_reads_nothing_is_logged_and_is_no_failure(
+    container: Container, board: Board
+) -> None:
+    container.start()
+    board.awaits(ZERO)
+    os.kill(board.process.pid, signal.SIGSTOP)
+    try:
+        filled = container.run("python3", "-c", _FILLER, PORT)
+        assert filled.code == 0, filled.err
+        check_clean_stop(container)
+    finally:
+        os.kill(board.process.pid, signal.SIGCONT)
+    assert "does not take zeros" in container.messages()
+    warnings = container.run("journalctl", "-o", "cat", "-u", UNIT, "-p", "warning")
+    assert "does not take zeros" in warnings.out
 
 
 def test_a_bad_configuration_ends_the_unit_with_78_and_it_stays_down(
