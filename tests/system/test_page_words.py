@@ -283,14 +283,6 @@ def test_a_gap_between_two_states_greys_the_release_button_and_does_not_restart_
     assert browser.text("complaint") == ""
 
 
-def test_a_program_that_drives_is_named_and_a_push_takes_over(
-    page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
-) -> None:
-    with robot[1].commanding(0.1):
-        shows(browser, "hint", "commander (app) drives. Hold and push to take over. It drives on")
-    shows(browser, "hint", "Hold and push to drive")
-
-
 def test_switch_on_is_beside_stop_and_only_offered_while_the_robot_is_off(
     page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
 ) -> None:
@@ -375,24 +367,6 @@ def test_a_held_enter_key_releases_only_what_the_button_said_before(
     shows(browser, "mode", "READY")
 
 
-def test_a_pulled_cable_is_in_the_mode_and_in_the_title_whatever_the_mode(
-    page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
-) -> None:
-    _, bus, board, _ = robot
-    bus.get("srv/stop")
-    shows(browser, "mode", "STOPPED")
-    board.unplug()
-    try:
-        shows(browser, "mode", "STOPPED · NO BOARD")
-        shows(browser, "doubt", "use the robot's own switch")
-        assert browser.js("document.title") == "STOPPED · NO BOARD · acsar"
-    finally:
-        board.plug()
-    until(lambda: browser.text("mode") == "STOPPED", 8.0, "the board is back")
-    browser.release()
-    shows(browser, "mode", "READY")
-
-
 def test_a_stop_during_a_fault_says_that_it_stays_latched_after_the_fault(
     page: Page, browser: Browser, robot: tuple[Daemon, Bus, Peer, Page]
 ) -> None:
@@ -411,18 +385,6 @@ def test_a_stop_during_a_fault_says_that_it_stays_latched_after_the_fault(
     browser.release()
     shows(browser, "mode", "READY")
     assert bus.state()["mode"] == "ready"
-
-
-NAMES = """import('/page/words.js').then(({person}) => [
-    person('unnamed'), person('0123456789abcdef [laptop]'), person('session 0123456789abcdef')])"""
-
-
-def test_the_page_shows_no_session_number_in_place_of_a_name(page: Page, browser: Browser) -> None:
-    assert browser.js(NAMES) == [
-        "a program without a name",
-        "laptop",
-        "a program without a name",
-    ]
 
 
 PARTS = """['map', 'erase', 'where'].map(

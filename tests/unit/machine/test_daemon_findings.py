@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
-from typing import get_args
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, get_args
 
 import pytest
 from msgspec.structs import replace
@@ -33,7 +35,6 @@ from acsard.core.values import GyroDoes
 from acsard.host.errors import CertificateError, NoAnswerError, UsageError
 from acsard.machine import daemon_findings
 from acsard.machine.daemon_findings import (
-    MAX_KEYS,
     Running,
     certificate,
     clocks,
@@ -61,25 +62,6 @@ def running(config: Config) -> Running:
     return Running(INFO, config, STATE, STATE, 0)
 
 
-def test_a_daemon_with_the_settings_of_the_file_is_ok() -> None:
-    (finding,) = compared(running(FILE), FILE)
-    assert finding.level == "ok"
-    assert "pid 77" in finding.text
-
-
-def test_each_key_that_differs_from_the_file_is_reported_with_both_values() -> None:
-    runs = replace(FILE, mcu=McuConfig(port="/dev/pts/3", baud_rate=57600))
-    assert [difference.describe(key) for key, difference in differences(runs, FILE).items()] == [
-        'mcu.port = "/dev/pts/3", not "sim"',
-        "mcu.baud_rate = 57600, not 115200",
-    ]
-    (finding,) = compared(running(runs), FILE)
-    assert finding.level == "ok"
-    assert 'mcu.port = "/dev/pts/3", not "sim"' in finding.text
-    assert "to keep these values after a restart, write" in finding.mend
-    assert "anew" not in finding.mend  # a restart would lead back to the simulator
-
-
 def test_values_of_command_line_options_are_offered_as_lines_for_the_file() -> None:
     bus = BusConfig(listen=("tcp/127.0.0.1:1", "tcp/127.0.0.1:2"))
     runs = replace(FILE, mcu=McuConfig(port="/dev/pts/3"), bus=bus)
@@ -88,48 +70,9 @@ def test_values_of_command_line_options_are_offered_as_lines_for_the_file() -> N
     assert parse("\n".join(re.split(r"; |(?<=]) (?=\w)", keep)).encode()) == runs
 
 
-def test_a_difference_in_a_key_without_an_option_is_a_warning() -> None:
-    (finding,) = compared(running(replace(FILE, odometry=replace(FILE.odometry, gyro=True))), FILE)
-    assert (finding.level, "odometry.gyro = true, not false" in finding.text) == ("warning", True)
-    assert "if the daemon runs with another file, name that file with --config" in finding.mend
-
-
-def test_settings_changed_at_run_time_are_reported_separately_from_options() -> None:
-    sources = (replace(FILE.commands.sources[0], timeout=0.4), *FILE.commands.sources[1:])
-    runs = replace(
-        FILE,
-        limits=replace(FILE.limits, linear_speed=0.4),
-        commands=replace(FILE.commands, sources=sources),
-    )
-    (finding,) = compared(running(runs), FILE)
-    assert "limits.linear_speed = 0.4, not 1.0" in finding.text
-    assert f"commands.sources.{sources[0].name}.timeout = 0.4, not 0.25" in finding.text
-    assert "set while the daemon ran" in finding.text
-    assert "acsard set KEY VALUE --keep" in finding.mend
-    assert "options" not in finding.text + finding.mend
-    both = replace(runs, mcu=McuConfig(port="/dev/pts/3"))
-    by_option, by_set = compared(running(both), FILE)
-    assert "mcu.port" in by_option.text
-    assert "mcu.port" not in by_set.text
-
-
 def test_a_source_that_only_the_file_has_is_reported() -> None:
     runs = replace(FILE, commands=replace(FILE.commands, sources=FILE.commands.sources[1:]))
     assert f"commands.sources.{FILE.commands.sources[0].name}.priority" in differences(runs, FILE)
-
-
-def test_for_a_different_file_only_the_first_differences_are_listed() -> None:
-    runs = replace(
-        FILE,
-        robot=RobotConfig("other"),
-        mcu=McuConfig("/dev/x", 9600, True, 0.1, "auto", 400),
-        bus=BusConfig(listen=("tcp/127.0.0.1:1",)),
-        drive=DriveConfig(0.06, 0.31, 1.1, 1.01, 0.99),
-    )
-    by_option, finding = compared(running(runs), FILE)
-    assert by_option.text.count(", not ") == 4
-    assert finding.text.count(", not ") == MAX_KEYS
-    assert f"and {len(differences(runs, FILE)) - 4 - MAX_KEYS} more" in finding.text
 
 
 NOW = 1_800_000_000_000_000_000
@@ -150,16 +93,6 @@ def test_clocks_that_agree_cause_no_finding(apart: float) -> None:
     assert list(clocks(running_daemon(apart, commands=7))) == []
 
 
-@pytest.mark.parametrize(
-    ("apart", "words"), [(3600.0, "3600.0 s ahead of"), (-0.5, "0.5 s behind")]
-)
-def test_clocks_that_disagree_are_a_warning_with_a_remedy(apart: float, words: str) -> None:
-    (finding,) = clocks(running_daemon(apart))
-    assert (finding.subject, finding.level) == ("clock", "warning")
-    assert words in finding.text
-    assert "timedatectl" in finding.mend
-
-
 def test_a_late_answer_is_not_taken_for_a_wrong_clock() -> None:
     assert (
         list(clocks(running_daemon(-0.5, trip=1.0)))
@@ -173,72 +106,7 @@ def test_a_daemon_on_this_machine_has_its_clock() -> None:
     assert list(clocks(running_daemon(-3.0, here=True))) == []
 
 
-def test_stamps_that_were_replaced_are_reported() -> None:
-    (finding,) = clocks(running_daemon(0.0, stamps_replaced=12))
-    assert "12 commands" in finding.text
-
-
-def test_periods_missed_in_the_last_minute_are_a_warning_after_months() -> None:
-    running = running_daemon(0.0, lines_sent=345_600_000, missed_periods=600)
-    assert not list(late(running))
-    row = DiagnosticStatus(1, "acsard: control loop", "600 of 6000 periods missed", "acsar", [])
-    (finding,) = late(replace(running, rows=(row,)))
-    assert finding.level == "warning"
-    assert "600 of 6000" in finding.text
-
-
-@pytest.mark.parametrize("does", ["off", "used", "waiting for rest", "waiting for turn"])
-def test_a_gyro_that_works_causes_no_warning(does: str) -> None:
-    assert [finding.level for finding in gyro(does, {})] == ([] if does == "off" else ["ok"])
-
-
-@each("does", [*get_args(GyroDoes)[4:], "what a later one does"])
-def test_a_gyro_that_does_not_work_is_a_warning_with_a_remedy(does: str) -> None:
-    (finding,) = gyro(does, {})
-    assert (finding.subject, finding.level) == ("gyro", "warning")
-    assert finding.text
-    assert finding.mend
-
-
-def test_rejected_samples_of_a_gyro_are_reported_with_their_reasons() -> None:
-    counters = {"imu_out_of_range": 3, "imu_second_sender": 12, "imu_not_finite": 0, "lines": 9}
-    _, finding = gyro("used", counters)
-    assert finding.level == "warning"
-    assert "12 second sender, 3 out of range" in finding.text
-    assert finding.mend
-
-
-def test_a_stop_that_a_restart_would_lose_is_a_warning_with_a_remedy() -> None:
-    trouble = (
-        "a stop would not survive a restart: the latch file (/x/a.latches.json) cannot be written: "
-        "Read-only file system"
-    )
-    running = running_daemon(0.0)
-    running = replace(running, state=replace(running.state, latch_file_error=trouble))
-    (finding,) = (item for item in daemon(running) if item.subject == "latch file")
-    assert (finding.level, finding.text) == ("warning", trouble)
-    assert "control.state_directory" in finding.mend
-
-
 CONFIG = Config(mcu=McuConfig(port="/dev/ttyX"))
-
-
-@pytest.mark.parametrize(
-    ("here", "mend"),
-    [
-        (True, "try-reload-or-restart acsard-gateway acsard-web"),
-        (True, "if the robot connects to a router, also `sudo systemctl reload acsard`"),
-        (False, "`acsard doctor` on the daemon's machine"),
-    ],
-)
-def test_an_expiring_certificate_in_use_is_a_warning_with_a_remedy(here: bool, mend: str) -> None:
-    words = "expires in 9 days (certificate of the router tls/router.local:7447)"
-    row = DiagnosticStatus(1, "acsard: certificate", words, "acsar", [])
-    (finding,) = certificate(row, here)
-    assert (finding.subject, finding.level) == ("certificates", "warning")
-    assert finding.text.endswith(words)
-    assert mend in finding.mend
-    assert list(certificate(replace(row, level=0), here)) == list(certificate(None, here)) == []
 
 
 @pytest.mark.parametrize("here", [True, False])
@@ -251,9 +119,132 @@ def test_changed_settings_of_a_daemon_on_another_machine_are_a_warning(here: boo
     assert texts == ([] if here else [words])
 
 
-def link_findings(before: dict[str, int], after: dict[str, int], **state: str) -> list[Finding]:
+def link_findings(
+    before: dict[str, int], after: dict[str, int], config: Config = CONFIG, **state: Any
+) -> list[Finding]:
     first, two = replace(STATE, counters=before), replace(STATE, counters=after, **state)
-    return list(link(Running(INFO, CONFIG, first, two, 0)))
+    return list(link(Running(INFO, config, first, two, 0)))
+
+
+def settings_findings(**changes: Any) -> list[Finding]:
+    """Return the findings about a daemon whose settings differ in this way from its file."""
+    return list(compared(running(replace(FILE, **changes)), FILE))
+
+
+def board(config: Config = CONFIG, **state: Any) -> list[Finding]:
+    """Return the findings about the inputs and wheels of a board with a sound link."""
+    seen = replace(STATE, **state)
+    return [item for item in link(Running(INFO, config, seen, seen, 0)) if item.subject != "link"]
+
+
+def state_findings(subject: str, here: bool = False, **state: Any) -> list[Finding]:
+    seen = running_daemon(0.0, here=here)
+    found = daemon(replace(seen, state=replace(seen.state, **state)))
+    return [finding for finding in found if finding.subject == subject]
+
+
+BEFORE, AFTER = {"lines": 5, "lines_sent": 900}, {"lines": 104, "lines_sent": 1000}
+"""The counters of a sound link, a second apart."""
+FREE = Config(mcu=McuConfig(port="/dev/ttyX", reply_period=0.1))
+FRONT_REAR = replace(CONFIG, safety=SafetyConfig(bumpers=("front", "rear")))
+BATTERY = replace(CONFIG, battery=BatteryConfig(warning_below=22.0, stop_below=21.0))
+SOURCES = (replace(FILE.commands.sources[0], timeout=0.4), *FILE.commands.sources[1:])
+SET = {
+    "limits": replace(FILE.limits, linear_speed=0.4),
+    "commands": replace(FILE.commands, sources=SOURCES),
+}
+CERTIFICATE = DiagnosticStatus(
+    1, "acsard: certificate", "expires in 9 days (certificate of the router tls/x:7447)", "", []
+)
+MISSED = DiagnosticStatus(1, "acsard: control loop", "600 of 6000 periods missed", "acsar", [])
+MONTHS = running_daemon(0.0, lines_sent=345_600_000, missed_periods=600)
+
+
+def situations() -> dict[str, Iterable[Finding]]:
+    """Return the findings of each situation."""
+    return {
+        "the settings of the file": settings_findings(),
+        "options of the command line": settings_findings(
+            mcu=McuConfig(port="/dev/pts/3", baud_rate=57600)
+        ),
+        "another key than those of options": settings_findings(
+            odometry=replace(FILE.odometry, gyro=True)
+        ),
+        "settings that were set": settings_findings(**SET),
+        "an option and settings that were set": settings_findings(
+            **SET, mcu=McuConfig(port="/dev/pts/3")
+        ),
+        "a different file": settings_findings(
+            robot=RobotConfig("other"),
+            mcu=McuConfig("/dev/x", 9600, True, 0.1, "auto", 400),
+            bus=BusConfig(listen=("tcp/127.0.0.1:1",)),
+            drive=DriveConfig(0.06, 0.31, 1.1, 1.01, 0.99),
+        ),
+        "settings that were changed, on another machine": state_findings(
+            "configuration", settings_differ="rates.odom = 7.5"
+        ),
+        "settings that were changed, here": state_findings(
+            "configuration", here=True, settings_differ="rates.odom = 7.5"
+        ),
+        "a clock ahead": clocks(running_daemon(3600.0)),
+        "a clock behind": clocks(running_daemon(-0.5)),
+        "stamps that were replaced": clocks(running_daemon(0.0, stamps_replaced=12)),
+        "missed periods since the start": late(MONTHS),
+        "missed periods in the last minute": late(replace(MONTHS, rows=(MISSED,))),
+        **{
+            f"a gyro: {does}": gyro(does, {})
+            for does in ("off", *get_args(GyroDoes), "what is new")
+        },
+        "rejected samples of a gyro": gyro(
+            "used", {"imu_out_of_range": 3, "imu_second_sender": 12}
+        ),
+        "a latch file that cannot be written": state_findings("latch file", latch_file_error="why"),
+        "an expiring certificate, here": certificate(CERTIFICATE, is_local=True),
+        "an expiring certificate, elsewhere": certificate(CERTIFICATE, is_local=False),
+        "a fault of the board": state_findings("daemon", mode="fault", code="impossible_speeds"),
+        "a fault of acsard": state_findings("daemon", mode="fault", code="guard_too_fast"),
+        "a sound link": link_findings(BEFORE, AFTER),
+        "a sound link to a board with its own clock": link_findings(BEFORE, AFTER, FREE),
+        "too few lines to judge": link_findings(BEFORE, {"lines": 44, "lines_sent": 939}),
+        "a missing link": link_findings(
+            {}, {}, link="booting", mode="waiting", reason="nothing came"
+        ),
+        "a link that this computer lost": link_findings(
+            {}, {}, link="stale", mode="waiting", code="host_late"
+        ),
+        "lines that are not answered": link_findings(
+            {"lines": 80, "lines_sent": 100}, {"lines": 160, "lines_sent": 200}
+        ),
+        "losses by a late computer": link_findings({}, {"link_lost": 3, "link_lost_host_stall": 3}),
+        "losses by the board, too": link_findings({}, {"link_lost": 5, "link_lost_host_stall": 3}),
+        "losses of the simulator": link_findings({}, {"link_lost": 2}, Config()),
+        "a wheel fault": board(wheel_fault="rear left: its encoder stands"),
+        **{
+            f"an emergency stop: {now}": board(emergency_stop=now)
+            for now in ("pressed", "silent", "released")
+        },
+        "a missing emergency stop": board(replace(CONFIG, safety=SafetyConfig(estop="required"))),
+        "a pressed bumper": board(FRONT_REAR, bumpers=[True, False]),
+        "released bumpers": board(FRONT_REAR, bumpers=[False, False]),
+        "missing bumpers": board(FRONT_REAR),
+        "a full battery": board(BATTERY, battery=BatterySummary(24.0, 80.0, -1.0, "ok")),
+        "a low battery": board(BATTERY, battery=BatterySummary(21.5, None, None, "warning")),
+        "an empty battery": board(BATTERY, battery=BatterySummary(20.5, None, None, "stop")),
+        "an unknown battery": board(BATTERY, battery=BatterySummary(None, None, None, "unknown")),
+        "a missing battery": board(BATTERY),
+        "a board without inputs": board(),
+    }
+
+
+def test_each_situation_has_its_findings(approved: Callable[[Path, str], None]) -> None:
+    """To write the file anew, add `--approve`, and then read `git diff`."""
+    page = ""
+    for name, findings in situations().items():
+        page += f"--- {name}\n"
+        for finding in findings:
+            page += f"{finding.level} {finding.subject}: {finding.text}\n"
+            page += f"  -> {finding.mend}\n" if finding.mend else ""
+    approved(Path(__file__).with_name("daemon_findings.txt"), page)
 
 
 @pytest.mark.parametrize(
@@ -278,59 +269,6 @@ def test_a_failed_query_of_the_daemon_has_advice_that_fits_its_error(
     assert finding.mend.endswith(mend) if mend else not finding.mend
 
 
-@pytest.mark.parametrize(
-    ("code", "mend", "unfit"),
-    [
-        ("impossible_speeds", "acsard mcu check", "defect of acsard"),
-        ("guard_too_fast", "defect of acsard", "acsard mcu check"),
-    ],
-)
-def test_the_advice_about_a_fault_fits_its_cause(code: str, mend: str, unfit: str) -> None:
-    state = replace(STATE, mode="fault", code=code)
-    first = next(daemon(Running(INFO, CONFIG, state, state, 0)))
-    assert mend in first.mend
-    assert unfit not in first.mend
-    assert "acsard call clear" in first.mend
-
-
-def test_a_sound_link_gives_one_ok_finding() -> None:
-    (finding,) = link_findings({"lines": 5, "lines_sent": 900}, {"lines": 104, "lines_sent": 1000})
-    assert (finding.subject, finding.level) == ("link", "ok")
-
-
-@each(("period", "answers_are_counted"), [(0.0, True), (0.1, False)])
-def test_a_sound_link_says_which_lines_were_judged(
-    period: float, answers_are_counted: bool
-) -> None:
-    config = Config(mcu=McuConfig(port="/dev/ttyX", reply_period=period))
-    before = replace(STATE, counters={"lines": 5, "lines_sent": 900})
-    state = replace(STATE, counters={"lines": 104, "lines_sent": 1000})
-    (finding,) = link(Running(INFO, config, before, state, 0))
-    assert finding.level == "ok"
-    assert ("almost all lines to and from the board arrive" in finding.text) is answers_are_counted
-    assert ("cannot check the lines to the board" in finding.text) is not answers_are_counted
-    state = replace(STATE, counters={"lines": 44, "lines_sent": 939})
-    (finding,) = link(Running(INFO, config, before, state, 0))
-    assert finding.level == "ok"
-    assert ("sends too few lines in a second" in finding.text) is answers_are_counted
-
-
-@pytest.mark.parametrize("state", ["booting", "stale"])
-def test_a_missing_link_is_a_failure_with_its_reason_and_the_check_command(state: str) -> None:
-    (finding,) = link_findings({}, {}, link=state, mode="waiting", reason="nothing was received")
-    assert finding.level == "failure"
-    assert "nothing was received" in finding.text
-    assert "acsard mcu check --port /dev/ttyX" in finding.mend
-    assert "kill 77" in finding.mend
-
-
-def test_lines_that_are_not_answered_are_a_warning() -> None:
-    (finding,) = link_findings({"lines": 80, "lines_sent": 100}, {"lines": 160, "lines_sent": 200})
-    assert finding.level == "warning"
-    assert "answered only 80 of the 100 lines that the daemon sent in a second" in finding.text
-    assert "mcu check" in finding.mend
-
-
 @each(
     ("sent", "line_count", "period", "findings"),
     [(100, 100, 0.0, 0), (100, 98, 0.0, 0), (100, 97, 0.0, 0), (100, 96, 0.0, 1),
@@ -351,74 +289,7 @@ def test_rejected_lines_are_reported_by_kind_above_one_in_fifty() -> None:
     assert "12 malformed, 30 crc error" in text
 
 
-def test_a_link_lost_because_the_computer_was_late_is_not_blamed_on_the_board() -> None:
-    (late,) = link_findings({}, {"link_lost": 3, "link_lost_host_stall": 3})
-    assert "lost 3 times" in late.text
-    assert "the daemon's computer" in late.text
-    assert "mcu check" not in late.mend
-    late, board = link_findings({}, {"link_lost": 5, "link_lost_host_stall": 3})
-    assert "lost 2 times" in board.text
-    assert "mcu check" in board.mend
-    states = replace(STATE, counters={"link_lost": 2})
-    (sim,) = link(Running(INFO, Config(), STATE, states, 0))
-    assert "the daemon's computer" in sim.text
-    assert "mcu check" not in sim.mend
-    (finding,) = link_findings({}, {}, link="stale", mode="waiting", code="host_late")
-    assert "mcu check" not in finding.mend
-
-
-def test_a_wheel_fault_is_a_warning() -> None:
-    *_, finding = link_findings({}, {}, wheel_fault="rear left: its encoder stands")
-    assert (finding.subject, finding.level) == ("wheels", "warning")
-
-
-@pytest.mark.parametrize(
-    ("state", "level"), [("pressed", "warning"), ("silent", "failure"), ("released", "ok")]
-)
-def test_the_emergency_stop_of_the_board_is_reported(state: str, level: str) -> None:
-    *_, finding = link_findings({}, {}, emergency_stop=state)
-    assert (finding.subject, finding.level) == ("emergency stop", level)
-
-
-def test_a_required_emergency_stop_that_the_board_does_not_report_is_a_failure() -> None:
-    config = replace(CONFIG, safety=SafetyConfig(estop="required"))
-    *_, finding = link(Running(INFO, config, STATE, STATE, 0))
-    assert (finding.subject, finding.level) == ("emergency stop", "failure")
-
-
-@pytest.mark.parametrize(
-    ("bumpers", "level"),
-    [([True, False], "warning"), ([False, False], "ok"), (None, "failure")],
-)
-def test_the_bumpers_of_the_board_are_reported(bumpers: list[bool] | None, level: str) -> None:
-    config = replace(CONFIG, safety=SafetyConfig(bumpers=("front", "rear")))
-    state = replace(STATE, bumpers=bumpers)
-    *_, finding = link(Running(INFO, config, state, state, 0))
-    assert (finding.subject, finding.level) == ("bumpers", level)
-
-
 THRESHOLDS = BatteryConfig(warning_below=22.0, stop_below=21.0)
-
-
-@pytest.mark.parametrize(
-    ("battery", "level"),
-    [
-        (BatterySummary(24.0, 80.0, -1.0, "ok"), "ok"),
-        (BatterySummary(21.5, None, None, "warning"), "warning"),
-        (BatterySummary(20.5, None, None, "stop"), "failure"),
-        (BatterySummary(None, None, None, "unknown"), "warning"),
-        (None, "warning"),
-    ],
-)
-def test_the_battery_of_the_board_is_reported(battery: BatterySummary | None, level: str) -> None:
-    state = replace(STATE, battery=battery)
-    config = replace(CONFIG, battery=THRESHOLDS)
-    *_, finding = link(Running(INFO, config, state, state, 0))
-    assert (finding.subject, finding.level) == ("battery", level)
-
-
-def test_a_board_without_a_battery_has_no_finding_unless_thresholds_need_it() -> None:
-    assert [finding.subject for finding in link_findings({}, {})] == ["link"]
 
 
 DAYS_40 = {"lines": 340_000_000, "lines_sent": 345_600_000}
