@@ -107,7 +107,8 @@ def screens(width: int) -> dict[str, list[str]]:
     found = {f"top: {name}": lines_of(data, width) for name, data in TOP.items()}
     for name, data in DRIVE.items():
         found[f"drive: {name}"] = [line.plain for line in drive_screen.lines(data, width)]
-    found["drive without a screen"] = drive_screen.report_lines(OBJECTED, width)
+    for name, data in DRIVE.items():
+        found[f"drive without a screen: {name}"] = drive_screen.report_lines(data, width)
     for name, data in ENDS.items():
         found[f"drive has ended: {name}"] = drive_screen.last_report_lines(data, width)
     found["fleet"] = table(FLEET, width)
