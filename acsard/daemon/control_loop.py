@@ -360,13 +360,15 @@ class ControlLoop:
         return None
 
     def _publish(self, outputs: Outputs, answers: tuple[Answer, ...]) -> None:
-        bus, queued_ns = self._bus, None
+        bus, delays = self._bus, self._bus.feedback_delays
+        while delays:
+            self._stopwatch.figures["feedback_to_bus"].add(*delays.popleft())
+        # Of several lines in a step, the first was read first.
+        read_ns = outputs.estimates[0].heard_ns if outputs.estimates else None
         for key, message in self.report.due(outputs, bus.wanted_keys, self._snapshot):
-            bus.publish(key, message)
-            if key in FEEDBACK_TOPICS:
-                queued_ns = self._mono_ns()
+            bus.publish(key, message, read_ns if key in FEEDBACK_TOPICS else None)
         for estimate in outputs.estimates:
-            self._stopwatch.feedback(estimate, queued_ns)
+            self._stopwatch.feedback(estimate)
         for answer in answers:
             self._answers.append((outputs.now.mono_ns, answer))
         if self._answers:

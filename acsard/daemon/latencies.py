@@ -53,9 +53,9 @@ class Histogram:
 
 # period_lateness: from the due time of a period, or of the first missed one, to its step.
 # step_time: of its work. command_age: from arrival to each line with the command; command_to_wire:
-# to the first, unless it waited for its source. feedback_to_bus: from the read of a line to the
-# queue of its messages. mcu_round_trip: from a line to its reply's end, only with `mcu.link_check`,
-# as other replies do not name their line.
+# to the first, unless it waited for its source. feedback_to_bus: from the read of a line until
+# Zenoh has each of its messages. mcu_round_trip: from a line to its reply's end, only with
+# `mcu.link_check`, as other replies do not name their line.
 Name = Literal[
     "period_lateness",
     "step_time",
@@ -158,10 +158,8 @@ class Stopwatch:
         if command_ns > before_ns:
             self.figures["command_to_wire"].add(sent_ns, sent_ns - command_ns)
 
-    def feedback(self, estimate: Estimate, queued_ns: Ns | None) -> None:
-        """Record `mcu_round_trip`, and `feedback_to_bus` if there are subscribers."""
+    def feedback(self, estimate: Estimate) -> None:
+        """Record `mcu_round_trip` if the estimate's line names the line that it answers."""
         at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
         if asked_ns is not None:
             self.figures["mcu_round_trip"].add(at_ns, at_ns - asked_ns)
-        if queued_ns is not None:
-            self.figures["feedback_to_bus"].add(queued_ns, queued_ns - at_ns)

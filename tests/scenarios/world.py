@@ -112,6 +112,7 @@ class MemoryBus:
     def __init__(self, wanted: Collection[str]) -> None:
         self.wanted_keys = set(wanted)
         self.published: dict[str, deque[Message]] = {}
+        self.feedback_delays: deque[tuple[int, int]] = deque()
         self.replies: dict[int, list[Reply]] = {}
         self.finished: set[int] = set()
         self.arrivals: list[Arrival] = []
@@ -131,7 +132,7 @@ class MemoryBus:
         del self.queries[:queries]
         return batch
 
-    def publish(self, key: str, message: Message) -> None:
+    def publish(self, key: str, message: Message, read_ns: int | None = None) -> None:
         self.published.setdefault(key, deque(maxlen=100_000)).append(message)
 
     def flush(self) -> None: ...

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import MutableMapping
 from collections.abc import Set as AbstractSet
 from typing import Protocol
@@ -12,7 +13,7 @@ from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query, Reply
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import GatewayState, Message
-from acsard.core.values import Event, RoutersStatus
+from acsard.core.values import Event, Ns, RoutersStatus
 
 
 class BusInput(Struct, frozen=True):
@@ -54,8 +55,15 @@ class Bus(Protocol):
         the limit, and others. The rest waits.
         """
 
-    def publish(self, key: str, message: Message) -> None:
-        """Queue a message for the subscribers of `key`, which the next `flush` sends."""
+    @property
+    def feedback_delays(self) -> deque[tuple[Ns, Ns]]:
+        """When each message with a `read_ns` was sent, and how long after that time."""
+
+    def publish(self, key: str, message: Message, read_ns: Ns | None = None) -> None:
+        """Queue a message for the subscribers of `key`, which the next `flush` sends.
+
+        `read_ns` says when the feedback line of the message was read.
+        """
 
     def flush(self) -> None:
         """Start to send the queued messages, without waiting."""

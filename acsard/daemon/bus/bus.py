@@ -7,6 +7,7 @@ event loop.
 from __future__ import annotations
 
 import time
+from collections import deque
 from functools import partial
 
 import zenoh
@@ -23,7 +24,7 @@ from acsard.core.messages.schema import Message
 from acsard.core.messages.signature import Signature
 from acsard.core.ros.names import gid
 from acsard.core.ros.transports import Endpoint, claims, endpoints, left_out, node_tokens
-from acsard.core.values import NS_PER_S
+from acsard.core.values import NS_PER_S, Ns
 from acsard.daemon.bus.inbox import Inbox, Replies
 from acsard.daemon.bus.outlets import Outlets
 from acsard.daemon.bus.router_links import RouterLinks
@@ -70,8 +71,12 @@ class ZenohBus(Bus):
         dropped, stuck = self._outlets.losses(clock.mono_ns())
         return replace(batch, dropped=dropped, stuck=stuck) if dropped or stuck else batch
 
-    def publish(self, key: str, message: Message) -> None:
-        self._outlets.publish(key, message)
+    @property
+    def feedback_delays(self) -> deque[tuple[Ns, Ns]]:
+        return self._outlets.feedback_delays
+
+    def publish(self, key: str, message: Message, read_ns: Ns | None = None) -> None:
+        self._outlets.publish(key, message, read_ns)
 
     def flush(self) -> None:
         # An exception that has ended a thread of the bus must end the daemon too.

@@ -8,6 +8,7 @@ control period.
 
 from __future__ import annotations
 
+from collections import deque
 from threading import Lock
 from typing import Any
 
@@ -66,7 +67,10 @@ class Outlets:
         self._counting = Lock()
         # Native keys with a subscriber or a latched publisher.
         self.wanted: frozenset[str] = frozenset()
-        self._slots: dict[str, Mailbox[Message]] = {}
+        # Each message with its `read_ns`.
+        self._slots: dict[str, Mailbox[tuple[Message, Ns | None]]] = {}
+        # The thread appends, and the control loop removes them in each step.
+        self.feedback_delays: deque[tuple[Ns, Ns]] = deque(maxlen=4 * SLOT_MESSAGES)
         self._bell = Bell()  # one for all slots, because a step fills several
         self._waiting = self._leaving = self._stuck = False
         self._dropped = 0  # displaced since the last `losses`
@@ -86,9 +90,12 @@ class Outlets:
 
     # The control loop calls the methods below. None of them waits or calls Zenoh.
 
-    def publish(self, topic: str, message: Message) -> None:
-        """Put a message into the slot of its native key; `flush` wakes the thread."""
-        if not self._slots[topic].store(message):
+    def publish(self, topic: str, message: Message, read_ns: Ns | None = None) -> None:
+        """Put a message into the slot of its native key; `flush` wakes the thread.
+
+        With `read_ns`, its delay since then is measured when it is sent.
+        """
+        if not self._slots[topic].store((message, read_ns)):
             self._dropped += 1
         self._waiting = True
 
@@ -130,7 +137,11 @@ class Outlets:
             self._began_ns = clock.mono_ns()
             for topic, slot in self._slots.items():
                 while slot.waiting:
-                    self._send(topic, slot.waiting.popleft())
+                    message, read_ns = slot.waiting.popleft()
+                    self._send(topic, message)
+                    if read_ns is not None:
+                        now_ns = clock.mono_ns()
+                        self.feedback_delays.append((now_ns, now_ns - read_ns))
             self._began_ns = None
 
     def _send(self, topic: str, message: Message) -> None:

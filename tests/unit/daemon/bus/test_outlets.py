@@ -6,6 +6,8 @@ The loop never waits, and an outlet sends only the newest value.
 from __future__ import annotations
 
 import threading
+import time
+from collections import deque
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -18,6 +20,7 @@ from acsard.core.messages.schema import Twist, Vector3
 from acsard.daemon.bus.bus import ZenohBus
 from acsard.daemon.bus.outlets import BLOCKED_AFTER_NS, SLOT_MESSAGES, Outlets
 from acsard.host import clock
+from tests.scenarios.world import MemoryBus, World
 
 TOPIC, KEY = "cmd_vel_out", "acsard/acsar/cmd_vel_out"
 WAIT_S = 5.0
@@ -120,3 +123,51 @@ def test_an_error_of_the_thread_ends_the_control_loop() -> None:
     bus._outlets.stop(WAIT_S)
     with pytest.raises(ValueError, match="a bug"):
         bus.flush()
+
+
+class SlowPublisher(Publisher):
+    """A publisher whose put takes 20 ms of the clock `now_ns`."""
+
+    now_ns = 0
+
+    def put(self, payload: bytes) -> None:
+        self.now_ns += 20_000_000
+
+
+class OutletBus(MemoryBus):
+    """A bus in memory that sends `odom` through real outlets, and waits until it is sent."""
+
+    def __init__(self, publisher: Publisher) -> None:
+        super().__init__({"odom"})
+        self.errors: list[BaseException] = []
+        self.outlets = Outlets(self.errors)
+        self.outlets.declare(cast(zenoh.Session, publisher), "odom", "odom", "msgpack", "")
+        self.outlets.start()
+
+    @property
+    def feedback_delays(self) -> deque[tuple[int, int]]:
+        return self.outlets.feedback_delays
+
+    @feedback_delays.setter
+    def feedback_delays(self, value: object) -> None: ...
+
+    def publish(self, *arguments: Any) -> None:
+        self.outlets.publish(*arguments)
+        self.outlets.flush()
+        deadline_s = time.monotonic() + WAIT_S
+        while self.outlets._slots["odom"].waiting or self.outlets._began_ns is not None:
+            assert time.monotonic() < deadline_s, self.errors
+            time.sleep(0.0005)
+
+
+def test_the_delay_of_feedback_includes_sending_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    publisher, world = SlowPublisher(), World()
+    monkeypatch.setattr(clock, "mono_ns", lambda: world.now_ns + publisher.now_ns)
+    world.bus = world.loop._bus = bus = OutletBus(publisher)
+    world.run(0.2)
+    bus.outlets.stop(WAIT_S)
+    bus.wanted_keys.clear()
+    world.run(0.02)
+    delay = world.loop._stopwatch.measured(world.now_ns)["feedback_to_bus"].since_start
+    assert delay.count >= 15
+    assert delay.p50 >= 20_000
