@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import get_args
 
 import acsard
-from acsard.core.codes import CODES, Code, StateCode, joined, reason, sentence
+from acsard.core.codes import CODES, Code, StateCode, WaitCode, joined, reason, sentence
 from acsard.recording.file import Recording
 from acsard.recording.file_replay import steps
 from tests import recordings
@@ -40,6 +40,19 @@ def test_each_code_is_in_the_program() -> None:
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 found.add(node.value)
     assert not set(CODES) - found
+
+
+def test_the_page_lists_the_codes_of_the_sources_with_the_first_words_of_their_texts() -> None:
+    page = (PACKAGE.parent / "deploy/clients/README.md").read_text(encoding="utf-8")
+    table = page.partition("| code | first words of the reason |")[2].partition("\n\n")[0]
+    listed = set()
+    for row in table.splitlines()[2:]:
+        first, words, *_ = (re.findall(r"`([^`]*)`", cell) for cell in row.split("|")[1:])
+        codes = [code for code in get_args(Code) if code in first]
+        listed |= set(codes)
+        for part in "".join(words).split("…"):
+            assert part.strip() in sentence(codes[-1], **VALUES).text, row
+    assert listed == {*get_args(WaitCode), "no_command"}
 
 
 def test_the_recordings_publish_only_codes_of_the_table() -> None:
