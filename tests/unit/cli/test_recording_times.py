@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from acsard.core.config.settings import Config
-from tests.scenarios.taped import Tape, recorded_world
+from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 from tests.system.typed import typed
 
@@ -76,40 +76,6 @@ def test_a_time_is_found_in_every_file_of_the_ring(ring: Ring) -> None:
 
 
 @pytest.mark.slow
-def test_a_range_over_several_files_names_all_of_them(ring: Ring) -> None:
-    where, names, stops = ring
-    times = ("--from", local(stops[3] - 0.05), "--to", local(stops[6] + 0.05))
-    code, out, err = recording(where, "show", *times)
-    assert (code, out.count("  stop: ")) == (0, 4)
-    assert f"4 of 30 recordings in {where}: {', '.join(names[3:7])}" in err
-    assert recording(where, "show", "all")[1].count("  stop: ") == FILES
-
-
-@pytest.mark.slow
-def test_a_time_between_two_recordings_names_both(tmp_path: Path) -> None:
-    tape, later = Tape(), Tape()
-    World(recorder=tape).run(1.0)
-    world = World(recorder=later)
-    world.wall_offset_ns += 3600 * 10**9
-    world.run(1.0)
-    tape.write(tmp_path / "000001-20270115T080000Z.mcap", Config())
-    later.write(tmp_path / "000002-20270115T090000Z.mcap", Config())
-    times = ("--from", local(600.0), "--to", local(700.0))
-    code, out, err = recording(tmp_path, "show", *times)
-    assert (code, out) == (1, "")
-    assert "before that time is 000001-20270115T080000Z.mcap, " in err
-    assert "after that time is 000002-20270115T090000Z.mcap, " in err
-    times = ("--from", local(-60.0), "--to", local(7200.0))
-    code, out, err = recording(tmp_path, "show", *times)
-    begins = [line.split("  ")[0] for line in out.splitlines() if "  start: " in line]
-    assert (code, begins) == (0, [local(0.0), local(3600.0)])
-    gaps = ((-60.0, 0.0), (1.0, 3600.0), (3601.0, 7200.0))
-    words = "; ".join(f"from {local(begin)[:19]} to {local(end)[:19]}" for begin, end in gaps)
-    assert f"nothing was recorded {words}" in err
-    assert "nothing was recorded" not in recording(tmp_path, "show", "--to", local(0.9))[2]
-
-
-@pytest.mark.slow
 def test_a_time_of_day_is_looked_up_before_now_in_the_ring(
     ring: Ring, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -124,43 +90,6 @@ def test_a_time_of_day_is_looked_up_before_now_in_the_ring(
     times = ("--from", f"yesterday {first}", "--to", f"yesterday {last}")
     code, out, err = recording(where, "show", *times)
     assert (code, out.count("  stop: "), names[7] in err) == (0, 1, True)
-
-
-@pytest.mark.slow
-def test_a_drive_across_a_rotation_is_one_drive(tmp_path: Path) -> None:
-    """The drive begins in the first of four files and ends in the last file."""
-    tape, world = recorded_world(every=STEPS)
-    world.run(0.5)
-    world.drive(0.5, seconds=2.0)
-    world.run(1.5)
-    names = rotated(tape, tmp_path, 4)
-    tape.write(tmp_path / "whole", Config())
-    (drive,) = [
-        line
-        for line in recording(tmp_path, "show", str(tmp_path / "whole"))[1].splitlines()
-        if "  drive: " in line
-    ]
-    # The range begins in the third file, two files after the one in which the drive began.
-    code, out, err = recording(tmp_path, "show", "--from", local(2.2))
-    assert (code, [line for line in out.splitlines() if "  drive: " in line]) == (0, [drive])
-    assert f"4 of 4 recordings in {tmp_path}: {', '.join(names)}" in err
-
-
-@pytest.mark.slow
-def test_a_file_alone_says_that_its_drive_began_before_it_and_goes_on_after_it(
-    tmp_path: Path,
-) -> None:
-    tape, world = recorded_world(every=STEPS)
-    world.run(0.5)
-    world.drive(0.5, seconds=2.0)
-    world.run(1.5)
-    rotated(tape, tmp_path, 4)
-    first, second, last = (recording(tmp_path, "show", number)[1].splitlines() for number in "124")
-    assert "  drive: was driving, 0." in first[-1]
-    assert first[-1].endswith(" so far (by app)")
-    counted = ", counted from the beginning of this recording (by app)"
-    assert second[-1].endswith(f" s so far{counted}")
-    assert any("  drive: drove " in line and line.endswith(counted) for line in last)
 
 
 @pytest.mark.slow
@@ -201,34 +130,6 @@ def test_a_report_goes_on_across_a_rotation(
     assert "<td>was driving, 1." in text
 
 
-def test_a_time_before_a_clock_that_was_set_back_is_found(tmp_path: Path) -> None:
-    tape, world = recorded_world()
-    world.run(1.0)
-    world.wall_offset_ns -= 3600 * 10**9
-    world.run(0.5)
-    world.call("stop")
-    world.run(0.5)
-    tape.write(tmp_path / "000001-20270115T080000Z.mcap", Config())
-    times = ("--from", local(1.4 - 3600), "--to", local(1.6 - 3600))
-    code, out, _ = recording(tmp_path, "show", *times)
-    assert (code, "  stop: " in out, "  start: " in out) == (0, True, False)
-
-
-def test_two_runs_of_the_daemon_become_two_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (where := tmp_path / "ring").mkdir()
-    for number in (1, 2):
-        tape = Tape()
-        World(recorder=tape).run(1.0)
-        tape.write(where / f"00000{number}-20270115T080000Z.mcap", Config())
-    code, _, err = recording(where, "export", "all", "both.csv", "--csv")
-    assert (code, "has 2 separate parts, because the daemon restarted" in err) == (2, True)
-    assert recording(where, "export", "all", "--csv")[0] == 0
-    assert len([*tmp_path.glob("00000[12]-*.csv")]) == 2
-
-
 @pytest.mark.slow
 def test_a_search_reports_the_drive_and_the_cut_at_the_end_of_the_newest_recording(
     tmp_path: Path,
@@ -255,13 +156,3 @@ def test_a_search_reports_the_drive_and_the_cut_at_the_end_of_the_newest_recordi
         os.utime(part, (written_s, written_s))
     _, out, _ = recording(tmp_path, "show", "--to", local(2.0))
     assert "  drive: was driving, 0." in out.splitlines()[-1]
-
-
-def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
-    tape = Tape()
-    World(recorder=tape).run(1.0)
-    tape.write(tmp_path / "000001-20270115T080000Z.mcap", Config())
-    (tmp_path / "000002-20270115T080000Z.mcap").write_bytes(b"no recording")
-    code, out, err = recording(tmp_path, "show", "--from", local(0.0))
-    assert (code, "start: " in out) == (0, True)
-    assert "000002-20270115T080000Z.mcap is not a recording of acsard" in err

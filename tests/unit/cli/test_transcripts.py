@@ -115,13 +115,41 @@ def days(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tape.write(where / "evening.mcap", config, first=2000)
 
 
-SLOW = ("mcu", "recording")
+def ring(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Record a drive in four files, two runs an hour apart, and a clock that is set back."""
+    for name in ("ring", "runs", "set-back"):
+        (where / name).mkdir()
+    tape, world = recorded_world(every=200)
+    world.run(0.5)
+    world.drive(0.5, seconds=2.0)
+    world.run(1.5)
+    for number in range(4):
+        end = None if number == 3 else 200 * (number + 1)
+        name = f"00000{number + 1}-20270115T080000Z.mcap"
+        tape.write(where / "ring" / name, Config(), 200 * number, end=end)
+    (where / "ring/000005-20270115T080000Z.mcap").write_bytes(b"no recording")
+    for number in range(2):
+        tape, world = recorded_world()
+        world.wall_offset_ns += number * 3600 * NS_PER_S
+        world.run(1.0)
+        tape.write(where / f"runs/00000{number + 1}-20270115T080000Z.mcap", Config())
+    tape, world = recorded_world()
+    world.run(1.0)
+    world.wall_offset_ns -= 3600 * NS_PER_S
+    world.run(0.5)
+    world.call("stop")
+    world.run(0.5)
+    tape.write(where / "set-back/000001-20270115T080000Z.mcap", Config())
+
+
+SLOW = ("mcu", "recording", "times")
 
 PREPARED: dict[str, Callable[[Path, pytest.MonkeyPatch], None]] = {
     "recording": recordings,
     "calibrate": logs,
     "tls": authorities,
     "timeline": days,
+    "times": ring,
 }
 """Makes the files of a transcript, by its name."""
 
