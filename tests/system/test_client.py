@@ -264,6 +264,45 @@ def test_connecting_without_a_daemon_raises_a_connection_error_with_the_remedy()
     assert "acsard run" in str(error.value)
 
 
+_ONLY_ITS_LIBRARIES = """\
+import asyncio, importlib, pkgutil, sys
+
+class Finder:
+    others = set()
+
+    def find_spec(self, name, path=None, target=None):
+        library = name.partition(".")[0]
+        if library not in {"acsard", "msgspec", "xxhash", "zenoh", *sys.stdlib_module_names}:
+            self.others.add(library)
+            raise ModuleNotFoundError(f"{name} is not for client programs")
+
+sys.meta_path.insert(0, Finder())
+import acsard.client
+
+for module in pkgutil.iter_modules(acsard.client.__path__):
+    importlib.import_module(f"acsard.client.{module.name}")
+
+async def state(endpoint):
+    async with acsard.client.connect_async(endpoint) as robot:
+        return await anext(robot.messages("state"))
+
+with acsard.client.connect(sys.argv[1]) as robot:
+    robot.drive(0.1, 0.0, seconds=0.1)
+    robot.call("stop")
+    robot.call("clear")
+    print(robot.pose().x > 0.0, asyncio.run(state(sys.argv[1])).link)
+print("others:", *Finder.others - {"typing_extensions"})  # msgspec does not need it
+"""
+
+
+def test_a_client_program_needs_no_library_but_zenoh_msgspec_and_xxhash(
+    shared: Daemon, fresh: Bus
+) -> None:
+    done = finish([sys.executable, "-c", _ONLY_ITS_LIBRARIES, shared.endpoint], ROOT)
+    assert done.code == 0, done.err
+    assert done.out.splitlines() == ["True up", "others:"]
+
+
 async def test_connecting_async_without_a_daemon_raises_the_same_error() -> None:
     with pytest.raises(UnreachableError):
         async with connect_async(free_endpoint()):
