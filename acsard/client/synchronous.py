@@ -31,7 +31,7 @@ from acsard.client.driving import UnheardError, drive, repeat_zeros
 from acsard.client.identity import ClientIdentity, identity
 from acsard.core.incoming.commands import require_size
 from acsard.core.incoming.imu import UNKNOWN_COVARIANCE
-from acsard.core.incoming.queries import BUSY, invalid_call
+from acsard.core.incoming.queries import BUSY_ENCODING, invalid_call
 from acsard.core.messages import schema
 from acsard.core.messages.encodings import (
     DecodeError,
@@ -357,9 +357,10 @@ class Client:
                 raise self._unanswered(name)
             if reply.ok is not None:
                 return encoded(reply.ok)
-            error_text = ""
+            error_text = encoding = ""
             if reply.err is not None:
                 error_text = reply.err.payload.to_bytes().decode(errors="replace")
+                encoding = str(reply.err.encoding)
             if error_text == TIMED_OUT:
                 raise NoAnswerError(
                     f"no answer on the Zenoh key {self.key(name)} within {REPLY_TIMEOUT_S:g} s: "
@@ -368,7 +369,7 @@ class Client:
                 )
             # Repeat a query, but not a service call: since the first attempt, another client may
             # have called a service with the opposite effect.
-            if error_text != BUSY or name in VERBS or time.monotonic() > end_s:
+            if encoding != BUSY_ENCODING or name in VERBS or time.monotonic() > end_s:
                 raise ReplyError(f"{name}: {error_text}")
             time.sleep(0.03)
 

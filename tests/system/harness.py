@@ -33,7 +33,7 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 import zenoh
 
-from acsard.core.incoming.queries import BUSY
+from acsard.core.incoming.queries import BUSY_ENCODING
 from acsard.core.messages.keys_and_roles import command_key
 
 T = TypeVar("T")
@@ -736,9 +736,8 @@ class Bus:
         """
         deadline = time.monotonic() + 5.0
         answers = self.ask(key, payload)
-        while [answer.payload for answer in answers] == [
-            BUSY.encode()
-        ] and time.monotonic() < deadline:
+        busy = [BUSY_ENCODING]
+        while [answer.encoding for answer in answers] == busy and time.monotonic() < deadline:
             time.sleep(0.02)
             answers = self.ask(key, payload)
         assert len(answers) == 1, f"{key}: {answers}"

@@ -66,6 +66,8 @@ MAX_WILDCARD_LENGTH = 512  # of a wildcard: no key is longer, and it would delay
 
 BUSY = "busy: too many queries at once; ask again"
 
+BUSY_ENCODING = "text/plain;busy"  # by which a client knows the error reply `BUSY`
+
 
 class Query(Struct, frozen=True):
     """A query as Zenoh delivered it."""
@@ -259,14 +261,14 @@ def _fits(pattern: str, chunk: str) -> bool:
     return chunk.endswith(last) and at <= len(chunk) - len(last)
 
 
-def refused(query: Query, why: str, wall_ns: WallNs) -> Reply | None:
+def refused(query: Query, why: str, wall_ns: WallNs, encoding: str = "text/plain") -> Reply | None:
     """Return the reply that refuses a query, or None if the client could not read any.
 
     A ROS client receives no error replies of Zenoh, so it gets a response that says that the call
     failed.
     """
     if query.via == "native":
-        return Reply(query.ticket, query.topic, why.encode(), "text/plain", ok=False)
+        return Reply(query.ticket, query.topic, why.encode(), encoding, ok=False)
     try:
         asked = unpack(query.attachment) if query.via == "rmw" else None
     except DecodeError:
@@ -275,8 +277,8 @@ def refused(query: Query, why: str, wall_ns: WallNs) -> Reply | None:
         payload, name = _encoded(ServiceReply(False, why), "cdr"), "ServiceReply"
     else:
         payload, name = failure(query.topic.removeprefix(PARAMETERS_PREFIX), why, query.payload), ""
-    encoding = encoding_name("cdr", name)
-    return Reply(query.ticket, query.topic, payload, encoding, attachment=_echo(asked, wall_ns))
+    cdr, attachment = encoding_name("cdr", name), _echo(asked, wall_ns)
+    return Reply(query.ticket, query.topic, payload, cdr, attachment=attachment)
 
 
 def invalid_call(verb: Verb, error: DecodeError) -> ServiceReply:

@@ -18,7 +18,7 @@ import zenoh
 
 from acsard.core.incoming.bus_interface import NO_INPUT, BusInput, Waker
 from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via, parts
-from acsard.core.incoming.queries import BUSY, Query, Reply, most_bytes, refused
+from acsard.core.incoming.queries import BUSY, BUSY_ENCODING, Query, Reply, most_bytes, refused
 from acsard.core.messages.keys_and_roles import (
     IMU,
     JSON_TREE,
@@ -319,7 +319,7 @@ class Inbox:
         )
         waiting = self._queue_of(topic, via)
         if len(waiting) >= QUERY_QUEUE:
-            busy = refused(item, BUSY, arrived.wall_ns)
+            busy = refused(item, BUSY, arrived.wall_ns, BUSY_ENCODING)
             if busy is not None:
                 self._replies.send(busy)
             self._replies.retire(ticket)

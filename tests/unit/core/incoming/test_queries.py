@@ -20,6 +20,7 @@ from acsard.core.config.settings import (
 )
 from acsard.core.incoming.queries import (
     BUSY,
+    BUSY_ENCODING,
     Queries,
     Query,
     Reply,
@@ -608,9 +609,9 @@ def test_a_rejected_ros_trigger_gets_a_reply_with_the_reason(via: str) -> None:
 
 
 def test_a_rejected_native_query_gets_an_error_with_the_reason() -> None:
-    reply = refused(query("odom"), BUSY, WALL_NS)
+    reply = refused(query("odom"), BUSY, WALL_NS, BUSY_ENCODING)
     assert reply is not None
-    assert (reply.ok, reply.payload) == (False, BUSY.encode())
+    assert (reply.ok, reply.payload, reply.encoding) == (False, BUSY.encode(), "text/plain;busy")
 
 
 def test_over_rmw_a_rejected_request_without_an_attachment_gets_no_reply() -> None:
