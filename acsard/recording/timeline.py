@@ -179,7 +179,8 @@ class WaitingSenders:
 
     def __init__(self, priorities: Mapping[str, int]) -> None:
         self._priorities = priorities  # of the sources
-        self._commander = ""  # "source (sender)" of the last event
+        self._commander = ""  # "source (sender)" of the last event; several if it joins changes
+        self._known = ""  # source of this commander, if a single one, which has sent since
         self._waiting: dict[tuple[str, str], _Waiting] = {}  # by source and sender
         self._reported_ns = -MIN_REASON_NS  # last entry
 
@@ -187,17 +188,19 @@ class WaitingSenders:
         """Yield an entry for each sender that has waited for `MIN_WAIT_NS` and has none."""
         for event in step.recorded.events:
             if event.name == "commander":
-                # If the log combined several changes of the sender, `by` contains several names.
-                self._commander = event.by
+                self._commander, self._known = event.by, ""
         mode, _, _, source, _ = step.recorded.status
         if mode != "driving":
             self._waiting.clear()
             return
         for command in step.inputs.commands:
+            if _named(command.source, command.sender) == self._commander:
+                self._known = command.source
+        for command in step.inputs.commands:
             yield from self._command(command, source, step.inputs.now)
 
     def _command(self, command: Command, source: str, now: Instant) -> Iterator[TimelineEntry]:
-        key, known = (command.source, command.sender), self._sender_is_known(source)
+        key, known = (command.source, command.sender), self._known == source
         shared = command.source == source
         speed = command.twist.linear or command.twist.angular
         why = self._why(command.source, source)
@@ -226,10 +229,6 @@ class WaitingSenders:
             }
             self._waiting = recent
         return len(self._waiting) < MAX_WAITING
-
-    def _sender_is_known(self, source: str) -> bool:
-        # A single sender in `_commander`, with this source.
-        return self._commander.startswith(f"{source} (") and ", " not in self._commander
 
     def _why(self, waiting: str, followed: str) -> str:
         # Such as "which came first". A source of the higher priority does not wait: its commands
