@@ -1,17 +1,20 @@
 """Install acsard as a systemd service: a copy of the program, units, udev rules and a first
-configuration. Or remove the service, or show its status.
+configuration. Upgrade it, go back to the version before, remove the service, or show its status.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 from collections.abc import Iterable
+from pathlib import Path
 
+from acsard.cli.common import between
 from acsard.host.errors import Exit, MendableError, NotPermittedError
 from acsard.machine import service_installation as service
-from acsard.machine import versions
+from acsard.machine import upgrade, versions
 from acsard.machine.service_installation import Step, missing_prerequisite
 from acsard.terminal.output import show, table
 
@@ -22,9 +25,27 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         ("install", main_install, "write the service's files, then enable and start the service"),
         ("uninstall", main_uninstall, "stop and disable the service, and remove its files"),
         ("status", main_status, "show which files are installed and whether the service runs"),
+        ("upgrade", main_upgrade, "run a new version; go back by itself if it does not work"),
+        ("rollback", main_rollback, "run the version again that was in use before"),
     ):
         action = actions.add_parser(name, help=text, description=text.capitalize() + ".")
-        if name != "status":
+        if name == "upgrade":
+            action.add_argument(
+                "new",
+                metavar="FILE.deb|DIRECTORY",
+                type=Path,
+                help="a package of acsard, the environment (venv, uv tool, pipx) with the new "
+                "version, or an installed version in /opt/acsard",
+            )
+        if name in ("upgrade", "rollback"):
+            action.add_argument(
+                "--wait",
+                type=between(0.0, 86400.0, "seconds"),
+                metavar="SECONDS",
+                default=upgrade.WAIT_S,
+                help="wait at most so long until the robot stands (default: %(default)g)",
+            )
+        if name in ("install", "uninstall"):
             action.add_argument(
                 "--dry-run",
                 action="store_true",
@@ -90,6 +111,45 @@ def main_uninstall(args: argparse.Namespace) -> int:
     return 0
 
 
+def main_upgrade(args: argparse.Namespace) -> int:
+    _require_root()
+    _require_service()
+    with versions.changing():
+        # The watch goes on if the connection of this terminal is lost.
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        upgrade.change(upgrade.prepare(args.new.absolute()), _say, args.wait)
+    return 0
+
+
+def main_rollback(args: argparse.Namespace) -> int:
+    _require_root()
+    _require_service()
+    with versions.changing():
+        before = versions.previous()
+        if before not in versions.installed():
+            raise MendableError(
+                "there is no version before the one in use; `acsard service upgrade` installs "
+                "another one"
+            )
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        upgrade.change(before, _say, args.wait)
+    return 0
+
+
+def _say(text: str) -> None:
+    try:
+        print(text, flush=True)
+    except OSError:
+        pass  # the terminal is gone, and the change goes on
+
+
+def _require_service() -> None:
+    if not versions.current():
+        raise MendableError(
+            "the service is not installed; `acsard service install` installs this version"
+        )
+
+
 def main_status(args: argparse.Namespace) -> int:
     """Print the state of files and units; return 0 if the daemon's unit is active, else 1."""
     used = versions.current()
@@ -110,6 +170,11 @@ def _ready(args: argparse.Namespace) -> None:
         raise NotPermittedError(
             "run this command with sudo, or add --dry-run to see what the command would do"
         )
+
+
+def _require_root() -> None:
+    if os.geteuid() != 0:
+        raise NotPermittedError("run this command with sudo")
 
 
 def _do(steps: Iterable[Step], dry_run: bool) -> None:

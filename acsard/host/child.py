@@ -18,6 +18,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 
 from acsard.core.values import NS_PER_S, Ns
 from acsard.host import clock
@@ -54,6 +55,10 @@ class Silence:
 
 def acsard(*words: str) -> list[str]:
     """Return the command that runs acsard with the arguments `words`."""
+    # In /opt/acsard only this program knows where the libraries are (`machine/versions.py`).
+    lib = Path(__file__).parents[2]
+    if lib.name == "lib" and (program := lib.parent / "bin" / "acsard").is_file():
+        return [sys.executable, "-I", str(program), *words]
     # With -P Python ignores the working directory, so it runs the installed package.
     return [sys.executable, "-P", "-m", "acsard", *words]
 

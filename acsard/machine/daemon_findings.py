@@ -482,6 +482,9 @@ def certificate(row: DiagnosticStatus | None, is_local: bool) -> Iterator[Findin
     yield Finding("certificates", LEVELS[min(row.level, 2)], text, mend)
 
 
+MAX_MISSED_FRACTION = 0.01  # of the control periods
+
+
 def late(running: Running) -> Iterator[Finding]:
     """Yield a warning about 1 % of missed periods since the start, or recent ones."""
     counters = running.state.counters
@@ -489,7 +492,7 @@ def late(running: Running) -> Iterator[Finding]:
     messages = [
         row.message for row in running.rows if row.name == "acsard: control loop" and row.level
     ]
-    if missed > 0.01 * max(1, lines):
+    if missed > MAX_MISSED_FRACTION * max(1, lines):
         messages = [f"the daemon missed {missed} control periods"]
     for text in messages:
         mend = (

@@ -173,8 +173,9 @@ class InstallCopy(Struct, frozen=True):
         return f"copy    acsard from {sys.prefix} to {versions.HOME}/{version()}"
 
     def do(self) -> None:
-        versions.remove_unfinished()
-        versions.use(versions.copy())
+        versions.make_home()
+        with versions.changing():
+            versions.use(versions.copy())
 
 
 class Link(Struct, frozen=True):

@@ -8,6 +8,7 @@ one step: after a kill or a power cut at any moment, `current` is a version that
 from __future__ import annotations
 
 import compileall
+import fcntl
 import os
 import re
 import shutil
@@ -16,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from filecmp import cmp
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
@@ -34,6 +35,8 @@ CURRENT, PREVIOUS = "current", "previous"
 PACKAGE = "dist"  # the Debian package's own copies, from which it makes the others by hard links
 STOP_PROGRAM = "acsard-stop"
 
+UNFINISHED = ".unfinished-"
+
 # The extras that users install. `test` and `dds` are for developers.
 EXTRAS = frozenset({"foxglove", "tools"})
 
@@ -50,12 +53,10 @@ def launcher(interpreter: str) -> str:
     """
     return f"""\
 #!{interpreter} -I
-import os
 import sys
+from pathlib import Path
 
-lib = os.path.join(os.path.dirname(os.path.dirname(os.path.realpath(__file__))), "lib")
-sys.path.insert(0, lib)
-os.environ["PYTHONPATH"] = lib  # for child processes
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "lib"))
 
 from acsard.cli import entry
 
@@ -104,6 +105,45 @@ def use(name: str, home: Path = HOME) -> None:
     _link(home / CURRENT, name)
 
 
+def go_back(name: str, older: str, home: Path = HOME) -> None:
+    """Undo `use`: `name` was in use before, and `older` or "" the previous one."""
+    _link(home / CURRENT, name)
+    if older:
+        _link(home / PREVIOUS, older)
+    else:
+        (home / PREVIOUS).unlink(missing_ok=True)
+
+
+def deploy_of(name: str, home: Path = HOME) -> Path:
+    """Return the `deploy/` of a version."""
+    return home / name / "lib" / "acsard" / "deploy"
+
+
+def remove_others(home: Path = HOME) -> None:
+    """Remove each version that is not in use, not the previous one and not of the package."""
+    packaged = {path.name for path in (home / PACKAGE).glob("*")}
+    for name in {*installed(home)} - {current(home), previous(home)} - packaged:
+        shutil.rmtree(home / name, ignore_errors=True)
+
+
+@contextmanager
+def changing(home: Path = HOME) -> Iterator[None]:
+    """Keep other changes out. Raises `MendableError` while another program changes a version."""
+    handle = os.open(home, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise MendableError(
+                f"another program changes the version in {home}; wait until it has ended"
+            ) from None
+        for place in home.glob(f"{UNFINISHED}*"):  # its program was killed
+            shutil.rmtree(place, ignore_errors=True)
+        yield
+    finally:
+        os.close(handle)
+
+
 def _link(link: Path, target: str) -> None:
     new = link.with_name(f".{link.name}")
     with suppress(FileNotFoundError):
@@ -116,6 +156,13 @@ def _link(link: Path, target: str) -> None:
 # A copy of the environment that runs this
 
 
+def make_home(home: Path = HOME) -> None:
+    """Make the directory of the versions, which every user may read."""
+    if not home.exists():
+        home.mkdir(parents=True)
+        home.chmod(0o755)
+
+
 def copy(home: Path = HOME) -> str:
     """Copy acsard and its libraries from the environment that runs this; return the copy's name.
 
@@ -123,9 +170,6 @@ def copy(home: Path = HOME) -> str:
     `MendableError`, and leaves nothing then.
     """
     python = service_python()
-    if not home.exists():
-        home.mkdir(parents=True)
-        home.chmod(0o755)
     place = Path(tempfile.mkdtemp(dir=home, prefix=UNFINISHED))
     try:
         _fill(place, python)
@@ -145,15 +189,6 @@ def copy(home: Path = HOME) -> str:
             "the command again. Nothing else was changed"
         ) from None
     finally:
-        shutil.rmtree(place, ignore_errors=True)
-
-
-UNFINISHED = ".unfinished-"
-
-
-def remove_unfinished(home: Path = HOME) -> None:
-    """Remove the copies whose program was killed."""
-    for place in home.glob(f"{UNFINISHED}*"):
         shutil.rmtree(place, ignore_errors=True)
 
 

@@ -79,10 +79,7 @@ def test_the_launcher_imports_from_its_own_version_also_after_a_switch(tmp_path:
         package = tmp_path / name / "lib" / "acsard"
         package.mkdir(parents=True)
         (package / "__init__.py").touch()
-        # It imports again, as a child process does.
-        text = "import subprocess, sys\ndef entry():\n"
-        text += "    subprocess.run([sys.executable, '-P', '-c', 'import acsard.name'])\n"
-        (package / "cli.py").write_text(text)
+        (package / "cli.py").write_text("def entry():\n    import acsard.name\n")
         (package / "name.py").write_text(f"print({name!r})\n")
         program = tmp_path / name / "bin" / "acsard"
         program.parent.mkdir()
