@@ -125,6 +125,7 @@ LOG = "tests/unit/cli/test_recording.py"
 TRANSCRIPT = Elsewhere(
     "tests/unit/cli/test_transcripts.py", "test_each_command_prints_what_its_transcript_says"
 )
+UPGRADE = "tests/systemd/test_upgrade.py"
 SERVICE, OPEN = "tests/systemd/test_service.py", "tests/systemd/test_web.py"
 WEB = "tests/system/test_web_strangers.py"
 SIMULATED = "tests/system/test_simulated.py"
@@ -457,6 +458,13 @@ COMMANDS: dict[str, How] = {
     "deploy/systemd/requirements.lock": DOWNLOADED,
     ".venv/bin/pip install --no-index --no-deps --no-build-isolation .": DOWNLOADED,
     "sudo systemctl restart acsard": OPENED,
+    "sudo acsard service upgrade .venv": Elsewhere(
+        UPGRADE, "test_an_environment_is_upgraded_to_by_its_directory"
+    ),
+    "sudo acsard service upgrade acsard_0.2.0-1~deb12_arm64.deb": Elsewhere(
+        UPGRADE, "test_a_package_is_upgraded_to_and_dpkg_alone_changes_nothing"
+    ),
+    "sudo acsard service rollback": Elsewhere(UPGRADE, "test_twenty_upgrades_and_rollbacks"),
     "sudo acsard doctor --config /etc/acsard/acsard.toml": Elsewhere(
         "tests/system/test_doctor.py",
         "test_the_text_output_has_a_line_for_each_finding_and_one_for_its_remedy",

@@ -21,6 +21,7 @@ from acsard.core.values import NS_PER_S, Ns
 from acsard.host import clock, real_time
 from acsard.host.kernel_counters import Kernel, Reading
 from acsard.host.processes import holders, is_running
+from acsard.machine import versions
 from acsard.machine.certificate_findings import certificates, router_certificates
 from acsard.machine.daemon_findings import (
     Running,
@@ -50,6 +51,14 @@ def port_grabbers() -> Iterator[Finding]:
             "ModemManager is running; this program sends data to each new serial port",
             mend,
         )
+
+
+def unused_version() -> Iterator[Finding]:
+    """Yield a finding about an installed version that the service does not run."""
+    if newer := versions.unused():
+        text = f"{newer} is installed, but not in use; the service runs {versions.current()}"
+        mend = f"`sudo acsard service upgrade {versions.HOME / newer}` changes to it"
+        yield Finding("version", "warning", text, mend)
 
 
 def clock_year() -> Iterator[Finding]:
@@ -248,6 +257,7 @@ def examine(
         yield Finding("configuration", "warning", warning, "see acsard.toml")
     yield from serial_port(config)
     yield from port_grabbers()
+    yield from unused_version()
     yield from clock_year()
     yield from scheduling(
         config.control.real_time, running.info.pid if isinstance(running, Running) else None

@@ -162,7 +162,7 @@ def _address(file: Path) -> Address:
 
 
 def _stands(address: Address, wait_s: Seconds) -> Look:
-    """Return the daemon's state when the robot has stood for a while. Raises `MendableError`."""
+    # Raises `MendableError`, also without an answer.
     end_s = time.monotonic() + wait_s
     since_s = None
     while True:

@@ -24,6 +24,7 @@ from acsard.core.values import REST, Role, Twist
 from acsard.host import clock
 from acsard.host.own_identity import sender_id
 from acsard.host.rate_limits import Bucket, Buckets
+from acsard.machine import versions
 from acsard.web import socket_messages
 from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.calls import Calls
@@ -313,6 +314,7 @@ class Viewer:
                 if not self.who.may(least)
             },
             self._camera,
+            versions.unused(),
         )
         self._out.enqueue(socket_messages.Hello(greeting))
 

@@ -5,7 +5,10 @@ A version is a copy of the installed one by hard links, with another number and 
 
 from __future__ import annotations
 
+import os
+import random
 import re
+import signal
 import subprocess
 import time
 from collections.abc import Iterator
@@ -18,6 +21,7 @@ from tests.system.harness import until
 from tests.systemd.container import (
     ACSARD,
     CONFIG,
+    HOME,
     PORT,
     UNIT,
     USUAL,
@@ -34,6 +38,8 @@ from tests.systemd.container import (
 pytestmark = pytest.mark.systemd
 
 NEW = "9.0.0"
+INSTALLED = "/srv/installed"
+"""A second name of the installed version, because an upgrade removes what is not needed."""
 SHORT_S = 6.0
 """Time of the watch in the tests of `.ci/run`."""
 
@@ -54,6 +60,20 @@ BAD = {
 }
 
 
+HELLO = """\
+import asyncio, sys
+sys.path.insert(0, "{lib}")
+import aiohttp
+
+async def main():
+    async with aiohttp.ClientSession() as session:
+        async with session.ws_connect("http://127.0.0.1:8080/ws") as socket:
+            print((await socket.receive(5.0)).data)
+
+asyncio.run(main())
+"""
+
+
 class Robot(NamedTuple):
     """A container with the service, a board and a client that always wants to drive."""
 
@@ -64,6 +84,7 @@ class Robot(NamedTuple):
     def runs(self) -> str:
         """Return the version from which the daemon's process has its libraries."""
         maps = Path(f"/proc/{self.container.main_pid()}/maps").read_text()
+        name: str
         (name,) = set(re.findall(rf"{VERSIONS}/([^/\n]+)/lib/", maps))
         return name
 
@@ -133,6 +154,7 @@ def installed(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
             container.write(CONFIG, USUAL)
             done = container.run(ACSARD, "service", "install")
             assert done.code == 0, done.err
+            container.types(f"cp -al {VERSIONS}/[0-9]* {INSTALLED}")
             yield container
     except UnavailableError as why:
         unavailable(why)
@@ -144,9 +166,8 @@ def robot(installed: Container) -> Iterator[Robot]:
     container = installed
     old = container.run(ACSARD, "--version").out.split()[1]
     container.run("systemctl", "stop", UNIT)
-    container.types(f"cd {VERSIONS} && ln -sfn {old} current && rm -f previous")
     container.types(
-        f"cd {VERSIONS} && find . -mindepth 1 -maxdepth 1 -type d ! -name {old} -exec rm -rf {{}} +"
+        f"rm -rf {VERSIONS}/* && cp -al {INSTALLED} {VERSIONS}/{old} && ln -s {old} {VERSIONS}/current"
     )
     container.forget()
     container.run("systemctl", "reset-failed", UNIT)
@@ -173,6 +194,13 @@ def test_an_upgrade_runs_the_new_version_and_a_rollback_the_old_one_with_the_sto
     assert (robot.readlink(), robot.readlink("previous")) == (robot.old, NEW)
     assert robot.runs() == robot.old
     assert (robot.latch(), robot.kept(), robot.moved(began)) == (number, kept, [])
+    # The doctor and the page tell the operator that the new version is still there.
+    found = robot.types("doctor", "--config", CONFIG).out
+    assert f"{NEW} is installed, but not in use; the service runs {robot.old}" in found
+    call = HELLO.format(lib=f"{VERSIONS}/{robot.old}/lib")
+    said = f'"unused":"{NEW}"'
+    words = ("python3", "-I", "-c", call)
+    until(lambda: said in robot.container.run(*words).out, 20.0, "the page says so too")
 
 
 @pytest.mark.parametrize("how", ["crashes at once", "has no link", "refuses the configuration"])
@@ -201,3 +229,238 @@ def test_a_driving_robot_is_not_upgraded(robot: Robot) -> None:
         assert done.code == 1
         assert "the robot drives" in done.err
         assert (robot.readlink(), robot.container.main_pid()) == (robot.old, pid)
+
+
+# The figures of an upgrade. They take an hour.
+
+TIMES = 20
+KILLS = 50
+nightly = pytest.mark.nightly
+
+
+class Change(NamedTuple):
+    code: int
+    out: str
+    back_s: float
+    """From the change of the version to the end of the command."""
+
+
+def commanded(robot: Robot, *words: str) -> Change:
+    """Run a subcommand of `acsard service` that changes the version."""
+    command = robot.container.inside("acsard", "service", *words)
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        assert process.stdout is not None
+        out, switched = "", time.monotonic()
+        for line in process.stdout:
+            out += line
+            if "watching it" in line:
+                switched = time.monotonic()
+        return Change(process.wait(), out, time.monotonic() - switched)
+
+
+@nightly
+@pytest.mark.timeout(3600)
+def test_twenty_upgrades_and_rollbacks(robot: Robot) -> None:
+    robot.makes(NEW)
+    with Driver(robot.container) as driver:
+        for n in range(TIMES):
+            if latched := n % 2 == 0:
+                robot.stops()
+                driver.sends(0.3)
+            number, kept, recordings = robot.latch(), robot.kept(), robot.recordings()
+            assert (number != "0") is latched
+            began = time.monotonic()
+            for words, name in (
+                (("upgrade", f"{VERSIONS}/{NEW}"), NEW),
+                (("rollback",), robot.old),
+            ):
+                done = commanded(robot, *words)
+                assert done.code == 0, done.out
+                assert (robot.readlink(), robot.runs(), robot.link()) == (name, name, True)
+                assert (robot.latch(), robot.kept()) == (number, kept)
+            assert recordings <= robot.recordings()
+            assert robot.moved(began) == []
+            print(f"{n + 1} of {TIMES}: upgraded and rolled back, latched: {latched}")
+            driver.sends(0.0)
+            robot.types("call", "clear")
+
+
+@nightly
+@pytest.mark.timeout(1200)
+def test_twenty_upgrades_of_a_driving_robot_are_refused(robot: Robot) -> None:
+    robot.makes(NEW)
+    with Driver(robot.container) as driver:
+        driver.drives(robot.board)
+        pid = robot.container.main_pid()
+        for n in range(TIMES):
+            wait = ("--wait", str(n % 4))
+            done = robot.types("service", "upgrade", f"{VERSIONS}/{NEW}", *wait)
+            assert (done.code, "the robot drives" in done.err) == (1, True), done.err
+            assert (robot.readlink(), robot.container.main_pid()) == (robot.old, pid)
+    print(f"{TIMES} of {TIMES} refused")
+
+
+@nightly
+@pytest.mark.timeout(3600)
+def test_twenty_bad_versions_are_left_again_within_45_s(robot: Robot) -> None:
+    took: dict[str, list[float]] = {}
+    with Driver(robot.container) as driver:
+        for n in range(TIMES):
+            how = list(BAD)[n % len(BAD)]
+            robot.makes(NEW, BAD[how])
+            if n // len(BAD) % 2 == 0:
+                robot.stops()
+                driver.sends(0.3)
+            number, kept, recordings = robot.latch(), robot.kept(), robot.recordings()
+            began = time.monotonic()
+            done = commanded(robot, "upgrade", f"{VERSIONS}/{NEW}")
+            assert done.code == 1, done.out
+            assert done.back_s < BACK_WITHIN_S
+            assert (robot.readlink(), robot.runs()) == (robot.old, robot.old), done.out
+            until(robot.link, 5.0, "the link is up again")
+            assert (robot.latch(), robot.kept()) == (number, kept)
+            assert recordings <= robot.recordings()
+            assert robot.moved(began) == []
+            took.setdefault(how, []).append(done.back_s)
+            print(f"{how}: back after {done.back_s:.1f} s: {done.out.splitlines()[-1]}")
+            driver.sends(0.0)
+            robot.types("call", "clear")
+    for how, seconds in took.items():
+        print(f"{how}: {len(seconds)} of {len(seconds)}, at most {max(seconds):.1f} s")
+
+
+def environment(robot: Robot, number: str) -> str:
+    """Make a venv with another version of acsard, and return its directory in the container."""
+    place = f"/srv/{number}"
+    robot.container.types(
+        f"rm -rf {place} && mkdir {place} && cp -r {HOME}/venv {place}/venv && "
+        f"mkdir {place}/src && cp -r {HOME}/src/acsard {HOME}/src/deploy {HOME}/src/acsard.toml "
+        f"{place}/src && sed -i 's/^__version__ = .*/__version__ = \"{number}\"/' "
+        f"{place}/src/acsard/__init__.py && sed -i 's|{HOME}/src|{place}/src|' "
+        f"{place}/venv/lib/*/site-packages/acsard.pth && "
+        f"ln -sf $(readlink {HOME}/venv/bin/python) {place}/venv/bin/python"
+    )
+    return f"{place}/venv"
+
+
+@nightly
+def test_an_environment_is_upgraded_to_by_its_directory(robot: Robot) -> None:
+    place = environment(robot, "9.1.0")
+    done = commanded(robot, "upgrade", place)
+    assert done.code == 0, done.out
+    assert (robot.readlink(), robot.runs()) == ("9.1.0", "9.1.0")
+    assert '"version":"9.1.0"' in robot.types("get", "info").out.replace(" ", "")
+    assert commanded(robot, "rollback").code == 0
+    assert robot.runs() == robot.old
+
+
+POSTINST = f"""\
+#!/bin/sh -e
+cd {VERSIONS}
+[ -e {{number}} ] || {{{{ cp -al dist/{{number}} .new && mv -T .new {{number}}; }}}}
+[ -e current ] || ln -s {{number}} current
+"""
+
+
+def package(robot: Robot, number: str) -> str:
+    """Make a Debian package with another version of acsard, and return its path."""
+    place, file = f"/srv/deb-{number}", f"/srv/acsard_{number}.deb"
+    robot.makes(number)
+    robot.container.types(
+        f"rm -rf {place} && mkdir -p {place}/DEBIAN {place}{VERSIONS}/dist && "
+        f"cp -r {VERSIONS}/{number} {place}{VERSIONS}/dist/ && rm -rf {VERSIONS}/{number}"
+    )
+    control = f"Package: acsard\nVersion: {number}-1\nArchitecture: all\n"
+    control += "Maintainer: acsard <acsard@localhost>\nDescription: acsard of a test\n"
+    robot.container.write(f"{place}/DEBIAN/control", control)
+    robot.container.write(f"{place}/DEBIAN/postinst", POSTINST.format(number=number), 0o755)
+    robot.container.types(f"dpkg-deb -Znone --build {place} {file} && rm -rf {place}")
+    return file
+
+
+@nightly
+def test_a_package_is_upgraded_to_and_dpkg_alone_changes_nothing(robot: Robot) -> None:
+    first, second = package(robot, "9.2.0"), package(robot, "9.3.0")
+    try:
+        done = commanded(robot, "upgrade", first)
+        assert done.code == 0, done.out
+        assert robot.runs() == "9.2.0"
+        pid = robot.container.main_pid()
+        robot.container.types(f"dpkg -i {second}")
+        assert (robot.readlink(), robot.container.main_pid()) == ("9.2.0", pid)
+        assert "9.3.0 is installed, but not in use" in robot.types("service", "status").out
+        # dpkg has deleted its own copy of the version in use, and not that of the service.
+        robot.container.run("systemctl", "restart", UNIT)
+        assert robot.runs() == "9.2.0"
+        done = commanded(robot, "upgrade", f"{VERSIONS}/9.3.0")
+        assert done.code == 0, done.out
+        assert (robot.runs(), robot.readlink("previous")) == ("9.3.0", "9.2.0")
+    finally:
+        robot.container.run("dpkg", "--purge", "acsard")
+
+
+@nightly
+@pytest.mark.timeout(3600)
+def test_an_upgrade_that_is_killed_at_any_moment_leaves_a_version_that_starts(
+    robot: Robot,
+) -> None:
+    """The moments are random, and half of the upgrades copy an environment."""
+    moments = random.Random(68)
+    robot.makes(NEW)
+    place = environment(robot, "9.1.0")
+    robot.stops()
+    number, kept, began = robot.latch(), robot.kept(), time.monotonic()
+    started: dict[str, int] = {}
+    with Driver(robot.container) as driver:
+        driver.sends(0.3)
+        for n in range(KILLS):
+            if copies := n % 2 == 0:
+                robot.container.run("rm", "-rf", f"{VERSIONS}/9.1.0")
+            new = place if copies else f"{VERSIONS}/{NEW}"
+            command = robot.container.inside("acsard", "service", "upgrade", new)
+            with subprocess.Popen(
+                command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            ) as process:  # fmt: skip
+                time.sleep(moments.uniform(0.0, 25.0 if copies else 8.0))
+                os.killpg(process.pid, signal.SIGKILL)
+            robot.container.run("systemctl", "restart", UNIT)
+            assert robot.container.show("ActiveState") == "active"
+            name = robot.readlink()
+            assert robot.runs() == name
+            until(robot.link, 10.0, "the link is up")
+            assert (robot.latch(), robot.kept()) == (number, kept)
+            started[name] = started.get(name, 0) + 1
+            if name != robot.old:
+                done = robot.changes(robot.old)
+                assert done.code == 0, done.err
+    assert robot.moved(began) == []
+    print(f"started after {KILLS} kills: {started}")
+
+
+@nightly
+def test_with_a_full_disk_the_old_version_runs_on_and_no_part_of_the_new_one_stays(
+    robot: Robot,
+) -> None:
+    container = robot.container
+    place, file = environment(robot, "9.1.0"), package(robot, "9.2.0")
+    container.run("systemctl", "stop", UNIT)
+    try:
+        container.types("mount -t tmpfs -o size=1g none /opt")
+        container.types(f"{ACSARD} service install")
+        used = int(container.types("du -sm /opt").out.split()[0])
+        container.types(f"mount -o remount,size={used + 40}m /opt")
+        until(robot.link, 10.0, "the link is up")
+        pid, before = container.main_pid(), container.types(f"ls -A {VERSIONS}").out
+        for new in (place, file):
+            done = commanded(robot, "upgrade", new)
+            assert (done.code, "No space left on device" in done.out) == (1, True), done.out
+            assert container.main_pid() == pid
+            assert robot.link()
+            robot.container.run("dpkg", "--purge", "acsard")
+            assert container.types(f"ls -A {VERSIONS}").out == before
+    finally:
+        container.run("systemctl", "stop", UNIT)
+        container.run("umount", "/opt")

@@ -287,7 +287,7 @@ function greeted({ detail }) {
   $("tab-set").hidden = !settable();
   if (view === "set" && !settable()) open("drive");
   $("simulated").hidden = !hello.simulated;
-  $("role").textContent = hello.role;
+  $("role").textContent = hello.role + (hello.unused && ` · version ${hello.unused} is installed, not in use`);
   drive.sender = hello.sender;
   camera.show(hello.camera);
   drive.limits = hello.limits;

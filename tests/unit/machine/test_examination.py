@@ -10,7 +10,8 @@ import pytest
 
 from acsard.host import real_time
 from acsard.host.kernel_counters import Kernel
-from acsard.machine.examination import scheduling, slowness
+from acsard.machine import versions
+from acsard.machine.examination import scheduling, slowness, unused_version
 from tests.unit.host.kernel_files import HWMON, POLICY, QUIET, write
 
 WANTED = True
@@ -62,3 +63,13 @@ def test_each_present_cause_of_lateness_is_a_warning_with_a_remedy(tmp_path: Pat
     assert "power supply" in findings[0].mend
     assert "powersave keeps the processor at 600 of 1500 MHz" in findings[1].text
     assert "schedutil" in findings[1].mend
+
+
+def test_a_newer_version_that_is_not_in_use_is_a_warning_with_the_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert list(unused_version()) == []
+    monkeypatch.setattr(versions, "unused", lambda: "0.3.0")
+    (finding,) = unused_version()
+    assert finding.level == "warning"
+    assert "`sudo acsard service upgrade /opt/acsard/0.3.0`" in finding.mend

@@ -23,7 +23,7 @@ from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
 
 GREETING = socket_messages.Greeting(
     "acsar", "1", "operator", "phone/1f", socket_messages.Limits(1.0, 4.0), True, 10.0,
-    {"set": "for maintainers; your role is operator"}, False,
+    {"set": "for maintainers; your role is operator"}, False, "",
 )  # fmt: skip
 
 SAID: tuple[Struct, ...] = (
