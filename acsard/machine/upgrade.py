@@ -70,8 +70,10 @@ def _from_package(file: Path) -> str:
     if name != "acsard":
         raise MendableError(f"{file} is the package {name}; name a package of acsard")
     # apt checks before it unpacks that this system has the Python that the package needs.
-    installing = ("env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "install", "--yes")
-    _ran((*installing, "--allow-downgrades", str(file.absolute())), COPY_TIMEOUT_S)
+    installing = ("env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "install", "--yes", "--quiet")
+    # Without a terminal of its own, dpkg writes its errors to stderr.
+    options = ("--allow-downgrades", "--option=Dpkg::Use-Pty=0")
+    _ran((*installing, *options, str(file.absolute())), COPY_TIMEOUT_S)
     listed = _ran(("dpkg-query", "--listfiles", name), 60.0)
     found = re.search(rf"(?m)^{versions.HOME / versions.PACKAGE}/([^/\n]+)$", listed)
     if found is None or found[1] not in versions.installed():

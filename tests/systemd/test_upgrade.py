@@ -167,7 +167,7 @@ def robot(installed: Container) -> Iterator[Robot]:
     old = container.run(ACSARD, "--version").out.split()[1]
     container.run("systemctl", "stop", UNIT)
     container.types(
-        f"rm -rf {VERSIONS}/* && cp -al {INSTALLED} {VERSIONS}/{old} && ln -s {old} {VERSIONS}/current"
+        f"cd {VERSIONS} && rm -rf ./* && cp -al {INSTALLED} {old} && ln -s {old} current"
     )
     container.forget()
     container.run("systemctl", "reset-failed", UNIT)
