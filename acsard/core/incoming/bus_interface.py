@@ -11,7 +11,7 @@ from msgspec import Struct
 
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query, Reply
-from acsard.core.messages.encodings import DecodeError, Decoder
+from acsard.core.messages.encodings import DecodeError, StrictDecoder
 from acsard.core.messages.schema import GatewayState, Message
 from acsard.core.values import Event, Ns, RoutersStatus
 
@@ -77,7 +77,7 @@ class Bus(Protocol):
 
 GATEWAY_KEY = "gateway"
 
-_decoder = Decoder(GatewayState)
+_decoder = StrictDecoder(GatewayState)
 
 
 class GatewayFollower:

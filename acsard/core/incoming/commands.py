@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import JointsConfig
 from acsard.core.messages import signature
-from acsard.core.messages.encodings import DecodeError, Decoder, decode_cdr, detect
+from acsard.core.messages.encodings import DecodeError, StrictDecoder, decode_cdr, detect
 from acsard.core.messages.keys_and_roles import COMMANDS, SERVICES
 from acsard.core.messages.schema import (
     MESSAGES,
@@ -96,7 +96,7 @@ class Arrival(Struct, frozen=True):
     received_ns: WallNs | None = None
 
 
-class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
+class _TwistPayload(Struct, frozen=True):
     # A Twist (`linear`, `angular`), or a TwistStamped (`header`, `twist`).
     linear: Vector3 | UnsetType = UNSET
     angular: Vector3 | UnsetType = UNSET
@@ -110,10 +110,10 @@ TWIST_CDR_BYTES, STAMPED_CDR_BYTES = 52, 68
 TWISTS = ("geometry_msgs/msg/Twist", "acsard.Twist.v1")
 STAMPED_TWISTS = ("geometry_msgs/msg/TwistStamped", "acsard.TwistStamped.v1")
 
-_twists = Decoder(_TwistPayload)
-_wheels = Decoder(JointState)
+_twists = StrictDecoder(_TwistPayload)
+_wheels = StrictDecoder(JointState)
 _payloads = {
-    verb: Decoder[Message](MESSAGES[service.payload])
+    verb: StrictDecoder[Message](MESSAGES[service.payload])
     for verb, service in SERVICES.items()
     if service.payload
 }

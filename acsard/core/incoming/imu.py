@@ -14,7 +14,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, claimed_identity
-from acsard.core.messages.encodings import DecodeError, Decoder, decode_cdr, detect
+from acsard.core.messages.encodings import DecodeError, StrictDecoder, decode_cdr, detect
 from acsard.core.messages.schema import Covariance3, Header, Imu, Quaternion, Vector3
 from acsard.core.messages.signature import public_name
 from acsard.core.values import NS_PER_S, Event, GyroSample, Ns
@@ -30,7 +30,7 @@ MAX_NAME_LENGTH = 64  # characters of a sender's name in a text
 UNKNOWN_COVARIANCE = [0.0] * 9  # zeros mean "unknown" in sensor_msgs/Imu
 
 
-class _Reading(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class _Reading(Struct, frozen=True, kw_only=True):
     header: Header = Header()
     orientation: Quaternion = Quaternion()
     orientation_covariance: Covariance3 = []
@@ -40,7 +40,7 @@ class _Reading(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     linear_acceleration_covariance: Covariance3 = []
 
 
-_readings = Decoder(_Reading)
+_readings = StrictDecoder(_Reading)
 
 
 class GyroFollower:

@@ -7,7 +7,7 @@ import math
 from msgspec import Struct
 
 from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, caller_name
-from acsard.core.messages.encodings import DecodeError, Decoder, decode_cdr, detect
+from acsard.core.messages.encodings import DecodeError, StrictDecoder, decode_cdr, detect
 from acsard.core.messages.keys_and_roles import SPEED_LIMIT
 from acsard.core.messages.schema import Header, SpeedLimit
 from acsard.core.values import SpeedCap
@@ -15,13 +15,13 @@ from acsard.core.values import SpeedCap
 NO_LIMIT_VALUE = 0.0  # of nav2_msgs/SpeedLimit, in m/s and in %
 
 
-class _Payload(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class _Payload(Struct, frozen=True, kw_only=True):
     header: Header = Header()
     percentage: bool = False
     speed_limit: float
 
 
-_decoder = Decoder(_Payload)
+_decoder = StrictDecoder(_Payload)
 
 
 def decode_limit(arrival: Arrival, configured: float) -> SpeedCap:

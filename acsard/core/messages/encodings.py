@@ -13,12 +13,14 @@ import msgspec
 
 from acsard.core.codes import RefusalCode
 from acsard.core.messages.cdr import Cdr, CdrError
+from acsard.core.messages.strict_types import strict
 from acsard.core.values import AcsardError
 
 Format = Literal["msgpack", "json", "cdr"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 
 T = TypeVar("T")
+M = TypeVar("M", bound=msgspec.Struct)
 
 _FORM_OF: dict[str, Format] = {f"application/{form}": form for form in FORMATS}
 _FORM_OF["text/json"] = "json"
@@ -77,7 +79,10 @@ def detect(encoding: str, payload: bytes) -> Format:
 
 
 class Decoder(Generic[T]):
-    """Decodes payloads of one message type in msgpack, JSON and, for ROS types, CDR."""
+    """Decodes payloads of one message type in msgpack, JSON and, for ROS types, CDR.
+
+    Fields that the type does not have are ignored: it is for what a client receives.
+    """
 
     def __init__(self, cls: type[T]) -> None:
         self._cls = cls
@@ -99,6 +104,15 @@ class Decoder(Generic[T]):
         except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:
             words = _where(str(error), payload) if form == "json" else str(error)
             raise DecodeError("malformed", words) from None
+
+
+class StrictDecoder(Decoder[M]):
+    """Decodes what the daemon receives: a payload with an unknown field is an error."""
+
+    def __init__(self, cls: type[M]) -> None:
+        super().__init__(cls)
+        kind = strict(cls)
+        self._pack, self._text = msgspec.msgpack.Decoder(kind), msgspec.json.Decoder(kind)
 
 
 def _where(words: str, payload: bytes) -> str:

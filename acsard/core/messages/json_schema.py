@@ -18,8 +18,10 @@ from acsard.core.messages.schema import (
     Imu,
     JointState,
     SpeedLimit,
+    Message,
     TwistStamped,
 )
+from acsard.core.messages.strict_types import strict
 
 INCOMING_ONLY = {
     "Twist",
@@ -51,9 +53,9 @@ def going_out(cls: type, name: str) -> Schema:
     return schema
 
 
-def coming_in(cls: type, name: str) -> Schema:
+def coming_in(cls: type[Message], name: str) -> Schema:
     """Return the schema of messages that the daemon accepts from clients."""
-    schema = _described(cls, name)
+    schema = _described(strict(cls), name)
     return schema | {"required": REQUIRED_FIELDS[cls]} if cls in REQUIRED_FIELDS else schema
 
 

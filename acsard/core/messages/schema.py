@@ -1,8 +1,9 @@
 """The types of the messages on the bus, with the unit of each field.
 
 If ROS 2 has a corresponding type, the struct has the same name and fields. A field means the same
-in msgpack, JSON and CDR. Decoding refuses unknown fields, so a command with a misspelled axis is
-an error. If the misspelled field were ignored, the speed on that axis would silently be zero.
+in msgpack, JSON and CDR. A client ignores fields that it does not know, and a field that a later
+version adds has a default, so that clients and daemons of different versions understand each other.
+The daemon refuses unknown fields (`strict_types.py`).
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def one_of(values: Iterable[object]) -> Meta:
     return Meta(extra_json_schema={"enum": list(values)})
 
 
-class Message(Struct, frozen=True, forbid_unknown_fields=True):
+class Message(Struct, frozen=True):
     """Base class of all messages on the bus and of their parts."""
 
 

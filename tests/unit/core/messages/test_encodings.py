@@ -6,35 +6,105 @@ Bad input raises `DecodeError` and no other error.
 from __future__ import annotations
 
 import struct
+from typing import Any
 
 import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import (
     FORMATS,
     DecodeError,
     Decoder,
     Format,
+    StrictDecoder,
     detect,
     encode,
     encoding_name,
 )
-from acsard.core.messages.schema import Info, RobotState, Time, Twist, Vector3
+from acsard.core.messages.report import Report
+from acsard.core.messages.schema import (
+    Change,
+    Header,
+    Info,
+    JointState,
+    Message,
+    Release,
+    ReplyData,
+    RobotState,
+    ServiceReply,
+    SetPose,
+    Settings,
+    TFMessage,
+    Time,
+    Twist,
+    TwistStamped,
+    Vector3,
+)
 from tests.each import each
+from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
 
 TWIST = Twist(Vector3(0.5), Vector3(z=0.2))
 AS_CDR = b"\x00\x01\x00\x00" + struct.pack("<6d", 0.5, 0, 0, 0, 0, 0.2)
 AS_JSON = b'{"linear":{"x":0.5,"y":0.0,"z":0.0},"angular":{"x":0.0,"y":0.0,"z":0.2}}'
 
 twists = Decoder(Twist)
+received_twists = StrictDecoder(Twist)
 
 
 def refusal(encoding: str, payload: bytes) -> str:
     with pytest.raises(DecodeError) as caught:
-        twists.decode(encoding, payload)
+        received_twists.decode(encoding, payload)
     return caught.value.reason
+
+
+def grown(value: Any) -> Any:
+    """Return the message with one more field in each of its parts."""
+    match value:
+        case msgspec.Struct():
+            fields = {name: grown(getattr(value, name)) for name in value.__struct_fields__}
+            return fields | {"later": {"deep": [1]}}
+        case list() | tuple():
+            return [grown(item) for item in value]
+        case dict():
+            return {key: grown(item) for key, item in value.items()}
+    return value
+
+
+REPORT = Report(Config(), START)
+list(REPORT.due(OUTPUTS, {"state"}, lambda: SNAPSHOT))
+MESSAGES = [
+    *(REPORT.current(key, lambda: SNAPSHOT) for key in ("odom", "tf", "state", "diagnostics")),
+    ServiceReply(True, "done", ReplyData(7, {"rates.odom": Change(1.0, 2.0)})),
+    TwistStamped(Header(Time(1, 2), "odom"), TWIST),
+    JointState(name=["a"], velocity=[1.0]),
+    Release(7),
+    SetPose(1.0, 2.0, 3.0),
+    Settings({"rates.odom": 5.0}),
+]
+
+
+@each("message", MESSAGES)
+@each("form", ["json", "msgpack"])
+def test_a_client_ignores_unknown_fields_and_the_daemon_refuses_them(
+    message: Message, form: Format
+) -> None:
+    plain, more, kind = encode(message, form), encode(grown(message), form), type(message)
+    assert Decoder(kind).decode("", more) == message
+    received = StrictDecoder(kind).decode("", plain)
+    assert isinstance(received, kind)
+    assert msgspec.to_builtins(received) == msgspec.to_builtins(message)
+    with pytest.raises(DecodeError, match="unknown field `later`"):
+        StrictDecoder(kind).decode("", more)
+
+
+@each("payload", [b'{"header":{"stamp":{"Sec":1}},"twist":{}}', b'{"transforms":[{"x":1}]}'])
+def test_the_daemon_refuses_an_unknown_field_in_a_part_of_a_message(payload: bytes) -> None:
+    kind = TwistStamped if b"twist" in payload else TFMessage
+    with pytest.raises(DecodeError, match="unknown field"):
+        StrictDecoder(kind).decode("", payload)
 
 
 def test_an_encoding_names_the_format_the_type_and_its_version() -> None:

@@ -55,9 +55,8 @@ def test_a_message_has_the_fields_of_its_ros_message_in_the_same_order(
 
 
 @each("cls", STRUCTS)
-def test_every_message_is_frozen_and_refuses_unknown_fields(cls: type[Message]) -> None:
+def test_every_message_is_frozen(cls: type[Message]) -> None:
     assert cls.__struct_config__.frozen
-    assert cls.__struct_config__.forbid_unknown_fields
 
 
 def test_every_message_of_the_bus_is_registered_under_its_name() -> None:
@@ -98,7 +97,7 @@ def test_two_joint_states_do_not_share_their_lists() -> None:
     assert JointState().name == []
 
 
-@each("text", [b'{"x": 1, "w": 0}', b'{"x": "1"}', b'{"x": null}', b'{"x": true}'])
+@each("text", [b'{"x": "1"}', b'{"x": null}', b'{"x": true}'])
 def test_a_vector_with_invalid_fields_is_refused(text: bytes) -> None:
     with pytest.raises(msgspec.ValidationError):
         msgspec.json.decode(text, type=Vector3)
