@@ -51,7 +51,7 @@ FaultCode = Literal[
 ]  # fmt: skip
 
 StateCode = Literal[
-    StopCode, FaultCode, LinkCode, WaitCode, "switched_off", "shutting_down",
+    StopCode, FaultCode, LinkCode, WaitCode, "switched_off", "other_version", "shutting_down",
     "emergency_stop_missing", "bumpers_missing", "commanded", "limits_zero", "no_command",
     "bumper_away", "bumper_blocks",
 ]  # fmt: skip
@@ -111,6 +111,8 @@ shutting_down
     the daemon is shutting down
 switched_off
     switched off by {by}
+other_version
+    {cause} ({named})
 stopped
     stopped by {by}
 stopped_at_start
@@ -326,6 +328,11 @@ def sentence(code: Code, **values: object) -> Reason:
     entry = CODES[code]
     text = f"{entry.text} {entry.advice}" if entry.advice else entry.text
     return Reason(code, text.format(**values))
+
+
+def received_text(code: str, text: str) -> str:
+    """Return the text of a received reason, with its code if only a later version knows it."""
+    return f"{text} ({code})" if code and code not in CODES else text
 
 
 def joined(why: Reason) -> Reason:

@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.core.codes import Reason, reason
+from acsard.core.codes import CODES, Reason, reason
 from acsard.core.motion.lifecycle import (
     NAMELESS,
     latch_of,
@@ -38,9 +38,6 @@ MAX_ANSWER_DELAY_NS = NS_PER_S // 5
 DAEMON_NAME = "acsard"  # sender of a stop that the daemon itself sets
 
 
-NO_EARLIER = ("earlier", ())  # field of a latch with one cause, which the file leaves out
-
-
 class LatchFileError(AcsardError):
     """The content of a latch file is damaged, of another version or of another robot."""
 
@@ -58,14 +55,16 @@ def encode(robot: str, latches: Latches) -> bytes:
         for latch in (latches.stop, latches.fault, latches.inactive)
     )
     content = _Content(FORMAT, robot, Latches(stop, fault, inactive))
-    return msgspec.json.format(msgspec.json.encode(_plain(content)), indent=2) + b"\n"
+    return msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n"
 
 
 def decode(robot: str, data: bytes) -> Latches:
     """Return the latches of a robot's file, all `kept` from before this run.
 
-    Raises `LatchFileError` for other versions or robots and for damage: a power cut may leave a
-    part, and one wrong letter in a field's name must not make a stop disappear.
+    A later version may have written it: fields that it added are ignored, and a cause that it added
+    still holds the robot. Raises `LatchFileError` for other robots, for a format or a kind of latch
+    that this version does not know, and for damage: a power cut may leave a part, and one wrong
+    letter in a field's name must not make a stop disappear.
     """
     if not data.strip(b"\0 \r\n"):
         raise LatchFileError("it is empty")
@@ -77,7 +76,7 @@ def decode(robot: str, data: bytes) -> Latches:
                 f"another version of acsard wrote the file (format {number}, but this daemon reads "
                 f"format {FORMAT})"
             )
-        content = msgspec.convert(raw, _Content)
+        content = msgspec.convert(_with_known_codes(raw), _Content)
     except MSGSPEC_ERRORS as error:
         raise LatchFileError(f"it is damaged ({error})") from None
     if content.robot != robot:
@@ -95,8 +94,10 @@ def decode(robot: str, data: bytes) -> Latches:
             # above 64 bits.
             if not (0 <= cause.number <= MAX_NUMBER and abs(cause.at_ns) < 1 << 63):
                 raise LatchFileError("it is damaged (a number or a time is out of range)")
-    if _plain(content) != raw:
-        raise LatchFileError("it is damaged (a field name is missing or unknown)")
+    _require_names(content, raw)
+    for name in raw["latches"].keys() - set(Latches.__struct_fields__):
+        if raw["latches"][name]:
+            raise LatchFileError(f"another version of acsard has latched {_safe(name)!r:.60}")
     return latches.after_restart()
 
 
@@ -218,16 +219,41 @@ class Handover:
         return None if self._keeper is None else self._keeper.trouble
 
 
-def _plain(content: Any) -> Any:
-    # `earlier` is left out if it is empty.
-    match msgspec.to_builtins(content):
-        case dict() as fields:
-            pairs = fields.items()
-            return {name: _plain(value) for name, value in pairs if (name, value) != NO_EARLIER}
-        case tuple() as items:
-            return [_plain(item) for item in items]
-        case value:
-            return value
+def _with_known_codes(raw: Any) -> Any:
+    # The decoded JSON of a file, in which `Latch` can represent the code of each cause.
+    match raw:
+        case {"latches": dict() as latches}:
+            known = {name: _with_known_code(latch) for name, latch in latches.items()}
+            return raw | {"latches": known}
+    return raw
+
+
+def _with_known_code(raw: Any) -> Any:
+    match raw:
+        case {"earlier": list() as earlier}:
+            raw = raw | {"earlier": [_known_cause(cause) for cause in earlier]}
+    return _known_cause(raw)
+
+
+def _known_cause(raw: Any) -> Any:
+    match raw:
+        case {"code": str(code), "why": str(why)} if code not in CODES:
+            cause = reason("other_version", part=_safe(code), cause=why, named=code)
+            return raw | {"code": cause.code, "why": cause.text, "part": cause.part}
+    return raw
+
+
+def _require_names(part: object, raw: Any) -> None:
+    # A field with a default may be missing in messages, but not in the file.
+    match part:
+        case Struct():
+            for name in part.__struct_fields__:
+                if name not in raw:
+                    raise LatchFileError(f"it is damaged (the field {name} is missing)")
+                _require_names(getattr(part, name), raw[name])
+        case tuple():
+            for item, raw_item in zip(part, raw, strict=True):
+                _require_names(item, raw_item)
 
 
 def _with_safe_text(latch: Latch) -> Latch:

@@ -165,6 +165,41 @@ def test_a_file_without_one_of_its_names_is_refused() -> None:
             decode("acsar", msgspec.json.encode(less))
 
 
+def test_fields_that_a_later_version_added_are_ignored() -> None:
+    causes = Latches(replace(STOP, earlier=(replace(STOP, by="anna"),)), FAULT, INACTIVE)
+    raw = msgspec.json.decode(encode("acsar", causes))
+    for latch in (*raw["latches"].values(), raw["latches"]["stop"]["earlier"][0]):
+        latch["later"] = {"deep": [1]}
+    raw["latches"]["later"] = None
+    raw["later"] = 1
+    assert decode("acsar", msgspec.json.encode(raw)) == causes.after_restart()
+
+
+@each("name", ["stop", "fault", "inactive"])
+def test_a_cause_that_a_later_version_added_still_holds_the_robot(name: str) -> None:
+    raw = msgspec.json.decode(encode("acsar", ALL))
+    latch = raw["latches"][name]
+    latch["earlier"] = [latch | {"code": "stopped_by_rain", "why": "stopped by rain"}]
+    latch |= {"code": "stopped_by_music", "why": "stopped by music"}
+    latches = decode("acsar", msgspec.json.encode(raw))
+    life = Lifecycle(latches)
+    before = {"stop": STOP, "fault": FAULT, "inactive": INACTIVE}[name]
+    held = getattr(latches, name)
+    assert held.number == before.number
+    assert (held.code, held.why) == ("other_version", "stopped by music (stopped_by_music)")
+    assert [cause.why for cause in held.earlier] == ["stopped by rain (stopped_by_rain)"]
+    assert len({cause.cause for cause in held.causes}) == 2
+    assert life.mode in ("fault", "stopped", "inactive")
+    assert decode("acsar", encode("acsar", latches)) == latches
+
+
+def test_a_kind_of_latch_that_a_later_version_added_makes_the_file_unreadable() -> None:
+    raw = msgspec.json.decode(encode("acsar", Latches()))
+    raw["latches"]["parked"] = {"number": 7}
+    with pytest.raises(LatchFileError, match="another version of acsard has latched 'parked'"):
+        decode("acsar", msgspec.json.encode(raw))
+
+
 @each(
     "data",
     [
@@ -175,6 +210,7 @@ def test_a_file_without_one_of_its_names_is_refused() -> None:
         b'{"format": "2"}',
         encode("acsar", ALL).replace(b'"format": 2', b'"format": 3'),
         encode("other", ALL),
+        encode("acsar", ALL).replace(b"earlier", b"earliex"),
     ],
 )
 def test_a_file_without_latches_of_this_robot_is_refused(data: bytes) -> None:
@@ -318,7 +354,7 @@ def test_every_cause_of_a_stop_is_in_the_file_with_at_most_500_characters() -> N
     assert (first.code, first.kept) == ("bumper", True)
     assert (second.by, second.kept) == ("a" * 500, True)
     damaged = encode("r", life.latches).replace(b'"earlier"', b'"earliex"')
-    with pytest.raises(LatchFileError, match="a field name is missing or unknown"):
+    with pytest.raises(LatchFileError, match="the field earlier is missing"):
         decode("r", damaged)
 
 
