@@ -158,7 +158,7 @@ class CommandSigner:
 def objection(state: RobotState, source: str, sender: str) -> str:
     """Return why the robot does not follow a sender (by public name); "" if it does."""
     if state.mode in NEVER_DRIVING_MODES:
-        return state.reason
+        return state.why
     ours = _entry(state, source)
     if ours is None:
         names = ", ".join(entry.name for entry in state.sources)
@@ -167,17 +167,17 @@ def objection(state: RobotState, source: str, sender: str) -> str:
             f"{source} to commands.sources in the robot's acsard.toml and restart the daemon"
         )
     if state.mode == "waiting":
-        return state.reason
+        return state.why
     if ours.wait == "command":
         return (
             f"the daemon receives no command of source {source}; `acsard top` shows whether the "
             "daemon refuses commands"
         )
     if state.source != source:
-        return ours.waits_for or state.reason
+        return ours.waits_for or state.why
     # The robot is `ready`: the zeros of this client arrive, but do not let it drive yet.
     if state.mode != "driving":
-        return state.reason
+        return state.why
     if state.sender in ("", sender):
         return ""
     return (

@@ -183,7 +183,7 @@ def link(running: Running) -> Iterator[Finding]:
             )
         if config.mcu.simulated or state.code in HOST_CODES:
             mend = BUSY_ADVICE
-        text = f"{state.link}: {state.reason}" if state.mode == "waiting" else state.link
+        text = f"{state.link}: {state.why}" if state.mode == "waiting" else state.link
         yield Finding("link", "failure", text, mend)
         return
     passed = {
@@ -436,7 +436,7 @@ def daemon(running: Running) -> Iterator[Finding]:
             "lists the recordings), then release the fault with `acsard call clear`"
         )
     mend = mend if level == "failure" else ""
-    yield Finding("daemon", level, f"{state.mode}: {state.reason}", mend)
+    yield Finding("daemon", level, f"{state.mode}: {state.why}", mend)
     yield Finding("role", "ok", running.role)
     yield from link(running)
     yield from clocks(running)

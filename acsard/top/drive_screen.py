@@ -50,7 +50,7 @@ def lines(teleop: Teleop, width: int, height: int | None = None) -> list[Text]:
     if teleop.state is not None:
         state = teleop.state
         mode = f" {printable(state.mode).upper()} "
-        mode_lines = _wrapped(f"{mode} {printable(state.reason)}", width, "bold")
+        mode_lines = _wrapped(f"{mode} {printable(state.why)}", width, "bold")
         for first in mode_lines[:1]:
             first.stylize(MODE_STYLES.get(state.mode, "reverse"), 0, len(mode))
         rows += mode_lines
@@ -75,7 +75,7 @@ def report_lines(teleop: Teleop, width: int) -> list[str]:
         return _wrap_parts([silence(teleop), *parts], width)
     if teleop.objection:
         parts.insert(0, refused(teleop))
-    why = f"{printable(teleop.state.mode)}: {printable(teleop.state.reason)}"
+    why = f"{printable(teleop.state.mode)}: {printable(teleop.state.why)}"
     return _wrap_parts([why, *parts], width, measured(teleop.state))
 
 
@@ -86,7 +86,7 @@ def last_report_lines(teleop: Teleop, width: int) -> list[str]:
     what = "still moves" if moves(teleop.state) else "stands still"
     if teleop.state.linear is None:
         what = "reports no speed"
-    why = f"{printable(teleop.state.mode)}: {printable(teleop.state.reason)}"
+    why = f"{printable(teleop.state.mode)}: {printable(teleop.state.why)}"
     return _wrap_parts([f"drive ended: the robot {what}", why], width, measured(teleop.state))
 
 

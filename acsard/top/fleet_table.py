@@ -106,7 +106,7 @@ def _version(state: RobotState, newest: tuple[int, ...]) -> str:
 def _why(state: RobotState) -> str:
     same = SAME_AS_REASON.get(state.code)
     problems = [warning for warning in warnings(state) if warning.what != same]
-    parts = [printable(state.reason)]
+    parts = [printable(state.why)]
     if problems:
         parts.insert(1 if state.mode in URGENT else 0, brief(problems))
     details = [(warning.what.replace("_", " "), warning.text) for warning in problems]

@@ -77,7 +77,7 @@ def _mode(data: ScreenData, width: int) -> list[Text]:
     if state is None:
         return [Text("waiting for the first state message of the daemon", "yellow")]
     badge = Text(f" {clean(state.mode).upper()[:12]} ", MODE_STYLES.get(state.mode, "reverse"))
-    words = clean(state.reason)
+    words = clean(state.why)
     first, second = _split(words, width - badge.cell_len - 2)
     if width < narrow_screen.MIN_WIDE_COLUMNS:
         return [badge, *narrow_screen.folded(words, width, 2)]

@@ -269,7 +269,7 @@ class ReportThrottle:
     def should_print(self, teleop: Teleop, now: float) -> bool:
         """Return whether to print a report now, and count it as printed."""
         state = teleop.state
-        words = ("", "") if state is None else (state.mode, state.reason)
+        words = ("", "") if state is None else (state.mode, state.why)
         what = (*words, teleop.objection, teleop.linear, teleop.angular, teleop.silent)
         moving = state is not None and moves(state)
         wait = MOVING_REPORT_S if moving else RESTING_REPORT_S

@@ -176,7 +176,7 @@ class LegDriver:
         why = self._objection(state)
         if state.mode in (*NEVER_DRIVING_MODES, "waiting"):
             late = state.code in HOST_CODES
-            self._halt(f"the robot is {state.mode}: {state.reason}", disturbed=late)
+            self._halt(f"the robot is {state.mode}: {state.why}", disturbed=late)
         elif state.source not in ("", self._source):
             self._halt(
                 f"the source {state.source} commands the robot now: end the program that uses "

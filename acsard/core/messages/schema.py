@@ -13,7 +13,7 @@ from typing import Annotated, get_args
 
 from msgspec import Meta, Struct
 
-from acsard.core.codes import Code, StateCode, WaitCode
+from acsard.core.codes import Code, StateCode, WaitCode, received_text
 from acsard.core.link.link_state import State
 from acsard.core.messages.certificate_expiry import CertificateCode
 from acsard.core.messages.keys_and_roles import Direction
@@ -431,6 +431,11 @@ class RobotState(Message, frozen=True):
     version: str = ""
     """Version of the daemon, such as `0.2.0`, or `0.2.0.dev0+g1a2b3c4d5` if it is not a release."""
 
+    @property
+    def why(self) -> str:
+        """The reason for people, with its code if this version does not know it."""
+        return received_text(self.code, self.reason)
+
 
 class GatewayState(Message, frozen=True):
     """Status that the TLS gateway (`acsard gateway`) reports to the daemon."""
@@ -580,6 +585,8 @@ class Info(Message, frozen=True):
     """Control rate, Hz."""
     listen: list[str]
     connect: list[str]
+    services: dict[str, list[str]] = {}
+    """The services of the robot, each with the fields that its payload may have."""
 
 
 class HardwareInterface(Message, frozen=True):

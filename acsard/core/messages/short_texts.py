@@ -44,7 +44,7 @@ def _odometry(odom: Odometry) -> list[str]:
 
 
 def _state(state: RobotState) -> list[str]:
-    mode = printable(f"{state.mode}: {state.reason}")
+    mode = printable(f"{state.mode}: {state.why}")
     parts = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular), mode]
     left = charge(state.battery)
     return [*parts, *filter(None, (left and f"battery {left}", brief(warnings(state))))]
