@@ -7,7 +7,7 @@ time, are never part of a reference cycle.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 from msgspec import Meta, Struct
 from msgspec.structs import replace
@@ -143,7 +143,10 @@ Plain = (
 class Request(Struct, frozen=True):
     """A call of a service, or a stop that was published on the bus, with `id` 0 and no reply."""
 
-    verb: Verb
+    if TYPE_CHECKING:
+        verb: Verb
+    else:
+        verb: str  # in a recording of a later version
     id: int = 0
     pose: Pose | None = None
     asked_ns: Ns | None = None  # arrival (None: this step); `clear` does not release a later stop
@@ -199,7 +202,12 @@ Level = Literal["info", "warning", "error"]
 class Event(Struct, frozen=True):
     """An event for the log. `event_throttle.py` joins frequent ones."""
 
-    name: EventName
+    # A recording of a later version may have names and codes that this one does not know, so its
+    # decoder accepts any text.
+    if TYPE_CHECKING:
+        name: EventName
+    else:
+        name: str
     text: str
     level: Level = "info"
     by: str = ""  # client that caused it
@@ -207,7 +215,10 @@ class Event(Struct, frozen=True):
     count: int = 1  # occurrences
     news: bool = True  # False: only repeats an earlier event, so its line may be delayed
     # Code of the cause, of the last of several events; "" if `name` says everything.
-    code: Code | Literal[""] = ""
+    if TYPE_CHECKING:
+        code: Code | Literal[""] = ""
+    else:
+        code: str = ""
 
 
 class Estimate(Struct, frozen=True, gc=False):

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from msgspec import Struct
 
 from acsard.core.config.live import changed, flat
-from acsard.core.config.parsing import ConfigError, effective, parse
+from acsard.core.config.parsing import ConfigError, effective, parse, parse_recorded
 from acsard.core.config.settings import Config
 from acsard.core.config.toml_text import document
 from acsard.core.formatting import printable
@@ -74,7 +74,7 @@ class ReplayResult(NamedTuple):
 def config_of(recording: Recording) -> Config:
     """Return the configuration at the beginning of a recording. Raises `RecordingError`."""
     try:
-        return parse(recording.about.config.encode())
+        return parse_recorded(recording.about.config.encode())
     except ConfigError as error:
         raise RecordingError(
             "this version of acsard cannot use the configuration in the recording "

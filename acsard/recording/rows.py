@@ -2,7 +2,8 @@
 
 Times and poses are differences from earlier ones, so similar steps give equal bytes, which compress
 well. Each batch is decoded alone. A forged one with values that no daemon records is refused. If
-you change a struct of this module, change `FORMAT` as well.
+you change a struct of this module so that an older version cannot read it, change `FORMAT` as well.
+An added field with a default is ignored there, and so is a call of an unknown service.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from itertools import chain
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, get_args
 
 import msgspec
 from msgspec import Meta, Struct
@@ -28,6 +29,7 @@ from acsard.core.values import (
     Refusal,
     Request,
     SpeedCap,
+    Verb,
 )
 from acsard.recording.recorded_steps import (
     FinishedStep,
@@ -42,6 +44,8 @@ from acsard.recording.recorded_steps import (
 )
 
 FORMAT = "4"  # of the messages in a recording
+
+VERBS = frozenset(get_args(Verb))
 
 MAX_ROWS = 4096  # like the recorder's queue
 
@@ -253,7 +257,7 @@ def _steps(batch: Batch) -> Iterator[RecordedStep]:
             port_trouble=trouble,
             received=tuple(received),
             commands=rare.commands,
-            requests=rare.requests,
+            requests=tuple([one for one in rare.requests if one.verb in VERBS]),
             refusals=rare.refusals,
             gyro=rare.gyro,
             speed_cap=rare.speed_cap,

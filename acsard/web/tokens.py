@@ -19,7 +19,7 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
-from acsard.core.values import Role
+from acsard.core.values import ROLES, Role
 from acsard.host.atomic_file import replace
 from acsard.host.errors import MSGSPEC_ERRORS, MendableError, NotPermittedError, UsageError
 from acsard.web.callers import AdmittedClient
@@ -37,7 +37,7 @@ class Token(Struct, frozen=True):
     """The stored record of a token."""
 
     name: str
-    role: Role
+    role: str  # admits nobody if only a later version knows it
     digest: str
     made: int  # s since 1970
     ends: int  # s since 1970
@@ -193,7 +193,8 @@ def owner_in(tokens: Sequence[Token], text: str) -> AdmittedClient | None:
             match = token
     if match is None or match.ends <= time.time():
         return None
-    return AdmittedClient(match.role, match.name, match.digest)
+    role = next((role for role in ROLES if role == match.role), None)
+    return role and AdmittedClient(role, match.name, match.digest)
 
 
 def _digest(text: str) -> str:

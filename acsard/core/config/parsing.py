@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import tomllib
 from codecs import BOM_UTF8
+from typing import Any
 
 from msgspec import convert, to_builtins
 
 from acsard.core.config.contradictions import contradictions
 from acsard.core.config.partial import view_without
 from acsard.core.config.settings import Config
-from acsard.core.config.validation import build_partly
+from acsard.core.config.validation import build_partly, known_part
 from acsard.core.values import AcsardError
 
 MAX_BYTES = 65536  # the `acsard.toml` in the repository has a third of this
@@ -29,12 +30,29 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
 
     Raises `ConfigError`, which lists every mistake.
     """
+    table = _table(text)
+    for section, values in (overrides or {}).items():
+        inner = table.setdefault(section, {})
+        if isinstance(inner, dict):
+            inner.update(values)
+    return _checked(table)
+
+
+def parse_recorded(text: bytes) -> Config:
+    """Decode and check a configuration that a daemon of any version has written.
+
+    Keys that this version does not have are ignored. Raises `ConfigError`.
+    """
+    return _checked(known_part(Config, _table(text)))
+
+
+def _table(text: bytes) -> dict[str, Any]:
     if len(text) > MAX_BYTES:
         raise ConfigError(
             [f"more than {MAX_BYTES} bytes: too large for a configuration; shorten the file"]
         )
     try:
-        table = tomllib.loads(text.removeprefix(BOM_UTF8).decode("utf-8"))
+        return tomllib.loads(text.removeprefix(BOM_UTF8).decode("utf-8"))
     except UnicodeDecodeError as error:
         raise ConfigError([f"not UTF-8 text: {error}; save the file as UTF-8"]) from None
     except tomllib.TOMLDecodeError as error:
@@ -46,10 +64,9 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
         raise ConfigError(
             ["not TOML: a number is too long or lists are nested too deep; shorten them"]
         ) from None
-    for section, values in (overrides or {}).items():
-        inner = table.setdefault(section, {})
-        if isinstance(inner, dict):
-            inner.update(values)
+
+
+def _checked(table: object) -> Config:
     problems: list[str] = []
     invalid: set[str] = set()
     try:

@@ -69,6 +69,23 @@ def build_partly(
     return cls(**values) if complete else None
 
 
+def known_part(cls: type[msgspec.Struct], table: object) -> object:
+    """Return a TOML table without the keys that the struct and its parts do not have."""
+    if not isinstance(table, Mapping):
+        return table
+    names = {field.encode_name: field for field in fields(cls)}
+    return {key: _known(names[key], value) for key, value in table.items() if key in names}
+
+
+def _known(field: FieldInfo, value: object) -> object:
+    match inspect.type_info(field.type):
+        case inspect.StructType(cls=cls):
+            return known_part(cls, value)
+        case inspect.VarTupleType(item_type=inspect.StructType(cls=cls)) if isinstance(value, list):
+            return [known_part(cls, item) for item in value]
+    return value
+
+
 def _value(
     field: FieldInfo, raw: object, where: str, problems: list[str], invalid: set[str]
 ) -> Any:

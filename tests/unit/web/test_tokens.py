@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import stat
 from pathlib import Path
@@ -13,6 +14,7 @@ from msgspec.structs import replace
 
 from acsard.host.errors import MendableError, NotPermittedError, UsageError
 from acsard.web import tokens
+from acsard.web.callers import AdmittedClient
 from acsard.web.tokens import Token, Vault, owner_in
 
 
@@ -63,6 +65,20 @@ def test_with_a_damaged_file_no_token_is_valid(tmp_path: Path) -> None:
         assert vault.valid_digests() == frozenset()
         with pytest.raises(UsageError, match="is not a list of tokens"):
             vault.invite("viewer", "tv", 1)
+
+
+def test_a_role_and_a_field_of_a_later_version_leave_the_other_tokens_valid(tmp_path: Path) -> None:
+    vault = Vault(tmp_path, "acsar")
+    text, token = vault.invite("operator", "phone", 1)
+    pilot, other = vault.invite("viewer", "pilot", 1)
+    rows = json.loads(vault.path.read_bytes())
+    rows[0]["later"], rows[1]["role"] = 1, "pilot"
+    vault.path.write_text(json.dumps(rows))
+    assert vault.valid_digests() == {token.digest, other.digest}
+    assert vault.find_owner(text) == AdmittedClient("operator", "phone", token.digest)
+    assert vault.find_owner(pilot) is None
+    vault.revoke("pilot")
+    assert [row["name"] for row in json.loads(vault.path.read_bytes())] == ["phone"]
 
 
 def test_a_damaged_file_is_not_written_over(tmp_path: Path) -> None:

@@ -15,7 +15,13 @@ from hypothesis import strategies as st
 from msgspec import inspect
 
 from acsard.core.config.contradictions import warnings
-from acsard.core.config.parsing import ConfigError, effective, from_builtins, parse
+from acsard.core.config.parsing import (
+    ConfigError,
+    effective,
+    from_builtins,
+    parse,
+    parse_recorded,
+)
 from acsard.core.config.settings import Config, Source
 from tests.each import each
 from tests.unit.keys import KEYS, Key
@@ -42,6 +48,29 @@ def accepted(text: str) -> Config:
 
 def test_an_empty_file_gives_the_defaults() -> None:
     assert parse(b"") == Config()
+
+
+def test_a_recorded_configuration_may_have_keys_of_another_version() -> None:
+    text = b"""
+    later = 1
+    [limits]
+    linear_speed = 0.7
+    later = [1]
+    [fog]
+    x = 1
+    [[commands.sources]]
+    name = "app"
+    priority = 10
+    timeout = 0.25
+    later = true
+    """
+    config = parse_recorded(text)
+    assert config.limits.linear_speed == 0.7
+    assert [source.name for source in config.commands.sources] == ["app"]
+    with pytest.raises(ConfigError, match=r"limits.later = .*: unknown key"):
+        parse(text)
+    with pytest.raises(ConfigError, match=r"limits.linear_speed"):
+        parse_recorded(b"[limits]\nlinear_speed = -1.0")
 
 
 def test_a_file_may_begin_with_a_byte_order_mark() -> None:
