@@ -52,6 +52,7 @@ PROMISED = (
     Promise("srv/reset_odometry", "service", "ServiceReply", "operator", "acsard/reset_odometry"),
     Promise("srv/set_pose", "service", "ServiceReply", "maintainer"),
     Promise("srv/set", "service", "ServiceReply", "maintainer"),
+    Promise("srv/<verb>", "service", "ServiceReply", None),
     Promise("info", "query", "Info", "viewer"),
     Promise("config", "query", "Config", "maintainer"),
     Promise("interfaces", "query", "Interfaces", "viewer"),
@@ -66,7 +67,11 @@ PUBLISHED = tuple(
 )
 """The keys on which the robot publishes messages."""
 
-SERVICES = {row.key.removeprefix("srv/"): row for row in PROMISED if row.direction == "service"}
+SERVICES = {
+    row.key.removeprefix("srv/"): row
+    for row in PROMISED
+    if row.direction == "service" and row.key != "srv/<verb>"
+}
 """The services, by their names."""
 
 TRIGGERS = tuple(name for name, row in SERVICES.items() if row.ros)

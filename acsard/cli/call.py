@@ -24,6 +24,12 @@ from acsard.host.errors import UsageError
 CALLABLE_SERVICES = tuple(service for service in SERVICES if service != "set")
 
 
+class _Known(tuple[str, ...]):
+    # For the completion of the shell. Any word is accepted, because the daemon may have others.
+    def __contains__(self, word: object) -> bool:
+        return True
+
+
 def add_options(parser: argparse.ArgumentParser) -> None:
     fields = {service: " ".join(_fields(service)) for service in CALLABLE_SERVICES}
     forms = [f"{service} {names.upper()}" for service, names in fields.items() if names]
@@ -32,7 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         # Accept `srv/stop` too, because the messages on `state` and the table of keys contain the
         # name in this form.
         type=lambda word: word.removeprefix("srv/"),
-        choices=CALLABLE_SERVICES,
+        choices=_Known(CALLABLE_SERVICES),
         metavar="SERVICE",
         help=", ".join(CALLABLE_SERVICES),
     )
@@ -48,7 +54,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    wanted = _fields(args.service)
+    if args.service == "set":
+        raise UsageError("a setting is changed with `acsard set KEY VALUE`")
+    # The daemon refuses a service that it does not have. It may have one that is unknown here.
+    wanted = _fields(args.service) if args.service in SERVICES else ()
     if len(args.values) != len(wanted):
         form = " ".join(["acsard call", args.service, *(name.upper() for name in wanted)])
         raise UsageError(f"wrong number of arguments; type: {form}")

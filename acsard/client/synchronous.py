@@ -31,7 +31,7 @@ from acsard.client.driving import UnheardError, drive, repeat_zeros
 from acsard.client.identity import ClientIdentity, identity
 from acsard.core.incoming.commands import require_size
 from acsard.core.incoming.imu import UNKNOWN_COVARIANCE
-from acsard.core.incoming.queries import BUSY_ENCODING, invalid_call
+from acsard.core.incoming.queries import BUSY_ENCODING, invalid_call, not_offered
 from acsard.core.messages import schema
 from acsard.core.messages.encodings import (
     DecodeError,
@@ -46,6 +46,7 @@ from acsard.core.messages.keys_and_roles import (
     by_key,
     command_key,
     full_key,
+    is_service,
     key_hint,
     service_key,
     unknown,
@@ -312,7 +313,8 @@ class Client:
         that state. The daemon then refuses the call if the robot was stopped or switched off again
         after that state.
         """
-        if service in ("clear", "activate") and "latch" not in fields:
+        releases = service in ("clear", "activate")
+        if releases and "latch" not in fields and "latch" in self._offered().get(service, ()):
             fields["latch"] = self.get("state").latch
         return self.request(service, fields)
 
@@ -323,6 +325,11 @@ class Client:
         daemon.
         """
         return self.request("set", {"settings": settings})
+
+    def _offered(self) -> dict[str, list[str]]:
+        # A daemon of another version refuses a service, and a field of a payload, that it lacks.
+        services: dict[str, list[str]] = self.get("info").services
+        return services
 
     def request(self, service: str, fields: Mapping[str, object]) -> schema.ServiceReply:
         """Call the service `service` with `fields` as its payload, and return its reply.
@@ -369,7 +376,7 @@ class Client:
                 )
             # Repeat a query, but not a service call: since the first attempt, another client may
             # have called a service with the opposite effect.
-            if encoding != BUSY_ENCODING or name in VERBS or time.monotonic() > end_s:
+            if encoding != BUSY_ENCODING or is_service(name) or time.monotonic() > end_s:
                 raise ReplyError(f"{name}: {error_text}")
             time.sleep(0.03)
 
@@ -507,6 +514,9 @@ class Client:
             us = self.whoami()
             if us.silence:
                 return NoAnswerError(f"{no_answer}: {us.silence}")
+            verb = key.removeprefix(service_key(""))
+            if is_service(key) and verb not in (offered := self._offered()):
+                return ReplyError(not_offered(verb, offered))
             if why := us.lacks(key):
                 return NotPermittedError(why)
         where = self.where

@@ -21,6 +21,7 @@ from acsard.bus.certificate_watch import watch_certificates
 from acsard.bus.tls import expiry_times, require_usable
 from acsard.bus.zenoh_sessions import log_from_environment
 from acsard.core.config.settings import Config
+from acsard.core.incoming.queries import offered_services
 from acsard.core.link.codec import Codec
 from acsard.core.messages.schema import Info
 from acsard.core.values import NS_PER_S, Event, Latches, Ns, WallNs
@@ -293,4 +294,5 @@ def _info(config: Config, path: str) -> Info:
         rate=config.rate_hz,
         listen=list(config.bus.listening),
         connect=list(config.bus.connect),
+        services=offered_services(),
     )

@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 from acsard.client import Client
 from acsard.core.incoming.queries import BUSY
 from acsard.core.messages.encodings import DecodeError
-from acsard.core.messages.keys_and_roles import SERVICES
-from acsard.core.messages.permissions import SERVICE_ROLES
+from acsard.core.messages.keys_and_roles import SERVICE_NAME, service_key
+from acsard.core.messages.permissions import least_role
 from acsard.core.messages.schema import ServiceReply
 from acsard.host.errors import MendableError, UsageError
 from acsard.host.rate_limits import Places
@@ -166,12 +166,13 @@ class Stops:
 
 
 def require(caller: AdmittedClient, verb: str) -> None:
-    """Raise `RequestRefusedError` if the service does not exist, or the client may not call it."""
-    if verb not in SERVICES:
-        raise RequestRefusedError(
-            "malformed", f"{verb!r} is not a service; choose one of {', '.join(SERVICES)}"
-        )
-    caller.require(SERVICE_ROLES[verb], verb)
+    """Raise `RequestRefusedError` if the client may not call the service.
+
+    The daemon refuses a service that it does not have. One that is unknown here is for maintainers.
+    """
+    if not SERVICE_NAME.fullmatch(verb):
+        raise RequestRefusedError("malformed", f"{verb!r} is not the name of a service")
+    caller.require(least_role(service_key(verb)), verb)
 
 
 def _named(client: Client, identity: AdmittedClient) -> Client:

@@ -13,8 +13,15 @@ from typing import Any, Literal
 from msgspec import Struct
 
 from acsard.core.messages.json_schema import SCHEMAS
-from acsard.core.messages.keys_and_roles import SERVICES, TOPICS, VERBS, Topic
-from acsard.core.messages.permissions import SERVICE_ROLES, least_role
+from acsard.core.messages.keys_and_roles import (
+    ANY_SERVICE,
+    SERVICE_NAME,
+    SERVICES,
+    TOPICS,
+    VERBS,
+    Topic,
+)
+from acsard.core.messages.permissions import least_role
 from acsard.core.values import ROLES, Role
 from acsard.host.rate_limits import Rate
 from acsard.web.limits import REQUEST_RATE, STOPS
@@ -27,7 +34,7 @@ RECORDINGS_ROLE: Role = "operator"
 JSON, FORM = "application/json", "application/x-www-form-urlencoded"
 
 # A path parameter with another name matches any text without a slash.
-PARAMETERS = {"type": "[A-Za-z0-9_]{1,80}"}
+PARAMETERS = {"type": "[A-Za-z0-9_]{1,80}", "verb": SERVICE_NAME.pattern}
 
 _PARAMETER = re.compile(r"{(\w+)}")
 
@@ -90,15 +97,16 @@ def values(handler: Handler) -> Iterator[Route]:
 def services(handler: Handler) -> Iterator[Route]:
     """Yield the route `POST /api/srv/<name>` for each service of the robot."""
     notes = {topic.key: topic.note for topic in TOPICS}
-    for key, verb in VERBS.items():
+    # The row for unknown services comes last, because the first path that matches counts.
+    for key, verb in (*VERBS.items(), (ANY_SERVICE, None)):
         # The daemon decodes the payload, so a refusal contains the daemon's message.
-        takes = SERVICES[verb].payload or None
+        takes = SERVICES[verb].payload or None if verb else None
         gives = {
             200: Body("The service call succeeded.", "ServiceReply"),
             409: Body("The service call failed; the reason is in the answer.", "ServiceReply"),
         }
         yield Route(
-            "POST", f"/api/{key}", SERVICE_ROLES[verb], handler, notes[key],
+            "POST", f"/api/{key.replace('<verb>', '{verb}')}", least_role(key), handler, notes[key],
             takes=takes, gives=gives, rate=STOPS if verb == "stop" else REQUEST_RATE,
             waits=verb == "stop",
         )  # fmt: skip

@@ -6,11 +6,12 @@ clear a latch. Other keys may be queried with a wildcard.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from msgspec import Struct
 from msgspec.structs import replace
 
+from acsard.core.config.nearest import hint
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Receiver, Via, caller_name
@@ -31,7 +32,9 @@ from acsard.core.messages.keys_and_roles import (
     VERBS,
     WHOAMI,
     full_key,
+    is_service,
     offered,
+    service_key,
     whoami_key,
 )
 from acsard.core.messages.schema import (
@@ -63,6 +66,8 @@ from acsard.core.values import ROLES, Answer, Ns, Outputs, Request, Verb, WallNs
 Current = Callable[[str], Message | None]
 
 MAX_WILDCARD_LENGTH = 512  # of a wildcard: no key is longer, and it would delay the control loop
+
+MAX_VERB_LENGTH = 40  # characters of an unknown verb in a reply
 
 BUSY = "busy: too many queries at once; ask again"
 
@@ -134,6 +139,8 @@ class Queries:
             form = _format(query)
             if query.topic in VERBS:
                 return self._service(query, form)
+            if is_service(query.topic):
+                return [_unknown_service(query, form)]
             return [
                 Reply(query.ticket, key, encode(value, form), encoding_name(form, name))
                 for key, name, value in self._values(query, current, outputs)
@@ -286,6 +293,13 @@ def invalid_call(verb: Verb, error: DecodeError) -> ServiceReply:
     return ServiceReply(False, f"{error}; send {SERVICES[verb].example}")
 
 
+def _unknown_service(query: Query, form: Format) -> Reply:
+    verb = query.topic.removeprefix(service_key(""))
+    reply = ServiceReply(False, not_offered(verb, SERVICES))
+    payload, name = _encoded(reply, form), encoding_name(form, "ServiceReply")
+    return Reply(query.ticket, query.topic, payload, name)
+
+
 def _encoded(reply: ServiceReply, form: Format) -> bytes:
     return encode(Trigger(reply.success, reply.message) if form == "cdr" else reply, form)
 
@@ -314,12 +328,27 @@ def _format(query: Query) -> Format:
         raise DecodeError(
             "unknown_format", f"fmt={query.fmt}: write fmt=json, fmt=msgpack or fmt=cdr"
         )
-    if query.topic in VERBS and query.payload:
+    if is_service(query.topic) and query.payload:
         try:
             return detect(query.encoding, query.payload)
         except DecodeError:
             pass  # a service that needs no payload ignores a payload that cannot be decoded
     return "json"
+
+
+def not_offered(verb: str, services: Iterable[str]) -> str:
+    """Return the words that refuse a call of a service that the robot does not have."""
+    verb, known = verb[:MAX_VERB_LENGTH], list(services)
+    why = hint(verb, known, f"its services are {', '.join(known)}")
+    return f"{verb!r} is not a service of this robot; {why}"
+
+
+def offered_services() -> dict[str, list[str]]:
+    """Return the services of a daemon of this version, with the fields of their payloads."""
+    return {
+        verb: list(MESSAGES[service.payload].__struct_fields__) if service.payload else []
+        for verb, service in SERVICES.items()
+    }
 
 
 def topic_table(config: Config) -> Topics:

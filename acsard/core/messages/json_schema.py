@@ -17,8 +17,8 @@ from acsard.core.messages.schema import (
     MESSAGES,
     Imu,
     JointState,
-    SpeedLimit,
     Message,
+    SpeedLimit,
     TwistStamped,
 )
 from acsard.core.messages.strict_types import strict

@@ -109,8 +109,20 @@ def whoami_key(role: str) -> str:
     return WHOAMI.replace("<role>", role)
 
 
+# For a service that the daemon does not have, such as one of a later version: it refuses the call
+# in words. Over TLS only exact keys are allowed, so there the client explains the silence.
+ANY_SERVICE = "srv/<verb>"
+
+SERVICE_NAME = re.compile("[a-z0-9_]{1,40}")
+
+
 def service_key(verb: str) -> str:
-    return f"srv/{verb}"
+    return ANY_SERVICE.replace("<verb>", verb)
+
+
+def is_service(key: str) -> bool:
+    """Return whether a key calls a service, which this version may not know."""
+    return key.startswith(service_key(""))
 
 
 JSON_TREE = "json/"
@@ -198,6 +210,10 @@ TOPICS: tuple[Topic, ...] = (
         publish="maintainer", local=True,
     ),
     *(_service(verb) for verb in SERVICES),
+    Topic(
+        ANY_SERVICE, "service", "ServiceReply", "",
+        "refuses a service that this daemon does not have", query="maintainer", local=True,
+    ),
     _query("info", "Info", "name, version and settings of the daemon"),
     _query("config", "Config", "the effective configuration", "maintainer"),
     _query("interfaces", "Interfaces", "command and state interfaces"),

@@ -20,11 +20,13 @@ from acsard.core.incoming.bus_interface import NO_INPUT, BusInput, Waker
 from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via, parts
 from acsard.core.incoming.queries import BUSY, BUSY_ENCODING, Query, Reply, most_bytes, refused
 from acsard.core.messages.keys_and_roles import (
+    ANY_SERVICE,
     IMU,
     JSON_TREE,
     SPEED_LIMIT,
     VERBS,
     full_key,
+    is_service,
     service_key,
     source_keys,
 )
@@ -123,8 +125,9 @@ STOP_BUFFER = 16  # no flood of commands displaces a stop
 # are refused with `BUSY`. One slow query per step: the last of 256 waits 2.6 s at 100 Hz.
 QUERY_QUEUE = 256
 
-# rmw_zenoh's has 33, acsard's up to 140. A longer one is cut off and names no sender.
-MAX_ATTACHMENT_BYTES = 256
+# rmw_zenoh's has 33, acsard's up to 140, and a later version's may have more. A longer one is cut
+# off and names no sender.
+MAX_ATTACHMENT_BYTES = 1024
 
 STOP, SET = service_key("stop"), service_key("set")
 STOP_ALL = full_key("*", "stop")
@@ -275,10 +278,12 @@ class Inbox:
         """Queue a query on the key `topic`, without the robot's id.
 
         A wildcard must not call a service, and `**` matches a JSON key (`json/...`) too, whose
-        other key answers.
+        other key answers. `ANY_SERVICE` also matches the services that have a key of their own.
         """
         asked = str(query.key_expr).removeprefix(self._prefix)
-        if asked != topic and (topic in VERBS or topic.startswith(JSON_TREE)):
+        if topic == ANY_SERVICE and asked not in VERBS and is_service(asked) and "*" not in asked:
+            topic = asked
+        if asked != topic and (is_service(topic) or topic.startswith(JSON_TREE)):
             # Returning without a ticket drops the query.
             return
         self._queried(query, topic, asked, "", "native")

@@ -391,7 +391,7 @@ def test_an_imu_message_needs_only_the_angular_velocity_as_for_the_daemon(payloa
     assert message.angular_velocity_covariance == UNKNOWN
 
 
-@each("payload", [b"{}", b'{"angular_velocity":{"z":0.5},"gyro":1}'])
+@each("payload", [b"{}", b'{"angular_velocity":{"z":"0.5"}}'])
 def test_an_imu_message_that_the_daemon_refuses_is_not_decoded(payload: bytes) -> None:
     with pytest.raises(DecodeError):
         reading(Arrival("imu", True, payload, "", 0, None, ""))

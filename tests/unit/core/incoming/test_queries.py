@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import pytest
@@ -25,6 +25,7 @@ from acsard.core.incoming.queries import (
     Query,
     Reply,
     most_bytes,
+    offered_services,
     refused,
     topic_table,
 )
@@ -362,8 +363,31 @@ def test_a_service_does_not_run_for_a_key_that_only_resembles_its_own(asked: str
     assert queries().serve(query("srv/stop", asked), nothing, None) == []
 
 
-def test_a_service_that_does_not_exist_does_nothing() -> None:
-    assert queries().serve(query("srv/explode"), nothing, None) == []
+@each(
+    ("verb", "words"),
+    [
+        ("explode", "'explode' is not a service of this robot; its services are stop, clear, "),
+        ("stopp", "'stopp' is not a service of this robot; did you mean stop?"),
+        ("x" * 999, f"'{'x' * 40}' is not a service of this robot; its services are "),
+    ],
+)
+def test_a_service_that_this_daemon_does_not_have_is_refused_in_words(
+    verb: str, words: str
+) -> None:
+    made = queries()
+    (reply,) = cast(list[Reply], made.serve(query(f"srv/{verb}", payload=b"{}"), nothing, None))
+    answer = msgspec.json.decode(reply.payload, type=ServiceReply)
+    assert (reply.key, reply.ok, answer.success) == (f"srv/{verb}", True, False)
+    assert answer.message.startswith(words)
+    assert made.answered(Answer(7, True, "done"), WALL_NS) is None
+
+
+def test_info_offers_each_service_with_the_fields_of_its_payload() -> None:
+    services = offered_services()
+    assert set(services) == set(SERVICES)
+    assert services["stop"] == []
+    assert services["clear"] == ["latch"]
+    assert services["set_pose"] == ["x", "y", "yaw"]
 
 
 @pytest.mark.parametrize("success", [True, False])

@@ -124,8 +124,9 @@ def test_every_key_of_the_table_has_its_row_and_an_unknown_key_has_no_row() -> N
             .replace("<certificate>", "laptop anna")
             .replace("<Type>", "Twist")
             .replace("<role>", "viewer")
+            .replace("<verb>", "ghost")
         )
         assert row_of(filled) is topic
         assert row_of(topic.key) is topic
-    for key in ("", "cmd", "cmd/", "cmd/app/x/y", "cmd//x", "schema/", "odometry", "srv/ghost"):
+    for key in ("", "cmd", "cmd/", "cmd/app/x/y", "cmd//x", "schema/", "odometry", "srv/a/b"):
         assert row_of(key) is None
