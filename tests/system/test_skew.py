@@ -1,0 +1,401 @@
+"""A client and a daemon of two versions work together, in both directions.
+
+The older one is the wheel of this tree. The newer one is the same wheel with a field added to all
+that a client receives, to each attachment and to each file, and with a verb, words and a code that
+the older one does not know (`versions.py`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from signal import SIGTERM
+from typing import Any, NamedTuple
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+import pytest
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from acsard.core.messages import schema
+from acsard.core.messages.keys_and_roles import PUBLISHED, SERVICES
+from acsard.core.messages.schema import Message
+from acsard.web.callers import PROTOCOL
+from tests.system.harness import Bus, Daemon, Finished, Peer, Program, finish, free_endpoint, until
+from tests.system.terminals import at_terminal
+from tests.system.versions import (
+    CODE,
+    LATCH_CODE,
+    MODE,
+    ONLY_SENT,
+    REASON,
+    VERB,
+    Version,
+    built_wheel,
+    grow,
+    plain_environment,
+)
+from tests.unit.core.messages.test_schema import ROS_FIELDS
+
+pytestmark = pytest.mark.slow
+
+
+class Versions(NamedTuple):
+    older: Version
+    newer: Version
+
+
+class Pair(NamedTuple):
+    """A running daemon of one version, and the other version, whose clients use it."""
+
+    daemon: Daemon
+    version: Version
+    client: Version
+    where: Path
+
+    @property
+    def is_client_older(self) -> bool:
+        return self.client.place.name == "older"
+
+    def tool(self, *words: str, within: float = 20.0) -> Finished:
+        """Run a tool of the client's version to its end."""
+        config = ("--config", str(self.daemon.config))
+        return finish(
+            [self.client.acsard, *words, *config], self.where, within, plain_environment()
+        )
+
+
+@pytest.fixture(scope="module")
+def versions(tmp_path_factory: pytest.TempPathFactory) -> Versions:
+    where = tmp_path_factory.mktemp("versions")
+    wheel = built_wheel(where)
+    with ThreadPoolExecutor(2) as at_once:
+        older, newer = at_once.map(lambda name: Version(where / name, wheel), ("older", "newer"))
+    grow(newer)
+    return Versions(older, newer)
+
+
+def daemon_of(version: Version, where: Path, name: str = "daemon", **more: Any) -> Daemon:
+    """Return the daemon of a version, which records and keeps its latches in files."""
+    config = {"record": {"directory": str(where / f"{name}.recordings")}}
+    daemon = Daemon(where, config=config, name=name, env=plain_environment(), **more)
+    daemon.words[:3] = [version.acsard]
+    return daemon
+
+
+@pytest.fixture(scope="module", params=["old client", "new client"])
+def pair(
+    request: pytest.FixtureRequest, versions: Versions, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Pair]:
+    where = tmp_path_factory.mktemp("pair")
+    version, client = versions if request.param == "new client" else versions[::-1]
+    with daemon_of(version, where) as daemon, Bus(daemon.endpoint) as bus:
+        until(lambda: bus.state()["link"] == "up" or None, 10, "the link is up")
+        yield Pair(daemon, version, client, where)
+
+
+def test_the_newer_version_has_another_field_in_each_message_that_a_client_receives() -> None:
+    kinds = {
+        kind.__name__
+        for kind in vars(schema).values()
+        if isinstance(kind, type) and issubclass(kind, Message)
+    }
+    received = {service.payload for service in SERVICES.values()} | {"GatewayState", "SpeedLimit"}
+    ros = {*ROS_FIELDS, "Battery", "Imu", "Odometry", "TFMessage"}
+    assert kinds - received - ros - {"Message"} == ONLY_SENT
+
+
+READING_TOOLS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "get info": (("get", "info"), ("version",)),
+    "get config": (("get", "config"), ("linear_speed",)),
+    "get state": (("get", "state"), ("counters",)),
+    "echo": (("echo", "state", "-n", "1"), ("counters",)),
+    "echo --short": (("echo", "odom", "-n", "1", "--short"), ("forward",)),
+    "echo state": (("echo", "state", "-n", "1", "--short"), ("yaw",)),
+    "echo --rate": (("echo", "odom", "-n", "2", "--rate"), ("Hz",)),
+    "echo --csv": (("echo", "wheel_states", "sim/pose", "-n", "4", "--csv"), ("t,",)),
+    "echo of all": (("echo", "state", "-n", "1", "--id", "*"), ("counters",)),
+    "top": (("top", "--once"), ("up",)),
+    "fleet": (("fleet", "--once"), ("acsar",)),
+    "fleet --json": (("fleet", "--json"), ("counters",)),
+    "doctor": (("doctor",), ("daemon",)),
+    "set": (("set",), ("limits.linear_speed",)),
+}
+"""The tools that read from the daemon, with words of their output."""
+
+SHOW_REASON = ("echo state", "top", "fleet", "doctor")
+
+
+def test_each_tool_that_reads_understands_the_other_version(pair: Pair) -> None:
+    with ThreadPoolExecutor(3) as at_once:
+        runs = {
+            name: at_once.submit(pair.tool, *words) for name, (words, _) in READING_TOOLS.items()
+        }
+    ended = {name: run.result() for name, run in runs.items()}
+    assert {name: end.err for name, end in ended.items() if end.code != 0} == {}
+    for name, (_, expected) in READING_TOOLS.items():
+        for word in expected:
+            assert word in ended[name].out, (name, ended[name])
+    if pair.is_client_older:
+        for name in SHOW_REASON:
+            shown = " ".join(ended[name].out.split())
+            assert REASON in shown, (name, shown)
+            assert CODE in shown, (name, shown)
+            assert MODE in shown.lower(), (name, shown)
+
+
+CALLS: tuple[tuple[tuple[str, ...], int, str], ...] = (
+    (("call", "stop"), 0, "stopped"),
+    (("call", "clear"), 0, "cleared"),
+    (("call", "deactivate"), 0, "inactive"),
+    (("call", "activate"), 0, "active"),
+    (("call", "reset_odometry"), 0, "pose is x 0"),
+    (("call", "set_pose", "1", "2", "0.5"), 0, "pose is x 1"),
+    (("set", "limits.linear_speed", "0.9"), 0, "0.9"),
+    (("set", "limits.lineer_speed", "0.9"), 1, "limits.linear_speed"),
+)
+
+
+def test_each_service_can_be_called_from_the_other_version(pair: Pair) -> None:
+    for words, code, expected in CALLS:
+        ended = pair.tool(*words)
+        assert ended.code == code, (words, ended)
+        assert expected in ended.out, (words, ended)
+
+
+def test_the_daemon_and_no_list_of_the_client_refuses_an_unknown_verb(pair: Pair) -> None:
+    ended = pair.tool("call", VERB)
+    if pair.is_client_older:
+        assert (ended.code, ended.out, ended.err) == (0, "dances", "")
+    else:
+        assert (ended.code, ended.err) == (1, "")
+        assert f"'{VERB}' is not a service of this robot" in ended.out
+    nearly = pair.tool("call", "stopp")
+    assert (nearly.code, nearly.err) == (1, "")
+    assert "did you mean stop?" in nearly.out
+
+
+CLIENT = f"""\
+import asyncio, json
+from acsard.client import connect, connect_async
+from acsard.core.messages.keys_and_roles import SERVICES
+
+NAMES = {[topic.key for topic in PUBLISHED if topic.key != "battery"]!r}
+FIXED = ["info", "config", "interfaces", "topics", "schema/Twist", "whoami/viewer"]
+
+def used(robot):
+    for name in NAMES + FIXED:
+        robot.get(name)
+    for name in NAMES:
+        if name not in ("tf_static", "events", "diagnostics"):
+            assert next(robot.messages(name, timeout=5), None) is not None, name
+    done = {{"role": robot.whoami().role, "events": len(robot.get("events").events)}}
+    robot.set({{"limits.linear_speed": 0.8}})
+    for verb in ("stop", "clear", "deactivate", "activate", "reset_odometry"):
+        reply = robot.call(verb)
+        assert reply.success, (verb, reply)
+        done[verb] = reply.data.latch
+    robot.drive(0.3, seconds=0.5)
+    done["x"] = robot.pose().x
+    reply = robot.call("set_pose", x=1.0, y=2.0, yaw=0.5)
+    assert reply.success
+    done["{VERB}"] = [(reply := robot.call("{VERB}")).success, reply.message]
+    refused = robot.request("set_pose", {{"x": 1, "y": 2, "yaw": 0, "zaw": 1}})
+    done["strict"] = [refused.success, refused.message]
+    return done
+
+async def awaited():
+    async with connect_async() as robot:
+        await robot.get("state")
+        async for _ in robot.messages("odom"):
+            break
+        await robot.whoami()
+        await robot.drive(-0.3, seconds=0.3)
+        await robot.pose()
+        return (await robot.call("stop")).success and (await robot.call("clear")).success
+
+with connect() as robot:
+    done = used(robot)
+done["async"] = asyncio.run(awaited())
+print(json.dumps(done))
+"""
+
+
+def test_each_method_of_the_python_client_works_with_the_other_version(pair: Pair) -> None:
+    env = plain_environment(ACSARD_CONFIG=str(pair.daemon.config))
+    ended = finish([pair.client.python, "-c", CLIENT], pair.where, 40, env)
+    assert (ended.code, ended.err) == (0, ""), ended
+    done = json.loads(ended.out)
+    assert done["role"] == "maintainer"
+    assert done["stop"] == done["clear"] > 0
+    assert done["x"] > 0.05
+    assert done["async"] is True
+    success, text = done[VERB]
+    assert success is pair.is_client_older
+    assert text == "dances" or "is not a service of this robot" in text
+    success, text = done["strict"]
+    assert success is False
+    assert "unknown field `zaw`" in text
+
+
+def test_the_keyboard_drives_a_robot_of_the_other_version(pair: Pair) -> None:
+    how = f"""\
+import fcntl, os, sys, termios
+del os.environ["PYTHONPATH"]
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+os.execv({pair.client.acsard!r}, ["acsard", *sys.argv[1:]])
+"""
+    words = ("drive", "--config", str(pair.daemon.config))
+    with Bus(pair.daemon.endpoint) as bus, at_terminal(pair.where, *words, how=how) as (at, tool):
+
+        def drives() -> bool | None:
+            at.press("i")
+            return bus.state()["mode"] == "driving" or None
+
+        until(drives, 15, f"the robot drives\n{at.screen}")
+        at.press("\x03")
+        assert tool.ended(10) == 0, at.screen
+
+
+def test_a_guided_calibration_begins_with_the_other_version(pair: Pair) -> None:
+    words = ["calibrate", "--positions", "sim/pose", "--yes", "--config", str(pair.daemon.config)]
+    program = [pair.client.acsard, *words]
+    with (
+        Bus(pair.daemon.endpoint) as bus,
+        Program(program, pair.where, plain_environment()) as tool,
+    ):
+        until(
+            lambda: tool.process.poll() is not None or bus.state()["mode"] == "driving" or None,
+            20,
+            "it drives",
+        )
+        assert tool.process.poll() is None, tool
+
+
+def test_foxglove_shows_a_robot_of_the_other_version(pair: Pair) -> None:
+    port = free_endpoint().rpartition(":")[2]
+    words = ["foxglove", "--address", f"127.0.0.1:{port}", "--config", str(pair.daemon.config)]
+    with Program([pair.client.acsard, *words], pair.where, plain_environment()) as tool:
+        tool.says("connect Foxglove")
+        with connect(
+            f"ws://127.0.0.1:{port}", subprotocols=[Subprotocol("foxglove.sdk.v1")]
+        ) as socket:
+            seen = ""
+            while "/state" not in seen:
+                seen += str(socket.recv(timeout=10))
+
+
+def test_the_page_shows_stops_and_calls_a_robot_of_the_other_version(pair: Pair) -> None:
+    port = free_endpoint().rpartition(":")[2]
+    address = f"http://127.0.0.1:{port}"
+    words = ["web", "--address", address, "--config", str(pair.daemon.config)]
+    env = plain_environment(XDG_STATE_HOME=str(pair.where))
+
+    def posted(verb: str, **fields: object) -> dict[str, Any]:
+        body = json.dumps(fields).encode()
+        head = {"Content-Type": "application/json"}
+        request = Request(f"{address}/api/srv/{verb}", body, head, method="POST")
+        try:
+            with urlopen(request, timeout=10) as answer:
+                return dict(json.load(answer))
+        except HTTPError as error:
+            return dict(json.load(error))
+
+    with Program([pair.client.acsard, *words], pair.where, env) as tool:
+        tool.says(address)
+        with connect(f"ws://127.0.0.1:{port}/ws", subprotocols=[Subprotocol(PROTOCOL)]) as socket:
+            heard: dict[str, Any] = {}
+            socket.send('{"subscribe": "state"}')
+            while not heard.get("value"):
+                heard |= json.loads(socket.recv(timeout=10))
+            assert heard["hello"]["robot"] == "acsar"
+            assert ("later" in heard["value"]) is pair.is_client_older
+            with urlopen(f"{address}/api/settings", timeout=10) as answer:
+                assert any(row["key"] == "limits.linear_speed" for row in json.load(answer))
+            with urlopen(f"{address}/metrics", timeout=10) as answer:
+                assert b"acsard" in answer.read()
+            assert posted("stop")["success"] is True
+            latch = until(lambda: state_of(address)["latch"] or None, 5, "it is stopped")
+            assert posted("clear", latch=latch)["success"] is True
+            for answer in (posted(VERB), called(socket, VERB)):
+                text = answer.get("message") or answer.get("text")
+                assert text == "dances" or "is not a service of this robot" in str(text), answer
+
+
+def state_of(address: str) -> dict[str, Any]:
+    with urlopen(f"{address}/api/state", timeout=10) as answer:
+        return dict(json.load(answer))
+
+
+def called(socket: Any, verb: str) -> dict[str, Any]:
+    """Call a service over the page's WebSocket, and return the answer or the refusal."""
+    socket.send(json.dumps({"call": verb, "id": verb}))
+    while True:
+        message = json.loads(socket.recv(timeout=10))
+        if message.get("answer") == verb or "refused" in message:
+            return dict(message)
+
+
+INVITE = """\
+from acsard.web.tokens import Vault, place
+Vault(place(), "acsar").invite("viewer", "tv", 30)
+"""
+
+
+def test_the_older_version_reads_the_latches_the_tokens_and_the_recording_of_the_newer_one(
+    versions: Versions, tmp_path: Path, peer: Peer
+) -> None:
+    older, newer = versions
+    with daemon_of(newer, tmp_path, port=peer.path) as daemon, Bus(daemon.endpoint) as bus:
+        until(lambda: bus.state()["link"] == "up" or None, 10, "the link is up")
+        config = ("--config", str(daemon.config))
+        env = plain_environment(XDG_STATE_HOME=str(tmp_path))
+        for words in (("call", "deactivate"), ("call", VERB), ("call", "stop")):
+            assert finish([newer.acsard, *words, *config], tmp_path, env=env).code == 0
+        invited = finish([newer.python, "-c", INVITE], tmp_path, env=env)
+        assert (invited.code, invited.err) == (0, "")
+        kept = list(tmp_path.glob("daemon.states/*.latches.json"))
+        daemon.signal(SIGTERM)
+        assert daemon.ended(5) == 0
+    text = kept[0].read_text()
+    assert LATCH_CODE in text
+    assert "later" in text
+    tokens = tmp_path / "acsard-web/tokens.json"
+    rows = json.loads(tokens.read_text())
+    assert rows[0]["later"] == 1
+    tokens.write_text(json.dumps([*rows, rows[0] | {"name": "pilot", "role": "pilot"}]))
+
+    with ThreadPoolExecutor(3) as at_once:
+        (recording,) = tmp_path.glob("daemon.recordings/*.mcap")
+        out = tmp_path / "out"
+        acts = {
+            "list": ("recording",),
+            "show": ("recording", "show", str(recording)),
+            "report": ("recording", "report", str(recording), str(out.with_suffix(".html"))),
+            "export": ("recording", "export", str(recording), str(out.with_suffix(".mcap"))),
+            "replay": ("recording", "replay", str(recording)),
+            "tokens": ("web", "--tokens"),
+        }
+        runs = {
+            name: at_once.submit(finish, [older.acsard, *words, *config], tmp_path, 40, env)
+            for name, words in acts.items()
+        }
+    ended = {name: run.result() for name, run in runs.items()}
+    assert {name: end for name, end in ended.items() if end.code} == {}
+    assert "stopped by" in ended["show"].out
+    assert f"{VERB}: dances" in ended["show"].out
+    assert "damaged" not in ended["show"].err
+    assert "tv" in ended["tokens"].out
+
+    with daemon_of(older, tmp_path, port=peer.path) as daemon, Bus(daemon.endpoint) as bus:
+        state = bus.state()
+        assert state["mode"] == "stopped"
+        assert "stopped by" in state["reason"]
+        assert LATCH_CODE in state["reason"]
+        assert "cannot be read" not in state["reason"]
+        ended_call = finish([older.acsard, "call", "clear", *config], tmp_path, env=env)
+        assert ended_call.code == 0, ended_call
+        assert bus.state()["mode"] == "inactive"
