@@ -1,0 +1,195 @@
+"""Make the Debian packages and bare roots of Debian, in which tests install them.
+
+$ACSARD_TEST_DEBS names a directory for both. What it already has is used again. The roots of arm64
+run under qemu-user-static, so their speed means nothing.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import tomllib
+import venv
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tests.system.harness import ROOT
+
+RELEASE = ROOT / "deploy" / "release"
+
+SUITES = {"12": "bookworm", "13": "trixie"}
+PYTHONS = {"12": "3.11", "13": "3.13"}
+
+NUMBER, NEWER = "0.2.0.dev1", "0.2.0.dev2"
+"""The version of the packages, and that of copies which only have another version."""
+
+BINFMT = Path("/proc/sys/fs/binfmt_misc")
+
+
+def missing_programs() -> str:
+    """Return the reason why this machine cannot make packages and roots, or ""."""
+    if os.geteuid() != 0:
+        return "not root"
+    wanted = ("mmdebstrap", "ip", "x86_64-linux-gnu-strip", "aarch64-linux-gnu-strip")
+    names = [name for name in wanted if shutil.which(name) is None]
+    return f"no {', '.join(names)}" if names else ""
+
+
+def runs_arm64() -> bool:
+    """Return whether this kernel runs programs for arm64, also in a root without qemu.
+
+    If qemu-user-static is installed but not registered, as in a container, register it.
+    """
+    entry = BINFMT / "qemu-aarch64"
+    rule = Path("/usr/lib/binfmt.d/qemu-aarch64.conf")
+    if not entry.exists() and rule.exists() and (BINFMT / "register").exists():
+        (BINFMT / "register").write_text(rule.read_text().strip())
+    return entry.exists() and "F" in entry.read_text().split("flags:")[1].splitlines()[0]
+
+
+def packages(out: Path, tools: Path) -> list[Path]:
+    """Return the four packages of this clone in the directory `out`, with the version `NUMBER`.
+
+    If it does not exist, make them with a venv of the locked tools, in the directory `tools`.
+    """
+    if not out.exists():
+        python = str(tools / "bin" / "python")
+        if not tools.exists():
+            venv.create(tools, with_pip=True)
+            _run(python, "-m", "pip", "install", "-q", "-r", str(RELEASE / "requirements.lock"))
+        with tempfile.TemporaryDirectory() as work:
+            wheel = _wheel(Path(work))
+            made = Path(tempfile.mkdtemp(dir=out.parent))
+            _run(python, str(RELEASE / "debian.py"), str(wheel), str(made))
+            made.rename(out)
+    return sorted(out.glob("*.deb"))
+
+
+def _wheel(work: Path) -> Path:
+    # Of the files that git tracks, because others are not in a release.
+    git = ["git", "-c", "safe.directory=*", "ls-files", "-z", "--cached", "--others"]
+    listed = subprocess.run(
+        [*git, "--exclude-standard"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    for name in filter(None, listed.stdout.split("\0")):
+        if (ROOT / name).is_file():
+            (work / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(ROOT / name, work / name)
+    init = work / "acsard" / "__init__.py"
+    text, _, _ = init.read_text().rpartition("__version__")
+    init.write_text(f'{text}__version__ = "{NUMBER}"\n')
+    _run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(work), str(work))
+    return next(work.glob("*.whl"))
+
+
+def package(made: Iterable[Path], debian: str, machine: str) -> Path:
+    """Return the package for a Debian release and an architecture."""
+    return next(path for path in made if path.name.endswith(f"deb{debian}_{machine}.deb"))
+
+
+def newer(package: Path, out: Path) -> Path:
+    """Write a copy of the package with the version `NEWER`, and return it."""
+    with tempfile.TemporaryDirectory() as work:
+        tree = Path(work, "tree")
+        _run("dpkg-deb", "--raw-extract", str(package), str(tree))
+        home = tree / "opt/acsard/dist"
+        (home / NUMBER).rename(home / NEWER)
+        ours = home / NEWER / "lib/acsard"
+        texts = [tree / "DEBIAN/control", tree / "DEBIAN/postinst", ours / "__init__.py"]
+        for file in (*texts, *ours.glob("__pycache__/__init__*.pyc")):
+            data = file.read_bytes()
+            for before, after in ((NUMBER, NEWER), (debian_version(NUMBER), debian_version(NEWER))):
+                data = data.replace(before.encode(), after.encode())
+            file.write_bytes(data)
+        target = out / package.name.replace(debian_version(NUMBER), debian_version(NEWER))
+        _run("dpkg-deb", "-Znone", "--root-owner-group", "--build", str(tree), str(target))
+    return target
+
+
+def debian_version(number: str) -> str:
+    """Return the version as the packages write it."""
+    return number.replace(".dev", "~dev")
+
+
+def packages_of_tests(where: Path, debian: str) -> Path:
+    """Return a directory with what the tests import besides acsard, without numpy."""
+    place = where / f"test-packages-{debian}"
+    if not place.exists():
+        project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+        extras = project["optional-dependencies"]
+        wanted = [name for name in extras["test"] if not name.startswith("acsard")]
+        words = [sys.executable, "-m", "pip", "install", "--quiet", "--target", str(place)]
+        words += ["--only-binary", ":all:", "--python-version", PYTHONS[debian]]
+        _run(*words, *wanted, *extras["foxglove"])
+        # The tests run on Debian's numpy.
+        for name in place.glob("numpy*"):
+            shutil.rmtree(name)
+    return place
+
+
+class Root:
+    """A minimal Debian without Python, in a directory, with /proc and /dev of this machine."""
+
+    def __init__(self, path: Path, debian: str) -> None:
+        self.path, self.debian = path, debian
+
+    def words(self, *words: str) -> list[str]:
+        """Return the words of a host command that runs `words` inside."""
+        variables = ["HOME=/root", "PATH=/usr/sbin:/usr/bin", "LANG=C.UTF-8", "TERM=dumb"]
+        variables += ["DEBIAN_FRONTEND=noninteractive"]
+        # The mounts end with the program, because they are in a mount namespace of its own.
+        enter = (
+            'mount -t proc proc "$0/proc" && mount --rbind /dev "$0/dev" && exec chroot "$0" "$@"'
+        )
+        words = ("env", "-i", *variables, *words)
+        return ["unshare", "--mount", "sh", "-c", enter, str(self.path), *words]
+
+    def run(self, command: str, within: float = 900.0) -> str:
+        """Run a shell command inside, and return its output. Fail if it fails."""
+        done = subprocess.run(
+            self.words("sh", "-c", command), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True, timeout=within,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{command}\n{done.stdout}"
+        return done.stdout
+
+    def files(self) -> dict[str, str]:
+        """Return each file of the root with its kind and mode, but not what changes by itself."""
+        passing = ("proc", "dev", "sys", "tmp", "run", "var/cache", "var/log", "var/lib/dpkg",
+                   "var/lib/apt", "var/lib/systemd/deb-systemd-helper-enabled")  # fmt: skip
+        found = {}
+        for directory, names, files in os.walk(self.path):
+            inside = os.path.relpath(directory, self.path)
+            names[:] = [
+                name for name in names if os.path.normpath(f"{inside}/{name}") not in passing
+            ]
+            for name in (*names, *files):
+                path = os.path.join(directory, name)
+                found[os.path.normpath(f"/{inside}/{name}")] = oct(os.lstat(path).st_mode)
+        return found
+
+
+@contextmanager
+def root(where: Path, debian: str, machine: str) -> Iterator[Root]:
+    """Provide a newly made minimal Debian with apt's lists, and remove it afterwards."""
+    suite = SUITES[debian]
+    base = where / f"{suite}-{machine}.tar"
+    if not base.exists():
+        words = ["mmdebstrap", "--quiet", "--variant=minbase", f"--architectures={machine}"]
+        # mmdebstrap removes apt's lists, which are not part of an installation by a person.
+        words += ["--skip=cleanup/apt", suite, str(base), "http://deb.debian.org/debian"]
+        _run(*words)
+    with tempfile.TemporaryDirectory(dir=where) as place:
+        _run("tar", "-xf", str(base), "-C", place)
+        os.chmod(place, 0o755)
+        shutil.copyfile("/etc/resolv.conf", Path(place, "etc/resolv.conf"))
+        yield Root(Path(place), debian)
+
+
+def _run(*words: str) -> None:
+    done = subprocess.run(words, capture_output=True, text=True, timeout=1800)
+    assert done.returncode == 0, f"{' '.join(words)}\n{done.stdout}{done.stderr}"

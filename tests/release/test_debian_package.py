@@ -1,0 +1,229 @@
+"""The Debian packages install, drive, upgrade and go in bare roots of Debian."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.release.debian_root import (
+    NEWER,
+    NUMBER,
+    SUITES,
+    Root,
+    debian_version,
+    missing_programs,
+    newer,
+    package,
+    packages,
+    packages_of_tests,
+    root,
+    runs_arm64,
+)
+from tests.system.chromium import CHROMIUM, PHONE, browsing
+from tests.system.harness import ROOT, Program, until
+from tests.system.hosts import ip, on
+from tests.systemd.container import GATEWAY, PAGE, UNIT, Container
+
+pytestmark = [
+    pytest.mark.systemd,
+    pytest.mark.nightly,
+    pytest.mark.timeout(3600),
+    pytest.mark.skipif(bool(missing_programs()), reason=missing_programs()),
+]
+
+MACHINES = ("amd64", "arm64")
+
+LIMIT_MB = 60
+
+CONFIG = "/etc/acsard/acsard.toml"
+
+
+@pytest.fixture(scope="session")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Provide the directory of the packages and of the archives of the roots."""
+    named = os.environ.get("ACSARD_TEST_DEBS")
+    where = Path(named) if named else tmp_path_factory.mktemp("debs")
+    where.mkdir(parents=True, exist_ok=True)
+    return where
+
+
+@pytest.fixture(scope="session")
+def made(place: Path) -> list[Path]:
+    """Provide the four packages."""
+    return packages(place / "packages", place / "tools")
+
+
+@pytest.fixture
+def bare(request: pytest.FixtureRequest, place: Path, made: list[Path]) -> Iterator[Root]:
+    """Provide a new root of the Debian release and the architecture that the test names.
+
+    It has the package of this version, and that of a newer one.
+    """
+    debian, machine = request.param
+    if machine == "arm64" and not runs_arm64():
+        pytest.skip("needs qemu-user-static")
+    with root(place, debian, machine) as bare:
+        deb = package(made, debian, machine)
+        shutil.copyfile(deb, bare.path / deb.name)
+        newer(deb, bare.path)
+        yield bare
+
+
+on_each = pytest.mark.parametrize(
+    "bare", [(debian, machine) for debian in SUITES for machine in MACHINES],
+    indirect=True, ids="-".join,
+)  # fmt: skip
+on_amd64 = pytest.mark.parametrize(
+    "bare", [(debian, "amd64") for debian in SUITES], indirect=True, ids="-".join
+)
+
+
+def deb(number: str) -> str:
+    """Return a shell pattern of this version's package."""
+    return f"/acsard_{debian_version(number)}-*.deb"
+
+
+@on_each
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium-headless-shell")
+def test_two_commands_lead_from_a_bare_debian_to_driving_in_a_browser(bare: Root) -> None:
+    host = f"acsard{os.getpid()}d"
+    ip("netns", "add", host)
+    try:
+        ip("-n", host, "link", "set", "lo", "up")
+        began = time.monotonic()
+        bare.run(f"apt-get install --yes {deb(NUMBER)}")
+        installed = time.monotonic()
+        daemon = Program(bare.words("acsard", "run", "--port", "sim"), "/")
+        with on(host, daemon), browsing(host) as browser:
+            daemon.says("page is ready", within=300.0)
+            browser.size(*PHONE)
+            browser.open("http://localhost:8080")
+            until(lambda: "READY" in browser.text("mode"), 60.0, "the page shows the robot")
+            browser.hold(lambda: "DRIVING" in browser.text("mode"))
+            print(
+                f"{installed - began:.0f} s to install, {time.monotonic() - began:.0f} s to drive"
+            )
+            browser.lift()
+    finally:
+        ip("netns", "delete", host, check=False)
+
+
+@on_each
+def test_it_takes_60_mb_and_every_module_imports(bare: Root) -> None:
+    bare.run(f"apt-get install --yes --no-install-recommends {deb(NUMBER)}")
+    files = bare.run("dpkg-query --listfiles acsard").splitlines()
+    paths = [bare.path / name.lstrip("/") for name in files]
+    paths += bare.path.glob("opt/acsard/[0-9]*/**/*")
+    inodes = {path.lstat().st_ino: path.lstat().st_size for path in paths if not path.is_dir()}
+    # The hard links in dist/ and beside it are one file.
+    size_mb = sum(inodes.values()) / 1e6
+    print(f"{size_mb:.1f} MB")
+    assert size_mb <= LIMIT_MB
+    bare.run("apt-get install --yes --no-install-recommends python3-numpy")
+    code = (
+        "import importlib, pkgutil, acsard\n"
+        "for module in pkgutil.walk_packages(acsard.__path__, 'acsard.'):\n"
+        "    if not module.name.startswith(('acsard.foxglove', 'acsard.__main__')):\n"
+        "        importlib.import_module(module.name)\n"
+        "import aiohttp.web, cryptography.x509, zstandard, lz4.frame, mcap.reader, zenoh\n"
+        "assert zstandard.decompress(zstandard.compress(b'a')) == b'a'\n"
+        "assert lz4.frame.decompress(lz4.frame.compress(b'a')) == b'a'\n"
+        "print('all')\n"
+    )
+    (bare.path / "imports.py").write_text(code)
+    python = "PYTHONPATH=/opt/acsard/current/lib python3 -P"
+    assert bare.run(f"{python} /imports.py") == "all\n"
+    assert "sudo apt install python3-numpy" not in bare.run("acsard calibrate --help")
+
+
+@on_amd64
+def test_the_unit_tests_pass_on_the_installed_files(bare: Root, place: Path) -> None:
+    bare.run(f"apt-get install --yes {deb(NUMBER)} git")
+    packages = packages_of_tests(place, bare.debian)
+    shutil.copytree(packages, bare.path / "packages")
+    for name in ("tests", "deploy", "README.md", "pyproject.toml", "acsard.toml"):
+        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copyfile
+        (bare.path / "clone").mkdir(exist_ok=True)
+        copy(ROOT / name, bare.path / "clone" / name)
+    # Some tests read the source.
+    (bare.path / "clone/acsard").symlink_to("/opt/acsard/current/lib/acsard")
+    told = bare.run(
+        "cd /clone && PYTHONPATH=/opt/acsard/current/lib:/packages python3 -P -m pytest "
+        "--import-mode=append -p no:cacheprovider -q -n 2 --timeout 600 tests/unit",
+        within=3000.0,
+    )
+    assert " passed" in told.splitlines()[-1]
+    print(told.splitlines()[-1])
+
+
+@on_amd64
+def test_an_upgrade_switches_nothing_and_purge_leaves_nothing(bare: Root) -> None:
+    apt = "apt-get install --yes --no-install-recommends"
+    bare.run(f"{apt} python3")
+    before = bare.files()
+    bare.run(f"{apt} {deb(NUMBER)}")
+    config = bare.path / CONFIG.lstrip("/")
+    assert 'port = "/dev/acsar"' in config.read_text()
+    config.write_text("# mine\n")
+
+    bare.run(f"{apt} {deb(NEWER)}")
+    assert os.readlink(bare.path / "opt/acsard/current") == NUMBER
+    assert NUMBER in bare.run("acsard --version")
+    assert NEWER in bare.run(f"/opt/acsard/{NEWER}/bin/acsard --version")
+    assert config.read_text() == "# mine\n"
+    assert sorted(os.listdir(bare.path / "opt/acsard/dist")) == [NEWER]
+
+    bare.run("apt-get remove --yes acsard")
+    assert not (bare.path / "opt/acsard").exists()
+    assert config.read_text() == "# mine\n"
+    bare.run(f"{apt} {deb(NEWER)}")
+    assert os.readlink(bare.path / "opt/acsard/current") == NEWER
+    assert config.read_text() == "# mine\n"
+
+    bare.run("apt-get purge --yes acsard")
+    assert bare.files() == before
+
+
+def test_the_same_source_gives_the_same_bytes(
+    made: list[Path], place: Path, tmp_path: Path
+) -> None:
+    again = packages(tmp_path / "again", place / "tools")
+    assert [path.name for path in made] == [path.name for path in again]
+    for one, other in zip(made, again, strict=True):
+        assert one.read_bytes() == other.read_bytes(), one.name
+
+
+def test_the_first_installation_starts_the_service_and_no_upgrade_restarts_it(
+    made: list[Path], place: Path, tmp_path: Path
+) -> None:
+    with root(place, "12", "amd64") as bare:
+        bare.run("apt-get install --yes --no-install-recommends systemd-sysv dbus udev python3")
+        first = package(made, "12", "amd64")
+        shutil.copyfile(first, bare.path / first.name)
+        second = newer(first, bare.path)
+        with Container(bare.path, tmp_path, "acsard-deb") as container:
+            done = container.run("dpkg", "--install", f"/{first.name}")
+            assert done.code == 0, done.err
+            for unit in (UNIT, GATEWAY, PAGE):
+                assert container.run("systemctl", "is-enabled", unit).out == "enabled\n"
+                assert container.show("ActiveState", unit) == "active"
+            daemon = container.main_pid()
+            done = container.run("dpkg", "--install", f"/{second.name}")
+            assert done.code == 0, done.err
+            assert container.main_pid() == daemon
+            assert NUMBER in container.run("acsard", "--version").out
+
+            container.run("systemctl", "stop", PAGE, GATEWAY, UNIT)
+            container.run("dpkg", "--install", f"/{second.name}")
+            assert container.show("ActiveState") == "inactive"
+
+            container.run("systemctl", "start", UNIT)
+            done = container.run("dpkg", "--purge", "acsard")
+            assert done.code == 0, done.err
+            left = container.run("find", "/", "-xdev", "-name", "*acsa*", "-not", "-name", "*.deb")
+            print(left.out)
