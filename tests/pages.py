@@ -126,6 +126,11 @@ TRANSCRIPT = Elsewhere(
     "tests/unit/cli/test_transcripts.py", "test_each_command_prints_what_its_transcript_says"
 )
 UPGRADE = "tests/systemd/test_upgrade.py"
+PACKAGE = "tests/release/test_debian_package.py"
+TWO_COMMANDS = Elsewhere(
+    PACKAGE, "test_two_commands_lead_from_a_bare_debian_to_driving_in_a_browser"
+)
+PACKAGING = Elsewhere(PACKAGE, "test_the_same_source_gives_the_same_bytes")
 SERVICE, OPEN = "tests/systemd/test_service.py", "tests/systemd/test_web.py"
 WEB = "tests/system/test_web_strangers.py"
 SIMULATED = "tests/system/test_simulated.py"
@@ -200,6 +205,25 @@ _ROUTERS = _ROUTER.replace("robot1", "robot1,robot2")
 _RMW_ROUTER = """ZENOH_CONFIG_OVERRIDE='listen/endpoints=["tcp/127.0.0.1:7447"]'"""
 
 COMMANDS: dict[str, How] = {
+    "sudo apt install mmdebstrap binutils binutils-aarch64-linux-gnu debian-archive-keyring": (
+        UntestedCommand("the test says which of these packages is missing")
+    ),
+    "python3 -m venv tools": PACKAGING,
+    "tools/bin/pip install -r deploy/release/requirements.lock": PACKAGING,
+    "tools/bin/python deploy/release/debian.py acsard-0.2.0-py3-none-any.whl packages": PACKAGING,
+    "sudo ACSARD_TEST_DEBS=/var/tmp/debs .venv/bin/pytest -n 0 -s -m systemd "
+    "tests/release/test_debian_package.py": PACKAGING,
+    "lintian packages/*.deb": UntestedCommand("lintian differs between releases of Debian"),
+    "sudo piuparts --distribution bookworm packages/acsard_*deb12_amd64.deb": Elsewhere(
+        PACKAGE,
+        "test_an_upgrade_switches_nothing_and_purge_leaves_nothing",
+        but="piuparts was typed by hand; the test compares the same lists of files",
+    ),
+    "sudo apt install ./acsard_0.2.0-1~deb12_arm64.deb": TWO_COMMANDS,
+    "acsard run --port sim": TWO_COMMANDS,
+    "sudo systemctl disable --now acsard acsard-web acsard-gateway": Elsewhere(
+        PACKAGE, "test_the_first_installation_starts_the_service_and_no_upgrade_restarts_it"
+    ),
     # README.md
     "python3 -m venv .venv && .venv/bin/pip install '.[tools]' && .venv/bin/acsard run": FIRST,
     "python3 -m venv .venv && .venv/bin/pip install -e '.[test]' && .venv/bin/pytest": InCi(

@@ -49,8 +49,8 @@ def at(block: Block) -> str:
 
 
 def test_each_part_has_a_page_in_its_own_directory() -> None:
-    parts = ("calibration", "clients", "firmware", "foxglove", "ros2", "systemd", "web", "zenoh")
-    beside = {f"deploy/{part}/README.md" for part in parts}
+    parts = ("calibration", "clients", "firmware", "foxglove", "release", "ros2", "systemd", "web")
+    beside = {f"deploy/{part}/README.md" for part in (*parts, "zenoh")}
     assert set(PAGES) == {
         "README.md",
         "acsard/README.md",
