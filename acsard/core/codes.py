@@ -12,6 +12,7 @@ import re
 from typing import Literal, get_args
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 # Conditions that a command source waits for (`values.Wait`)
 WaitCode = Literal[
@@ -145,15 +146,18 @@ driver_fault
 impossible_speeds
     the board reports impossible speeds ({cause})
 wheel_dead
-    {wheel} wheel does not turn, or its encoder is dead: check cable, motor and encoder, and for
-    motor d also the setting mcu.trailing_comma {figures}
+    {wheel} wheel does not turn, or its encoder is dead {figures}:
+    -> check cable, motor and encoder, and for motor d also the setting mcu.trailing_comma
 wheel_reversed
-    {wheel} wheel turns against its command: check the leads of its motor, the wires A and B of its
-    encoder, and the wheel's sign in mcu.wheels {figures}
+    {wheel} wheel turns against its command {figures}:
+    -> check the leads of its motor, the wires A and B of its encoder, and the wheel's sign in
+    mcu.wheels
 wheel_runaway
-    {wheel} wheel turns faster than commanded: check the motor driver and the encoder {figures}
+    {wheel} wheel turns faster than commanded {figures}:
+    -> check the motor driver and the encoder
 wheel_stuck
-    {wheel} wheel reports a speed that never changes: its encoder is stuck {figures}
+    {wheel} wheel reports a speed that never changes, so its encoder is stuck {figures}:
+    -> check the encoder and its cable
 guard_line_damaged
     the daemon's guard replaced a line for the board with zeros: the line is not complete, or does
     not have four wheel speeds
@@ -337,4 +341,4 @@ def received_text(code: str, text: str) -> str:
 
 def joined(why: Reason) -> Reason:
     """Return a reason with its advice at the end of its text."""
-    return Reason(why.code, f"{why.text} {why.advice}") if why.advice else why
+    return replace(why, text=f"{why.text} {why.advice}", advice="") if why.advice else why

@@ -302,7 +302,7 @@ def first_run(host: Host) -> None:
     host.note(
         "damaged board",
         "^wheel fault: .*front_left wheel is left out .* check its encoder",
-        "^fault: front_left wheel turns against its command: check the leads of its motor",
+        "^fault: front_left wheel turns against its command .*: check the leads of its motor",
         "^mode: driving -> fault: front_left wheel",
         after=0.3,
     )

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from acsard.core.codes import Reason, reason
+from acsard.core.codes import Reason, joined, reason
 from acsard.core.config.motion_rules import MIN_EVIDENCE_LINES
 from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.codec import Motors
@@ -158,7 +158,8 @@ class _Side:
                     wheel, command = self.wheels[i], self.expected.commanded
                     name = WHEELS[wheel]
                     figures = f"(commanded {command:.1f}, measured {speeds[wheel]:.1f} rad/s)"
-                    return reason(WITNESS_CODES[kind], part=name, wheel=name, figures=figures)
+                    code = WITNESS_CODES[kind]
+                    return joined(reason(code, part=name, wheel=name, figures=figures))
         return None
 
     def agree(self, dt: float) -> None:
