@@ -15,9 +15,11 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import msgspec
 from msgspec import Struct
+from msgspec.structs import asdict
 
 from acsard.core.values import ROLES, Role
 from acsard.host.atomic_file import replace
@@ -142,9 +144,13 @@ class Vault:
             handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX)
-                tokens = self._load_tokens()
+                data = self._load()
+                tokens = self._decoded(data)
                 yield tokens
-                self._write(tokens)
+                # A field that only a later version knows may limit its token, so it is kept.
+                stored = {row["digest"]: row for row in msgspec.json.decode(data)}
+                rows = [stored.get(token.digest, {}) | asdict(token) for token in tokens]
+                self._write(rows)
             finally:
                 os.close(handle)
         except PermissionError:
@@ -154,23 +160,27 @@ class Vault:
         except OSError as error:
             raise MendableError(f"cannot write {self.path}: {error.strerror}") from None
 
-    def _load_tokens(self) -> list[Token]:
+    def _load(self) -> bytes:
         try:
-            return msgspec.json.decode(self.path.read_bytes(), type=list[Token])
+            return self.path.read_bytes()
         except FileNotFoundError:
-            return []
+            return b"[]"
+
+    def _decoded(self, data: bytes) -> list[Token]:
+        try:
+            return msgspec.json.decode(data, type=list[Token])
         except MSGSPEC_ERRORS as error:
             raise UsageError(
                 f"{self.path} is not a list of tokens ({error}): correct it, or move it away "
                 "and invite all users again"
             ) from None
 
-    def _write(self, tokens: list[Token]) -> None:
+    def _write(self, rows: list[dict[str, Any]]) -> None:
         # If root writes the file, give it to the directory's owner, because the service reads it as
         # its own user.
         directory = self.path.parent.stat()
         owner = (directory.st_uid, directory.st_gid) if os.geteuid() == 0 else None
-        replace(self.path, msgspec.json.encode(tokens), mode=0o600, owner=owner)
+        replace(self.path, msgspec.json.encode(rows), mode=0o600, owner=owner)
 
 
 def place() -> Path:
