@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 import pytest
 import zenoh
+from msgspec import structs
 
 from acsard import client
 from acsard.client import AcsardError, Client, NoAnswerError, asynchronous, driving
@@ -29,6 +30,7 @@ from acsard.core.messages.schema import Header, Imu, Quaternion, Time, Vector3
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import NS_PER_S, REST, Command
 from acsard.host import clock
+from acsard.host.errors import ReplyError
 from tests.each import each
 
 RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
@@ -332,6 +334,36 @@ def test_a_stop_is_sent_whatever_the_size_of_its_payload(session: Session) -> No
     session.close()
     with pytest.raises(NoAnswerError):
         client_of(session).request("stop", {"why": "x" * (MAX_COMMAND_BYTES + 1)})
+
+
+@pytest.mark.parametrize("offered", [["latch"], ["numbers"]])
+def test_a_release_names_the_latch_only_if_the_daemon_offers_this_field(
+    session: Session, monkeypatch: pytest.MonkeyPatch, offered: list[str]
+) -> None:
+    ours, sent = client_of(session), list[object]()
+    answers = {
+        "info": structs.replace(INFO, services={"clear": offered}),
+        "state": SimpleNamespace(latch=7),
+    }
+    monkeypatch.setattr(ours, "get", answers.get)
+    monkeypatch.setattr(ours, "request", lambda service, fields: sent.append(dict(fields)))
+    ours.call("clear")
+    ours.call("clear", latch=3)
+    assert sent == [{"latch": 7} if offered == ["latch"] else {}, {"latch": 3}]
+
+
+def test_over_tls_a_service_that_the_robot_does_not_have_is_refused_with_those_that_it_has(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours = client_of(session)
+    ours.where = ours.where._replace(tls="certificates")
+    info = structs.replace(INFO, services={"stop": [], "dance": []})
+    monkeypatch.setattr(ours, "whoami", lambda: ClientIdentity("viewer", "anna", "anna/1"))
+    monkeypatch.setattr(ours, "get", {"info": info}.get)
+    with pytest.raises(ReplyError, match="'danc' is not a service of this robot; did you mean dan"):
+        ours.request("danc", {})
+    with pytest.raises(client.NotPermittedError):
+        ours.request("dance", {})
 
 
 @pytest.mark.parametrize("names_role", [False, True])
