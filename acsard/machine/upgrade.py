@@ -76,9 +76,12 @@ def _from_package(file: Path) -> str:
     _ran((*installing, *options, str(file.absolute())), COPY_TIMEOUT_S)
     listed = _ran(("dpkg-query", "--listfiles", name), 60.0)
     found = re.search(rf"(?m)^{versions.HOME / versions.PACKAGE}/([^/\n]+)$", listed)
-    if found is None or found[1] not in versions.installed():
-        raise MendableError(f"{file} was installed, but has no version of acsard; build it again")
-    return found[1]
+    packaged = versions.HOME / versions.PACKAGE / (found[1] if found else "")
+    # The package adds a number to the version if another build has this name.
+    for version in versions.installed():
+        if found and versions.same(packaged, versions.HOME / version):
+            return version
+    raise MendableError(f"{file} was installed, but has no version of acsard; build it again")
 
 
 def _ran(words: tuple[str, ...], within_s: Seconds) -> str:

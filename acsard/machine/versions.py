@@ -180,7 +180,7 @@ def copy(home: Path = HOME) -> str:
                 os.rename(place, there)
                 sync(home)
                 return name
-            if _same(place, there):
+            if same(place, there):
                 return name
         raise AssertionError  # the names do not end
     except OSError as error:
@@ -285,7 +285,8 @@ def _require_start(place: Path) -> None:
         )
 
 
-def _same(one: Path, other: Path) -> bool:
+def same(one: Path, other: Path) -> bool:
+    """Return whether two versions have the same content, except bytecode."""
     files = [_files(tree) for tree in (one, other)]
     return files[0] == files[1] and all(cmp(one / name, other / name) for name in files[0])
 
