@@ -7,6 +7,7 @@ new version stays in use.
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import time
@@ -133,7 +134,6 @@ class UnitState(Struct, frozen=True, rename="pascal"):
 
     active_state: str
     n_restarts: int
-    exec_main_status: int
     pid: int = field(name="MainPID")
 
     @property
@@ -154,8 +154,9 @@ def configuration_file(pid: int) -> Path:
         environment = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
     except OSError:
         environment = []
-    named = [word[15:].decode() for word in environment if word.startswith(b"ACSARD_CONFIG=")]
-    return Path(named[0]) if named else service.CONFIG_DIRECTORY / "acsard.toml"
+    variable = b"ACSARD_CONFIG="
+    named = [word.removeprefix(variable) for word in environment if word.startswith(variable)]
+    return Path(os.fsdecode(named[0])) if named else service.CONFIG_DIRECTORY / "acsard.toml"
 
 
 def _address(file: Path) -> Address:
@@ -263,7 +264,7 @@ def watch(address: Address, before: Look | None, running: list[str], watch_s: Se
         for unit in running:
             state = unit_state(unit)
             if state.n_restarts or state.active_state == "failed":
-                return f"does not keep {unit} running (last exit code {state.exec_main_status})"
+                return f"does not keep {unit} running"
             if state.active_state == "inactive" and unit == UNIT:
                 raise MendableError(
                     f"another program stopped {unit}, so the new version was not watched to the "
@@ -272,11 +273,11 @@ def watch(address: Address, before: Look | None, running: list[str], watch_s: Se
             if over and state.active_state != "active":
                 return f"has not started {unit} within {watch_s:g} s"
         if over:
-            return _unlike(before, look(address))
+            return worse(before, look(address))
         time.sleep(0.5)
 
 
-def _unlike(before: Look | None, after: Look | None) -> str:
+def worse(before: Look | None, after: Look | None) -> str:
     if after is None:
         return "runs, but does not answer on the bus"
     if before is None:

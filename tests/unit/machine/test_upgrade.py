@@ -1,0 +1,95 @@
+"""Tests of when a robot stands, and of when a new version is worse than the one before it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from acsard.host.errors import MendableError
+from acsard.machine.upgrade import Look, UnitState, configuration_file, prepare, worse
+from tests.unit.top.screens import STATE
+
+
+def seen(
+    link: str = "up",
+    wheels: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0),
+    missed: int = 0,
+    commanded: bool = False,
+) -> Look:
+    """Return what a daemon answers that has sent 3,000 lines."""
+    counters = {"lines_sent": 3000} | ({"missed_periods": missed} if missed else {})
+    state = msgspec.structs.replace(STATE, link=link, wheels=[*wheels], counters=counters)
+    return Look(state, commanded)
+
+
+@pytest.mark.parametrize(
+    ("look", "stands"),
+    [
+        (seen(), True),
+        (seen(wheels=()), True),
+        (seen(wheels=(0.0, 0.0, -0.2, 0.0)), False),
+        (seen(commanded=True), False),
+    ],
+)
+def test_a_robot_stands_if_no_wheel_turns_and_no_speed_is_sent(look: Look, stands: bool) -> None:
+    assert look.stands is stands
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "why"),
+    [
+        (seen(), seen(), ""),
+        (seen(), None, "does not answer"),
+        (None, seen("down"), ""),
+        (seen(), seen("stale"), "no link"),
+        (seen("down"), seen("down"), ""),
+        (seen(), seen(missed=30), ""),
+        (seen(), seen(missed=31), "missed 31 control periods"),
+        (seen(missed=40), seen(missed=40), ""),
+        (seen(missed=40), seen(missed=41), "missed 41 control periods"),
+    ],
+)
+def test_a_version_is_worse_without_the_link_or_with_more_missed_periods(
+    before: Look | None, after: Look | None, why: str
+) -> None:
+    found = worse(before, after)
+    assert why in found
+    assert bool(found) is bool(why)
+
+
+@pytest.mark.parametrize(
+    ("state", "runs"),
+    [("active", True), ("activating", True), ("inactive", False), ("failed", False)],
+)
+def test_a_unit_that_is_restarted_again_and_again_counts_as_running(state: str, runs: bool) -> None:
+    assert UnitState(state, 0, 0).runs is runs
+
+
+def test_the_configuration_file_is_the_one_that_the_daemon_s_environment_names() -> None:
+    assert configuration_file(0) == Path("/etc/acsard/acsard.toml")
+    environment = os.environ | {"ACSARD_CONFIG": "/srv/robot.toml"}
+    words = [sys.executable, "-c", "input()"]
+    with subprocess.Popen(words, env=environment, stdin=subprocess.PIPE) as daemon:
+        assert configuration_file(daemon.pid) == Path("/srv/robot.toml")
+        daemon.communicate(b"\n", 10.0)
+
+
+def test_only_a_package_or_an_environment_is_a_new_version(tmp_path: Path) -> None:
+    with pytest.raises(MendableError, match=r"neither a \.deb nor an environment"):
+        prepare(tmp_path)
+    (tmp_path / "x.deb").write_text("no package")
+    with pytest.raises(MendableError, match="dpkg-deb"):
+        prepare(tmp_path / "x.deb")
+
+
+def test_an_environment_whose_program_cannot_copy_itself_is_refused(tmp_path: Path) -> None:
+    python = tmp_path / "bin" / "python"
+    python.parent.mkdir()
+    python.symlink_to("/usr/bin/false")
+    with pytest.raises(MendableError, match=r"acsard\.machine\.versions: ended with exit code 1"):
+        prepare(tmp_path)
