@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator
+from glob import glob
 from pathlib import Path
 from typing import NamedTuple
 
@@ -581,4 +582,9 @@ def promises() -> list[list[str]]:
         cell = row.rstrip(" |").rpartition(" | ")[2]
         spans += [span for span in re.findall(r"`([^`]+)`", cell) if "tests/" in span]
     spans += [c.removeprefix(".venv/bin/pytest") for c, how in COMMANDS.items() if how == PYTEST]
-    return [shlex.split(span) for span in spans]
+    return [_expanded(shlex.split(span)) for span in spans]
+
+
+def _expanded(words: list[str]) -> list[str]:
+    # As a shell does it.
+    return [name for word in words for name in sorted(glob(word, root_dir=ROOT)) or [word]]
