@@ -172,7 +172,7 @@ class Admission:
         except TimeoutError:
             return problem(503, "the disk of this page's server does not answer: try again")
         except TroubleError as trouble:
-            return problem(trouble.status, str(trouble))
+            return problem(trouble.status, str(trouble), trouble.detail)
         except web.HTTPException as error:
             if error.status < 400:
                 raise

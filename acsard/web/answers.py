@@ -56,17 +56,17 @@ POLICY = (
 class TroubleError(AcsardError):
     """A permitted request cannot be fulfilled now. `status` is the HTTP status of the answer."""
 
-    def __init__(self, status: int, text: str) -> None:
+    def __init__(self, status: int, text: str, detail: str = "") -> None:
         super().__init__(text)
-        self.status = status
+        self.status, self.detail = status, detail
 
 
 def reply(body: object, status: int = 200) -> web.Response:
     return web.Response(body=msgspec.json.encode(body), content_type=JSON, status=status)
 
 
-def problem(status: int, text: str) -> web.Response:
-    return reply(Problem(text), status)
+def problem(status: int, text: str, detail: str = "") -> web.Response:
+    return reply(Problem(text, detail), status)
 
 
 def file_answer(request: web.Request, file: File) -> web.Response:

@@ -100,7 +100,7 @@ class Camera:
         # None after a failure, and 5 s after a client's last request
         self.newest: Picture | None = None
         self._number = 0
-        self._trouble = "the camera's stream has no picture yet"
+        self._trouble = ("the camera's stream has no picture yet", "")  # and its detail
         self._asked_ns = 0
         self._changed, self._sent = asyncio.Event(), asyncio.Event()
         self._sends = Places(SENDS, SENDS_OF_TOKEN)
@@ -114,7 +114,8 @@ class Camera:
         if not self._url:
             raise TroubleError(
                 404,
-                "no camera is configured: to show one, set web.camera to the address of its stream",
+                "no camera is configured",
+                "to show one, set web.camera to the address of its stream",
             )
         self._asked_ns = clock.steady_ns()
         if self._reading is None or self._reading.done():
@@ -125,7 +126,7 @@ class Camera:
                     await self._changed.wait()
         newest = self.newest
         if newest is None:
-            raise TroubleError(503, self._trouble)
+            raise TroubleError(503, *self._trouble)
         return None if newest.number == number else newest
 
     @asynccontextmanager
@@ -140,7 +141,7 @@ class Camera:
                     await self._sent.wait()
         except TimeoutError:
             text = f"{SENDS_OF_TOKEN} pictures with this token, or {SENDS} in total, are being sent"
-            raise TroubleError(503, f"{text}: ask again when one of them has arrived") from None
+            raise TroubleError(503, text, "ask again when one of them has arrived") from None
         try:
             yield
         finally:
@@ -159,7 +160,8 @@ class Camera:
                 try:
                     await self._read(session)
                 except (aiohttp.ClientError, TimeoutError, OSError, ValueError) as error:
-                    self._trouble = f"the camera's stream cannot be read: {error or 'no answer'}"
+                    detail = str(error) or "no answer"
+                    self._trouble = ("the camera's stream cannot be read", detail)
                     self.newest = None  # clients get the reason instead of an old picture
                 await asyncio.sleep(0.5)
         self.newest = None  # the next client must not get this old picture

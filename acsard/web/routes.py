@@ -39,10 +39,11 @@ PARAMETERS = {"type": "[A-Za-z0-9_]{1,80}", "verb": SERVICE_NAME.pattern}
 _PARAMETER = re.compile(r"{(\w+)}")
 
 
-class Problem(Struct, frozen=True):
+class Problem(Struct, frozen=True, omit_defaults=True):
     """Why a request was not fulfilled, in words."""
 
     error: str
+    detail: str = ""  # for the person who sets up the robot, if it is more than a user needs
 
 
 class Body(Struct, frozen=True):

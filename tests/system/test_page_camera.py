@@ -177,7 +177,10 @@ def test_a_robot_without_a_camera_says_which_setting_names_one(tmp_path: Path) -
     async def story(url: str) -> None:
         async with aiohttp.ClientSession() as session, session.get(f"{url}/api/camera") as response:
             assert response.status == 404
-            assert "web.camera" in (await response.json())["error"]
+            assert await response.json() == {
+                "error": "no camera is configured",
+                "detail": "to show one, set web.camera to the address of its stream",
+            }
 
     with Daemon(tmp_path) as daemon, Page(daemon, tmp_path) as server:
         asyncio.run(story(server.here))
@@ -189,9 +192,9 @@ def test_a_stream_that_cannot_be_read_is_named_with_the_reason(tmp_path: Path) -
     async def story(url: str) -> None:
         async with aiohttp.ClientSession() as session, session.get(f"{url}/api/camera") as response:
             assert response.status == 503
-            error = (await response.json())["error"]
-            assert "the camera's stream cannot be read" in error
-            assert port in error
+            problem = await response.json()
+            assert problem["error"] == "the camera's stream cannot be read"
+            assert port in problem["detail"]
 
     config = {"web": {"camera": f"http://127.0.0.1:{port}/stream"}}
     with Daemon(tmp_path, config=config) as daemon, Page(daemon, tmp_path) as server:

@@ -62,8 +62,8 @@ export class Camera {
       const headers = this.#tag ? { "If-None-Match": this.#tag } : {};
       const answer = await fetch("api/camera", { headers, cache: "no-store", signal: expiring(5000) });
       if (answer.status === 304) return "";
-      // The text behind the colon is for the person who sets up the camera, who can request api/camera.
-      if (!answer.ok) return (await answer.json()).error?.split(":")[0] ?? `${answer.status}`;
+      // The answer's `detail` is for the person who sets up the camera, who can request api/camera.
+      if (!answer.ok) return (await answer.json()).error ?? `${answer.status}`;
       // The time for which the request traveled is unknown and counts as 0, so the shown age is never too low.
       const held = Number(answer.headers.get("Waited-Ms")) - Number(answer.headers.get("Age-Ms"));
       const picture = await createImageBitmap(await answer.blob());
