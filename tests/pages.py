@@ -149,7 +149,7 @@ PLACES = Elsewhere(
 )
 PYTEST = Collected()
 FIRST = Elsewhere(HERE, "test_the_first_command_of_the_readme_installs_it_and_the_robot_is_up")
-DOWNLOADED = UntestedCommand("downloads 44 MB; typed by hand, the venv then runs acsard")
+BY_UV = UntestedCommand("needs uv and the files of a release; typed by hand, it runs acsard")
 VENV = Elsewhere(HERE, "test_the_service_s_venv_has_all_that_lan_and_service_need")
 AUTHORITY = Elsewhere(
     HERE, "test_the_install_line_of_the_fleet_page_suffices_to_make_its_authority"
@@ -250,7 +250,7 @@ COMMANDS: dict[str, How] = {
     "acsard run": FIRST,
     "acsard sim --link ./mcu": CABLE,
     "acsard run --port ./mcu": CABLE,
-    "cp acsard.toml robot.toml": Run(),
+    "acsard check > robot.toml": Run(),
     "export ACSARD_CONFIG=$PWD/robot.toml": Run(),
     "acsard mcu check --port DEVICE --write": Elsewhere(
         "tests/system/test_mcu.py",
@@ -478,10 +478,8 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/pip install --no-deps --no-build-isolation .": VENV,
     "sudo .venv/bin/acsard service install": INSTALLED,
     "git pull && .venv/bin/pip install '.[tools]'": UntestedCommand("needs a newer commit"),
-    "python3 -m pip download -r deploy/systemd/requirements.lock -d wheels": DOWNLOADED,
-    ".venv/bin/pip install --no-index --find-links wheels -r "
-    "deploy/systemd/requirements.lock": DOWNLOADED,
-    ".venv/bin/pip install --no-index --no-deps --no-build-isolation .": DOWNLOADED,
+    "uv tool install -c constraints.txt './acsard-0.2.0-py3-none-any.whl[tools]'": BY_UV,
+    "sudo ~/.local/bin/acsard service install": INSTALLED._replace(but="from a venv"),
     "sudo systemctl restart acsard": OPENED,
     "sudo acsard service upgrade .venv": Elsewhere(
         UPGRADE, "test_an_environment_is_upgraded_to_by_its_directory"
