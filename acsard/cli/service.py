@@ -156,7 +156,11 @@ def main_status(args: argparse.Namespace) -> int:
     print(f"version in use: {used or 'none'}")
     if newer := versions.unused():
         print(f"version {newer} is installed, but not in use")
-    show(table((file.condition(), str(file.path)) for file in service.files()))
+    conditions = [(file.condition(), str(file.path)) for file in service.files()]
+    if (versions.HOME / versions.PACKAGE).exists():
+        # The package has its units and rules in /usr/lib, and `dpkg --verify acsard` checks them.
+        conditions = [row for row in conditions if row[0] != "missing"]
+    show(table(conditions))
     state = service.state(service.UNIT)
     print(state or "systemd does not answer: check that this machine runs systemd")
     if state:

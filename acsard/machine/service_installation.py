@@ -205,7 +205,10 @@ UNIT, GATEWAY, PAGE = "acsard.service", "acsard-gateway.service", "acsard-web.se
 ALL_UNITS = (UNIT, GATEWAY, PAGE)
 # Removed when they become empty.
 OWN_DIRECTORIES = ("acsard", *(f"{unit}.d" for unit in ALL_UNITS))
-UNIT_DIRECTORY = Path("/etc/systemd/system")
+UNIT_DIRECTORY, PACKAGE_UNIT_DIRECTORY = (
+    Path("/etc/systemd/system"),
+    Path("/usr/lib/systemd/system"),
+)
 RULES = Path("/etc/udev/rules.d/70-acsar.rules")
 CONFIG_DIRECTORY = Path("/etc/acsard")
 LAN_DROP_IN = "lan.conf"
@@ -281,7 +284,8 @@ def admitting(directory: Path) -> Write | Keep | None:
     Its drop-in permits more than loopback, and root's files. Of an existing one only the paths
     change: the user may have restricted the networks. Return None without the service or root.
     """
-    if os.geteuid() != 0 or not (UNIT_DIRECTORY / GATEWAY).exists():
+    units = [place / GATEWAY for place in (UNIT_DIRECTORY, PACKAGE_UNIT_DIRECTORY)]
+    if os.geteuid() != 0 or not any(unit.exists() for unit in units):
         return None
     file = lan_drop_in(GATEWAY)
     return admitted(file, file.current_content(), directory)
