@@ -135,6 +135,7 @@ class UnitState(Struct, frozen=True, rename="pascal"):
     active_state: str
     n_restarts: int
     pid: int = field(name="MainPID")
+    job: str = ""  # systemd is about to stop or start it
 
     @property
     def runs(self) -> bool:
@@ -265,7 +266,7 @@ def watch(address: Address, before: Look | None, running: list[str], watch_s: Se
             state = unit_state(unit)
             if state.n_restarts or state.active_state == "failed":
                 return f"does not keep {unit} running"
-            if state.active_state == "inactive" and unit == UNIT:
+            if state.active_state == "inactive" and not state.job and unit == UNIT:
                 raise MendableError(
                     f"another program stopped {unit}, so the new version was not watched to the "
                     "end, and stays in use; `sudo acsard service rollback` goes back"
