@@ -34,6 +34,9 @@ from acsard.machine.daemon_findings import (
 from acsard.machine.finding import Finding, Level
 from acsard.machine.serial_ports import BOARDS, serial_devices
 
+# Of `service install`, and of the Debian package.
+UDEV_RULES = ("/etc/udev/rules.d/70-acsar.rules", "/usr/lib/udev/rules.d/70-acsar.rules")
+
 
 def port_grabbers() -> Iterator[Finding]:
     """Yield findings about programs that take over serial ports or send data to them."""
@@ -43,7 +46,7 @@ def port_grabbers() -> Iterator[Finding]:
             "serial ports of CH340 and FTDI chips"
         )
         yield Finding("brltty", "failure", "the program brltty is running", mend)
-    if is_running("ModemManager") and not Path("/etc/udev/rules.d/70-acsar.rules").is_file():
+    if is_running("ModemManager") and not any(map(os.path.isfile, UDEV_RULES)):
         mend = "install deploy/udev/70-acsar.rules (`acsard service install` does that)"
         yield Finding(
             "ModemManager",

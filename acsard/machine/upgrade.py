@@ -77,12 +77,17 @@ def _from_package(file: Path) -> str:
     _ran((*installing, *options, str(file.absolute())), COPY_TIMEOUT_S)
     listed = _ran(("dpkg-query", "--listfiles", name), 60.0)
     found = re.search(rf"(?m)^{versions.HOME / versions.PACKAGE}/([^/\n]+)$", listed)
-    packaged = versions.HOME / versions.PACKAGE / (found[1] if found else "")
-    # The package adds a number to the version if another build has this name.
-    for version in versions.installed():
-        if found and versions.same(packaged, versions.HOME / version):
-            return version
-    raise MendableError(f"{file} was installed, but has no version of acsard; build it again")
+    version = found[1] if found else ""
+    if version not in versions.installed():
+        raise MendableError(f"{file} was installed, but has no version of acsard; build it again")
+    # The package never replaces the version in use.
+    packaged = versions.HOME / versions.PACKAGE / version
+    if not versions.same(packaged, versions.HOME / version):
+        raise MendableError(
+            f"version {version} of another build is in use already; change to another version "
+            "first, or build the package again from a commit"
+        )
+    return version
 
 
 def _ran(words: tuple[str, ...], within_s: Seconds) -> str:
