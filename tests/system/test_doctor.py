@@ -27,7 +27,6 @@ from tests.system.harness import (
     free_endpoint,
     until,
 )
-from tests.system.typed import typed
 
 pytestmark = pytest.mark.network
 
@@ -183,25 +182,6 @@ def test_doctor_does_not_check_the_local_port_for_a_daemon_on_another_machine(
     assert "runs on another machine" in findings["daemon"][0]["text"]
     assert "port" not in findings
     assert [finding["level"] for finding in findings["configuration"]] == ["ok"]
-
-
-@each(
-    ("options", "words"),
-    [
-        (("--connect", "robot"), "robot is not an endpoint"),
-        (("--connect", "tcp/127.0.0.1"), "tcp/127.0.0.1 is not an endpoint, because its port"),
-        (("--connect", "tcp/127.0.0.1:99999"), "tcp/127.0.0.1:99999 is not an endpoint"),
-        (("--id", "a/b"), "'a/b' is not a robot's id"),
-        (("--id", "*"), "names several robots"),
-    ],
-)
-def test_invalid_connect_options_of_doctor_end_with_2_and_one_sentence(
-    options: tuple[str, ...], words: str
-) -> None:
-    done = typed("doctor", *options)
-    assert (done.code, done.out) == (2, "")
-    assert done.err.startswith("acsard: ")
-    assert words in done.err
 
 
 @pytest.mark.nightly

@@ -365,13 +365,6 @@ def test_set_ends_with_1_if_one_robot_refuses_and_with_69_if_one_does_not_answer
     assert re.search(r"^robot9: NO ANSWER: ", ended.out, re.M)
 
 
-def test_only_stop_can_be_called_on_many_robots(robots: Robots) -> None:
-    for service in ("clear", "activate"):
-        ended = robots.tool("call", service)
-        assert ended.code == 2
-        assert "only stop" in ended.err
-
-
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_the_two_robots_of_the_fleet_page_are_in_one_view(tmp_path: Path) -> None:
