@@ -131,7 +131,7 @@ def test_a_sender_with_a_steady_clock_drives_on_as_soon_as_it_is_prompt_again() 
         speaker.deliver(message)
     world.run(0.02)
     assert world.state.mode == "ready"
-    assert "too late" in world.state.reason
+    assert world.state.code == "late"
     speaker.hold(0.4, 1.0)
     assert world.state.mode == "driving"
 

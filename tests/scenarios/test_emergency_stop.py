@@ -270,7 +270,7 @@ def test_a_robot_that_needs_the_input_waits_for_it_and_then_becomes_ready() -> N
     world = World(Config(safety=SafetyConfig(estop="required")))
     world.run(1.0)
     assert (world.state.mode, world.state.link) == ("waiting", "up")
-    assert world.state.reason.startswith('safety.estop = "required", but the microcontroller')
+    assert world.state.code == "emergency_stop_missing"
     with world.mcu.estop():
         world.run(0.2)
         assert world.state.mode == "ready"

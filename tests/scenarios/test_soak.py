@@ -197,9 +197,7 @@ def test_the_robot_does_not_move_before_neutral_after_any_kind_of_restart(count:
         world.hold(linear, dice.uniform(-1, 1), 1.5, source, hz)
         lines = [line for _, line in world.port.sent]
         still = len(lines) > 100 and lines[0] == ZERO and set(lines) == {ZERO}
-        waiting = (
-            world.state.mode == "ready" and f"send a zero first: {source}" in world.state.reason
-        )
+        waiting = world.state.mode == "ready" and world.state.code == "neutral"
         successes += still and waiting
         counts[kind] += still and waiting
         world.run(0.3)
@@ -284,38 +282,39 @@ TROUBLES = (
     "bad commands", "clock", "stop",
 )  # fmt: skip
 
+WHEEL_CODES = ("wheel_dead", "wheel_reversed", "wheel_runaway", "wheel_stuck")
+
 
 def trouble(world: World, kind: str, dice: random.Random) -> str:
     """Cause one fault and end it.
 
-    Returns an error text if the reason in `state` lacks the expected word during the fault, else
-    "".
+    Returns an error text if the `state` has another code than expected during the fault, else "".
     """
     seconds, wheel, linear = dice.uniform(0.5, 4.0), dice.randrange(4), 0.5
     if kind == "mute":
         with world.mcu.mute():
             world.hold(linear, seconds=seconds)
-            return _missing_text(world, "fallen silent")
+            return _wrong_code(world, "link_silent")
     if kind in ("noise", "partial_line"):
         with getattr(world.mcu, kind)():
             world.hold(linear, seconds=seconds)
-            return _missing_text(world, "fallen silent")
+            return _wrong_code(world, "link_silent")
     if kind == "reset":
         world.mcu.reset(world.now_ns)
         world.hold(linear, seconds=1.0)
-        return _missing_text(world, "fallen silent")
+        return _wrong_code(world, "link_silent")
     if kind == "unplug":
         world.port.unplug()
         world.hold(linear, seconds=seconds)
-        word = _missing_text(world, "reopened")
+        wrong = _wrong_code(world, "port_closed")
         world.mcu = FakeMcu(world.config, world.now_ns)
         world.port.plug(world.mcu)
-        return word
+        return wrong
     if kind == "block":
         world.port.blocked = True
         world.hold(linear, seconds=seconds)
         world.port.blocked = False
-        return _missing_text(world, "the serial port sends nothing")
+        return _wrong_code(world, "port_blocked")
     if kind == "stall":
         world.send(linear)
         world.stall(seconds / 4)
@@ -324,26 +323,27 @@ def trouble(world: World, kind: str, dice: random.Random) -> str:
         gain = dice.choice((-1.0, 3.0, 9.0))
         with world.mcu.stuck_encoder(wheel) if kind == "stuck" else world.mcu.bias(wheel, gain):
             world.hold(linear, seconds=2.5)
-            return _missing_text(world, "wheel" if kind == "stuck" or gain < 9 else "rad/s is over")
+            fast = kind == "bias" and gain == 9.0
+            return _wrong_code(world, *(("impossible_speeds",) if fast else WHEEL_CODES))
     if kind == "bad commands":
         world.put("cmd/app", b"{")
         world.put("cmd/*", b"{}")
         world.put("wheel_cmd/app", b"\x80")
         world.send(1e300, -1e300, source="stranger")
         world.run(seconds)
-        return _missing_text(world, "waiting for a command")
+        return _wrong_code(world, "no_command")
     if kind == "clock":
         world.wall_offset_ns += dice.choice((-1, 1)) * dice.randrange(DAY_NS)
         world.hold(linear, seconds=seconds)
-        return _missing_text(world, "commanded by app")
+        return _wrong_code(world, "commanded")
     world.put("stop", b"")
     world.hold(linear, seconds=seconds)
-    return _missing_text(world, "stopped by unnamed (native) at")
+    return _wrong_code(world, "stopped")
 
 
-def _missing_text(world: World, word: str) -> str:
+def _wrong_code(world: World, *codes: str) -> str:
     state = world.state
-    return "" if word in state.reason else f"{word!r} is not in {state.mode}: {state.reason!r}"
+    return "" if state.code in codes else f"{codes}, not {state.mode}: {state.reason!r}"
 
 
 def recover(world: World) -> None:

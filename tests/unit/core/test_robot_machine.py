@@ -616,14 +616,7 @@ class RobotMachine(RuleBasedStateMachine):
         if any(event.name == "fault" for event in outputs.events) and "clear" not in done:
             assert mode in ("fault", "shutdown")
         if mode == "ready" and outputs.due:
-            begins = (
-                "send a zero first: ", "waiting for a command: ", "commands of ",
-                "the daemon stalled: ",
-            )  # fmt: skip
-            assert (
-                outputs.reason.startswith(begins)
-                or "is new: the robot follows it" in outputs.reason
-            )
+            assert outputs.code in ("neutral", "no_command", "late", "stalled", "proof")
         if mode == "driving":
             assert outputs.code in ("commanded", "zeros", "limits_zero")
             assert outputs.linked
