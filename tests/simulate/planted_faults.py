@@ -507,6 +507,21 @@ FAULTS = (
         "return Twist(twist.linear * scale, twist.angular * scale)",
         "return Twist(twist.linear * scale, twist.angular * scale * scale)",
     ),
+    fault(
+        "kinematics curve",
+        "the right wheels turn 0.03 rad/s too fast",
+        KINEMATICS,
+        "        return WheelSpeeds(right, left, left, right)",
+        "        right += 0.03 if right else 0.0\n"
+        "        return WheelSpeeds(right, left, left, right)",
+    ),
+    fault(
+        "kinematics rear",
+        "the rear wheels turn by 5 % slower than the front wheels",
+        KINEMATICS,
+        "        return WheelSpeeds(right, left, left, right)",
+        "        return WheelSpeeds(right, left, 0.95 * left, 0.95 * right)",
+    ),
     # robot
     fault(
         "robot clear",
@@ -646,6 +661,36 @@ FAULTS = (
         "            self._life.leave()\n",
         "            pass\n",
     ),
+    fault(
+        "robot end reason",
+        "`state` has no reason while the daemon ends",
+        ROBOT,
+        "                return SHUTDOWN_REASON\n",
+        '                return Reason("shutdown", "")\n',
+    ),
+    fault(
+        "session mute",
+        "a board that does not answer yet gets no lines",
+        SESSION,
+        "        if self.negotiation.asking:\n            return self.negotiation.question(now_ns)",
+        "        if self.silent(now_ns):\n            return None\n"
+        "        if self.negotiation.asking:\n            return self.negotiation.question(now_ns)",
+    ),
+    fault(
+        "codec zeros",
+        "a speed has one digit behind its point if it can",
+        CODEC,
+        "hundredths % 100:02d}",
+        "hundredths % 100:d}",
+    ),
+    fault(
+        "codec rim",
+        "a wheel speed above 1 rad/s is written 0.03 rad/s too high",
+        CODEC,
+        "    direction = ",
+        "    hundredths += 3 * (hundredths > 100)\n    direction = ",
+        BLIND_GUARD,
+    ),
     # log
     fault(
         "log flooded",
@@ -701,6 +746,20 @@ FAULTS = (
         "                self._bus.reply(reply)\n"
         "                self._bus.retire",
     ),
+    fault(
+        "commands raise",
+        "a command that is too big raises an exception",
+        COMMANDS,
+        'raise DecodeError("too_big", f"{len(arrival.payload)} bytes are too many for a command")',
+        'raise ValueError("too big")',
+    ),
+    fault(
+        "bus counts",
+        "commands of zero are not counted",
+        ROBOT,
+        'self.counters["commands"] += 1',
+        'self.counters["commands"] += message.twist != REST',
+    ),
     # odometry
     fault(
         "odometry turn",
@@ -753,6 +812,22 @@ FAULTS = (
         '            if link != "up" and session.good_lines:\n'
         "                self._odometry._path.advance(0.01 * self._odometry.twist.linear, 0.0)\n"
         "            return ()",
+    ),
+    fault(
+        "odometry endless",
+        "the covariance of a robot that has stood for 3 s is infinite",
+        ODOMETRY,
+        "        at_rest = self._still > REST_S\n",
+        "        at_rest = self._still > REST_S\n"
+        "        if self._still > 3.0:\n"
+        "            self._uncertainty.doubt(math.inf, math.inf)\n",
+    ),
+    fault(
+        "odometry leap",
+        "a lost line moves the pose by 2 m",
+        ODOMETRY,
+        "            self.bridged += bridged\n",
+        "            self.bridged += bridged\n            self._path.advance(2.0, 0.0)\n",
     ),
     # latch file
     fault(
