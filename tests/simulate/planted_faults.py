@@ -358,6 +358,13 @@ FAULTS = (
             "        self._rested_ns = now_ns if zero else getattr(self, '_rested_ns', now_ns)\n",
         ),
     ),
+    fault(
+        "neutral overtaken",
+        "a speed that arrives behind a later zero moves the robot",
+        NEUTRAL,
+        "            if self._overtaken(command, self._ended):",
+        "            if False:",
+    ),
     # freshness
     Fault(
         "freshness age",
@@ -456,6 +463,13 @@ FAULTS = (
         LIMITS,
         "return Twist(linear * scale, angular * scale)",
         "return Twist(linear * scale, angular)",
+    ),
+    fault(
+        "limits below",
+        "a robot at the limit of its wheels stays 0.05 rad/s below it",
+        LIMITS,
+        "self._within_speed(wished), self._wheel_speed)",
+        "self._within_speed(wished), self._wheel_speed - 0.05)",
     ),
     # modes and latches
     fault(
