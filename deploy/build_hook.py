@@ -1,4 +1,7 @@
-"""Adds the git commit of the source to wheel and sdist. hatchling runs this file when it builds."""
+"""Adds files to wheel and sdist: the commit of the source and, to wheels, the SBOM (PEP 770).
+
+hatchling runs this file when it builds.
+"""
 
 import sys
 import tempfile
@@ -9,19 +12,25 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 
 class CustomBuildHook(BuildHookInterface):
-    """Writes the commit into a file of the package, if the source is a git clone.
+    """Writes the files into a temporary directory.
 
-    A wheel that is made from an sdist gets the file of the sdist. An editable installation gets no
-    file, because acsard then reads the commit from the clone.
+    A wheel that is made from an sdist gets the commit from the sdist's file. An editable
+    installation gets no file, because acsard then reads the commit from the clone.
     """
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         sys.path.insert(0, self.root)
         from acsard.host.version import COMMIT_FILE, source_of
+        from deploy.release import contents
 
-        commit = source_of(Path(self.root))
-        if commit and version != "editable":
-            self.made = tempfile.TemporaryDirectory()
+        if version == "editable":
+            return
+        self.made = tempfile.TemporaryDirectory()
+        if commit := source_of(Path(self.root)):
             made = Path(self.made.name, COMMIT_FILE)
             made.write_text(f"{commit}\n")
             build_data["force_include"][str(made)] = f"acsard/{COMMIT_FILE}"
+        if self.target_name == "wheel":
+            made = Path(self.made.name, contents.SBOM)
+            made.write_text(contents.sbom(self.metadata.version))
+            build_data["sbom_files"].append(str(made))

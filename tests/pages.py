@@ -210,6 +210,9 @@ COMMANDS: dict[str, How] = {
         UntestedCommand("the test says which of these packages is missing")
     ),
     "python3 -m venv tools": PACKAGING,
+    "deploy/release/build --out dist": Elsewhere(
+        "tests/test_release.py", "test_two_builds_of_a_commit_give_the_same_files"
+    ),
     "tools/bin/pip install -r deploy/release/requirements.lock": PACKAGING,
     "tools/bin/python deploy/release/debian.py acsard-0.2.0-py3-none-any.whl packages": PACKAGING,
     "sudo ACSARD_TEST_DEBS=/var/tmp/debs .venv/bin/pytest -n 0 -s -m systemd "

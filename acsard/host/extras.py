@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import sys
+from pathlib import Path
 from typing import Literal
 
 from acsard.host.errors import MendableError
@@ -13,12 +15,35 @@ Extra = Literal["foxglove", "tools"]
 
 def install(extra: Extra = "tools") -> str:
     """Return the advice that installs an extra, as the end of a sentence."""
-    # acsard is not in any package index, so pip needs the clone.
-    return (
-        f"type `{shlex.quote(sys.executable)} -m pip install '.[{extra}]'` in the clone of acsard"
-    )
+    came_from = _url()
+    if came_from.endswith(".whl"):
+        return f"type `{_installer()} 'acsard[{extra}] @ {came_from}'`"
+    if came_from:
+        return f"type `{_installer()} '.[{extra}]'` in the clone of acsard"
+    return f"type `{_installer()} 'acsard[{extra}]'`"
 
 
 def missing(library: str, extra: Extra = "tools") -> MendableError:
     """Return the error of a subcommand whose library is missing."""
     return MendableError(f"this subcommand needs the library {library}: {install(extra)}")
+
+
+def _url() -> str:
+    # The file or directory from which acsard was installed, or "" if an index had it (PEP 610).
+    from importlib.metadata import PackageNotFoundError, distribution  # slow, and rarely needed
+
+    try:
+        text = distribution("acsard").read_text("direct_url.json")
+    except PackageNotFoundError:
+        return ""
+    return "" if text is None else str(json.loads(text)["url"])
+
+
+def _installer() -> str:
+    # uv and pipx keep these files in the environments that they make. Outside of an environment,
+    # Debian's pip refuses to install anything.
+    if Path(sys.prefix, "uv-receipt.toml").exists():
+        return "uv tool install"
+    if Path(sys.prefix, "pipx_metadata.json").exists() or sys.prefix == sys.base_prefix:
+        return "pipx install --force"
+    return f"{shlex.quote(sys.executable)} -m pip install"
