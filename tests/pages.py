@@ -418,7 +418,7 @@ COMMANDS: dict[str, How] = {
     "acsard web --revoke phone": COOKIE,
     "sudo acsard tls init": BY_THE_SERVICE,
     "sudo install -D -m 0644 -t /etc/systemd/system/acsard-web.service.d "
-    "deploy/systemd/lan.conf": BY_THE_SERVICE,
+    "/opt/acsard/current/lib/acsard/deploy/systemd/lan.conf": BY_THE_SERVICE,
     'sudo sh -c "systemctl daemon-reload && systemctl restart acsard-web"': BY_THE_SERVICE,
     "sudo acsard web --config /etc/acsard/acsard.toml "
     "--invite operator --name phone": BY_THE_SERVICE,

@@ -224,7 +224,8 @@ class Container:
 
         Its directory is by default the clone in the container.
         """
-        ran = self.run("sh", "-c", f"cd {where} && {command}")
+        here = f"cd {where} && export PATH=$PATH:{VERSIONS}/current/bin"
+        ran = self.run("sh", "-c", f"{here} && {command}")
         assert ran.code == 0, f"{command}\n{ran.out}\n{ran.err}"
         return ran
 
@@ -273,6 +274,8 @@ class Container:
         self.write(f"{VERSIONS}/test/bin/acsard", program, 0o755)
         self.write(f"{VERSIONS}/test/bin/acsard-stop", (deploy / "acsard-stop").read_text(), 0o755)
         self.path(f"{VERSIONS}/current").symlink_to("test")
+        self.path(f"{VERSIONS}/test/lib/acsard").mkdir(parents=True)
+        self.path(f"{VERSIONS}/test/lib/acsard/deploy").symlink_to(f"{HOME}/src/deploy")
         for unit in (UNIT, GATEWAY, PAGE):
             self.write(f"{UNITS}/{unit}", (deploy / unit).read_text())
         self.run("systemctl", "daemon-reload")
