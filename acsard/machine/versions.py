@@ -345,12 +345,16 @@ def _copy_installed(package: Distribution, lib: Path) -> None:
             "libraries"
         )
     for file in package.files:
-        # Programs of the library are outside of `lib`. Bytecode is made again.
-        if ".." in file.parts or file.suffix in (".pyc", ".pth"):
+        # Programs of the library are outside of `lib`.
+        if ".." in file.parts or file.suffix == ".pth":
             continue
         # An environment from which acsard runs in its clone lists only what pip wrote about it.
-        if package.name != "acsard" or file.parts[0].endswith(".dist-info"):
-            _copy_file(Path(str(package.locate_file(file))), lib / file)
+        if package.name == "acsard" and not file.parts[0].endswith(".dist-info"):
+            continue
+        there = Path(str(package.locate_file(file)))
+        # Bytecode that is missing is made again, which takes a minute on a slow computer.
+        if file.suffix != ".pyc" or there.exists():
+            _copy_file(there, lib / file)
 
 
 def _copy_file(file: Path, to: Path) -> None:

@@ -216,7 +216,7 @@ class Container:
 
     def run(self, *words: str) -> Ran:
         """Run a program in the container to its end, and return its result."""
-        done = subprocess.run(self.inside(*words), capture_output=True, text=True, timeout=60)
+        done = subprocess.run(self.inside(*words), capture_output=True, text=True, timeout=180)
         return Ran(done.returncode, done.stdout, done.stderr)
 
     def types(self, command: str, where: str = f"{HOME}/src") -> Ran:
