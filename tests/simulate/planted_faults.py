@@ -536,6 +536,15 @@ FAULTS = (
         "        return WheelSpeeds(right, left, left, right)",
         "        return WheelSpeeds(right, left, 0.95 * left, 0.95 * right)",
     ),
+    fault(
+        "lifecycle seen",
+        "an activate that names no latch works at once",
+        LIFECYCLE,
+        "        if number is None:\n            self._require_latch_was_seen(\n"
+        '                f"the robot was {_stopped(latch)}"',
+        "        if False:\n            self._require_latch_was_seen(\n"
+        '                f"the robot was {_stopped(latch)}"',
+    ),
     # robot
     fault(
         "robot clear",
@@ -705,6 +714,14 @@ FAULTS = (
         "    hundredths += 3 * (hundredths > 100)\n    direction = ",
         BLIND_GUARD,
     ),
+    fault(
+        "session creep",
+        "a board that does not answer is driven slowly",
+        SESSION,
+        "            speeds = STILL\n",
+        "            speeds = WheelSpeeds(0.1, 0.1, 0.1, 0.1)\n",
+        BLIND_GUARD,
+    ),
     # log
     fault(
         "log flooded",
@@ -719,6 +736,13 @@ FAULTS = (
         "core/motion/arbiter_text.py",
         "        if mode is not before:\n",
         "        if False:\n",
+    ),
+    fault(
+        "log empty",
+        "the line of the log about a link that is up has no text",
+        "core/link/link_diagnosis.py",
+        '"up": sentence("link_up"),',
+        '"up": Reason("link_up", ""),',
     ),
     # sanity
     fault(
