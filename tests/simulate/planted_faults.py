@@ -365,6 +365,16 @@ FAULTS = (
         "            if self._overtaken(command, self._ended):",
         "            if False:",
     ),
+    fault(
+        "neutral late",
+        "a newer command counts only after 60 ms",
+        NEUTRAL,
+        "        self.twist, self._doubted_ns = command.twist, None\n"
+        "        self.arrived_ns = self._present_ns = now_ns\n",
+        "        self._doubted_ns, self._present_ns = None, now_ns\n"
+        "        if self.arrived_ns is None or now_ns - self.arrived_ns > 60_000_000 or zero:\n"
+        "            self.twist, self.arrived_ns = command.twist, now_ns\n",
+    ),
     # freshness
     Fault(
         "freshness age",
