@@ -555,6 +555,18 @@ FAULTS = (
         "        if False:\n            self._require_latch_was_seen(\n"
         '                f"the robot was {_stopped(latch)}"',
     ),
+    fault(
+        "latches names",
+        "a second stop replaces the name of the first client",
+        LIFECYCLE,
+        '        self._latch(stop=self._stop(now, "", why))\n',
+        '        self._latch(stop=self._new_latch(now, "", why))\n',
+        Edit(
+            LIFECYCLE,
+            "self._latch(stop=self._stop(now, by, why))",
+            'self._latch(stop=self._new_latch(now, "", reason("stopped", by=NAMELESS)))',
+        ),
+    ),
     # robot
     fault(
         "robot clear",

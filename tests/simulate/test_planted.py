@@ -52,8 +52,8 @@ def test_each_fault_with_plans_of_its_own_has_plans() -> None:
     assert names | {name.split()[0] for name in names} >= PLANS_OF_FAULT.keys()
 
 
-def test_there_are_a_hundred_and_twenty_six_faults_and_eleven_cases() -> None:
-    assert len(FAULTS) == len({fault.name for fault in FAULTS}) == 126
+def test_there_are_a_hundred_and_twenty_seven_faults_and_eleven_cases() -> None:
+    assert len(FAULTS) == len({fault.name for fault in FAULTS}) == 127
     assert len(CASES) == 11
 
 
