@@ -149,7 +149,10 @@ PLACES = Elsewhere(
 )
 PYTEST = Collected()
 FIRST = Elsewhere(HERE, "test_the_first_command_of_the_readme_installs_it_and_the_robot_is_up")
-BY_UV = UntestedCommand("needs uv and the files of a release; typed by hand, it runs acsard")
+BY_UV = Elsewhere(
+    "tests/test_installed.py",
+    "test_every_subcommand_of_an_installed_wheel_works_or_names_its_extra",
+)
 VENV = Elsewhere(HERE, "test_the_service_s_venv_has_all_that_lan_and_service_need")
 AUTHORITY = Elsewhere(
     HERE, "test_the_install_line_of_the_fleet_page_suffices_to_make_its_authority"
