@@ -52,7 +52,8 @@ def unpack(attachment: bytes) -> Signature | None:
         return None
     try:
         return (_json if attachment[:1] == b"{" else _msgpack).decode(attachment)
-    except (msgspec.DecodeError, UnicodeDecodeError):
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        # An unknown field may be nested too deeply.
         return None
 
 

@@ -16,6 +16,7 @@ from acsard.core.messages.signature import (
     public_name,
     unpack,
 )
+from acsard.daemon.bus.inbox import MAX_ATTACHMENT_BYTES
 from tests.each import each
 
 WHOLE = {"sender": "joystick-7", "stamp": 1_795_154_884_365_624_370, "sequence": 12}
@@ -51,6 +52,8 @@ def test_a_map_in_json_or_msgpack_with_a_sender_is_a_signature(
         json.dumps(WHOLE | {"stamp": 1 << 70}).encode(),
         json.dumps(WHOLE | {"sequence": 1.5}).encode(),
         msgspec.msgpack.encode([1, 2, 3]),
+        b'{"later": '.ljust(MAX_ATTACHMENT_BYTES, b"["),
+        b"\x81\xa5later".ljust(MAX_ATTACHMENT_BYTES, b"\x91"),
     ],
 )
 def test_any_other_attachment_is_not_a_signature(attachment: bytes) -> None:
