@@ -221,7 +221,7 @@ COMMANDS: dict[str, How] = {
     "sudo ACSARD_TEST_DEBS=/var/tmp/debs .venv/bin/pytest -n 0 -s -m systemd "
     "tests/release/test_debian_package.py": PACKAGING,
     "lintian packages/*.deb": UntestedCommand("lintian differs between releases of Debian"),
-    "sudo piuparts -d bookworm -i /opt packages/acsard_*deb12_amd64.deb": Elsewhere(
+    "sudo piuparts -d bookworm -i /opt/ packages/acsard_*deb12_amd64.deb": Elsewhere(
         PACKAGE,
         "test_an_upgrade_switches_nothing_and_purge_leaves_nothing",
         but="piuparts was typed by hand; the test compares the same lists of files",
