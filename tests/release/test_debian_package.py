@@ -43,6 +43,14 @@ MACHINES = ("amd64", "arm64")
 
 LIMIT_MB = 60
 
+OF_A_CLONE = (
+    # A page of the clone, which the package does not have.
+    "tests/unit/core/test_codes.py::"
+    "test_the_page_lists_the_codes_of_the_sources_with_the_first_words_of_their_texts",
+    # With the package's gateway, `tls init` also writes its drop-in.
+    "tests/unit/cli/test_transcripts.py::test_each_command_prints_what_its_transcript_says[tls]",
+)
+
 CONFIG = "/etc/acsard/acsard.toml"
 
 
@@ -165,9 +173,13 @@ def test_the_unit_tests_pass_on_the_installed_files(bare: Root, place: Path) -> 
         copy(ROOT / name, bare.path / "clone" / name)
     # Some tests read the source.
     (bare.path / "clone/acsard").symlink_to("/opt/acsard/current/lib/acsard")
+    left_out = " ".join(f"--deselect '{name}'" for name in OF_A_CLONE)
     told = bare.run(
-        "cd /clone && PYTHONPATH=/opt/acsard/current/lib:/packages python3 -P -m pytest "
-        "--import-mode=append -p no:cacheprovider -q -n 2 --timeout 600 tests/unit",
+        # Some tests list all processes, and others of this machine may use the same ptys.
+        "cd /clone && PYTHONPATH=/opt/acsard/current/lib:/packages "
+        "unshare --pid --fork --mount-proc --propagation unchanged "
+        "python3 -P -m pytest --import-mode=append -p no:cacheprovider -q -n 2 --timeout 600 "
+        f"tests/unit {left_out}",
         within=3000.0,
     )
     assert " passed" in told.splitlines()[-1]
