@@ -244,7 +244,7 @@ def test_the_first_installation_starts_the_service_and_no_upgrade_restarts_it(
             assert (status.code, "missing" in status.out) == (0, False), status.out
             container.types(f"acsard tls init --write {CONFIG}", "/")
             container.types("systemctl daemon-reload && systemctl restart acsard", "/")
-            assert container.show("ActiveState", GATEWAY) == "active", container.messages(GATEWAY)
+            until(lambda: container.show("ActiveState", GATEWAY) == "active", 20.0, "a gateway")
 
             daemon = container.main_pid()
             done = container.run("dpkg", "--install", f"/{second.name}")
