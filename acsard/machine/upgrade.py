@@ -225,18 +225,22 @@ def change(name: str, say: Say, wait_s: Seconds = WAIT_S, watch_s: Seconds = WAT
         seen = _stands(address, wait_s)
     running = [unit for unit in ALL_UNITS if unit_state(unit).runs]
     versions.use(name)
-    _start(before, name, running, say)
-    if UNIT not in running:
+    trouble = ""
+    try:
+        _start(before, name, running, say)
+    except (OSError, MendableError) as error:
+        trouble = f"cannot be started ({error})"
+    if not trouble and UNIT not in running:
         say(f"version {name} is in use. The service does not run: `sudo systemctl start acsard`")
         return
-    say(f"version {name} is in use; watching it for {watch_s:g} s")
-    trouble = watch(address, seen, running, watch_s)
+    if not trouble:
+        say(f"version {name} is in use; watching it for {watch_s:g} s")
+        trouble = watch(address, seen, running, watch_s)
     if trouble:
         versions.go_back(before, older)
         _start(name, before, running, say)
-        raise MendableError(
-            f"version {name} {trouble}; {_came_back(before)}. `journalctl -u acsard` has the log"
-        )
+        back = _came_back(before) if UNIT in running else f"version {before} is in use again"
+        raise MendableError(f"version {name} {trouble}; {back}. `journalctl -u acsard` has the log")
     versions.remove_others()
     say(f"version {name} works; `sudo acsard service rollback` goes back to {before}")
 
@@ -268,7 +272,10 @@ def watch(address: Address, before: Look | None, running: list[str], watch_s: Se
     while True:
         over = time.monotonic() >= end_s
         for unit in running:
-            state = unit_state(unit)
+            try:
+                state = unit_state(unit)
+            except MendableError as error:  # a version that takes all processor time does this
+                return f"could not be watched ({error})"
             if state.n_restarts or state.active_state == "failed":
                 return f"does not keep {unit} running"
             if state.active_state == "inactive" and not state.job and unit == UNIT:

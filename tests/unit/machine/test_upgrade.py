@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -10,7 +11,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from acsard.bus.address import Address
 from acsard.host.errors import MendableError
+from acsard.machine import upgrade, versions
 from acsard.machine.upgrade import Look, UnitState, configuration_file, prepare, worse
 from tests.unit.top.screens import STATE
 
@@ -73,8 +76,12 @@ def test_a_unit_that_is_restarted_again_and_again_counts_as_running(state: str, 
 def test_the_configuration_file_is_the_one_that_the_daemon_s_environment_names() -> None:
     assert configuration_file(0) == Path("/etc/acsard/acsard.toml")
     environment = os.environ | {"ACSARD_CONFIG": "/srv/robot.toml"}
-    words = [sys.executable, "-c", "input()"]
-    with subprocess.Popen(words, env=environment, stdin=subprocess.PIPE) as daemon:
+    # The kernel may show a process without its environment until its first line.
+    words = [sys.executable, "-c", "print(flush=True); input()"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words, env=environment, stdin=pipe, stdout=pipe) as daemon:
+        assert daemon.stdout is not None
+        daemon.stdout.readline()
         assert configuration_file(daemon.pid) == Path("/srv/robot.toml")
         daemon.communicate(b"\n", 10.0)
 
@@ -93,3 +100,35 @@ def test_an_environment_whose_program_cannot_copy_itself_is_refused(tmp_path: Pa
     python.symlink_to("/usr/bin/false")
     with pytest.raises(MendableError, match=r"acsard\.machine\.versions: ended with exit code 1"):
         prepare(tmp_path)
+
+
+def test_a_version_that_cannot_be_started_is_left_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    used = ["1.0.0"]
+    started = []
+
+    def start(old: str, new: str, running: list[str], say: object) -> None:
+        started.append(new)
+        if new == "1.1.0":
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(versions, "current", lambda: used[-1])
+    monkeypatch.setattr(versions, "previous", lambda: "0.9.0")
+    monkeypatch.setattr(versions, "use", used.append)
+    monkeypatch.setattr(versions, "go_back", lambda name, older: used.extend([older, name]))
+    monkeypatch.setattr(upgrade, "unit_state", lambda unit: UnitState("inactive", 0, 0))
+    monkeypatch.setattr(upgrade, "configuration_file", lambda pid: Path("/nonexistent"))
+    monkeypatch.setattr(upgrade, "_start", start)
+    with pytest.raises(MendableError, match=r"1\.1\.0 cannot be started .*No space.*1\.0\.0 is in"):
+        upgrade.change("1.1.0", print)
+    assert used == ["1.0.0", "1.1.0", "0.9.0", "1.0.0"]
+    assert started == ["1.1.0", "1.0.0"]
+
+
+def test_a_version_under_which_systemd_does_not_answer_does_not_work(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def silent(unit: str) -> UnitState:
+        raise MendableError("systemctl show: timed out")
+
+    monkeypatch.setattr(upgrade, "unit_state", silent)
+    assert "timed out" in upgrade.watch(Address("tcp/127.0.0.1:1", "r", ""), None, ["x"], 0.0)
