@@ -251,6 +251,11 @@ def test_the_first_installation_starts_the_service_and_no_upgrade_restarts_it(
             assert done.code == 0, done.err
             assert container.main_pid() == daemon
             assert NUMBER in container.run("acsard", "--version").out
+            # dpkg has replaced the unit in /usr/lib, so the version in use has its own in /etc.
+            assert container.show("FragmentPath") == f"/etc/systemd/system/{UNIT}"
+            assert container.run("systemctl", "is-enabled", UNIT).out == "enabled\n"
+            used = f"/opt/acsard/{NUMBER}/lib/acsard/deploy/systemd/{UNIT}"
+            container.types(f"cmp {used} /etc/systemd/system/{UNIT}", "/")
 
             container.run("systemctl", "stop", PAGE, GATEWAY, UNIT)
             container.run("dpkg", "--install", f"/{second.name}")
