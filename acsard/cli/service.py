@@ -174,6 +174,11 @@ def _ready(args: argparse.Namespace) -> None:
         raise NotPermittedError(
             "run this command with sudo, or add --dry-run to see what the command would do"
         )
+    if (versions.HOME / versions.PACKAGE).exists():
+        raise MendableError(
+            "the Debian package has installed the service: `sudo acsard service upgrade` changes "
+            "its version, and `sudo apt remove acsard` removes it"
+        )
 
 
 def _require_root() -> None:

@@ -212,8 +212,7 @@ UNIT_DIRECTORY, PACKAGE_UNIT_DIRECTORY = (
 RULES = Path("/etc/udev/rules.d/70-acsar.rules")
 CONFIG_DIRECTORY = Path("/etc/acsard")
 LAN_DROP_IN = "lan.conf"
-# `acsard` in the PATH of every user, also under sudo. The Debian package has the second link.
-COMMAND, PACKAGE_COMMAND = Path("/usr/local/bin/acsard"), Path("/usr/bin/acsard")
+COMMAND = Path("/usr/local/bin/acsard")  # in the PATH of every user, also under sudo
 PROGRAM = versions.HOME / versions.CURRENT / "bin" / "acsard"
 TLS_DIRECTORY = "/etc/acsard/tls"  # in the drop-in `lan.conf`
 # Directories by unit, with their content.
@@ -343,8 +342,7 @@ def installing(
 
 def linking() -> list[Step]:
     """Return the step that puts `acsard` into the PATH, unless there is one."""
-    there = [path for path in (PACKAGE_COMMAND, COMMAND) if os.path.lexists(path)]
-    return [] if there else [Link(COMMAND, PROGRAM)]
+    return [] if os.path.lexists(COMMAND) else [Link(COMMAND, PROGRAM)]
 
 
 def config_directories() -> list[Path]:
@@ -420,9 +418,7 @@ def uninstalling(
 
 
 def programs() -> list[Path]:
-    """Return the copies and links that an installation without the Debian package has made."""
-    if (versions.HOME / versions.PACKAGE).exists():
-        return []
+    """Return the copies and links that the installation has made."""
     links = (versions.CURRENT, versions.PREVIOUS)
     return [
         *([COMMAND] if COMMAND.is_symlink() and COMMAND.readlink() == PROGRAM else ()),
