@@ -18,7 +18,7 @@ def test_the_service_of_the_debian_package_is_left_to_apt(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    (tmp_path / versions.PACKAGE).mkdir()
+    (tmp_path / versions.PACKAGE).mkdir(exist_ok=True)
     monkeypatch.setattr(versions, "HOME", tmp_path)
     assert main(["service", action, "--dry-run"]) == 1
     shown = capsys.readouterr()
