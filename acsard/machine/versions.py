@@ -123,7 +123,10 @@ def remove_others(home: Path = HOME) -> None:
     """Remove each version that is not in use, not the previous one and not of the package."""
     packaged = {path.name for path in (home / PACKAGE).glob("*")}
     for name in {*installed(home)} - {current(home), previous(home)} - packaged:
-        shutil.rmtree(home / name, ignore_errors=True)
+        with suppress(OSError):
+            # If this program is killed now, the rest is no version, and `changing` removes it.
+            os.rename(home / name, home / f"{UNFINISHED}{name}")
+        shutil.rmtree(home / f"{UNFINISHED}{name}", ignore_errors=True)
 
 
 @contextmanager

@@ -74,6 +74,22 @@ def test_a_newer_version_that_is_not_in_use_is_found(tmp_path: Path) -> None:
     assert versions.unused(tmp_path) == "0.3.0"
 
 
+def test_what_a_killed_removal_leaves_is_no_version_and_is_removed_by_the_next_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    versions_in(tmp_path, "0.1.0", "0.2.0", "0.3.0")
+    versions.use("0.2.0", tmp_path)
+    versions.use("0.3.0", tmp_path)
+    monkeypatch.setattr(os, "unlink", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        versions.remove_others(tmp_path)
+    assert versions.installed(tmp_path) == ["0.2.0", "0.3.0"]
+    monkeypatch.undo()
+    with versions.changing(tmp_path):
+        left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"0.2.0", "0.3.0", "current", "previous"}
+
+
 def test_the_launcher_imports_from_its_own_version_also_after_a_switch(tmp_path: Path) -> None:
     for name in ("1", "2"):
         package = tmp_path / name / "lib" / "acsard"
