@@ -291,7 +291,9 @@ def _require_start(place: Path) -> None:
 def same(one: Path, other: Path) -> bool:
     """Return whether two versions have the same content, except bytecode."""
     files = [_files(tree) for tree in (one, other)]
-    return files[0] == files[1] and all(cmp(one / name, other / name) for name in files[0])
+    return files[0] == files[1] and all(
+        cmp(one / name, other / name, shallow=False) for name in files[0]
+    )
 
 
 def _files(tree: Path) -> set[Path]:

@@ -163,3 +163,13 @@ def test_a_copy_with_other_content_gets_a_name_of_its_own(
     assert versions.is_own(first)
     assert versions.is_own(second)
     assert sorted(os.listdir(tmp_path)) == sorted((first, second))
+
+
+def test_files_of_one_size_and_date_are_compared_by_their_content(tmp_path: Path) -> None:
+    # All files of a package have one date, and each commit has one length.
+    for name, commit in (("one", "a1b2"), ("other", "c3d4")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "commit").write_text(commit)
+        os.utime(tmp_path / name / "commit", (0, 0))
+    assert not versions.same(tmp_path / "one", tmp_path / "other")
+    assert versions.same(tmp_path / "one", tmp_path / "one")
