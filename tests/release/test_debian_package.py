@@ -30,7 +30,8 @@ from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
 from tests.system.harness import ROOT, Program, until
 from tests.system.hosts import inside, ip, on
 from tests.system.terminals import Terminal
-from tests.systemd.container import GATEWAY, PAGE, UNIT, Container
+from tests.systemd.container import CONFIG, GATEWAY, PAGE, UNIT, Board, Container
+from tests.systemd.test_upgrade import Robot, commanded
 
 pytestmark = [
     pytest.mark.systemd,
@@ -50,8 +51,6 @@ OF_A_CLONE = (
     # With the package's gateway, `tls init` also writes its drop-in.
     "tests/unit/cli/test_transcripts.py::test_each_command_prints_what_its_transcript_says[tls]",
 )
-
-CONFIG = "/etc/acsard/acsard.toml"
 
 
 @pytest.fixture(scope="session")
@@ -242,6 +241,9 @@ def test_the_first_installation_starts_the_service_and_no_upgrade_restarts_it(
                 assert container.show("ActiveState", unit) == "active", container.messages(unit)
             status = container.run("acsard", "service", "status")
             assert (status.code, "missing" in status.out) == (0, False), status.out
+            refused = container.run("acsard", "service", "uninstall", "--purge")
+            assert (refused.code, "sudo apt remove acsard" in refused.err) == (1, True)
+            assert container.show("ActiveState") == "active"
             container.types(f"acsard tls init --write {CONFIG}", "/")
             container.types("systemctl daemon-reload && systemctl restart acsard", "/")
             until(lambda: container.show("ActiveState", GATEWAY) == "active", 20.0, "a gateway")
@@ -267,3 +269,44 @@ def test_the_first_installation_starts_the_service_and_no_upgrade_restarts_it(
             left = container.run("find", "/", "-xdev", "-name", "*acsa*", "-not", "-name", "*.deb")
             # The container itself has a clone there.
             assert [path for path in left.out.split() if not path.startswith("/srv/acsard")] == []
+
+
+def test_service_upgrade_changes_to_a_package_and_rollback_back_with_the_stop_latched(
+    made: list[Path], place: Path, tmp_path: Path
+) -> None:
+    with root(place, "12", "amd64") as bare:
+        bare.run("apt-get install --yes --no-install-recommends systemd-sysv dbus udev python3")
+        first = package(made, "12", "amd64")
+        shutil.copyfile(first, bare.path / first.name)
+        second = newer(first, bare.path)
+        with Container(bare.path, tmp_path, "acsard-deb") as container, Board(container) as board:
+            done = container.run("dpkg", "--install", f"/{first.name}")
+            assert done.code == 0, done.err
+            robot = Robot(container, board, NUMBER)
+            until(robot.link, 60.0, "the link is up")
+            robot.stops()
+            number, kept, recordings = robot.latch(), robot.kept(), robot.recordings()
+            assert number != "0"
+            pid, began = container.main_pid(), time.monotonic()
+
+            for words, new, old in (
+                (("upgrade", f"/{second.name}"), NEWER, NUMBER),
+                (("rollback",), NUMBER, NEWER),
+            ):
+                change = commanded(robot, *words)
+                assert change.code == 0, change.out
+                assert (robot.readlink(), robot.readlink("previous"), robot.runs()) == (
+                    new, old, new,
+                )  # fmt: skip
+                assert container.main_pid() != pid
+                pid = container.main_pid()
+                info = robot.types("get", "info").out.replace(" ", "")
+                assert f'"version":"{new}"' in info
+                assert (robot.link(), robot.latch(), robot.kept()) == (True, number, kept)
+                assert recordings <= robot.recordings()
+                # The unit in use is this version's own.
+                used = f"/opt/acsard/{new}/lib/acsard/deploy/systemd/{UNIT}"
+                container.types(f"cmp {used} /etc/systemd/system/{UNIT}", "/")
+            assert robot.moved(began) == []
+            status = robot.types("service", "status").out
+            assert f"version {NEWER} is installed, but not in use" in status
