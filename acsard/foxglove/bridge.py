@@ -42,7 +42,7 @@ class Bridge:
     ) -> None:
         self._robot, self._id, self._tell = robot, robot.where.robot_id, tell
         robot.name += " foxglove"
-        self._wake, self._ended = Event(), Event()
+        self._wake, self._ended = Event(), False
         self._here = self._was_here = True
         # Whether the daemon has ended since the last query of its configuration. `_here` does not
         # show this if the daemon ends and starts again within one round.
@@ -61,7 +61,7 @@ class Bridge:
 
     def run(self) -> None:
         """Run the main loop until `end` is called."""
-        while not self._ended.is_set():
+        while not self._ended:
             self._wake.wait(0.5)
             # Collect messages before a round, which saves a third of the processor time. The pause
             # is shorter than one frame at 60 Hz.
@@ -70,9 +70,9 @@ class Bridge:
             self._round()
 
     def end(self) -> None:
-        """Let `run` return. A signal handler may call this method."""
-        self._ended.set()
-        self._wake.set()
+        """Let `run` return within 0.5 s. A signal handler may call this method."""
+        # `Event.set` would wait for ever if a second signal came while it holds the event's lock.
+        self._ended = True
 
     def close(self) -> None:
         with suppress(TimeoutError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
@@ -191,3 +192,24 @@ def test_a_viewer_that_comes_while_the_daemon_is_gone_is_told(world: World) -> N
     world.bridge._relay.follow = lambda *_: None  # type: ignore[method-assign]
     world.passes(1.0)
     assert world.server.shown == [GONE, GONE]
+
+
+@pytest.mark.timeout(20)
+def test_two_signals_end_the_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
+    # `timeout` and a closing terminal send two. The second one may interrupt the handler of the
+    # first one at any call or return.
+    for moment in range(20):
+        bridge, passed = World(monkeypatch).bridge, 0
+
+        def interrupt(*_: object, bridge: Bridge = bridge, moment: int = moment) -> None:
+            nonlocal passed
+            passed += 1
+            if passed == moment:
+                bridge.end()
+
+        sys.setprofile(interrupt)
+        try:
+            bridge.end()
+        finally:
+            sys.setprofile(None)
+        bridge.run()
