@@ -54,6 +54,13 @@ def test_every_action_of_a_workflow_is_pinned_by_its_commit() -> None:
     assert [line for line in used if not re.fullmatch(r"\S+@[0-9a-f]{40}  # v[\d.]+", line)] == []
 
 
+def test_the_workflow_installs_the_packages_that_the_page_names() -> None:
+    page = (ROOT / "deploy/release/README.md").read_text()
+    workflow = (ROOT / ".github/workflows/release.yml").read_text()
+    named = re.findall(r"^sudo apt install (.*)$", page, re.M)
+    assert named == re.findall(r"apt-get install -y -qq (.*)$", workflow, re.M)
+
+
 def test_the_address_of_the_project_is_everywhere_the_same() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     hook = project["tool"]["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]
