@@ -35,6 +35,9 @@ from tests.simulate.reports import Echo, HalfDuplex, Reports, judge_pose, judge_
 from tests.simulate.roads import FOREIGN, NS, Message, messages, parameters, read_reply, sample
 from tests.simulate.spread import Spread
 
+REPLAYED = 10
+"""One plan in so many is recorded and replayed."""
+
 RELEASING = {"clear", "activate", "deactivate", "set"}
 """Calls after which the robot may do more or less. Only the answer shows from when on. A `stop`
 counts from its arrival on."""
@@ -186,10 +189,14 @@ class Run:
 
     def play(self) -> Counter[str]:
         """Play the plan to its end; raise `BrokenError` for a promise that does not hold."""
+        if self.plan["seed"] % REPLAYED == 0:
+            self.product.record()
         try:
             self._begin()
             self.run_to(int(self.plan["seconds"] * NS))
             self.liveness.end()
+            if difference := self.product.replayed():
+                raise BrokenError("a recording replays to the bit", self.true_ns, difference)
         except BrokenError:
             raise
         except Exception as error:

@@ -49,14 +49,15 @@ MEASURED_WITH = (
 
 CHILD = """
 import json, sys
-from tests.simulate.actors import collect_seldom, played
+from tests.simulate.actors import REPLAYED, collect_seldom, played
 from tests.simulate.board_inputs import kinds
 from tests.simulate.plan import make_plan
 collect_seldom()
 seed, left, kind = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
 while left > 0.0:
     plan = make_plan(seed)
-    if not kind or kind in kinds(plan) | {plan.get("moment", "")}:
+    recorded = "" if seed % REPLAYED else "recorded"
+    if not kind or kind in kinds(plan) | {plan.get("moment", ""), recorded}:
         result = played(plan)
         left -= result.cpu_s
         print(json.dumps([seed, result.promise, result.cpu_s, result.simulated_s]), flush=True)
@@ -205,11 +206,12 @@ For a fault of the emergency stop, of bumpers that let the robot drive away, of 
 of the battery, only plans with this input are played, about one in fifteen. For a fault that only
 a late step with several events shows, only plans with such a step are played, about one in twenty.
 For `freshness halves` and `freshness budget`, only plans with new senders whose commands are held
-back, or with delays that rise in steps, are played, about one in sixty. A fault must be found
-within {fault:g} core-minutes, a case within {case:g}. A row keeps its last measurement. Its last
-column is the version of the simulator that measured it: a digest of the modules that make, play and
-judge plans. With the present plans, another seed may find an older row's fault. `--again` prints
-the present version, plays the seed of each row again, and lists the rows that no longer hold. "not
+back, or with delays that rise in steps, are played, about one in sixty. For a fault that only a
+replay shows, only plans that are recorded are played, one in ten. A fault must be found within
+{fault:g} core-minutes, a case within {case:g}. A row keeps its last measurement. Its last column is
+the version of the simulator that measured it: a digest of the modules that make, play and judge
+plans. With the present plans, another seed may find an older row's fault. `--again` prints the
+present version, plays the seed of each row again, and lists the rows that no longer hold. "not
 found" says that no seed found the fault in the core-minutes of that row. `--missing` measures those
 faults again, and all without a row.
 """

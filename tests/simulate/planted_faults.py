@@ -26,6 +26,7 @@ PLANS_OF_FAULT = {
     "wheel press": "behind a press", "wheel counts": "coarse encoders",
     "wheel waited": "late lines", "limits saturated": "wheel limit",
     "freshness halves": "backlogs of newcomers", "freshness budget": "later and later",
+    "replay": "recorded",
 }  # fmt: skip
 """Kinds of plans by the name of a fault, or by the first word of its name."""
 
@@ -42,7 +43,7 @@ class Fault(NamedTuple):
     def kind(self) -> str:
         """The kind of plans that can find the fault, or "" for all plans.
 
-        It is a kind of inputs or a moment of `bad_moments.py`.
+        It is a kind of inputs, a moment of `bad_moments.py`, or "recorded".
         """
         first = self.name.split()[0]
         return PLANS_OF_FAULT.get(self.name) or PLANS_OF_FAULT.get(first, "")
@@ -903,6 +904,22 @@ FAULTS = (
         VALUES,
         "return Latches(stop, fault, inactive)",
         "return Latches(stop, None, inactive)",
+    ),
+    # recording
+    fault(
+        "replay clock",
+        "the pose depends on a clock that the inputs do not have",
+        ODOMETRY,
+        "        own = dt - feedback.bridged\n",
+        "        own = dt - feedback.bridged\n"
+        '        self._path.advance(__import__("time").perf_counter_ns() % 2 * 1e-9, 0.0)\n',
+    ),
+    fault(
+        "replay state",
+        "the state at the start of a recording has another heading",
+        "recording/state.py",
+        "            return State(robot, memory)\n",
+        "            robot._odometry._path.turn(0.001)\n            return State(robot, memory)\n",
     ),
     # inputs of the board
     fault(

@@ -19,14 +19,16 @@ import msgspec
 
 import acsard
 from acsard.core.config.parsing import ConfigError, parse
+from acsard.core.guard import Guard
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query
 from acsard.core.messages.encodings import encode as encode_message
+from acsard.core.robot import Robot
 from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.simulated_robot import WatchedMcu
 from acsard.core.values import Estimate as Measured
-from acsard.core.values import Event, Instant, Latches, Outputs, Received
+from acsard.core.values import Event, Inputs, Instant, Latches, Outputs, Received, Recording
 from acsard.daemon.latch_rules import (
     LatchFileError,
     after_failed_write,
@@ -38,6 +40,10 @@ from acsard.daemon.latch_rules import (
     unwritable,
 )
 from acsard.daemon.pacing import Period
+from acsard.recording import rows
+from acsard.recording.recorded_steps import FinishedStep
+from acsard.recording.replay import Replay
+from acsard.recording.state import freeze, thaw
 from tests.scenarios.world import START, World
 from tests.simulate.gyro_faults import FaultyGyro, GyroFaults
 
@@ -46,6 +52,12 @@ WALL_OFFSET_NS = START.wall_ns - START.mono_ns
 
 HELD = 16
 """Samples of one key that wait for a step, as the real inbox holds them."""
+
+BATCH = 200
+"""Steps that a recording encodes together."""
+
+FILE = 5 * BATCH
+"""Steps of a file of the recording. The next file begins with the robot's state."""
 
 Estimate = tuple[int, float, float, float, tuple[float, ...], tuple[float, ...]]
 """Time of the sample, x, y, yaw, the upper triangle of the covariance, and the wheel angles."""
@@ -175,6 +187,47 @@ class Disk:
         return self._newest
 
 
+class Tape:
+    """Records the steps of one daemon as the black box does, and replays them."""
+
+    def __init__(self, robot: Robot, guard: Guard) -> None:
+        self.difference = ""
+        """The first step whose replay has another result, and the outputs that differ."""
+        self.status = Recording()
+        self._steps: list[FinishedStep] = []
+        self._number = 0
+        self._replay = Replay(*thaw(freeze(robot, guard.memory)))
+
+    def begins(self, robot: Robot, guard: Guard) -> None: ...
+
+    def step(
+        self, inputs: Inputs, outputs: Outputs, sent: bytes | None, robot: Robot, guard: Guard
+    ) -> None:
+        self._steps.append(FinishedStep(inputs, outputs, sent))
+        if len(self._steps) == BATCH:
+            self.replay()
+            if self._number % FILE == 0:
+                self._replay.resume(*thaw(freeze(robot, guard.memory)))
+
+    def died(self, inputs: Inputs) -> None: ...
+
+    def replay(self) -> None:
+        """Replay the steps that have not been replayed yet."""
+        if not self._steps or self.difference:
+            self._steps.clear()
+            return
+        for step in rows.decode(rows.encode(self._number, self._steps)):
+            self._replay.step(step)
+        self._number += len(self._steps)
+        self._steps.clear()
+        comparison = self._replay.comparison
+        if comparison.first is not None:
+            what = ", ".join(comparison.first.what)
+            self.difference = f"the step at {comparison.first.at.mono_ns / 1e9:.3f} s: {what}"
+        elif not comparison.exact:
+            self.difference = f"an estimate in the {BATCH} steps before step {self._number}"
+
+
 class Product:
     """One robot with its computer and its board. Its daemon may end and start several times."""
 
@@ -195,6 +248,7 @@ class Product:
         self.unplugged_ns = self.plugged_ns = START_NS
         """When the board was last unplugged, and plugged in: a daemon that starts finds it so."""
         self._world = World(self._config, keeper=self.disk, gyro=self._imperfect)
+        self._tapes: list[Tape] | None = None
         self._began()
 
     def _began(self) -> None:
@@ -202,6 +256,8 @@ class Product:
         world.bus.wanted_keys = set()
         world.watch = self._watch
         self.dropped = 0
+        if self._tapes is not None:
+            self.record()
         feed = world.port.feed
 
         def noticed(received: Received) -> None:
@@ -242,6 +298,22 @@ class Product:
                 events,
             )
         )
+
+    # the recording
+
+    def record(self) -> None:
+        """Record this daemon and each later one, and replay their steps."""
+        loop = self._world.loop
+        tape = Tape(loop.robot, loop._guard)
+        loop._recorder = tape
+        self._tapes = [*(self._tapes or []), tape]
+
+    def replayed(self) -> str:
+        """Return the first difference between the recorded steps and their replay, or ""."""
+        tapes = self._tapes or []
+        for tape in tapes:
+            tape.replay()
+        return next((tape.difference for tape in tapes if tape.difference), "")
 
     # time
 
