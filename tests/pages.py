@@ -490,7 +490,7 @@ COMMANDS: dict[str, How] = {
     "sudo acsard service upgrade .venv": Elsewhere(
         UPGRADE, "test_an_environment_is_upgraded_to_by_its_directory"
     ),
-    "sudo acsard service upgrade acsard_0.2.0-1~deb12_arm64.deb": Elsewhere(
+    "sudo acsard service upgrade acsard_0.3.0-1~deb12_arm64.deb": Elsewhere(
         UPGRADE, "test_a_package_is_upgraded_to_and_dpkg_alone_changes_nothing"
     ),
     "sudo acsard service rollback": Elsewhere(UPGRADE, "test_twenty_upgrades_and_rollbacks"),
