@@ -102,7 +102,13 @@ def test_version_prints_the_name_and_ends_with_0() -> None:
 
 @each(
     "words",
-    [["dirve"], ["call", "halt"], ["echo"], ["sim", "--fault", "x"], ["run", "--prot", "sim"]],
+    [
+        ["dirve"],
+        ["call", "stop", "now"],
+        ["echo"],
+        ["sim", "--fault", "x"],
+        ["run", "--prot", "sim"],
+    ],
 )
 def test_a_mistyped_command_ends_with_2(words: list[str]) -> None:
     ended = typed(*words)
