@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -12,15 +13,23 @@ from acsard.host.errors import MendableError
 
 Extra = Literal["foxglove", "tools"]
 
+# A library that acsard has only with this extra.
+_LIBRARIES = {"foxglove": "foxglove", "tools": "aiohttp"}
+
 
 def install(extra: Extra = "tools") -> str:
     """Return the advice that installs an extra, as the end of a sentence."""
-    came_from = _url()
+    came_from, installer = _url(), _installer()
+    extras: str = extra
+    if not installer.endswith(" -m pip install"):
+        # uv and pipx make the environment anew, without the extras that the command omits.
+        there = {name for name, library in _LIBRARIES.items() if find_spec(library)}
+        extras = ",".join(sorted({extra, *there}))
     if came_from.endswith(".whl"):
-        return f"type `{_installer()} 'acsard[{extra}] @ {came_from}'`"
+        return f"type `{installer} 'acsard[{extras}] @ {came_from}'`"
     if came_from:
-        return f"type `{_installer()} '.[{extra}]'` in the clone of acsard"
-    return f"type `{_installer()} 'acsard[{extra}]'`"
+        return f"type `{installer} '.[{extras}]'` in the clone of acsard"
+    return f"type `{installer} 'acsard[{extras}]'`"
 
 
 def missing(library: str, extra: Extra = "tools") -> MendableError:

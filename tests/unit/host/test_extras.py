@@ -12,6 +12,7 @@ from typing import get_args
 
 import pytest
 
+from acsard.host import extras
 from acsard.host.extras import Extra, install, missing
 from tests.each import each
 from tests.pages import ROOT
@@ -55,6 +56,7 @@ def test_the_advised_command_installs_the_extra_as_acsard_was_installed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(metadata, "distribution", lambda name: Installed(url))
+    monkeypatch.setattr(extras, "find_spec", lambda library: None)
     prefix = tmp_path / (file or "venv")
     prefix.mkdir(exist_ok=True)
     monkeypatch.setattr(sys, "prefix", str(prefix))
@@ -62,6 +64,16 @@ def test_the_advised_command_installs_the_extra_as_acsard_was_installed(
         (prefix / file).touch()
     words = shlex.split(install(extra).split("`")[1])
     assert words == [*command, what.format(extra)]
+
+
+@each("file", ["uv-receipt.toml", "pipx_metadata.json"])
+def test_uv_and_pipx_keep_the_other_extra(
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extras, "find_spec", lambda library: library == "aiohttp" or None)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    (tmp_path / file).touch()
+    assert "[foxglove,tools]" in install("foxglove")
 
 
 def test_the_error_names_the_library_and_the_extra() -> None:
