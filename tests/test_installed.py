@@ -9,10 +9,10 @@ import os
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Timer
 
 import pytest
 
@@ -20,6 +20,7 @@ from acsard.cli import UNLISTED, VERBS
 from acsard.host.version import commit_of
 from deploy.release import contents
 from tests.pages import ROOT
+from tests.unit.calibration.cut import usual
 
 pytestmark = [
     pytest.mark.slow,
@@ -30,29 +31,47 @@ pytestmark = [
 
 WITHIN_S = 60.0
 
-# Subcommands that end by themselves, with a word of their output. `{}` is the test's directory.
+# What each subcommand says, and its exit code. `{}` is the test's directory.
 WORKS = {
-    "--version": "acsard 0",
-    "check": "faults = []",
-    "topics": "cmd_vel",
-    "ports": "",
-    "tls router robot1": "",
-    "service install --dry-run": "systemctl enable --now acsard.service",
-    "service uninstall --dry-run": "",
-    "get info": '"version":"',
-    "echo state -n 1 --short": "m/s",
-    "echo odom -n 1": '"child_frame_id"',
-    "call stop": "stopped and latched",
-    "call clear": "cleared",
-    "set": "limits.linear_speed",
-    "set limits.linear_speed 0.4": "0.4",
-    "fleet --once": "sim",
-    "recording show {}/recordings": "",
-    "recording export {}/recordings {}/export.csv": "",
+    "--version": (0, "acsard 0"),
+    "check": (0, "faults = []"),
+    "topics": (0, "cmd_vel"),
+    "ports": (0, ""),
+    "tls router robot1": (0, "// The configuration of a Zenoh"),
+    "service install --dry-run": (0, "systemctl enable --now acsard.service"),
+    "service uninstall --dry-run": (0, ""),
+    "get info": (0, '"version":"'),
+    "echo state -n 1 --short": (0, "m/s"),
+    "echo odom -n 1": (0, '"child_frame_id"'),
+    "top --once": (0, "pose and twist"),
+    "fleet --once": (0, "1 robot"),
+    "doctor": (0, "the running daemon"),
+    "call stop": (0, "stopped and latched"),
+    "call clear": (0, "cleared"),
+    "set": (0, "limits.linear_speed"),
+    "set limits.linear_speed 0.4": (0, "limits.linear_speed = 0.4"),
+    "recording": (0, "[being recorded]"),
+    "recording show": (0, "link up"),
+    "recording export 1 {}/export.csv --csv": (0, "rows in"),
+    "calibrate --log {}/drive.csv": (0, "wheel_separation_multiplier"),
+    "drive": (2, "reads single key presses"),
+    "mcu check": (2, "`acsard mcu check --port DEVICE`"),
 }
 NEED_TOOLS = {
-    "tls init --directory {}/tls": "",
-    "set limits.linear_speed 0.3 --keep": "0.3",
+    "tls init --directory {}/tls": (0, "ca.pem"),
+    "set limits.linear_speed 0.3 --keep": (0, "limits.linear_speed = 0.3"),
+    "web --tokens": (0, "no tokens"),
+}
+
+# What subcommands say that serve until a signal. The gateway needs what `tls init` made.
+SERVE = {
+    "run --port sim": "link_up",
+    "sim": "acsard run --port /dev/",
+    "router {}/router.json5": "listens at tcp/",
+}
+SERVE_WITH_TOOLS = {
+    "web": "http://127.0.0.1:",
+    "gateway --config {}/gateway.toml": "listens at tls/",
 }
 
 
@@ -64,21 +83,28 @@ def free_port() -> int:
 
 
 @contextmanager
-def running(words: list[str], env: dict[str, str]) -> Iterator[None]:
-    """Run the daemon of this environment in the block."""
-    daemon = subprocess.Popen(
-        words, env=env, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
+def serving(words: list[str], expected: str, env: dict[str, str]) -> Iterator[None]:
+    """Run a subcommand that serves in the block, which starts when `expected` was printed."""
+    server = subprocess.Popen(
+        words, env=env, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        text=True,
     )  # fmt: skip
+    assert server.stdout is not None
+    late = Timer(WITHIN_S, server.kill)
+    late.start()
+    output = ""
     try:
-        until = time.monotonic() + WITHIN_S
-        while run([words[0], "get", "info"], env)[0]:
-            assert daemon.poll() is None
-            assert time.monotonic() < until
+        while expected not in output:
+            line = server.stdout.readline()
+            assert line, f"{words}: {output}"
+            output += line
+        late.cancel()
         yield
     finally:
-        daemon.terminate()
-        daemon.wait(10.0)
+        late.cancel()
+        server.terminate()
+        rest, _ = server.communicate(timeout=WITHIN_S)
+    assert server.returncode == 0, f"{words}: {output}{rest}"
 
 
 def run(words: list[str], env: dict[str, str], within_s: float = WITHIN_S) -> tuple[int, str]:
@@ -126,8 +152,9 @@ def test_every_subcommand_of_an_installed_wheel_works_or_names_its_extra(
     (wheel,) = made.glob("*.whl")
     programs = tmp_path / "bin"
     config = tmp_path / "acsard.toml"
+    daemon = f"tcp/127.0.0.1:{free_port()}"
     config.write_text(
-        f'robot.id = "installed"\nbus.listen = ["tcp/127.0.0.1:{free_port()}"]\n'
+        f'robot.id = "installed"\nbus.listen = ["{daemon}"]\n'
         f'web.address = ["http://127.0.0.1:{free_port()}"]\n'
         f'record.directory = "{tmp_path}/recordings"\n'
     )
@@ -139,31 +166,45 @@ def test_every_subcommand_of_an_installed_wheel_works_or_names_its_extra(
         "PIPX_HOME": str(tmp_path / "pipx"),
         "PIPX_BIN_DIR": str(programs),
     }
+    (tmp_path / "drive.csv").write_text(usual().csv(places=False))
+    (tmp_path / "router.json5").write_text(
+        f'{{mode: "router", listen: {{endpoints: ["tcp/127.0.0.1:{free_port()}"]}}}}'
+    )
+    (tmp_path / "gateway.toml").write_text(
+        f'robot.id = "installed"\nbus.tls = "{tmp_path}/tls"\n'
+        f'bus.listen = ["{daemon}", "tls/127.0.0.1:{free_port()}"]\n'
+    )
     what = f"acsard[{extra}] @ {wheel.as_uri()}" if extra else str(wheel)
     code, output = run(way(made, what), env, 600.0)
     assert code == 0, output
-    acsard = str(programs / "acsard")
-    _, python, *_ = (programs / "acsard").read_text().splitlines()[0].partition("#!")
-    code, output = run([python, "-c", VERSIONS], env)
+    acsard = programs / "acsard"
+    code, output = run([str(acsard.resolve().parent / "python"), "-c", VERSIONS], env)
+    assert code == 0, output
     installed = dict(line.split("==") for line in output.split())
     tested = dict(contents.pins())
     assert {name: tested.get(name) for name in installed} == installed
 
-    for verb in (*VERBS, *UNLISTED):
-        code, output = run([acsard, verb, "--help"], env)
-        assert code == 0, f"{verb}: {output}"
-    with running([acsard, "run", "--port", "sim"], env):
-        for words, expected in (WORKS | (NEED_TOOLS if extra else {})).items():
-            code, output = run([acsard, *words.replace("{}", str(tmp_path)).split()], env)
-            assert code == 0, f"{words}: {output}"
-            assert expected in output, f"{words}: {output}"
-    lacking = ["foxglove"] if extra else ["foxglove", "web", *NEED_TOOLS]
-    for words in lacking:
-        code, output = run([acsard, *words.replace("{}", str(tmp_path)).split()], env)
-        assert code == 1, f"{words}: {output}"
-        named = "foxglove" if words == "foxglove" else "tools"
-        installer = "uv tool install" if way is with_uv else "pipx install --force"
-        assert f"type `{installer} 'acsard[{named}] @ {wheel.as_uri()}'`" in output, output
+    def typed(text: str) -> list[str]:
+        return [str(acsard), *text.replace("{}", str(tmp_path)).split()]
+
+    # uv and pipx would remove an extra that the command does not name.
+    lacking = {"foxglove": "foxglove,tools" if extra else "foxglove"}
+    lacking |= dict.fromkeys([] if extra else ["web", *NEED_TOOLS], "tools")
+    first, *others = (SERVE | (SERVE_WITH_TOOLS if extra else {})).items()
+    with serving(typed(first[0]), first[1], env):
+        for text, expected in (WORKS | (NEED_TOOLS if extra else {})).items():
+            code, output = run(typed(text), env)
+            assert (code, expected[1] in output) == (expected[0], True), f"{text}: {code} {output}"
+        for text, word in others:
+            with serving(typed(text), word, env):
+                pass
+        for text, named in lacking.items():
+            code, output = run(typed(text), env)
+            assert code == 1, f"{text}: {output}"
+            installer = "uv tool install" if way is with_uv else "pipx install --force"
+            assert f"type `{installer} 'acsard[{named}] @ file://{wheel}'`" in output, output
+    tried = {text.split()[0] for text in (*WORKS, *SERVE, *SERVE_WITH_TOOLS, *lacking)}
+    assert {*VERBS, *UNLISTED} <= tried
 
 
 VERSIONS = """\
