@@ -20,7 +20,7 @@ def test_without_its_library_it_says_which_extra_to_install(
     for name in [name for name in sys.modules if name.startswith("acsard.foxglove")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "foxglove", None)  # as if the library were not installed
-    with pytest.raises(MendableError, match=r"pip install .*\[foxglove\]'") as error:
+    with pytest.raises(MendableError, match=r"pipx? install .*\[foxglove(,tools)?\]'") as error:
         foxglove.main(argparse.Namespace())
     assert error.value.code == Exit.FAILURE
 

@@ -110,7 +110,7 @@ def test_write_without_tomlkit_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "tomlkit", None)
-    with pytest.raises(MendableError, match=r"pip install .*\[tools\]'"):
+    with pytest.raises(MendableError, match=r"pipx? install .*\[(foxglove,)?tools\]'"):
         called(tmp_path, "--port", "sim", "--yes", "--write")
 
 
