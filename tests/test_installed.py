@@ -63,7 +63,8 @@ NEED_TOOLS = {
     "web --tokens": (0, "no tokens"),
 }
 
-# What subcommands say that serve until a signal. The gateway needs what `tls init` made.
+# These subcommands run until a signal, and print this when they are ready. The gateway needs the
+# certificates of `tls init`.
 SERVE = {
     "run --port sim": "link_up",
     "sim": "acsard run --port /dev/",

@@ -238,8 +238,13 @@ def change(name: str, say: Say, wait_s: Seconds = WAIT_S, watch_s: Seconds = WAT
         trouble = watch(address, seen, running, watch_s)
     if trouble:
         versions.go_back(before, older)
-        _start(name, before, running, say)
-        back = _came_back(before) if UNIT in running else f"version {before} is in use again"
+        back = f"version {before} is in use again"
+        try:
+            _start(name, before, running, say)
+            if UNIT in running:
+                back = _came_back(before)
+        except (OSError, MendableError) as error:
+            back += f", but cannot be started ({error})"
         raise MendableError(f"version {name} {trouble}; {back}. `journalctl -u acsard` has the log")
     versions.remove_others()
     say(f"version {name} works; `sudo acsard service rollback` goes back to {before}")

@@ -224,14 +224,19 @@ def test_the_same_source_gives_the_same_bytes(
         assert one.read_bytes() == other.read_bytes(), one.name
 
 
+def _two_packages(bare: Root, made: list[Path]) -> tuple[Path, Path]:
+    """Give a root systemd and two packages of different versions, the older first."""
+    bare.run("apt-get install --yes --no-install-recommends systemd-sysv dbus udev python3")
+    first = package(made, "12", "amd64")
+    shutil.copyfile(first, bare.path / first.name)
+    return first, newer(first, bare.path)
+
+
 def test_the_first_installation_starts_the_service_and_no_upgrade_restarts_it(
     made: list[Path], place: Path, tmp_path: Path
 ) -> None:
     with root(place, "12", "amd64") as bare:
-        bare.run("apt-get install --yes --no-install-recommends systemd-sysv dbus udev python3")
-        first = package(made, "12", "amd64")
-        shutil.copyfile(first, bare.path / first.name)
-        second = newer(first, bare.path)
+        first, second = _two_packages(bare, made)
         with Container(bare.path, tmp_path, "acsard-deb") as container:
             done = container.run("dpkg", "--install", f"/{first.name}")
             assert done.code == 0, done.err
@@ -275,10 +280,7 @@ def test_service_upgrade_changes_to_a_package_and_rollback_back_with_the_stop_la
     made: list[Path], place: Path, tmp_path: Path
 ) -> None:
     with root(place, "12", "amd64") as bare:
-        bare.run("apt-get install --yes --no-install-recommends systemd-sysv dbus udev python3")
-        first = package(made, "12", "amd64")
-        shutil.copyfile(first, bare.path / first.name)
-        second = newer(first, bare.path)
+        first, second = _two_packages(bare, made)
         with Container(bare.path, tmp_path, "acsard-deb") as container, Board(container) as board:
             done = container.run("dpkg", "--install", f"/{first.name}")
             assert done.code == 0, done.err

@@ -112,8 +112,8 @@ def test_a_process_that_is_not_there_has_no_name() -> None:
     [
         (tuple(acsard("run")), "acsard"),
         (("acsard", "sim"), "acsard"),
-        (("/opt/acsard/venv/bin/acsard", "run"), "acsard"),
-        (("/opt/acsard/venv/bin/python3.13", "/opt/acsard/venv/bin/acsard", "run"), "acsard"),
+        (("/opt/acsard/0.2.0/bin/acsard", "run"), "acsard"),
+        (("/usr/bin/python3.13", "/opt/acsard/0.2.0/bin/acsard", "run"), "acsard"),
         (("python", "-m", "acsard", "run"), "acsard"),
         (("python3", "-PBm", "acsard"), "acsard"),
         (("python3", "-X", "utf8", "-Wignore", "-macsard"), "acsard"),
@@ -142,7 +142,7 @@ def test_only_a_process_that_executes_acsard_has_its_name(
 @pytest.mark.parametrize(
     ("command", "here"),
     [
-        (("/opt/acsard/venv/bin/acsard", "run", "--config", "robot.toml"), True),
+        (("/opt/acsard/0.2.0/bin/acsard", "run", "--config", "robot.toml"), True),
         (tuple(acsard("run")), True),
         (("python3", "bin/acsard", "web"), False),
         (("python3", "-m", "other", "run"), False),
