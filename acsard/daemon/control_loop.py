@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from msgspec.structs import replace
 
 from acsard.core.codes import RefusalCode
-from acsard.core.config.live import differences
+from acsard.core.config.live import Difference
 from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.formatting import listed
@@ -119,7 +119,9 @@ class ControlLoop:
         self._others = [] if others is None else others
         self._beside = beside
         self._config, self._adopted = config, adopted
-        self._started, self._changed_settings = config, ""
+        # Highest speed at the start; settings that differ from then, and their values then.
+        self._top_speed = config.limits.linear_speed
+        self._differing: dict[str, Difference] = {}
         self._recorder, self._handover = recorder, Handover(latches, keeper)
         self._speed_cap: SpeedCap | None = None
         # Answers, with the time at which each was queued, until the latches are in their file.
@@ -236,7 +238,7 @@ class ControlLoop:
             outputs = self.outputs = self.robot.step(inputs)
             self._handover.take(outputs.latches)
             if self.robot.config is not self._config:
-                self._adopt(self.robot.config)
+                self._adopt(self.robot.config, outputs.answers)
             line = self._send(outputs, inputs.now)
         except Exception:
             if self._recorder is not None:
@@ -257,14 +259,16 @@ class ControlLoop:
         """Store the stops that arrived after the last step, which no step will process."""
         self._handover.take_stops(self._handover.latches, _stops(self._bus.take(0)), now)
 
-    def _adopt(self, config: Config) -> None:
-        self._config = config
+    def _adopt(self, config: Config, answers: tuple[Answer, ...]) -> None:
+        self._config = self._queries.config = config
         self._guard.use(config)
         self.report.use(config)
-        self._queries.use(config)
-        changes = differences(config, self._started)
-        texts = [change.describe(key) for key, change in changes.items()]
-        self._changed_settings = listed(texts, MAX_NAMED)
+        for answer in answers:
+            for key, (old, new) in answer.changes.items():
+                earlier = self._differing.pop(key, None)
+                ours = old if earlier is None else earlier.ours
+                if new != ours:
+                    self._differing[key] = Difference(new, ours)
 
     def _from_bus(
         self, now: Instant
@@ -291,7 +295,7 @@ class ControlLoop:
                 continue
             if arrival.key == SPEED_LIMIT:
                 try:
-                    self._speed_cap = decode_limit(arrival, self._started.limits.linear_speed)
+                    self._speed_cap = decode_limit(arrival, self._top_speed)
                 except DecodeError as error:
                     refusals.append(Refusal(error.reason, f"{SPEED_LIMIT}: {error}"))
                 continue
@@ -405,7 +409,9 @@ class ControlLoop:
             routers=self._routers.status,
             latch_file=self._handover.trouble,
             recording=Recording() if self._recorder is None else self._recorder.status,
-            settings_differ=self._changed_settings,
+            settings_differ=listed(
+                [one.describe(key) for key, one in self._differing.items()], MAX_NAMED
+            ),
         )
 
 

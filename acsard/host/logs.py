@@ -206,10 +206,14 @@ class Log:
                 form = "json"
         self._writer = Writer(stream)
         self._form, self._stream = form, stream
+        self._level = ""
         self.use(settings)
 
     def use(self, settings: LogConfig) -> None:
         """Use the log level of `settings`; the destination and the format stay."""
+        if settings.level == self._level:
+            return
+        self._level = settings.level
         self._logger: Any = structlog.wrap_logger(
             structlog.WriteLogger(self._writer),  # type: ignore[arg-type]
             processors=[

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from itertools import pairwise
 
 import msgspec
 import pytest
 
+from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, LimitsConfig
 from acsard.core.incoming.commands import Via
 from acsard.core.incoming.queries import Query
@@ -14,7 +16,9 @@ from acsard.core.messages.cdr import Cdr
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.messages.signature import public_name
 from acsard.core.ros import parameters as rcl
-from acsard.core.values import NS_PER_S, Outputs, Plain
+from acsard.core.values import NS_PER_S, Instant, Outputs, Plain
+from acsard.daemon.pacing import NO_PERIOD, Period
+from tests.each import each
 from tests.scenarios.speakers import Speaker, moved
 from tests.scenarios.world import World
 
@@ -264,3 +268,46 @@ def test_a_robot_that_does_not_brake_is_stopped_by_the_guard_whatever_is_set_mea
     still_ns = world.now_ns
     world.run(60.0)
     assert not moved(world, still_ns)
+
+
+def calls_of_longest_step(world: World, service: str, payload: bytes) -> int:
+    """Call a service, and return the largest number of function calls of a step meanwhile."""
+    step, counts = world.loop.step, list[int]()
+
+    def count(frame: object, event: str, argument: object) -> None:
+        counts[-1] += event in ("call", "c_call")
+
+    def counted(now: Instant, period: Period = NO_PERIOD) -> Outputs:
+        counts.append(0)
+        sys.setprofile(count)
+        try:
+            return step(now, period)
+        finally:
+            sys.setprofile(None)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(world.loop, "step", counted)
+        world.call(service, payload)
+    return max(counts)
+
+
+@each(
+    "settings",
+    [
+        {"limits.linear_speed": 0.4},
+        {"limits.linear_jerk": 2.0, "odometry.yaw_variance_per_radian": 0.5, "rates.odom": 10.0},
+        {"commands.sources.nav.timeout": 0.5},
+        {"limits.linear_speed": 0.9, "mcu.port": "/dev/x"},
+    ],
+)
+def test_a_set_costs_no_period(settings: dict[str, Plain]) -> None:
+    # Counted, because a time depends on the load of the machine. A step of `set_pose` has 314
+    # calls; five times as many take a quarter of a millisecond here, and one after a sleep.
+    world = World(parse(b""))
+    world.run(0.2)
+    for speed in (1.0, 1.1):
+        # The first ones fill caches.
+        world.call("set", msgspec.json.encode({"settings": {"limits.angular_speed": speed}}))
+    pose = calls_of_longest_step(world, "set_pose", b'{"x": 1.0}')
+    changed = calls_of_longest_step(world, "set", msgspec.json.encode({"settings": settings}))
+    assert changed < 5 * pose

@@ -7,7 +7,7 @@ not in `LIVE` takes effect at the next start.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -17,7 +17,7 @@ from acsard.core.config.nearest import hint
 from acsard.core.config.parsing import ConfigError, effective
 from acsard.core.config.removed import why_removed
 from acsard.core.config.settings import Config
-from acsard.core.config.validation import build, show
+from acsard.core.config.validation import build_value, keys_of, show
 from acsard.core.values import Plain
 
 When = Literal["always", "raised", "rest"]
@@ -136,34 +136,67 @@ def describe_changes(changes: Changes) -> str:
 def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tuple[Config, Changes]:
     """Return `config` with new values, and the changes; all or nothing. Raises `ConfigError`.
 
-    A value that is in force is ignored, even if its setting cannot change.
+    A value that is in force is ignored, even if its setting cannot change. A step of the control
+    loop calls this, so only a refusal looks at all settings.
     """
-    tables: dict[str, Any] = effective(config)
-    before = dict(flat(tables))
-    new = {key: value for key, value in wishes.items() if not _same(before.get(key), value)}
-    fixed = [key for key in new if find_live_setting(key) is None or key not in before]
+    tables = effective(config)
+    before = {key: _in_force(tables, key) for key in wishes}
+    new = {key: value for key, value in wishes.items() if not _same(before[key], value)}
+    fixed = [key for key in new if find_live_setting(key) is None or before[key] is None]
     if fixed:
         more = [f"and {len(fixed) - 1} more of these keys cannot be set"] if len(fixed) > 1 else []
-        raise ConfigError([_refusal(fixed[0], new[fixed[0]], before), *more])
+        raise ConfigError([_refusal(fixed[0], new[fixed[0]], dict(flat(tables))), *more])
     problems: list[str] = []
-    # `build` accepts the tables of the sources only as a list, as a TOML file has them.
-    tables["commands"]["sources"] = list(tables["commands"]["sources"])
+    made = config
     for key, value in new.items():
-        _set_value(tables, key.split("."), value)
-    sections = {key.partition(".")[0] for key in new}
-    built = {
-        name: build(type(getattr(config, name)), tables[name], name, problems) for name in sections
-    }
+        made = _with(made, key, value, problems)
     if problems:
         raise ConfigError(problems)
-    made = replace(config, **built)
-    after = dict(flat(effective(made)))
+    after = effective(made)
+    changes = {key: (_plain(before[key]), _plain(_in_force(after, key))) for key in new}
     problems = contradictions(made)
     if not at_rest:
-        problems += [line for key in new if (line := _must_stand(key, before[key], after[key]))]
+        problems += [line for key in changes if (line := _must_stand(key, *changes[key]))]
     if problems:
         raise ConfigError(problems)
-    return made, {key: (_plain(before[key]), _plain(after[key])) for key in new}
+    return made, changes
+
+
+def _in_force(tables: object, key: str) -> object:
+    # The value of a dotted key, or None: no setting has it.
+    inner = tables
+    for part in key.split("."):
+        if isinstance(inner, list | tuple):
+            inner = {table["name"]: {**table, "name": None} for table in inner}
+        inner = inner.get(part) if isinstance(inner, Mapping) else None
+    is_table = isinstance(inner, Mapping) or (
+        isinstance(inner, list | tuple) and any(isinstance(one, Mapping) for one in inner)
+    )
+    return None if is_table else inner
+
+
+def _with(config: Config, key: str, raw: object, problems: list[str]) -> Config:
+    # The value of a live setting, converted and checked like that of a file.
+    section, *middle, name = key.split(".")
+    table = getattr(config, section)
+    if not middle:
+        made = _with_value(table, name, raw, key, problems)
+    else:
+        sources = list(config.commands.sources)
+        at = [source.name for source in sources].index(middle[-1])
+        where = f"commands.sources[{at}].{name}"
+        sources[at] = _with_value(sources[at], name, raw, where, problems)
+        made = replace(table, sources=tuple(sources))
+    return replace(config, **{section: made})
+
+
+S = TypeVar("S", bound=Struct)
+
+
+def _with_value(table: S, name: str, raw: object, where: str, problems: list[str]) -> S:
+    key = keys_of(type(table))[name]
+    value = build_value(key, raw, where, problems, set())
+    return table if value is None else replace(table, **{key.field.name: value})
 
 
 def _plain(value: Any) -> Plain:
@@ -192,16 +225,6 @@ def _refusal(key: str, value: object, known: Mapping[str, object]) -> str:
             "the clock of its host; leave use_sim_time false in the nodes that use this robot"
         )
     return f"{show(key)}: unknown key; {hint(key, known, '`acsard set` lists the settings')}"
-
-
-def _set_value(tables: dict[str, Any], path: list[str], value: object) -> None:
-    inner: Any = tables
-    for part in path[:-1]:
-        if isinstance(inner, list):
-            inner = next(table for table in inner if table["name"] == part)
-        else:
-            inner = inner[part]
-    inner[path[-1]] = list(value) if isinstance(value, tuple) else value
 
 
 def _must_stand(key: str, before: object, after: object) -> str:

@@ -6,7 +6,8 @@ import math
 import re
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any, TypeVar
+from functools import cache
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import inspect
@@ -16,6 +17,20 @@ from acsard.core.config.nearest import nearest
 from acsard.core.config.removed import why_removed
 
 T = TypeVar("T", bound=msgspec.Struct)
+
+
+class Key(NamedTuple):
+    """A key of a table, with the type of its value as msgspec describes it."""
+
+    field: FieldInfo
+    kind: inspect.Type
+
+
+@cache  # msgspec takes 0.1 ms for a table, which is too long in a step of the control loop
+def keys_of(cls: type[msgspec.Struct]) -> dict[str, Key]:
+    """Return the keys of a table by their names in the file."""
+    return {field.encode_name: Key(field, inspect.type_info(field.type)) for field in fields(cls)}
+
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
 
@@ -42,7 +57,7 @@ def build_partly(
         header = f"[[{path.partition('[')[0]}]]" if path.endswith("]") else f"[{path}]"
         problems.append(f"{path} = {show(table)}: expected a table; write it as {header}")
         return None
-    known = {field.encode_name: field for field in fields(cls)}
+    known = keys_of(cls)
     prefix, complete = f"{path}." if path else "", True
     for key in table:
         if key not in known and (advice := why_removed(prefix + key)):
@@ -53,10 +68,10 @@ def build_partly(
             # The user may have meant the similar key, so treat the value of that key as invalid.
             invalid |= {prefix + name for name in near}
     values: dict[str, Any] = {}
-    for name, field in known.items():
-        where = prefix + name
+    for name, key in known.items():
+        where, field = prefix + name, key.field
         if name in table:
-            value = _value(field, table[name], where, problems, invalid)
+            value = build_value(key, table[name], where, problems, invalid)
             if value is not None:
                 values[field.name] = value
             elif field.required:
@@ -73,12 +88,12 @@ def known_part(cls: type[msgspec.Struct], table: object) -> object:
     """Return a TOML table without the keys that the struct and its parts do not have."""
     if not isinstance(table, Mapping):
         return table
-    names = {field.encode_name: field for field in fields(cls)}
-    return {key: _known(names[key], value) for key, value in table.items() if key in names}
+    keys = keys_of(cls)
+    return {name: _known(keys[name].kind, value) for name, value in table.items() if name in keys}
 
 
-def _known(field: FieldInfo, value: object) -> object:
-    match inspect.type_info(field.type):
+def _known(kind: inspect.Type, value: object) -> object:
+    match kind:
         case inspect.StructType(cls=cls):
             return known_part(cls, value)
         case inspect.VarTupleType(item_type=inspect.StructType(cls=cls)) if isinstance(value, list):
@@ -86,12 +101,11 @@ def _known(field: FieldInfo, value: object) -> object:
     return value
 
 
-def _value(
-    field: FieldInfo, raw: object, where: str, problems: list[str], invalid: set[str]
-) -> Any:
-    if isinstance(field.type, type) and issubclass(field.type, msgspec.Struct):
-        return build_partly(field.type, raw, where, problems, invalid)
-    kind = inspect.type_info(field.type)
+def build_value(key: Key, raw: object, where: str, problems: list[str], invalid: set[str]) -> Any:
+    """Convert the value of a key, or return None and append its mistakes."""
+    field, kind = key
+    if isinstance(kind, inspect.StructType):
+        return build_partly(kind.cls, raw, where, problems, invalid)
     if isinstance(kind, inspect.VarTupleType) and isinstance(kind.item_type, inspect.StructType):
         if not isinstance(raw, list):
             problems.append(f"{where} = {show(raw)}: expected tables; write them as [[{where}]]")

@@ -111,20 +111,11 @@ class Queries:
     """Answers queries by constants or the newest messages; makes requests of service calls."""
 
     def __init__(self, config: Config, info: Info) -> None:
-        self._config = config
-        self._fixed: dict[str, object] = {
-            "info": info,
-            "config": effective(config),
-            "topics": topic_table(config),
-        }
-        self._parameters = Parameters(effective(config))
+        self.config = config  # in force
+        self._fixed: dict[str, object] = {"info": info, "topics": topic_table(config)}
+        self._parameters: Parameters | None = None  # of `_parameters_of`
+        self._parameters_of = config
         self._waiting: dict[int, _Waiting] = {}
-
-    def use(self, config: Config) -> None:
-        """Answer queries with other settings from now on."""
-        self._config = config
-        self._fixed["config"] = effective(config)
-        self._parameters = Parameters(effective(config))
 
     def serve(
         self, query: Query, current: Current, outputs: Outputs | None
@@ -179,11 +170,17 @@ class Queries:
                 self._waiting[query.ticket] = _Waiting(query.topic, "cdr", asked, query.payload)
                 ticket, at_ns = query.ticket, query.arrived_ns
                 return Request("set", ticket, asked_ns=at_ns, by=by, settings=wish)
-            payload = self._parameters.answer(service, query.payload)
+            payload = self._in_force().answer(service, query.payload)
         except CdrError as error:
             raise DecodeError("malformed", str(error)) from None
         attachment, encoding = _echo(asked, wall_ns), encoding_name("cdr")
         return [Reply(query.ticket, query.topic, payload, encoding, attachment=attachment)]
+
+    def _in_force(self) -> Parameters:
+        # Not made by a `set`: it takes as long as the rest of its step.
+        if self._parameters is None or self._parameters_of is not self.config:
+            self._parameters, self._parameters_of = Parameters(effective(self.config)), self.config
+        return self._parameters
 
     def _service(self, query: Query, form: Format) -> list[Reply] | Request:
         if query.asked != query.topic:
@@ -215,7 +212,9 @@ class Queries:
             by = caller_name(query.via, query.attachment)
             return [(query.asked, "WhoAmI", WhoAmI(role, by)) for role in roles]
         if topic == "interfaces":
-            return [(topic, "Interfaces", interfaces(self._config, outputs))]
+            return [(topic, "Interfaces", interfaces(self.config, outputs))]
+        if topic == "config":
+            return [(topic, "", effective(self.config))]
         if topic in self._fixed:
             value = self._fixed[topic]
             return [(topic, type(value).__name__ if isinstance(value, Message) else "", value)]
@@ -228,7 +227,7 @@ class Queries:
             return query.asked == key
         if len(query.asked) > MAX_WILDCARD_LENGTH:
             return False
-        whole = full_key(self._config.robot.id, key)
+        whole = full_key(self.config.robot.id, key)
         return includes(query.asked, key) or includes(query.asked, whole)
 
 

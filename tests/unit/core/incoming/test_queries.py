@@ -668,7 +668,7 @@ def test_a_request_to_set_parameters_goes_to_the_robot_and_returns_its_answer(
 
 def test_config_and_the_parameter_services_return_a_changed_setting() -> None:
     made = queries()
-    made.use(replace(CONFIG, limits=LimitsConfig(linear_speed=0.7)))
+    made.config = replace(CONFIG, limits=LimitsConfig(linear_speed=0.7))
     (config_reply,) = made.serve(query("config"), nothing, OUTPUTS)  # type: ignore[misc]
     assert from_builtins(msgspec.json.decode(config_reply.payload)).limits.linear_speed == 0.7
     payload = Cdr(rcl.Names).encode(rcl.Names(["limits.linear_speed"]))
