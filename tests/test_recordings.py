@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from acsard.recording.file import Recording
 from acsard.recording.file_replay import replay_file
+from acsard.recording.mcap_file import Recording
 from acsard.recording.replay import TEXT_OUTPUTS
 from acsard.recording.replay_text import describe_difference
 from tests.each import each

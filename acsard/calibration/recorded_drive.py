@@ -11,7 +11,7 @@ from acsard.calibration.solve import Calibration, calibrate
 from acsard.core.config.settings import Config
 from acsard.host.errors import MendableError, RecordingError
 from acsard.recording.export import calibration_csv
-from acsard.recording.file import Recording
+from acsard.recording.mcap_file import Recording
 from acsard.recording.mcap_records import MAGIC
 
 MAX_FILE_BYTES = 1 << 30  # the file is read into memory

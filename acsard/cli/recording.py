@@ -30,8 +30,8 @@ from acsard.recording.directory import is_being_recorded
 from acsard.recording.directory import listed as recordings_in
 from acsard.recording.end_record import CRASH_CUTS, EndRecord, ending_text, read_end
 from acsard.recording.export import SUFFIX, Kind, export
-from acsard.recording.file import UNFINISHED, Recording, is_part, rewrite
 from acsard.recording.file_replay import config_of, replay_file, steps
+from acsard.recording.mcap_file import UNFINISHED, Recording, is_part, rewrite
 from acsard.recording.replay_text import (
     describe_difference,
     describe_gaps,

@@ -104,7 +104,7 @@ class Received(Struct, frozen=True):
     data: bytes
 
 
-class Command(Struct, frozen=True):
+class Command(Struct, frozen=True, omit_defaults=True):
     """A velocity that a sender requests.
 
     - source: command source, such as `app` for the key `cmd/app`.
@@ -140,7 +140,7 @@ Plain = (
 )
 
 
-class Request(Struct, frozen=True):
+class Request(Struct, frozen=True, omit_defaults=True):
     """A call of a service, or a stop that was published on the bus, with `id` 0 and no reply."""
 
     if TYPE_CHECKING:
@@ -164,7 +164,7 @@ class Answer(Struct, frozen=True):
     changes: dict[str, tuple[Plain, Plain]] = {}  # old and new value by dotted key
 
 
-class Refusal(Struct, frozen=True):
+class Refusal(Struct, frozen=True, omit_defaults=True):
     """A message from a client that the daemon refused.
 
     The robot counts it in `command_<reason>`, or in `commands_of_new_senders` if it is `unproven`.
@@ -199,7 +199,7 @@ EventName = Literal[
 Level = Literal["info", "warning", "error"]
 
 
-class Event(Struct, frozen=True):
+class Event(Struct, frozen=True, omit_defaults=True):
     """An event for the log. `event_throttle.py` joins frequent ones."""
 
     # A recording of a later version may have names and codes that this one does not know, so its
@@ -407,7 +407,7 @@ class SpeedCap(Struct, frozen=True):
     by: str = ""  # sender, for the log
 
 
-class Inputs(Struct, frozen=True):
+class Inputs(Struct, frozen=True, omit_defaults=True):
     """The complete input of one control step.
 
     - tick: compute the line of a control period.

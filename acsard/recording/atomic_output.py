@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from acsard.host.errors import RecordingError
-from acsard.recording.file import Recording
+from acsard.recording.mcap_file import Recording
 from acsard.recording.mcap_records import MAGIC
 
 PROFILE, HEADER_BYTES = b"acsard", 64  # MCAP profile of every recording, within its first bytes

@@ -28,7 +28,7 @@ from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S, Event, Instant, Ns, WallNs
 from acsard.host.atomic_file import real_path, sync
 from acsard.recording.end_record import CUT_TEXTS
-from acsard.recording.file import FILE_MODE, About, RecordingWriter
+from acsard.recording.mcap_file import FILE_MODE, About, RecordingWriter
 from acsard.recording.recovery import recover
 from acsard.recording.retention import (
     INCIDENT_MARGIN_NS,

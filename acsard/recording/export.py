@@ -22,7 +22,6 @@ from acsard.core.values import NS_PER_S, Estimate, GyroSample, Instant, Ns, Outp
 from acsard.host.errors import RecordingError
 from acsard.host.version import version
 from acsard.recording.atomic_output import METADATA, replacing, synced
-from acsard.recording.file import About, Recording
 from acsard.recording.file_replay import (
     PROGRESS_STEPS,
     Gap,
@@ -30,6 +29,7 @@ from acsard.recording.file_replay import (
     RecordedRun,
     no_progress,
 )
+from acsard.recording.mcap_file import About, Recording
 from acsard.recording.published import Published, Publisher
 from acsard.recording.recorded_steps import RecordedStep
 from acsard.recording.time_span import WHOLE_SPAN, Span

@@ -1,496 +1,398 @@
-"""Writes and reads one recording as an MCAP file, to which the writer adds every second.
+"""A recording is a file of concatenated zstd frames, each readable alone.
 
-It has the channels `steps` (batches of `rows.py`), `events` (JSON), `state` (a `Robot` of
-`state.py` in its own chunk, first if the file begins after the daemon's first step), and
-`unfinished` (inputs of a step in which the daemon failed). A metadata record names robot and
-version, and an attachment is the `acsard.toml`: both stand at the beginning and, in a finished
-file, again before the end. A file that was cut off has all that was synced, and `rewrite` finishes
-a copy.
+A frame holds records of MessagePack, each after its length and CRC-32: first a `Head` with all that
+a replay needs to begin there, then `Steps` of about one second each. Nothing marks the end of a
+file, so a file that was cut off anywhere is an ordinary file. Damage costs the rest of its frame.
+Structs of core are stored as maps without their defaults: another version ignores fields that it
+does not know, and fills in those that it misses.
+
+To read: `listed(directory)` gives the files of a directory in order, and `Recording(paths, begin,
+end)` the `Head`s and `RecordedStep`s of files between two wall-clock times.
 """
 
 from __future__ import annotations
 
-import errno
-import os
 import stat
+import struct
 import zlib
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, get_args
 
 import msgspec
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
+import zstandard
 from msgspec import Struct
+from msgspec.structs import replace
 
-from acsard.core.formatting import many
-from acsard.core.values import NS_PER_S, WallNs
-from acsard.host.errors import MSGSPEC_ERRORS, RecordingError
-from acsard.recording.end_record import (
-    END_RECORD_NAME,
-    EndRecord,
+from acsard.core.formatting import printable
+from acsard.core.values import (
+    NS_PER_S,
+    AcsardError,
+    Event,
+    Inputs,
+    Instant,
     Ns,
-    as_metadata,
-    end_in,
-    ending_text,
+    Received,
+    Verb,
+    WallNs,
 )
-from acsard.recording.mcap_records import GROWING_HEAD, MAGIC, GrowingChunk, Message, encoded, walk
-from acsard.recording.recorded_steps import Unfinished, UnfinishedError, unfinished
-from acsard.recording.rows import FORMAT, Batch, Row, first_of
-from acsard.recording.state import Checkpoint
-from acsard.recording.timeline import INCIDENT_WORDS, TimelineEntry, is_serious, summary
-
-# Longest time in an MCAP chunk: longer ones save little, and damage to one would destroy more.
-CHUNK_NS = 10 * NS_PER_S
-
-CHUNK_BYTES = 1 << 20  # uncompressed; ten seconds of driving take 160 000
-
-FILE_MODE = 0o640  # the group of the daemon's service may read
-
-Topic = Literal["steps", "events", "state", "unfinished"]
-
-# In the order of their MCAP numbers from 1, because the records that say so may be damaged.
-CHANNELS: tuple[Topic, ...] = ("steps", "state", "events", "unfinished")
-
-CHANNEL_NUMBERS = {topic: number for number, topic in enumerate(CHANNELS, 1)}
-
-# Metadata for people with another MCAP program.
-HOW_TO_READ = Metadata(
-    "how to read this file",
-    {
-        "export": "`acsard recording export FILE` writes this recording as ROS 2 messages in MCAP, "
-        "for Foxglove and PlotJuggler; with --rosbag2 as a bag, with --csv as a table",
-        "show": "`acsard recording show FILE` prints the events as text",
-        "replay": "`acsard recording replay FILE` runs the steps again and compares the results",
-        "channels": "the metadata of each channel says what its messages are",
-        "acsard.toml": "the configuration of the robot, as an attachment",
-    },
+from acsard.host.errors import MSGSPEC_ERRORS, RecordingError
+from acsard.recording.recorded_steps import (
+    FinishedStep,
+    Micropose,
+    RecordedOutputs,
+    RecordedStep,
+    Status,
+    checksum,
+    micropose,
+    status_of,
 )
 
-CHANNEL_DESCRIPTIONS: dict[Topic, str] = {
-    "steps": "the inputs and outputs of the control steps of about a second, in MessagePack: an "
-    f"array of {', '.join(Batch.__struct_fields__)}; each of the rows is a step, an array of "
-    f"{', '.join(Row.__struct_fields__)}; the module acsard.recording.rows documents each field",
-    "state": "the robot between two steps, in MessagePack: an array of "
-    f"{', '.join(Checkpoint.__struct_fields__)}; its element data is a Python pickle, which "
-    "only acsard reads safely",
-    "events": "an event, in JSON; the schema describes it",
-    "unfinished": "the inputs of the step in which the daemon failed, in MessagePack: a map of "
-    f"{', '.join(Unfinished.__struct_fields__)}",
-}
+SUFFIX = ".rec.zst"
 
-UNFINISHED = "the file has no end: it was cut off, or is still being recorded"
+MAGIC = b"\x28\xb5\x2f\xfd"  # of a zstd frame
 
-EVENTS_SCHEMA = 1  # MCAP schema of `events`
+MAX_FILE_BYTES = 1 << 28  # to be read; the recorder begins a new file long before
+
+MAX_RECORD_BYTES = 1 << 24  # uncompressed; a second of driving takes 50 000
+
+# The window that compression looks back. 1 MB holds a frame, and 4 times as much saves 1 %.
+WINDOW_LOG = 20
+
+_PARAMETERS = zstandard.ZstdCompressionParameters.from_level(3, window_log=WINDOW_LOG)
+
+# Bytes that are decompressed at once. Forged ones grow at most to 32 MB.
+_PIECE = 1024
+
+_PREFIX = struct.Struct("<II")  # length and CRC-32 of a record
+
+_NEVER = Instant(0, 0)  # in `Row.inputs`: the row has the time itself
+
+_MAX_WALL_NS = 1 << 62  # the year 2116
+
+_ALWAYS = (-(1 << 63), 1 << 64)
+
+# Of a file, read to find out when it begins: a head has 40 000, uncompressed.
+_BEGINNING = 1 << 18
+
+_VERBS = frozenset(get_args(Verb))
 
 
-class About(Struct, frozen=True):
-    """Which robot, program and configuration made a recording."""
+class Head(Struct, frozen=True, tag="head"):
+    """The beginning of a frame: the robot between two steps."""
 
-    robot: str
     version: str  # of acsard
-    python: str
+    robot: str  # id
+    number: int  # of the next step, from 0 at the daemon's start
     mono_ns: Ns
-    wall_ns: Ns
-    config: str = ""  # every key, as an `acsard.toml`
-    format: str = FORMAT  # `rows.FORMAT`
-    started_ns: Ns = 0  # start of the daemon, maybe hours before; 0 if unknown
+    wall_ns: WallNs
+    config: str = ""  # every key in force, as an `acsard.toml`
+    state: bytes = b""  # of the robot and its guard, `state.freeze`; b"": as after a start
+    started_ns: WallNs = 0  # start of the daemon
 
 
-class EndRecordBuilder:
-    """Builds the end record of a recording from its messages."""
+class Read(Struct, frozen=True, array_like=True):
+    """The bytes of one read from the serial port."""
 
-    def __init__(self, about: About) -> None:
-        self._wall_ns = self._last_ns = self._earliest_ns = about.wall_ns
-        self._incidents: list[TimelineEntry] = []
-        self._starts = False  # with the daemon's first step
-
-    def message(self, topic: Topic, wall_ns: WallNs, data: bytes) -> None:
-        """Add a message of any channel; an event must also go to `event`."""
-        self._last_ns = max(self._last_ns, wall_ns)
-        self._earliest_ns = min(self._earliest_ns, wall_ns)
-        if topic == "steps":
-            self._starts = self._starts or first_of(data) == 0
-        elif topic == "unfinished":
-            with suppress(UnfinishedError):
-                self._starts = self._starts or unfinished(data).number == 0
-
-    def event(self, event: TimelineEntry) -> None:
-        """Add an event to the summary, if its name is in `INCIDENT_WORDS`."""
-        if event.name in INCIDENT_WORDS:
-            self._incidents.append(event)
-
-    def end_record(self, cut: str = "", why: str = "") -> EndRecord:
-        """Return the end record so far; `cut` is a key of `CUT_TEXTS` or ""."""
-        text, serious = summary(self._incidents, self._starts), is_serious(self._incidents)
-        return EndRecord(self._wall_ns, self._last_ns, text, cut, why, self._earliest_ns, serious)
+    mono_ns: Ns
+    ahead_ns: Ns  # wall clock minus monotonic clock, which compresses better than a wall time
+    data: bytes
 
 
-class Index:
-    """The statistics and the index at the end of an MCAP file."""
+class Row(Struct, frozen=True, array_like=True):
+    """One step: its inputs, and those of its outputs that a replay compares."""
 
-    def __init__(self) -> None:
-        self._places: list[McapRecord] = []
-        self._totals = Statistics(
-            attachment_count=0,
-            channel_count=len(CHANNELS),
-            channel_message_counts=dict.fromkeys(CHANNEL_NUMBERS.values(), 0),
-            chunk_count=0,
-            message_count=0,
-            message_start_time=0,
-            message_end_time=0,
-            metadata_count=0,
-            schema_count=1,
+    mono_ns: Ns
+    ahead_ns: Ns
+    reads: tuple[Read, ...]
+    inputs: Inputs  # without its times and `received`
+    line: bytes | None
+    sent: bytes | None
+    status: Status | None  # None: as in the row before
+    poses: tuple[Micropose, ...]
+    events: tuple[Event, ...]
+
+
+class Steps(Struct, frozen=True, tag="steps"):
+    first: int  # number of the first step
+    rows: tuple[Row, ...]
+    checksum: int  # of exact poses, twists and wheel angles (`recorded_steps.checksum`)
+
+
+class Failure(Struct, frozen=True, tag="failure"):
+    """The step in which the daemon failed, as the last record of its run."""
+
+    number: int
+    why: str  # the exception
+    inputs: Inputs | None = None  # None if the daemon failed elsewhere
+
+
+class Damage(Struct, frozen=True):
+    """A part of a file that cannot be read."""
+
+    path: Path
+    begin: int  # offset
+    end: int
+    why: str
+
+    def __str__(self) -> str:
+        what = f"bytes {self.begin} to {self.end}"
+        return f"{self.path.name}: {what} cannot be read: {self.why}"
+
+
+Record = Head | Steps | Failure
+
+_decoder: msgspec.msgpack.Decoder[Record] = msgspec.msgpack.Decoder(Record)
+_encode = msgspec.msgpack.Encoder().encode
+
+
+# Writing
+
+
+class FrameWriter:
+    """Appends frames to a file. Every method may raise `OSError`; then only close the file."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._compressor: zstandard.ZstdCompressionObj | None = None
+
+    def begin(self, head: Head) -> None:
+        """Begin a new frame."""
+        self.end()
+        compressor = zstandard.ZstdCompressor(compression_params=_PARAMETERS)
+        self._compressor = compressor.compressobj()
+        self.add(head)
+
+    def add(self, record: Record) -> None:
+        """Write a record so that it can be read from now on."""
+        assert self._compressor is not None
+        data = _encode(record)
+        block = self._compressor.compress(_PREFIX.pack(len(data), zlib.crc32(data)) + data)
+        self._file.write(block + self._compressor.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK))
+
+    def end(self) -> None:
+        """End the frame, if there is one."""
+        if self._compressor is not None:
+            self._file.write(self._compressor.flush())
+            self._compressor = None
+
+
+def encode_steps(first: int, finished: Sequence[FinishedStep]) -> Steps:
+    """Return successive steps as a record."""
+    rows, before, crc = [], None, 0
+    for inputs, outputs, sent in finished:
+        now, status = inputs.now, status_of(outputs)
+        rows.append(
+            Row(
+                now.mono_ns,
+                now.wall_ns - now.mono_ns,
+                tuple([Read(r.at.mono_ns, _ahead(r.at), r.data) for r in inputs.received]),
+                replace(inputs, now=_NEVER, received=()),
+                outputs.line,
+                sent,
+                None if status == before else status,
+                tuple(map(micropose, outputs.estimates)),
+                outputs.events,
+            )
         )
-
-    def message(self, channel: int, wall_ns: WallNs) -> None:
-        """Count a message of the MCAP channel, at a time of at least 0."""
-        totals = self._totals
-        first_ns = totals.message_start_time if totals.message_count else wall_ns
-        totals.message_start_time = min(first_ns, wall_ns)
-        totals.message_end_time = max(totals.message_end_time, wall_ns)
-        totals.message_count += 1
-        counts = totals.channel_message_counts
-        counts[channel] = counts.get(channel, 0) + 1
-
-    def chunk(self) -> None:
-        self._totals.chunk_count += 1
-
-    def record(self, record: McapRecord, at: int, length: int) -> None:
-        """Add a metadata record or an attachment at this offset; ignore other records."""
-        if isinstance(record, Metadata):
-            self._totals.metadata_count += 1
-            self._places.append(MetadataIndex(at, length, record.name))
-        elif isinstance(record, Attachment):
-            self._totals.attachment_count += 1
-            times, size = (record.log_time, record.create_time), len(record.data)
-            kind = record.media_type
-            self._places.append(AttachmentIndex(at, length, *times, size, record.name, kind))
-
-    def records(self) -> list[McapRecord]:
-        return [self._totals, *self._places]
+        before, crc = status, checksum(outputs.estimates, crc)
+    return Steps(first, tuple(rows), crc)
 
 
-class RecordingWriter:
-    """A recording file that is being written. After an `OSError`, call only `close`."""
-
-    def __init__(self, path: Path, about: About, mode: int = FILE_MODE) -> None:
-        # Raises `OSError`: a file at `path` stays, and a new one that the disk refuses is deleted.
-        self.path, self._mode = path, mode
-        self._end_builder = EndRecordBuilder(about)
-        self._about = _about_records(about)
-        self._index = Index()
-        self._chunk: GrowingChunk | None = None
-        self._chunk_at: int | None = None  # offset of the header of the growing chunk
-        self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb")
-        try:
-            self._open(about)
-        except OSError:
-            self.close()
-            # On a full disk, the caller may need the room that this file takes.
-            path.unlink(missing_ok=True)
-            raise
-
-    def _open(self, about: About) -> None:
-        # The umask may have removed bits of the mode.
-        os.fchmod(self._file.fileno(), self._mode)
-        self._file.write(MAGIC)
-        self._write(Header("acsard", f"acsard {about.version}"))
-        for record in (HOW_TO_READ, *self._about, *_definitions()):
-            self._write(record)
-        self.flush()
-
-    def _write(self, record: McapRecord) -> None:
-        at = self._file.tell()
-        self._index.record(record, at, self._file.write(encoded(record)))
-
-    @property
-    def size(self) -> int:
-        """Number of bytes in the file, before the next `flush`."""
-        return self._file.tell()
-
-    def add(self, topic: Topic, wall_ns: WallNs, data: bytes) -> None:
-        """Add a message, which is written at the next `flush`; use `event` for events."""
-        self._end_builder.message(topic, wall_ns, data)
-        wall_ns = max(0, wall_ns)
-        chunk = self._chunk
-        if chunk is not None and (
-            topic == "state"
-            or chunk.size >= CHUNK_BYTES
-            or abs(wall_ns - chunk.first_ns) >= CHUNK_NS
-        ):
-            self.end_chunk()
-        self._chunk = self._chunk or GrowingChunk()
-        self._chunk.add(Message(CHANNEL_NUMBERS[topic], wall_ns, data))
-        self._index.message(CHANNEL_NUMBERS[topic], wall_ns)
-        if topic == "state":
-            self.end_chunk()
-
-    def event(self, event: TimelineEntry) -> None:
-        """Add an event to its channel and to the summary of the end record."""
-        wall_ns = int(event.seconds * NS_PER_S)
-        self.add("events", wall_ns, msgspec.json.encode(event))
-        self._end_builder.event(event)
-
-    def flush(self) -> None:
-        """Write all messages and sync the file. Raises `FileNotFoundError` if it was deleted."""
-        if self._chunk is not None and self._chunk.has_unwritten:
-            self._append(self._chunk.take())
-        self._sync()
-        # The disk also accepts data for a deleted file, but this data is lost.
-        if not os.fstat(self._file.fileno()).st_nlink:
-            raise FileNotFoundError(errno.ENOENT, f"{self.path.name} has been removed")
-
-    def _append(self, data: bytes) -> None:
-        if self._chunk_at is None:
-            self._chunk_at = self._file.tell()
-            self._file.write(GROWING_HEAD)
-        self._file.write(data)
-
-    def _sync(self) -> None:
-        self._file.flush()
-        os.fsync(self._file.fileno())
-
-    def end_chunk(self) -> None:
-        """End the chunk, so that the next message begins a new one."""
-        if self._chunk is None:
-            return
-        last, head = self._chunk.end()
-        self._append(last)
-        end = self._file.tell()
-        assert self._chunk_at is not None
-        self._file.seek(self._chunk_at)
-        self._file.write(head)
-        self._file.seek(end)
-        self._chunk = self._chunk_at = None
-        self._index.chunk()
-
-    def finish(self, cut: str = "", why: str = "") -> None:
-        """Write the end and close the file; `cut` is a key of `CUT_TEXTS` or ""."""
-        self.end_chunk()
-        for record in self._about:
-            self._write(record)
-        last, at = self._end_builder.end_record(cut, why), self._file.tell()
-        self._file.write(file_end(last, self._index, at, _definitions()))
-        self._sync()
-        self._file.close()
-
-    def close(self) -> None:
-        """Close the file without an end record; this raises no `OSError`."""
-        try:
-            self._file.close()
-        except OSError:
-            # A disk that refuses to write also refuses the rest of the buffer.
-            pass
+def _ahead(at: Instant) -> Ns:
+    return at.wall_ns - at.mono_ns
 
 
-def file_end(
-    last: EndRecord, index: Index, at: int, definitions: Iterable[McapRecord] = ()
-) -> bytes:
-    """Return the last bytes of an MCAP file, at this offset: end record, summary and footer.
-
-    The end record is added to `index`. `definitions` are the schema and the channels.
-    """
-    record = Metadata(END_RECORD_NAME, as_metadata(last))
-    data = encoded(record)
-    index.record(record, at, len(data))
-    data += encoded(DataEnd(0))
-    # In MCAP a checksum of 0 means that the checksum is absent.
-    footer = Footer(at + len(data), 0, 0)
-    return data + encoded(*definitions, *index.records(), footer) + MAGIC
+# Reading
 
 
-def _about_records(about: About) -> list[McapRecord]:
-    meta = {key: str(value) for key, value in msgspec.to_builtins(about).items()}
-    text, at_ns = meta.pop("config").encode(), about.wall_ns
-    return [
-        Metadata("acsard", {**meta, "checksum": str(_checksum(meta))}),
-        Attachment(at_ns, at_ns, "acsard.toml", "text/plain", text),
+def listed(directory: Path) -> list[Path]:
+    """Return the recordings in a directory, the oldest first. Raises `OSError`."""
+    # A pipe or a link with such a name is not a recording, and reading a pipe may never end.
+    numbered = [
+        (number, path)
+        for path in directory.iterdir()
+        if (number := number_of(path)) is not None and path.is_file() and not path.is_symlink()
     ]
+    return [path for _, path in sorted(numbered)]
 
 
-def _checksum(metadata: Mapping[str, str]) -> int:
-    # CRC-32, which MCAP does not define for metadata.
-    return zlib.crc32(msgspec.json.encode(metadata, order="sorted"))
-
-
-def _is_intact(metadata: Mapping[str, str]) -> bool:
-    rest = {key: value for key, value in metadata.items() if key != "checksum"}
-    return metadata.get("checksum", str(_checksum(rest))) == str(_checksum(rest))
-
-
-def _definitions() -> Iterator[McapRecord]:
-    schema = msgspec.json.encode(msgspec.json.schema(TimelineEntry))
-    yield Schema(EVENTS_SCHEMA, schema, "jsonschema", "acsard.TimelineEntry")
-    for topic, number in CHANNEL_NUMBERS.items():
-        events = topic == "events"
-        encoding, schema_id = ("json", EVENTS_SCHEMA) if events else (f"acsard-{topic}", 0)
-        yield Channel(number, topic, encoding, {"content": CHANNEL_DESCRIPTIONS[topic]}, schema_id)
+def number_of(path: Path) -> int | None:
+    """Return the number in the name of a recording, by which they are ordered."""
+    head, _, rest = path.name.partition("-")
+    is_number = head.isascii() and head.isdecimal() and len(head) < 16
+    return int(head) if is_number and rest.endswith(SUFFIX) else None
 
 
 class Recording:
-    """A recording read from a file, without its damaged parts.
+    """The records of files, in order, from one wall-clock time to another.
 
-    Only after the last message of `messages()` do `ended`, `damaged`, `cut`, `why`, `unfinished`
-    and the properties below have their final values.
+    Every frame that has such a step is read from its `Head` on, so that a replay can begin there;
+    `contains` says whether a step is in the time. Each call of `records` reads again.
     """
 
-    def __init__(self, path: Path) -> None:
-        # Raises `RecordingError`.
-        self.path = path
-        self.paths = [path]  # several only in a `Series`
+    def __init__(
+        self, paths: Iterable[Path], begin_ns: WallNs = _ALWAYS[0], end_ns: WallNs = _ALWAYS[1]
+    ) -> None:
+        self.paths = list(paths)
+        self.begin_ns, self.end_ns = begin_ns, end_ns
+        self.damage: list[Damage] = []  # so far, of the last `records()`
+
+    def contains(self, at: Instant) -> bool:
+        """Return whether a step at this time was asked for."""
+        return self.begin_ns <= at.wall_ns <= self.end_ns
+
+    def records(self) -> Iterator[Head | RecordedStep | Failure]:
+        """Yield each record. Raises `RecordingError` for a file that is not a recording."""
+        self.damage = []
+        for path in self.paths:
+            for record in _records(path, self.begin_ns, self.end_ns):
+                match record:
+                    case Damage():
+                        self.damage.append(record)
+                    case Steps():
+                        yield from _recorded_steps(record)
+                    case _:
+                        yield record
+
+    def steps(self) -> Iterator[RecordedStep]:
+        """Yield the steps in the time. Raises `RecordingError` as `records`."""
+        for record in self.records():
+            if isinstance(record, RecordedStep) and self.contains(record.inputs.now):
+                yield record
+
+    def head(self) -> Head | None:
+        """Return the first head, or None. Raises `RecordingError` as `records`."""
+        return next((record for record in self.records() if isinstance(record, Head)), None)
+
+
+class FrameError(AcsardError):
+    """The content of a frame is not that of a recording."""
+
+
+_DAMAGE = (zstandard.ZstdError, FrameError, *MSGSPEC_ERRORS)
+
+
+def _records(path: Path, begin_ns: WallNs, end_ns: WallNs) -> Iterator[Record | Damage]:
+    always = (begin_ns, end_ns) == _ALWAYS
+    data, at = _content(path, begin_ns, end_ns), 0
+    if not MAGIC.startswith(data[:4]) and _next_frame(data, 0) is None:
+        raise RecordingError(f"{path} is not a recording of acsard, or its beginning is missing")
+    while at < len(data):
         try:
-            if not stat.S_ISREG(path.stat().st_mode):
-                raise OSError(errno.EINVAL, "it is not a file")
-            self._data = path.read_bytes()
-        except MemoryError:
+            if not always and (after := _skipped(data, at, begin_ns, end_ns)):
+                at = after
+                continue
+            at = yield from _frame(data, at)
+        except _DAMAGE as error:
+            begin, at = at, _next_frame(data, at + 1) or len(data)
+            yield Damage(path, begin, at, printable(str(error))[:200])
+
+
+def _content(path: Path, begin_ns: WallNs, end_ns: WallNs) -> bytes:
+    # Empty if the file ended before `begin_ns`, or began after `end_ns`: a change of the clock
+    # begins a new file.
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise RecordingError(f"cannot read {path}: it is not a file")
+        if status.st_size > MAX_FILE_BYTES:
             raise RecordingError(
-                f"cannot read {path}: it is larger than the free memory; copy it to a computer "
-                "with more memory"
-            ) from None
-        except OSError as error:
-            raise RecordingError(
-                f"cannot read {path}: {error.strerror}; `acsard recording` lists the recordings"
-            ) from None
-        self.ended = False  # it has an end record
-        self.damaged = 0  # damaged places, without the incomplete end of a cut file
-        self.cut = ""  # key of `CUT_TEXTS`; "" for an ordinary end, and without one
-        self.why = ""  # of `bug`: the exception, and the number of a failed step
-        self.unfinished: bytes | None = None  # inputs of the step in which the daemon failed
-        self.about = self._about()
-
-    @property
-    def is_intact(self) -> bool:
-        return self.ended and not self.damaged
-
-    @property
-    def ending(self) -> str:
-        """How the recording was cut off; "" if the daemon ended normally."""
-        if not self.ended:
-            return UNFINISHED
-        return ending_text(self.cut, self.why)
-
-    @property
-    def missing_text(self) -> str:
-        """The number of damaged places and `ending`, for the user; "" if nothing is missing."""
-        places = many(self.damaged, "damaged place is", "damaged places are")
-        damaged = f"{places} left out" if self.damaged else ""
-        return "; ".join(filter(None, [damaged, self.ending]))
-
-    def compute_end_record(self) -> EndRecord:
-        """Return an end record that is built from the messages, which do not show `cut`."""
-        builder = EndRecordBuilder(self.about)
-        for topic, wall_ns, data in self.messages():
-            builder.message(topic, wall_ns, data)
-            if topic == "events":
-                with suppress(RecordingError):  # omit only the event that cannot be decoded
-                    builder.event(event_of(self, data))
-        return builder.end_record()
-
-    def messages(self) -> Iterator[tuple[Topic, WallNs, bytes]]:
-        """Yield topic, wall-clock time and data of each readable message."""
-        self.ended, self.damaged, self.cut, self.why = False, 0, "", ""
-        self.unfinished = None
-        topics = {number: topic for topic, number in CHANNEL_NUMBERS.items()}
-        for place in walk(self._data):
-            record = place.record
-            if isinstance(record, Footer):
-                self.ended = True
-            elif isinstance(record, Metadata) and record.name == END_RECORD_NAME:
-                self.cut, self.why = (record.metadata.get(key, "") for key in ("cut", "why"))
-            for channel, wall_ns, data in place.messages:
-                if channel in topics:
-                    topic = topics[channel]
-                    if topic == "unfinished":
-                        self.unfinished = data
-                    yield topic, wall_ns, data
-            # In a damaged chunk, all readable messages precede the damage.
-            self.damaged += place.damaged
-        if not self.ended and (end := end_in(self._data)) is not None:
-            # No complete chunk follows the damage, so `walk` took it for the end of a cut file.
-            self.ended, self.cut, self.why = True, end.cut, end.why
-            self.damaged += 1
-
-    def _about(self) -> About:
-        metadata: dict[str, str] = {}
-        config, intact = None, False
-        # If the beginning is damaged, read the copies at the end of a finished file.
-        is_finished = end_in(self._data) is not None
-        for place in walk(self._data):
-            record = place.record
-            if isinstance(record, Metadata) and record.name == "acsard":
-                if not metadata or _is_intact(record.metadata):
-                    metadata = record.metadata
-                    intact = _is_intact(metadata)
-            elif isinstance(record, Attachment) and record.name == "acsard.toml":
-                if config is None:
-                    config = record.data.decode(errors="replace")
-            elif place.messages and ((intact and config is not None) or not is_finished):
-                break
-        try:
-            if config is None:
-                raise ValueError(
-                    "the beginning of the file is missing, or another program wrote this MCAP file"
-                )
-            about = msgspec.convert({**metadata, "config": config}, About, strict=False)
-        except (ValueError, msgspec.ValidationError) as error:
-            raise RecordingError(f"{self.path} is not a recording of acsard: {error}") from None
-        if about.format != FORMAT:
-            raise RecordingError(
-                f"{self.path} has the format {about.format}, but this acsard reads the format "
-                f"{FORMAT}: read the file with acsard {about.version}, which wrote it"
+                f"cannot read {path}: it has more than {MAX_FILE_BYTES >> 20} MB, as no recording "
+                "of acsard has"
             )
-        return about
-
-
-def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
-    """Copy the readable messages to a new, finished file, and return their number.
-
-    Only an unfinished recording gets the cause `cut`. An error deletes the new file: `OSError`, or
-    `RecordingError` for an event that cannot be decoded.
-    """
-    writing = RecordingWriter(path, recording.about)
-    try:
-        count = 0
-        for topic, wall_ns, data in recording.messages():
-            if topic == "events":
-                writing.event(event_of(recording, data))
-            else:
-                writing.add(topic, wall_ns, data)
-            count += 1
-        writing.finish(recording.cut or ("" if recording.ended else cut), recording.why)
-    except BaseException:
-        writing.close()
-        path.unlink()
-        raise
-    return count
-
-
-def is_part(part: Recording, recording: Recording) -> bool:
-    """Return whether `recording` has all of `part`, and can replace it."""
-    if part.about != recording.about:
-        return False
-    return Counter(part.messages()) <= Counter(recording.messages())
-
-
-def event_of(recording: Recording, data: bytes) -> TimelineEntry:
-    """Decode a message of the channel `events`. Raises `RecordingError`."""
-    try:
-        return msgspec.json.decode(data, type=TimelineEntry)
-    except MSGSPEC_ERRORS as error:
+        with path.open("rb") as file:
+            beginning = file.read(_BEGINNING)
+            if (head := _head(beginning, 0)) is not None:
+                # If the file was written before it began, a copy has its time by another clock.
+                over = head.wall_ns < status.st_mtime_ns + NS_PER_S < begin_ns
+                if over or head.wall_ns > end_ns:
+                    return b""
+            return beginning + file.read(MAX_FILE_BYTES)
+    except OSError as error:
         raise RecordingError(
-            f"{recording.path} has an event that cannot be read: {error}"
+            f"cannot read {path}: {error.strerror}; `acsard recording` lists the recordings"
         ) from None
+
+
+def _frame(data: bytes, at: int) -> Generator[Record, None, int]:
+    # Yields the records of the frame at this offset, and returns that of its end. Raises `_DAMAGE`.
+    decompressor = zstandard.ZstdDecompressor(max_window_size=1 << WINDOW_LOG).decompressobj()
+    plain, is_first = bytearray(), True
+    while at < len(data) and not decompressor.eof:
+        plain += decompressor.decompress(data[at : at + _PIECE])
+        at += _PIECE
+        while (record := _taken(plain)) is not None:
+            if isinstance(record, Head) is not is_first:
+                raise FrameError("a frame does not have one head, at its beginning")
+            is_first = False
+            yield record
+    return min(at, len(data)) - len(decompressor.unused_data)
+
+
+def _taken(plain: bytearray) -> Record | None:
+    # The first record of the decompressed bytes, which it removes. None if it is not complete.
+    if len(plain) < _PREFIX.size:
+        return None
+    length, crc = _PREFIX.unpack_from(plain)
+    if length > MAX_RECORD_BYTES:
+        raise FrameError(f"a record has {length} bytes")
+    end = _PREFIX.size + length
+    if len(plain) < end:
+        return None
+    data = bytes(plain[_PREFIX.size : end])
+    if zlib.crc32(data) != crc:
+        raise FrameError("a checksum is wrong")
+    del plain[:end]
+    return _decoder.decode(data)
+
+
+def _next_frame(data: bytes, at: int) -> int | None:
+    # Offset of the first frame from this one on that begins with a head.
+    at = data.find(MAGIC, at)
+    while at >= 0 and _head(data, at) is None:
+        at = data.find(MAGIC, at + 1)
+    return at if at >= 0 else None
+
+
+def _head(data: bytes, at: int) -> Head | None:
+    try:
+        record = next(_frame(data, at), None)
+    except _DAMAGE:
+        return None
+    return record if isinstance(record, Head) else None
+
+
+def _skipped(data: bytes, at: int, begin_ns: WallNs, end_ns: WallNs) -> int | None:
+    # Offset of the next frame if no step of the one at this offset is in the time. A frame's steps
+    # lie between its head and the next one.
+    head, following = _head(data, at), _next_frame(data, at + 1)
+    if head is None:
+        return None
+    if following is None:
+        return len(data) if head.wall_ns > end_ns else None
+    last = _head(data, following)
+    assert last is not None
+    earliest, latest = sorted((head.wall_ns, last.wall_ns))
+    return following if latest < begin_ns or earliest > end_ns else None
+
+
+def _recorded_steps(steps: Steps) -> Iterator[RecordedStep]:
+    status: Status | None = None
+    last = len(steps.rows) - 1
+    for index, row in enumerate(steps.rows):
+        status = row.status or status or ("", "", "", "", "")
+        inputs = replace(
+            row.inputs,
+            now=_instant(row.mono_ns, row.ahead_ns),
+            # Another version may have more services.
+            requests=tuple([one for one in row.inputs.requests if one.verb in _VERBS]),
+            received=tuple([Received(_instant(r.mono_ns, r.ahead_ns), r.data) for r in row.reads]),
+        )
+        crc = steps.checksum if index == last else None
+        outputs = RecordedOutputs(row.line, row.sent, status, row.poses, row.events, crc)
+        yield RecordedStep(steps.first + index, inputs, outputs, begins=index == 0)
+
+
+def _instant(mono_ns: Ns, ahead_ns: Ns) -> Instant:
+    return Instant(mono_ns, min(max(mono_ns + ahead_ns, -_MAX_WALL_NS), _MAX_WALL_NS))

@@ -24,7 +24,7 @@ from acsard.core.robot import Robot
 from acsard.core.values import Ns, Outputs, WallNs
 from acsard.host.errors import RecordingError
 from acsard.recording.end_record import read_end
-from acsard.recording.file import Recording, event_of
+from acsard.recording.mcap_file import Recording, event_of
 from acsard.recording.recorded_steps import RecordedStep, UnfinishedError, unfinished
 from acsard.recording.replay import Comparison, Replay
 from acsard.recording.rows import BatchError, decode

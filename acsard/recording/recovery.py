@@ -18,7 +18,14 @@ from mcap.records import Attachment, Footer
 from acsard.core.formatting import many
 from acsard.host.errors import RecordingError
 from acsard.recording.end_record import EndRecord
-from acsard.recording.file import EndRecordBuilder, Index, Recording, event_of, file_end, rewrite
+from acsard.recording.mcap_file import (
+    EndRecordBuilder,
+    Index,
+    Recording,
+    event_of,
+    file_end,
+    rewrite,
+)
 from acsard.recording.mcap_records import LAST_BLOCK, MAGIC, chunk_places, encoded, walk
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)

@@ -17,7 +17,7 @@ from acsard.core.values import NS_PER_S, AcsardError
 from acsard.host.errors import RecordingError
 from acsard.recording.directory import listed, stem
 from acsard.recording.end_record import read_end
-from acsard.recording.file import Recording, Topic
+from acsard.recording.mcap_file import Recording, Topic
 from acsard.recording.time_span import Contents, Span, clock, part_between, read_contents
 
 # Tolerance of a search by the times of end records: the last message may have many seconds of steps

@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from acsard.core.values import NS_PER_S, AcsardError, Instant
-from acsard.recording.file import Recording
+from acsard.recording.mcap_file import Recording
 from acsard.recording.recorded_steps import RecordedStep
 from acsard.recording.rows import BatchError, decode
 from acsard.recording.timeline import MIN_CLOCK_CHANGE_NS, clock_change_ns

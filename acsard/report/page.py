@@ -20,8 +20,8 @@ import msgspec
 from acsard.core.formatting import lasting, printable
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import RecordingError
-from acsard.recording.file import Recording
 from acsard.recording.file_replay import PROGRESS_STEPS, DisplayReplay, Progress, no_progress
+from acsard.recording.mcap_file import Recording
 from acsard.recording.replay_text import verdict
 from acsard.recording.time_span import WHOLE_SPAN, Span, clock, date
 from acsard.report.figures import TimeFigures

@@ -21,7 +21,7 @@ from acsard.core.config.toml_text import document
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.values import Inputs, Instant, Outputs, Recording
-from acsard.recording.file import About, RecordingWriter
+from acsard.recording.mcap_file import About, RecordingWriter
 from acsard.recording.recorded_steps import FinishedStep
 from acsard.recording.rows import encode
 from tests.scenarios.world import START, World

@@ -17,7 +17,7 @@ from acsard.core.robot import Robot
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.faults import Fault
 from acsard.core.values import Inputs, Outputs, Recording
-from acsard.recording.file import About, RecordingWriter
+from acsard.recording.mcap_file import About, RecordingWriter
 from acsard.recording.recorded_steps import FinishedStep, RecordedStep
 from acsard.recording.replay import Replay
 from acsard.recording.rows import decode, encode

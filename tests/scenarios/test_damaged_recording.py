@@ -15,8 +15,14 @@ from acsard.host.errors import Exit
 from acsard.recording import recorder as module
 from acsard.recording import step_writer
 from acsard.recording.directory import listed
-from acsard.recording.file import CHANNEL_NUMBERS, Recording, RecordingWriter, event_of, rewrite
 from acsard.recording.file_replay import EventCopies, RecordedRun, replay_file, steps
+from acsard.recording.mcap_file import (
+    CHANNEL_NUMBERS,
+    Recording,
+    RecordingWriter,
+    event_of,
+    rewrite,
+)
 from acsard.recording.mcap_records import walk
 from acsard.recording.recorder import Recorder
 from acsard.recording.series import Series

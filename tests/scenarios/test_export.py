@@ -38,8 +38,8 @@ from acsard.core.messages.schema import (
 from acsard.core.ros.channels import BY_KEY, CHANNELS, CMD_VEL_IN, LOG_CHANNEL
 from acsard.core.ros.shapes import log, state
 from acsard.recording.export import export
-from acsard.recording.file import Recording
 from acsard.recording.file_replay import RecordedRun
+from acsard.recording.mcap_file import Recording
 from acsard.recording.published import MEASURED_ROWS, Publisher
 from tests.each import each
 from tests.scenarios.taped import (

@@ -18,7 +18,7 @@ from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.values import NS_PER_S, Event
 from acsard.host.errors import Exit
 from acsard.recording.directory import RecordingDirectory
-from acsard.recording.file import About, Recording, RecordingWriter
+from acsard.recording.mcap_file import About, Recording, RecordingWriter
 from acsard.recording.recorded_steps import FinishedStep, Unfinished
 from acsard.recording.recovery import recover
 from tests.scenarios.taped import Tape, chunks, recorded_world

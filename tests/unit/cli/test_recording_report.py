@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from acsard.core.motion.lifecycle import Lifecycle
-from acsard.recording.file import Recording
 from acsard.recording.file_replay import steps
+from acsard.recording.mcap_file import Recording
 from acsard.recording.recorded_steps import US_PER_S
 from tests.scenarios.taped import chunks
 from tests.system.typed import typed

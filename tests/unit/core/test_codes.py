@@ -10,8 +10,8 @@ from typing import get_args
 
 import acsard
 from acsard.core.codes import CODES, Code, StateCode, WaitCode, joined, reason, sentence
-from acsard.recording.file import Recording
 from acsard.recording.file_replay import steps
+from acsard.recording.mcap_file import Recording
 from tests import recordings
 
 PACKAGE = Path(acsard.__file__).parent

@@ -23,7 +23,7 @@ from acsard.recording.directory import (
     listed,
 )
 from acsard.recording.end_record import read_end
-from acsard.recording.file import About, Recording, RecordingWriter
+from acsard.recording.mcap_file import About, Recording, RecordingWriter
 from acsard.recording.retention import (
     MAX_KEPT_FILES,
     MIN_FILE_BYTES,

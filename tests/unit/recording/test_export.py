@@ -48,7 +48,7 @@ from acsard.recording.export import (
     offered_qos,
     wheel_columns,
 )
-from acsard.recording.file import Recording, RecordingWriter, Topic
+from acsard.recording.mcap_file import Recording, RecordingWriter, Topic
 from acsard.recording.time_span import Span
 from tests.scenarios.taped import BATCH, Tape, chunks, recorded_world
 from tests.scenarios.world import START

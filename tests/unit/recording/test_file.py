@@ -1,449 +1,297 @@
-"""Every complete chunk of a damaged recording can be read, and no damage causes a traceback."""
+"""Tests of the file of frames: what is written is read, and damage costs its frame."""
 
 from __future__ import annotations
 
+import io
 import os
 import random
-from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
-from mcap.reader import make_reader
-from mcap.records import Chunk
-from mcap.stream_reader import StreamReader
-from msgspec.structs import replace
+import zstandard
 
-from acsard.core.config.parsing import effective
-from acsard.core.config.settings import Config
-from acsard.core.config.toml_text import document
-from acsard.core.values import NS_PER_S, Instant
+from acsard.core.values import NS_PER_S, Instant, Request
 from acsard.host.errors import RecordingError
-from acsard.recording.end_record import EndRecord, read_end
+from acsard.recording import file as recording_file
 from acsard.recording.file import (
-    CHUNK_BYTES,
-    FILE_MODE,
-    HOW_TO_READ,
-    About,
+    MAGIC,
+    SUFFIX,
+    Failure,
+    FrameWriter,
+    Head,
     Recording,
-    RecordingWriter,
-    rewrite,
+    Steps,
+    encode_steps,
+    listed,
 )
-from acsard.recording.file_replay import config_of, replay_file, steps
-from acsard.recording.recorded_steps import status_of
-from acsard.recording.rows import encode
-from tests.scenarios.taped import BATCH, Tape, chunks, recorded_world
+from acsard.recording.recorded_steps import FinishedStep, RecordedStep
+from tests.each import each
+from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 
-
-@pytest.fixture(scope="module")
-def tape() -> Tape:
-    tape, world = recorded_world()
-    world.drive(0.5, 0.2, seconds=6.0)
-    world.call("stop")
-    return tape
+SECOND = 200  # steps in a record of these tests
 
 
 @pytest.fixture(scope="module")
-def whole(tape: Tape, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("record") / "whole.mcap"
-    tape.write(path, Config())
-    return path
-
-
-def numbers(path: Path) -> list[int]:
-    return [step.number for step in steps(Recording(path))]
-
-
-@pytest.mark.slow
-def test_all_recorded_data_is_read_back(tape: Tape, whole: Path) -> None:
-    recording = Recording(whole)
-    read = list(steps(recording))
-    assert [step.inputs for step in read] == [entry.inputs for entry in tape.taken]
-    assert [step.recorded.status for step in read] == [status_of(t.outputs) for t in tape.taken]
-    assert (recording.is_intact, recording.damaged) == (True, 0)
-    assert config_of(recording) == Config()
-    assert replay_file(recording).comparison.same
-
-
-def test_the_mcap_library_reads_a_recording(tape: Tape, whole: Path) -> None:
-    with whole.open("rb") as stream:
-        reader = make_reader(stream)
-        summary = reader.get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
-        topics = [channel.topic for _, channel, _ in reader.iter_messages()]
-        config, copy = list(reader.iter_attachments())
-        (about, about_copy) = [r for r in reader.iter_metadata() if r.name == "acsard"]
-        (how_to_read,) = [r for r in reader.iter_metadata() if r.name == HOW_TO_READ.name]
-        contents = {c.topic: c.metadata["content"] for c in summary.channels.values()}
-    assert topics.count("steps") == -(-len(tape.taken) // BATCH)
-    assert summary.statistics.message_count == len(topics)
-    assert config.name == "acsard.toml"
-    assert (config, about) == (copy, about_copy)
-    assert "acsard recording export" in how_to_read.metadata["export"]
-    assert "an array of first, mono_ns, " in contents["steps"]
-    assert contents.keys() == {"steps", "state", "events", "unfinished"}
-
-
-def on_a_machine(tape: Tape) -> None:
-    """Replace the times of the recorded steps by times as on a quiet machine.
-
-    A step is some tens of µs late, and each read is some µs older than its step.
-    """
-    dice = random.Random(1)
-    for at, step in enumerate(tape.taken):
-        late = 1000 * round(dice.expovariate(1 / 30))
-        mono, wall = step.inputs.now.mono_ns + late, step.inputs.now.wall_ns + late
-        now = Instant(mono, wall + 1000 * dice.randint(0, 1))
-        reads = tuple(
-            replace(read, at=Instant(mono - age, wall - age))
-            for read in step.inputs.received
-            if (age := 1000 * dice.randint(5, 15))
-        )
-        tape.taken[at] = step._replace(inputs=replace(step.inputs, now=now, received=reads))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("speed", "most"), [(None, 90e6), (0.5, 400e6)])
-def test_an_idle_day_takes_less_than_90_mb_and_a_day_of_driving_less_than_400(
-    speed: float | None, most: float, tmp_path: Path
-) -> None:
-    tape, sizes = Tape(), []
+def taken() -> list[FinishedStep]:
+    tape = Tape()
     world = World(recorder=tape)
-    world.run(3.0)
-    if speed is not None:
-        world.drive(speed, 0.2, seconds=1.0, hz=20.0)
-    del tape.taken[:-BATCH]
-    for seconds in (0.0, 10.0):
-        if speed is None:
-            world.run(seconds)
-        else:
-            world.hold(speed, 0.2, seconds=seconds)
-        path, now_ns = tmp_path / f"{seconds}.mcap", world.now_ns
-        on_a_machine(tape)
-        tape.write(path, Config(), apart=False)
-        sizes.append((path.stat().st_size, now_ns))
-    (little, began_ns), (much, ended_ns) = sizes
-    assert 0 < (much - little) / ((ended_ns - began_ns) / 1e9) * 86_400 < most
+    world.drive(0.5, 0.3, 3.0)
+    world.call("stop")
+    world.run(1.0)
+    return tape.taken
 
 
-def test_only_the_service_and_its_group_may_read_a_recording(whole: Path) -> None:
-    assert whole.stat().st_mode & 0o777 == FILE_MODE == 0o640
+def head(number: int, at: Instant) -> Head:
+    return Head("0.2.0", "acsar", number, at.mono_ns, at.wall_ns, "[robot]\n", b"state")
 
 
-@pytest.mark.parametrize(
-    "cuts", [30, pytest.param(1000, marks=[pytest.mark.slow, pytest.mark.nightly])]
-)
-def test_every_complete_chunk_of_a_cut_file_is_read(whole: Path, tmp_path: Path, cuts: int) -> None:
-    data, dice, path = whole.read_bytes(), random.Random(1), tmp_path / "cut.mcap"
-    (first, _), *_ = ends = chunks(data)
-    every = numbers(whole)
-    for _ in range(cuts):
-        size = dice.randrange(first, len(data))
-        tail = dice.choice([b"", bytes(512), dice.randbytes(64)])
-        path.write_bytes(data[:size] + tail)
-        count = sum(end <= size for _, end in ends)
-        indices = numbers(path)
-        assert indices == every[: len(indices)]
-        assert len(indices) >= count * BATCH or indices == every
+def write(taken: list[FinishedStep], seconds_per_frame: int = 2) -> bytes:
+    """Return the content of a file with these steps."""
+    file = io.BytesIO()
+    frames = FrameWriter(file)
+    for count, at in enumerate(range(0, len(taken), SECOND)):
+        if count % seconds_per_frame == 0:
+            frames.begin(head(at, taken[at].inputs.now))
+        frames.add(encode_steps(at, taken[at : at + SECOND]))
+    frames.end()
+    return file.getvalue()
 
 
-def test_every_second_that_was_synced_can_be_read_before_its_chunk_ends(
-    tape: Tape, tmp_path: Path
-) -> None:
-    path, now = tmp_path / "part.mcap", tape.taken[0].inputs.now
-    config = "\n".join(document(effective(Config())))
-    writing = RecordingWriter(
-        path, About("acsar", "0.1.0", "3.11.0", now.mono_ns, now.wall_ns, config)
-    )
-    for at in range(0, len(tape.taken), BATCH):
-        batch = tape.taken[at : at + BATCH]
-        writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch))
-        writing.flush()
-        assert numbers(path) == list(range(at + len(batch)))
-        ((_, claimed),) = chunks(path.read_bytes())
-        assert claimed > path.stat().st_size
-        recording = Recording(path)
-        list(recording.messages())
-        assert (recording.ended, recording.damaged) == (False, 0)
-    writing.finish()
-    assert len(chunks(path.read_bytes())) == 1
-    assert numbers(path) == list(range(len(tape.taken)))
+def content(*records: Any) -> bytes:
+    """Return a file with one frame of these records, of another version."""
+    file = io.BytesIO()
+    frames = FrameWriter(file)
+    frames.begin(records[0])
+    for record in records[1:]:
+        frames.add(record)
+    frames.end()
+    return file.getvalue()
 
 
-SECTOR = 512
-"""Bytes that a disk writes at once."""
-
-
-@pytest.mark.slow
-def test_a_power_cut_in_the_middle_of_a_sync_costs_nothing_of_the_syncs_before(
-    tape: Tape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """When the power fails, any of the sectors of the last sync may be on the disk.
-
-    The sync may also be the one at the end of a chunk or of the file.
-    """
-    path, cut, now = tmp_path / "part.mcap", tmp_path / "cut.mcap", tape.taken[0].inputs.now
-    monkeypatch.setattr("acsard.recording.file.CHUNK_NS", 3 * NS_PER_S)
-    synced: list[bytes] = []
-    monkeypatch.setattr(os, "fsync", lambda handle: synced.append(path.read_bytes()))
-    config = "\n".join(document(effective(Config())))
-    writing = RecordingWriter(
-        path, About("acsar", "0.1.0", "3.11.0", now.mono_ns, now.wall_ns, config)
-    )
-    for at in range(0, len(tape.taken), BATCH):
-        batch = tape.taken[at : at + BATCH]
-        writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch))
-        writing.flush()
-    writing.finish()
-    assert len(chunks(synced[-1])) > 1
-    dice = random.Random(7)
-    for before, after in pairwise(synced[1:]):
-        path.write_bytes(before)
-        safe = numbers(path)
-        for _ in range(20):
-            old = before.ljust(len(after), b"\0")
-            sectors = range(0, dice.choice([len(before), len(after)]), SECTOR)
-            cut.write_bytes(b"".join(dice.choice([old, after])[at : at + SECTOR] for at in sectors))
-            assert numbers(cut)[: len(safe)] == safe
-
-
-def test_a_chunk_covers_about_ten_seconds_and_a_jump_of_the_clock_ends_it(tmp_path: Path) -> None:
-    path = tmp_path / "long.mcap"
-    writing = RecordingWriter(path, About("acsar", "0.1.0", "3.11.0", 1, 2))
-    for second in (*range(25), 1_000_000, 3):
-        writing.add("steps", second * NS_PER_S, b"steps of one second")
-        writing.flush()
-    writing.finish()
-    with path.open("rb") as stream:
-        records = [
-            r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)
-        ]
-    times = [(r.message_start_time // NS_PER_S, r.message_end_time // NS_PER_S) for r in records]
-    assert times == [(0, 9), (10, 19), (20, 24), (1_000_000, 1_000_000), (3, 3)]
-
-
-def test_a_chunk_has_at_most_about_a_mebibyte(tmp_path: Path) -> None:
-    path = tmp_path / "much.mcap"
-    writing = RecordingWriter(path, About("acsar", "0.1.0", "3.11.0", 1, 2))
-    for _ in range(40):
-        writing.add("steps", 5, bytes(100_000))
-    writing.finish()
-    with path.open("rb") as stream:
-        records = [
-            r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)
-        ]
-    assert len(records) == 4
-    assert max(chunk.uncompressed_size for chunk in records) < CHUNK_BYTES + 110_000
-
-
-@pytest.mark.parametrize("cuts", [30, pytest.param(1000, marks=pytest.mark.slow)])
-def test_a_file_that_was_cut_before_its_first_chunk_is_refused_with_a_message(
-    whole: Path, tmp_path: Path, cuts: int
-) -> None:
-    data, dice, path = whole.read_bytes(), random.Random(5), tmp_path / "cut.mcap"
-    (first, _), *_ = chunks(data)
-    config_end = data.index(b"acsard.TimelineEntry") - 15  # the head of the record with this name
-    for _ in range(cuts):
-        size = dice.randrange(first)
-        tail = dice.choice([b"", bytes(512), dice.randbytes(64)])
-        path.write_bytes(data[:size] + tail)
-        with pytest.raises(RecordingError) as refused:
-            replay_file(Recording(path))
-        text = str(refused.value)
-        assert (str(path) in text, text.isprintable()) == (True, True)
-        if not tail:
-            lacks = (
-                "has no readable steps"
-                if size >= config_end
-                else "the beginning of the file is missing"
-            )
-            assert lacks in text
-
-
-@pytest.mark.parametrize("files", [15, pytest.param(200, marks=pytest.mark.slow)])
-def test_all_undamaged_chunks_of_a_damaged_file_are_read(
-    whole: Path, tmp_path: Path, files: int
-) -> None:
-    data, dice, path = whole.read_bytes(), random.Random(2), tmp_path / "damaged.mcap"
-    spans, hits = chunks(data), 0
-    for _ in range(files):
-        bad = bytearray(data)
-        hit = dice.randrange(len(spans))
-        start, end = spans[hit]
-        # The damage includes the chunk's head: its type, length, times and compression.
-        at = dice.randrange(start, dice.choice([start + 60, end]))
-        bad[at] ^= 1 << dice.randrange(8)
-        path.write_bytes(bad)
-        recording = Recording(path)
-        indices = [step.number for step in steps(recording)]
-        assert recording.damaged == 1 or indices == numbers(whole)  # the bit has no meaning
-        assert recording.is_intact == (recording.damaged == 0)
-        hits += recording.damaged
-        assert recording.ended
-        assert set(range(max(numbers(whole)) + 1)) - set(indices) <= set(
-            range(hit * BATCH, (hit + 1) * BATCH)
-        )
-    assert files / 2 < hits < files
-
-
-@pytest.mark.parametrize("hit", [0, 2, -1])
-@pytest.mark.parametrize("place", [0, 1, 8])
-def test_a_chunk_whose_head_is_damaged_costs_nothing(
-    place: int, hit: int, whole: Path, tmp_path: Path
-) -> None:
-    """The test damages each byte of the type and of the length in turn."""
-    bad, path = bytearray(whole.read_bytes()), tmp_path / "head.mcap"
-    bad[chunks(bad)[hit][0] + place] ^= 0x41
-    path.write_bytes(bad)
-    assert numbers(path) == numbers(whole)
-
-
-def test_two_neighbouring_damaged_chunks_cost_no_other_chunk(whole: Path, tmp_path: Path) -> None:
-    """The first chunk's header gives the length of both, and its content is damaged as well."""
-    bad, path = bytearray(whole.read_bytes()), tmp_path / "two.mcap"
-    (begin, middle), (_, end) = chunks(bad)[1:3]
-    bad[begin + 1 : begin + 9] = (end - begin - 9).to_bytes(8, "little")
-    bad[begin + 80 : middle + 80] = bytes(middle - begin)
-    path.write_bytes(bad)
-    every = numbers(whole)
-    assert numbers(path) == every[:BATCH] + every[3 * BATCH :]
-    recording = Recording(path)
-    list(recording.messages())
-    assert (recording.ended, recording.is_intact) == (True, False)
-
-
-def test_the_beginnings_of_two_neighbouring_damaged_chunks_are_read(tmp_path: Path) -> None:
-    path = tmp_path / "two.mcap"
-    writing = RecordingWriter(path, About("acsar", "0.1.0", "3.11.0", 1, 2))
-    for _ in range(4):
-        for second in range(5):
-            writing.add("steps", second, random.Random(second).randbytes(500))
-            writing.flush()
-        writing.end_chunk()
-    writing.finish()
-    every = [wall_ns for _, wall_ns, _ in Recording(path).messages()]
-    bad = bytearray(path.read_bytes())
-    for begin, end in chunks(bad)[1:3]:
-        at = (begin + end) // 2
-        bad[at : end - 3] = b"\xff" * (end - 3 - at)
-    path.write_bytes(bad)
-    recording = Recording(path)
-    assert every == [0, 1, 2, 3, 4] * 4
-    read = [wall_ns for _, wall_ns, _ in recording.messages()]
-    assert read == [0, 1, 2, 3, 4, 0, 1, 0, 1, 0, 1, 2, 3, 4]
-    assert (recording.damaged, recording.ended) == (2, True)
-
-
-@pytest.mark.slow
-def test_random_bytes_in_a_file_raise_only_recording_errors(whole: Path, tmp_path: Path) -> None:
-    data, dice, path = whole.read_bytes(), random.Random(3), tmp_path / "random.mcap"
-    errors: list[str] = []
-    for _ in range(40):
-        bad = bytearray(data)
-        for _ in range(dice.randint(1, 20)):
-            bad[dice.randrange(len(bad))] = dice.randrange(256)
-        path.write_bytes(bad)
-        try:
-            replay_file(Recording(path))
-        except RecordingError as error:
-            errors.append(str(error))
-    assert errors
-    assert all(str(path) in text for text in errors)
-
-
-@pytest.mark.parametrize("data", [b"", b"\x89MCAP", b"hello" * 100])
-def test_a_file_of_another_program_is_refused_with_a_message(data: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "other"
+def read(path: Path, data: bytes) -> tuple[list[int], Recording]:
+    """Return the numbers of the readable steps of a file with this content."""
     path.write_bytes(data)
+    recording = Recording([path])
+    return [step.number for step in recording.steps()], recording
+
+
+def frames_in(data: bytes) -> list[int]:
+    """Return the offsets of the frames."""
+    found, at = [], data.find(MAGIC)
+    while at >= 0:
+        found.append(at)
+        at = data.find(MAGIC, at + 1)
+    return found
+
+
+def test_every_step_is_read_as_it_was_written(taken: list[FinishedStep], tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(write(taken))
+    recording = Recording([path])
+    steps = list(recording.steps())
+    assert recording.damage == []
+    assert [step.inputs for step in steps] == [entry.inputs for entry in taken]
+    assert [step.recorded.line for step in steps] == [entry.outputs.line for entry in taken]
+    assert [step.recorded.sent for step in steps] == [entry.sent for entry in taken]
+    assert [step.recorded.status[0] for step in steps] == [entry.outputs.mode for entry in taken]
+    assert [step.recorded.events for step in steps] == [entry.outputs.events for entry in taken]
+    assert [step.number for step in steps if step.begins] == list(range(0, len(taken), SECOND))
+    assert recording.head() == head(0, taken[0].inputs.now)
+
+
+def test_a_file_that_was_cut_off_at_any_byte_has_every_complete_second(
+    taken: list[FinishedStep], tmp_path: Path
+) -> None:
+    data = write(taken)
+    file = io.BytesIO()
+    frames, ends = FrameWriter(file), []
+    for count, at in enumerate(range(0, len(taken), SECOND)):
+        if count % 2 == 0:
+            frames.begin(head(at, taken[at].inputs.now))
+        frames.add(encode_steps(at, taken[at : at + SECOND]))
+        ends.append(len(file.getvalue()))
+    for cut in range(0, len(data), 61):
+        numbers, recording = read(tmp_path / "a", data[:cut])
+        complete = sum(end <= cut for end in ends)
+        assert numbers == list(range(min(complete * SECOND, len(taken)))), cut
+        assert recording.damage == [], cut
+
+
+def test_damage_costs_the_rest_of_its_frame_and_is_said(
+    taken: list[FinishedStep], tmp_path: Path
+) -> None:
+    data, dice = write(taken), random.Random(1)
+    starts = [*frames_in(data), len(data)]
+    for _ in range(60):
+        at = dice.randrange(len(data) - 16)
+        damaged = data[:at] + dice.randbytes(16) + data[at + 16 :]
+        numbers, recording = read(tmp_path / "a", damaged)
+        hit = [i for i in range(len(starts) - 1) if starts[i] < at + 16 and at < starts[i + 1]]
+        whole = {n for n in range(len(taken)) if n // (2 * SECOND) not in hit}
+        assert whole <= set(numbers), at
+        assert numbers == sorted(set(numbers)), at
+        # The last bytes of a frame are its end mark only, which nothing needs.
+        assert recording.damage or len(numbers) == len(taken), at
+
+
+def test_a_missing_frame_is_a_gap_in_the_numbers(taken: list[FinishedStep], tmp_path: Path) -> None:
+    data = write(taken)
+    first, second, third = frames_in(data)[:3]
+    numbers, recording = read(tmp_path / "a", data[first:second] + data[third:])
+    assert numbers[: 2 * SECOND] == list(range(2 * SECOND))
+    assert numbers[2 * SECOND] == 4 * SECOND
+    assert recording.damage == []
+
+
+@each("content", [b"no recording", b"\x1f\x8b\x08", b"\x89MCAP0\r\n"])
+def test_another_file_is_refused_in_words(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(content)
     with pytest.raises(RecordingError, match="not a recording of acsard"):
-        Recording(path)
-    with pytest.raises(RecordingError, match="cannot read"):
-        Recording(tmp_path / "none")
+        list(Recording([path]).records())
 
 
-@pytest.mark.parametrize("name", ["wall_ns", "mono_ns", "started_ns"])
-def test_a_time_outside_of_the_calendar_is_refused(name: str, tmp_path: Path) -> None:
-    now = Config()
-    about = About(now.robot.id, "0.1.0", "3.11.0", 1, 2, "\n".join(document(effective(now))))
-    path = tmp_path / "far.mcap"
-    RecordingWriter(path, replace(about, **{name: 1 << 63})).finish()
-    with pytest.raises(RecordingError, match=name):
-        Recording(path)
-
-
-def test_an_event_without_a_valid_time_is_refused(tape: Tape, tmp_path: Path) -> None:
-    path = tmp_path / "far.mcap"
-    tape.write(path, Config())
-    recording, far = Recording(path), b'{"seconds": 1e300, "name": "stop", "text": "stopped"}'
-    writing = RecordingWriter(tmp_path / "new.mcap", recording.about)
-    writing.add("events", 1, far)
-    writing.finish()
-    with pytest.raises(RecordingError, match="an event that cannot be read"):
-        rewrite(Recording(tmp_path / "new.mcap"), tmp_path / "other.mcap")
-
-
-def test_a_cut_file_is_rewritten_as_a_finished_file(whole: Path, tmp_path: Path) -> None:
-    cut, new = tmp_path / "cut.mcap", tmp_path / "new.mcap"
-    cut.write_bytes(whole.read_bytes()[: chunks(whole.read_bytes())[3][1] + 20])
-    rewrite(Recording(cut), new)
-    recording = Recording(new)
-    assert [step.number for step in steps(recording)] == numbers(cut) == list(range(4 * BATCH))
-    assert recording.is_intact
-    assert recording.about == Recording(whole).about
-    with new.open("rb") as stream:
-        assert len(list(make_reader(stream).iter_messages())) > 0
-
-
-def test_a_replay_without_a_later_state_ends_at_missing_steps_and_reports_them(
-    whole: Path, tmp_path: Path
+@each("content", [b"", MAGIC[:3], MAGIC])
+def test_a_file_that_was_cut_off_before_its_first_second_has_no_steps(
+    content: bytes, tmp_path: Path
 ) -> None:
-    data, path = whole.read_bytes(), tmp_path / "gap.mcap"
-    start, _ = chunks(data)[2]
-    path.write_bytes(data[: start + 70] + bytes(20) + data[start + 90 :])
-    result = replay_file(Recording(path))
-    assert result.comparison.steps == 2 * BATCH
-    assert result.same
-    (gap,) = result.gaps
-    later = [step for step in steps(Recording(path)) if step.number >= 3 * BATCH]
-    assert (gap.unreadable, gap.skipped) == (BATCH, len(later))
-    assert gap.lines == sum(step.recorded.line is not None for step in later) > 0
+    assert read(tmp_path / "a", content)[0] == []
 
 
-def test_the_end_record_summarizes_the_recording(tape: Tape, whole: Path, tmp_path: Path) -> None:
-    first, last = tape.taken[0].inputs.now, tape.taken[-1].inputs.now
-    ending = read_end(whole)
-    assert ending is not None
-    assert (ending.wall_ns, ending.said) == (
-        first.wall_ns,
-        "start, 1 change of commander, 1 stop (stopped by unnamed (native))",
-    )
-    assert 0 <= last.wall_ns - ending.last_ns < 2e9
-    cut, new = tmp_path / "cut.mcap", tmp_path / "new.mcap"
-    cut.write_bytes(whole.read_bytes()[:-100])
-    assert read_end(cut) is None
-    rewrite(Recording(cut), new)
-    assert read_end(new) == replace(ending, cut="open")
-    assert ending == EndRecord(
-        ending.wall_ns, ending.last_ns, ending.said, earliest_ns=ending.wall_ns, serious=True
-    )
-    rewrite(Recording(new), tmp_path / "again.mcap", "crash")
-    assert read_end(tmp_path / "again.mcap") == read_end(new), "it was finished before"
-    assert read_end(tmp_path / "none") is None
+def test_a_missing_file_a_directory_and_a_pipe_are_refused_in_words(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "missing", tmp_path, tmp_path / "pipe"):
+        with pytest.raises(RecordingError, match="cannot read"):
+            list(Recording([path]).records())
 
 
-def test_a_device_is_not_read_as_a_recording() -> None:
-    with pytest.raises(RecordingError, match="it is not a file"):
-        Recording(Path("/dev/zero"))
+def test_a_file_larger_than_any_recording_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    with path.open("wb") as file:
+        file.truncate(recording_file.MAX_FILE_BYTES + 1)
+    with pytest.raises(RecordingError, match="more than 256 MB"):
+        list(Recording([path]).records())
 
 
-def test_a_recording_that_does_not_fit_into_memory_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_frame_that_would_need_much_memory_is_refused(tmp_path: Path) -> None:
+    """The window is bounded, and so is a record: 16 MB of zeros take 700 bytes of a file."""
+    wide = zstandard.ZstdCompressionParameters.from_level(3, window_log=27)
+    frames = [
+        zstandard.ZstdCompressor(compression_params=wide).compressobj(),
+        zstandard.ZstdCompressor(level=3).compressobj(),
+    ]
+    contents = [b"\0\0\0\1" + b"\0" * (1 << 27), b"\xff\xff\xff\xff\0\0\0\0" + b"\0" * (1 << 27)]
+    for frame, content in zip(frames, contents, strict=True):
+        path = tmp_path / "a"
+        path.write_bytes(frame.compress(content) + frame.flush())
+        recording = Recording([path])
+        assert list(recording.records()) == []
+        (damage,) = recording.damage
+        assert "memory" in str(damage) or "record has" in str(damage)
+
+
+def test_a_newer_version_may_add_fields_and_services(
+    taken: list[FinishedStep], tmp_path: Path
 ) -> None:
-    def too_large(self: Path) -> bytes:
-        raise MemoryError
+    row = msgspec.to_builtins(encode_steps(0, taken[:1]).rows[0], builtin_types=(bytes,))
+    row[3] |= {"added": 1, "requests": [{"verb": "dance"}, {"verb": "stop", "loudly": True}]}
+    beginning = msgspec.to_builtins(head(0, Instant(0, 0)), builtin_types=(bytes,))
+    steps = {"type": "steps", "first": 0, "rows": [[*row, "added"]], "checksum": 0, "added": {}}
+    path = tmp_path / "a"
+    path.write_bytes(content({**beginning, "added": [1]}, steps))
+    recording = Recording([path])
+    (step,) = recording.steps()
+    assert recording.damage == []
+    assert step.inputs.requests == (Request("stop"),)
 
-    (path := tmp_path / "large.mcap").touch()
-    monkeypatch.setattr(Path, "read_bytes", too_large)
-    with pytest.raises(RecordingError, match="larger than the free memory"):
-        Recording(path)
+
+def test_an_older_version_may_lack_fields(tmp_path: Path) -> None:
+    rows = [[5, 7, [], {"now": {"mono_ns": 0, "wall_ns": 0}, "tick": True, "port_open": True},
+             None, None, ["ready", "why", "up", "", "idle"], [], []]]  # fmt: skip
+    begin = {"type": "head", "version": "0.2.0", "robot": "r", "number": 0, "mono_ns": 0}
+    path = tmp_path / "a"
+    steps = {"type": "steps", "first": 0, "rows": rows, "checksum": 0}
+    path.write_bytes(content(begin | {"wall_ns": 0}, steps))
+    (step,) = Recording([path]).steps()
+    assert step.inputs.now == Instant(5, 12)
+    assert step.recorded.status[0] == "ready"
+
+
+def test_the_step_in_which_the_daemon_failed_is_the_last_record(
+    taken: list[FinishedStep], tmp_path: Path
+) -> None:
+    failure = Failure(0, "ZeroDivisionError: division by zero", taken[0].inputs)
+    path = tmp_path / "a"
+    path.write_bytes(content(head(0, taken[0].inputs.now), failure))
+    *_, last = Recording([path]).records()
+    assert last == failure
+
+
+def numbers_between(paths: list[Path], begin_ns: int, end_ns: int) -> list[int]:
+    return [step.number for step in Recording(paths, begin_ns, end_ns).steps()]
+
+
+def test_steps_between_two_times_are_found_over_all_files(
+    taken: list[FinishedStep], tmp_path: Path
+) -> None:
+    walls = [entry.inputs.now.wall_ns for entry in taken]
+    half = 2 * SECOND
+    paths = [tmp_path / "1", tmp_path / "2"]
+    for path, part in zip(paths, (taken[:half], taken[half:]), strict=True):
+        path.write_bytes(write(part, 1))
+    for begin in range(0, len(taken), 300):
+        for end in (begin, begin + 10, begin + half, len(taken) - 1):
+            at = walls[begin], walls[min(end, len(walls) - 1)]
+            expected = [
+                n % half if n < half else n - half
+                for n, w in enumerate(walls)
+                if at[0] <= w <= at[1]
+            ]
+            assert numbers_between(paths, *at) == expected, (begin, end)
+
+
+def test_a_frame_outside_the_time_is_not_read(taken: list[FinishedStep], tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(write(taken, 1))
+    begin = taken[2 * SECOND + 50].inputs.now.wall_ns
+    heads = [r.number for r in Recording([path], begin, begin + 1).records() if isinstance(r, Head)]
+    assert heads == [2 * SECOND]
+    whole = [
+        r for r in Recording([path], begin, begin + 1).records() if isinstance(r, RecordedStep)
+    ]
+    assert len(whole) == SECOND
+
+
+def test_a_file_that_ended_before_the_time_is_not_read(
+    taken: list[FinishedStep], tmp_path: Path
+) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(write(taken))
+    last = taken[-1].inputs.now.wall_ns
+    os.utime(path, ns=(last, last))
+    assert list(Recording([path], last + 2 * NS_PER_S).records()) == []
+    # A copy, by another clock.
+    os.utime(path, ns=(0, 0))
+    assert numbers_between([path], last, last) == [len(taken) - 1]
+
+
+def test_the_files_of_a_directory_are_ordered_by_their_numbers(tmp_path: Path) -> None:
+    names = ["000010-19700101T000000Z", "000009-20261129T000000Z", "1000000-20261129T000000Z"]
+    for name in [*names, "x-20261129T000000Z", "11"]:
+        (tmp_path / f"{name}{SUFFIX}").touch()
+    (tmp_path / "000001-20261129T000000Z.mcap").touch()
+    os.mkfifo(tmp_path / f"000002-x{SUFFIX}")
+    (tmp_path / f"000003-x{SUFFIX}").symlink_to(tmp_path / "11")
+    assert [path.name.removesuffix(SUFFIX) for path in listed(tmp_path)] == [
+        names[1],
+        names[0],
+        names[2],
+    ]
+
+
+def test_steps_are_a_struct_of_plain_data(taken: list[FinishedStep]) -> None:
+    steps = encode_steps(7, taken[:50])
+    assert msgspec.msgpack.decode(msgspec.msgpack.encode(steps), type=Steps) == steps

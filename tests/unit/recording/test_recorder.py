@@ -28,8 +28,8 @@ from acsard.recording import retention, step_writer
 from acsard.recording.directory import KEPT_SUFFIX, RecordingDirectory, listed
 from acsard.recording.end_record import ending_text, read_end
 from acsard.recording.export import export
-from acsard.recording.file import About, Recording, RecordingWriter, rewrite
 from acsard.recording.file_replay import replay_file, steps
+from acsard.recording.mcap_file import About, Recording, RecordingWriter, rewrite
 from acsard.recording.recorded_steps import unfinished
 from acsard.recording.recorder import Recorder
 from tests.scenarios.taped import Tape, recorded_world

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 
 from acsard.core.config.settings import Config
 from acsard.recording.end_record import END_RECORD_NAME, read_end
-from acsard.recording.file import CHUNK_BYTES, HOW_TO_READ, About, Recording, RecordingWriter
+from acsard.recording.mcap_file import CHUNK_BYTES, HOW_TO_READ, About, Recording, RecordingWriter
 from acsard.recording.mcap_records import GROWING_HEAD, LAST_BLOCK
 from acsard.recording.recovery import MAX_DELETED_BYTES, recover
 from tests.scenarios.taped import Tape, chunks

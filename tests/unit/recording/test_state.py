@@ -23,8 +23,8 @@ from acsard.core.values import NS_PER_S, REST, Command, Instant
 from acsard.host.errors import RecordingError
 from acsard.recording import file_replay
 from acsard.recording.export import export
-from acsard.recording.file import Recording, RecordingWriter
 from acsard.recording.file_replay import DisplayReplay, replay_file
+from acsard.recording.mcap_file import Recording, RecordingWriter
 from acsard.recording.rows import encode
 from acsard.recording.state import Checkpoint, State, StateError, adopt, freeze, thaw
 from acsard.recording.unpickling import MAX_BYTES, MAX_OPCODES
