@@ -1,8 +1,10 @@
 """Encodes a `Robot` between two steps as bytes, decodes it, and applies another configuration.
 
 A recording begins with a robot (a run's first file may not), and has one about every 20 s, so that
-a replay goes on after damage. `freeze` uses pickle, which takes a fraction of a millisecond, and
-`thaw` `unpickling.py`, because a forged file could run code through pickle.
+a replay goes on after damage. The state is a record: the configuration in force, the parts that are
+plain data (`PARTS`), and a pickle of the others. `thaw` reads that with `unpickling.py`, because a
+forged file could run code through pickle. When all parts are plain data, the pickle,
+`unpickling.py` and `adopt` go.
 """
 
 from __future__ import annotations
@@ -17,17 +19,25 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 from msgspec import Meta, Struct
 
+from acsard.core.config.contradictions import contradictions
+from acsard.core.config.settings import Config
 from acsard.core.formatting import printable
 from acsard.core.guard import Memory
+from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.modes import Mode
 from acsard.core.robot import Robot
 from acsard.core.values import AcsardError
-from acsard.recording.unpickling import unpickle
+from acsard.recording.unpickling import MAX_BYTES, unpickle
+
+# Attributes of a robot without configuration inside. A state is read by their types, and what an
+# older one lacks has its default.
+PARTS: dict[str, type[Struct]] = {
+    "_tally": EventThrottle,
+}
 
 # A package ends with a dot. The classes need constructors without side effects.
 PART_MODULES = (
-    "acsard.core.values", "acsard.core.codes", "acsard.core.robot", "acsard.core.guard",
-    "acsard.core.config.settings",
+    "acsard.core.values", "acsard.core.codes", "acsard.core.config.settings",
     "acsard.core.motion.", "acsard.core.link.",
 )  # fmt: skip
 
@@ -59,6 +69,15 @@ class State(NamedTuple):
     memory: Memory  # of the guard
 
 
+class Frozen(Struct):
+    """What `freeze` encodes."""
+
+    config: Config  # in force
+    memory: Memory
+    parts: dict[str, msgspec.Raw]
+    rest: bytes  # pickled attributes of the robot
+
+
 class Checkpoint(Struct, frozen=True, array_like=True):
     """A saved state, and the number of the step that follows it, for the channel `state`."""
 
@@ -82,11 +101,18 @@ def checkpoint(data: bytes) -> Checkpoint:
 
 def freeze(robot: Robot, memory: Memory) -> bytes:
     """Encode the state of a robot and of its guard, for `thaw`."""
+    rest = dict(vars(robot))
+    config = rest.pop("config")
+    parts = {name: msgspec.Raw(msgspec.msgpack.encode(rest.pop(name))) for name in PARTS}
     written = io.BytesIO()
     pickler = pickle.Pickler(written, PICKLE_PROTOCOL)
     pickler.dispatch_table = DISPATCH_TABLE
-    pickler.dump((robot, memory))
-    return written.getvalue()
+    pickler.dump(rest)
+    return msgspec.msgpack.encode(Frozen(config, memory, parts, written.getvalue()))
+
+
+_frozen = msgspec.msgpack.Decoder(Frozen)
+_parts = {name: msgspec.msgpack.Decoder(part) for name, part in PARTS.items()}
 
 
 def thaw(data: bytes) -> State:
@@ -95,13 +121,25 @@ def thaw(data: bytes) -> State:
     Raises `StateError`, also for another version that this one cannot use.
     """
     try:
-        made = unpickle(data, part_class)
-    except ValueError as error:
+        if len(data) > MAX_BYTES:
+            raise ValueError(f"it has {len(data)} bytes: the file is damaged or forged")
+        frozen = _frozen.decode(data)
+        if problems := contradictions(frozen.config):
+            raise ValueError(problems[0])
+        robot = Robot(frozen.config)
+        for name, raw in frozen.parts.items():
+            if name in PARTS:
+                setattr(robot, name, _parts[name].decode(raw))
+        rest = unpickle(frozen.rest, part_class)
+    except (ValueError, RecursionError) as error:  # msgspec's errors are a `ValueError`
         raise _unreadable(error) from None
-    match made:
-        case (Robot() as robot, Memory() as memory):
-            return State(robot, memory)
-    raise StateError("the robot state at the start of the recording is not valid")
+    if not isinstance(rest, dict):
+        raise StateError("the robot state at the start of the recording is not valid")
+    for name in vars(robot).keys() - PARTS.keys() - {"config"}:
+        # What an older version has not recorded is as in a new robot.
+        if name in rest:
+            setattr(robot, name, rest[name])
+    return State(robot, frozen.memory)
 
 
 def _unreadable(error: Exception) -> StateError:

@@ -6,12 +6,13 @@ loose contact floods the log.
 
 from __future__ import annotations
 
-from collections import Counter
+from operator import itemgetter
 from typing import get_args
 
+from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.core.values import NS_PER_S, Event, EventName, Level, Ns
+from acsard.core.values import NS_PER_S, Event, Level, Ns
 
 BURST = 5  # lines of one name without a delay: enough for a person who presses buttons
 
@@ -20,69 +21,70 @@ MAX_LISTED = 8  # kinds of events, and clients; further ones are "others"
 LEVELS: tuple[Level, ...] = get_args(Level)
 
 
-class _Held:
-    def __init__(self) -> None:
-        self.count, self.news, self._level = 0, False, 0
-        self.number = 0  # of the newest, in the sequence of all names
-        self._kinds: Counter[str] = Counter()
-        self._by: Counter[str] = Counter()
+class Held(Struct):
+    """Events of one name that wait for their line."""
 
-    def add(self, event: Event) -> None:
-        self.last = event
+    last: Event
+    count: int = 0
+    news: bool = False
+    level: int = 0  # the highest, in `LEVELS`
+    number: int = 0  # of the newest, in the sequence of all names
+    kinds: dict[str, int] = {}
+    by: dict[str, int] = {}
+
+    def add(self, event: Event, number: int) -> None:
+        self.last, self.number = event, number
         self.count += event.count
         self.news = self.news or event.news
-        self._level = max(self._level, LEVELS.index(event.level))
-        _count(self._kinds, event.kind, event.count)
-        _count(self._by, event.by, event.count)
+        self.level = max(self.level, LEVELS.index(event.level))
+        _count(self.kinds, event.kind, event.count)
+        _count(self.by, event.by, event.count)
 
     def line(self) -> Event:
-        last, what = self.last, _numbered(self._kinds)
+        last, what = self.last, _numbered(self.kinds)
         if self.count > 1 and not what:
             what = f"{self.count} times"
         if self.count > last.count and last.text:
             what = f"{what}; the last"
         text = ": ".join(part for part in (what, last.text) if part)
-        level, by = LEVELS[self._level], ", ".join(self._by)
+        level, by = LEVELS[self.level], ", ".join(self.by)
         kind = what if self.count > 1 else ""
         return replace(
             last, text=text, level=level, by=by, kind=kind, count=self.count, news=self.news
         )
 
 
-class EventThrottle:
+class EventThrottle(Struct):
     """Decides which events are logged now, and keeps the events that must wait."""
 
-    def __init__(self) -> None:
-        self._held: dict[EventName, _Held] = {}
-        self._number = 0  # of events of all names
-        self._free_ns: dict[EventName, int] = {}  # next line at one per second, after a burst
+    held: dict[str, Held] = {}  # by name
+    number: int = 0  # of events of all names
+    free_ns: dict[str, Ns] = {}  # next line of a name at one per second, after a burst
 
     def lines(self, events: list[Event], now_ns: Ns) -> tuple[Event, ...]:
         """Return the events to log now, which may stand for several of the same name."""
-        if not (events or self._held):
+        if not (events or self.held):
             return ()
         for event in events:
-            group = self._held.setdefault(event.name, _Held())
-            group.add(event)
-            self._number += 1
-            group.number = self._number
+            self.number += 1
+            self.held.setdefault(event.name, Held(event)).add(event, self.number)
         due_names = [
-            name for name, group in self._held.items() if self._may(name, group.news, now_ns)
+            name for name, group in self.held.items() if self._may(name, group.news, now_ns)
         ]
         if "stop" in due_names or "clear" in due_names:
             # A stop and a `clear` stay in order: the end of the log shows whether the robot stands.
             due_names += [
-                name for name in ("stop", "clear") if name in self._held and name not in due_names
+                name for name in ("stop", "clear") if name in self.held and name not in due_names
             ]
-            due_names.sort(key=lambda name: self._held[name].number)
-        return tuple([self._held.pop(name).line() for name in due_names])
+            due_names.sort(key=lambda name: self.held[name].number)
+        return tuple([self.held.pop(name).line() for name in due_names])
 
-    def _may(self, name: EventName, news: bool, now_ns: Ns) -> bool:
+    def _may(self, name: str, news: bool, now_ns: Ns) -> bool:
         # `BURST` is for news, and for each stop, whose time matters.
-        free_ns, at_once = self._free_ns.get(name, now_ns), news or name == "stop"
+        free_ns, at_once = self.free_ns.get(name, now_ns), news or name == "stop"
         if free_ns > now_ns + (BURST - 1 if at_once else 0) * NS_PER_S:
             return False
-        self._free_ns[name] = max(free_ns, now_ns) + NS_PER_S
+        self.free_ns[name] = max(free_ns, now_ns) + NS_PER_S
         return True
 
 
@@ -99,12 +101,14 @@ def merge(before: Event, line: Event) -> Event:
     return replace(line, text=text, level=level, by=by_text, kind=kind, count=count, news=False)
 
 
-def _count(counts: Counter[str], what: str, times: int) -> None:
+def _count(counts: dict[str, int], what: str, times: int) -> None:
     if what:
-        counts[what if what in counts or len(counts) < MAX_LISTED else "others"] += times
+        name = what if what in counts or len(counts) < MAX_LISTED else "others"
+        counts[name] = counts.get(name, 0) + times
 
 
-def _numbered(counts: Counter[str]) -> str:
-    if counts.total() == 1:
+def _numbered(counts: dict[str, int]) -> str:
+    if sum(counts.values()) == 1:
         return next(iter(counts))
-    return ", ".join(f"{times} x {what}" for what, times in counts.most_common())
+    by_count = sorted(counts.items(), key=itemgetter(1), reverse=True)
+    return ", ".join(f"{times} x {what}" for what, times in by_count)

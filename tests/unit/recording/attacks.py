@@ -14,8 +14,12 @@ import pickle
 import struct
 import sys
 
+import msgspec
+
+from acsard.core.config.settings import Config
+from acsard.core.guard import Memory
 from acsard.core.robot import Robot
-from acsard.recording.state import PICKLE_PROTOCOL, StateError, thaw
+from acsard.recording.state import PICKLE_PROTOCOL, Frozen, StateError, thaw
 from acsard.recording.unpickling import MAX_BYTES, MAX_KEY, MAX_OPCODES
 
 EXTENSION = 201
@@ -35,6 +39,11 @@ def named(module: str, name: str) -> bytes:
 def whole(body: bytes) -> bytes:
     """Return a complete pickle: this content between the first and the last opcode."""
     return pickle.PROTO + bytes([PICKLE_PROTOCOL]) + body + pickle.STOP
+
+
+def state_with(rest: bytes) -> bytes:
+    """Return the state of a new robot with this pickle of the parts that are not plain data."""
+    return msgspec.msgpack.encode(Frozen(Config(), Memory(), {}, rest))
 
 
 def doubled(times: int) -> bytes:
@@ -216,7 +225,7 @@ def main() -> None:
     os.system = ran.append  # type: ignore[assignment]
     for name, data in ATTACKS.items():
         try:
-            thaw(data)
+            thaw(state_with(data))
             errors[name] = ""
         except StateError as error:
             errors[name] = str(error)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
@@ -33,7 +34,7 @@ from acsard.report.report_data import ReportData
 from tests.each import each
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
-from tests.unit.recording.attacks import whole
+from tests.unit.recording.attacks import state_with, whole
 
 
 def test_a_robot_is_read_back_unchanged() -> None:
@@ -77,7 +78,7 @@ def test_senders_of_one_command_soon_leave_the_state() -> None:
 @each("value", [1, (1, 2), ("robot", b""), (Instant(1, 2), b"")])
 def test_bytes_that_are_not_a_robot_are_refused(value: object) -> None:
     with pytest.raises(StateError):
-        thaw(pickle.dumps(value))
+        thaw(state_with(pickle.dumps(value)))
 
 
 def test_damaged_bytes_are_refused_with_a_message(tmp_path: Path) -> None:
@@ -128,6 +129,30 @@ def test_attributes_that_an_older_robot_lacks_come_from_a_new_robot(tmp_path: Pa
     assert len([*looked.steps()]) == looked.replay.comparison.steps > 100
     assert looked.replay.comparison.same
     assert replay_file(recording).comparison.same
+
+
+@each(
+    ("part", "value"),
+    [("_tally", {"free_ns": {"stop": "soon"}}), ("_tally", 5), ("_tally", [{}, 0, {}])],
+)
+def test_a_part_with_a_value_of_another_type_is_refused(part: str, value: object) -> None:
+    frozen = msgspec.msgpack.decode(freeze(Robot(Config()), Memory()))
+    frozen["parts"][part] = value
+    with pytest.raises(StateError, match="Expected"):
+        thaw(msgspec.msgpack.encode(frozen))
+
+
+def test_what_a_part_of_an_older_version_lacks_has_its_default() -> None:
+    frozen = msgspec.msgpack.decode(freeze(driven(), Memory()))
+    assert frozen["parts"]["_tally"].pop("free_ns")
+    assert thaw(msgspec.msgpack.encode(frozen)).robot._tally.free_ns == {}
+
+
+def test_a_state_with_a_configuration_that_a_file_may_not_have_is_refused() -> None:
+    robot = Robot(Config())
+    robot.config = replace(PLAIN, limits=replace(PLAIN.limits, linear_deceleration=0.11))
+    with pytest.raises(StateError, match=r"limits\.linear_deceleration = 0\.11"):
+        thaw(freeze(robot, Memory()))
 
 
 SPOILERS: dict[str, Callable[[Robot], None]] = {
@@ -273,7 +298,7 @@ def test_forged_states_after_gaps_take_time_in_proportion_to_the_file(
     writing = RecordingWriter(path := tmp_path / "forged.mcap", about)
     writing.add("steps", about.wall_ns, encode(0, taped.taken[:1]))
     for number in range(10, 210, 10):
-        forged = Checkpoint(number, whole(b"(" + b"K\x01" * (MAX_OPCODES - 5) + b"t"))
+        forged = Checkpoint(number, state_with(whole(b"(" + b"K\x01" * (MAX_OPCODES - 5) + b"t")))
         writing.add("state", about.wall_ns, forged.encode())
         writing.add("steps", about.wall_ns, encode(number, taped.taken[1:2]))
     writing.finish()
