@@ -1,23 +1,29 @@
 """Replays steps: runs `Robot.step` with the recorded inputs, and compares the outputs.
 
 Behavior depends only on inputs and configuration, so the same ones give every line, mode and pose
-again. With changed code or configuration, the differences show what would have been.
+again. With changed code or configuration, the differences show what would have been. `Replay` does
+so for steps, and `Playback` for a recording, whose robot begins at a `Head`.
 """
 
 from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from itertools import zip_longest
 from typing import Literal
 
 from msgspec import Struct
 
+from acsard.core.config.parsing import ConfigError, parse_recorded
+from acsard.core.config.settings import Config
 from acsard.core.guard import Guard, Memory, Trip
 from acsard.core.robot import Robot
 from acsard.core.values import Event, Instant, Outputs
+from acsard.host.errors import RecordingError
+from acsard.recording.file import Failure, Head, Recording
 from acsard.recording.recorded_steps import (
     US_PER_S,
     Micropose,
@@ -28,6 +34,7 @@ from acsard.recording.recorded_steps import (
     micropose,
     status_of,
 )
+from acsard.recording.state import State, StateError, adopt, short, thaw
 
 # "sent line" is after the guard, "event" all but text and client. "input names" are compared at the
 # end of a batch.
@@ -217,3 +224,125 @@ def max_wheel_speed(line: bytes | None) -> int:
         return 0
     tokens = [line[start + 2 : start + 7].replace(b".", b"") for start in (0, 8, 16, 24)]
     return max([int(token) for token in tokens if token.isdigit()], default=0)
+
+
+# A recording
+
+
+class Gap(Struct, frozen=True):
+    """Steps that are missing in a recording, or that cannot be read."""
+
+    begin: Instant  # last step before it
+    end: Instant  # first one after it
+    steps: int
+
+
+class Playback:
+    """Replays a recording. After a gap, the robot goes on from the state in the next `Head`."""
+
+    def __init__(self, recording: Recording, other: Config | None = None) -> None:
+        # `other` replaces the recorded configuration.
+        self.gaps: list[Gap] = []  # found so far
+        self.failure: Failure | None = None  # of the recorded daemon, in the last step
+        self.head: Head | None = None  # last one that was read
+        self.replay: Replay | None = None  # its robot, and the comparison so far
+        self._recording, self._other = recording, other
+        self._next: int | None = None  # number of the next step; None: of the next head
+        self._last: Instant | None = None
+
+    @property
+    def robot(self) -> Robot:
+        assert self.replay is not None
+        return self.replay.robot
+
+    @property
+    def comparison(self) -> Comparison:
+        return Comparison() if self.replay is None else self.replay.comparison
+
+    def steps(self) -> Iterator[tuple[RecordedStep, Outputs]]:
+        """Replay each step in turn, and yield it with its outputs. Raises `RecordingError`.
+
+        The steps of a frame that precede the time of the recording come, too:
+        `Recording.contains` tells them apart.
+        """
+        for record in self._recording.records():
+            match record:
+                case Head():
+                    self._begin(record)
+                case Failure():
+                    self.failure = record
+                case RecordedStep(number=number) if number == self._next:
+                    assert self.replay is not None
+                    with self.errors():
+                        self.replay.step(record)
+                    self._next, self._last = number + 1, record.inputs.now
+                    assert self.replay.outputs is not None
+                    yield record, self.replay.outputs
+
+    def _begin(self, head: Head) -> None:
+        before, self.head = self.head, head
+        same_run = before is not None and before.started_ns == head.started_ns
+        if same_run and head.number == self._next:
+            return
+        if same_run and self._last is not None and self._next is not None:
+            at = Instant(head.mono_ns, head.wall_ns)
+            self.gaps.append(Gap(self._last, at, head.number - self._next))
+        with self.errors():
+            robot, memory = self._robot_at(head)
+            if self.replay is None:
+                self.replay = Replay(robot, memory)
+            else:
+                self.replay.resume(robot, memory)
+        self._next = head.number
+
+    def _robot_at(self, head: Head) -> State:
+        recorded = config_of(head)
+        config = self._other or recorded
+        if not head.state:
+            return State(Robot(config), Memory())
+        state = thaw(head.state)
+        if self._other is not None:
+            adopt(state.robot, Robot(recorded), Robot(config))
+        return state
+
+    @contextmanager
+    def errors(self) -> Iterator[None]:
+        """Raise `RecordingError` for every exception of the robot in a `with` block.
+
+        A forged recording may have any numbers, and so may one of another version.
+        """
+        try:
+            yield
+        except RecordingError:
+            raise
+        except (StateError, ConfigError) as error:
+            raise self._error(short(error)) from None
+        except Exception as error:
+            what = f"it fails with {type(error).__name__}: {short(error)}"
+            raise self._error(f"{what} in step {self._next}") from error
+
+    def _error(self, reason: str) -> RecordingError:
+        version = "" if self.head is None else f", which acsard {self.head.version} wrote"
+        paths = ", ".join([path.name for path in self._recording.paths[:3]])
+        return RecordingError(f"this acsard cannot replay {paths}{version}: {reason}")
+
+    def failed_step(self) -> str:
+        """Return whether the step in which the daemon failed fails here, too; "" without one."""
+        failure, replay = self.failure, self.replay
+        if failure is None:
+            return ""
+        if failure.inputs is None:
+            return f"the recorded daemon failed: {failure.why}"
+        name = f"step {failure.number}, in which the recorded daemon failed ({failure.why}),"
+        if replay is None or self._next != failure.number:
+            return f"{name} was not replayed, because the step before it is missing"
+        try:
+            replay.robot.step(failure.inputs)
+        except Exception as error:  # noqa: BLE001 - the failure may be any exception
+            return f"{name} also fails here, with {type(error).__name__}: {short(error)}"
+        return f"{name} does not fail in this version of acsard"
+
+
+def config_of(head: Head) -> Config:
+    """Return the configuration in force at a head. Raises `ConfigError`."""
+    return parse_recorded(head.config.encode())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import struct
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from acsard.core.robot import Robot
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.faults import Fault
 from acsard.core.values import Inputs, Outputs, Recording
+from acsard.recording.file import FrameWriter, Head, encode_steps
 from acsard.recording.mcap_file import About, RecordingWriter
 from acsard.recording.recorded_steps import FinishedStep, RecordedStep
 from acsard.recording.replay import Replay
@@ -121,6 +123,32 @@ class Tape:
             if apart:
                 writing.end_chunk()
         writing.finish()
+
+    def save(
+        self, path: Path, config: Config | None = None, first: int = 0, end: int | None = None
+    ) -> Path:
+        """Write the file that the daemon would write, and return its path.
+
+        The file begins at the step `first`, and has a frame from there and from each stored state.
+        Any step but the first one needs a stored state.
+        """
+        config = config or Config()
+        text = "\n".join(document(effective(config))) + "\n"
+        steps = self.taken[:end]
+        with path.open("wb") as file:
+            frames = FrameWriter(file)
+            begins = sorted({first, *[n for n in self.states if first < n < len(steps)]})
+            for begin, after in pairwise([*begins, len(steps)]):
+                now, state = steps[begin].inputs.now, self.states.get(begin, b"")
+                assert state or not begin
+                times = now.mono_ns, now.wall_ns
+                frames.begin(
+                    Head("0.2.0", config.robot.id, begin, *times, text, state, START.wall_ns)
+                )
+                for at in range(begin, after, BATCH):
+                    frames.add(encode_steps(at, steps[at : min(at + BATCH, after)]))
+            frames.end()
+        return path
 
 
 def recorded_world(

@@ -1,0 +1,148 @@
+"""Tests of the replay of a recording: after a gap it goes on at the next head."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.config.settings import Config
+from acsard.core.robot import Robot
+from acsard.core.values import Command, Instant, Twist
+from acsard.host.errors import RecordingError
+from acsard.recording.file import MAGIC, Failure, FrameWriter, Head, Recording
+from acsard.recording.replay import Playback
+from tests.scenarios.taped import Tape, recorded_world
+from tests.scenarios.world import START
+
+
+@pytest.fixture(scope="module")
+def tape() -> Tape:
+    tape, world = recorded_world(every=200)
+    world.drive(0.5, 0.3, 3.0)
+    world.call("stop")
+    world.run(1.0)
+    return tape
+
+
+def played(*paths: Path, other: Config | None = None) -> tuple[list[int], Playback, Recording]:
+    recording = Recording(paths)
+    playback = Playback(recording, other)
+    return [step.number for step, _ in playback.steps()], playback, recording
+
+
+def test_a_drive_replays_with_the_same_result(tape: Tape, tmp_path: Path) -> None:
+    numbers, playback, _ = played(tape.save(tmp_path / "a"))
+    assert numbers == list(range(len(tape.taken)))
+    assert playback.comparison.same
+    assert playback.comparison.exact
+    assert playback.gaps == []
+
+
+def test_a_replay_begins_at_a_state(tape: Tape, tmp_path: Path) -> None:
+    numbers, playback, _ = played(tape.save(tmp_path / "a", first=400))
+    assert numbers[0] == 400
+    assert playback.comparison.same
+
+
+def test_a_replay_goes_on_after_damage_at_the_next_state(tape: Tape, tmp_path: Path) -> None:
+    path = tape.save(tmp_path / "a")
+    data = bytearray(path.read_bytes())
+    second = data.index(MAGIC, 1)
+    data[second + 100 : second + 116] = b"sixteen bad byte"
+    path.write_bytes(data)
+    numbers, playback, recording = played(path)
+    assert numbers == [n for n in range(len(tape.taken)) if not 200 <= n < 400]
+    assert playback.comparison.same
+    (gap,) = playback.gaps
+    assert gap.steps == 200
+    assert gap.begin == tape.taken[199].inputs.now
+    assert gap.end == tape.taken[400].inputs.now
+    assert len(recording.damage) == 1
+
+
+def test_two_files_of_a_run_are_one_drive(tape: Tape, tmp_path: Path) -> None:
+    paths = tape.save(tmp_path / "1", end=400), tape.save(tmp_path / "2", first=400)
+    numbers, playback, _ = played(*paths)
+    assert numbers == list(range(len(tape.taken)))
+    assert playback.comparison.same
+    assert playback.gaps == []
+
+
+def test_a_missing_file_is_a_gap_and_another_run_is_none(tape: Tape, tmp_path: Path) -> None:
+    paths = tape.save(tmp_path / "1", end=200), tape.save(tmp_path / "2", first=400)
+    _, playback, _ = played(*paths)
+    assert [gap.steps for gap in playback.gaps] == [200]
+    with (tmp_path / "3").open("wb") as file:
+        FrameWriter(file).begin(Head("0.2.0", "acsar", 0, 0, 0, "", b"", started_ns=7))
+    _, playback, _ = played(tape.save(tmp_path / "1", end=200), tmp_path / "3")
+    assert playback.gaps == []
+
+
+def test_another_configuration_changes_the_lines(tape: Tape, tmp_path: Path) -> None:
+    config = Config()
+    slow = replace(config, limits=replace(config.limits, linear_speed=0.2))
+    for first in (0, 400):
+        _, playback, _ = played(tape.save(tmp_path / "a", first=first), other=slow)
+        assert "line" in playback.comparison.first_by_output
+        assert playback.robot.config == slow
+
+
+def test_steps_outside_the_time_are_told_apart(tape: Tape, tmp_path: Path) -> None:
+    path = tape.save(tmp_path / "a")
+    times = tape.taken[450].inputs.now.wall_ns, tape.taken[460].inputs.now.wall_ns
+    recording = Recording([path], *times)
+    playback = Playback(recording)
+    numbers = [s.number for s, _ in playback.steps() if recording.contains(s.inputs.now)]
+    assert numbers == list(range(450, 461))
+    assert playback.comparison.steps == 200
+    assert playback.comparison.same
+
+
+def test_a_state_that_this_version_cannot_use_is_refused_in_words(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    with path.open("wb") as file:
+        FrameWriter(file).begin(Head("9.9.9", "acsar", 5, 0, 0, "", b"no state"))
+    with pytest.raises(RecordingError, match=r"cannot replay a, which acsard 9\.9\.9 wrote: "):
+        played(path)
+
+
+def test_forged_numbers_give_an_error_in_words(tape: Tape, tmp_path: Path) -> None:
+    forged = Tape()
+    bad = Command("app", Twist(float("nan"), 0.0), -(1 << 62))
+    for n, entry in enumerate(tape.taken[:20]):
+        now = Instant((-1) ** n * (1 << 63 - n), 1 << 62 - n)
+        inputs = replace(entry.inputs, now=now, commands=(bad,), missed=1 << 62, late_ns=-(1 << 62))
+        forged.taken.append(entry._replace(inputs=inputs))
+    path = forged.save(tmp_path / "a")
+    try:
+        played(path)
+    except RecordingError as error:
+        assert "cannot replay" in str(error)  # noqa: PT017 - either result is right
+
+
+class BrokenError(Exception):
+    pass
+
+
+def test_the_step_in_which_the_daemon_failed_is_replayed_too(
+    tape: Tape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tape.save(tmp_path / "a", end=200)
+    with path.open("ab") as file:
+        frames = FrameWriter(file)
+        at, state = tape.taken[200].inputs.now, tape.states[200]
+        started_ns = START.wall_ns
+        frames.begin(Head("0.2.0", "acsar", 200, at.mono_ns, at.wall_ns, "", state, started_ns))
+        frames.add(Failure(200, "BrokenError: x", tape.taken[200].inputs))
+        frames.end()
+    _, playback, _ = played(path)
+    assert "(BrokenError: x), does not fail in this version" in playback.failed_step()
+    _, playback, _ = played(path)
+
+    def fail(*_: object) -> None:
+        raise BrokenError("y")
+
+    monkeypatch.setattr(Robot, "step", fail)
+    assert "also fails here, with BrokenError: y" in playback.failed_step()
