@@ -64,8 +64,6 @@ from acsard.daemon.latencies import Stopwatch
 from acsard.daemon.pacing import NO_PERIOD, Pace, Period
 from acsard.recording.recorded_steps import StepRecorder
 
-FEEDBACK_TOPICS = ("odom", "tf", "wheel_states")  # with messages of the board's feedback lines
-
 # Queries that a step takes, beside one slow one (`set`, ROS parameters). More wait, so that a flood
 # costs no period.
 QUERIES_PER_STEP = 8
@@ -148,6 +146,7 @@ class ControlLoop:
         line_ns = wire_ns(config.mcu.line_bytes, config.mcu.baud_rate)
         self.pace = Pace(line_ns, config.period_ns)
         self._stopwatch = Stopwatch()
+        bus.feedback_sent = self._stopwatch.figures["feedback_to_bus"].add
 
     @property
     def at_rest(self) -> bool:
@@ -226,9 +225,9 @@ class ControlLoop:
         # `adopted` may change the log's level, so call it after logging this step's events.
         if self._config is not before and self._adopted:
             self._adopted(self._config)
-        self._stopwatch.figures["step_time"].add(now.mono_ns, self._mono_ns() - now.mono_ns)
-        # Flush last, because the sending thread needs Python's interpreter lock, which is free only
-        # while this loop waits.
+        self._stopwatch.figures["step_time"].add(self._mono_ns() - now.mono_ns)
+        # Flush last, because the threads that send need this core and Python's interpreter lock,
+        # which are free only while this loop waits.
         self._bus.flush()
         return outputs
 
@@ -364,15 +363,13 @@ class ControlLoop:
         return None
 
     def _publish(self, outputs: Outputs, answers: tuple[Answer, ...]) -> None:
-        bus, delays = self._bus, self._bus.feedback_delays
-        while delays:
-            self._stopwatch.figures["feedback_to_bus"].add(*delays.popleft())
-        # Of several lines in a step, the first was read first.
-        read_ns = outputs.estimates[0].heard_ns if outputs.estimates else None
-        for key, message in self.report.due(outputs, bus.wanted_keys, self._snapshot):
-            bus.publish(key, message, read_ns if key in FEEDBACK_TOPICS else None)
+        bus, report, wanted = self._bus, self.report, self._bus.wanted_keys
         for estimate in outputs.estimates:
+            for topic in report.feedback_due(estimate, wanted):
+                bus.publish_feedback(topic, estimate)
             self._stopwatch.feedback(estimate)
+        for key, message in report.others_due(outputs, wanted, self._snapshot):
+            bus.publish(key, message)
         for answer in answers:
             self._answers.append((outputs.now.mono_ns, answer))
         if self._answers:

@@ -121,6 +121,7 @@ class Run:
         made.drive(0.0, 0.0, 0.2)
         made.bus.wanted_keys = {"odom"}
         setattr(made.bus, "publish", lambda key, message: encode(message, "msgpack"))  # noqa: B010
+        made.bus.publish_feedback = lambda topic, estimate: topic.encode(estimate, "msgpack")  # type: ignore[assignment, method-assign]
         feed, step = made.port.feed, made.loop.step
         robot, self.heard = made.loop.robot, list[Received]()
         self.lines = Timed(robot._odometry.fold)

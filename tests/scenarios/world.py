@@ -21,13 +21,23 @@ from acsard.core.incoming.queries import Query, Reply
 from acsard.core.link.codec import Codec
 from acsard.core.link.serial_output import Offered, SerialOutput
 from acsard.core.messages.encodings import encode
+from acsard.core.messages.frames import FeedbackTopic
 from acsard.core.messages.keys_and_roles import PUBLISHED
 from acsard.core.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
 from acsard.core.messages.signature import Signature
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.simulated_robot import Observation, WatchedMcu
 from acsard.core.simulator.true_messages import turn_rate
-from acsard.core.values import NS_PER_S, Event, Instant, Latches, Outputs, Pose, Received
+from acsard.core.values import (
+    NS_PER_S,
+    Estimate,
+    Event,
+    Instant,
+    Latches,
+    Outputs,
+    Pose,
+    Received,
+)
 from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_rules import LatchKeeper
 from acsard.daemon.pacing import NO_PERIOD, Period
@@ -112,7 +122,7 @@ class MemoryBus:
     def __init__(self, wanted: Collection[str]) -> None:
         self.wanted_keys = set(wanted)
         self.published: dict[str, deque[Message]] = {}
-        self.feedback_delays: deque[tuple[int, int]] = deque()
+        self.feedback_sent: Callable[[int], object] = list[int]().append
         self.replies: dict[int, list[Reply]] = {}
         self.finished: set[int] = set()
         self.arrivals: list[Arrival] = []
@@ -132,8 +142,11 @@ class MemoryBus:
         del self.queries[:queries]
         return batch
 
-    def publish(self, key: str, message: Message, read_ns: int | None = None) -> None:
+    def publish(self, key: str, message: Message) -> None:
         self.published.setdefault(key, deque(maxlen=100_000)).append(message)
+
+    def publish_feedback(self, topic: FeedbackTopic, estimate: Estimate) -> None:
+        self.publish(topic.key, topic.build(estimate))
 
     def flush(self) -> None: ...
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import MutableMapping
+from collections.abc import Callable, MutableMapping
 from collections.abc import Set as AbstractSet
 from typing import Protocol
 
@@ -12,8 +11,9 @@ from msgspec import Struct
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query, Reply
 from acsard.core.messages.encodings import DecodeError, StrictDecoder
+from acsard.core.messages.frames import FeedbackTopic
 from acsard.core.messages.schema import GatewayState, Message
-from acsard.core.values import Event, Ns, RoutersStatus
+from acsard.core.values import Estimate, Event, Ns, RoutersStatus
 
 
 class BusInput(Struct, frozen=True):
@@ -55,18 +55,21 @@ class Bus(Protocol):
         the limit, and others. The rest waits.
         """
 
-    @property
-    def feedback_delays(self) -> deque[tuple[Ns, Ns]]:
-        """When each message with a `read_ns` was sent, and how long after that time."""
+    # Gets the time from the read of a feedback line until Zenoh had its message, in any thread.
+    feedback_sent: Callable[[Ns], object]
 
-    def publish(self, key: str, message: Message, read_ns: Ns | None = None) -> None:
-        """Queue a message for the subscribers of `key`, which the next `flush` sends.
+    def publish(self, key: str, message: Message) -> None:
+        """Queue a message for the subscribers of `key`, which the next `flush` sends."""
 
-        `read_ns` says when the feedback line of the message was read.
-        """
+    def publish_feedback(self, topic: FeedbackTopic, estimate: Estimate) -> None:
+        """Queue the message of a feedback line, which the next `flush` sends."""
 
     def flush(self) -> None:
-        """Start to send the queued messages, without waiting."""
+        """Send the queued messages, or start to send them, without waiting.
+
+        Call this last in a step: if a message is sent here, another thread of Zenoh then needs this
+        thread's core.
+        """
 
     def reply(self, reply: Reply) -> None:
         """Send a reply to the query of `reply.ticket`."""

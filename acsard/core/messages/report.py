@@ -7,11 +7,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
+from itertools import chain
 
 from acsard.core.config.settings import DIAGNOSTICS_HZ, Config
 from acsard.core.messages.certificate_expiry import DAY_NS, expiry, first_expiry
 from acsard.core.messages.covariances import UNKNOWN_COVARIANCE, pose_covariance, twist_covariance
 from acsard.core.messages.diagnostics import diagnostics
+from acsard.core.messages.frames import (
+    FeedbackTopic,
+    odom_numbers,
+    tf_numbers,
+    wheel_states_numbers,
+)
 from acsard.core.messages.recent_events import RecentEvents
 from acsard.core.messages.schema import (
     Battery,
@@ -101,6 +108,11 @@ class Report:
         self._estimate: Estimate | None = None
         self._outputs: Outputs | None = None
         self._happened = RecentEvents()
+        self._feedback = (
+            FeedbackTopic("odom", self._odom, odom_numbers),
+            FeedbackTopic("tf", self._tf, tf_numbers),
+            FeedbackTopic("wheel_states", self._wheel_states, wheel_states_numbers),
+        )
         # Builders by key, at their own rate and with `status_changed`. None: there is no message
         # now.
         self._summaries: dict[str, Callable[[Outputs, Snapshot], Message | None]] = {
@@ -131,34 +143,47 @@ class Report:
 
         Those of the feedback come first, because `state` takes ten times as long.
         """
+        feedback = [
+            (topic.key, topic.build(estimate))
+            for estimate in outputs.estimates
+            for topic in self.feedback_due(estimate, wanted)
+        ]
+        return chain(feedback, self.others_due(outputs, wanted, get_snapshot))
+
+    def feedback_due(self, estimate: Estimate, wanted: Collection[str]) -> list[FeedbackTopic]:
+        """Return the topics on which a message of this feedback line is to be published."""
+        odom, tf, wheel_states = self._feedback
+        due, at_ns = list[FeedbackTopic](), estimate.at.mono_ns
+        if ("odom" in wanted or "tf" in wanted) and self._rates["odom"].due(at_ns):
+            if "odom" in wanted:
+                due.append(odom)
+            if "tf" in wanted and self._config.odometry.publish_tf:
+                due.append(tf)
+        if "wheel_states" in wanted and self._rates["wheel_states"].due(at_ns):
+            due.append(wheel_states)
+        return due
+
+    def others_due(
+        self, outputs: Outputs, wanted: Collection[str], get_snapshot: GetSnapshot
+    ) -> Iterator[tuple[str, Message]]:
+        """Return an iterator over the messages that are not of a feedback line."""
         self._outputs = outputs
         if outputs.events:
             self._happened.add(outputs.events, outputs.now)
         if outputs.estimates:
             self._estimate = outputs.estimates[-1]
         if (
-            (outputs.estimates and wanted)
-            or not self._summaries.keys().isdisjoint(wanted)
+            not self._summaries.keys().isdisjoint(wanted)
             or (outputs.due and "cmd_vel_out" in wanted)
             or (outputs.events and "events" in wanted)
         ):
-            return self._due(outputs, wanted, get_snapshot)
+            return self._others_due(outputs, wanted, get_snapshot)
         # Most steps end here, because no message with a subscriber is due.
         return iter(())
 
-    def _due(
+    def _others_due(
         self, outputs: Outputs, wanted: Collection[str], get_snapshot: GetSnapshot
     ) -> Iterator[tuple[str, Message]]:
-        for estimate in outputs.estimates:
-            if ("odom" in wanted or "tf" in wanted) and self._rates["odom"].due(
-                estimate.at.mono_ns
-            ):
-                if "odom" in wanted:
-                    yield "odom", self._odom(estimate)
-                if "tf" in wanted and self._config.odometry.publish_tf:
-                    yield "tf", self._tf(estimate)
-            if "wheel_states" in wanted and self._rates["wheel_states"].due(estimate.at.mono_ns):
-                yield "wheel_states", self._wheel_states(estimate)
         now_ns = outputs.now.mono_ns
         if outputs.due and "cmd_vel_out" in wanted and self._rates["cmd_vel_out"].due(now_ns):
             yield "cmd_vel_out", self._cmd_vel_out(outputs)

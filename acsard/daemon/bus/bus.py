@@ -7,7 +7,7 @@ event loop.
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections.abc import Callable
 from functools import partial
 
 import zenoh
@@ -19,12 +19,13 @@ from acsard.core.config.settings import Config
 from acsard.core.incoming.bus_interface import Bus, BusInput, Waker
 from acsard.core.incoming.imu import SIMULATOR_SENDER
 from acsard.core.incoming.queries import Reply
+from acsard.core.messages.frames import FeedbackTopic
 from acsard.core.messages.keys_and_roles import IMU, Topic, full_key, json_key, offered, published
 from acsard.core.messages.schema import Message
 from acsard.core.messages.signature import Signature
 from acsard.core.ros.names import gid
 from acsard.core.ros.transports import Endpoint, claims, endpoints, left_out, node_tokens
-from acsard.core.values import NS_PER_S, Ns
+from acsard.core.values import NS_PER_S, Estimate, Ns
 from acsard.daemon.bus.inbox import Inbox, Replies
 from acsard.daemon.bus.outlets import Outlets
 from acsard.daemon.bus.router_links import RouterLinks
@@ -50,7 +51,11 @@ class ZenohBus(Bus):
         self._replies = Replies(prefix, self._thread_errors)
         sources = tuple(source.name for source in config.commands.sources)
         self._inbox = Inbox(prefix, self._replies, sources, waker, config.rate_hz)
-        self._outlets = Outlets(self._thread_errors)
+        # Clients of this machine are trusted, and the TLS gateway lets the others use exact keys
+        # only. A router, a wildcard or a client without a certificate can lock the session's tables
+        # for seconds, and the first put that meets the lock would already cost periods.
+        lockable = config.bus.connect or config.bus.insecure or config.access.wildcards
+        self._outlets = Outlets(self._thread_errors, direct=not lockable)
         self._links = RouterLinks(config.bus, self._thread_errors)
         self._session: zenoh.Session
         self._entities: list[object] = []  # Zenoh undeclares an entity when nothing refers to it
@@ -71,12 +76,19 @@ class ZenohBus(Bus):
         dropped, stuck = self._outlets.losses(clock.mono_ns())
         return replace(batch, dropped=dropped, stuck=stuck) if dropped or stuck else batch
 
-    @property
-    def feedback_delays(self) -> deque[tuple[Ns, Ns]]:
-        return self._outlets.feedback_delays
+    def publish(self, key: str, message: Message) -> None:
+        self._outlets.publish(key, message)
 
-    def publish(self, key: str, message: Message, read_ns: Ns | None = None) -> None:
-        self._outlets.publish(key, message, read_ns)
+    @property
+    def feedback_sent(self) -> Callable[[Ns], object]:
+        return self._outlets.feedback_sent
+
+    @feedback_sent.setter
+    def feedback_sent(self, record: Callable[[Ns], object]) -> None:
+        self._outlets.feedback_sent = record
+
+    def publish_feedback(self, topic: FeedbackTopic, estimate: Estimate) -> None:
+        self._outlets.publish_feedback(topic, estimate)
 
     def flush(self) -> None:
         # An exception that has ended a thread of the bus must end the daemon too.

@@ -3,12 +3,14 @@
 A topic has native keys (msgpack, JSON) and perhaps ROS keys, each with a publisher, its outlet. A
 message is encoded once per encoding that is latched or has a subscriber. The control loop only puts
 it into the topic's bounded slot, and a thread sends it: a bus that blocks costs messages, but no
-control period.
+control period. The messages of feedback lines are sent by the control loop itself if no client can
+block the session, while no put is slow.
 """
 
 from __future__ import annotations
 
-from collections import deque
+from collections.abc import Callable
+from functools import partial
 from threading import Lock
 from typing import Any
 
@@ -17,9 +19,10 @@ import zenoh.ext
 
 from acsard.bus.subscription import direct
 from acsard.core.messages.encodings import Format, encode, encoding_name
+from acsard.core.messages.frames import FeedbackTopic
 from acsard.core.messages.schema import Message
 from acsard.core.ros.attachments import Attachment
-from acsard.core.values import NS_PER_S, Ns
+from acsard.core.values import NS_PER_S, Estimate, Ns
 from acsard.daemon.bus.bus_thread import BusThread
 from acsard.host import clock
 from acsard.host.mailbox import Bell, Mailbox
@@ -37,8 +40,21 @@ SLOT_MESSAGES = 16
 # The bus is blocked if messages wait for this time. Usually the thread needs 0.1 ms.
 BLOCKED_AFTER_NS = NS_PER_S // 4
 
+# After a slower put, the thread sends the topic. Usually a put takes 0.05 ms, and with a subscriber
+# that was stopped at most 0.09 ms, because Zenoh drops the sample.
+SLOW_PUT_NS = NS_PER_S // 2000
+
+# Feedback messages of one step that the control loop sends itself; after a stall there are more.
+MAX_DIRECT = 6
+
 # Heartbeat of latched ROS topics, as in rmw_zenoh.
 HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
+
+
+_Send = Callable[[], None]
+
+
+def _ignore(_delay_ns: Ns) -> None: ...
 
 
 class _Outlet:
@@ -60,17 +76,18 @@ class _Outlet:
 class Outlets:
     """The publishers of the daemon's session, and the thread that sends their messages."""
 
-    def __init__(self, errors: list[BaseException]) -> None:
-        # `errors` gets an exception that ends the thread.
+    def __init__(self, errors: list[BaseException], *, direct: bool = False) -> None:
+        # `errors` gets an exception that ends the thread. `direct`: no client can block a put.
+        self._direct = direct
         self._outlets: dict[str, list[_Outlet]] = {}  # by the topic's native key
         self._listeners: list[object] = []  # Zenoh ends a listener when nothing refers to it
         self._counting = Lock()
         # Native keys with a subscriber or a latched publisher.
         self.wanted: frozenset[str] = frozenset()
-        # Each message with its `read_ns`.
-        self._slots: dict[str, Mailbox[tuple[Message, Ns | None]]] = {}
-        # The thread appends, and the control loop removes them in each step.
-        self.feedback_delays: deque[tuple[Ns, Ns]] = deque(maxlen=4 * SLOT_MESSAGES)
+        self._slots: dict[str, Mailbox[_Send]] = {}
+        self._feedback: list[tuple[FeedbackTopic, Estimate]] = []  # of this step
+        self.feedback_sent: Callable[[Ns], object] = _ignore
+        self._slow: set[str] = set()  # feedback topics whose last put was slow
         self._bell = Bell()  # one for all slots, because a step fills several
         self._waiting = self._leaving = self._stuck = False
         self._dropped = 0  # displaced since the last `losses`
@@ -90,20 +107,42 @@ class Outlets:
 
     # The control loop calls the methods below. None of them waits or calls Zenoh.
 
-    def publish(self, topic: str, message: Message, read_ns: Ns | None = None) -> None:
-        """Put a message into the slot of its native key; `flush` wakes the thread.
+    def publish(self, topic: str, message: Message) -> None:
+        """Put a message into the slot of its native key; `flush` wakes the thread."""
+        self._store(topic, partial(self._send, topic, partial(encode, message)))
 
-        With `read_ns`, its delay since then is measured when it is sent.
-        """
-        if not self._slots[topic].store((message, read_ns)):
-            self._dropped += 1
-        self._waiting = True
+    def publish_feedback(self, topic: FeedbackTopic, estimate: Estimate) -> None:
+        """Queue the message of a feedback line for `flush`."""
+        self._feedback.append((topic, estimate))
 
     def flush(self) -> None:
-        """Wake the thread that sends the messages."""
+        """Send the messages of feedback lines, and wake the thread that sends the others."""
+        feedback = self._feedback
+        if feedback:
+            few = len(feedback) <= MAX_DIRECT
+            for topic, estimate in feedback:
+                if few and self._may_put(topic.key):
+                    self._send_feedback(topic, estimate)
+                else:
+                    self._store(topic.key, partial(self._send_feedback, topic, estimate))
+            feedback.clear()
         if self._waiting:
             self._waiting = False
             self._bell.ring()
+
+    def _may_put(self, topic: str) -> bool:
+        # Look for waiting messages first: the thread sets `_began_ns` before it takes one.
+        return (
+            self._direct
+            and not self._slots[topic].waiting
+            and self._began_ns is None
+            and self._slow.isdisjoint(self.wanted)
+        )
+
+    def _store(self, topic: str, send: _Send) -> None:
+        if not self._slots[topic].store(send):
+            self._dropped += 1
+        self._waiting = True
 
     @property
     def behind(self) -> bool:
@@ -127,30 +166,36 @@ class Outlets:
         self._bell.ring()
         self._thread.join(timeout)
 
-    # The thread runs `_run` and `_send`.
-
     def _run(self) -> None:
         leaving = False
         while not leaving:
             self._bell.wait()
             leaving = self._leaving
             self._began_ns = clock.mono_ns()
-            for topic, slot in self._slots.items():
+            for slot in self._slots.values():
                 while slot.waiting:
-                    message, read_ns = slot.waiting.popleft()
-                    self._send(topic, message)
-                    if read_ns is not None:
-                        now_ns = clock.mono_ns()
-                        self.feedback_delays.append((now_ns, now_ns - read_ns))
+                    slot.waiting.popleft()()
             self._began_ns = None
 
-    def _send(self, topic: str, message: Message) -> None:
+    # The thread and the control loop call the methods below.
+
+    def _send_feedback(self, topic: FeedbackTopic, estimate: Estimate) -> None:
+        began_ns = clock.mono_ns()
+        self._send(topic.key, partial(topic.encode, estimate))
+        now_ns = clock.mono_ns()
+        if now_ns - began_ns > SLOW_PUT_NS:
+            self._slow.add(topic.key)
+        else:
+            self._slow.discard(topic.key)
+        self.feedback_sent(now_ns - estimate.heard_ns)
+
+    def _send(self, topic: str, encoded: Callable[[Format], bytes]) -> None:
         payloads: dict[Format, bytes] = {}
         for outlet in self._outlets[topic]:
             if outlet.wanted:
                 form = outlet.form
                 if form not in payloads:
-                    payloads[form] = encode(message, form)
+                    payloads[form] = encoded(form)
                 outlet.put(payloads[form])
 
     def declare(

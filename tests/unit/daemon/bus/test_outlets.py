@@ -7,20 +7,28 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
 
 import msgspec
 import pytest
 import zenoh
+from msgspec.structs import replace
 
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import AccessConfig, BusConfig, Config
+from acsard.core.messages.frames import EXAMPLE, FeedbackTopic
 from acsard.core.messages.schema import Twist, Vector3
+from acsard.core.values import NS_PER_S, Estimate
 from acsard.daemon.bus.bus import ZenohBus
-from acsard.daemon.bus.outlets import BLOCKED_AFTER_NS, SLOT_MESSAGES, Outlets
+from acsard.daemon.bus.outlets import (
+    BLOCKED_AFTER_NS,
+    MAX_DIRECT,
+    SLOT_MESSAGES,
+    SLOW_PUT_NS,
+    Outlets,
+)
 from acsard.host import clock
-from tests.scenarios.world import MemoryBus, World
 
 TOPIC, KEY = "cmd_vel_out", "acsard/acsar/cmd_vel_out"
 WAIT_S = 5.0
@@ -34,13 +42,19 @@ class Publisher:
     def __init__(self, error: Exception | None = None) -> None:
         self.free, self.entered, self.error = threading.Event(), threading.Event(), error
         self.sent: list[float] = []
+        self.threads, self.thread = set[int](), 0
+        """Threads that put, and the last of them."""
+        self.takes_s = 0.0
 
     def declare_matching_listener(self, callback: object) -> object:
         return callback
 
     def put(self, payload: bytes) -> None:
+        self.threads.add(threading.get_ident())
+        self.thread = threading.get_ident()
         self.entered.set()
         assert self.free.wait(WAIT_S)
+        time.sleep(self.takes_s)
         if self.error:
             raise self.error
         self.sent.append(msgspec.msgpack.decode(payload, type=Twist).linear.x)
@@ -48,6 +62,13 @@ class Publisher:
     def declare_publisher(self, key: str, **options: Any) -> Publisher:
         """Return this publisher, as a Zenoh session does for its only key."""
         return self
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.0005)
 
 
 class Waker:
@@ -125,49 +146,120 @@ def test_an_error_of_the_thread_ends_the_control_loop() -> None:
         bus.flush()
 
 
-class SlowPublisher(Publisher):
-    """A publisher whose put takes 20 ms of the clock `now_ns`."""
-
-    now_ns = 0
-
-    def put(self, payload: bytes) -> None:
-        self.now_ns += 20_000_000
+def estimate(number: float, heard_ns: int = 0) -> Estimate:
+    return replace(EXAMPLE, pose=replace(EXAMPLE.pose, x=float(number)), heard_ns=heard_ns)
 
 
-class OutletBus(MemoryBus):
-    """A bus in memory that sends `odom` through real outlets, and waits until it is sent."""
+# The stamp is before 1970, so the message goes the ordinary way.
+ODOM = FeedbackTopic(
+    "odom", lambda estimate: Twist(Vector3(x=estimate.pose.x), Vector3()), lambda _: (0, 0)
+)
 
-    def __init__(self, publisher: Publisher) -> None:
-        super().__init__({"odom"})
-        self.errors: list[BaseException] = []
-        self.outlets = Outlets(self.errors)
+
+@pytest.mark.parametrize(
+    ("config", "direct"),
+    [
+        (Config(), True),
+        (Config(bus=BusConfig(connect=("tls/192.0.2.1:7447",))), False),
+        (Config(bus=BusConfig(mode="client", connect=("tcp/127.0.0.1:7447",))), False),
+        (Config(bus=BusConfig(insecure=True)), False),
+        (Config(access=AccessConfig(wildcards=True)), False),
+    ],
+)
+def test_the_control_loop_sends_feedback_itself_only_if_all_clients_use_exact_keys(
+    config: Config, direct: bool
+) -> None:
+    assert ZenohBus(config, Waker())._outlets._direct == direct
+
+
+class Feedback:
+    """Outlets for a feedback topic, as the control loop uses them."""
+
+    def __init__(self, publisher: Publisher, *, direct: bool = True) -> None:
+        self.publisher, self.outlets = publisher, Outlets([], direct=direct)
         self.outlets.declare(cast(zenoh.Session, publisher), "odom", "odom", "msgpack", "")
         self.outlets.start()
 
     @property
-    def feedback_delays(self) -> deque[tuple[int, int]]:
-        return self.outlets.feedback_delays
+    def idle(self) -> bool:
+        """Whether the thread has sent everything."""
+        return self.outlets._began_ns is None and not self.outlets._slots["odom"].waiting
 
-    @feedback_delays.setter
-    def feedback_delays(self, value: object) -> None: ...
-
-    def publish(self, *arguments: Any) -> None:
-        self.outlets.publish(*arguments)
+    def heard(self, *numbers: float) -> None:
+        """Publish the messages of these feedback lines, as one control step does."""
+        for number in numbers:
+            self.outlets.publish_feedback(ODOM, estimate(number))
         self.outlets.flush()
-        deadline_s = time.monotonic() + WAIT_S
-        while self.outlets._slots["odom"].waiting or self.outlets._began_ns is not None:
-            assert time.monotonic() < deadline_s, self.errors
-            time.sleep(0.0005)
 
 
-def test_the_delay_of_feedback_includes_sending_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    publisher, world = SlowPublisher(), World()
-    monkeypatch.setattr(clock, "mono_ns", lambda: world.now_ns + publisher.now_ns)
-    world.bus = world.loop._bus = bus = OutletBus(publisher)
-    world.run(0.2)
-    bus.outlets.stop(WAIT_S)
-    bus.wanted_keys.clear()
-    world.run(0.02)
-    delay = world.loop._stopwatch.measured(world.now_ns)["feedback_to_bus"].since_start
-    assert delay.count >= 15
-    assert delay.p50 >= 20_000
+def test_feedback_is_sent_by_the_control_loop_itself_and_in_order() -> None:
+    feedback = Feedback(publisher := Publisher())
+    publisher.free.set()
+    feedback.heard(1, 2)
+    assert publisher.sent == [1, 2]
+    assert publisher.threads == {threading.get_ident()}
+    feedback.outlets.stop(WAIT_S)
+
+
+def test_the_control_loop_never_sends_feedback_itself_if_a_client_can_block_the_bus() -> None:
+    """The bus is blocked before the first message, which would cost periods."""
+    feedback = Feedback(publisher := Publisher(), direct=False)
+    feedback.heard(0)
+    assert publisher.entered.wait(WAIT_S)
+    for number in range(1, 100):
+        feedback.heard(number)
+    publisher.free.set()
+    feedback.outlets.stop(WAIT_S)
+    assert publisher.sent == [0, *range(100 - SLOT_MESSAGES, 100)]
+    assert threading.get_ident() not in publisher.threads
+
+
+def test_after_a_slow_put_the_thread_sends_feedback_until_it_is_fast_again() -> None:
+    feedback = Feedback(publisher := Publisher())
+    publisher.free.set()
+    publisher.takes_s = 2 * SLOW_PUT_NS / NS_PER_S
+    feedback.heard(1)
+    assert publisher.threads == {threading.get_ident()}
+    for number in (2, 3):
+        feedback.heard(number)
+        wait_until(lambda: feedback.idle)
+        assert publisher.thread != threading.get_ident()
+    publisher.takes_s = 0.0
+    feedback.heard(4)
+    wait_until(lambda: feedback.idle)
+    feedback.heard(5)
+    assert publisher.thread == threading.get_ident()
+    feedback.outlets.stop(WAIT_S)
+    assert publisher.sent == [1, 2, 3, 4, 5]
+
+
+def test_the_lines_that_waited_during_a_stall_are_left_to_the_thread() -> None:
+    feedback = Feedback(publisher := Publisher())
+    feedback.heard(*range(MAX_DIRECT + 1))
+    publisher.free.set()
+    feedback.outlets.stop(WAIT_S)
+    assert publisher.sent == [*range(MAX_DIRECT + 1)]
+    assert threading.get_ident() not in publisher.threads
+
+
+def test_feedback_does_not_overtake_a_message_that_waits_for_the_thread() -> None:
+    feedback = Feedback(publisher := Publisher())
+    feedback.heard(*range(MAX_DIRECT + 1))
+    assert publisher.entered.wait(WAIT_S)
+    feedback.heard(100)
+    publisher.free.set()
+    feedback.outlets.stop(WAIT_S)
+    assert publisher.sent == [*range(MAX_DIRECT + 1), 100]
+
+
+@pytest.mark.parametrize("direct", [True, False])
+def test_the_delay_of_feedback_includes_sending_it(direct: bool) -> None:
+    feedback, delays = Feedback(publisher := Publisher(), direct=direct), list[int]()
+    publisher.free.set()
+    publisher.takes_s = 0.02
+    feedback.outlets.feedback_sent = delays.append
+    feedback.outlets.publish_feedback(ODOM, estimate(1, clock.mono_ns()))
+    feedback.outlets.flush()
+    feedback.outlets.stop(WAIT_S)
+    assert len(delays) == 1
+    assert 0.02 * NS_PER_S <= delays[0] < 1.0 * NS_PER_S
