@@ -26,7 +26,7 @@ from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import OBJECTIONS, CommandEvents, chosen, missed, refused
-from acsard.core.motion.battery import Battery
+from acsard.core.motion.battery import Battery, empty_reason
 from acsard.core.motion.bumpers import Bumpers, missing_reason
 from acsard.core.motion.emergency_stop import (
     DRIVER_FAULT_REASON,
@@ -145,9 +145,10 @@ class Robot:
         latched = [latch for latch in (latches.fault, latches.stop) if latch is not None]
         causes = [cause for latch in latched for cause in latch.causes]
         codes = {cause.code for cause in causes}
-        self._estop = EmergencyStop(config.safety.estop, "emergency_stop" in codes)
-        self._bumpers = Bumpers(config.safety)
-        self._battery = Battery(config.battery, "battery_empty" in codes)
+        self._estop = EmergencyStop(unpowered="emergency_stop" in codes)
+        self._bumpers = Bumpers()
+        empty = "battery_empty" in codes and config.battery.stop_below > 0.0
+        self._battery = Battery(known="stop" if empty else "ok")
         # Inputs that caused a latch in an earlier run, until the board reports them: no `clear`
         # before.
         self._unreported = {
@@ -189,7 +190,7 @@ class Robot:
             sender=self._choice.sender,
             estop=self._estop.state,
             bumpers=self._bumpers.pressed,
-            bumper=self._bumpers.why,
+            bumper=self._bumpers.why(self.config.safety),
             battery=self._battery.status,
             board=self._board(now_ns),
             speed_limit=self._cap_text,
@@ -223,7 +224,7 @@ class Robot:
         if inputs.commands or inputs.refusals:
             self._accept_commands(inputs, events)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)
-        limiting = self._bumpers.limiting
+        limiting = self._bumpers.limiting(self.config.safety)
         if limiting:
             self._limit_by_bumpers(inputs.now.mono_ns)
         self._life.command(self._choice.twist is not None)
@@ -330,7 +331,9 @@ class Robot:
                 self._arbiter.require_neutral(inputs.now.mono_ns)
         else:
             self._linked_once = True
-            self._life.link(up=not (self._estop.missing or self._bumpers.missing))
+            safety = self.config.safety
+            missing = self._estop.missing(safety) or self._bumpers.missing(safety)
+            self._life.link(up=not missing)
         now = inputs.now
         if inputs.gyro:
             self._odometry.checks.add_samples(inputs.gyro)
@@ -349,14 +352,15 @@ class Robot:
     def _watch_inputs(self, now: Instant, events: list[Event]) -> None:
         # A press stops the robot even if it began and ended between two steps.
         estop, bumpers, statuses = self._estop, self._bumpers, self.session.statuses
-        events += estop.process_reports(statuses, now.mono_ns)
+        safety = self.config.safety
+        events += estop.process_reports(statuses, now.mono_ns, safety)
         if estop.pressed_now is not None:
             self.counters["emergency_stops"] += 1
             self._life.press(estop.pressed_now, now)
-        events += bumpers.process_reports(statuses, now.mono_ns)
+        events += bumpers.process_reports(statuses, now.mono_ns, safety)
         if bumpers.pressed_now is not None:
             self.counters["bumper_presses"] += 1
-            if bumpers.latching:
+            if bumpers.latching(safety):
                 self._life.press(bumpers.pressed_now, now)
             else:
                 self._arbiter.require_neutral(now.mono_ns)
@@ -368,31 +372,33 @@ class Robot:
         if estop.driver_fault:
             self._fault(DRIVER_FAULT_REASON, now, events)
             self._life.caused_again(now.mono_ns)
-        battery = self._battery
-        events += battery.process_reports(statuses, now.mono_ns, self.session.link == "up")
+        battery, thresholds = self._battery, self.config.battery
+        is_up = self.session.link == "up"
+        events += battery.process_reports(statuses, now.mono_ns, is_up, thresholds)
         if battery.stopped_now:
-            self._life.press(battery.why, now)
+            self._life.press(empty_reason(thresholds), now)
         if self.session.forgot:
-            for part in (estop, bumpers, battery):
-                part.forget()
+            estop.forget()
+            bumpers.forget()
+            battery.forget(thresholds)
             self._unreported = {}
         refusal = self._awaited_report() if self._unreported else None
-        if estop.why is not None:
-            refusal = estop.why
-        elif bumpers.clear_refusal is not None:
-            refusal = bumpers.clear_refusal
+        if estop.is_pressed:
+            refusal = estop.why(safety)
+        elif (objection := bumpers.clear_refusal(safety)) is not None:
+            refusal = objection
         elif self.session.status.driver_fault:
             refusal = DRIVER_FAULT_REASON
         elif battery.refuses_clear:
-            refusal = battery.refusal
+            refusal = battery.refusal(thresholds)
         self._life.refuse_clear(refusal, now.mono_ns)
 
     def _awaited_report(self) -> Reason | None:
         # Until the board reports an input that caused a latch in an earlier run, `clear` is
         # refused.
         reported = {
-            "estop": self._estop.use == "off" or bool(self._estop.state),
-            "bumpers": self._bumpers.use == "off" or bool(self._bumpers.state),
+            "estop": self._estop.use(self.config.safety) == "off" or bool(self._estop.state),
+            "bumpers": self._bumpers.use(self.config.safety) == "off" or bool(self._bumpers.state),
             "driver": self.session.status.driver_fault is not None,
         }
         for name in [name for name in self._unreported if reported[name]]:
@@ -408,7 +414,7 @@ class Robot:
         twist = self._choice.twist
         if twist is None:
             return
-        away = self._bumpers.away(twist)
+        away = self._bumpers.away(twist, self.config.safety)
         if away is None:
             self._arbiter.require_neutral(now_ns)
             # `require_neutral` has discarded all commands, so the new choice has no twist.
@@ -451,7 +457,7 @@ class Robot:
         wheels = checks.wheels
         # While the emergency stop counts as pressed, the motors may have no power, so wheels that
         # do not follow the commanded speeds are not a sign of a fault.
-        pressed = self._estop.why is not None or self._estop.pressed_now is not None
+        pressed = self._estop.is_pressed or self._estop.pressed_now is not None
         if self.session.lateness.step_s > WRITE_PAUSE_S and not pressed:
             # This computer was late, and the board may have stopped the motors meanwhile. So the
             # feedback lines that waited to be read say nothing about faults of the wheels.
@@ -632,10 +638,10 @@ class Robot:
     def _with_bumper(self, why: Reason) -> Reason:
         match self._life.mode:
             case Mode.DRIVING:
-                limit = joined(self._bumpers.limit())
+                limit = joined(self._bumpers.limit(self.config.safety))
                 return Reason(limit.code, f"{why.text}; {limit.text}")
             case Mode.READY:
-                limit = joined(self._bumpers.limit())
+                limit = joined(self._bumpers.limit(self.config.safety))
                 return Reason(limit.code, f"{limit.text}; {why.text}")
             case _:
                 return why
@@ -650,7 +656,7 @@ class Robot:
                 return Reason(why.code, why.text + note) if note else why
             case Mode.WAITING:
                 if self.session.link == "up":
-                    if self._estop.missing:
+                    if self._estop.missing(self.config.safety):
                         return MISSING_REASON
                     return missing_reason(self.config.safety)
                 return self.session.describe_link(self._port_trouble)

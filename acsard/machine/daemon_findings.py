@@ -33,7 +33,7 @@ from acsard.core.messages.schema import (
 )
 from acsard.core.motion import bumpers
 from acsard.core.motion.battery import MISSING_REASON as NO_BATTERY
-from acsard.core.motion.battery import Battery
+from acsard.core.motion.battery import empty_reason
 from acsard.core.motion.battery import status_text as battery_words
 from acsard.core.motion.emergency_stop import (
     MISSING_REASON,
@@ -280,7 +280,7 @@ def _battery(config: BatteryConfig, battery: BatterySummary | None, mend: str) -
     elif level == "unknown":
         yield Finding("battery", "warning", text, mend)
     elif level == "stop":
-        mend = f"{Battery(config).why.advice}, then `acsard call clear`"
+        mend = f"{empty_reason(config).advice}, then `acsard call clear`"
         yield Finding("battery", "failure", text, mend)
     else:
         yield Finding("battery", "warning", text, "charge it")

@@ -23,6 +23,9 @@ from acsard.core.config.contradictions import contradictions
 from acsard.core.config.settings import Config
 from acsard.core.formatting import printable
 from acsard.core.guard import Memory
+from acsard.core.motion.battery import Battery
+from acsard.core.motion.bumpers import Bumpers
+from acsard.core.motion.emergency_stop import EmergencyStop
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.modes import Mode
 from acsard.core.robot import Robot
@@ -32,6 +35,9 @@ from acsard.recording.unpickling import MAX_BYTES, unpickle
 # Attributes of a robot without configuration inside. A state is read by their types, and what an
 # older one lacks has its default.
 PARTS: dict[str, type[Struct]] = {
+    "_estop": EmergencyStop,
+    "_bumpers": Bumpers,
+    "_battery": Battery,
     "_tally": EventThrottle,
 }
 

@@ -918,8 +918,8 @@ FAULTS = (
         "replay state",
         "the state at the start of a recording has another heading",
         "recording/state.py",
-        "            return State(robot, memory)\n",
-        "            robot._odometry._path.turn(0.001)\n            return State(robot, memory)\n",
+        "    return State(robot, frozen.memory)\n",
+        "    robot._odometry._path.turn(0.001)\n    return State(robot, frozen.memory)\n",
     ),
     # inputs of the board
     fault(
@@ -927,14 +927,14 @@ FAULTS = (
         "a fault of a motor driver that the board reports does not stop the robot",
         ROBOT,
         "        if estop.driver_fault:\n",
-        "        if not estop.why and estop.pressed_now:\n",
+        "        if not estop.is_pressed and estop.pressed_now:\n",
     ),
     fault(
         "driver clear",
         "a clear works while a motor driver has a fault",
         ROBOT,
         "        elif self.session.status.driver_fault:\n",
-        "        elif self.session.status.driver_fault and estop.why:\n",
+        "        elif self.session.status.driver_fault and estop.is_pressed:\n",
     ),
     fault(
         "driver without power",
@@ -947,7 +947,7 @@ FAULTS = (
         "driver release",
         "drivers that get their power later than the release latch a fault",
         EMERGENCY_STOP,
-        "not (pressed or self._unpowered)",
+        "not (pressed or self.unpowered)",
         "not pressed",
     ),
     fault(
@@ -1007,7 +1007,8 @@ FAULTS = (
         ROBOT,
         "        due = inputs.tick or (inputs.at_once and news)\n",
         "        due = inputs.tick or (inputs.at_once and news)\n"
-        "        due = due and not (self._estop.why and inputs.now.mono_ns % 10**8 < 25 * 10**6)\n",
+        "        late = inputs.now.mono_ns % 10**8 < 25 * 10**6\n"
+        "        due = due and not (self._estop.is_pressed and late)\n",
     ),
     fault(
         "estop clear",
@@ -1034,7 +1035,7 @@ FAULTS = (
         "estop needed",
         "a robot is ready before its board has reported the inputs that it needs",
         ROBOT,
-        "            self._life.link(up=not (self._estop.missing or self._bumpers.missing))\n",
+        "            self._life.link(up=not missing)\n",
         "            self._life.link(up=True)\n",
     ),
     fault(
@@ -1062,8 +1063,8 @@ FAULTS = (
         "away turns",
         "a corner of the robot sweeps into the obstacle while it drives away",
         BUMPERS,
-        "return Twist(self._direction() * min(speed, AWAY_SPEED)) if",
-        "return Twist(self._direction() * min(speed, AWAY_SPEED), twist.angular) if",
+        "return Twist(direction * min(speed, AWAY_SPEED)) if",
+        "return Twist(direction * min(speed, AWAY_SPEED), twist.angular) if",
     ),
     fault(
         "away pushes",
@@ -1078,8 +1079,8 @@ FAULTS = (
         "away silent",
         "a robot that may drive away from its bumpers drives on without reports of them",
         BUMPERS,
-        'return not self._away or self.state == "silent"',
-        "return not self._away",
+        'return self.state == "silent" or not _drives_away(safety)',
+        "return not _drives_away(safety)",
     ),
     fault(
         "battery stop",
@@ -1092,8 +1093,8 @@ FAULTS = (
         "battery cut",
         "an empty battery stops the robot without a ramp",
         ROBOT,
-        "            self._life.press(battery.why, now)\n",
-        "            self._life.press(battery.why, now)\n"
+        "            self._life.press(empty_reason(thresholds), now)\n",
+        "            self._life.press(empty_reason(thresholds), now)\n"
         "            self._limiter.cut()\n"
         "            self._made = self._said = (self._limiter.state, self._made_ns)\n",
     ),

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import get_args
 
+from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.core.codes import Reason, reason
@@ -69,145 +70,146 @@ def _with_unit(config: BatteryConfig, value: float) -> str:
     return f"{value:g} {'V' if config.measure == 'volts' else '%'}"
 
 
-class Battery:
+def empty_reason(config: BatteryConfig) -> Reason:
+    """Return the reason of a stop by an empty battery, without measured values."""
+    charged = _with_unit(config, config.stop_below + HYSTERESIS)
+    return reason("battery_empty", threshold=_threshold(config, "stop"), charged=charged)
+
+
+class Battery(Struct):
     """The battery values that the board reports, and the battery level computed from them."""
 
-    def __init__(self, config: BatteryConfig, stopped: bool = False) -> None:
-        # `stopped`: an empty battery had stopped the robot before this daemon started.
-        self._config = config
-        self._bounds = config.bounds
-        self.status: BatteryStatus | None = None  # until voltage or charge is reported
-        self.stopped_now = False  # in the last `process_reports`
-        self._values: dict[str, tuple[float, int]] = {}  # "volts", "percent", "amps", with arrival
-        self._awaited = True  # until the board on the new port reports what `battery.measure` names
-        # Last report of what `battery.measure` names, or last step without a link.
-        self._reported_ns: Ns | None = None
-        # Last level but "unknown"; "stop" only while the board reports the battery.
-        self._known: BatteryLevel = "stop" if stopped and "stop" in self._bounds else "ok"
-        self._told: BatteryLevel | None = None  # in the last event
-        self._mean: float | None = None
-        # First report since the last silence, and newest report in `_mean`.
-        self._since_ns = self._mean_ns = 0
-        self._stood_ns = 0  # sum of the weights in `_mean`
+    status: BatteryStatus | None = None  # until voltage or charge is reported
+    stopped_now: bool = False  # in the last `process_reports`
+    values: dict[str, tuple[float, Ns]] = {}  # "volts", "percent", "amps", with arrival
+    awaited: bool = True  # until the board on the new port reports what `battery.measure` names
+    # Last report of what `battery.measure` names, or last step without a link.
+    reported_ns: Ns | None = None
+    # Last level but "unknown"; "stop" only while the board reports the battery.
+    known: BatteryLevel = "ok"
+    told: BatteryLevel | None = None  # in the last event
+    mean: float | None = None
+    since_ns: Ns = 0  # first report since the last silence
+    mean_ns: Ns = 0  # newest report in `mean`
+    stood_ns: Ns = 0  # sum of the weights in `mean`
 
     @property
     def refuses_clear(self) -> bool:
         """Whether `clear` is refused, because the last known level is "stop"."""
-        return self._known == "stop"
+        return self.known == "stop"
 
-    @property
-    def why(self) -> Reason:
-        """Reason of a stop by an empty battery, without measured values."""
-        config = self._config
-        charged = _with_unit(config, config.stop_below + HYSTERESIS)
-        return reason("battery_empty", threshold=_threshold(config, "stop"), charged=charged)
-
-    @property
-    def refusal(self) -> Reason:
-        """Reason why `clear` is refused while `refuses_clear` is true."""
-        if self._told is None:
+    def refusal(self, config: BatteryConfig) -> Reason:
+        """Return why `clear` is refused while `refuses_clear` is true."""
+        why = empty_reason(config)
+        if self.told is None:
             advice = "wait until the board has reported its battery for some seconds"
-            return replace(self.why, advice=advice)
-        return self.why
+            return replace(why, advice=advice)
+        return why
 
     def reopen(self) -> None:
         """Record that the port was opened: another board may answer from now on."""
-        self._awaited = True
+        self.awaited = True
 
-    def forget(self) -> None:
+    def forget(self, config: BatteryConfig) -> None:
         """Forget the level, unless the board on the newly opened port has reported it."""
-        if self._awaited:
-            self._known, self._told, self._mean = "ok", None, None
-            self._values.pop(self._config.measure, None)
-            if not ("volts" in self._values or "percent" in self._values):
+        if self.awaited:
+            self.known, self.told, self.mean = "ok", None, None
+            self.values.pop(config.measure, None)
+            if not ("volts" in self.values or "percent" in self.values):
                 self.status = None
 
     def process_reports(
-        self, reports: Iterable[tuple[int, BoardStatus]], now_ns: Ns, linked: bool
+        self,
+        reports: Iterable[tuple[int, BoardStatus]],
+        now_ns: Ns,
+        linked: bool,
+        config: BatteryConfig,
     ) -> list[Event]:
         """Process status lines with their arrival; return an event if the level changed.
 
         Without a link the board cannot report, so a level "stop" stays.
         """
         self.stopped_now = False
-        if self._reported_ns is None or not linked:
-            self._reported_ns = now_ns
+        if self.reported_ns is None or not linked:
+            self.reported_ns = now_ns
         news = False
         for at_ns, line in reports:
             percent = None if line.charge is None else float(round(100 * line.charge))
             values = {"volts": line.volts, "percent": percent, "amps": line.amps}
             for name, value in values.items():
                 if value is not None:
-                    self._take(name, value, at_ns)
+                    self._take(name, value, at_ns, config.measure)
                     news = True
-        if self._known == "stop" and now_ns - self._reported_ns > SILENCE_TIMEOUT_S * NS_PER_S:
-            self._known = "ok"
-        if self.status is None and not ("volts" in self._values or "percent" in self._values):
+        if self.known == "stop" and now_ns - self.reported_ns > SILENCE_TIMEOUT_S * NS_PER_S:
+            self.known = "ok"
+        if self.status is None and not ("volts" in self.values or "percent" in self.values):
             return []
-        for name, (_, at_ns) in [*self._values.items()]:
+        for name, (_, at_ns) in [*self.values.items()]:
             if now_ns - at_ns > SILENCE_TIMEOUT_S * NS_PER_S:
-                del self._values[name]
+                del self.values[name]
                 news = True
-        level = self._level(now_ns)
+        level = self._level(now_ns, config)
         if not news and self.status is not None and self.status.level == (level or "unknown"):
             return []
         self.status = self._summed(level or "unknown")
-        if level is None or level == self._told:
+        if level is None or level == self.told:
             return []
-        before, self._told = self._told, level
-        return [self._event(level, before)]
+        before, self.told = self.told, level
+        return [self._event(level, before, config)]
 
-    def _take(self, name: str, value: float, at_ns: Ns) -> None:
-        first = not self._values
-        self._values[name] = value, at_ns
-        if name != self._config.measure:
-            self._since_ns = at_ns if first else self._since_ns
+    def _take(self, name: str, value: float, at_ns: Ns, measure: str) -> None:
+        first = not self.values
+        self.values[name] = value, at_ns
+        if name != measure:
+            self.since_ns = at_ns if first else self.since_ns
             return
-        self._awaited, self._reported_ns = False, at_ns
-        if self._mean is None:
-            self._mean, self._since_ns, self._mean_ns = value, at_ns, at_ns
-            self._stood_ns = 0
-        elif at_ns > self._mean_ns:
+        self.awaited, self.reported_ns = False, at_ns
+        if self.mean is None:
+            self.mean, self.since_ns, self.mean_ns = value, at_ns, at_ns
+            self.stood_ns = 0
+        elif at_ns > self.mean_ns:
             # A weighted mean of all reports until `TIME_CONSTANT_S`, then an exponential one.
-            stood_ns = min(at_ns - self._mean_ns, MAX_WEIGHT_NS)
-            self._stood_ns += stood_ns
-            span_ns = min(TIME_CONSTANT_S * NS_PER_S, self._stood_ns)
-            self._mean += (value - self._mean) * stood_ns / span_ns
-            self._mean_ns = at_ns
+            stood_ns = min(at_ns - self.mean_ns, MAX_WEIGHT_NS)
+            self.stood_ns += stood_ns
+            span_ns = min(TIME_CONSTANT_S * NS_PER_S, self.stood_ns)
+            self.mean += (value - self.mean) * stood_ns / span_ns
+            self.mean_ns = at_ns
 
-    def _level(self, now_ns: Ns) -> BatteryLevel | None:
-        measure, values = self._config.measure, self._values
+    def _level(self, now_ns: Ns, config: BatteryConfig) -> BatteryLevel | None:
+        measure, values, bounds = config.measure, self.values, config.bounds
         if measure not in values:
-            self._mean = None
+            self.mean = None
         if not ("volts" in values or "percent" in values):
             return "unknown"
-        if not self._bounds:
+        if not bounds:
             return "ok"
-        lasted_ns = now_ns - self._since_ns if self._mean is None else self._stood_ns
+        lasted_ns = now_ns - self.since_ns if self.mean is None else self.stood_ns
         if lasted_ns < SETTLE_S * NS_PER_S:
             return None
-        if self._mean is None:
+        if self.mean is None:
             return "unknown"
-        reached = LEVELS_BY_URGENCY.index(self._known)
+        reached = LEVELS_BY_URGENCY.index(self.known)
         new_level: BatteryLevel = "ok"
-        for level, below in self._bounds.items():
+        for level, below in bounds.items():
             rise = HYSTERESIS if reached >= LEVELS_BY_URGENCY.index(level) else 0.0
-            if self._mean < below + rise:
+            if self.mean < below + rise:
                 new_level = level
-        self.stopped_now = new_level == "stop" != self._known
-        self._known = new_level
+        self.stopped_now = new_level == "stop" != self.known
+        self.known = new_level
         return new_level
 
     def _summed(self, level: BatteryLevel) -> BatteryStatus:
-        values = {name: value for name, (value, _) in self._values.items()}
-        times = [at_ns for _, at_ns in self._values.values()]
-        return BatteryStatus(level, max(times, default=None), **values, mean=self._mean)
+        values = {name: value for name, (value, _) in self.values.items()}
+        times = [at_ns for _, at_ns in self.values.values()]
+        return BatteryStatus(level, max(times, default=None), **values, mean=self.mean)
 
-    def _event(self, level: BatteryLevel, before: BatteryLevel | None) -> Event:
+    def _event(
+        self, level: BatteryLevel, before: BatteryLevel | None, config: BatteryConfig
+    ) -> Event:
         assert self.status is not None
-        text = status_text(self._config, self.status)
+        text = status_text(config, self.status)
         if level == "stop":
-            why = self.why
+            why = empty_reason(config)
             text = f"{text}; {why.advice}, then call srv/clear"
             return Event("battery_stop", text, "error", code=why.code)
         if before == "stop" and level != "unknown":

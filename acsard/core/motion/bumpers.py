@@ -10,13 +10,14 @@ function, because the status line may be lost or late.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 from acsard.core.codes import Reason, reason, sentence
-from acsard.core.config.settings import Place, SafetyConfig
+from acsard.core.config.settings import EstopUse, Place, SafetyConfig
 from acsard.core.formatting import many
 from acsard.core.link.board_status import BoardStatus
-from acsard.core.motion.emergency_stop import SILENCE_TIMEOUT_S, TRANSITIONS, BoardInput
-from acsard.core.values import REST, EstopState, Twist
+from acsard.core.motion.emergency_stop import SILENCE_TIMEOUT_S, TRANSITIONS, BoardInput, Sign
+from acsard.core.values import REST, EstopState, EventName, Twist
 
 AWAY_SPEED = 0.1  # m/s
 
@@ -49,73 +50,81 @@ class Bumpers(BoardInput):
 
     # In contrast to `TRANSITIONS`, silence changes the state even while a bumper is pressed,
     # because a silent board cannot report the press of another bumper.
-    table = TRANSITIONS | {("pressed", "silence"): "silent"}
-    silent, events = SILENT_REASON, ("bumper_pressed", "bumper_released")
+    table: ClassVar[dict[tuple[EstopState, Sign], EstopState]] = TRANSITIONS | {
+        ("pressed", "silence"): "silent"
+    }
+    silent: ClassVar[Reason] = SILENT_REASON
+    events: ClassVar[tuple[EventName, EventName]] = ("bumper_pressed", "bumper_released")
 
-    def __init__(self, safety: SafetyConfig) -> None:
-        off = safety.bumper == "off"
-        super().__init__("off" if off else "required" if safety.bumpers else "auto")
-        self._places = safety.bumpers
-        self._away = safety.bumper == "away" and len(safety.bumpers) > 0
-        self._count = 0  # in the last status line that reported bumpers
+    count: int = 0  # in the last status line that reported bumpers
 
-    @property
-    def limiting(self) -> bool:
-        """Whether a pressed bumper limits the motion now and does not latch a stop."""
-        return self._away and self.state == "pressed"
+    def limiting(self, safety: SafetyConfig) -> bool:
+        """Return whether a pressed bumper limits the motion now and does not latch a stop."""
+        return self.state == "pressed" and _drives_away(safety)
 
-    @property
-    def latching(self) -> bool:
-        """Whether a pressed bumper latches a stop; with "away", only if it is not reported."""
-        return not self._away or self.state == "silent"
+    def latching(self, safety: SafetyConfig) -> bool:
+        """Return whether a pressed bumper latches a stop; with "away", only a silent one."""
+        return self.state == "silent" or not _drives_away(safety)
 
-    @property
-    def clear_refusal(self) -> Reason | None:
-        """Why `clear` must not release a stop now; None if the bumpers allow it."""
-        return self.why if self.latching else None
+    def clear_refusal(self, safety: SafetyConfig) -> Reason | None:
+        """Return why `clear` must not release a stop now; None if the bumpers allow it."""
+        return self.why(safety) if self.latching(safety) else None
 
-    def away(self, twist: Twist) -> Twist | None:
+    def away(self, twist: Twist, safety: SafetyConfig) -> Twist | None:
         """Return the allowed part of `twist` (rest, or straight away at `AWAY_SPEED`), or None."""
         if twist == REST:
             return REST
-        speed = twist.linear * self._direction()
-        return Twist(self._direction() * min(speed, AWAY_SPEED)) if speed > 0.0 else None
+        direction = self._direction(safety)
+        speed = twist.linear * direction
+        return Twist(direction * min(speed, AWAY_SPEED)) if speed > 0.0 else None
 
-    def limit(self) -> Reason:
+    def limit(self, safety: SafetyConfig) -> Reason:
         """Return a reason that names the pressed bumpers, with the allowed motion as the advice."""
-        bumpers, allowed = self.pressed_reason().text, ALLOWED.get(self._direction())
+        bumpers = self.pressed_reason(safety).text
+        allowed = ALLOWED.get(self._direction(safety))
         if allowed is None:
             return reason("bumper_blocks", bumpers=bumpers)
         return reason("bumper_away", bumpers=bumpers, direction=allowed, speed=AWAY_SPEED)
 
-    def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
+    def use(self, safety: SafetyConfig) -> EstopUse:
+        if safety.bumper == "off":
+            return "off"
+        return "required" if safety.bumpers else "auto"
+
+    def read(self, status: BoardStatus, safety: SafetyConfig) -> tuple[bool, ...] | None:
         # A line with an unexpected number of bumpers may lack a pressed one, so it is not used.
         # Expected are the places, or else the last number; a press counts with any number then.
         bumpers = status.bumpers
         if bumpers is None:
             return None
-        expected = len(self._places) or self._count
-        self._count = len(bumpers)
-        if len(bumpers) == expected or (any(bumpers) and not self._places):
+        expected = len(safety.bumpers) or self.count
+        self.count = len(bumpers)
+        if len(bumpers) == expected or (any(bumpers) and not safety.bumpers):
             return bumpers
         return None
 
-    def pressed_reason(self) -> Reason:
-        words = pressed_words(self._places, self.pressed or ())
+    def pressed_reason(self, safety: SafetyConfig) -> Reason:
+        words = pressed_words(safety.bumpers, self.pressed or ())
         return reason("bumper", part=words, bumpers=words)
 
-    def advice(self, why: Reason) -> str:
-        return self.limit().advice if self.limiting else super().advice(why)
+    def advice(self, why: Reason, safety: SafetyConfig) -> str:
+        if self.limiting(safety):
+            return self.limit(safety).advice
+        return super().advice(why, safety)
 
-    def released(self, before: EstopState) -> str:
+    def released(self, before: EstopState, safety: SafetyConfig) -> str:
         if not before:
             count = len(self.pressed or ())
             return f"the board reports {many(count, 'bumper')}, and none is pressed"
-        if self._away and before == "pressed":
+        if before == "pressed" and _drives_away(safety):
             return "the bumpers are released and allow every direction again"
         return "the bumpers are released; a latched stop lasts until srv/clear is called"
 
-    def _direction(self) -> int:
-        pressed = zip(self._places, self.pressed or (), strict=True)
+    def _direction(self, safety: SafetyConfig) -> int:
+        pressed = zip(safety.bumpers, self.pressed or (), strict=True)
         signs = {DIRECTIONS[place] for place, on in pressed if on}
         return signs.pop() if len(signs) == 1 else 0
+
+
+def _drives_away(safety: SafetyConfig) -> bool:
+    return safety.bumper == "away" and len(safety.bumpers) > 0

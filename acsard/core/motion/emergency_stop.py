@@ -9,13 +9,14 @@ function is the hardware, which cuts the motors' power without the daemon.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from itertools import zip_longest
-from typing import Literal
+from typing import ClassVar, Literal
+
+from msgspec import Struct
 
 from acsard.core.codes import Reason, reason, sentence
-from acsard.core.config.settings import EstopUse
+from acsard.core.config.settings import EstopUse, SafetyConfig
 from acsard.core.link.board_status import BoardStatus
 from acsard.core.values import NS_PER_S, EstopState, Event, EventName, Ns
 
@@ -46,140 +47,147 @@ MISSING_REASON = sentence("emergency_stop_missing")
 DRIVER_FAULT_REASON = reason("driver_fault")
 
 
-class BoardInput(ABC):
+class BoardInput(Struct):
     """The state of one safety input, or of several that the board always reports together."""
 
-    table = TRANSITIONS
-    silent: Reason  # of a stop that is latched because the inputs are not reported
-    events: tuple[EventName, EventName]  # for a press and for a release
+    table: ClassVar[dict[tuple[EstopState, Sign], EstopState]] = TRANSITIONS
+    silent: ClassVar[Reason]  # of a stop that is latched because the inputs are not reported
+    events: ClassVar[tuple[EventName, EventName]]  # for a press and for a release
 
-    def __init__(self, use: EstopUse) -> None:
-        self.use = use
-        self.state: EstopState = ""  # "" if never reported
-        self.pressed: tuple[bool, ...] | None = None  # None if never reported
-        self._awaited = True  # until the board on the newly opened port reports the inputs
-        self.pressed_now: Reason | None = None  # by the last `process_reports`
-        self._reported_ns = self._looked_ns = 0
-        self._excused = False
+    state: EstopState = ""  # "" if never reported
+    pressed: tuple[bool, ...] | None = None  # None if never reported
+    awaited: bool = True  # until the board on the newly opened port reports the inputs
+    pressed_now: Reason | None = None  # by the last `process_reports`
+    reported_ns: Ns = 0
+    looked_ns: Ns = 0  # last step
+    excused: bool = False  # a late step, since the last report
 
-    @property
-    def why(self) -> Reason | None:
-        """Why an input counts as pressed; None if none does."""
+    def why(self, safety: SafetyConfig) -> Reason | None:
+        """Return why an input counts as pressed; None if none does."""
         if self.state == "silent":
             return self.silent
-        return self.pressed_reason() if self.state == "pressed" else None
+        return self.pressed_reason(safety) if self.state == "pressed" else None
 
-    @property
-    def missing(self) -> bool:
-        """Whether the robot needs the inputs, but the board on the port has not reported them.
+    def missing(self, safety: SafetyConfig) -> bool:
+        """Return whether the robot needs the inputs, but the board has not reported them.
 
         While this is true, the robot cannot drive.
         """
-        return self.use == "required" and self._awaited
+        return self.awaited and self.use(safety) == "required"
 
     def reopen(self) -> None:
         """Record that the port was opened; the state stays until a report or `forget`."""
-        self._awaited = True
+        self.awaited = True
 
     def forget(self) -> None:
         """Forget the state if the board is certain not to report the inputs.
 
         Otherwise, a press that an earlier board has reported would prevent `clear` forever.
         """
-        if self._awaited:
+        if self.awaited:
             self.state, self.pressed = "", None
 
     def process_reports(
-        self, reports: Sequence[tuple[int, BoardStatus]], now_ns: Ns
+        self, reports: Sequence[tuple[int, BoardStatus]], now_ns: Ns, safety: SafetyConfig
     ) -> list[Event]:
         """Process status lines with their arrival; return the events of changes."""
         self.pressed_now = None
-        if self.use == "off":
+        if self.use(safety) == "off":
             return []
         events: list[Event] = []
         for at_ns, status in reports:
-            pressed = self.read(status)
+            pressed = self.read(status, safety)
             if pressed is not None:
-                self._reported_ns, self._excused, self._awaited = at_ns, False, False
-                events += self._take("pressed" if any(pressed) else "ok", pressed)
-        late, self._looked_ns = now_ns - self._looked_ns > LATE_STEP_NS, now_ns
-        if self.pressed is not None and now_ns - self._reported_ns > _SILENT_NS:
+                self.reported_ns, self.excused, self.awaited = at_ns, False, False
+                events += self._take("pressed" if any(pressed) else "ok", pressed, safety)
+        late, self.looked_ns = now_ns - self.looked_ns > LATE_STEP_NS, now_ns
+        if self.pressed is not None and now_ns - self.reported_ns > _SILENT_NS:
             # Excuse a late step once between two reports, or a loop that is always late would delay
             # the stop forever.
-            if late and not self._excused:
-                self._reported_ns, self._excused = now_ns - _SILENT_NS + CATCH_UP_NS, True
+            if late and not self.excused:
+                self.reported_ns, self.excused = now_ns - _SILENT_NS + CATCH_UP_NS, True
             else:
-                events += self._take("silence", (True,) * len(self.pressed))
+                events += self._take("silence", (True,) * len(self.pressed), safety)
         return events
 
-    @abstractmethod
-    def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
+    def use(self, safety: SafetyConfig) -> EstopUse:
+        raise NotImplementedError
+
+    def read(self, status: BoardStatus, safety: SafetyConfig) -> tuple[bool, ...] | None:
         """Return whether each input is pressed; None if `status` does not report them."""
+        raise NotImplementedError
 
-    @abstractmethod
-    def pressed_reason(self) -> Reason:
+    def pressed_reason(self, safety: SafetyConfig) -> Reason:
         """Return which inputs are pressed, as the reason of a stop."""
+        raise NotImplementedError
 
-    @abstractmethod
-    def released(self, before: EstopState) -> str:
+    def released(self, before: EstopState, safety: SafetyConfig) -> str:
         """Return the text of a release; `before` is "" for the first report of the inputs."""
+        raise NotImplementedError
 
-    def advice(self, why: Reason) -> str:
+    def advice(self, why: Reason, safety: SafetyConfig) -> str:
         """Return the instruction to the operator when an input is pressed."""
         return f"{why.advice}, then call srv/clear"
 
-    def _take(self, sign: Sign, pressed: tuple[bool, ...]) -> list[Event]:
+    def _take(self, sign: Sign, pressed: tuple[bool, ...], safety: SafetyConfig) -> list[Event]:
         before, was = self.state, self.pressed or ()
         self.state, self.pressed = self.table.get((before, sign), before), pressed
         more = any(now and not then for now, then in zip_longest(pressed, was, fillvalue=False))
         if self.state == before and not more:
             return []
-        why = self.why
+        why = self.why(safety)
         if why is not None:
             self.pressed_now = why
-            text = f"{why.text}; {self.advice(why)}"
+            text = f"{why.text}; {self.advice(why, safety)}"
             return [Event(self.events[0], text, "error", code=why.code)]
-        return [Event(self.events[1], self.released(before))]
+        return [Event(self.events[1], self.released(before, safety))]
 
 
 class EmergencyStop(BoardInput):
     """The state of the emergency stop."""
 
-    silent, events = SILENT_REASON, ("emergency_stop", "emergency_stop_released")
+    silent: ClassVar[Reason] = SILENT_REASON
+    events: ClassVar[tuple[EventName, EventName]] = ("emergency_stop", "emergency_stop_released")
 
-    def __init__(self, use: EstopUse, unpowered: bool = False) -> None:
-        super().__init__(use)
-        self.driver_fault = False  # in the last `process_reports`, while the drivers have power
-        # The stop cuts the drivers' power, and one without power reports a fault. It may come back
-        # late, so no such fault counts until `clear`.
-        self._unpowered = unpowered
+    driver_fault: bool = False  # in the last `process_reports`, while the drivers have power
+    # The stop cuts the drivers' power, and one without power reports a fault. It may come back
+    # late, so no such fault counts until `clear`.
+    unpowered: bool = False
 
     def process_reports(
-        self, reports: Sequence[tuple[int, BoardStatus]], now_ns: Ns
+        self, reports: Sequence[tuple[int, BoardStatus]], now_ns: Ns, safety: SafetyConfig
     ) -> list[Event]:
-        self.driver_fault, pressed = False, self.why is not None
-        self._unpowered |= self.state == "pressed"
+        self.driver_fault, pressed = False, self.is_pressed
+        self.unpowered |= self.state == "pressed"
         for _, status in reports:
-            if self.use != "off" and status.estop is not None:
+            if safety.estop != "off" and status.estop is not None:
                 pressed = status.estop
-                self._unpowered |= pressed
-            self.driver_fault |= bool(status.driver_fault) and not (pressed or self._unpowered)
-        events = super().process_reports(reports, now_ns)
-        if self.why is not None:
+                self.unpowered |= pressed
+            self.driver_fault |= bool(status.driver_fault) and not (pressed or self.unpowered)
+        events = super().process_reports(reports, now_ns, safety)
+        if self.is_pressed:
             self.driver_fault = False
         return events
 
+    @property
+    def is_pressed(self) -> bool:
+        """Whether the stop counts as pressed."""
+        return self.state in ("pressed", "silent")
+
     def powered(self) -> None:
         """Record that `clear` has released the stop, so that driver faults count from now on."""
-        self._unpowered = False
+        self.unpowered = False
 
-    def read(self, status: BoardStatus) -> tuple[bool, ...] | None:
+    def use(self, safety: SafetyConfig) -> EstopUse:
+        return safety.estop
+
+    def read(self, status: BoardStatus, safety: SafetyConfig) -> tuple[bool, ...] | None:
         return None if status.estop is None else (status.estop,)
 
-    def pressed_reason(self) -> Reason:
+    def pressed_reason(self, safety: SafetyConfig) -> Reason:
         return PRESSED_REASON
 
-    def released(self, before: EstopState) -> str:
+    def released(self, before: EstopState, safety: SafetyConfig) -> str:
         if not before:
             return "the board reports an emergency-stop input, which is released"
         return "the emergency stop is released; the robot stays stopped until srv/clear is called"

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import pickle
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
+from msgspec import Struct, inspect
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
@@ -27,7 +28,7 @@ from acsard.recording.export import export
 from acsard.recording.file_replay import DisplayReplay, replay_file
 from acsard.recording.mcap_file import Recording, RecordingWriter
 from acsard.recording.rows import encode
-from acsard.recording.state import Checkpoint, State, StateError, adopt, freeze, thaw
+from acsard.recording.state import PARTS, Checkpoint, State, StateError, adopt, freeze, thaw
 from acsard.recording.unpickling import MAX_BYTES, MAX_OPCODES
 from acsard.report import page
 from acsard.report.report_data import ReportData
@@ -129,6 +130,25 @@ def test_attributes_that_an_older_robot_lacks_come_from_a_new_robot(tmp_path: Pa
     assert len([*looked.steps()]) == looked.replay.comparison.steps > 100
     assert looked.replay.comparison.same
     assert replay_file(recording).comparison.same
+
+
+def structs(kind: inspect.Type) -> Iterator[type[Struct]]:
+    """Yield the Structs in a type."""
+    if isinstance(kind, inspect.StructType):
+        yield kind.cls
+    for name in kind.__struct_fields__:
+        inner = getattr(kind, name)
+        for part in inner if isinstance(inner, tuple) else (inner,):
+            part = part.type if isinstance(part, inspect.Field) else part
+            if isinstance(part, inspect.Type):
+                yield from structs(part)
+
+
+@pytest.mark.parametrize("part", PARTS.values(), ids=PARTS)
+def test_a_part_that_is_plain_data_has_no_configuration_inside(part: type[Struct]) -> None:
+    modules = {cls.__module__ for cls in structs(inspect.type_info(part))}
+    assert part.__module__ in modules
+    assert not [name for name in modules if name.startswith("acsard.core.config")]
 
 
 @each(

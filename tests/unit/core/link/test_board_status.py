@@ -223,7 +223,8 @@ def test_damage_never_changes_the_state_of_a_bumper(
     dice, extra = random.Random(34), (b"", b" volts=24.31", b" driver=ok temp=41.5")
     # A release stays until the next line that counts, so each damaged line has bumpers of its own.
     for number in range(count // 4):
-        bumpers, marks = Bumpers(SafetyConfig(bumpers=places)), bytearray(b"....")
+        safety = SafetyConfig(bumpers=places)
+        bumpers, marks = Bumpers(), bytearray(b"....")
         for pressed in dice.sample(range(4), dice.randint(0, 4)):
             marks[pressed] = b"X"[0]
         state = "pressed" if b"X" in marks else "released"
@@ -231,17 +232,17 @@ def test_damage_never_changes_the_state_of_a_bumper(
         line = sealed(line) if check else line
         whole = [(number, decode_status.__wrapped__(line, check))]
         # Without places the number of the bumpers counts from the second line on.
-        bumpers.process_reports(whole * 2, number)
+        bumpers.process_reports(whole * 2, number, safety)
         for _ in range(4):
             frame = damaged(line, (line, *REPLIES), dice)
             if frame.startswith(STATUS):
                 with suppress(FrameError):
                     status = decode_status.__wrapped__(frame, check)
-                    bumpers.process_reports([(number, status)], number)
+                    bumpers.process_reports([(number, status)], number, safety)
             assert bumpers.state == state, (number, line, frame)
             if not places:
                 # Without places only a single damaged line is known by its number of bumpers.
-                bumpers.process_reports(whole, number)
+                bumpers.process_reports(whole, number, safety)
 
 
 def test_a_false_press_needs_half_a_second_of_damage() -> None:
@@ -249,14 +250,14 @@ def test_a_false_press_needs_half_a_second_of_damage() -> None:
 
     The daemon assumes a pressed emergency stop only after five lost status lines in a row.
     """
-    dice, estop = random.Random(5), EmergencyStop("auto")
+    dice, estop = random.Random(5), EmergencyStop()
     step_ns, presses, runs, last_ns = NS_PER_S // 100, 0, 0, 0
     for step in range(200_000):
         now_ns, reports = step * step_ns, []
         if step % 10 == 0 and (step == 0 or dice.random() < 0.5):
             reports = [(now_ns, decode_status(OK, False))]
             last_ns = now_ns
-        estop.process_reports(reports, now_ns)
+        estop.process_reports(reports, now_ns, SafetyConfig())
         presses += bool(estop.pressed_now)
         runs += now_ns - last_ns == int(SILENCE_TIMEOUT_S * NS_PER_S) + step_ns
     assert presses == runs

@@ -15,6 +15,7 @@ from acsard.core.motion.battery import (
     SILENT_REASON,
     TIME_CONSTANT_S,
     Battery,
+    empty_reason,
     status_text,
 )
 from acsard.core.values import BatteryLevel, BatteryStatus
@@ -31,7 +32,8 @@ class Pack:
     """A battery monitor with a simulated time. The first step is at 10 s."""
 
     def __init__(self, config: BatteryConfig = CONFIG) -> None:
-        self.battery = Battery(config)
+        self.battery = Battery()
+        self.config = config
         self.now_ms = 10_000
         self.linked = True
         self.events: list[tuple[str, str]] = []
@@ -41,7 +43,7 @@ class Pack:
         """Process these status lines `ms` after the last step, and return the level."""
         self.now_ms += ms
         reports = [(self.now_ms * MS, line) for line in lines]
-        events = self.battery.process_reports(reports, self.now_ms * MS, self.linked)
+        events = self.battery.process_reports(reports, self.now_ms * MS, self.linked, self.config)
         self.events += [(event.name, event.text) for event in events]
         self.stops += self.battery.stopped_now
         return None if self.battery.status is None else self.battery.status.level
@@ -149,7 +151,7 @@ def test_the_stop_is_reported_once_and_held_until_the_hysteresis() -> None:
     pack = Pack()
     pack.at(20.9, 5.0)
     assert (pack.stops, pack.battery.refuses_clear) == (1, True)
-    assert pack.battery.why.code == pack.battery.refusal.code == "battery_empty"
+    assert empty_reason(CONFIG).code == pack.battery.refusal(CONFIG).code == "battery_empty"
     pack.at(21.3, 60.0)
     assert pack.battery.refuses_clear
     pack.at(24.0, 10.0)
@@ -327,7 +329,7 @@ def test_a_board_that_does_not_report_the_measure_is_named(
     for _ in range(100):
         assert pack.step(line) == "unknown"
     assert pack.events == [("battery", text)]
-    assert status_text(pack.battery._config, pack.status) == text
+    assert status_text(pack.config, pack.status) == text
 
 
 def test_a_measure_that_the_board_no_longer_reports_is_named() -> None:
@@ -355,16 +357,16 @@ def test_a_stop_level_is_forgotten_unless_the_new_board_reports_the_measure() ->
     assert pack.battery.refuses_clear
     pack.battery.reopen()
     pack.step(BoardStatus(volts=19.0))
-    pack.battery.forget()
+    pack.battery.forget(pack.config)
     assert pack.battery.refuses_clear
     pack.battery.reopen()
     pack.step(BoardStatus(charge=0.9, amps=-1.0))
-    pack.battery.forget()
+    pack.battery.forget(pack.config)
     assert not pack.battery.refuses_clear
     assert pack.step(BoardStatus(charge=0.9)) == "unknown"
     pack.quiet(6.0)
     pack.battery.reopen()
-    pack.battery.forget()
+    pack.battery.forget(pack.config)
     assert pack.quiet(1.0) is None
     assert pack.at(24.0, 5.0) == "ok"
     assert pack.stops == 1

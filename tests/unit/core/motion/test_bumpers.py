@@ -27,9 +27,22 @@ class Pins:
     """Bumper inputs with a simulated time. The first step is at 10 s."""
 
     def __init__(self, safety: SafetyConfig) -> None:
-        self.bumpers = Bumpers(safety)
+        self.bumpers = Bumpers()
+        self.safety = safety
         self.now_ms = 10_000
         self.events: list[Event] = []
+
+    @property
+    def missing(self) -> bool:
+        return self.bumpers.missing(self.safety)
+
+    @property
+    def limiting(self) -> bool:
+        return self.bumpers.limiting(self.safety)
+
+    @property
+    def clear_refusal(self) -> Reason | None:
+        return self.bumpers.clear_refusal(self.safety)
 
     def step(self, *reports: str, ms: int = 10) -> str:
         """Process status lines with these bumpers ("" for none) after `ms`. Return the state."""
@@ -38,7 +51,8 @@ class Pins:
             (self.now_ms * MS, BoardStatus(bumpers=tuple(mark == "X" for mark in marks) or None))
             for marks in reports
         ]
-        self.events += self.bumpers.process_reports(statuses, self.now_ms * MS)
+        now_ns = self.now_ms * MS
+        self.events += self.bumpers.process_reports(statuses, now_ns, self.safety)
         return self.bumpers.state
 
     def quiet(self, ms: int) -> str:
@@ -72,7 +86,7 @@ def test_each_place_allows_only_the_straight_motion_that_leads_away(
     pins = away(*FOUR)
     pins.step(pressed)
     for twist in TWISTS:
-        allowed = pins.bumpers.away(twist)
+        allowed = pins.bumpers.away(twist, pins.safety)
         if twist == REST:
             assert allowed == REST
         elif twist.linear * sign <= 0:
@@ -90,8 +104,8 @@ def test_two_bumpers_at_one_place_allow_the_same_motion_as_one() -> None:
     pins = away("front", "front", "rear")
     for pressed in ("X..", ".X.", "XX."):
         pins.step(pressed)
-        assert pins.bumpers.away(Twist(-0.5, 1.0)) == Twist(-0.1, 0.0)
-        assert joined(pins.bumpers.limit()).code == "bumper_away"
+        assert pins.bumpers.away(Twist(-0.5, 1.0), pins.safety) == Twist(-0.1, 0.0)
+        assert joined(pins.bumpers.limit(pins.safety)).code == "bumper_away"
 
 
 def test_every_place_has_a_direction() -> None:
@@ -109,9 +123,9 @@ def test_a_pressed_bumper_that_limits_says_whether_it_allows_a_motion(
     pins = away(*FOUR)
     pins.step("....")
     pins.step(pressed)
-    assert pins.bumpers.limiting
-    assert pins.bumpers.clear_refusal is None
-    assert joined(pins.bumpers.limit()).code == code
+    assert pins.limiting
+    assert pins.clear_refusal is None
+    assert joined(pins.bumpers.limit(pins.safety)).code == code
     event = pins.events[-1]
     assert (event.name, event.level, event.code) == ("bumper_pressed", "error", "bumper")
 
@@ -127,13 +141,13 @@ def test_a_press_counts_immediately_until_the_release() -> None:
     pins.step("..")
     assert pins.step("X.") == "pressed"
     assert pins.bumpers.pressed == (True, False)
-    assert pins.bumpers.pressed_now == pins.bumpers.clear_refusal == pressed("front bumper")
-    assert not pins.bumpers.limiting
+    assert pins.bumpers.pressed_now == pins.clear_refusal == pressed("front bumper")
+    assert not pins.limiting
     pins.step("X.")
     assert pins.bumpers.pressed_now is None
-    assert pins.bumpers.clear_refusal == pressed("front bumper")
+    assert pins.clear_refusal == pressed("front bumper")
     assert pins.step("..") == "released"
-    assert (pins.bumpers.clear_refusal, pins.bumpers.pressed) == (None, (False, False))
+    assert (pins.clear_refusal, pins.bumpers.pressed) == (None, (False, False))
     assert [(event.name, event.code) for event in pins.events] == [
         ("bumper_released", ""), ("bumper_pressed", "bumper"), ("bumper_released", ""),
     ]  # fmt: skip
@@ -146,7 +160,7 @@ def test_a_second_pressed_bumper_is_a_new_press_but_the_release_of_one_bumper_is
     assert pins.bumpers.pressed_now == pressed("front and rear bumpers")
     pins.step(".X")
     assert pins.bumpers.pressed_now is None
-    assert pins.bumpers.clear_refusal == pressed("rear bumper")
+    assert pins.clear_refusal == pressed("rear bumper")
     assert len(pins.events) == 2
     pins.step("XX", ".X", "..")
     assert (pins.bumpers.pressed_now, pins.bumpers.state) == (
@@ -164,8 +178,8 @@ def test_half_a_second_of_silence_latches_with_both_choices(
     assert pins.quiet(500) != "silent"
     assert pins.step("") == "silent"
     assert pins.bumpers.pressed == (True, True)
-    assert pins.bumpers.pressed_now == pins.bumpers.clear_refusal == SILENT_REASON
-    assert not pins.bumpers.limiting
+    assert pins.bumpers.pressed_now == pins.clear_refusal == SILENT_REASON
+    assert not pins.limiting
     assert pins.events[-1].code == "bumpers_silent"
     assert pins.step("..") == "released"
 
@@ -184,12 +198,16 @@ def test_a_release_says_that_a_stop_stays_only_if_there_is_one() -> None:
 
 def test_bumpers_with_places_are_missing_until_the_board_reports_their_number() -> None:
     pins = stop("front", "rear")
-    assert pins.bumpers.missing
+    assert pins.missing
     for wrong in (".", "...", "XXX", ""):
         assert pins.step(wrong) == ""
-    assert (pins.bumpers.missing, pins.bumpers.pressed, pins.events) == (True, None, [])
+    assert (pins.missing, pins.bumpers.pressed, pins.events) == (
+        True,
+        None,
+        [],
+    )
     pins.step("..")
-    assert not pins.bumpers.missing
+    assert not pins.missing
 
 
 def test_a_line_with_the_wrong_number_of_bumpers_does_not_count_as_a_report() -> None:
@@ -202,11 +220,11 @@ def test_a_line_with_the_wrong_number_of_bumpers_does_not_count_as_a_report() ->
 
 def test_without_places_every_bumper_counts_wherever_it_is() -> None:
     pins = stop()
-    assert not pins.bumpers.missing
+    assert not pins.missing
     assert pins.step("....") == ""
     assert pins.step("....") == "released"
     assert pins.step("..X.") == "pressed"
-    assert pins.bumpers.clear_refusal == pressed("bumper 3")
+    assert pins.clear_refusal == pressed("bumper 3")
 
 
 def test_without_places_the_first_line_with_another_number_of_bumpers_releases_nothing() -> None:
@@ -222,10 +240,17 @@ def test_without_places_the_first_line_with_another_number_of_bumpers_releases_n
 def test_without_places_no_motion_leads_away_so_a_press_latches() -> None:
     pins = away()
     pins.step("X")
-    assert (pins.bumpers.limiting, pins.bumpers.clear_refusal) == (False, pressed("bumper 1"))
+    assert (pins.limiting, pins.clear_refusal) == (
+        False,
+        pressed("bumper 1"),
+    )
 
 
 def test_bumpers_that_are_off_are_ignored() -> None:
     pins = Pins(SafetyConfig(bumpers=("front",), bumper="off"))
     assert pins.step("X") == pins.quiet(1000) == ""
-    assert (pins.bumpers.missing, pins.bumpers.pressed, pins.events) == (False, None, [])
+    assert (pins.missing, pins.bumpers.pressed, pins.events) == (
+        False,
+        None,
+        [],
+    )

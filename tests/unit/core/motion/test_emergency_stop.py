@@ -8,7 +8,7 @@ from typing import get_args
 import pytest
 
 from acsard.core.codes import Reason
-from acsard.core.config.settings import EstopUse
+from acsard.core.config.settings import EstopUse, SafetyConfig
 from acsard.core.link.board_status import BoardStatus
 from acsard.core.motion.emergency_stop import (
     PRESSED_REASON,
@@ -36,7 +36,8 @@ class Input:
     """An emergency-stop input with a simulated time. The first step is at 10 s."""
 
     def __init__(self, use: EstopUse = "auto") -> None:
-        self.estop = EmergencyStop(use)
+        self.estop = EmergencyStop()
+        self.safety = SafetyConfig(estop=use)
         self.now_ms = 10_000
         self.events: list[str] = []
 
@@ -45,7 +46,8 @@ class Input:
         self.now_ms += ms
         statuses = [(self.now_ms * MS, BoardStatus(estop=pressed)) for pressed in reports]
         self.events += [
-            event.name for event in self.estop.process_reports(statuses, self.now_ms * MS)
+            event.name
+            for event in self.estop.process_reports(statuses, self.now_ms * MS, self.safety)
         ]
         return self.estop.state
 
@@ -74,18 +76,18 @@ def code(why: Reason | None) -> str:
 def test_an_input_that_is_never_reported_is_never_pressed() -> None:
     pin = Input()
     assert pin.quiet(2000) == pin.step(None) == ""
-    assert (pin.estop.why, pin.events) == (None, [])
+    assert (pin.estop.why(pin.safety), pin.events) == (None, [])
 
 
 def test_a_press_counts_immediately_until_the_release() -> None:
     pin = Input()
     pin.step(False)
     assert pin.step(True) == "pressed"
-    assert pin.estop.pressed_now == pin.estop.why == PRESSED_REASON
+    assert pin.estop.pressed_now == pin.estop.why(pin.safety) == PRESSED_REASON
     assert pin.step(True) == "pressed"
-    assert (code(pin.estop.pressed_now), code(pin.estop.why)) == ("", "emergency_stop")
+    assert (code(pin.estop.pressed_now), code(pin.estop.why(pin.safety))) == ("", "emergency_stop")
     assert pin.step(False) == "released"
-    assert (code(pin.estop.why), pin.estop.pressed) == ("", (False,))
+    assert (code(pin.estop.why(pin.safety)), pin.estop.pressed) == ("", (False,))
     assert pin.events == ["emergency_stop_released", "emergency_stop", "emergency_stop_released"]
 
 
@@ -93,7 +95,7 @@ def test_a_press_and_its_release_in_one_read_still_count() -> None:
     pin = Input()
     pin.step(False)
     assert pin.step(True, False) == "released"
-    assert (pin.estop.pressed_now, pin.estop.why) == (PRESSED_REASON, None)
+    assert (pin.estop.pressed_now, pin.estop.why(pin.safety)) == (PRESSED_REASON, None)
 
 
 def test_the_first_report_may_be_a_press() -> None:
@@ -107,10 +109,10 @@ def test_a_new_board_must_report_a_required_input_itself(before: bool) -> None:
     pin = Input("required")
     pin.step(before)
     pin.estop.reopen()
-    assert pin.estop.missing
+    assert pin.estop.missing(pin.safety)
     assert pin.step() == ("pressed" if before else "released")
     pin.step(False)
-    assert not pin.estop.missing
+    assert not pin.estop.missing(pin.safety)
 
 
 def test_the_input_is_forgotten_unless_the_new_board_reports_it() -> None:
@@ -131,7 +133,7 @@ def test_half_a_second_without_the_input_counts_as_pressed() -> None:
     pin.step(False)
     assert pin.quiet(500) == "released"
     assert pin.step(None) == "silent"
-    assert pin.estop.pressed_now == pin.estop.why == SILENT_REASON
+    assert pin.estop.pressed_now == pin.estop.why(pin.safety) == SILENT_REASON
     assert pin.quiet(1000) == "silent"
     assert pin.estop.pressed_now is None
     assert pin.step(True) == "pressed"
@@ -170,14 +172,14 @@ def test_a_computer_that_is_always_late_is_excused_once() -> None:
 def test_a_robot_without_the_input_ignores_reports(state: bool) -> None:
     pin = Input("off")
     assert pin.step(state) == pin.quiet(1000) == ""
-    assert (pin.estop.pressed_now, pin.estop.missing, pin.events) == (None, False, [])
+    assert (pin.estop.pressed_now, pin.estop.missing(pin.safety), pin.events) == (None, False, [])
 
 
 @pytest.mark.parametrize("use", ["auto", "required"])
 def test_a_required_input_is_missing_until_the_first_report(use: EstopUse) -> None:
     pin = Input(use)
-    assert pin.estop.missing == (use == "required")
+    assert pin.estop.missing(pin.safety) == (use == "required")
     pin.step(None)
-    assert pin.estop.missing == (use == "required")
+    assert pin.estop.missing(pin.safety) == (use == "required")
     pin.step(True)
-    assert not pin.estop.missing
+    assert not pin.estop.missing(pin.safety)
