@@ -11,17 +11,13 @@ from __future__ import annotations
 
 import re
 from functools import lru_cache
-from typing import Literal
 
 from msgspec import Struct
 
-from acsard.core.codes import GuardCode
 from acsard.core.config.settings import Config
-from acsard.core.values import NS_PER_S, Ns, Outputs
+from acsard.core.values import NS_PER_S, Ns, Outputs, Trip
 
 Wheels = tuple[int, int, int, int]  # speeds of the motors a to d, in hundredths of rad/s
-
-Trip = GuardCode | Literal[""]  # why the guard replaced a line
 
 _ZERO: Wheels = (0, 0, 0, 0)
 _COLUMNS = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")

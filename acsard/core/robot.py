@@ -1,8 +1,9 @@
 """The robot as one pure object. `Robot.step(Inputs) -> Outputs` calls all its parts in order.
 
 A step updates the odometry, chooses one command, checks the mode, limits the command and converts
-it to wheel speeds. Only `step` changes the state, and only from its inputs. The control loop reads
-and writes the port, and `core/guard.py` checks each line.
+it to wheel speeds. `sent` follows each line and says what really left: only then the limiter
+advances, so a line that was lost leaves no trace. The control loop reads and writes the port, and
+`core/guard.py` checks each line.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import assert_never
+from typing import NamedTuple, assert_never
 
 from msgspec.structs import replace
 
@@ -36,7 +37,7 @@ from acsard.core.motion.emergency_stop import (
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.lifecycle import Lifecycle
-from acsard.core.motion.limits import Limiter
+from acsard.core.motion.limits import Limiter, State
 from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
@@ -59,6 +60,8 @@ from acsard.core.values import (
     Request,
     Snapshot,
     SpeedCap,
+    Trip,
+    WheelSpeeds,
 )
 
 # Largest time step of the limiter, s, but at least 1.5 control periods. After a longer stall the
@@ -94,6 +97,13 @@ NOTHING_CHANGED = "nothing changed: all settings already have these values"
 MAX_REFUSAL_LENGTH = 200  # characters in `state`: the text may quote the message of a client
 
 
+class _Line(NamedTuple):
+    # A line that `sent` has not confirmed yet.
+    state: State  # of the limiter
+    speeds: WheelSpeeds
+    tick: bool  # of a control period, not between two of them
+
+
 class Robot:
     def __init__(self, config: Config, latches: Latches = Latches()) -> None:  # noqa: B008
         # As after a start of the daemon; `latches` decides the first mode.
@@ -121,24 +131,21 @@ class Robot:
             self._first_event = Event("mode", why.text, "warning", kind=kind, code=why.code)
         self._choice = Choice()
         self._speeds = STILL
-        # Of the last line, and of the last one on the port: after a press of the emergency stop,
-        # the wheels turn so until the zeros are written.
-        self._computed = self._written = STILL
+        # Of the last line that left: after a press of the emergency stop, the wheels turn so until
+        # the zeros are written.
+        self._written = STILL
         # Arrival of the command, and the mode, of the last line. None after a press: a new line is
         # due.
         self._made_of: tuple[int | None, Mode] | None = (None, self._life.mode)
-        # Last line, and last press of the emergency stop or a bumper.
-        self._made_ns = self._pressed_ns = 0
-        # State of the limiter and its time, of the last line and of the last one on the port, to
-        # which `_settle` returns. At rest after a press and without a link.
-        self._made = self._said = (self._limiter.state, 0)
+        self._line: _Line | None = None  # until `sent`
+        # Last line, last one that left, and last press of the emergency stop or a bumper.
+        self._made_ns = self._left_ns = self._pressed_ns = 0
+        self._trip: Trip = ""  # of the guard, until the next step
         self._status: tuple[str, Code, str, str, str] = ("", "booting", "", "", "")
         self._battery_level = ""  # in the previous step
         # Since the start: `commands` (accepted), `command_<reason>` (refused),
         # `commands_of_new_senders` (not proved yet), lines to the board, and events.
         self.counters: Counter[str] = Counter()
-        # Whether the last step's line was that of a period. None: it made no line.
-        self._period_line: bool | None = None
         self._refused = ""
         self._refused_ns: Ns | None = None
         self._sanity = Sanity(config.feedback)
@@ -216,7 +223,6 @@ class Robot:
         if inputs.missed:
             self.counters["missed_periods"] += inputs.missed
             events.append(missed(inputs.missed, self.config.period_ns))
-        self._settle(inputs)
         estimates = self._fold(inputs, events)
         answers = self._serve(inputs, events)
         if inputs.speed_cap is not None:
@@ -233,8 +239,7 @@ class Robot:
         news = (self._choice.arrived_ns, self._life.mode) != self._made_of
         due = inputs.tick or (inputs.at_once and news)
         line = self._drive(inputs) if due else None
-        self._period_line = None if line is None else inputs.tick
-        applied = self._limiter.twist
+        applied = self._limiter.twist if self._line is None else self._line.state.twist
         self._odometry.command(applied)
         link = self.session.link
         why = self._reason()
@@ -267,34 +272,36 @@ class Robot:
             self._life.latches,
         )
 
-    # The outcome of the previous line.
+    def sent(self, left_ns: Ns, line: bytes | None, trip: Trip = "") -> None:
+        """Record what left of the last step's line, and when: nothing, if `line` is None.
 
-    def _settle(self, inputs: Inputs) -> None:
-        if self._period_line is not None and not inputs.superseded:
+        `trip` says why the guard replaced it with the stop line. Call this after each line, before
+        the next step.
+        """
+        made, self._line = self._line, None
+        assert made is not None
+        self._trip = trip
+        # The board must not be expected to answer a line that the guard has replaced.
+        self.session.sent(left_ns, was_written=line is not None and not trip)
+        if trip:
+            self._limiter.cut()
+        if line is not None:
             self.counters["lines_sent"] += 1
-        elif self._period_line and inputs.port_open:
+            self._left_ns = self._made_ns
+            if trip:
+                self._written = STILL
+            else:
+                self._limiter.state, self._written = made.state, made.speeds
+        elif made.tick and self.session.link != "down":
             # Count the lines of periods only. If a line between two periods is superseded, the line
             # of the period still follows.
             self.counters["lines_superseded"] += 1
-        # To the last line on the port: from zero if the guard replaced it, from the one before if
-        # it was not written.
-        if inputs.guard_trip:
-            # The guard has replaced the line with the stop line, which contains zeros.
-            self._limiter.cut()
-            self._made = (self._limiter.state, self._made_ns)
-            self._computed = STILL
-        if not inputs.superseded:
-            self._said, self._written = self._made, self._computed
-        self._made, self._computed = self._said, self._written
 
     # Feedback.
 
     def _fold(self, inputs: Inputs, events: list[Event]) -> tuple[Estimate, ...]:
         session, before = self.session, self.session.link
-        unsent = inputs.superseded or bool(inputs.guard_trip)
-        feedback = session.update(
-            inputs.now, inputs.port_open, inputs.opened, inputs.received, unsent, inputs.late_ns
-        )
+        feedback = session.update(inputs.now, inputs.port_open, inputs.opened, inputs.received)
         link = session.link
         warning = self._answered.check(
             self.counters["lines_sent"], session.good_lines, link == "up"
@@ -325,7 +332,6 @@ class Robot:
             # link returns, a command from before the loss is too old to follow.
             self._limiter.cut()
             self._speeds = STILL
-            self._made = self._said = (self._limiter.state, self._made_ns)
             self._life.link(up=False)
             if link == "down" and before != "down":
                 self._arbiter.require_neutral(inputs.now.mono_ns)
@@ -368,7 +374,6 @@ class Robot:
             # Do not ramp: the hardware has cut the motors, or the robot touches an obstacle.
             self._limiter.cut()
             self._speeds, self._made_of, self._pressed_ns = STILL, None, now.mono_ns
-            self._made = self._said = (self._limiter.state, self._made_ns)
         if estop.driver_fault:
             self._fault(DRIVER_FAULT_REASON, now, events)
             self._life.caused_again(now.mono_ns)
@@ -479,8 +484,9 @@ class Robot:
     # Requests.
 
     def _serve(self, inputs: Inputs, events: list[Event]) -> tuple[Answer, ...]:
-        if inputs.guard_trip:
-            self._fault(reason(inputs.guard_trip), inputs.now, events)
+        trip, self._trip = self._trip, ""
+        if trip:
+            self._fault(reason(trip), inputs.now, events)
             self._life.caused_again(inputs.now.mono_ns)
         if inputs.shutting_down and self._life.mode is not Mode.SHUTDOWN:
             self._life.leave()
@@ -541,10 +547,9 @@ class Robot:
         return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 
     def _set(self, settings: dict[str, Plain], now_ns: Ns) -> Changes:
-        # The robot is at rest only if two lines are zero: the last one that was written to the
-        # port, which the wheels follow, and the last one that was computed.
-        sent_twist, made = self._said[0].twist, self._limiter.twist
-        before, at_rest = self.config, self._speeds == STILL and sent_twist == made == REST
+        # The robot is at rest only if two lines are zero: the last one that left, which the wheels
+        # follow, and the last one that was computed.
+        before, at_rest = self.config, self._speeds == STILL and self._limiter.twist == REST
         try:
             self.config, changes = changed(before, settings, at_rest)
         except ConfigError as error:
@@ -618,9 +623,8 @@ class Robot:
     def _drive(self, inputs: Inputs) -> bytes | None:
         now_ns, twist, limiter = inputs.now.mono_ns, self._choice.twist, self._limiter
         self._made_of = (self._choice.arrived_ns, self._life.mode)
-        limiter.state, said_ns = self._said
-        since = (now_ns - said_ns) / NS_PER_S
-        pressed = said_ns < self._pressed_ns
+        before, since = limiter.state, (now_ns - self._left_ns) / NS_PER_S
+        pressed = self._left_ns < self._pressed_ns
         if pressed or self.session.link != "up" or since > WRITE_PAUSE_S:
             # The first written line after a press contains zeros, even if the input is already
             # released and the commands that arrived meanwhile may move the robot.
@@ -629,9 +633,11 @@ class Robot:
             limiter.follow(twist, min(since, self._max_dt))
         else:
             limiter.coast(since, stop=self._life.mode in HALTED)
-        self._made, self._made_ns = (limiter.state, now_ns), now_ns
-        self._speeds = self._computed = self._kinematics.wheel_speeds(limiter.twist)
-        return self.session.line(now_ns, self._speeds)
+        state, limiter.state, self._made_ns = limiter.state, before, now_ns
+        self._speeds = self._kinematics.wheel_speeds(state.twist)
+        line = self.session.line(now_ns, self._speeds)
+        self._line = None if line is None else _Line(state, self._speeds, inputs.tick)
+        return line
 
     # Report.
 

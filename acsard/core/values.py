@@ -34,6 +34,8 @@ Role = Literal["viewer", "operator", "maintainer"]
 
 ROLES: tuple[Role, ...] = get_args(Role)
 
+Trip = GuardCode | Literal[""]  # why the guard replaced a line
+
 
 class AcsardError(Exception):
     """Base of the errors that acsard raises on purpose. Any other exception is a bug."""
@@ -426,7 +428,7 @@ class Inputs(Struct, frozen=True, omit_defaults=True):
     gyro: tuple[GyroSample, ...] = ()
     refusals: tuple[Refusal, ...] = ()  # messages that did not become a `Command`
     # Why the guard replaced the last line: the robot latches a fault.
-    guard_trip: GuardCode | Literal[""] = ""
+    guard_trip: Trip = ""
     superseded: bool = False  # the previous line was not written
     missed: int = 0  # control periods without a step since the previous one
     events: tuple[Event, ...] = ()  # of other parts, to be logged with the robot's

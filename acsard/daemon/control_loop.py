@@ -16,7 +16,7 @@ from acsard.core.config.live import Difference
 from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.formatting import listed
-from acsard.core.guard import Guard, Trip
+from acsard.core.guard import Guard
 from acsard.core.incoming.bus_interface import GATEWAY_KEY as GATEWAY
 from acsard.core.incoming.bus_interface import (
     NO_INPUT,
@@ -58,6 +58,7 @@ from acsard.core.values import (
     Request,
     Snapshot,
     SpeedCap,
+    Trip,
 )
 from acsard.daemon.latch_rules import MAX_ANSWER_DELAY_NS, Handover, LatchKeeper
 from acsard.daemon.latencies import Stopwatch
@@ -138,10 +139,9 @@ class ControlLoop:
         self._counters: Counter[str] = Counter()
         self._turn_rates: list[GyroSample] = []  # since the last step
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
-        self._superseded, self._late_ns = False, 0
-        # About the last line: not sent, so a newer one must replace it; why the guard replaced it;
-        # from its step to the write, if over `MIN_WRITE_DELAY_NS`.
-        self._trip: Trip = ""
+        # For the recording, about the last line: why the guard replaced it; not sent, so a newer
+        # one must replace it; from its step to the write.
+        self._last_line: tuple[Trip, bool, Ns] = ("", False, 0)
         # Use the longest line of both directions, because answers must not queue in the MCU either.
         line_ns = wire_ns(config.mcu.line_bytes, config.mcu.baud_rate)
         self.pace = Pace(line_ns, config.period_ns)
@@ -186,7 +186,7 @@ class ControlLoop:
             self._stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns, missed)
             self._others += self._handover.take_events()
         commands, refusals, requests = self._from_bus(now)
-        port, pace = self._port, self.pace
+        port, pace, (trip, superseded, late_ns) = self._port, self.pace, self._last_line
         # Call `take` before reading `is_open`. After a suspend of the computer, `take` closes the
         # port.
         received = port.take(now if missed else None)
@@ -203,13 +203,13 @@ class ControlLoop:
             requests,
             tuple(self._turn_rates),
             refusals,
-            self._trip,
-            self._superseded,
+            trip,
+            superseded,
             missed,
             tuple(self._others),
             pace.at_once(now.mono_ns, port.sent_ns),
             self.shutting_down,
-            self._late_ns,
+            late_ns,
             self._speed_cap,
         )
         self._speed_cap = None
@@ -347,20 +347,22 @@ class ControlLoop:
 
     def _send(self, outputs: Outputs, now: Instant) -> bytes | None:
         # None: not written.
-        line, self._trip = self._guard.check(outputs)
-        self._superseded, self._late_ns = False, 0
+        line, trip = self._guard.check(outputs)
+        self._last_line = "", False, 0
         if line is None:
             return None
-        before_ns = self._port.sent_ns
-        if self._port.offer(line, now) == "sent":
+        before_ns, late_ns = self._port.sent_ns, 0
+        was_written = self._port.offer(line, now) == "sent"
+        if was_written:
             self._guard.record_written(line)
             sent_ns = self._port.sent_ns
             self._stopwatch.line(outputs, sent_ns, before_ns)
             late_ns = sent_ns - now.mono_ns
-            self._late_ns = late_ns if late_ns >= MIN_WRITE_DELAY_NS else 0
-            return line
-        self._superseded = True
-        return None
+            late_ns = late_ns if late_ns >= MIN_WRITE_DELAY_NS else 0
+        sent = line if was_written else None
+        self.robot.sent(now.mono_ns + late_ns, sent, trip)
+        self._last_line = trip, not was_written, late_ns
+        return sent
 
     def _publish(self, outputs: Outputs, answers: tuple[Answer, ...]) -> None:
         bus, report, wanted = self._bus, self.report, self._bus.wanted_keys

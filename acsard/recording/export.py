@@ -351,7 +351,7 @@ def _write_steps(
         if number % PROGRESS_STEPS == 0:
             progress(step.inputs.now.wall_ns)
         with run.state_errors():
-            outputs = run.robot.step(step.inputs)
+            outputs = run.stepped.step(step.inputs)
         if is_inside(step):
             writer.step(step, outputs)
         elif not over:
@@ -380,7 +380,7 @@ def calibration_csv(recording: Recording) -> bytes:
                 # A calibration compares whole drives, and part of this drive is missing.
                 break
             last = step.number
-            lines += measured_csv_rows(step, run.robot.step(step.inputs))
+            lines += measured_csv_rows(step, run.stepped.step(step.inputs))
             has_gyro = has_gyro or bool(step.inputs.gyro)
     if not has_gyro:
         raise RecordingError(

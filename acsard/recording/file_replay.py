@@ -29,6 +29,7 @@ from acsard.recording.recorded_steps import RecordedStep, UnfinishedError, unfin
 from acsard.recording.replay import Comparison, Replay
 from acsard.recording.rows import BatchError, decode
 from acsard.recording.state import Checkpoint, State, StateError, adopt, checkpoint, short, thaw
+from acsard.recording.stepped_robot import SteppedRobot
 from acsard.recording.timeline import TimelineEntry, entry_of
 from acsard.recording.unpickling import MAX_BYTES
 
@@ -193,10 +194,15 @@ class RecordedRun(_Source):
         # Next step, and the state of the robot, or None.
         self._next, self._state = _first_state(recording)
         # The robot, with the memory of its guard.
-        self.robot, self.memory = self._state or (Robot(config), Memory())
+        robot, self.memory = self._state or (Robot(config), Memory())
+        self.stepped = SteppedRobot(robot)
         if self._state is not None:
             with self.state_errors():
                 adopt(self.robot, Robot(self._recorded), Robot(config))
+
+    @property
+    def robot(self) -> Robot:
+        return self.stepped.robot
 
     def steps(self) -> Iterator[RecordedStep]:
         """Yield the steps that can be replayed. Raises `RecordingError` if there are none."""
@@ -253,7 +259,8 @@ class RecordedRun(_Source):
         if state is None:
             return False
         self._state = state
-        self.robot, self.memory = state
+        robot, self.memory = state
+        self.stepped = SteppedRobot(robot)
         return True
 
 
@@ -285,11 +292,11 @@ def replay_file(
                 replay.resume(run.robot, run.memory)
             replay.step(step)
     copies.end()
-    failed_step = _failed_step(recording, replay.robot, run.number)
+    failed_step = _failed_step(recording, replay.stepped, run.number)
     return ReplayResult(replay.comparison, run.gaps, failed_step, copies.difference)
 
 
-def _failed_step(recording: Recording, robot: Robot, last: int | None) -> str:
+def _failed_step(recording: Recording, robot: SteppedRobot, last: int | None) -> str:
     # After the last message; `last` is the last step that `robot` has replayed.
     if recording.unfinished is None:
         return ""

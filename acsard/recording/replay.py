@@ -19,9 +19,9 @@ from msgspec import Struct
 
 from acsard.core.config.parsing import ConfigError, parse_recorded
 from acsard.core.config.settings import Config
-from acsard.core.guard import Guard, Memory, Trip
+from acsard.core.guard import Guard, Memory
 from acsard.core.robot import Robot
-from acsard.core.values import Event, Instant, Outputs
+from acsard.core.values import Event, Instant, Outputs, Trip
 from acsard.host.errors import RecordingError
 from acsard.recording.file import Failure, Head, Recording
 from acsard.recording.recorded_steps import (
@@ -35,6 +35,7 @@ from acsard.recording.recorded_steps import (
     status_of,
 )
 from acsard.recording.state import State, StateError, adopt, short, thaw
+from acsard.recording.stepped_robot import SteppedRobot
 
 # "sent line" is after the guard, "event" all but text and client. "input names" are compared at the
 # end of a batch.
@@ -109,15 +110,19 @@ class Replay:
 
     def resume(self, robot: Robot, memory: Memory | None) -> None:
         """Go on with another robot, for example after missing steps, and its guard's memory."""
-        self.robot = robot
+        self.stepped = SteppedRobot(robot)
         self._config = robot.config
         self._guard = Guard(robot.session.codec.stop, robot.config, memory)
+
+    @property
+    def robot(self) -> Robot:
+        return self.stepped.robot
 
     def step(self, step: RecordedStep) -> Difference | None:
         """Replay the next step; return how it differs, or None."""
         if step.begins:
             self._checksum = self._names = 0
-        outputs = self.outputs = self.robot.step(step.inputs)
+        outputs = self.outputs = self.stepped.step(step.inputs)
         # A step that changes a setting gives the robot a new configuration.
         if self.robot.config is not self._config:
             self._config = self.robot.config
@@ -337,7 +342,7 @@ class Playback:
         if replay is None or self._next != failure.number:
             return f"{name} was not replayed, because the step before it is missing"
         try:
-            replay.robot.step(failure.inputs)
+            replay.stepped.step(failure.inputs)
         except Exception as error:  # noqa: BLE001 - the failure may be any exception
             return f"{name} also fails here, with {type(error).__name__}: {short(error)}"
         return f"{name} does not fail in this version of acsard"

@@ -16,7 +16,6 @@ from typing import Annotated, NamedTuple, get_args
 import msgspec
 from msgspec import Meta, Struct
 
-from acsard.core.guard import Trip
 from acsard.core.values import (
     AcsardError,
     Command,
@@ -29,6 +28,7 @@ from acsard.core.values import (
     Refusal,
     Request,
     SpeedCap,
+    Trip,
     Verb,
 )
 from acsard.recording.recorded_steps import (

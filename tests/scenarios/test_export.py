@@ -85,7 +85,7 @@ def exported(recording: Recording) -> Said:
     run = RecordedRun(recording)
     publisher, messages = Publisher(run.robot, recording.about.started_ns), defaultdict(list)
     for step in run.steps():
-        for output in publisher.step(step, run.robot.step(step.inputs)):
+        for output in publisher.step(step, run.stepped.step(step.inputs)):
             messages[output.channel.native.replace("<source>", output.source)].append(
                 output.message
             )
@@ -138,20 +138,43 @@ def test_every_exported_message_equals_the_published_one(key: str, both: Any) ->
     assert_same(world.bus.published[key], exports[key])
 
 
+def without_lines(counters: dict[str, int]) -> dict[str, int]:
+    """Return counters without those of lines: a replay learns a step later that a line left."""
+    return {name: count for name, count in counters.items() if not name.startswith("lines_")}
+
+
 def test_every_exported_state_equals_the_published_one_without_latencies_and_version(
     both: Any,
 ) -> None:
     world, _, exports = both
     then = [
-        replace(robot_state, latencies={}, version="")
+        replace(robot_state, latencies={}, version="", counters=without_lines(robot_state.counters))
         for robot_state in world.bus.published["state"]
     ]
     assert all(
         isinstance(robot_state, RobotState) and robot_state.counters["lines"]
         for robot_state in then[20:]
     )
-    assert_same(then, exports["state"])
+    states = [
+        replace(robot_state, counters=without_lines(robot_state.counters))
+        for robot_state in exports["state"]
+    ]
+    assert_same(then, states)
     assert then[-1].counters["commands_superseded"] > 0
+
+
+def without_counts(messages: Sequence[Any]) -> list[DiagnosticArray]:
+    """Return diagnostics without the counts of lines (`without_lines`)."""
+    return [
+        replace(
+            message,
+            status=[
+                replace(row, values=[v for v in row.values if not v.key.startswith("lines_")])
+                for row in message.status
+            ],
+        )
+        for message in messages
+    ]
 
 
 def test_every_exported_diagnostics_has_the_same_rows_except_measured_ones(both: Any) -> None:
@@ -161,7 +184,7 @@ def test_every_exported_diagnostics_has_the_same_rows_except_measured_ones(both:
         DiagnosticArray(message.header, [row for row in message.status if row.name not in left_out])
         for message in world.bus.published["diagnostics"]
     ]
-    assert_same(then, exports["diagnostics"])
+    assert_same(without_counts(then), without_counts(exports["diagnostics"]))
     assert {row.name for row in then[-1].status} >= {"acsard: mode", "acsard: commands"}
 
 

@@ -165,7 +165,8 @@ def test_a_replay_counts_lines_and_commands_as_the_daemon_did() -> None:
     world.run(0.1)
     counters = world.loop.robot.counters
     assert counters["lines_sent"] > 50
-    assert counters["lines_superseded"] == 5
+    # One of these was lost with the port.
+    assert counters["lines_superseded"] == 6
     assert counters["commands_superseded"] == 1
     assert replayed(tape, PLAIN).robot.counters == counters
 

@@ -608,8 +608,8 @@ FAULTS = (
         "robot unsent",
         "a line that never left counts as obeyed",
         ROBOT,
-        "        if not inputs.superseded:\n            self._said",
-        "        if True:\n            self._said",
+        "        if line is not None:\n",
+        "        if True:\n",
     ),
     # session
     fault(
@@ -977,8 +977,7 @@ FAULTS = (
         ROBOT,
         "            self._fault(DRIVER_FAULT_REASON, now, events)\n",
         "            self._fault(DRIVER_FAULT_REASON, now, events)\n"
-        "            self._limiter.cut()\n            self._speeds = STILL\n"
-        "            self._made = self._said = (self._limiter.state, self._made_ns)\n",
+        "            self._limiter.cut()\n            self._speeds = STILL\n",
     ),
     fault(
         "estop ramp",
@@ -1095,8 +1094,7 @@ FAULTS = (
         ROBOT,
         "            self._life.press(empty_reason(thresholds), now)\n",
         "            self._life.press(empty_reason(thresholds), now)\n"
-        "            self._limiter.cut()\n"
-        "            self._made = self._said = (self._limiter.state, self._made_ns)\n",
+        "            self._limiter.cut()\n",
     ),
     fault(
         "battery start",

@@ -220,21 +220,22 @@ async def test_a_port_whose_driver_accepts_no_bytes_is_reported_while_it_still_r
     """The simulated board sends reports and reads nothing, so the port's output buffer fills."""
     os.set_blocking(line.board, False)
     os.set_blocking(line.device, False)
-    wake, session, unsent = asyncio.Event(), McuSession(McuConfig(), 100.0), False
+    wake, session = asyncio.Event(), McuSession(McuConfig(), 100.0)
     async with line.port(wake=wake.set) as port:
 
         async def blocked(link: str) -> bool:
             """Step until the link is so, and return whether the session calls it blocked."""
-            nonlocal unsent
             deadline_ns = clock.mono_ns() + 5 * NS_PER_S
             while session.link != link and clock.mono_ns() < deadline_ns:
                 os.write(line.board, GO * 2)
                 await asyncio.wait_for(wake.wait(), 5.0)
                 wake.clear()
                 now = clock.now()
-                session.update(now, port.is_open, port.opened, port.take(), unsent)
+                session.update(now, port.is_open, port.opened, port.take())
                 data = session.line(now.mono_ns, STILL)
-                unsent = data is not None and port.offer(data, now) != "sent"
+                if data is not None:
+                    written = port.offer(data, now) == "sent"
+                    session.sent(now.mono_ns, was_written=written)
                 await asyncio.sleep(0.01)  # the wire is free again
             assert session.link == link
             return session.blocked

@@ -96,6 +96,7 @@ class McuSession:
         self.good_lines = 0
         self._heard_ns: Ns | None = None
         self.restarted = False  # the last `update` began a new session
+        self._resumed = False  # the port accepts lines again after `LONG_GAP_NS`
         self.events: list[Event] = []  # of the last `update`, for the log
         self._starting_over = False
         self._announced: tuple[LinkState, str, bool, bool]
@@ -118,19 +119,16 @@ class McuSession:
         port_open: bool,
         opened: int,
         received: tuple[Received, ...],
-        unsent: bool = False,
-        late_ns: Ns = 0,
     ) -> list[Feedback]:
         """Process the state of the port and the received bytes, and return the good lines in order.
 
-        `opened` counts the openings of the port. `unsent` says that the last result of `line()` was
-        not written, and `late_ns` how long after its making it was.
+        `opened` counts the openings of the port.
         """
-        self.restarted, self._starting_over, self.events = False, False, []
+        self.restarted, self._resumed = self._resumed, False
+        self._starting_over, self.events = False, []
         self.reopened = self.forgot = False
         if self.statuses:
             self.statuses = []
-        self._settle(not unsent, port_open, late_ns)
         feedback = []
         if not port_open or opened != self._opened:
             self._begin(port_open, opened, now.mono_ns)
@@ -203,23 +201,24 @@ class McuSession:
         check = self.negotiation
         return "" if check.state == "off" else f" (serial lines {check.in_force})"
 
-    # sessions
-
-    def _settle(self, was_written: bool, port_open: bool, late_ns: Ns) -> None:
+    def sent(self, left_ns: Ns, *, was_written: bool) -> None:
+        """Record whether and when the last result of `line()` was written to the port."""
         made = self._made
         if made is None:
             return
         blind, self._made, self._just_blind = self._just_blind, None, False
-        self.negotiation.settle(was_written, late_ns)
+        line, made_ns = made
+        self.negotiation.settle(was_written, left_ns - made_ns)
         self._held_up = not was_written
         if was_written:
-            line, left_ns = made[0], made[1] + late_ns
             self.negotiation.written(line)
             self._timeline.written(left_ns, moves=not line.startswith(self._rest))
-            self.restarted = self.blocked and left_ns - self._left_ns >= LONG_GAP_NS
+            self._resumed = self.blocked and left_ns - self._left_ns >= LONG_GAP_NS
             self._left_ns = left_ns
-        elif blind and port_open:
+        elif blind and self.link != "down":
             self._blind.undo()
+
+    # sessions
 
     def _begin(self, port_open: bool, opened: int, now_ns: Ns) -> None:
         self._link.apply("opened" if port_open else "closed")

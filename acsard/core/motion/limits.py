@@ -24,7 +24,7 @@ class _Axis(Struct, frozen=True):
     jerk: float
 
 
-class _State(Struct, frozen=True):
+class State(Struct, frozen=True):
     twist: Twist
     linear_slope: float
     angular_slope: float
@@ -35,7 +35,7 @@ class Limiter:
 
     def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
         self._kinematics = kinematics
-        self.state = _State(REST, 0.0, 0.0)  # `Robot` resets it to that of the last line
+        self.state = State(REST, 0.0, 0.0)  # `Robot` resets it to that of the last line
         self._cap = math.inf
         self.use(limits)
 
@@ -60,7 +60,7 @@ class Limiter:
         )
         self._wheel_speed = limits.wheel_speed
         self._wished = self._goal = REST  # requested, and within the speed limits
-        self._arrived: _State | None = None  # `_goal` is reached, and kept
+        self._arrived: State | None = None  # `_goal` is reached, and kept
 
     def cap(self, speed: float) -> None:
         """Allow at most this linear speed, too; a faster robot slows down as configured."""
@@ -88,7 +88,7 @@ class Limiter:
             now.twist.angular, goal.angular, now.angular_slope, dt, self._angular
         )
         twist = self._fitted(Twist(linear, angular))
-        self.state = _State(twist, slope_v, slope_w)
+        self.state = State(twist, slope_v, slope_w)
         if dt > 0.0 and twist == goal and slope_v == slope_w == 0.0:
             self._arrived = self.state
         return twist
@@ -126,12 +126,12 @@ class Limiter:
         )
         share = 1.0 - dt / seconds if seconds > dt else 0.0
         fallen = Twist(twist.linear * share, twist.angular * share) if share else REST
-        self.state = _State(fallen, 0.0, 0.0)
+        self.state = State(fallen, 0.0, 0.0)
         return fallen
 
     def cut(self) -> Twist:
         """Set the allowed twist to zero without a ramp, and return it."""
-        self.state = _State(REST, 0.0, 0.0)
+        self.state = State(REST, 0.0, 0.0)
         return REST
 
     def _within_speed(self, wished: Twist) -> Twist:

@@ -24,7 +24,7 @@ from acsard.core.config.settings import (
     Source,
     WheelMap,
 )
-from acsard.core.guard import RAMP_MARGIN_NS, Guard, Memory, Trip
+from acsard.core.guard import RAMP_MARGIN_NS, Guard, Memory
 from acsard.core.link.checked_line import seal
 from acsard.core.link.codec import Codec
 from acsard.core.motion.kinematics import Kinematics
@@ -40,10 +40,12 @@ from acsard.core.values import (
     Plain,
     Received,
     Request,
+    Trip,
     Twist,
     Verb,
     WheelSpeeds,
 )
+from acsard.recording.stepped_robot import SteppedRobot
 from tests.each import each
 
 MS = 1_000_000
@@ -568,6 +570,7 @@ class Loop:
 
     def __init__(self, config: Config, wheel_speed: float | None = None) -> None:
         self.robot = Robot(config)
+        self.stepped = SteppedRobot(self.robot)
         self.stop = self.robot.session.codec.stop
         most = config.limits.wheel_speed if wheel_speed is None else wheel_speed
         self.guard = Guarded(self.stop, most, config.commands.sources)
@@ -594,7 +597,7 @@ class Loop:
     ) -> Outputs:
         self.now_ns += int(ms * MS)
         now = Instant(self.now_ns, self.now_ns)
-        result = self.robot.step(
+        result = self.stepped.step(
             Inputs(
                 now=now,
                 tick=tick,

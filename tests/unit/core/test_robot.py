@@ -23,7 +23,6 @@ from acsard.core.config.settings import (
     SafetyConfig,
     Source,
 )
-from acsard.core.guard import Trip
 from acsard.core.link.codec import Codec
 from acsard.core.motion.arbiter_text import MAX_SENDER_LENGTH
 from acsard.core.robot import Robot
@@ -47,10 +46,12 @@ from acsard.core.values import (
     Refusal,
     Request,
     SpeedCap,
+    Trip,
     Twist,
     Verb,
     WheelSpeeds,
 )
+from acsard.recording.stepped_robot import SteppedRobot
 from tests.each import each
 
 MS = 1_000_000
@@ -74,6 +75,7 @@ class Bench:
         # speeds.
         config = replace(config or Config(), feedback=FeedbackConfig(fault_time=fault_time))
         self.robot = Robot(config, latches)
+        self.stepped = SteppedRobot(self.robot)
         self.codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
         self.now_ns = 50 * NS_PER_S
         self.period_ms = 1000 / config.rate_hz
@@ -81,7 +83,7 @@ class Bench:
         self.port_open = True
         self.reply: bytes | None = self.codec.stop
         self.shutting_down = False
-        self.out = self.robot.step(Inputs(self.now, tick=False, port_open=False))
+        self.out = self.stepped.step(Inputs(self.now, tick=False, port_open=False))
 
     @property
     def now(self) -> Instant:
@@ -112,7 +114,7 @@ class Bench:
         self.now_ns += int((self.period_ms if ms is None else ms) * MS)
         has_reply = self.reply is not None and self.port_open
         stamp_ns = None if late_ms is None else self.now_ns + WALL_NS - int(late_ms * MS)
-        self.out = self.robot.step(
+        self.out = self.stepped.step(
             Inputs(
                 now=self.now,
                 tick=tick,
@@ -168,7 +170,7 @@ class Bench:
     def set(self, settings: dict[str, Plain]) -> None:
         self.now_ns += 10 * MS
         requests = (Request("set", 7, settings=settings),)
-        self.out = self.robot.step(Inputs(self.now, True, True, self.opened, requests=requests))
+        self.out = self.stepped.step(Inputs(self.now, True, True, self.opened, requests=requests))
         assert self.out.answers[0].success
 
     def link(self) -> str:
@@ -229,7 +231,7 @@ def test_a_press_between_two_ticks_sends_zero_immediately_if_a_line_is_allowed()
     inputs = Inputs(
         bench.now, False, True, 1, received=(Received(bench.now, PRESSED_LINE),), at_once=True
     )
-    out = bench.robot.step(inputs)
+    out = bench.stepped.step(inputs)
     assert (out.mode, out.line) == ("stopped", ZERO_LINE)
 
 
@@ -1192,7 +1194,7 @@ def test_several_requests_of_one_step_are_answered_in_order() -> None:
     bench = Bench().linked()
     bench.now_ns += 10 * MS
     requests = (Request("stop", 1), Request("activate", 2), Request("reset_odometry", 3))
-    out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=requests))
+    out = bench.stepped.step(Inputs(bench.now, True, True, 1, requests=requests))
     assert [(answer.id, answer.success) for answer in out.answers] == [
         (1, True),
         (2, False),
@@ -1208,7 +1210,7 @@ def test_a_clear_in_the_same_step_as_a_stop_does_not_release_the_stop(
     bench.step(ask="stop")
     bench.now_ns += 10 * MS
     requests = tuple(Request(verb) for verb in order)
-    assert bench.robot.step(Inputs(bench.now, True, True, 1, requests=requests)).mode == "stopped"
+    assert bench.stepped.step(Inputs(bench.now, True, True, 1, requests=requests)).mode == "stopped"
 
 
 def test_a_service_that_is_called_continuously_causes_one_event_per_second() -> None:
@@ -1223,10 +1225,10 @@ def test_a_stop_that_arrives_before_its_query_and_with_it_is_one_event() -> None
         asked_ns = bench.now_ns
         ahead = Request("stop", asked_ns=asked_ns, by="joe (native)")
         bench.now_ns += 10 * MS
-        out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=(ahead,)))
+        out = bench.stepped.step(Inputs(bench.now, True, True, 1, requests=(ahead,)))
         batches = [out.events]
         bench.now_ns += 1500 * MS
-        out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=(replace(ahead, id=7),)))
+        out = bench.stepped.step(Inputs(bench.now, True, True, 1, requests=(replace(ahead, id=7),)))
         assert out.answers[0].success
         batches.append(out.events)
         stops = [event for events in batches for event in events if event.name == "stop"]
@@ -1252,7 +1254,7 @@ def test_a_refused_command_is_reported_with_its_reason_and_its_sender() -> None:
 def test_missed_periods_are_reported_with_their_number() -> None:
     bench = Bench().linked()
     bench.now_ns += 50 * MS
-    out = bench.robot.step(Inputs(bench.now, True, True, 1, missed=4))
+    out = bench.stepped.step(Inputs(bench.now, True, True, 1, missed=4))
     assert [(event.name, event.count) for event in out.events] == [("missed_periods", 4)]
     assert bench.counters()["missed_periods"] == 4
 
@@ -1262,7 +1264,7 @@ def test_a_speed_limit_applies_until_it_ends_and_each_change_is_an_event() -> No
 
     def cap(speed: float | None) -> list[str]:
         bench.now_ns += 10 * MS
-        bench.out = bench.robot.step(
+        bench.out = bench.stepped.step(
             Inputs(
                 bench.now, True, True, 1, received=(Received(bench.now, bench.codec.stop),),
                 commands=(Command("app", GO, bench.now_ns),), speed_cap=SpeedCap(speed, "joe"),
@@ -1289,7 +1291,7 @@ def test_events_from_outside_the_robot_come_first_and_are_throttled() -> None:
     lost = Event("port_lost", "it is gone", "warning")
     for _ in range(1000):
         bench.now_ns += 10 * MS
-        events += bench.robot.step(Inputs(bench.now, True, True, 1, events=(lost,))).events
+        events += bench.stepped.step(Inputs(bench.now, True, True, 1, events=(lost,))).events
     assert events[0] == lost
     lines = [event for event in events if event.name == "port_lost"]
     assert len(lines) <= 15
@@ -1608,7 +1610,7 @@ def test_a_flood_of_bytes_faster_than_the_wire_raises_no_error() -> None:
 
     Many reads have the same time, so the host cannot estimate the board's clock from them.
     """
-    robot = Robot(Config())
+    robot = SteppedRobot(Robot(Config()))
     good = b"a0.00,b0.00,c0.00,d0.00\r\n"
     for n in range(2000):
         odd, after = n % 12 == 0, n % 12 == 1
@@ -1685,7 +1687,7 @@ def test_an_invalid_setting_is_refused_and_changes_nothing() -> None:
     before = bench.robot.config
     settings: dict[str, Plain] = {"limits.linear_speed": -1.0}
     request = Request("set", 7, settings=settings)
-    outputs = bench.robot.step(Inputs(bench.now, True, True, bench.opened, requests=(request,)))
+    outputs = bench.stepped.step(Inputs(bench.now, True, True, bench.opened, requests=(request,)))
     assert not outputs.answers[0].success
     assert "limits.linear_speed" in outputs.answers[0].message
     assert bench.robot.config is before
@@ -1717,10 +1719,10 @@ def test_a_refused_message_disarms_only_the_zeros_before_it(refused_ms: int, mod
             commands=(Command("app", REST, zero_ns + MS, shared=True),) if number == 0 else (),
             refusals=(refused,) if number == refused_ms // 10 else (),
         )  # fmt: skip
-        bench.out = bench.robot.step(inputs)
+        bench.out = bench.stepped.step(inputs)
     bench.now_ns += 10 * MS
     command = Command("app", GO, bench.now_ns, shared=True)
-    bench.out = bench.robot.step(
+    bench.out = bench.stepped.step(
         Inputs(bench.now, True, True, bench.opened, commands=(command,),
                received=(Received(bench.now, bench.codec.stop),))
     )  # fmt: skip
@@ -1754,5 +1756,5 @@ def test_lines_that_are_not_answered_are_reported() -> None:
 def test_stamps_that_a_router_replaced_are_counted() -> None:
     bench = Bench().linked()
     command = Command("app", REST, bench.now_ns, stamp_replaced=True)
-    bench.robot.step(Inputs(bench.now, True, True, bench.opened, commands=(command,)))
+    bench.stepped.step(Inputs(bench.now, True, True, bench.opened, commands=(command,)))
     assert bench.counters()["stamps_replaced"] == 1

@@ -31,7 +31,7 @@ from acsard.core.config.settings import (
     McuConfig,
     Source,
 )
-from acsard.core.guard import Guard, Trip
+from acsard.core.guard import Guard
 from acsard.core.link.sample_time import MAX_FILLED_GAP_S
 from acsard.core.motion.arbiter_text import waiting
 from acsard.core.motion.odometry import MAX_RECOMPUTED_LINES
@@ -50,9 +50,11 @@ from acsard.core.values import (
     Pose,
     Received,
     Request,
+    Trip,
     Twist,
     Verb,
 )
+from acsard.recording.stepped_robot import SteppedRobot
 
 MS = 1_000_000
 WALL_NS = 1_800_000_000 * NS_PER_S
@@ -178,6 +180,7 @@ class RobotMachine(RuleBasedStateMachine):
     def start(self, config: Config, rolling: bool, latches: Latches = KEPT[0]) -> None:
         self.latches = latches
         self.robot = Robot(config, latches)
+        self.stepped = SteppedRobot(self.robot)
         self.config, self.limits = config, self.robot.config.limits
         self.guard = Guard(self.robot.session.codec.stop, self.robot.config)
         self.quiet_ns = round(NS_PER_S * max(0.1, 4 / config.rate_hz))
@@ -236,7 +239,7 @@ class RobotMachine(RuleBasedStateMachine):
             wall_ns = self.now_ns + WALL_NS
             zeros = [Command(name, REST, self.now_ns, wall_ns, name) for name in NAMES]
             now = Instant(self.now_ns, wall_ns)
-            self.robot.step(Inputs(now, tick=False, port_open=False, commands=tuple(zeros)))
+            self.stepped.step(Inputs(now, tick=False, port_open=False, commands=tuple(zeros)))
 
     # events
 
@@ -522,7 +525,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.broken = self.broken or (self.reported and not pressed) is True
         now = Instant(self.now_ns, self.now_ns + WALL_NS)
         commands, requests = tuple(self.commands), tuple(self.requests)
-        outputs = self.robot.step(
+        outputs = self.stepped.step(
             Inputs(
                 now=now,
                 tick=tick,

@@ -49,6 +49,7 @@ from acsard.recording.export import (
     wheel_columns,
 )
 from acsard.recording.mcap_file import Recording, RecordingWriter, Topic
+from acsard.recording.stepped_robot import SteppedRobot
 from acsard.recording.time_span import Span
 from tests.scenarios.taped import BATCH, Tape, chunks, recorded_world
 from tests.scenarios.world import START
@@ -442,7 +443,7 @@ def test_an_export_does_not_compare_the_end_record_with_the_events(
 
 
 def test_the_table_has_a_row_for_each_feedback_line_and_each_gyro_sample(tape: Tape) -> None:
-    robot = Robot(GYRO)
+    robot = SteppedRobot(Robot(GYRO))
     lines: list[str] = []
     for step in tape.steps():
         lines += csv_rows(step, robot.step(step.inputs))
@@ -458,7 +459,7 @@ def test_the_table_has_a_row_for_each_feedback_line_and_each_gyro_sample(tape: T
 def test_calibration_reads_the_same_from_the_whole_table_and_from_the_measured_columns(
     tape: Tape,
 ) -> None:
-    robot, twin = Robot(GYRO), Robot(GYRO)
+    robot, twin = SteppedRobot(Robot(GYRO)), SteppedRobot(Robot(GYRO))
     whole, part = [CSV_HEADER], [MEASURED_CSV_HEADER]
     for step in tape.steps():
         whole += csv_rows(step, robot.step(step.inputs))

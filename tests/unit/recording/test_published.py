@@ -12,14 +12,15 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.schema import Time
 from acsard.core.robot import Robot
 from acsard.recording.published import MEASURED_ROWS, Published, Publisher
+from acsard.recording.stepped_robot import SteppedRobot
 from acsard.recording.timeline import TimelineWriter
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 
 
 def published_messages(tape: Tape, config: Config) -> list[Published]:
-    robot = Robot(config)
-    publisher = Publisher(robot, START.wall_ns)
+    robot = SteppedRobot(Robot(config))
+    publisher = Publisher(robot.robot, START.wall_ns)
     return [m for step in tape.steps() for m in publisher.step(step, robot.step(step.inputs))]
 
 
@@ -94,8 +95,8 @@ def test_the_log_has_the_same_lines_as_the_timeline() -> None:
 
 
 def test_the_lines_after_the_last_step_have_the_drive_and_the_ending() -> None:
-    tape, robot = driven(), Robot(Config())
-    publisher = Publisher(robot, START.wall_ns)
+    tape, robot = driven(), SteppedRobot(Robot(Config()))
+    publisher = Publisher(robot.robot, START.wall_ns)
     for step in tape.steps():
         list(publisher.step(step, robot.step(step.inputs)))
     drive, cut = [line.message for line in publisher.end("the disk accepted no more data")]

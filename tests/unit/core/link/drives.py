@@ -207,7 +207,9 @@ class Host:
         self.now = at
         now = _instant(at)
         self._update(now, ())
-        return self.session.line(now.mono_ns, ROLLING) is not None
+        line = self.session.line(now.mono_ns, ROLLING)
+        self.session.sent(now.mono_ns, was_written=True)
+        return line is not None
 
     def read(self, at: float, data: bytes) -> None:
         """Let the host read these bytes piece by piece, as an adapter delivers them."""

@@ -34,7 +34,7 @@ class Bench:
         self, mcu: McuConfig | None = None, rate_hz: float = 100.0, longest_reply: float = 0.25
     ) -> None:
         self.session = McuSession(mcu or McuConfig(), rate_hz, longest_reply=longest_reply)
-        self.now_ns = 1000 * MS
+        self.now_ns = self.made_ns = 1000 * MS
         self.opened = 0
         self.port_open = False
 
@@ -46,6 +46,7 @@ class Bench:
         return self.session.link
 
     def line(self, speeds: WheelSpeeds = SLOW) -> bytes | None:
+        self.made_ns = self.now_ns
         return self.session.line(self.now_ns, speeds)
 
     def answer(self, line: bytes | None) -> bytes:
@@ -87,6 +88,7 @@ class Bench:
         """Let `ms` pass, then update the session with the bytes that were read just now."""
         self.now_ns += int(ms * MS)
         received = tuple(Received(self.now, data) for data in reads)
+        self.session.sent(self.made_ns, was_written=True)
         return self.session.update(self.now, self.port_open, self.opened, received)
 
     def happen(self, port: str, ms: float, data: bytes) -> None:
@@ -752,7 +754,8 @@ def update(bench: Bench, *, left: bool, ms: float = 10, read: bytes = GOOD) -> N
     """Let time pass, then update the session. `left` says whether the port sent the last line."""
     bench.now_ns += int(ms * MS)
     received = (Received(bench.now, read),) if read else ()
-    bench.session.update(bench.now, bench.port_open, bench.opened, received, unsent=not left)
+    bench.session.sent(bench.made_ns, was_written=left)
+    bench.session.update(bench.now, bench.port_open, bench.opened, received)
 
 
 def blocked(bench: Bench, ms: float) -> Bench:
