@@ -259,9 +259,8 @@ class ControlLoop:
         self._handover.take_stops(self._handover.latches, _stops(self._bus.take(0)), now)
 
     def _adopt(self, config: Config, answers: tuple[Answer, ...]) -> None:
-        self._config = self._queries.config = config
+        self._config = self._queries.config = self.report.config = config
         self._guard.use(config)
-        self.report.use(config)
         for answer in answers:
             for key, (old, new) in answer.changes.items():
                 earlier = self._differing.pop(key, None)

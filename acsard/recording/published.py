@@ -62,7 +62,7 @@ class Publisher:
         # A step that changes a setting gives the robot a new configuration.
         if self.robot.config is not self._config:
             self._config = self.robot.config
-            self._report.use(self._config)
+            self._report.config = self._config
             self._wanted = self._wanted_keys()
             self._static_due = True
         now = step.inputs.now

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from itertools import chain
 
-from acsard.core.config.settings import DIAGNOSTICS_HZ, Config
+from acsard.core.config.settings import DIAGNOSTICS_HZ, STATE_HZ, Config
 from acsard.core.messages.certificate_expiry import DAY_NS, expiry, first_expiry
 from acsard.core.messages.covariances import UNKNOWN_COVARIANCE, pose_covariance, twist_covariance
 from acsard.core.messages.diagnostics import diagnostics
@@ -61,6 +61,9 @@ from acsard.core.values import Twist as BodyTwist
 
 GetSnapshot = Callable[[], Snapshot]
 
+# Returns None if there is no message now.
+BuildSummary = Callable[[Outputs, Snapshot], Message | None]
+
 UNKNOWN_STATUS, CHARGING, DISCHARGING, NOT_CHARGING = range(4)  # `Battery.power_supply_status`
 
 
@@ -71,21 +74,18 @@ NEVER_NS = -(1 << 62)
 
 
 class _Rate:
-    # Messages of one key; 0 Hz is no limit.
+    # Messages of one key. A change of its rate must not make one due, so the last one counts.
     def __init__(self) -> None:
-        self._period_ns = 0
         self._last_ns = NEVER_NS
 
-    def use(self, hz: float) -> None:
-        self._period_ns = int(NS_PER_S / hz) if hz else 0
-
-    def due(self, now_ns: Ns, at_once: bool = False) -> bool:
-        # Allow a twentieth of the period as grace. Otherwise a step that is a microsecond early
-        # would wait for the next period.
-        next_ns = self._last_ns + self._period_ns
-        if not at_once and now_ns < next_ns - self._period_ns // 20:
+    def due(self, now_ns: Ns, hz: float, at_once: bool = False) -> bool:
+        # 0 Hz is no limit. Allow a twentieth of the period as grace. Otherwise a step that is a
+        # microsecond early would wait for the next period.
+        period_ns = int(NS_PER_S / hz) if hz else 0
+        next_ns = self._last_ns + period_ns
+        if not at_once and now_ns < next_ns - period_ns // 20:
             return False
-        behind = at_once or now_ns - next_ns > self._period_ns
+        behind = at_once or now_ns - next_ns > period_ns
         self._last_ns = now_ns if behind else next_ns
         return True
 
@@ -113,28 +113,15 @@ class Report:
             FeedbackTopic("tf", self._tf, tf_numbers),
             FeedbackTopic("wheel_states", self._wheel_states, wheel_states_numbers),
         )
-        # Builders by key, at their own rate and with `status_changed`. None: there is no message
-        # now.
-        self._summaries: dict[str, Callable[[Outputs, Snapshot], Message | None]] = {
-            "state": self._state,
-            "diagnostics": self._diagnostics,
-            "battery": self._battery,
+        # Builders by key, with their highest rate, Hz; also due with `status_changed`.
+        self._summaries: dict[str, tuple[BuildSummary, float]] = {
+            "state": (self._state, STATE_HZ),
+            "diagnostics": (self._diagnostics, DIAGNOSTICS_HZ),
+            "battery": (self._battery, BATTERY_HZ),
         }
         limited = ("odom", "wheel_states", "cmd_vel_out", *self._summaries)
         self._rates = {key: _Rate() for key in limited}
-        self.use(config)
-
-    def use(self, config: Config) -> None:
-        """Use other rates and frames from the next message on."""
-        self._config = config
-        rates = config.rates
-        # A change must not make messages due, so each `_Rate` remembers its last message.
-        self._rates["odom"].use(rates.odom)
-        self._rates["wheel_states"].use(rates.telemetry)
-        self._rates["cmd_vel_out"].use(rates.telemetry)
-        self._rates["state"].use(rates.state_hz)
-        self._rates["diagnostics"].use(rates.at_most(DIAGNOSTICS_HZ))
-        self._rates["battery"].use(rates.at_most(BATTERY_HZ))
+        self.config = config  # in force
 
     def due(
         self, outputs: Outputs, wanted: Collection[str], get_snapshot: GetSnapshot
@@ -153,13 +140,14 @@ class Report:
     def feedback_due(self, estimate: Estimate, wanted: Collection[str]) -> list[FeedbackTopic]:
         """Return the topics on which a message of this feedback line is to be published."""
         odom, tf, wheel_states = self._feedback
+        rates = self.config.rates
         due, at_ns = list[FeedbackTopic](), estimate.at.mono_ns
-        if ("odom" in wanted or "tf" in wanted) and self._rates["odom"].due(at_ns):
+        if ("odom" in wanted or "tf" in wanted) and self._rates["odom"].due(at_ns, rates.odom):
             if "odom" in wanted:
                 due.append(odom)
-            if "tf" in wanted and self._config.odometry.publish_tf:
+            if "tf" in wanted and self.config.odometry.publish_tf:
                 due.append(tf)
-        if "wheel_states" in wanted and self._rates["wheel_states"].due(at_ns):
+        if "wheel_states" in wanted and self._rates["wheel_states"].due(at_ns, rates.telemetry):
             due.append(wheel_states)
         return due
 
@@ -184,13 +172,14 @@ class Report:
     def _others_due(
         self, outputs: Outputs, wanted: Collection[str], get_snapshot: GetSnapshot
     ) -> Iterator[tuple[str, Message]]:
-        now_ns = outputs.now.mono_ns
-        if outputs.due and "cmd_vel_out" in wanted and self._rates["cmd_vel_out"].due(now_ns):
+        now_ns, rates, telemetry = outputs.now.mono_ns, self._rates, self.config.rates.telemetry
+        if outputs.due and "cmd_vel_out" in wanted and rates["cmd_vel_out"].due(now_ns, telemetry):
             yield "cmd_vel_out", self._cmd_vel_out(outputs)
         if outputs.events and "events" in wanted and (events_message := self._happened.message()):
             yield "events", events_message
-        for key, build in self._summaries.items():
-            if key in wanted and self._rates[key].due(now_ns, outputs.status_changed):
+        for key, (build, hz) in self._summaries.items():
+            most = self.config.rates.at_most(hz)
+            if key in wanted and rates[key].due(now_ns, most, outputs.status_changed):
                 message = build(outputs, get_snapshot())
                 if message is not None:
                     yield key, message
@@ -206,7 +195,7 @@ class Report:
                     self._odom(estimate, get_snapshot().measured is not None) if estimate else None
                 )
             case "tf":
-                return self._tf(estimate) if estimate and self._config.odometry.publish_tf else None
+                return self._tf(estimate) if estimate and self.config.odometry.publish_tf else None
             case "wheel_states":
                 return (
                     self._wheel_states(estimate, get_snapshot().speeds is not None)
@@ -218,22 +207,22 @@ class Report:
             case "events":
                 return self._happened.message()
             case _:
-                build = self._summaries.get(key)
-                return build(outputs, get_snapshot()) if build and outputs else None
+                summary = self._summaries.get(key)
+                return summary[0](outputs, get_snapshot()) if summary and outputs else None
 
     def tf_static(self) -> TFMessage:
         """Return the transform of the lidar, empty if it is switched off."""
-        lidar = self._config.lidar
+        lidar = self.config.lidar
         if not lidar.publish_tf:
             return TFMessage([])
-        base = Header(Time.from_ns(self._start.wall_ns), self._config.odometry.base_frame)
+        base = Header(Time.from_ns(self._start.wall_ns), self.config.odometry.base_frame)
         place = Vector3(lidar.lidar_x_offset, lidar.lidar_y_offset)
         pose = Transform(place, from_yaw(lidar.lidar_yaw))
         return TFMessage([TransformStamped(base, lidar.lidar_frame, pose)])
 
     def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
         # Not `live`: without feedback, the twist is 0 and of `UNKNOWN_COVARIANCE`.
-        frames, pose = self._config.odometry, estimate.pose
+        frames, pose = self.config.odometry, estimate.pose
         of_pose = pose_covariance(estimate.covariance)
         of_twist = twist_covariance(estimate.twist_variances) if live else UNKNOWN_COVARIANCE
         return Odometry(
@@ -244,7 +233,7 @@ class Report:
         )
 
     def _tf(self, estimate: Estimate) -> TFMessage:
-        frames, pose = self._config.odometry, estimate.pose
+        frames, pose = self.config.odometry, estimate.pose
         header = Header(Time.from_ns(estimate.at.wall_ns), frames.odom_frame)
         where = Transform(Vector3(pose.x, pose.y), from_yaw(pose.yaw))
         return TFMessage([TransformStamped(header, frames.base_frame, where)])
@@ -258,7 +247,7 @@ class Report:
         )
 
     def _cmd_vel_out(self, outputs: Outputs) -> TwistStamped:
-        header = Header(Time.from_ns(outputs.now.wall_ns), self._config.odometry.base_frame)
+        header = Header(Time.from_ns(outputs.now.wall_ns), self.config.odometry.base_frame)
         return TwistStamped(header, _twist(outputs.applied))
 
     def _state(self, outputs: Outputs, snapshot: Snapshot) -> RobotState:
@@ -308,7 +297,7 @@ class Report:
         )
 
     def _certificate_days(self, now: Instant) -> float | None:
-        if not (self._config.bus.tls and self.certificate_ends):
+        if not (self.config.bus.tls and self.certificate_ends):
             return None
         return round((first_expiry(self.certificate_ends)[1] - now.wall_ns) / DAY_NS, 2)
 
@@ -332,13 +321,13 @@ class Report:
         )
 
     def _certificate(self, now: Instant) -> tuple[str, str]:
-        if not self._config.bus.tls:
+        if not self.config.bus.tls:
             return "", ""
         return expiry(self.certificate_ends, now.wall_ns)
 
     def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
         certificate = self._certificate(outputs.now)
-        return diagnostics(self._config, outputs, snapshot, certificate)
+        return diagnostics(self.config, outputs, snapshot, certificate)
 
 
 def _summary(battery: BatteryStatus | None) -> BatterySummary | None:

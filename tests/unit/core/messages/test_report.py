@@ -482,7 +482,7 @@ def test_a_change_of_a_setting_makes_no_message_due(key: str, most: int) -> None
     config = rates(odom=20.0, telemetry=10.0)
     report, count = Report(config, START), 0
     for step in range(1000):
-        report.use(config)
+        report.config = config
         count += len(list(report.due(at(later(step / 100)), {key}, get_snapshot)))
     assert abs(count - 10 * most) <= 1
 
@@ -491,7 +491,7 @@ def test_a_new_rate_counts_from_the_last_message_on() -> None:
     report, steps = Report(rates(odom=1.0), START), []
     for step in range(200):
         if step == 30:
-            report.use(rates(odom=2.0))
+            report.config = rates(odom=2.0)
         if list(report.due(at(later(step / 100)), {"odom"}, get_snapshot)):
             steps.append(step)
     assert steps[0] == 0
