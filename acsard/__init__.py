@@ -19,7 +19,6 @@ Where to look: each package may import only the packages below it in this list.
 
     cli/             one file per subcommand: its options, a call into another package, output
     foxglove/        `acsard foxglove`: a live server for Foxglove
-    report/          `acsard recording report`: turns a recording into an HTML page
     top/             `acsard top`, `acsard drive` and `acsard fleet`: the robot in a terminal
     web/             `acsard web`: the robot's page, in a separate process
     calibration/     `acsard calibrate`: calibrates from a recorded drive or a new one
@@ -56,7 +55,6 @@ Inside `core/`, in the same order:
                      and the remedy
     core/values.py   the values in SI units: Instant, Twist, Pose, Command, Inputs, Outputs
     core/formatting.py  safe text, numbers, durations and counts for every message
-    core/thinning.py    reduces long curves and paths to a bounded number of points
 
 Three invariants hold, and each is tested:
 

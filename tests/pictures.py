@@ -18,12 +18,11 @@ from pathlib import Path
 
 from acsard.core.config.settings import Config
 from acsard.machine.authority import Authority
-from tests.scenarios.taped import drive_through_faults, happenings, recorded_world
+from tests.scenarios.taped import drive_through_faults, happenings, recorded_world, two_drivers
 from tests.system.browser import NAME, TRUSTING, Page
 from tests.system.camera_stream import Stream
 from tests.system.chromium import DESKTOP, PHONE, SIDEWAYS, Browser, browsing
 from tests.system.harness import PLAIN, Bus, Daemon, Peer, acsard, finish, until
-from tests.unit.report.driven import two_drivers
 
 VIEWS = ("drive", "status", "events", "set")
 
@@ -236,7 +235,7 @@ def states(on_state: Callable[[Browser, str], None]) -> None:
         screen.look_at_no_board()
 
 
-DRAWN = "document.querySelectorAll('.picture.js-plotly-plot .main-svg').length"
+DRAWN = "document.querySelectorAll('.js-plotly-plot:has(.main-svg)').length"
 
 
 def report(directory: Path) -> list[Path]:
@@ -252,7 +251,7 @@ def report(directory: Path) -> list[Path]:
         for size, look in itertools.product(("phone", "desktop"), LOOKS):
             browser.size(*SIZES[size], touch=size != "desktop", dark=look == "dark")
             browser.open(drawn.as_uri())
-            until(lambda: browser.js(DRAWN) >= 7, 30.0, "all pictures")
+            until(lambda: browser.js(DRAWN) == 2, 30.0, "all pictures")
             browser.js("new Promise(done => setTimeout(() => requestAnimationFrame(done), 500))")
             written.append(directory / f"report-{size}-{look}.png")
             browser.picture(written[-1], whole=True)

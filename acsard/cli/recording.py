@@ -31,7 +31,9 @@ from acsard.recording.directory import listed as recordings_in
 from acsard.recording.end_record import CRASH_CUTS, EndRecord, ending_text, read_end
 from acsard.recording.export import SUFFIX, Kind, export
 from acsard.recording.file_replay import config_of, replay_file, steps
+from acsard.recording.html_report import report
 from acsard.recording.mcap_file import UNFINISHED, Recording, is_part, rewrite
+from acsard.recording.published import published
 from acsard.recording.replay_text import (
     describe_difference,
     describe_gaps,
@@ -56,8 +58,9 @@ from acsard.recording.time_span import (
     span,
 )
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
-from acsard.report.page import make_report
 from acsard.terminal.output import show, table
+
+NOTHING_IN_SPAN = "no step of this recording is in that span of time; correct --from and --to"
 
 MAX_NAMES = 10  # recordings, and gaps, that a search prints
 
@@ -137,18 +140,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         description=EXPORT_DESCRIPTION,
     )
     exported.set_defaults(main=main_export)
-    report = actions.add_parser(
+    drawn = actions.add_parser(
         "report",
         help="draw the robot's path and speeds, the command sources, the serial link and the "
         "events of a recording, as one HTML file",
         description=REPORT_DESCRIPTION,
     )
-    report.set_defaults(main=main_report)
+    drawn.set_defaults(main=main_report)
     number = "the recording's number in the list of `acsard recording`"
     file = f"file of a recording, or {number} (default: the newest recording)"
     default = "the newest recording, or all if --from or --to is a date or a time"
     several = f"file of a recording, {number}, or `all` (default: {default})"
-    for action, words in ((view, several), (replay, file), (exported, several), (report, several)):
+    for action, words in ((view, several), (replay, file), (exported, several), (drawn, several)):
         action.add_argument("file", nargs="?", metavar="FILE", help=words)
     for action, name, default in (
         (
@@ -156,7 +159,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             "NEW",
             "the recording's name with the new format's suffix, in the working directory",
         ),
-        (report, "NEW.html", "FILE.html in the working directory"),
+        (drawn, "NEW.html", "FILE.html in the working directory"),
     ):
         words = f"file to write (default: {default})"
         action.add_argument("new", nargs="?", metavar=name, help=words)
@@ -167,15 +170,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             metavar="FILE",
             help="another acsard.toml to use instead of the recorded configuration",
         )
-    for action in (recover, exported, report):
+    for action in (recover, exported, drawn):
         action.add_argument("--force", action="store_true", help="overwrite an existing file")
-    for action in (view, exported, report):
+    for action in (view, exported, drawn):
         _times(action, argparse.SUPPRESS, f"{ALL_EXAMPLES} (not with FILE `all`)")
-    for action in (view, replay, recover, exported, report):
+    for action in (view, replay, recover, exported, drawn):
         _directory(action, argparse.SUPPRESS)
     # `replay` and `export` do not get this option. Their own option --config names a configuration
     # to try, and not the one that names the directory of the recordings.
-    for action in (view, recover, report):
+    for action in (view, recover, drawn):
         _own_config(action, argparse.SUPPRESS)
 
 
@@ -276,9 +279,7 @@ def _bracketed(text: str) -> str:
 def main_show(args: argparse.Namespace) -> int:
     for recording, part in _parts(args):
         if not _show(recording, part, args.json) and part != WHOLE_SPAN:
-            raise RecordingError(
-                f"{recording.path} has no step in that span of time: correct --from and --to"
-            )
+            raise RecordingError(f"{recording.path}: {NOTHING_IN_SPAN}")
         note = recording.missing_text
         if _is_being_recorded(recording):
             note = note.replace(UNFINISHED, "being recorded")
@@ -416,11 +417,14 @@ def main_report(args: argparse.Namespace) -> int:
     for recording, part in _files_to_write(args):
         new = Path(args.new or f"{recording.path.name.partition('.')[0]}.html")
         with _written(new), replacing(new, args.force) as file, _progress(recording) as tell:
-            text, notes = make_report(recording, part, tell)
+            messages = list(published(recording, part, tell))
+            if not messages:
+                raise RecordingError(f"{recording.path}: {NOTHING_IN_SPAN}")
+            notes = [recording.missing_text] if recording.missing_text else []
+            text = report(messages, recording.about.robot, notes)
             file.write_text(text, encoding="utf-8")
         print(f"{new}: {len(text) / 1e6:.1f} MB; open it in any browser")
-        for note in notes:
-            _note(recording, note)
+        _note(recording, _bracketed(recording.missing_text))
     return Exit.OK
 
 

@@ -21,7 +21,7 @@ from acsard.core.config.toml_text import document
 from acsard.core.formatting import printable
 from acsard.core.guard import Memory
 from acsard.core.robot import Robot
-from acsard.core.values import Ns, Outputs, WallNs
+from acsard.core.values import Ns, WallNs
 from acsard.host.errors import RecordingError
 from acsard.recording.end_record import read_end
 from acsard.recording.mcap_file import Recording, event_of
@@ -315,51 +315,6 @@ def _failed_step(recording: Recording, robot: SteppedRobot, last: int | None) ->
             f"{short(error)}"
         )
     return f"{name} does not fail in this version of acsard"
-
-
-class DisplayReplay(_Source):
-    """Replays every readable step, to display the recorded drive.
-
-    It does not skip steps after a gap, so the robot may be wrong until the next recorded state.
-    """
-
-    def __init__(self, recording: Recording) -> None:
-        # A state that cannot be used gives a note. Raises `RecordingError` for the configuration.
-        super().__init__(recording)
-        self.notes: list[str] = []  # possible differences to the recorded drive
-        self.config = config_of(recording)  # at the beginning
-        self._in_gap = False  # missing steps, until the next recorded state
-        try:
-            _, self._state = _first_state(recording)
-            with self.state_errors():
-                if self._state is not None:
-                    adopt(self._state.robot, Robot(self.config), Robot(self.config))
-                self.replay = Replay(*(self._state or (Robot(self.config),)))
-        except RecordingError as error:
-            self._state, self.replay = None, Replay(Robot(self.config))
-            self.notes.append(
-                "the recorded state of the robot cannot be used, so the replay begins with a robot "
-                f"that has just started, and may differ from the recorded drive: {error}"
-            )
-
-    def steps(self) -> Iterator[tuple[RecordedStep, Outputs, Robot]]:
-        """Yield each readable step, its outputs, and the robot. Raises `RecordingError`."""
-        number: int | None = None
-        for step, saved in _steps_and_states(self._recording):
-            if number is None and self._state is None and step.number > 0 and not self.notes:
-                self.notes.append(
-                    "the first steps of the recording are missing: the replay begins after them"
-                )
-            if number is not None and step.number != number + 1:
-                self._in_gap = True
-            number = step.number
-            if self._in_gap and (state := self._resumed(saved, number)) is not None:
-                self._state, self._in_gap = state, False
-                self.replay.resume(*state)
-            with self.state_errors():
-                self.replay.step(step)
-            if self.replay.outputs is not None:
-                yield step, self.replay.outputs, self.replay.robot
 
 
 def _first_state(recording: Recording) -> tuple[int, State | None]:

@@ -7,6 +7,7 @@ daemon's measurements of itself, which are not recorded. Messages on `log` are t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -19,7 +20,10 @@ from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG_CHANNEL, Channel, p
 from acsard.core.ros.shapes import LEVELS, Log, command_message
 from acsard.core.ros.transports import left_out
 from acsard.core.values import NS_PER_S, Command, Instant, Outputs, WallNs
+from acsard.recording.file_replay import PROGRESS_STEPS, Progress, RecordedRun, no_progress
+from acsard.recording.mcap_file import Recording
 from acsard.recording.recorded_steps import RecordedStep
+from acsard.recording.time_span import Span
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
 
 # Rows of `diagnostics` that are not recorded.
@@ -36,6 +40,29 @@ class Published(NamedTuple):
     source: str  # of a received command
     wall_ns: WallNs
     message: Any
+
+
+def published(
+    recording: Recording, span: Span, progress: Progress = no_progress
+) -> Iterator[Published]:
+    """Replay a recording, and yield the messages in a part of it. Raises `RecordingError`."""
+    run, about = RecordedRun(recording), recording.about
+    skipped: list[RecordedStep] = []
+    run.on_skipped = skipped.append
+    with run.state_errors():
+        publisher = Publisher(run.robot, about.started_ns or about.wall_ns)
+        for number, step in enumerate(run.steps()):
+            if number % PROGRESS_STEPS == 0:
+                progress(step.inputs.now.wall_ns)
+            messages = [message for late in skipped for message in publisher.skip(late)]
+            skipped.clear()
+            outputs = run.robot.step(step.inputs)
+            publisher.robot = run.robot
+            messages += publisher.step(step, outputs)
+            if span.begin <= (step.inputs.now.mono_ns - about.mono_ns) / NS_PER_S <= span.end:
+                yield from messages
+        if span.end == math.inf:
+            yield from publisher.end(recording.ending)
 
 
 class Publisher:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import math
+from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from typing import Any, TypeVar
@@ -18,7 +20,6 @@ from acsard.client.follower import Watch, restarted
 from acsard.core.config.settings import RatesConfig
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import Info, PoseStamped, RobotState, Twist, TwistStamped
-from acsard.core.thinning import Place, Track
 from acsard.core.values import NS_PER_S, Ns
 from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
@@ -36,7 +37,10 @@ RETRY_DELAY_S = 1.0
 ABOUT_PERIOD_S, ABOUT_RETRY_S = 10.0, 1.0
 
 # Of the drawn path: age and number of its points, and the least distance of two.
-PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.02
+PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.05
+
+# No robot drives so far between two states: its pose was set, and the path begins again.
+PATH_JUMP_M = 1.0
 
 T = TypeVar("T")
 
@@ -56,10 +60,28 @@ class About(Struct, frozen=True):
     timeouts: Mapping[str, float]  # of the command sources, s
 
 
-def _path() -> Track:
-    # The last argument, 1 m, is the longest step of a path. No robot drives 1 m between two states.
-    # So a longer step means that the pose was set, and the path restarts.
-    return Track(PATH_POINTS, PATH_STEP_M, PATH_S, 1.0)
+class PathHistory:
+    """The path of the last ten minutes."""
+
+    def __init__(self) -> None:
+        # Time, s, and position, m.
+        self._points = deque[tuple[float, float, float]](maxlen=PATH_POINTS)
+        self._last: tuple[float, float] | None = None
+
+    def add(self, t: float, x: float, y: float) -> None:
+        points, last = self._points, self._last
+        self._last = x, y
+        if last is not None and math.dist(last, (x, y)) > PATH_JUMP_M:
+            points.clear()
+        while points and t - points[0][0] > PATH_S:
+            points.popleft()
+        if not points or math.dist(points[-1][1:], (x, y)) >= PATH_STEP_M:
+            points.append((t, x, y))
+
+    def points(self) -> list[tuple[float, float]]:
+        """Return the points (x, y), m, in the order of time; the last is the newest position."""
+        places = [(x, y) for _, x, y in self._points] + ([self._last] if self._last else [])
+        return [(round(x, 3), round(y, 3)) for x, y in places]
 
 
 class _TaskQueries:
@@ -92,7 +114,7 @@ class FollowedRobot:
         # why the robot is not reachable, or ""
         self.gone = f"no daemon answers at {address.endpoint} yet"
         self._connect, self._counts = connect, counts
-        self._paths = {"path": _path(), "truth": _path()}
+        self._paths = {"path": PathHistory(), "truth": PathHistory()}
         self._minute = Minute()
         self._poses, self._wishes = Decoder(PoseStamped), Decoder(TwistStamped)
         self._refresh_requested = asyncio.Event()
@@ -130,10 +152,7 @@ class FollowedRobot:
 
         "path" is the path in the odom frame, and "truth" the true one of a simulated robot.
         """
-        return {
-            name: [(round(place.x, 3), round(place.y, 3)) for place in path.places()]
-            for name, path in self._paths.items()
-        }
+        return {name: path.points() for name, path in self._paths.items()}
 
     def minute(self) -> Plotted:
         return self._minute.plotted(clock.steady_ns())
@@ -190,8 +209,8 @@ class FollowedRobot:
 
     def _take(self, before: RobotState | None, state: RobotState, now_ns: Ns) -> None:
         if restarted(before, state):
-            self._paths = {name: _path() for name in self._paths}
-        self._paths["path"].add(Place(now_ns / NS_PER_S, state.x, state.y, state.yaw))
+            self._paths = {name: PathHistory() for name in self._paths}
+        self._paths["path"].add(now_ns / NS_PER_S, state.x, state.y)
         if self._minute.due(now_ns):
             self._minute.add(now_ns, state, self._wished(now_ns))
 
@@ -218,7 +237,7 @@ class FollowedRobot:
             at = self._poses.decode(*raw).pose.position
         except DecodeError:
             return
-        self._paths["truth"].add(Place(now_ns / NS_PER_S, at.x, at.y, 0.0))
+        self._paths["truth"].add(now_ns / NS_PER_S, at.x, at.y)
 
     async def _ask_again_and_again(self) -> None:
         while True:

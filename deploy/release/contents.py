@@ -18,7 +18,7 @@ LOCK = ROOT / "deploy" / "systemd" / "requirements.lock"
 
 SBOM = "acsard.cdx.json"  # its name in the wheel
 
-PLOTLY = ROOT / "acsard" / "report" / "plotly-basic.min.js"
+PLOTLY = ROOT / "acsard" / "recording" / "plotly-basic.min.js"
 
 RUN, BUILD = "# To run acsard", "# To build acsard"  # the two parts of the lock
 

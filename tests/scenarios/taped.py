@@ -243,3 +243,16 @@ def happenings(world: World, dice: random.Random) -> None:
     world.run(1.0)
     world.call("deactivate")
     world.call("activate")
+
+
+def two_drivers(world: World) -> None:
+    """Drive with the source nav, then with teleop. Stop and clear."""
+    world.drive(0.5, 0.3, seconds=2.0, source="nav", hz=10.0)
+    for n in range(40):
+        world.send(0.5, 0.3, "nav")
+        world.send(-0.3 if n else 0.0, -0.8 if n else 0.0, "teleop")
+        world.run(0.05)
+    world.call("stop")
+    world.hold(0.3, seconds=0.5, source="teleop")
+    world.call("clear")
+    world.run(0.5)

@@ -13,13 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from acsard.report.page import PLOTLY, page
+from acsard.recording.html_report import report
 from tests import pictures
 from tests.pictures import LOOKS
 from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, browsing
 from tests.system.harness import until
-from tests.unit.report.driven import drive_of_two, report_from, report_of
-from tests.unit.report.test_page import EVIL, clock, evil_steps, origin
+from tests.unit.recording.test_html_report import drive_of_two, evil
 
 BROWSER = shutil.which("chromium")
 
@@ -39,10 +38,9 @@ QUIETLY = (
 def test_a_report_is_drawn_and_an_injected_script_does_not_run(tmp_path: Path) -> None:
     assert BROWSER is not None
     path = tmp_path / "evil.html"
-    evil = "<script>document.title = 'taken'</script>"
-    text = page(report_from(evil_steps()), origin(robot=evil + EVIL), PLOTLY.read_text(), clock)
+    script = "<script>document.title = 'taken'</script>"
     # If the escaping were missing somewhere, the policy would still block the script.
-    path.write_text(text.replace("<h1>", f"<h1>{evil}"), encoding="utf-8")
+    path.write_text(evil().replace("<h1>", f"<h1>{script}"), encoding="utf-8")
     done = subprocess.run(
         [
             BROWSER,
@@ -58,10 +56,10 @@ def test_a_report_is_drawn_and_an_injected_script_does_not_run(tmp_path: Path) -
         timeout=100,
     )
     drawn = done.stdout
-    assert len(re.findall(r'<div class="picture js-plotly-plot"', drawn)) == 7
+    assert len(re.findall(r'class="js-plotly-plot"', drawn)) == 2
     assert len(re.findall(r'<g class="trace bars"', drawn)) >= 3
     title, *_ = re.findall(r"<title>(.*?)</title>", drawn)  # the others are in the pictures
-    assert title.startswith("&lt;script&gt;document.title")
+    assert title.startswith("&lt;/script&gt;")
 
 
 WIDER = """[...document.querySelectorAll('body *')]
@@ -70,52 +68,45 @@ WIDER = """[...document.querySelectorAll('body *')]
     .filter(([, box]) => box.left < -0.5 || box.right > innerWidth + 0.5)
     .map(([name, box]) => [name, box.left, box.right])"""
 
-CUT = """[...document.querySelectorAll('.picture text')]
+CUT = """[...document.querySelectorAll('.js-plotly-plot text')]
     .filter(one => one.textContent.trim())
     .map(one => [one.textContent, one.getBoundingClientRect(),
-        one.closest('.picture').getBoundingClientRect()])
+        one.closest('.js-plotly-plot').getBoundingClientRect()])
     .filter(([, text, box]) => text.width > 0 && (text.left < box.left - 0.5
         || text.right > box.right + 0.5 || text.bottom > box.bottom + 0.5))
     .map(([name]) => name)"""
 
-DRAWN = "document.querySelectorAll('.picture.js-plotly-plot .main-svg').length"
+DRAWN = "document.querySelectorAll('.js-plotly-plot:has(.main-svg)').length"
 
 
 @pytest.mark.nightly
 def test_no_label_of_a_picture_is_cut_on_a_phone_also_after_it_is_turned(tmp_path: Path) -> None:
     path = tmp_path / "new.html"
-    # The labels of two seconds have tenths, and are the widest.
-    report, _ = report_of(lambda world: world.run(2.0))
-    path.write_text(page(report, origin(), PLOTLY.read_text(), clock), encoding="utf-8")
+    path.write_text(report(drive_of_two(), "acsar", []), encoding="utf-8")
     with browsing() as browser:
         browser.size(*PHONE)
         browser.open(path.as_uri())
-        until(lambda: browser.js(DRAWN) >= 7, 30.0, "all pictures")
+        until(lambda: browser.js(DRAWN) == 2, 30.0, "all pictures")
         for size in (PHONE, SIDEWAYS, PHONE):
             browser.size(*size)
-            drawn = f"document.querySelector('#loop .main-svg').clientWidth > {0.8 * size[0]}"
+            drawn = f"document.querySelector('#time .main-svg').clientWidth > {0.8 * size[0]}"
             fits = f"{drawn} && document.documentElement.scrollWidth <= {size[0]}"
             until(lambda fits=fits: browser.js(fits), 10.0, f"pictures for {size}")  # type: ignore[misc]
             browser.js("new Promise(done => setTimeout(() => requestAnimationFrame(done), 500))")
             assert browser.js("innerWidth") == size[0]
-            assert browser.js("document.querySelectorAll('.xtick text').length") >= 2 * 6
+            assert browser.js("document.querySelectorAll('.xtick text').length") >= 2
             assert browser.js(CUT) == [], size
 
 
 def test_plotly_knows_every_attribute_of_the_pictures(tmp_path: Path) -> None:
     path = tmp_path / "new.html"
-    course, _ = drive_of_two()
-    path.write_text(page(course, origin(), PLOTLY.read_text(), clock), encoding="utf-8")
+    path.write_text(report(drive_of_two(), "acsar", []), encoding="utf-8")
     with browsing() as browser:
         browser.open(path.as_uri())
-        until(lambda: browser.js(DRAWN) >= 7, 30.0, "all pictures")
-        # `Plotly.validate` does not know numbers in base64, although plotly draws them.
-        # "dynamic" is a time that it writes in another form, "unused" the grid of one diagram.
+        until(lambda: browser.js(DRAWN) == 2, 30.0, "all pictures")
         unknown = browser.js(
-            "JSON.parse(document.getElementById('pictures').textContent, "
-            "(_, value) => 'bdata' in Object(value) ? [1] : value)"
+            "JSON.parse(document.getElementById('pictures').textContent)"
             ".flatMap(one => Plotly.validate(one.data, one.layout) || [])"
-            ".filter(error => !['dynamic', 'unused'].includes(error.code))"
             ".map(error => error.msg)"
         )
         assert unknown == []
@@ -126,14 +117,13 @@ def test_no_part_of_a_report_is_wider_than_the_window_of_a_phone_or_a_desktop(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "new.html"
-    course, _ = drive_of_two()
-    long = origin(file=f"{'0' * 70}.mcap", robot="robot-" * 12)
-    path.write_text(page(course, long, PLOTLY.read_text(), clock), encoding="utf-8")
+    notes = [f"{'0' * 70}.mcap"]
+    path.write_text(report(drive_of_two(), "robot-" * 12, notes), encoding="utf-8")
     with browsing() as browser:
         for width, height in (DESKTOP, PHONE):
             browser.size(width, height, touch=width < 600)
             browser.open(path.as_uri())
-            until(lambda: browser.js(DRAWN) >= 7, 30.0, "all pictures")
+            until(lambda: browser.js(DRAWN) == 2, 30.0, "all pictures")
             assert browser.js("innerWidth") == width
             assert browser.js("document.documentElement.scrollWidth") <= width
             assert browser.js(WIDER) == []

@@ -9,7 +9,6 @@ import pickle
 import random
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import pytest
@@ -20,18 +19,17 @@ from acsard.core.config.settings import Config
 from acsard.core.guard import Memory
 from acsard.core.motion.freshness import Freshness
 from acsard.core.robot import Robot
-from acsard.core.thinning import Curve
 from acsard.core.values import NS_PER_S, REST, Command, Instant
 from acsard.host.errors import RecordingError
 from acsard.recording import file_replay
 from acsard.recording.export import export
-from acsard.recording.file_replay import DisplayReplay, replay_file
+from acsard.recording.file_replay import replay_file
 from acsard.recording.mcap_file import Recording, RecordingWriter
+from acsard.recording.published import published
 from acsard.recording.rows import encode
 from acsard.recording.state import PARTS, Checkpoint, State, StateError, adopt, freeze, thaw
+from acsard.recording.time_span import WHOLE_SPAN
 from acsard.recording.unpickling import MAX_BYTES, MAX_OPCODES
-from acsard.report import page
-from acsard.report.report_data import ReportData
 from tests.each import each
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
@@ -126,9 +124,6 @@ def test_attributes_that_an_older_robot_lacks_come_from_a_new_robot(tmp_path: Pa
             del side.late
 
     recording = of_older_code(tmp_path / "old.mcap", forget)
-    looked = DisplayReplay(recording)
-    assert len([*looked.steps()]) == looked.replay.comparison.steps > 100
-    assert looked.replay.comparison.same
     assert replay_file(recording).comparison.same
 
 
@@ -226,41 +221,6 @@ def test_a_wrong_part_of_a_state_behind_a_gap_is_reported_with_its_place(
         drawn(Recording(path))
 
 
-def say_many(counters: Any, name: str) -> None:
-    counters[name] = "many"
-
-
-READ_BY_REPORTS: dict[str, Callable[[Robot], None]] = {
-    "words for a count of commands": lambda robot: say_many(robot.counters, "command_stale"),
-    "words for a count of lines": lambda robot: say_many(robot.session.rejects, "checksum"),
-    "a number for the counts of lines": lambda robot: setattr(robot.session, "rejects", 5),
-}
-
-
-@pytest.mark.parametrize("how", READ_BY_REPORTS)
-def test_a_report_of_a_robot_with_a_wrong_counter_is_refused_with_a_message(
-    how: str, taped: Tape, tmp_path: Path
-) -> None:
-    robot, memory = thaw(taped.states[100])
-    READ_BY_REPORTS[how](robot)
-    spoilt = replace_state(taped, freeze(robot, memory))
-    spoilt.write(path := tmp_path / "spoilt.mcap", Config(), 100)
-    with pytest.raises(RecordingError, match="cannot read the robot state"):
-        page.make_report(Recording(path))
-
-
-def test_a_defect_of_the_report_is_not_reported_as_a_wrong_robot_state(
-    taped: Tape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        raise ZeroDivisionError
-
-    taped.write(path := tmp_path / "whole.mcap", Config(), 100)
-    monkeypatch.setattr(Curve, "add", fail)
-    with pytest.raises(ZeroDivisionError):
-        page.make_report(Recording(path))
-
-
 def replace_state(tape: Tape, state: bytes) -> Tape:
     """Return the recording of the same drive with this robot as its first state."""
     other = Tape()
@@ -270,12 +230,7 @@ def replace_state(tape: Tape, state: bytes) -> Tape:
 
 def drawn(recording: Recording) -> None:
     """Replay a recording as the drawing of a report does."""
-    looked = DisplayReplay(recording)
-    report = ReportData(looked.config, robot_errors=looked.state_errors)
-    for step, outputs, robot in looked.steps():
-        report.step(step, outputs, robot)
-    if looked.notes:
-        raise RecordingError(looked.notes[0])
+    list(published(recording, WHOLE_SPAN))
 
 
 @pytest.mark.slow
@@ -292,7 +247,7 @@ def test_a_missing_part_that_a_new_robot_lacks_too_gives_a_message(tmp_path: Pat
     with pytest.raises(RecordingError, match=words):
         replay_file(recording)
     with pytest.raises(RecordingError, match=words):
-        list(DisplayReplay(recording).steps())
+        drawn(recording)
     with pytest.raises(RecordingError, match=words):
         export(recording, tmp_path / "new.mcap", "mcap")
     assert [*tmp_path.iterdir()] == [recording.path]

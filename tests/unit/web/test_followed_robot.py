@@ -28,7 +28,14 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.threads import NoThreadError
 from acsard.web import followed_robot
-from acsard.web.followed_robot import PROCESS_PERIOD_S, About, FollowedRobot, _TaskQueries
+from acsard.web.followed_robot import (
+    PATH_POINTS,
+    PROCESS_PERIOD_S,
+    About,
+    FollowedRobot,
+    PathHistory,
+    _TaskQueries,
+)
 from acsard.web.metrics import Counts
 from tests.each import each
 from tests.unit.client.test_follower import UNREADABLE, Robot
@@ -224,3 +231,26 @@ async def test_the_page_learns_about_its_robot_although_a_thread_could_not_start
     assert not running.done()
     assert page.about.version == INFO.version
     running.cancel()
+
+
+def test_the_path_keeps_ten_minutes_a_bounded_number_of_points_and_the_newest_place() -> None:
+    path = PathHistory()
+    for n in range(30_000):
+        path.add(n / 10, n / 100, 0.0)
+    first, *_, last = path.points()
+    assert first == pytest.approx((240.0, 0.0), abs=0.1)
+    assert last == (299.99, 0.0)
+    for n in range(20_000):
+        path.add(3000 + n / 100, 300 + n / 10, 0.0)
+    assert len(path.points()) == PATH_POINTS + 1
+
+
+def test_the_path_begins_again_when_the_pose_is_set_and_is_a_point_while_the_robot_rests() -> None:
+    path = PathHistory()
+    assert path.points() == []
+    for n in range(10):
+        path.add(n / 10, 0.1 * n, 0.0)
+    for n in range(10):
+        path.add(1 + n / 10, 50.0, 2.0)
+    assert set(path.points()) == {(50.0, 2.0)}
+    assert len(path.points()) == 2
