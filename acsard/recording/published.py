@@ -56,7 +56,7 @@ def published(
                 progress(step.inputs.now.wall_ns)
             messages = [message for late in skipped for message in publisher.skip(late)]
             skipped.clear()
-            outputs = run.robot.step(step.inputs)
+            outputs = run.stepped.step(step.inputs)
             publisher.robot = run.robot
             messages += publisher.step(step, outputs)
             if span.begin <= (step.inputs.now.mono_ns - about.mono_ns) / NS_PER_S <= span.end:

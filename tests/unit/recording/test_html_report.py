@@ -27,6 +27,7 @@ from acsard.core.ros.shapes import LEVELS, Log, command_message
 from acsard.core.values import NS_PER_S, Twist
 from acsard.recording.html_report import MAX_EVENTS, MAX_ROWS, Rows, report
 from acsard.recording.published import Published, Publisher
+from acsard.recording.stepped_robot import SteppedRobot
 from tests.scenarios.taped import Tape, two_drivers
 from tests.scenarios.world import World
 
@@ -38,8 +39,8 @@ def drive_of_two() -> tuple[Published, ...]:
     """Return the messages of a drive with two sources."""
     tape = Tape()
     two_drivers(World(Config(), recorder=tape))
-    robot = Robot(Config())
-    publisher = Publisher(robot, 0)
+    robot = SteppedRobot(Robot(Config()))
+    publisher = Publisher(robot.robot, 0)
     return tuple(
         message
         for step in tape.steps()
