@@ -26,12 +26,12 @@ from acsard.core.formatting import json_line, listed, many, printable
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import Exit, ExitError, MendableError, RecordingError, UsageError
 from acsard.recording.atomic_output import replacing
-from acsard.recording.directory import is_being_recorded
-from acsard.recording.directory import listed as recordings_in
 from acsard.recording.end_record import CRASH_CUTS, EndRecord, ending_text, read_end
 from acsard.recording.export import SUFFIX, Kind, export
 from acsard.recording.file_replay import config_of, replay_file, steps
 from acsard.recording.html_report import report
+from acsard.recording.mcap_directory import is_being_recorded
+from acsard.recording.mcap_directory import listed as recordings_in
 from acsard.recording.mcap_file import UNFINISHED, Recording, is_part, rewrite
 from acsard.recording.published import published
 from acsard.recording.replay_text import (

@@ -56,7 +56,6 @@ MAX_FILE_BYTES = 1 << 28  # to be read; the recorder begins a new file long befo
 
 MAX_RECORD_BYTES = 1 << 24  # uncompressed; a second of driving takes 50 000
 
-# The window that compression looks back. 1 MB holds a frame, and 4 times as much saves 1 %.
 WINDOW_LOG = 20
 
 _PARAMETERS = zstandard.ZstdCompressionParameters.from_level(3, window_log=WINDOW_LOG)
@@ -164,9 +163,21 @@ class FrameWriter:
         self.add(head)
 
     def add(self, record: Record) -> None:
-        """Write a record so that it can be read from now on."""
+        """Write a record so that it can be read as soon as the file is flushed."""
+        self._add(_encode(record))
+
+    def add_steps(self, first: int, steps: Sequence[FinishedStep]) -> None:
+        """Write successive steps, as several records if one would be too large to be read."""
+        data = _encode(encode_steps(first, steps))
+        if len(data) > MAX_RECORD_BYTES and len(steps) > 1:
+            half = len(steps) // 2
+            self.add_steps(first, steps[:half])
+            self.add_steps(first + half, steps[half:])
+        else:
+            self._add(data)
+
+    def _add(self, data: bytes) -> None:
         assert self._compressor is not None
-        data = _encode(record)
         block = self._compressor.compress(_PREFIX.pack(len(data), zlib.crc32(data)) + data)
         self._file.write(block + self._compressor.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK))
 
@@ -373,8 +384,9 @@ def _skipped(data: bytes, at: int, begin_ns: WallNs, end_ns: WallNs) -> int | No
         return len(data) if head.wall_ns > end_ns else None
     last = _head(data, following)
     assert last is not None
-    earliest, latest = sorted((head.wall_ns, last.wall_ns))
-    return following if latest < begin_ns or earliest > end_ns else None
+    # A clock that was set back: the frame begins later than it ends.
+    over = head.wall_ns < last.wall_ns < begin_ns
+    return following if over or min(head.wall_ns, last.wall_ns) > end_ns else None
 
 
 def _recorded_steps(steps: Steps) -> Iterator[RecordedStep]:

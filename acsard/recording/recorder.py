@@ -1,41 +1,69 @@
 """The black box of a running daemon: records each step without delaying the control loop.
 
-Once a second a thread writes the queued steps to a file and syncs it. If the queue is full, steps
-are lost and counted, and the recording goes on in a new file with the robot's state.
+The loop appends each step to a bounded queue, which a thread writes to a file once a second: a kill
+of the daemon costs at most 1.5 s of the recording, a power cut 10 s. If the queue is full, or the
+disk refuses, steps are lost and counted, and the recording goes on with the robot's state.
 """
 
 from __future__ import annotations
 
+import errno
+import os
 import threading
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from typing import BinaryIO, NamedTuple
 
+from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
+from acsard.core.config.toml_text import document
 from acsard.core.formatting import many
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
-from acsard.core.values import NS_PER_S, Event, Inputs, Ns, Outputs, Recording, WallNs
-from acsard.recording.recorded_steps import FinishedStep, StateBeforeStep, StepRecorder, Unfinished
+from acsard.core.values import NS_PER_S, Event, Inputs, Instant, Ns, Outputs, Recording, WallNs
+from acsard.host.version import version
+from acsard.host.wait_timer import WaitTimer
+from acsard.recording.directory import RecordingDirectory
+from acsard.recording.file import Failure, FrameWriter, Head
+from acsard.recording.recorded_steps import FinishedStep, StepRecorder
 from acsard.recording.state import MAX_ERROR_LENGTH, freeze
-from acsard.recording.step_writer import Bug, StepWriter
 
 MAX_QUEUED_STEPS = 4096  # 10 s at 400 steps a second
 
-SLOW_SYNC_NS = 3 * NS_PER_S  # of a sync, after which the log reports that the disk hangs
+WRITE_PAUSE_S = 0.98  # between two writes: with one, about a second
+
+SYNC_NS = 10 * NS_PER_S  # between two syncs, at most
+
+# Between two heads. Damage costs this much, a head 15 kB, and the state in it 0.3 ms of the control
+# loop, after it has written its line.
+HEAD_NS = 20 * NS_PER_S
+
+FILE_NS = 3600 * NS_PER_S  # of one file
+
+CLOCK_JUMP_NS = NS_PER_S  # of the wall clock: a new file begins, by whose time it is found
+
+RETRY_ROUNDS = 5  # about 1 s each, after an error of the disk
+
+SLOW_DISK_NS = 3 * NS_PER_S  # of one write, after which the log reports that the disk hangs
 
 SLOW_DISK = "the disk has accepted no data for 3 s"
 
-SYNC_PAUSE_S = 0.98  # between two syncs: with one, about a second
-
-# Text for the log and `state`.
 ENDED = (
     "the recorder has ended because of an internal error, which is in the log: restart the daemon "
     "to record again"
 )
 
-# In `close()`: for the last steps and the end of the file, then for a marker.
-CLOSE_S, MARK_S = 0.5, 0.1
+CLOSE_S = 0.5  # for the last steps, when the daemon ends
+
+
+class Start(NamedTuple):
+    """The robot between two steps, for a `Head`."""
+
+    number: int  # of the next step
+    at: Instant
+    config: Config  # in force
+    state: bytes
 
 
 class Recorder(StepRecorder):
@@ -44,86 +72,74 @@ class Recorder(StepRecorder):
     def __init__(
         self, config: Config, report: Callable[[Event], None], started_ns: WallNs = 0
     ) -> None:
-        # `report` runs in the thread of the control loop. An export stamps messages that never
-        # change with `started_ns`, the daemon's start.
-        self._queue: deque[FinishedStep | StateBeforeStep] = deque()
+        # `report` runs in the thread of the control loop.
         self._report = report
-        self._events: deque[Event] = deque()  # of the thread; each `step` reports one
+        self._queue: deque[FinishedStep | Start | Failure] = deque()
         self._number = 0  # of the next step
+        self._head_ns = 0  # when the next head is due
         self._lost = 0  # for a full queue
         self._full = False  # until half of the queue is free again
-        self._sync_ns = 0  # running sync at the last `step`, or 0
         self._slow = False  # a slow disk was reported
-        self._lost_before = 0  # `_lost` at that time
-        self._failed_inputs: Inputs | None = None  # of the step in which the daemon failed
-        # For a new file or a checkpoint. The thread sets it, and `step` after a full queue; `step`
-        # clears it.
-        self._wants_state = False
-        self._writer = StepWriter(config, self._events.append, self._request_state, started_ns)
+        self._waited_ns = self._lost_before = 0  # at the last step; `_lost` when the disk hung
+        self._failed: Inputs | None = None  # of the step in which the daemon failed
+        self._first = config, b""  # configuration and state before the first step
+        self._writer = _Writer(config, started_ns)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._work, name="record", daemon=True)
         self._thread.start()
 
-    # These methods run in the control loop's thread.
+    # The control loop calls these methods.
 
     def begins(self, robot: Robot, guard: Guard) -> None:
         # Without this call, a replay begins with a new robot and guard.
-        self._queue.append(StateBeforeStep(0, freeze(robot, guard.memory), robot.config))
+        self._first = robot.config, freeze(robot, guard.memory)
 
     def step(
         self, inputs: Inputs, outputs: Outputs, sent: bytes | None, robot: Robot, guard: Guard
     ) -> None:
+        now, writer, queue = inputs.now, self._writer, self._queue
+        if writer.events:
+            self._report(writer.events.popleft())
+        if self._number == 0:
+            self._head_ns = now.mono_ns + HEAD_NS
+            queue.append(Start(0, now, *self._first))
         self._number += 1
-        if self._events:
-            self._report(self._events.popleft())
-        self._enqueue(FinishedStep(inputs, outputs, sent), robot, guard)
-        self._watch_disk(inputs.now.mono_ns)
+        if len(queue) >= MAX_QUEUED_STEPS or self._full:
+            self._lose()
+        else:
+            queue.append(FinishedStep(inputs, outputs, sent))
+        if (writer.wants_head or now.mono_ns >= self._head_ns) and not self._full:
+            writer.wants_head, self._head_ns = False, now.mono_ns + HEAD_NS
+            queue.append(Start(self._number, now, robot.config, freeze(robot, guard.memory)))
+        self._watch_disk(now.mono_ns)
 
-    def _enqueue(self, step: FinishedStep, robot: Robot, guard: Guard) -> None:
-        queue = self._queue
-        if self._full:
-            self._lost += 1
-            if len(queue) > MAX_QUEUED_STEPS // 2:
-                return
-            self._full, self._wants_state = False, True
-        elif len(queue) >= MAX_QUEUED_STEPS:
-            self._hangs()
+    def _lose(self) -> None:
+        self._lost += 1
+        if not self._full:
             self._full = True
-            self._lost += 1
             cause = "the disk is too slow" if self._thread.is_alive() else "the recorder has ended"
             text = f"{cause}, so steps are missing in the recording"
             self._report(Event("recording", text, "warning"))
-            return
-        else:
-            queue.append(step)
-        if self._wants_state:
-            self._wants_state = False
-            queue.append(StateBeforeStep(self._number, freeze(robot, guard.memory), robot.config))
+        elif len(self._queue) <= MAX_QUEUED_STEPS // 2:
+            self._full, self._writer.wants_head = False, True
 
     def _watch_disk(self, now_ns: Ns) -> None:
-        timer = self._writer.sync_timer
-        ended, last_ns = timer.ended, self._sync_ns
-        self._sync_ns = timer.wait_ns(now_ns)
-        if self._slow and timer.ended != ended and last_ns <= SLOW_SYNC_NS:
-            self._slow = False
-            missing = many(self._lost - self._lost_before, "step is", "steps are")
-            self._report(
-                Event(
-                    "recording",
-                    f"the disk is fast enough again; {missing} missing in the recording",
-                )
-            )
-        elif self._sync_ns > SLOW_SYNC_NS and not self._slow:
-            self._hangs()
-            self._report(Event("recording", f"{SLOW_DISK}; driving goes on", "warning"))
-
-    def _hangs(self) -> None:
-        if not self._slow:
+        timer, waited_ns = self._writer.timer, self._waited_ns
+        ended = timer.ended
+        self._waited_ns = timer.wait_ns(now_ns)
+        if self._slow:
+            if timer.ended != ended and waited_ns <= SLOW_DISK_NS:
+                self._slow = False
+                missing = many(self._lost - self._lost_before, "step is", "steps are")
+                text = f"the disk is fast enough again; {missing} missing in the recording"
+                self._report(Event("recording", text))
+        elif self._waited_ns > SLOW_DISK_NS:
             self._slow, self._lost_before = True, self._lost
+            self._report(Event("recording", f"{SLOW_DISK}; driving goes on", "warning"))
 
     def died(self, inputs: Inputs) -> None:
         # Recorded by `close`.
-        self._failed_inputs = inputs
+        self._failed = inputs
 
     @property
     def status(self) -> Recording:
@@ -135,53 +151,193 @@ class Recorder(StepRecorder):
         return Recording(self._writer.where, trouble, self._lost + self._writer.lost)
 
     def close(self, error: BaseException | None = None) -> None:
-        """Write the last steps and the end of the file within `CLOSE_S`.
-
-        If the disk is slower and the daemon has not failed, create a marker within `MARK_S`. Only
-        an `Exception` (the first of a group) is a failure.
-        """
+        """Write the last steps within `CLOSE_S`, and the failure if `error` is an `Exception`."""
         while isinstance(error, BaseExceptionGroup):
             error = error.exceptions[0]
         if isinstance(error, Exception):
-            self._writer.bug = self._bug(error)
+            why = type(error).__name__
+            # Python may fail to produce the text of an exception. Then only its type is recorded.
+            with suppress(Exception):
+                why = f"{why}: {error}"[:MAX_ERROR_LENGTH].encode(errors="replace").decode()
+            if self._number == 0 and self._failed is not None:
+                self._queue.append(Start(0, self._failed.now, *self._first))
+            self._queue.append(Failure(self._number, why, self._failed))
         self._over.set()
         self._thread.join(CLOSE_S)
-        while self._events:
-            self._report(self._events.popleft())
-        if self._thread.is_alive() and self._writer.bug is None:
-            # A hanging disk may delay the marker too, but must not delay the end of the daemon.
-            marking = threading.Thread(target=self._writer.mark_cut, args=["late"], daemon=True)
-            marking.start()
-            marking.join(MARK_S)
+        while self._writer.events:
+            self._report(self._writer.events.popleft())
 
-    def _bug(self, error: Exception) -> Bug:
-        why = type(error).__name__
-        # Python may fail to produce the text of an exception. Then only its type is recorded.
-        with suppress(Exception):
-            why = f"{why}: {error}"[:MAX_ERROR_LENGTH].encode(errors="replace").decode()
-        if self._failed_inputs is None:
-            return Bug(why, None, b"")
-        number, data = self._number, b""
-        # The input that made the step fail may also be impossible to encode.
-        with suppress(Exception):
-            data = Unfinished(number, self._failed_inputs).encode()
-        return Bug(f"in step {number}, {why}", self._failed_inputs.now, data)
-
-    # These methods run in the recorder's thread.
-
-    def _request_state(self) -> None:
-        self._wants_state = True
+    # The thread.
 
     def _work(self) -> None:
         over = False
         while not over:
-            over = self._over.wait(SYNC_PAUSE_S)
+            over = self._over.wait(WRITE_PAUSE_S)
             try:
-                self._writer.write(self._take_queue(), over)
+                queue = self._queue
+                self._writer.write([queue.popleft() for _ in range(len(queue))], over)
             except Exception:
-                self._events.append(Event("recording", ENDED, "error"))
+                self._writer.events.append(Event("recording", ENDED, "error"))
                 raise
 
-    def _take_queue(self) -> list[FinishedStep | StateBeforeStep]:
-        queue = self._queue
-        return [queue.popleft() for _ in range(len(queue))]
+
+class _Writer:
+    # The part of the recorder that runs in its thread.
+
+    def __init__(self, config: Config, started_ns: WallNs) -> None:
+        self.events: deque[Event] = deque()  # for the control loop to report
+        self.wants_head = False  # the control loop clears it
+        self.where = config.record.directory
+        self.trouble = ""  # the present error of the disk, in words
+        self.lost = 0  # steps, for errors of the disk
+        self.timer = WaitTimer()  # of a write
+        self._robot, self._started_ns = config.robot.id, started_ns
+        self._directory = RecordingDirectory(config.record)
+        self._file: BinaryIO | None = None
+        self._frames: FrameWriter | None = None  # into `_file`
+        self._ends = False  # the file, at the next head
+        self._number = 0  # of the next step
+        self._began_ns = self._synced_ns = 0  # of the file
+        self._last: Instant | None = None  # step in the file
+        self._has_steps = False  # the file, as far as the disk has accepted them
+        self._pause = 0  # calls that still write nothing
+        self._records = False  # it was reported
+        self._lost_before = 0  # when the disk began to refuse
+        self._text = config, _text(config)  # of the last head
+
+    def write(self, items: list[FinishedStep | Start | Failure], over: bool) -> None:
+        """Write the items of the recorder's queue. The last call ends the file."""
+        steps, written = sum(isinstance(item, FinishedStep) for item in items), 0
+        if self._pause and not over:
+            self._pause -= 1
+        else:
+            self.timer.begin()
+            try:
+                written = self._write(items)
+                self._flush()
+                if over:
+                    self._end()
+            except OSError as error:
+                written = 0
+                self._refuse(error)
+            finally:
+                self.timer.end()
+        self.lost += steps - written
+        if written:
+            self._report_success()
+        elif steps and self._frames is None and not self._pause:
+            self.wants_head = True
+
+    def _write(self, items: list[FinishedStep | Start | Failure]) -> int:
+        # Returns the number of steps that were written: those that follow a head.
+        steps: list[FinishedStep] = []
+        written = 0
+        for item in items:
+            if isinstance(item, FinishedStep):
+                steps.append(item)
+                continue
+            written += self._add(steps)
+            steps = []
+            if isinstance(item, Start):
+                self._begin(item)
+            elif self._frames is not None:
+                _add_failure(self._frames, item)
+        return written + self._add(steps)
+
+    def _add(self, steps: list[FinishedStep]) -> int:
+        if not steps or self._frames is None:
+            return 0
+        self._frames.add_steps(self._number, steps)
+        self._number += len(steps)
+        last, now = self._last, steps[-1].inputs.now
+        if last is not None and abs(_ahead_ns(now) - _ahead_ns(last)) > CLOCK_JUMP_NS:
+            self._ends = self.wants_head = True
+        self._last = now
+        return len(steps)
+
+    def _begin(self, start: Start) -> None:
+        if self._ends:
+            self._end()
+        if self._frames is None:
+            self._file = self._directory.begin(start.at.wall_ns)
+            self._frames, self._last, self._has_steps = FrameWriter(self._file), None, False
+            self._began_ns = self._synced_ns = start.at.mono_ns
+            self._make_room()
+        if start.config is not self._text[0]:
+            self._text = start.config, _text(start.config)
+        robot, (mono_ns, wall_ns) = self._robot, (start.at.mono_ns, start.at.wall_ns)
+        begin = version(), robot, start.number, mono_ns, wall_ns
+        self._frames.begin(Head(*begin, self._text[1], start.state, self._started_ns))
+        self._number = start.number
+
+    def _make_room(self) -> None:
+        if text := self._directory.make_room():
+            self.events.append(Event("recording", text, "warning"))
+
+    def _flush(self) -> None:
+        if self._file is None or self._last is None:
+            return
+        self._file.flush()
+        # The disk also accepts data for a deleted file, but this data is lost.
+        if not os.fstat(self._file.fileno()).st_nlink:
+            raise FileNotFoundError(errno.ENOENT, "the file that is being recorded was removed")
+        self._has_steps = True
+        now_ns = self._last.mono_ns
+        if now_ns - self._synced_ns > SYNC_NS:
+            os.fsync(self._file.fileno())
+            self._synced_ns = now_ns
+            self._make_room()
+            is_large = self._file.tell() > self._directory.file_bytes
+            if is_large or now_ns - self._began_ns > FILE_NS:
+                self._ends = self.wants_head = True
+
+    def _report_success(self) -> None:
+        if self._records and not self.trouble:
+            return
+        since = ""
+        if self.trouble:
+            missing = many(self.lost - self._lost_before, "step is", "steps are")
+            # The disk also refused the event that gave the reason, so repeat the reason here.
+            since = f" again; {missing} missing (the error was: {self.trouble})"
+        self._records, self.trouble = True, ""
+        self.events.append(Event("recording", f"the daemon records to {self.where}{since}"))
+
+    def _end(self) -> None:
+        if self._file is not None and self._frames is not None:
+            self._frames.end()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+        self._file, self._frames, self._ends = None, None, False
+
+    def _refuse(self, error: OSError) -> None:
+        text = f"{self.where}: {error.strerror or error}"
+        if not self.trouble:
+            self._lost_before = self.lost
+        if text != self.trouble:
+            self.trouble = text
+            self.events.append(Event("recording", f"{text}; driving goes on", "warning"))
+        if self._file is not None:
+            with suppress(OSError):
+                self._file.close()
+            if not self._has_steps:
+                with suppress(OSError):
+                    os.unlink(self._file.name)
+        self._file, self._frames, self._ends = None, None, False
+        self._pause = RETRY_ROUNDS
+
+
+def _add_failure(frames: FrameWriter, failure: Failure) -> None:
+    try:
+        frames.add(failure)
+    except (TypeError, ValueError, OverflowError):
+        # The input that made the step fail may also be impossible to encode.
+        frames.add(Failure(failure.number, failure.why))
+
+
+def _text(config: Config) -> str:
+    return "\n".join(document(effective(config))) + "\n"
+
+
+def _ahead_ns(at: Instant) -> Ns:
+    return at.wall_ns - at.mono_ns

@@ -15,8 +15,8 @@ from msgspec import Struct, field
 
 from acsard.core.values import NS_PER_S, AcsardError
 from acsard.host.errors import RecordingError
-from acsard.recording.directory import listed, stem
 from acsard.recording.end_record import read_end
+from acsard.recording.mcap_directory import listed, stem
 from acsard.recording.mcap_file import Recording, Topic
 from acsard.recording.time_span import Contents, Span, clock, part_between, read_contents
 

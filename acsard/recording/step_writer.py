@@ -20,7 +20,7 @@ from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S, Event, Instant, Ns, WallNs
 from acsard.host.version import version
 from acsard.host.wait_timer import WaitTimer
-from acsard.recording.directory import RecordingDirectory, Run, disk_has_room, mark_cut
+from acsard.recording.mcap_directory import RecordingDirectory, Run, disk_has_room, mark_cut
 from acsard.recording.mcap_file import About, RecordingWriter
 from acsard.recording.mcap_records import MAX_DATA_BYTES
 from acsard.recording.recorded_steps import FinishedStep, StateBeforeStep, split_at_states

@@ -14,8 +14,8 @@ from msgspec import Meta, Struct
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.threads import in_thread
-from acsard.recording.directory import NAME_TIME_FORMAT, PART_SUFFIX, is_being_recorded, listed
 from acsard.recording.end_record import ending_text, read_end
+from acsard.recording.mcap_directory import NAME_TIME_FORMAT, PART_SUFFIX, is_being_recorded, listed
 from acsard.web.answers import READ_TIMEOUT_S, TroubleError
 from acsard.web.callers import RequestRefusedError, is_loopback
 from acsard.web.followed_robot import FollowedRobot

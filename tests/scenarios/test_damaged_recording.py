@@ -12,10 +12,10 @@ from acsard.cli import main
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import Exit
-from acsard.recording import recorder as module
+from acsard.recording import mcap_recorder as module
 from acsard.recording import step_writer
-from acsard.recording.directory import listed
 from acsard.recording.file_replay import EventCopies, RecordedRun, replay_file, steps
+from acsard.recording.mcap_directory import listed
 from acsard.recording.mcap_file import (
     CHANNEL_NUMBERS,
     Recording,
@@ -23,8 +23,8 @@ from acsard.recording.mcap_file import (
     event_of,
     rewrite,
 )
+from acsard.recording.mcap_recorder import Recorder
 from acsard.recording.mcap_records import walk
-from acsard.recording.recorder import Recorder
 from acsard.recording.series import Series
 from tests.each import each
 from tests.scenarios.taped import chunks, recorded_world

@@ -31,9 +31,9 @@ from acsard.core.incoming.queries import Query
 from acsard.core.simulator import protocol
 from acsard.core.values import NS_PER_S, BatteryLevel, Latch, Latches
 from acsard.host.errors import Exit
-from acsard.recording import recorder as module
-from acsard.recording.directory import listed
-from acsard.recording.recorder import Recorder
+from acsard.recording import mcap_recorder as module
+from acsard.recording.mcap_directory import listed
+from acsard.recording.mcap_recorder import Recorder
 from tests.scenarios.speakers import Speaker, over
 from tests.scenarios.taped import chunks
 from tests.scenarios.world import World

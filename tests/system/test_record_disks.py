@@ -18,8 +18,8 @@ from pathlib import Path
 import pytest
 
 from acsard.core.config.settings import RecordConfig
-from acsard.recording.directory import RecordingDirectory, Run
 from acsard.recording.end_record import read_end
+from acsard.recording.mcap_directory import RecordingDirectory, Run
 from acsard.recording.mcap_file import About, Recording, RecordingWriter
 from acsard.recording.recovery import recover
 from acsard.recording.step_writer import INCIDENTS

@@ -17,7 +17,7 @@ from acsard.cli.recording import SERVICE_DIRECTORY
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.values import NS_PER_S, Event
 from acsard.host.errors import Exit
-from acsard.recording.directory import RecordingDirectory
+from acsard.recording.mcap_directory import RecordingDirectory
 from acsard.recording.mcap_file import About, Recording, RecordingWriter
 from acsard.recording.recorded_steps import FinishedStep, Unfinished
 from acsard.recording.recovery import recover

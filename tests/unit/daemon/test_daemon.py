@@ -17,7 +17,7 @@ from acsard.daemon.daemon import Departure, _control, _recorder
 from acsard.daemon.wakeup import Wakeup
 from acsard.host.logs import Log
 from acsard.host.systemd import Systemd
-from acsard.recording import recorder
+from acsard.recording import mcap_recorder as recorder
 from acsard.recording.end_record import read_end
 from tests.scenarios.world import World
 

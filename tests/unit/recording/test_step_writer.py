@@ -12,8 +12,8 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.values import Event, Received
-from acsard.recording.directory import listed
 from acsard.recording.file_replay import steps
+from acsard.recording.mcap_directory import listed
 from acsard.recording.mcap_file import Recording
 from acsard.recording.mcap_records import MAX_MESSAGE_BYTES
 from acsard.recording.step_writer import MAX_BATCH_STEPS, RETRY_ROUNDS, StepWriter
