@@ -37,7 +37,7 @@ from acsard.core.motion.emergency_stop import (
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.lifecycle import Lifecycle
-from acsard.core.motion.limits import Limiter, State
+from acsard.core.motion.limits import AT_REST, Motion
 from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
@@ -99,7 +99,7 @@ MAX_REFUSAL_LENGTH = 200  # characters in `state`: the text may quote the messag
 
 class _Line(NamedTuple):
     # A line that `sent` has not confirmed yet.
-    state: State  # of the limiter
+    motion: Motion
     speeds: WheelSpeeds
     tick: bool  # of a control period, not between two of them
 
@@ -121,7 +121,7 @@ class Robot:
             self.session.quiet_ns / NS_PER_S,
         )
         self._arbiter = Arbiter(config.commands)
-        self._limiter = Limiter(config.limits, self._kinematics)
+        self._motion = AT_REST  # of the last line that left
         self._cap = SpeedCap(None)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
         self._life = Lifecycle(latches)
@@ -239,7 +239,7 @@ class Robot:
         news = (self._choice.arrived_ns, self._life.mode) != self._made_of
         due = inputs.tick or (inputs.at_once and news)
         line = self._drive(inputs) if due else None
-        applied = self._limiter.twist if self._line is None else self._line.state.twist
+        applied = (self._motion if self._line is None else self._line.motion).twist
         self._odometry.command(applied)
         link = self.session.link
         why = self._reason()
@@ -284,14 +284,14 @@ class Robot:
         # The board must not be expected to answer a line that the guard has replaced.
         self.session.sent(left_ns, was_written=line is not None and not trip)
         if trip:
-            self._limiter.cut()
+            self._motion = AT_REST
         if line is not None:
             self.counters["lines_sent"] += 1
             self._left_ns = self._made_ns
             if trip:
                 self._written = STILL
             else:
-                self._limiter.state, self._written = made.state, made.speeds
+                self._motion, self._written = made.motion, made.speeds
         elif made.tick and self.session.link != "down":
             # Count the lines of periods only. If a line between two periods is superseded, the line
             # of the period still follows.
@@ -330,7 +330,7 @@ class Robot:
         if link != "up":
             # Without a link the daemon cannot ramp, so set the speeds to zero at once. When the
             # link returns, a command from before the loss is too old to follow.
-            self._limiter.cut()
+            self._motion = AT_REST
             self._speeds = STILL
             self._life.link(up=False)
             if link == "down" and before != "down":
@@ -372,7 +372,7 @@ class Robot:
                 self._arbiter.require_neutral(now.mono_ns)
         if estop.pressed_now is not None or bumpers.pressed_now is not None:
             # Do not ramp: the hardware has cut the motors, or the robot touches an obstacle.
-            self._limiter.cut()
+            self._motion = AT_REST
             self._speeds, self._made_of, self._pressed_ns = STILL, None, now.mono_ns
         if estop.driver_fault:
             self._fault(DRIVER_FAULT_REASON, now, events)
@@ -549,12 +549,11 @@ class Robot:
     def _set(self, settings: dict[str, Plain], now_ns: Ns) -> Changes:
         # The robot is at rest only if two lines are zero: the last one that left, which the wheels
         # follow, and the last one that was computed.
-        before, at_rest = self.config, self._speeds == STILL and self._limiter.twist == REST
+        before, at_rest = self.config, self._speeds == STILL and self._motion.twist == REST
         try:
             self.config, changes = changed(before, settings, at_rest)
         except ConfigError as error:
             raise RefusedError(str(error)) from None
-        self._limiter.use(self.config.limits)
         self._odometry.use(self.config.odometry)
         if self.config.commands != before.commands:
             self._arbiter.use(self.config.commands)
@@ -609,7 +608,6 @@ class Robot:
         before, self._cap = self._cap, cap
         if cap.speed == before.speed:
             return
-        self._limiter.cap(math.inf if cap.speed is None else cap.speed)
         text = "the speed limit has ended" if cap.speed is None else f"{cap.speed:.3g} m/s"
         events.append(Event("speed_limit", text, by=cap.by, news=False))
 
@@ -621,22 +619,23 @@ class Robot:
         return f"{cap.speed:.3g} m/s, set by {cap.by}; back to {highest:g} m/s when this limit ends"
 
     def _drive(self, inputs: Inputs) -> bytes | None:
-        now_ns, twist, limiter = inputs.now.mono_ns, self._choice.twist, self._limiter
-        self._made_of = (self._choice.arrived_ns, self._life.mode)
-        before, since = limiter.state, (now_ns - self._left_ns) / NS_PER_S
+        now_ns, twist, limits = inputs.now.mono_ns, self._choice.twist, self.config.limits
+        self._made_of, self._made_ns = (self._choice.arrived_ns, self._life.mode), now_ns
+        since = (now_ns - self._left_ns) / NS_PER_S
         pressed = self._left_ns < self._pressed_ns
         if pressed or self.session.link != "up" or since > WRITE_PAUSE_S:
             # The first written line after a press contains zeros, even if the input is already
             # released and the commands that arrived meanwhile may move the robot.
-            limiter.cut()
+            motion = AT_REST
         elif self._life.mode is Mode.DRIVING and twist is not None:
-            limiter.follow(twist, min(since, self._max_dt))
+            cap = math.inf if self._cap.speed is None else self._cap.speed
+            dt = min(since, self._max_dt)
+            motion = self._motion.follow(twist, dt, limits, self._kinematics, cap)
         else:
-            limiter.coast(since, stop=self._life.mode in HALTED)
-        state, limiter.state, self._made_ns = limiter.state, before, now_ns
-        self._speeds = self._kinematics.wheel_speeds(state.twist)
+            motion = self._motion.coast(since, limits, stop=self._life.mode in HALTED)
+        self._speeds = self._kinematics.wheel_speeds(motion.twist)
         line = self.session.line(now_ns, self._speeds)
-        self._line = None if line is None else _Line(state, self._speeds, inputs.tick)
+        self._line = None if line is None else _Line(motion, self._speeds, inputs.tick)
         return line
 
     # Report.

@@ -23,18 +23,23 @@ from acsard.core.config.contradictions import contradictions
 from acsard.core.config.settings import Config
 from acsard.core.formatting import printable
 from acsard.core.guard import Memory
+from acsard.core.motion.arbiter import Choice
 from acsard.core.motion.battery import Battery
 from acsard.core.motion.bumpers import Bumpers
 from acsard.core.motion.emergency_stop import EmergencyStop
 from acsard.core.motion.event_throttle import EventThrottle
+from acsard.core.motion.limits import Motion
 from acsard.core.motion.modes import Mode
 from acsard.core.robot import Robot
-from acsard.core.values import AcsardError
+from acsard.core.values import AcsardError, SpeedCap
 from acsard.recording.unpickling import MAX_BYTES, unpickle
 
 # Attributes of a robot without configuration inside. A state is read by their types, and what an
 # older one lacks has its default.
 PARTS: dict[str, type[Struct]] = {
+    "_motion": Motion,
+    "_cap": SpeedCap,
+    "_choice": Choice,
     "_estop": EmergencyStop,
     "_bumpers": Bumpers,
     "_battery": Battery,

@@ -15,6 +15,7 @@ from acsard.core.incoming.queries import Query
 from acsard.core.messages.cdr import Cdr
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.messages.signature import public_name
+from acsard.core.motion.limits import Motion
 from acsard.core.ros import parameters as rcl
 from acsard.core.values import NS_PER_S, Instant, Outputs, Plain
 from acsard.daemon.pacing import NO_PERIOD, Period
@@ -256,8 +257,7 @@ def test_a_robot_that_does_not_brake_is_stopped_by_the_guard_whatever_is_set_mea
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     world.drive(1.0, seconds=2.0)
-    limiter = world.loop.robot._limiter
-    monkeypatch.setattr(limiter, "coast", lambda dt, stop=False: limiter.twist)
+    monkeypatch.setattr(Motion, "coast", lambda motion, *_, **__: motion)
     world.put("stop", b"")
     began_ns = world.now_ns
     while world.state.mode != "fault" and world.now_ns - began_ns < 10 * NS_PER_S:

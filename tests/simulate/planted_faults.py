@@ -423,15 +423,15 @@ FAULTS = (
         "limits stall",
         "the robot leaps after a stall",
         ROBOT,
-        "limiter.follow(twist, min(since, self._max_dt))",
-        "limiter.follow(twist, since)",
+        "dt = min(since, self._max_dt)",
+        "dt = since",
     ),
     fault(
         "limits swapped",
         "the robot speeds up by its deceleration",
         LIMITS,
-        "axis.acceleration if abs(target) > abs(speed) else axis.deceleration",
-        "axis.deceleration if abs(target) > abs(speed) else axis.acceleration",
+        "acceleration if abs(target) > abs(speed) else deceleration",
+        "deceleration if abs(target) > abs(speed) else acceleration",
     ),
     fault(
         "limits speed",
@@ -458,15 +458,15 @@ FAULTS = (
         "limits slow",
         "a robot that follows a slower command falls by half of its deceleration",
         LIMITS,
-        "if abs(target) > abs(speed) else axis.deceleration",
-        "if abs(target) > abs(speed) else axis.deceleration / 2",
+        "if abs(target) > abs(speed) else deceleration",
+        "if abs(target) > abs(speed) else deceleration / 2",
     ),
     fault(
         "limits brake",
         "the robot always brakes by the stop deceleration",
         LIMITS,
-        "return axis.stop_deceleration if stop else axis.deceleration",
-        "return axis.stop_deceleration",
+        "        if stop:\n",
+        "        if True:\n",
     ),
     fault(
         "limits curvature",
@@ -479,8 +479,8 @@ FAULTS = (
         "limits below",
         "a robot at the limit of its wheels stays 0.05 rad/s below it",
         LIMITS,
-        "self._within_speed(wished), self._wheel_speed)",
-        "self._within_speed(wished), self._wheel_speed - 0.05)",
+        "_within_speed(wished, limits, cap), limits.wheel_speed)",
+        "_within_speed(wished, limits, cap), limits.wheel_speed - 0.05)",
     ),
     # modes and latches
     fault(
@@ -515,8 +515,8 @@ FAULTS = (
         "limits jerk",
         "the robot speeds up at once, whatever jerk is allowed",
         LIMITS,
-        "    if axis.jerk and abs(target) > abs(speed):",
-        "    if False and axis.jerk and abs(target) > abs(speed):",
+        "    if jerk and abs(target) > abs(speed):",
+        "    if False and jerk and abs(target) > abs(speed):",
     ),
     fault(
         "limits saturated",
@@ -587,8 +587,9 @@ FAULTS = (
         "robot limits",
         "set answers, but the old limits stay in force",
         ROBOT,
-        "        self._limiter.use(self.config.limits)\n",
-        "",
+        "            motion = self._motion.follow(twist, dt, limits, self._kinematics, cap)\n",
+        "            self._first = limits = getattr(self, '_first', limits)\n"
+        "            motion = self._motion.follow(twist, dt, limits, self._kinematics, cap)\n",
     ),
     fault(
         "robot reason",
@@ -977,7 +978,7 @@ FAULTS = (
         ROBOT,
         "            self._fault(DRIVER_FAULT_REASON, now, events)\n",
         "            self._fault(DRIVER_FAULT_REASON, now, events)\n"
-        "            self._limiter.cut()\n            self._speeds = STILL\n",
+        "            self._motion = AT_REST\n            self._speeds = STILL\n",
     ),
     fault(
         "estop ramp",
@@ -1094,7 +1095,7 @@ FAULTS = (
         ROBOT,
         "            self._life.press(empty_reason(thresholds), now)\n",
         "            self._life.press(empty_reason(thresholds), now)\n"
-        "            self._limiter.cut()\n",
+        "            self._motion = AT_REST\n",
     ),
     fault(
         "battery start",

@@ -17,7 +17,7 @@ from acsard.core.codes import HOST_CODES
 from acsard.core.config.settings import Config, DriveConfig, LimitsConfig
 from acsard.core.messages.schema import RobotState
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.limits import Limiter
+from acsard.core.motion.limits import AT_REST
 from acsard.core.values import REST, Twist, WheelSpeeds
 
 STALL_REASON = (
@@ -61,7 +61,7 @@ class CommandedPath:
 
     def __init__(self, drive: DriveConfig, limits: LimitsConfig, now: float) -> None:
         self._kinematics = Kinematics(drive)
-        self._ramps = Limiter(limits, self._kinematics)
+        self._limits, self._motion = limits, AT_REST
         self._lever = drive.wheel_separation * drive.wheel_separation_multiplier / 2.0
         self._stepped = now
         self._sampled: tuple[float, Twist] | None = None  # stamp of the last sample, s, and twist
@@ -74,7 +74,9 @@ class CommandedPath:
     def command(self, twist: Twist, now: float) -> None:
         """Add the path of the command `twist`, which was in force since the last call."""
         passed, self._stepped = now - self._stepped, now
-        allowed = self._ramps.follow(twist, passed) if passed > 0.0 else self._ramps.twist
+        if passed > 0.0:
+            self._motion = self._motion.follow(twist, passed, self._limits, self._kinematics)
+        allowed = self._motion.twist
         x, turn = allowed.linear * passed, allowed.angular * passed
         self._commanded = self._commanded[0] + x, self._commanded[1] + turn
         self._lengths[0] += abs(x)

@@ -16,162 +16,130 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import REST, Twist
 
 
-class _Axis(Struct, frozen=True):
-    speed: float
-    acceleration: float
-    deceleration: float
-    stop_deceleration: float
-    jerk: float
+class Motion(Struct, frozen=True):
+    """An allowed twist, and the acceleration of each axis that led to it."""
 
+    twist: Twist = REST
+    linear_slope: float = 0.0
+    angular_slope: float = 0.0
 
-class State(Struct, frozen=True):
-    twist: Twist
-    linear_slope: float
-    angular_slope: float
+    def follow(
+        self,
+        wished: Twist,
+        dt: float,
+        limits: LimitsConfig,
+        kinematics: Kinematics,
+        cap: float = math.inf,
+    ) -> Motion:
+        """Return the motion `dt` s later, towards a finite twist; `cap` also limits the speed.
 
-
-class Limiter:
-    """Moves the allowed twist step by step towards a requested twist, within the limits."""
-
-    def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
-        self._kinematics = kinematics
-        self.state = State(REST, 0.0, 0.0)  # `Robot` resets it to that of the last line
-        self._cap = math.inf
-        self.use(limits)
-
-    def use(self, limits: LimitsConfig) -> None:
-        """Use other limits; a faster robot slows down at the configured deceleration.
-
-        A lower wheel speed takes effect without a ramp, so lower it only at rest.
+        A robot that is faster than the limits slows down as configured, but a lower wheel speed has
+        no ramp, so lower it only at rest.
         """
-        self._linear = _Axis(
-            limits.linear_speed,
+        now = self.twist
+        goal = kinematics.saturate(_within_speed(wished, limits, cap), limits.wheel_speed)
+        if now == goal and self.linear_slope == self.angular_slope == 0.0:
+            return self  # as in most steps
+        linear, linear_slope = _approach(
+            now.linear,
+            goal.linear,
+            self.linear_slope,
+            dt,
             limits.linear_acceleration,
             limits.linear_deceleration,
-            limits.linear_stop_deceleration,
             limits.linear_jerk,
         )
-        self._angular = _Axis(
-            limits.angular_speed,
+        angular, angular_slope = _approach(
+            now.angular,
+            goal.angular,
+            self.angular_slope,
+            dt,
             limits.angular_acceleration,
             limits.angular_deceleration,
-            limits.angular_stop_deceleration,
             limits.angular_jerk,
         )
-        self._wheel_speed = limits.wheel_speed
-        self._wished = self._goal = REST  # requested, and within the speed limits
-        self._arrived: State | None = None  # `_goal` is reached, and kept
+        twist = _fitted(now, Twist(linear, angular), kinematics, limits.wheel_speed)
+        return Motion(twist, linear_slope, angular_slope)
 
-    def cap(self, speed: float) -> None:
-        """Allow at most this linear speed, too; a faster robot slows down as configured."""
-        self._cap = speed
-        self._wished = self._goal = REST
-        self._arrived = None
-
-    @property
-    def twist(self) -> Twist:
-        """The allowed twist of the last step."""
-        return self.state.twist
-
-    def follow(self, wished: Twist, dt: float) -> Twist:
-        """Move the allowed twist towards a finite one for `dt` s, and return it."""
-        if wished is not self._wished:  # most steps have the same command as the step before
-            self._wished, self._arrived = wished, None
-            self._goal = self._kinematics.saturate(self._within_speed(wished), self._wheel_speed)
-        goal, now = self._goal, self.state
-        if now is self._arrived:
-            return now.twist
-        linear, slope_v = _approach(
-            now.twist.linear, goal.linear, now.linear_slope, dt, self._linear
-        )
-        angular, slope_w = _approach(
-            now.twist.angular, goal.angular, now.angular_slope, dt, self._angular
-        )
-        twist = self._fitted(Twist(linear, angular))
-        self.state = State(twist, slope_v, slope_w)
-        if dt > 0.0 and twist == goal and slope_v == slope_w == 0.0:
-            self._arrived = self.state
-        return twist
-
-    def _fitted(self, twist: Twist) -> Twist:
-        kinematics, most, now = self._kinematics, self._wheel_speed, self.twist
-        if kinematics.fits(twist, most):
-            return twist
-        # On the way, both axes together may need a faster wheel than at the start or at the goal.
-        # So one axis changes as far as it may, and the other one as far as the wheels allow. An
-        # axis that slows down goes first, because braking must not wait.
-        changes = [Twist(twist.linear - now.linear), Twist(angular=twist.angular - now.angular)]
-        turns_slower = abs(twist.angular) < abs(now.angular)
-        if turns_slower and abs(twist.linear) >= abs(now.linear):
-            changes.reverse()
-        # If the wheels do not allow the whole change of the first axis, the second one goes first.
-        first, second = (kinematics.fits(_sum(now, change), most) for change in changes)
-        if second and not first:
-            changes.reverse()
-        fitted = now
-        for change in changes:
-            fitted = _sum(fitted, change, kinematics.room(fitted, change, most))
-        # Rounding has added an error.
-        return kinematics.saturate(fitted, most)
-
-    def coast(self, dt: float, stop: bool = False) -> Twist:
-        """Slow down towards rest for `dt` s, both speeds in proportion; return the allowed twist.
+    def coast(self, dt: float, limits: LimitsConfig, stop: bool = False) -> Motion:
+        """Return the motion `dt` s later, both speeds reduced towards rest in proportion.
 
         `stop` uses `*_stop_deceleration`. A negative `dt` is 0, and cannot speed up the robot.
         """
         dt, twist = max(0.0, dt), self.twist
-        seconds = max(
-            abs(twist.linear) / _braking(self._linear, stop),
-            abs(twist.angular) / _braking(self._angular, stop),
-        )
+        if stop:
+            linear, angular = limits.linear_stop_deceleration, limits.angular_stop_deceleration
+        else:
+            linear, angular = limits.linear_deceleration, limits.angular_deceleration
+        seconds = max(abs(twist.linear) / linear, abs(twist.angular) / angular)
         share = 1.0 - dt / seconds if seconds > dt else 0.0
-        fallen = Twist(twist.linear * share, twist.angular * share) if share else REST
-        self.state = State(fallen, 0.0, 0.0)
-        return fallen
+        return Motion(Twist(twist.linear * share, twist.angular * share)) if share else AT_REST
 
-    def cut(self) -> Twist:
-        """Set the allowed twist to zero without a ramp, and return it."""
-        self.state = State(REST, 0.0, 0.0)
-        return REST
 
-    def _within_speed(self, wished: Twist) -> Twist:
-        most = min(self._linear.speed, self._cap)
-        linear = wished.linear if most else 0.0
-        angular = wished.angular if self._angular.speed else 0.0
-        scale = 1.0
-        if abs(linear) > most:
-            scale = most / abs(linear)
-        if abs(angular) * scale > self._angular.speed:
-            scale = self._angular.speed / abs(angular)
-        return Twist(linear * scale, angular * scale)
+AT_REST = Motion()  # without a ramp, if it replaces another motion
+
+
+def _within_speed(wished: Twist, limits: LimitsConfig, cap: float) -> Twist:
+    most, most_angular = min(limits.linear_speed, cap), limits.angular_speed
+    linear = wished.linear if most else 0.0
+    angular = wished.angular if most_angular else 0.0
+    scale = 1.0
+    if abs(linear) > most:
+        scale = most / abs(linear)
+    if abs(angular) * scale > most_angular:
+        scale = most_angular / abs(angular)
+    return Twist(linear * scale, angular * scale)
+
+
+def _fitted(now: Twist, twist: Twist, kinematics: Kinematics, most: float) -> Twist:
+    if kinematics.fits(twist, most):
+        return twist
+    # On the way, both axes together may need a faster wheel than at the start or at the goal. So
+    # one axis changes as far as it may, and the other one as far as the wheels allow. An axis that
+    # slows down goes first, because braking must not wait.
+    changes = [Twist(twist.linear - now.linear), Twist(angular=twist.angular - now.angular)]
+    turns_slower = abs(twist.angular) < abs(now.angular)
+    if turns_slower and abs(twist.linear) >= abs(now.linear):
+        changes.reverse()
+    # If the wheels do not allow the whole change of the first axis, the second one goes first.
+    first, second = (kinematics.fits(_sum(now, change), most) for change in changes)
+    if second and not first:
+        changes.reverse()
+    fitted = now
+    for change in changes:
+        fitted = _sum(fitted, change, kinematics.room(fitted, change, most))
+    # Rounding has added an error.
+    return kinematics.saturate(fitted, most)
 
 
 def _sum(a: Twist, b: Twist, share: float = 1.0) -> Twist:
     return Twist(a.linear + b.linear * share, a.angular + b.angular * share)
 
 
-def _braking(axis: _Axis, stop: bool) -> float:
-    return axis.stop_deceleration if stop else axis.deceleration
-
-
 def _approach(
-    speed: float, goal: float, slope: float, dt: float, axis: _Axis
+    speed: float,
+    goal: float,
+    slope: float,
+    dt: float,
+    acceleration: float,
+    deceleration: float,
+    jerk: float,
 ) -> tuple[float, float]:
     # `slope` is the previous acceleration.
     if dt <= 0.0:
         return speed, slope
     # A change of direction is split at zero into deceleration and acceleration.
     target = 0.0 if speed * goal < 0 else goal
-    most = axis.acceleration if abs(target) > abs(speed) else axis.deceleration
+    most = acceleration if abs(target) > abs(speed) else deceleration
     wanted = (target - speed) / dt
-    if axis.jerk and abs(target) > abs(speed):
+    if jerk and abs(target) > abs(speed):
         # A slope in the other direction is left over from braking.
         slope = slope if slope * wanted > 0 else 0.0
-        step = axis.jerk * dt
+        step = jerk * dt
         most = min(most, abs(slope) + step, _flattenable(abs(target - speed), step, dt))
         # The slope may fall faster than the jerk limit only if the speed would pass the goal
         # otherwise. It never exceeds the acceleration limit, which may have been lowered.
-        most = min(axis.acceleration, max(most, abs(slope) - step))
+        most = min(acceleration, max(most, abs(slope) - step))
     used = max(-most, min(most, wanted))
     # Return the goal itself if it is reached: in floating point, speed + wanted * dt may miss it.
     return (target if used == wanted else speed + used * dt), used

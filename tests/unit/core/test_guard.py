@@ -28,7 +28,7 @@ from acsard.core.guard import RAMP_MARGIN_NS, Guard, Memory
 from acsard.core.link.checked_line import seal
 from acsard.core.link.codec import Codec
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.limits import Limiter
+from acsard.core.motion.limits import AT_REST
 from acsard.core.robot import Robot
 from acsard.core.values import (
     REST,
@@ -163,14 +163,15 @@ def test_zero_passes_always(guard: Guarded, mode: str, linked: bool) -> None:
 @pytest.mark.parametrize("trailing_comma", [True, False])
 def test_a_ramp_to_zero_passes_to_the_end(trailing_comma: bool) -> None:
     kinematics = Kinematics(DriveConfig())
-    codec, limiter = Codec(WheelMap(), trailing_comma), Limiter(LimitsConfig(), kinematics)
+    codec, limits = Codec(WheelMap(), trailing_comma), LimitsConfig()
     guard = Guarded(codec.stop, 40.0, SOURCES)
-    limiter.follow(Twist(0.7, -2.3), 1000.0)
-    data = codec.encode(kinematics.wheel_speeds(limiter.twist))
+    motion = AT_REST.follow(Twist(0.7, -2.3), 1000.0, limits, kinematics)
+    data = codec.encode(kinematics.wheel_speeds(motion.twist))
     assert guard.check(outputs(data)) == data
     guard.note_sent()
-    while limiter.twist != REST:
-        data = codec.encode(kinematics.wheel_speeds(limiter.coast(0.01)))
+    while motion.twist != REST:
+        motion = motion.coast(0.01, limits)
+        data = codec.encode(kinematics.wheel_speeds(motion.twist))
         assert guard.check(coasting(data)) == data
         guard.note_sent()
     assert data == codec.stop

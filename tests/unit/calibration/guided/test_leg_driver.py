@@ -15,7 +15,7 @@ from acsard.client.follower import MAX_STATE_AGE_S
 from acsard.core.config.settings import Config, DriveConfig, LimitsConfig
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.limits import Limiter
+from acsard.core.motion.limits import AT_REST
 from acsard.core.values import REST, Twist, WheelSpeeds
 from tests.each import each
 
@@ -354,11 +354,13 @@ def test_the_ramps_of_the_configuration_are_part_of_the_commanded_path() -> None
     world = World(SQUARE)
     config = Config(limits=SLOW_RAMPS)
     world.driver = LegDriver(SQUARE, "app", config, world.now, US)
-    limiter = Limiter(SLOW_RAMPS, Kinematics(DriveConfig()))
+    motion, kinematics = AT_REST, Kinematics(DriveConfig())
 
     def follow(state: RobotState) -> RobotState:
-        twist = limiter.follow(Twist(state.linear or 0.0, state.angular or 0.0), TICK)
-        return msgspec.structs.replace(state, wheels=telling(twist).wheels)
+        nonlocal motion
+        wish = Twist(state.linear or 0.0, state.angular or 0.0)
+        motion = motion.follow(wish, TICK, SLOW_RAMPS, kinematics)
+        return msgspec.structs.replace(state, wheels=telling(motion.twist).wheels)
 
     world.tells = follow
     world.run(40.0)

@@ -23,7 +23,7 @@ from acsard.core.config.settings import (
     McuConfig,
 )
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.limits import Limiter
+from acsard.core.motion.limits import AT_REST
 from acsard.core.values import REST, Twist
 from tests.each import each
 
@@ -119,13 +119,13 @@ def test_every_accepted_robot_comes_to_rest_in_time_from_any_reachable_speed(
     for _ in range(12):
         lines = problems(config)
         config = mended(config, lines[0]) if lines else config
-    limiter = Limiter(config.limits, Kinematics(config.drive))
+    motion, wish = AT_REST, Twist(way[0] * 10.0, way[1] * 50.0)
     for _ in range(20):
-        limiter.follow(Twist(way[0] * 10.0, way[1] * 50.0), 10.0)
+        motion = motion.follow(wish, 10.0, config.limits, Kinematics(config.drive))
     longest = MAX_STOP_S if stop else MAX_RAMP_S
     for _ in range(round(longest / DT) + 1):
-        limiter.coast(DT, stop)
-    assert limiter.twist == REST
+        motion = motion.coast(DT, config.limits, stop)
+    assert motion.twist == REST
 
 
 def test_a_stop_of_exactly_the_longest_duration_is_accepted_and_a_longer_one_is_not() -> None:

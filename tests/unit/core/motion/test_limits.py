@@ -1,6 +1,6 @@
 """Tests of the limits that turn a requested twist into a safe one.
 
-The limits are speed, acceleration, deceleration, jerk, coasting, and the cut to zero.
+The limits are speed, acceleration, deceleration, jerk and coasting.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from acsard.core.config.settings import DriveConfig, LimitsConfig
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.limits import Limiter
+from acsard.core.motion.limits import AT_REST
 from acsard.core.values import REST, Twist
 from tests.each import each
 
@@ -52,11 +52,31 @@ periods = st.floats(0.001, 0.05)
 millimetres = st.integers(-1000, 1000).map(lambda number: number / 1000)
 
 
-def limiter(limits: LimitsConfig = FREE) -> Limiter:
-    return Limiter(limits, KINEMATICS)
+class Ramp:
+    """The motion of a robot whose limits may change."""
+
+    def __init__(self, limits: LimitsConfig, kinematics: Kinematics = KINEMATICS) -> None:
+        self.motion, self.limits, self.kinematics = AT_REST, limits, kinematics
+        self.cap = math.inf
+
+    @property
+    def twist(self) -> Twist:
+        return self.motion.twist
+
+    def follow(self, wish: Twist, dt: float) -> Twist:
+        self.motion = self.motion.follow(wish, dt, self.limits, self.kinematics, self.cap)
+        return self.twist
+
+    def coast(self, dt: float, stop: bool = False) -> Twist:
+        self.motion = self.motion.coast(dt, self.limits, stop)
+        return self.twist
 
 
-def moving(linear: float, angular: float = 0.0, limits: LimitsConfig = FREE) -> Limiter:
+def limiter(limits: LimitsConfig = FREE) -> Ramp:
+    return Ramp(limits)
+
+
+def moving(linear: float, angular: float = 0.0, limits: LimitsConfig = FREE) -> Ramp:
     """Return a limiter that has reached this twist and holds it."""
     ramp = limiter(limits)
     followed(ramp, Twist(linear, angular), 2, dt=1000.0)
@@ -64,7 +84,7 @@ def moving(linear: float, angular: float = 0.0, limits: LimitsConfig = FREE) -> 
     return ramp
 
 
-def followed(ramp: Limiter, wish: Twist, steps: int, dt: float = DT) -> list[Twist]:
+def followed(ramp: Ramp, wish: Twist, steps: int, dt: float = DT) -> list[Twist]:
     return [ramp.follow(wish, dt) for _ in range(steps)]
 
 
@@ -190,7 +210,7 @@ def test_the_wheel_limit_counts_also_if_both_axes_speed_up() -> None:
     """The smaller left wheel turns faster straight ahead than in the curve to the left."""
     kinematics = Kinematics(DriveConfig(left_wheel_radius_multiplier=0.5))
     quick = msgspec.structs.replace(TALL, linear_acceleration=100.0, wheel_speed=30.0)
-    first = Limiter(quick, kinematics).follow(Twist(1.0, 3.0), 0.01)
+    first = Ramp(quick, kinematics).follow(Twist(1.0, 3.0), 0.01)
     assert max(map(abs, kinematics.wheel_speeds(first).as_tuple())) == pytest.approx(30.0)
     assert first.linear < 1.0
 
@@ -208,7 +228,7 @@ def test_at_the_wheel_limit_too_each_axis_changes_by_no_more_than_its_limit(
     wishes: list[tuple[Twist, float]], start: Twist, left: float, braking: float
 ) -> None:
     kinematics = Kinematics(DriveConfig(left_wheel_radius_multiplier=left))
-    ramp = Limiter(msgspec.structs.replace(TALL, linear_deceleration=braking), kinematics)
+    ramp = Ramp(msgspec.structs.replace(TALL, linear_deceleration=braking), kinematics)
     before = ramp.follow(start, 1000.0)
     for wish, dt in wishes:
         after = ramp.follow(wish, dt)
@@ -226,11 +246,11 @@ def test_wheels_of_unequal_size_never_keep_the_robot_from_its_goal(
     side: str, wishes: list[tuple[Twist, float]], goal: Twist
 ) -> None:
     kinematics = Kinematics(DriveConfig(**{f"{side}_wheel_radius_multiplier": 0.8}))
-    ramp = Limiter(TALL, kinematics)
+    ramp = Ramp(TALL, kinematics)
     for wish, dt in wishes:
         ramp.follow(wish, dt)
     last = followed(ramp, goal, 2000)[-1]
-    fresh = Limiter(TALL, kinematics).follow(goal, 1000.0)
+    fresh = Ramp(TALL, kinematics).follow(goal, 1000.0)
     assert pair(last) == approx(*pair(fresh))
 
 
@@ -238,7 +258,7 @@ def test_a_small_wheel_at_its_limit_turns_the_robot_until_it_has_slowed_down() -
     # Without the turn the right wheel would be too fast, so the turn falls only as fast as the
     # speed allows.
     kinematics = Kinematics(DriveConfig(right_wheel_radius_multiplier=0.9))
-    ramp = Limiter(TALL, kinematics)
+    ramp = Ramp(TALL, kinematics)
     start = ramp.follow(Twist(-1.0, 0.2), 1000.0)
     assert kinematics.wheel_speeds(start).front_right == pytest.approx(-20.0)
     after = ramp.follow(Twist(-0.8, 0.0), 0.01)
@@ -255,7 +275,7 @@ def test_a_very_small_wheel_at_its_limit_never_stops_the_way_to_the_goal(
     wheel_speed: float, start: Twist, goal: Twist, dt: float
 ) -> None:
     kinematics = Kinematics(DriveConfig(left_wheel_radius_multiplier=0.1))
-    ramp = Limiter(LimitsConfig(wheel_speed=wheel_speed), kinematics)
+    ramp = Ramp(LimitsConfig(wheel_speed=wheel_speed), kinematics)
     for step in range(1, 21):
         ramp.follow(Twist(start.linear * step / 20, start.angular * step / 20), dt)
     for _ in range(1000):
@@ -480,7 +500,7 @@ def test_with_jerk_the_goal_is_approached_from_one_side_reached_and_never_oversh
 def test_with_jerk_a_lowered_acceleration_applies_from_the_next_step() -> None:
     ramp = limiter(JERKY)
     followed(ramp, Twist(1.0, 0.0), 30)
-    ramp.use(msgspec.structs.replace(JERKY, linear_acceleration=0.3))
+    ramp.limits = msgspec.structs.replace(JERKY, linear_acceleration=0.3)
     before = ramp.twist.linear
     assert ramp.follow(Twist(1.0, 0.0), DT).linear <= before + 0.3 * DT + EPS
 
@@ -589,38 +609,10 @@ def test_after_coasting_jerk_begins_from_a_level_slope(sign: float) -> None:
     assert pair(ramp.follow(wish, DT)) == expected
 
 
-# cut and restore
-
-
-def test_a_cut_brings_the_robot_to_rest_in_one_step() -> None:
-    ramp = moving(1.0, 4.0)
-    assert ramp.cut() == REST
-    assert ramp.twist == REST
-
-
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_after_a_cut_jerk_begins_from_a_level_slope(sign: float) -> None:
-    ramp, wish = limiter(JERKY), Twist(sign * 0.5, sign * 2.0)
-    followed(ramp, wish, 20)
-    ramp.cut()
-    assert pair(ramp.follow(wish, DT)) == approx(sign * 0.0005, sign * 0.002)
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_new_limiter_begins_from_a_level_slope(sign: float) -> None:
+def test_jerk_begins_at_rest_from_a_level_slope(sign: float) -> None:
     wish = Twist(sign * 0.5, sign * 2.0)
     assert pair(limiter(JERKY).follow(wish, DT)) == approx(sign * 0.0005, sign * 0.002)
-
-
-@pytest.mark.parametrize("limits", [FREE, JERKY])
-def test_putting_the_state_back_undoes_a_step(limits: LimitsConfig) -> None:
-    ramp = limiter(limits)
-    followed(ramp, Twist(1.0, 2.0), 20)
-    before = ramp.state
-    once = ramp.follow(Twist(1.0, 2.0), DT)
-    ramp.state = before
-    assert ramp.twist == before.twist
-    assert ramp.follow(Twist(1.0, 2.0), DT) == once
 
 
 SPEEDS = st.floats(0.0, 3.0)
@@ -633,11 +625,11 @@ def test_the_speed_never_exceeds_both_the_limit_and_the_cap_but_on_the_way_down(
     steps: list[tuple[float, float, float]],
 ) -> None:
     limits = LimitsConfig()
-    limiter = Limiter(limits, KINEMATICS)
+    ramp = Ramp(limits)
     for cap, setting, wish in steps:
-        limiter.use(msgspec.structs.replace(limits, linear_speed=setting))
-        limiter.cap(cap)
+        ramp.limits = msgspec.structs.replace(limits, linear_speed=setting)
+        ramp.cap = cap
         for _ in range(5):
-            before = abs(limiter.twist.linear)
-            speed = abs(limiter.follow(Twist(wish), DT).linear)
+            before = abs(ramp.twist.linear)
+            speed = abs(ramp.follow(Twist(wish), DT).linear)
             assert speed <= max(min(cap, setting), before - limits.linear_deceleration * DT) + 1e-9
