@@ -11,13 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from acsard.recording.file_replay import replay_file
-from acsard.recording.mcap_file import Recording
-from acsard.recording.replay import TEXT_OUTPUTS
+from acsard.recording.file import SUFFIX, Recording
+from acsard.recording.replay import TEXT_OUTPUTS, Playback
 from acsard.recording.replay_text import describe_difference
 from tests.each import each
 
-RECORDINGS = sorted((Path(__file__).parent / "recordings").glob("*.mcap"))
+RECORDINGS = sorted((Path(__file__).parent / "recordings").glob(f"*{SUFFIX}"))
 
 MOST_BYTES = 100_000
 
@@ -30,13 +29,15 @@ def test_there_are_at_least_three_recordings_and_each_is_small() -> None:
 
 @each("path", RECORDINGS)
 def test_a_recording_replays_with_the_same_result(path: Path) -> None:
-    recording = Recording(path)
-    result = replay_file(recording)
-    comparison = result.comparison
-    assert result.gaps == []
+    recording = Recording([path])
+    playback = Playback(recording)
+    steps = [step for step, _ in playback.steps()]
+    comparison = playback.comparison
+    assert (playback.gaps, recording.damage) == ([], [])
+    assert [step.number for step in steps] == list(range(len(steps)))
     for output, first in comparison.first_by_output.items():
         if output not in TEXT_OUTPUTS:
-            pytest.fail("\n".join(describe_difference(first, recording.about.mono_ns)))
+            pytest.fail("\n".join(describe_difference(first, steps[0].inputs.now.mono_ns)))
     assert comparison.lines == comparison.lines_same > 100
     assert comparison.modes_same == comparison.steps
     assert comparison.exact, "an estimate is another in its last bits"

@@ -262,7 +262,7 @@ class Recording:
                     case Damage():
                         self.damage.append(record)
                     case Steps():
-                        yield from _recorded_steps(record)
+                        yield from steps_of(record)
                     case _:
                         yield record
 
@@ -389,7 +389,8 @@ def _skipped(data: bytes, at: int, begin_ns: WallNs, end_ns: WallNs) -> int | No
     return following if over or min(head.wall_ns, last.wall_ns) > end_ns else None
 
 
-def _recorded_steps(steps: Steps) -> Iterator[RecordedStep]:
+def steps_of(steps: Steps) -> Iterator[RecordedStep]:
+    """Yield the steps of a record."""
     status: Status | None = None
     last = len(steps.rows) - 1
     for index, row in enumerate(steps.rows):

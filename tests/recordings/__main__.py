@@ -10,6 +10,7 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
+from acsard.recording.file import SUFFIX
 from tests.scenarios.taped import Tape, drive_through_faults
 from tests.scenarios.world import World
 
@@ -60,9 +61,7 @@ def main() -> None:
         tape = Tape()
         world = World(config, recorder=tape)
         drive(world)
-        path = HERE / f"{name}.mcap"
-        path.unlink(missing_ok=True)
-        tape.write(path, config, apart=False)
+        path = tape.save(HERE / f"{name}{SUFFIX}", config)
         print(f"{path.name}: {path.stat().st_size} bytes, {len(tape.taken)} steps")
 
 

@@ -40,7 +40,7 @@ from acsard.daemon.latch_rules import (
     unwritable,
 )
 from acsard.daemon.pacing import Period
-from acsard.recording import rows
+from acsard.recording.file import Steps, encode_steps, steps_of
 from acsard.recording.recorded_steps import FinishedStep
 from acsard.recording.replay import Replay
 from acsard.recording.state import freeze, thaw
@@ -216,7 +216,8 @@ class Tape:
         if not self._steps or self.difference:
             self._steps.clear()
             return
-        for step in rows.decode(rows.encode(self._number, self._steps)):
+        data = msgspec.msgpack.encode(encode_steps(self._number, self._steps))
+        for step in steps_of(msgspec.msgpack.decode(data, type=Steps)):
             self._replay.step(step)
         self._number += len(self._steps)
         self._steps.clear()
