@@ -24,14 +24,15 @@ from acsard.core.config.settings import Config
 from acsard.core.incoming.queries import offered_services
 from acsard.core.link.codec import Codec
 from acsard.core.messages.schema import Info
-from acsard.core.values import NS_PER_S, Event, Latches, Ns, WallNs
+from acsard.core.values import NS_PER_S, Event, Instant, Latches, Ns, WallNs
 from acsard.daemon.bus.bus import ZenohBus
 from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_file import LatchFile
+from acsard.daemon.pacing import NO_PERIOD, Period
+from acsard.daemon.pulse import Pulse
 from acsard.daemon.serial.port import SerialPort
 from acsard.daemon.serial.simulator_pty import Simulated
 from acsard.daemon.supervisor import GATEWAY, PAGE, keep_running
-from acsard.daemon.wakeup import Next, Ticker, Wakeup
 from acsard.host import clock, real_time
 from acsard.host.child import end_signals
 from acsard.host.logs import Log
@@ -107,9 +108,9 @@ async def run(
     `gateway` (with `bus.outside`) and `page` are the arguments of child processes, if this daemon
     has to start them.
     """
-    wake = Wakeup()
+    pulse = Pulse()
     manager = Systemd(os.environ, os.getpid())
-    departure = Departure(log, wake, manager)
+    departure = Departure(log, pulse, manager)
     async with AsyncExitStack() as stack:
         stack.callback(manager.close)
         stack.enter_context(departure)
@@ -126,7 +127,7 @@ async def run(
         keeper = _keeper(config, stack)
         path = config.mcu.port if simulated is None else simulated.path
         after = stack.enter_context(ExitStack())
-        bus, port = ZenohBus(config, wake), _port(config, path, wake, events.append)
+        bus, port = ZenohBus(config, pulse), _port(config, path, pulse, events.append)
         ends = _certificates(config, gateway is not None)
         info = _info(config, path)  # takes a while in a clone: before the port is open
         # Open the bus before the port. If another program uses the robot's id or the address, the
@@ -170,7 +171,7 @@ async def run(
         if ends:
             helpers.append(watch_certificates(config.bus, control.report.certificate_ends))
         async with _beside([port.keep_open(), _repeat_latched(bus, control), *helpers]):
-            await _control(config, control, departure, wake, manager)
+            await _control(config, control, departure, pulse, manager)
 
 
 def _recorder(
@@ -193,10 +194,10 @@ def _keeper(config: Config, stack: AsyncExitStack) -> LatchFile | None:
     return keeper
 
 
-def _port(config: Config, path: str, wake: Wakeup, tell: Callable[[Event], None]) -> SerialPort:
+def _port(config: Config, path: str, pulse: Pulse, tell: Callable[[Event], None]) -> SerialPort:
     mcu = config.mcu
     stop = Codec(mcu.wheels, mcu.trailing_comma).stop
-    return SerialPort(path, mcu.baud_rate, stop, config.period_ns, wake, tell)
+    return SerialPort(path, mcu.baud_rate, stop, config.period_ns, pulse, tell)
 
 
 @asynccontextmanager
@@ -222,7 +223,7 @@ async def _control(
     config: Config,
     control: ControlLoop,
     departure: Departure,
-    wake: Wakeup,
+    pulse: Pulse,
     manager: Systemd,
 ) -> None:
     # Let each of the other tasks run once first. This first round is slow, and must end before the
@@ -230,31 +231,28 @@ async def _control(
     await asyncio.sleep(0)
     gc.collect()
     gc.freeze()  # the present objects live to the end, so later collections skip them
-    with Ticker(config.period_ns, wake) as ticker:
 
-        def step() -> Next | None:
-            now = clock.now()
-            control.shutting_down = departure.begun_ns is not None
-            period = ticker.take(now.mono_ns)
-            manager.step(control.step(now, period))
-            if control.shutting_down and departure.over(now.mono_ns, control.at_rest):
-                return None
-            return Next(
-                control.pace.accepts_early_command,
-                control.retry_ns,
-                period_ended=period.expired > 0,
-            )
+    def step(now: Instant, period: Period) -> bool:
+        control.shutting_down = departure.begun_ns is not None
+        manager.step(control.step(now, period))
+        if control.shutting_down and departure.over(now.mono_ns, control.at_rest):
+            return False
+        pulse.expect(
+            early=control.pace.accepts_early_command,
+            retry_ns=control.retry_ns,
+            period_ended=period is not NO_PERIOD,
+        )
+        return True
 
-        ticker.start(clock.now().mono_ns)
-        try:
-            await wake.run(step)
-        except BaseException:
-            # No more steps feed systemd's watchdog, and ending the daemon may take longer than the
-            # watchdog waits. Its SIGABRT would hide the error. After `stopping`, systemd stops the
-            # watchdog, and waits for TimeoutStopSec instead.
-            manager.stopping()
-            manager.status("ending after an error in the daemon")
-            raise
+    try:
+        await pulse.run(config.period_ns, step)
+    except BaseException:
+        # No more steps feed systemd's watchdog, and ending the daemon may take longer than the
+        # watchdog waits. Its SIGABRT would hide the error. After `stopping`, systemd stops the
+        # watchdog, and waits for TimeoutStopSec instead.
+        manager.stopping()
+        manager.status("ending after an error in the daemon")
+        raise
 
 
 @asynccontextmanager

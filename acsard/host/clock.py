@@ -17,10 +17,16 @@ from acsard.core.values import NS_PER_S, Instant, Ns
 mono_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC_RAW)
 
 
+# The clock of the kernel's timers.
+timer_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC)
+
+_boot_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
+
+
 def asleep_ns() -> Ns:
     """Return the total time for which this computer has been suspended since its start."""
-    awake_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
-    return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - awake_ns
+    awake_ns = timer_ns()
+    return _boot_ns() - awake_ns
 
 
 def steady_ns() -> Ns:

@@ -1,7 +1,7 @@
 """A timer of the kernel that wakes the event loop more precisely than asyncio's own timers.
 
 asyncio rounds every wait up to whole milliseconds. Python itself offers timerfd only from 3.13 on,
-so this module calls the C library.
+so this module calls the C library to set a timer. Reading one needs only `os`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from acsard.core.values import NS_PER_S, Ns
 from acsard.host import clock
 
 CLOCK_MONOTONIC: Final = 1
+TFD_TIMER_ABSTIME: Final = 1
 
 
 class _Timespec(ctypes.Structure):
@@ -29,7 +30,8 @@ class _Itimerspec(ctypes.Structure):
 class TimerFd:
     """A timer whose file descriptor becomes readable when the timer expires.
 
-    The kernel has no timerfd for CLOCK_MONOTONIC_RAW, so `set` passes the remaining time.
+    The kernel has no timerfd for CLOCK_MONOTONIC_RAW, so `set` passes the remaining time, and
+    `repeat` counts by CLOCK_MONOTONIC.
     """
 
     def __init__(self) -> None:
@@ -46,10 +48,19 @@ class TimerFd:
 
     def set(self, at_ns: Ns) -> None:
         """Let the timer expire once, at a time of `clock.mono_ns`."""
-        wait_ns = max(1, at_ns - clock.mono_ns())
-        value = self._spec.it_value
-        value.tv_sec, value.tv_nsec = divmod(wait_ns, NS_PER_S)
-        if self._settime(self._fd, 0, self._where, None) < 0:
+        self._start(max(1, at_ns - clock.mono_ns()), 0, 0)
+
+    def repeat(self, period_ns: Ns) -> Ns:
+        """Let the timer expire after each period; return the first time, by `clock.timer_ns`."""
+        first_ns = clock.timer_ns() + period_ns
+        self._start(first_ns, period_ns, TFD_TIMER_ABSTIME)
+        return first_ns
+
+    def _start(self, value_ns: Ns, interval_ns: Ns, flags: int) -> None:
+        value, interval = self._spec.it_value, self._spec.it_interval
+        value.tv_sec, value.tv_nsec = divmod(value_ns, NS_PER_S)
+        interval.tv_sec, interval.tv_nsec = divmod(interval_ns, NS_PER_S)
+        if self._settime(self._fd, flags, self._where, None) < 0:
             raise OSError(ctypes.get_errno(), "timerfd_settime failed")
 
     def expirations(self) -> int:

@@ -21,22 +21,6 @@ from acsard.host.processes import holder_of
 _left_open: list[int] = []  # descriptors that `close` had no thread for
 
 
-class _Device(serial.Serial):  # type: ignore[misc]
-    # A port whose `read` makes one system call and never waits.
-    def read(self, size: int = 1) -> bytes:
-        if self.fd is None:
-            raise serial.PortNotOpenError
-        try:
-            data = os.read(self.fd, size)
-        except BlockingIOError:
-            return b""
-        except OSError as error:
-            raise serial.SerialException(f"read failed: {error}") from error
-        if not data:
-            raise serial.SerialException("the serial device was disconnected")
-        return data
-
-
 def open_raw(path: str, baud_rate: int) -> serial.Serial:
     """Open the port in raw mode, lock it and empty its buffers. Raises `OSError`."""
     # Close the devices that `close` could not close. Two threads may empty the list at the same
@@ -46,7 +30,7 @@ def open_raw(path: str, baud_rate: int) -> serial.Serial:
             _end(_left_open.pop())
     # An inter-byte timeout makes pyserial set VMIN = 1. A read without data then fails with EAGAIN,
     # so an empty read always means a hang-up.
-    device = _Device(
+    device = serial.Serial(
         baudrate=baud_rate, timeout=0, write_timeout=0, inter_byte_timeout=0, exclusive=True
     )
     device.port = path

@@ -1,8 +1,8 @@
 """The daemon's serial port: opens, reads and reopens the device, and sends STOP before closing it.
 
-pyserial-asyncio only reads: its transport would queue bytes that the kernel does not accept and
-send an old line later. So the daemon writes to the descriptor. Opening runs in a thread with a time
-limit, because drivers may block.
+The event loop watches the descriptor, and the daemon reads and writes it itself: a transport would
+queue bytes that the kernel does not accept and send an old line later. Opening runs in a thread
+with a time limit, because drivers may block.
 """
 
 from __future__ import annotations
@@ -12,10 +12,8 @@ import errno
 import itertools
 import os
 from collections.abc import Callable
-from contextlib import suppress
 
 import serial
-import serial_asyncio
 
 from acsard.core.link.serial_output import Offered, Port, SerialOutput
 from acsard.core.values import Event, Instant, Ns, Received
@@ -63,7 +61,7 @@ class SerialPort(Port):
         self._wake, self._log = wake, log
         self._received: list[Received] = []
         self._output = SerialOutput(baud_rate, stop, period_ns)
-        self._transport: serial_asyncio.SerialTransport | None = None
+        self._device: serial.Serial | None = None  # while it is open
         self._lost = asyncio.Event()
         self._fd = -1
         # Devices that threads are opening: `st_dev`, `st_ino`.
@@ -82,12 +80,9 @@ class SerialPort(Port):
         # move the robot.
         if self._asleep.detect():
             self._leave(OSError(errno.EIO, "this computer was suspended"))
-        if late is not None and self._transport is not None:
+        if late is not None and self.is_open:
             # Without the waiting bytes, the delay of the step would look like silence of the board.
-            # If the port is lost, the reader notices and reports it.
-            with suppress(serial.SerialException):
-                data = self._transport.serial.read(4096)  # the size of a driver's buffer
-                self._received += [Received(late, data)] if data else []
+            self._read(late)
         if not self._received:
             return ()
         pieces = tuple(self._received)
@@ -165,17 +160,10 @@ class SerialPort(Port):
         except TimeoutError:
             raise OSError(errno.EIO, DRIVER_HUNG) from None
         self._lost.clear()
-        self._fd = device.fileno()
+        self._device, self._fd = device, device.fileno()
         self._output = SerialOutput(baud_rate, self._stop, self._period_ns)
         self._received.clear()
-        loop = asyncio.get_running_loop()
-        try:
-            self._transport, _ = await serial_asyncio.connection_for_serial(
-                loop, lambda: _Reader(self), device
-            )
-        except OSError:  # the library sets up the port again, which may fail
-            close(device, lost=True)
-            raise
+        asyncio.get_running_loop().add_reader(self._fd, self._readable)
         self.is_open, self.trouble = True, ""
         self.opened += 1
         self._log(Event("port_open", f"{path} at {baud_rate} baud"))
@@ -186,22 +174,36 @@ class SerialPort(Port):
             self.trouble = text
             self._log(Event("port_waiting", text, "warning"))
 
-    # The reader calls the methods below.
+    # Reading and losing the port.
+
+    def _readable(self) -> None:
+        if self._read(clock.now()):
+            self._wake()
+
+    def _read(self, now: Instant) -> bool:
+        # Whether there were bytes.
+        try:
+            data = os.read(self._fd, 4096)  # the size of a driver's buffer
+        except BlockingIOError:
+            return False  # a late step has read them
+        except OSError as error:
+            self._leave(error)
+            return False
+        if data:
+            self._received.append(Received(now, data))
+            return True
+        self._leave(OSError(errno.EIO, "the serial device was disconnected"))
+        return False
 
     def _leave(self, error: BaseException | None) -> None:
         # None: the daemon ends.
-        if not self.is_open:
+        device, self._device = self._device, None
+        if device is None:
             return
         self.is_open = False
-        transport, self._transport = self._transport, None
-        if transport is not None and transport.serial is not None:
-            # The transport would drain and close the device on the event loop. `close` gives
-            # /dev/null to the transport instead.
-            transport.pause_reading()
-            close(transport.serial, lost=error is not None)
-            # The transport is closing already if its reader has just detected a hang-up.
-            if not transport.is_closing():
-                transport.abort()
+        asyncio.get_running_loop().remove_reader(self._fd)
+        close(device, lost=error is not None)
+        device.close()  # /dev/null
         if error is not None:
             self.trouble = f"the serial port {self._path} was lost ({error}); the daemon reopens it"
             self._log(Event("port_lost", self.trouble, "warning"))
@@ -220,22 +222,3 @@ class SerialPort(Port):
         for pause in draining(self._fd, deadline_ns) if self.is_open else ():
             await asyncio.sleep(pause)
         self._leave(None)
-
-
-class _Reader(asyncio.Protocol):
-    def __init__(self, port: SerialPort) -> None:
-        self._port = port
-        self._transport: asyncio.BaseTransport | None = None
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = transport
-
-    def data_received(self, data: bytes) -> None:
-        self._port._received.append(Received(clock.now(), data))
-        self._port._wake()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        # Ignore the end of an old transport, because the port may have been reopened since.
-        if self._port._transport is self._transport:
-            self._port._transport = None
-            self._port._leave(exc or OSError(errno.EIO, "closed"))

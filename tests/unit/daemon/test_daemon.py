@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.values import Instant, Received
 from acsard.daemon.daemon import Departure, _control, _recorder
-from acsard.daemon.wakeup import Wakeup
+from acsard.daemon.pulse import Pulse
 from acsard.host.logs import Log
 from acsard.host.systemd import Systemd
 from acsard.recording import mcap_recorder as recorder
@@ -66,11 +66,11 @@ def test_systemd_receives_stopping_before_the_daemon_cleans_up_after_an_error(
         service_manager.setblocking(False)
 
         async def run() -> None:
-            wake = Wakeup()
+            pulse = Pulse()
             manager = Systemd({"NOTIFY_SOCKET": str(tmp_path / "notify")}, os.getpid())
-            departure = Departure(Log(world.config.log), wake, manager)
+            departure = Departure(Log(world.config.log), pulse, manager)
             with pytest.raises(ValueError, match="a fault of our own"):
-                await _control(world.config, world.loop, departure, wake, manager)
+                await _control(world.config, world.loop, departure, pulse, manager)
             manager.close()
 
         asyncio.run(run())

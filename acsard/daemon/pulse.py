@@ -1,0 +1,135 @@
+"""Runs a control step when the kernel, the bus or the serial port requires one.
+
+The event loop watches an interval timer for the periods, an eventfd that Zenoh's threads write, and
+a timer for an early line (`pacing.py`). A step runs in its callback, as waking a task would cost
+another round. Missed periods only count: they are never made up.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Callable
+
+from acsard.core.values import Instant, Ns
+from acsard.daemon.pacing import NO_PERIOD, Period
+from acsard.host import clock
+from acsard.host.timerfd import TimerFd
+
+# Gets the time and the periods that have ended; returns whether the daemon goes on.
+Step = Callable[[Instant, Period], bool]
+
+
+class Pulse:
+    """Wakes the control loop. Calling it runs a step in the thread of the event loop."""
+
+    def __init__(self) -> None:
+        # Never closed: a thread of Zenoh may write until the process ends, and a closed descriptor
+        # may be another file by then.
+        self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._periods, self._alarm = TimerFd(), TimerFd()
+        self._period_ns = self._due_ns = 0  # the latter by the timer's clock
+        self._next_ns = 0  # about the same time by the daemon's clock
+        self._alarm_ns: Ns | None = None
+        self._step: Step | None = None
+        self._over: asyncio.Future[None] | None = None
+        self._early = self._command_waits = self._stop_waits = False
+
+    async def run(self, period_ns: Ns, step: Step) -> None:
+        """Run `step` at the end of each period, and between, until it returns False."""
+        loop = asyncio.get_running_loop()
+        self._over, self._step, self._period_ns = loop.create_future(), step, period_ns
+        callbacks = {
+            self._periods.fileno(): self._period_ended,
+            self._bell: self._rung,
+            self._alarm.fileno(): self._alarmed,
+        }
+        for fd, callback in callbacks.items():
+            loop.add_reader(fd, callback)
+        self._due_ns = self._periods.repeat(period_ns)
+        self._next_ns = clock.mono_ns() + period_ns
+        try:
+            await self._over
+        finally:
+            self._step = None
+            for fd in callbacks:
+                loop.remove_reader(fd)
+            self._periods.close()
+            self._alarm.close()
+
+    def __call__(self) -> None:
+        # After a stall, the periods that have ended meanwhile count before this event.
+        now = clock.now()
+        self._run(now, NO_PERIOD if now.mono_ns < self._next_ns else self._ended(now))
+
+    def _period_ended(self) -> None:
+        now = clock.now()
+        period = self._ended(now)
+        # A step for another event may have counted the period.
+        if period is not NO_PERIOD:
+            self._run(now, period)
+
+    def _ended(self, now: Instant) -> Period:
+        expired = self._periods.expirations()
+        if not expired:
+            return NO_PERIOD
+        due_ns = now.mono_ns - (clock.timer_ns() - self._due_ns)
+        ended_ns = expired * self._period_ns
+        self._due_ns += ended_ns
+        self._next_ns = due_ns + ended_ns
+        return Period(expired, due_ns)
+
+    def _rung(self) -> None:
+        os.eventfd_read(self._bell)
+        self()
+
+    def _alarmed(self) -> None:
+        # A timer that was set again after it had expired reports no expiration.
+        if self._alarm.expirations() and self._alarm_ns is not None:
+            self._alarm_ns = None
+            self()
+
+    def _run(self, now: Instant, period: Period) -> None:
+        step, self._step, self._command_waits = self._step, None, False
+        if step is None or self._over is None:
+            return  # during a step, such as for a port that it has found lost, or after the last
+        try:
+            if step(now, period):
+                self._step = step
+            else:
+                self._over.set_result(None)
+        except BaseException as error:  # noqa: BLE001
+            # The event loop would only log the exception, but a bug in a step must end the process.
+            self._over.set_exception(error)
+
+    def expect(self, *, early: bool, retry_ns: Ns | None, period_ended: bool) -> None:
+        """Say at the end of a step which events may run another one before the period ends.
+
+        Args:
+            early: the next command does.
+            retry_ns: when the command that waits can be sent, or None without one.
+            period_ended: this step was a period's, so the next stop runs a step at once.
+        """
+        if retry_ns is not None and retry_ns != self._alarm_ns:
+            self._alarm.set(retry_ns)
+        self._alarm_ns = retry_ns
+        if early or period_ended:
+            self._stop_waits = False
+        self._early = early
+        if early and self._command_waits:
+            self.command()  # it arrived during the step, perhaps too late for it
+
+    # Any thread may call the methods below.
+
+    def command(self) -> None:
+        """Report a sample that may be a command. The first runs a step if the last said `early`."""
+        self._command_waits = True
+        if self._early:
+            self._early = False
+            os.eventfd_write(self._bell, 1)
+
+    def stop(self) -> None:
+        """Report a stop, of which a flood runs one step in each period."""
+        if not self._stop_waits:
+            self._stop_waits = True
+            os.eventfd_write(self._bell, 1)
