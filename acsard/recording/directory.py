@@ -88,6 +88,8 @@ class RecordingDirectory:
         The newest file stays, because the daemon may be writing it.
         """
         sizes: dict[Path, int] = {}
+        if not self._path.is_dir():
+            return ""
         for path in listed(self._path):
             with suppress(FileNotFoundError):  # another process has just removed it
                 sizes[path] = path.stat().st_size

@@ -259,10 +259,10 @@ class _Writer:
         if self._ends:
             self._end()
         if self._frames is None:
+            self._make_room()
             self._file = self._directory.begin(start.at.wall_ns)
             self._frames, self._last, self._has_steps = FrameWriter(self._file), None, False
             self._began_ns = self._synced_ns = start.at.mono_ns
-            self._make_room()
         if start.config is not self._text[0]:
             self._text = start.config, _text(start.config)
         robot, (mono_ns, wall_ns) = self._robot, (start.at.mono_ns, start.at.wall_ns)

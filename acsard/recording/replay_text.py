@@ -11,9 +11,11 @@ from acsard.core.config.settings import Config
 from acsard.core.config.validation import show
 from acsard.core.formatting import listed, many, printable
 from acsard.core.values import NS_PER_S, Event, Ns
+from acsard.recording.file import Damage
 from acsard.recording.file_replay import Gap
 from acsard.recording.recorded_steps import US_PER_S, RecordedOutputs
 from acsard.recording.replay import Comparison, Difference, max_wheel_speed
+from acsard.recording.replay import Gap as Missing
 
 # Settings that affect the speeds in the lines to the board.
 LINE_SETTINGS = ("limits.", "drive.", "mcu.wheels.")
@@ -73,6 +75,16 @@ def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
         parts.append("the end of the recording, which may contain more steps, cannot be read")
     because = f" ({'; '.join(parts)})" if parts else ""
     return f"{how}: {seconds:.1f} s in {many(len(gaps), 'damaged place')}{because}"
+
+
+def describe_missing(gaps: Sequence[Missing], damage: Sequence[Damage], how: str) -> list[str]:
+    """Return lines about the steps that a recording lacks, the first of which begin with `how`."""
+    lines = []
+    if gaps:
+        steps = many(sum(gap.steps for gap in gaps), "step is missing", "steps are missing")
+        seconds = sum(gap.end.mono_ns - gap.begin.mono_ns for gap in gaps) / NS_PER_S
+        lines.append(f"{how}: {seconds:.1f} s in {many(len(gaps), 'place')}, where {steps}")
+    return lines + [str(place) for place in damage]
 
 
 def describe_difference(difference: Difference, began_ns: Ns) -> list[str]:
