@@ -148,7 +148,7 @@ class Robot:
         self.counters: Counter[str] = Counter()
         self._refused = ""
         self._refused_ns: Ns | None = None
-        self._sanity = Sanity(config.feedback)
+        self._sanity = Sanity()
         latched = [latch for latch in (latches.fault, latches.stop) if latch is not None]
         causes = [cause for latch in latched for cause in latch.causes]
         codes = {cause.code for cause in causes}
@@ -436,7 +436,7 @@ class Robot:
 
     def _plausible(self, line: Feedback, now: Instant, events: list[Event]) -> list[Feedback]:
         # A line after a long gap may wait for one that confirms its speeds.
-        why = self._sanity.impossible(line)
+        why = self._sanity.impossible(line, self.config.feedback.wheel_speed)
         if self._sanity.warning is not None:
             events.append(self._sanity.warning)
         if why:

@@ -24,12 +24,14 @@ from acsard.core.config.settings import Config
 from acsard.core.formatting import printable
 from acsard.core.guard import Memory
 from acsard.core.motion.arbiter import Choice
+from acsard.core.motion.arbiter_text import CommandEvents
 from acsard.core.motion.battery import Battery
 from acsard.core.motion.bumpers import Bumpers
 from acsard.core.motion.emergency_stop import EmergencyStop
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.limits import Motion
 from acsard.core.motion.modes import Mode
+from acsard.core.motion.sanity import Sanity
 from acsard.core.robot import Robot
 from acsard.core.values import AcsardError, SpeedCap
 from acsard.recording.unpickling import MAX_BYTES, unpickle
@@ -43,6 +45,8 @@ PARTS: dict[str, type[Struct]] = {
     "_estop": EmergencyStop,
     "_bumpers": Bumpers,
     "_battery": Battery,
+    "_sanity": Sanity,
+    "_told": CommandEvents,
     "_tally": EventThrottle,
 }
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import get_args
 
+from msgspec import Struct
+
 from acsard.core.codes import Reason, sentence
 from acsard.core.formatting import lasting, many
 from acsard.core.motion.arbiter import MAX_SENDERS, Choice, Objection
@@ -84,28 +86,28 @@ def refused(refusal: Refusal) -> Event:
     return Event("command_refused", refusal.text, "warning", by, kind, news=False, code=kind)
 
 
-class CommandEvents:
+class CommandEvents(Struct):
     """Events for a new mode, and for a new source or sender that drives the robot."""
 
-    def __init__(self, mode: Mode) -> None:
-        self._mode, self._commander = mode, ("", "")
-        self._kept = ""  # source whose speeds have no effect, by the last event
+    mode: Mode
+    commander: tuple[str, str] = ("", "")  # source and sender
+    kept: str = ""  # source whose speeds have no effect, by the last event
 
     def changes(self, mode: Mode, choice: Choice, why: Reason) -> list[Event]:
         """Return the events for a new mode, a new commander, and speeds without effect.
 
         A commander that drives again after a pause is not new. `why` is the reason of the mode.
         """
-        drives, before, last = mode is Mode.DRIVING, self._mode, self._commander
+        drives, before, last = mode is Mode.DRIVING, self.mode, self.commander
         if drives:
-            self._commander = (choice.source, choice.sender)
-        self._mode, events = mode, []
+            self.commander = (choice.source, choice.sender)
+        self.mode, events = mode, []
         if mode is not before:
-            why, by = (chosen(choice), _name(self._commander)) if drives else (why, "")
+            why, by = (chosen(choice), _name(self.commander)) if drives else (why, "")
             kind = f"{before} -> {mode}"
             events.append(Event("mode", why.text, by=by, kind=kind, code=why.code))
-        if self._commander != last:
-            by = _name(self._commander)
+        if self.commander != last:
+            by = _name(self.commander)
             events.append(Event("commander", "", by=by, kind=f"{_name(last)} -> {by}"))
         return events + self._kept_waiting(mode, choice)
 
@@ -113,12 +115,12 @@ class CommandEvents:
         # A warning, once, if the speeds of a source have had no effect for a while.
         wait, source = choice.wait, ""
         if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):
-            self._kept = ""
+            self.kept = ""
         elif wait.lasts:
             source = wait.source if wait.what == "neutral" else wait.kept
-        if not source or source == self._kept:
+        if not source or source == self.kept:
             return []
-        self._kept = source
+        self.kept = source
         by = _name((choice.source, choice.sender))
         why = waiting(wait)
         return [Event("commands_without_effect", why.text, "warning", by, source, code=why.code)]

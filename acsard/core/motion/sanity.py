@@ -13,10 +13,11 @@ from __future__ import annotations
 import math
 from operator import sub
 
-from acsard.core.config.settings import FeedbackConfig
+from msgspec import Struct
+
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
-from acsard.core.values import WHEELS, Event, WheelSpeeds
+from acsard.core.values import WHEELS, Event, RadPerS, WheelSpeeds
 
 FAULT_LINES = 3  # in a row: 30 ms at 100 Hz
 
@@ -48,78 +49,77 @@ MIN_INTERVAL_S = 0.004
 NOT_FAST, AT_REST = (0, 0, 0, 0), (0.0, 0.0, 0.0, 0.0)
 
 
-class Sanity:
+class Sanity(Struct):
     """Checks whether the wheel speeds in each feedback line are physically possible.
 
     Changes count from the last possible line. If that one is not trusted, a line that contradicts
     it is possible if it agrees with one of the impossible lines in between.
     """
 
-    def __init__(self, feedback: FeedbackConfig) -> None:
-        self._settings = feedback
-        self._last: WheelSpeeds | None = None
-        self._trusted = False  # the wheels can change back to the line before by the next one
-        # Newest impossible lines since `_last`, with the time since it, s; not too fast ones.
-        self._rejected: list[tuple[WheelSpeeds, float]] = []
-        self._since = 0.0
-        self._longest = 0.0  # s that a recent line covers (recent for as long)
-        self._impossible = 0
-        self._fast = NOT_FAST  # successive lines of each wheel over `feedback.wheel_speed`
-        # Sums of the speeds in these lines, rad/s. A speed far above the limit is damage, so each
-        # adds the limit and a quantization step at most.
-        self._totals = AT_REST
-        self._lines = self._dropped = 0  # all lines of the window, and impossible ones
-        self.warning: Event | None = None  # only if the last line caused it
+    last: WheelSpeeds | None = None  # possible speeds
+    trusted: bool = False  # the wheels can change back to the line before by the next one
+    # Newest impossible lines since `last`, with the time since it, s; not too fast ones.
+    rejected: list[tuple[WheelSpeeds, float]] = []
+    since: float = 0.0  # s since `last`
+    longest: float = 0.0  # s that a recent line covers (recent for as long)
+    count: int = 0  # of the last impossible lines
+    fast: tuple[int, int, int, int] = NOT_FAST  # successive lines of each wheel over the limit
+    # Sums of the speeds in these lines, rad/s. A speed far above the limit is damage, so each
+    # adds the limit and a quantization step at most.
+    totals: Motors = AT_REST
+    lines: int = 0  # of the window
+    dropped: int = 0  # impossible ones of the window
+    warning: Event | None = None  # only if the last line caused it
 
     def forget(self) -> None:
         """Start over after a lost link or a cleared fault; the last line is not trusted."""
-        self._trusted, self._impossible, self._fast = False, 0, NOT_FAST
+        self.trusted, self.count, self.fast = False, 0, NOT_FAST
 
     @property
     def doubtful(self) -> bool:
         """Whether the last `FAULT_LINES` lines were impossible, which latches a fault."""
-        return self._impossible >= FAULT_LINES
+        return self.count >= FAULT_LINES
 
-    def impossible(self, feedback: Feedback) -> str:
-        """Return why no wheel can have these speeds, or "".
+    def impossible(self, feedback: Feedback, fastest: RadPerS) -> str:
+        """Return why no wheel can have these speeds, or ""; `fastest` is `feedback.wheel_speed`.
 
         The allowed change grows with the time since the last possible line, so a real jump is
         accepted in time. Updates `doubtful` and `warning`.
         """
         dt, since = feedback.dt, feedback.since
         since = dt if dt > since else since
-        self._since += since
-        longest = self._longest - since if self._longest > since else 0.0
-        self._longest = longest if longest > since else since
+        self.since += since
+        longest = self.longest - since if self.longest > since else 0.0
+        self.longest = longest if longest > since else since
         if feedback.gap:
-            self._last, self._fast = None, NOT_FAST
-            self._rejected.clear()
-        speeds, last = feedback.speeds, self._last
+            self.last, self.fast = None, NOT_FAST
+            self.rejected.clear()
+        speeds, last = feedback.speeds, self.last
         wheels = speeds.as_tuple()
         change = 0.0 if last is None else max(map(abs, map(sub, wheels, last.as_tuple())))
-        most = self._most(self._since, longest)
+        most = self._most(self.since, longest)
         why = ""
-        if max(map(abs, wheels)) > self._settings.wheel_speed or change > most:
+        if max(map(abs, wheels)) > fastest or change > most:
             # Only few lines need the quantization steps.
-            why = self._too_fast(feedback)
+            why = self._too_fast(feedback, fastest)
             if not why and last is not None:
                 why = self._jump(feedback, last, most)
                 if why:
-                    agrees = not self._trusted and self._agrees(feedback, longest)
-                    self._rejected = [*self._rejected[1 - FAULT_LINES :], (speeds, self._since)]
+                    agrees = not self.trusted and self._agrees(feedback, longest)
+                    self.rejected = [*self.rejected[1 - FAULT_LINES :], (speeds, self.since)]
                     why = "" if agrees else why
         else:
-            self._fast = NOT_FAST
+            self.fast = NOT_FAST
         self._count(why)
         if why:
-            self._impossible += 1
+            self.count += 1
             return why
         # If this line is damaged, the speeds change back by `change` in the next line. Every next
         # line may at least change by as much as a wheel can in half of `_longest`.
-        self._trusted = last is not None and change <= self._most(0.0, self._longest)
-        self._last, self._since, self._impossible = speeds, 0.0, 0
-        if self._rejected:
-            self._rejected.clear()
+        self.trusted = last is not None and change <= self._most(0.0, self.longest)
+        self.last, self.since, self.count = speeds, 0.0, 0
+        if self.rejected:
+            self.rejected.clear()
         return ""
 
     def _most(self, since: float, longest: float) -> float:
@@ -129,31 +129,31 @@ class Sanity:
 
     def _agrees(self, line: Feedback, longest: float) -> bool:
         return any(
-            not self._jump(line, speeds, self._most(self._since - since, longest))
-            for speeds, since in self._rejected
+            not self._jump(line, speeds, self._most(self.since - since, longest))
+            for speeds, since in self.rejected
         )
 
     def _count(self, why: str) -> None:
-        self._lines += 1
+        self.lines += 1
         self.warning = None
         if why:
-            self._dropped += 1
-            if self._dropped == int(WARNING_FRACTION * WINDOW_LINES) + 1:
+            self.dropped += 1
+            if self.dropped == int(WARNING_FRACTION * WINDOW_LINES) + 1:
                 self.warning = Event("lines_implausible", self._warning_text(why), "warning")
-        if self._lines == WINDOW_LINES:
-            self._lines = self._dropped = 0
+        if self.lines == WINDOW_LINES:
+            self.lines = self.dropped = 0
 
     def _warning_text(self, why: str) -> str:
         setting = why.rpartition(" over ")[2]
         return (
-            f"{self._dropped} of {self._lines} lines were dropped, because no wheel can do "
+            f"{self.dropped} of {self.lines} lines were dropped, because no wheel can do "
             f"what they report; the last: {why}. If a wheel really does that, raise {setting}. "
             "Otherwise lines arrive damaged: check cable and ground; firmware that "
             'supports mcu.link_check = "auto" protects each line with a checksum'
         )
 
-    def _too_fast(self, line: Feedback) -> str:
-        wheels, fastest = line.speeds.as_tuple(), self._settings.wheel_speed
+    def _too_fast(self, line: Feedback, fastest: RadPerS) -> str:
+        wheels = line.speeds.as_tuple()
         turned, own = _proven(line), line.dt - line.bridged
         # A line without a known time moves nothing, so no count in it is excused.
         count = COARSEST_COUNT / max(own, MIN_COUNT_S) if own > 0.0 else 0.0
@@ -161,18 +161,18 @@ class Sanity:
         learned = max(line.steps) < math.inf
         a, b, c, d = (
             lines + 1 if abs(now) > fastest else 0
-            for now, lines in zip(wheels, self._fast, strict=True)
+            for now, lines in zip(wheels, self.fast, strict=True)
         )
-        self._fast = a, b, c, d
+        self.fast = a, b, c, d
         front_right, front_left, rear_left, rear_right = (
             min(abs(now), fastest + step) + (total if lines > 1 else 0.0)
             for now, total, step, lines in zip(
-                wheels, self._totals, line.steps, self._fast, strict=True
+                wheels, self.totals, line.steps, self.fast, strict=True
             )
         )
-        self._totals = front_right, front_left, rear_left, rear_right
+        self.totals = front_right, front_left, rear_left, rear_right
         rows = zip(
-            WHEELS, wheels, line.steps, turned or wheels, self._fast, self._totals, strict=True
+            WHEELS, wheels, line.steps, turned or wheels, self.fast, self.totals, strict=True
         )
         for name, now, step, angle, lines, total in rows:
             size = abs(now)

@@ -91,7 +91,7 @@ class Host:
     def __init__(self, feedback: FeedbackConfig | None = None, counts: int = 0) -> None:
         """`counts` is the configured number of counts per turn, or 0 if it is unknown."""
         self.session = McuSession(McuConfig(encoder_counts=counts), 100.0)
-        self.sanity = Sanity(feedback or FeedbackConfig())
+        self.sanity, self.fastest = Sanity(), (feedback or FeedbackConfig()).wheel_speed
         self.odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()), counts)
         self.now_ns = 1_000_000_000
         self.lines = self.dropped = 0
@@ -102,7 +102,7 @@ class Host:
         now = Instant(self.now_ns, self.now_ns + WALL_NS)
         for feedback in self.session.update(now, True, 1, (Received(now, line),)):
             self.lines += 1
-            why = self.sanity.impossible(feedback)
+            why = self.sanity.impossible(feedback, self.fastest)
             if why:
                 self.why = why
                 self.dropped += 1

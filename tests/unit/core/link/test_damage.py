@@ -21,6 +21,8 @@ from acsard.core.link.quantization import CountRecovery
 from acsard.core.motion.sanity import Sanity
 from acsard.core.values import STILL, Instant, WheelSpeeds
 
+FASTEST = FeedbackConfig().wheel_speed
+
 KINDS = ("bit flipped", "byte lost", "byte doubled", "lines merged", "noise")
 PLACES = (31, 33, 33, 33, 33)
 """Number of possible start positions of each accident.
@@ -77,7 +79,7 @@ def test_damage_raises_no_exception_and_is_rarely_accepted(count: int) -> None:
     lines = drive(rng, 5000)
     truth = [codec.decode(line[:-2]) for line in lines]
     tried, wrong, believed = Counter[int](), Counter[int](), Counter[int]()
-    sanity, feed, decode = Sanity(FeedbackConfig()), LineReader().feed, codec.decode
+    sanity, feed, decode = Sanity(), LineReader().feed, codec.decode
     chance, kinds, last = rng.random, len(KINDS), len(lines) - 1
     for i in range(count):
         kind, at = i % kinds, 1 + i % last
@@ -111,12 +113,12 @@ def plausible(
     `steps` are the quantization steps of the encoders.
     """
     sanity.forget()
-    sanity.impossible(Feedback(AT, before, 0.01))
-    return not sanity.impossible(Feedback(AT, speeds, 0.01, steps=steps))
+    sanity.impossible(Feedback(AT, before, 0.01), FASTEST)
+    return not sanity.impossible(Feedback(AT, speeds, 0.01, steps=steps), FASTEST)
 
 
 def test_the_slew_check_distinguishes_a_leap_from_a_step() -> None:
-    sanity = Sanity(FeedbackConfig())
+    sanity = Sanity()
     assert plausible(sanity, STILL, WheelSpeeds(5.0, 5.0, 5.0, 5.0))
     assert not plausible(sanity, STILL, WheelSpeeds(0.0, 40.0, 0.0, 0.0))
 
@@ -128,7 +130,7 @@ def count_errors(lines: list[bytes], every: int) -> tuple[int, int, int]:
     accepted without the quantization steps learned from all lines.
     """
     rng, codec, recovery = random.Random(5), Codec(WheelMap()), CountRecovery()
-    sanity, wrong, believed, before = Sanity(FeedbackConfig()), 0, [0, 0], STILL
+    sanity, wrong, believed, before = Sanity(), 0, [0, 0], STILL
     for i, line in enumerate(lines):
         truth, speeds = codec.decode(line[:-2]), None
         sent = hurt(0, line, line, rng.random(), rng.randrange(31)) if i % every == 0 else line

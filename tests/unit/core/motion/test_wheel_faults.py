@@ -317,13 +317,13 @@ class Fall:
             begun = int(rng.integers(300, 700))
         lying = LIES[kind](true, wheel, begun)
         healthy, plain, robot = Plain(), Plain(), odometry()
-        sanity = Sanity(FeedbackConfig())
+        sanity = Sanity()
         self.out_s = self.wrong = 0.0
         off = out = None
         truth, wishing = lines(true), wishes(speeds)
         for i, line in enumerate(lines(lying, counts)):
             healthy.fold(truth[i])
-            if sanity.impossible(line):
+            if sanity.impossible(line, FeedbackConfig().wheel_speed):
                 plain.skip(line)
                 robot.skip(line)
                 if sanity.doubtful:
