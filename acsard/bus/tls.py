@@ -262,18 +262,19 @@ def trouble(endpoint: str, directory: str) -> str:
     host, port = host_and_port(endpoint)
     try:
         plain = socket.create_connection((host, int(port)), HANDSHAKE_TIMEOUT_S)
-    except socket.gaierror:
-        return (
-            f"the name {host} does not resolve on this machine; write the robot's IP address "
-            "(`hostname -I` on the robot prints it; the robot's certificate must contain this "
-            "address), or fix DNS, mDNS or /etc/hosts"
-        )
     except TimeoutError:
         return (
             f"{host} does not answer on port {port}: is {host} switched on, and does a firewall "
             "drop connections?"
         )
     except (OSError, ValueError, OverflowError) as error:
+        # Since Python 3.13 the lookup also rejects an impossible port.
+        if isinstance(error, socket.gaierror) and error.errno != socket.EAI_SERVICE:
+            return (
+                f"the name {host} does not resolve on this machine; write the robot's IP address "
+                "(`hostname -I` on the robot prints it; the robot's certificate must contain this "
+                "address), or fix DNS, mDNS or /etc/hosts"
+            )
         if isinstance(error, OSError) and error.errno in UNREACHABLE:
             return (
                 f"{host} cannot be reached ({error.strerror}): is {host} switched on, is it in "
