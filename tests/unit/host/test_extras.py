@@ -76,7 +76,8 @@ def test_uv_and_pipx_keep_the_other_extra(
     assert "[foxglove,tools]" in install("foxglove")
 
 
-def test_the_error_names_the_library_and_the_extra() -> None:
+def test_the_error_names_the_library_and_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(extras, "find_spec", lambda library: None)
     assert "needs the library segno" in str(missing("segno"))
     assert "[tools]" in str(missing("segno"))
 
