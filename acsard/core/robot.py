@@ -174,7 +174,7 @@ class Robot:
     def snapshot(self, now_ns: Ns) -> Snapshot:
         """Return what `state` and `diagnostics` need beyond outputs; too slow for every step."""
         session, since, silent = self.session, self._refused_ns, self.session.silent(now_ns)
-        counters = {"lines": session.good_lines} | self._odometry.missed()
+        counters = {"lines": session.good_lines} | self._odometry.unseen.counters()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
         if session.count_recovery.coarse_lines:
             counters["coarse_encoder_lines"] = session.count_recovery.coarse_lines
@@ -240,7 +240,7 @@ class Robot:
         due = inputs.tick or (inputs.at_once and news)
         line = self._drive(inputs) if due else None
         applied = (self._motion if self._line is None else self._line.motion).twist
-        self._odometry.command(applied)
+        self._odometry.commanded.command(applied)
         link = self.session.link
         why = self._reason()
         if limiting:

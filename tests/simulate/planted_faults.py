@@ -834,8 +834,8 @@ FAULTS = (
         "odometry yaw",
         "the pose turns by a fifth too much",
         PATH,
-        "_wrapped(self._yaw, turn)",
-        "_wrapped(self._yaw, 1.2 * turn)",
+        "_wrapped(self.pose.yaw, turn)",
+        "_wrapped(self.pose.yaw, 1.2 * turn)",
     ),
     fault(
         "odometry set",
@@ -888,8 +888,8 @@ FAULTS = (
         "odometry leap",
         "a lost line moves the pose by 2 m",
         ODOMETRY,
-        "            self.bridged += bridged\n",
-        "            self.bridged += bridged\n            self._path.advance(2.0, 0.0)\n",
+        "            self.unseen.filled += bridged\n",
+        "            self.unseen.filled += bridged\n            self._path.advance(2.0, 0.0)\n",
     ),
     # latch file
     fault(

@@ -41,6 +41,7 @@ from acsard.core.values import (
     STILL,
     Estimate,
     Pose,
+    RadPerS,
     Twist,
     TwistVariances,
     WheelSpeeds,
@@ -65,6 +66,54 @@ class Step(Struct, frozen=True, gc=False):
     on_trial: bool
 
 
+class Commanded(Struct):
+    """The last twist that the motors were commanded."""
+
+    twist: Twist = REST
+    # Highest speeds since the last line: in a gap, the robot may have driven as fast.
+    highest: Twist = REST
+    heard: bool = False  # a line was used since the last command
+
+    def command(self, twist: Twist) -> None:
+        """Record the twist that the motors are commanded from now on."""
+        if self.heard or twist != self.twist:
+            # The robot may still follow the previous command.
+            highest = self.twist if self.heard else self.highest
+            self.highest = Twist(
+                max(abs(highest.linear), abs(twist.linear)),
+                max(abs(highest.angular), abs(twist.angular)),
+            )
+            self.twist, self.heard = twist, False
+
+
+class Unseen(Struct):
+    """Gaps in the feedback, in which the robot may have moved."""
+
+    gaps: int = 0
+    seconds: float = 0.0
+    filled: float = 0.0  # s of gaps that were filled
+
+    def counters(self) -> dict[str, int]:
+        """Return the counters `gaps`, `gap_ms` and `gaps_filled_ms` that are not 0."""
+        ms = {"gap_ms": round(1e3 * self.seconds), "gaps_filled_ms": round(1e3 * self.filled)}
+        return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
+
+
+class Quantization(Struct):
+    """Quantization of the speeds in the last line, rad/s."""
+
+    steps: Motors = AT_REST
+    coarsest: RadPerS = 0.0  # the largest known one, 0 if none is known
+    largest: RadPerS = math.inf  # the same, but infinite
+
+    def follow(self, steps: Motors) -> None:
+        if steps is self.steps:
+            return
+        known = [step for step in steps if step < math.inf]
+        self.coarsest, self.largest = max(known, default=0.0), max(known, default=math.inf)
+        self.steps = steps
+
+
 class Odometry:
     """The odometry: pose, covariance and angles of the wheels, integrated from feedback."""
 
@@ -83,9 +132,7 @@ class Odometry:
         self._rolling = Rolling(quiet)
         self._confirmation = Confirmation()
         self._held = AT_REST  # rad at rest; for the pose beyond two counts, or in a drive
-        # Quantization of each speed in the last line, and the largest known one, rad/s (0 and
-        # infinite if none is known).
-        self._steps_of, self._coarsest, self._largest_step = AT_REST, 0.0, 0.0
+        self._quantization = Quantization()
         self._path = Path()
         self._errors = ErrorModel(odometry, kinematics)
         self._uncertainty = PoseUncertainty(self._errors, encoder_counts)
@@ -98,10 +145,7 @@ class Odometry:
         self._still = 0.0  # s of zero speeds, without filled gaps
         self.twist = REST  # in the last line
         self.speeds = STILL  # in the last line
-        self._commanded = self._highest = REST  # last twist; highest speeds since the last line
-        self._folded = False  # a line was used since the last command
-        # Gaps in which the robot may have moved, their s, and s of filled gaps.
-        self.gaps, self.unseen, self.bridged = 0, 0.0, 0.0
+        self.commanded, self.unseen = Commanded(), Unseen()
         self.travelled = 0.0  # m since the daemon started, forwards plus backwards
 
     def use(self, odometry: OdometryConfig) -> None:
@@ -126,25 +170,6 @@ class Odometry:
     @property
     def pose(self) -> Pose:
         return self._path.pose
-
-    def missed(self) -> dict[str, int]:
-        """Return the counters `gaps`, `gap_ms` and `gaps_filled_ms` that are not 0."""
-        ms = {"gap_ms": round(1e3 * self.unseen), "gaps_filled_ms": round(1e3 * self.bridged)}
-        return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
-
-    def command(self, twist: Twist) -> None:
-        """Record the twist that the motors are commanded from now on.
-
-        Call this in each step after its lines: in a gap, the robot may have driven as fast.
-        """
-        if self._folded or twist != self._commanded:
-            # The robot may still follow the previous command.
-            highest = self._commanded if self._folded else self._highest
-            self._highest = Twist(
-                max(abs(highest.linear), abs(twist.linear)),
-                max(abs(highest.angular), abs(twist.angular)),
-            )
-            self._commanded, self._folded = twist, False
 
     def skip(self, feedback: Feedback) -> None:
         """Ignore the speeds of an implausible line; the next plausible one adds both motions.
@@ -177,11 +202,7 @@ class Odometry:
         """
         speeds, dt, before, checks = feedback.speeds, feedback.dt, self.twist, self.checks
         rolled = self._rolling.take(feedback, self.speeds)
-        if feedback.steps is not self._steps_of:
-            self._steps_of = feedback.steps
-            known = [step for step in feedback.steps if step < math.inf]
-            self._coarsest = max(known, default=0.0)
-            self._largest_step = max(known, default=math.inf)
+        self._quantization.follow(feedback.steps)
         if checks.check_line(feedback, rolled):
             self._take_back()
         turn, slips = checks.turn, checks.slips
@@ -192,7 +213,7 @@ class Odometry:
         self._still = self._still + own if believed == AT_REST else 0.0
         at_rest = self._still > REST_S
         after_gap = rolled.bridged > 0.0 or rolled.unknown > 0.0
-        self._rounding.add(believed, own, self._still, after_gap, self._largest_step)
+        self._rounding.add(believed, own, self._still, after_gap, self._quantization.largest)
         if rolled.unknown > 0.0:
             self._add_unseen_motion(rolled.unknown, before, twist)
         turned = self._move(self._settled(rolled, at_rest), turn, speeds, slips)
@@ -202,7 +223,7 @@ class Odometry:
         variances = self._twist_variances(twist, feedback, at_rest, turn, slips)
         if turn is not None and dt > 0.0:
             twist = Twist(linear, turn.rate)
-        self.twist, self.speeds, self._folded = twist, speeds, True
+        self.twist, self.speeds, self.commanded.heard = twist, speeds, True
         checks.finish(turned)
         return Estimate(
             feedback.at,
@@ -285,8 +306,8 @@ class Odometry:
     def _go_on(self, rolled: Rolled, feedback: Feedback, before: Twist, twist: Twist) -> None:
         bridged = rolled.bridged
         if bridged > 0.0:
-            self.bridged += bridged
-            along, yaw = self._gaps.fill(bridged, before, twist, self._highest)
+            self.unseen.filled += bridged
+            along, yaw = self._gaps.fill(bridged, before, twist, self.commanded.highest)
             by_counts, turn_by_counts = self._rounded(bridged)
             self._uncertainty.doubt(along + by_counts, yaw + turn_by_counts)
             if rolled.missed != AT_REST:
@@ -308,7 +329,7 @@ class Odometry:
     def _twist_variances(
         self, twist: Twist, feedback: Feedback, at_rest: bool, gyro: Turn | None, slips: bool
     ) -> TwistVariances:
-        spread, step = self._twist_uncertainty, self._coarsest
+        spread, step = self._twist_uncertainty, self._quantization.coarsest
         if at_rest:
             variances = spread.at_rest(self._still, step)
         else:
@@ -326,10 +347,10 @@ class Odometry:
         return linear * square, 0.0 if self.checks.turn is not None else angular * square
 
     def _add_unseen_motion(self, seconds: float, before: Twist, after: Twist) -> None:
-        if before != REST or after != REST or self._highest != REST:
-            self.gaps += 1
-            self.unseen += seconds
-        along, yaw = self._gaps.unseen(seconds, before, after, self._highest)
+        if before != REST or after != REST or self.commanded.highest != REST:
+            self.unseen.gaps += 1
+            self.unseen.seconds += seconds
+        along, yaw = self._gaps.unseen(seconds, before, after, self.commanded.highest)
         by_counts, turn_by_counts = self._rounded(seconds)
         self._uncertainty.add_gap(
             seconds * (before.linear + after.linear) / 2,

@@ -9,43 +9,45 @@ from __future__ import annotations
 
 import math
 
+from msgspec import Struct
+
 from acsard.core.values import Metres, Pose, Rad
 
 TAU_REST = 2.4492935982947064e-16  # 2 pi minus `math.tau`
 
 
-class Path:
+class Path(Struct):
     """The pose at the end of a path of arcs."""
 
-    def __init__(self) -> None:
-        self.set(Pose())
+    pose: Pose = Pose()  # of base_link in odom, yaw within [-pi, pi]
+    # Rounding errors of the pose.
+    x_rest: Metres = 0.0
+    y_rest: Metres = 0.0
+    yaw_rest: Rad = 0.0
 
     def set(self, pose: Pose) -> None:
-        self._x, self._x_rest = pose.x, 0.0
-        self._y, self._y_rest = pose.y, 0.0
-        self._yaw, self._yaw_rest = math.remainder(pose.yaw, math.tau), 0.0
-        self.pose = Pose(self._x, self._y, self._yaw)  # of base_link in odom, yaw within [-pi, pi]
+        self.pose = Pose(pose.x, pose.y, math.remainder(pose.yaw, math.tau))
+        self.x_rest = self.y_rest = self.yaw_rest = 0.0
 
     def advance(self, distance: Metres, turn: Rad) -> tuple[float, float, float]:
         """Add an arc; return x and y, m, and the direction, rad, of its chord in odom."""
-        half = turn / 2
+        half, pose = turn / 2, self.pose
         # sin(h)/h is accurate in doubles down to tiny h. Only h = 0 needs its limit.
         chord = distance * (math.sin(half) / half if half else 1.0)
-        heading = self._yaw + half
+        heading = pose.yaw + half
         dx, dy = chord * math.cos(heading), chord * math.sin(heading)
-        self._x, self._x_rest = plus(self._x, dx + self._x_rest)
-        self._y, self._y_rest = plus(self._y, dy + self._y_rest)
-        self._turn(turn)
-        self.pose = Pose(self._x, self._y, self._yaw)
+        x, self.x_rest = plus(pose.x, dx + self.x_rest)
+        y, self.y_rest = plus(pose.y, dy + self.y_rest)
+        self.pose = Pose(x, y, self._turned(turn))
         return dx, dy, heading
 
     def turn(self, turn: Rad) -> None:
-        self._turn(turn)
-        self.pose = Pose(self._x, self._y, self._yaw)
+        self.pose = Pose(self.pose.x, self.pose.y, self._turned(turn))
 
-    def _turn(self, turn: float) -> None:
-        wrapped, rest = _wrapped(self._yaw, turn)
-        self._yaw, self._yaw_rest = plus(wrapped, rest + self._yaw_rest)
+    def _turned(self, turn: Rad) -> Rad:
+        wrapped, rest = _wrapped(self.pose.yaw, turn)
+        yaw, self.yaw_rest = plus(wrapped, rest + self.yaw_rest)
+        return yaw
 
 
 def plus(a: float, b: float) -> tuple[float, float]:

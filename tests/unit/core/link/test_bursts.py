@@ -42,7 +42,7 @@ def drive(seed: int, seconds: float, model: Model, robots: int) -> Array:
     p = end.covariance
     covariance = [[p.xx, p.xy, p.xyaw], [p.xy, p.yy, p.yyaw], [p.xyaw, p.yyaw, p.yawyaw]]
     pose = np.array([end.pose.x, end.pose.y, end.pose.yaw])
-    assert host.found.bridged > 0.05
+    assert host.found.unseen.filled > 0.05
     return nees(pose, np.array(covariance), ends[:, 0])
 
 

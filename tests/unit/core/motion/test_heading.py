@@ -101,7 +101,7 @@ def test_a_gap_before_a_skipped_line_counts_for_the_next_line() -> None:
     robot.fold(feedback_of(Line(10.0, 10.0)))
     robot.skip(feedback_of(Line(10.0, 10.0, gap=0.5)))
     robot.fold(feedback_of(Line(10.0, 10.0)))
-    assert robot.missed() == {"gaps": 1, "gap_ms": 500}
+    assert robot.unseen.counters() == {"gaps": 1, "gap_ms": 500}
 
 
 def test_the_gyro_is_compared_with_the_wheels_over_no_unknown_distance() -> None:

@@ -361,23 +361,23 @@ def test_the_errors_of_several_gaps_add_up_without_cancelling() -> None:
 def test_a_robot_commanded_to_move_in_a_gap_may_have_moved_between_two_rests() -> None:
     robot = odometry()
     robot.fold(feedback(0.0, 0.0, 0.01))
-    robot.command(Twist(-0.4, 0.0))
-    robot.command(REST)
+    robot.commanded.command(Twist(-0.4, 0.0))
+    robot.commanded.command(REST)
     covariance = robot.fold(feedback(0.0, 0.0, 0.0, gap=1.0)).covariance
     assert matrix(covariance)[0, 0] > matrix(START)[0, 0] + 0.1**2
     assert matrix(covariance)[2, 2] == matrix(START)[2, 2]
-    assert robot.missed() == {"gaps": 1, "gap_ms": 1000}
+    assert robot.unseen.counters() == {"gaps": 1, "gap_ms": 1000}
 
 
 def test_only_the_commands_since_the_line_before_a_gap_count_in_it() -> None:
     """One command before this line counts too, because the robot may still follow it."""
     robot = odometry()
-    robot.command(Twist(0.4, 0.0))
+    robot.commanded.command(Twist(0.4, 0.0))
     robot.fold(feedback(0.0, 0.0, 0.01))
-    robot.command(REST)
+    robot.commanded.command(REST)
     assert robot.fold(feedback(0.0, 0.0, 0.0, gap=1.0)).covariance != START
     grown = robot.fold(feedback(0.0, 0.0, 0.01)).covariance
-    robot.command(REST)
+    robot.commanded.command(REST)
     assert robot.fold(feedback(0.0, 0.0, 0.0, gap=1.0)).covariance == grown
 
 
@@ -816,11 +816,11 @@ def test_gaps_and_bridged_times_are_counted_but_a_gap_at_rest_is_not() -> None:
     odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
     at, moving = Instant(0, 0), WheelSpeeds(5.0, 5.0, 5.0, 5.0)
     odometry.fold(Feedback(at, WheelSpeeds(), 0.0, gap=2.0))
-    assert odometry.missed() == {}
+    assert odometry.unseen.counters() == {}
     odometry.fold(Feedback(at, moving, 0.01))
     odometry.fold(Feedback(at, moving, 0.0, gap=0.25))
     odometry.fold(Feedback(at, moving, 0.04, bridged=0.03))
-    assert odometry.missed() == {"gaps": 1, "gap_ms": 250, "gaps_filled_ms": 30}
+    assert odometry.unseen.counters() == {"gaps": 1, "gap_ms": 250, "gaps_filled_ms": 30}
 
 
 # whole counts of a single line
