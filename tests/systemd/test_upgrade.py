@@ -410,9 +410,8 @@ def test_a_package_is_upgraded_to_and_dpkg_alone_changes_nothing(robot: Robot) -
 def test_an_upgrade_that_is_killed_at_any_moment_leaves_a_version_that_starts(
     robot: Robot,
 ) -> None:
-    """The moments are random, and half of the upgrades copy an environment."""
+    """Half of the upgrades copy an environment, and a third of the kills are after the change."""
     moments = random.Random(68)
-    robot.makes(NEW)
     place = environment(robot, "9.1.0")
     robot.stops()
     number, kept, began = robot.latch(), robot.kept(), time.monotonic()
@@ -420,22 +419,30 @@ def test_an_upgrade_that_is_killed_at_any_moment_leaves_a_version_that_starts(
     with Driver(robot.container) as driver:
         driver.sends(0.3)
         for n in range(KILLS):
-            if copies := n % 2 == 0:
-                robot.container.run("rm", "-rf", f"{VERSIONS}/9.1.0")
-            new = place if copies else f"{VERSIONS}/{NEW}"
+            # Each change has removed the versions that are not needed.
+            robot.makes(NEW)
+            robot.container.run("rm", "-rf", f"{VERSIONS}/9.1.0")
+            new = f"{VERSIONS}/{NEW}" if n % 2 else place
+            # The change is between these two messages.
+            after, within_s = (("", 20.0), ("waiting until", 4.0), ("watching it", 8.0))[n // 2 % 3]
             command = robot.container.inside("acsard", "service", "upgrade", new)
             with subprocess.Popen(
-                command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
                 start_new_session=True,
             ) as process:  # fmt: skip
-                time.sleep(moments.uniform(0.0, 25.0 if copies else 8.0))
+                assert process.stdout is not None
+                assert not after or any(after in line for line in process.stdout)
+                time.sleep(moments.uniform(0.0, within_s))
                 os.killpg(process.pid, signal.SIGKILL)
+            assert process.returncode == -signal.SIGKILL
             robot.container.run("systemctl", "restart", UNIT)
             assert robot.container.show("ActiveState") == "active"
             name = robot.readlink()
             assert robot.runs() == name
+            assert after != "watching it" or name != robot.old
             until(robot.link, 10.0, "the link is up")
             assert (robot.latch(), robot.kept()) == (number, kept)
+            print(f"{n + 1} of {KILLS}: killed after {after or 'the start'!r}, {name} starts")
             started[name] = started.get(name, 0) + 1
             if name != robot.old:
                 done = robot.changes(robot.old)
