@@ -160,11 +160,6 @@ class ControlLoop:
         counters = self._snapshot().counters
         return {"seconds": round(seconds, 1), "metres": round(metres, 2), **counters}
 
-    @property
-    def retry_ns(self) -> Ns | None:
-        """When a step between periods can send a command that came too soon after a line."""
-        return self.pace.retry_ns(self._port.sent_ns)
-
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
         """Run one control step, and return the robot's outputs.
 
@@ -220,7 +215,9 @@ class ControlLoop:
         before = self._config
         outputs, was_written = self._decided(inputs)
         has_input = bool(commands or refusals or requests)
-        pace.record_step(inputs.tick, outputs.due, was_written, outputs.news, has_input)
+        pace.record_step(
+            inputs.tick, outputs.due, was_written, outputs.news, has_input, port.sent_ns
+        )
         self._publish(outputs, outputs.answers)
         # `adopted` may change the log's level, so call it after logging this step's events.
         if self._config is not before and self._adopted:

@@ -47,7 +47,7 @@ MAX_EXIT_RAMP_S = 0.6
 class Departure:
     """The daemon's shutdown by signals, of which one during the start cancels the start."""
 
-    def __init__(self, log: Log, wake: Callable[[], None], manager: Systemd) -> None:
+    def __init__(self, log: Log, wake: Callable[[Instant], None], manager: Systemd) -> None:
         self._log, self._wake, self._manager = log, wake, manager
         self._starting = asyncio.current_task()
         self.begun_ns: Ns | None = None
@@ -77,7 +77,7 @@ class Departure:
             # A second signal must not cancel the end of the start.
             self._starting.cancel()
             self._starting = None
-        self._wake()
+        self._wake(clock.now())
 
     def over(self, now_ns: Ns, at_rest: bool) -> bool:
         """Return whether the daemon may end: after a signal, at rest or after the ramp."""
@@ -234,18 +234,13 @@ async def _control(
 
     def step(now: Instant, period: Period) -> bool:
         control.shutting_down = departure.begun_ns is not None
-        manager.step(control.step(now, period))
-        if control.shutting_down and departure.over(now.mono_ns, control.at_rest):
-            return False
-        pulse.expect(
-            early=control.pace.accepts_early_command,
-            retry_ns=control.retry_ns,
-            period_ended=period is not NO_PERIOD,
-        )
-        return True
+        outputs = control.step(now, period)
+        if period is not NO_PERIOD or outputs.status_changed:
+            manager.step(outputs)
+        return not (control.shutting_down and departure.over(now.mono_ns, control.at_rest))
 
     try:
-        await pulse.run(config.period_ns, step)
+        await pulse.run(config.period_ns, step, control.pace)
     except BaseException:
         # No more steps feed systemd's watchdog, and ending the daemon may take longer than the
         # watchdog waits. Its SIGABRT would hide the error. After `stopping`, systemd stops the

@@ -33,6 +33,10 @@ MAX_IDLE_WAKES = 3
 class Pace:
     """Decides when a line may be written; `sent_ns` is always the last line's time.
 
+    After `record_step`, `early` says whether the next command gets an extra step and does not wait
+    for another one, and `retry_ns` says when the command that waits may be sent; it is None without
+    one.
+
     Args:
         line_ns: wire time of the longest line.
         period_ns: control period.
@@ -45,6 +49,8 @@ class Pace:
         self._tried = False  # an early line, in this period
         self._waiting = False  # for a command that came too soon after the last line
         self._idle = 0
+        self.early = self._possible
+        self.retry_ns: Ns | None = None
 
     def period_ended(self, missed: int) -> bool:
         """Record the end of a period, and return whether its line must be written.
@@ -60,7 +66,7 @@ class Pace:
         return self._possible and not self._tried and now_ns - sent_ns >= self._gap_ns
 
     def record_step(
-        self, tick: bool, due: bool, written: bool, changed: bool, had_input: bool
+        self, tick: bool, due: bool, written: bool, changed: bool, had_input: bool, sent_ns: Ns
     ) -> None:
         """Record the result of a step.
 
@@ -72,13 +78,6 @@ class Pace:
         self._idle += had_input and not changed
         if due and not tick:
             self._tried, self._ahead = True, written
-
-    @property
-    def accepts_early_command(self) -> bool:
-        """Whether the next command gets an extra step, and does not wait for another one."""
-        return self._possible and not (self._tried or self._waiting or self._idle > MAX_IDLE_WAKES)
-
-    def retry_ns(self, sent_ns: Ns) -> Ns | None:
-        """Return when the waiting command may be sent, or None without one."""
-        waits = self._waiting and self._possible and not self._tried
-        return sent_ns + self._gap_ns if waits else None
+        may_try = self._possible and not self._tried
+        self.early = may_try and not self._waiting and self._idle <= MAX_IDLE_WAKES
+        self.retry_ns = sent_ns + self._gap_ns if self._waiting and may_try else None

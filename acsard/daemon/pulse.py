@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable
 
 from acsard.core.values import Instant, Ns
-from acsard.daemon.pacing import NO_PERIOD, Period
+from acsard.daemon.pacing import NO_PERIOD, Pace, Period
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
 
@@ -21,7 +21,7 @@ Step = Callable[[Instant, Period], bool]
 
 
 class Pulse:
-    """Wakes the control loop. Calling it runs a step in the thread of the event loop."""
+    """Wakes the control loop. Calling it with the time runs a step, in the event loop's thread."""
 
     def __init__(self) -> None:
         # Never closed: a thread of Zenoh may write until the process ends, and a closed descriptor
@@ -32,13 +32,18 @@ class Pulse:
         self._next_ns = 0  # about the same time by the daemon's clock
         self._alarm_ns: Ns | None = None
         self._step: Step | None = None
+        self._pace: Pace | None = None
         self._over: asyncio.Future[None] | None = None
         self._early = self._command_waits = self._stop_waits = False
 
-    async def run(self, period_ns: Ns, step: Step) -> None:
-        """Run `step` at the end of each period, and between, until it returns False."""
+    async def run(self, period_ns: Ns, step: Step, pace: Pace) -> None:
+        """Run `step` at the end of each period, and between, until it returns False.
+
+        After each step, `pace` says which events may run another one before the period ends.
+        """
         loop = asyncio.get_running_loop()
         self._over, self._step, self._period_ns = loop.create_future(), step, period_ns
+        self._pace = pace
         callbacks = {
             self._periods.fileno(): self._period_ended,
             self._bell: self._rung,
@@ -57,9 +62,8 @@ class Pulse:
             self._periods.close()
             self._alarm.close()
 
-    def __call__(self) -> None:
+    def __call__(self, now: Instant) -> None:
         # After a stall, the periods that have ended meanwhile count before this event.
-        now = clock.now()
         self._run(now, NO_PERIOD if now.mono_ns < self._next_ns else self._ended(now))
 
     def _period_ended(self) -> None:
@@ -81,55 +85,49 @@ class Pulse:
 
     def _rung(self) -> None:
         os.eventfd_read(self._bell)
-        self()
+        self(clock.now())
 
     def _alarmed(self) -> None:
         # A timer that was set again after it had expired reports no expiration.
         if self._alarm.expirations() and self._alarm_ns is not None:
             self._alarm_ns = None
-            self()
+            self(clock.now())
 
     def _run(self, now: Instant, period: Period) -> None:
-        step, self._step, self._command_waits = self._step, None, False
-        if step is None or self._over is None:
+        step, pace, over = self._step, self._pace, self._over
+        if step is None or pace is None or over is None:
             return  # during a step, such as for a port that it has found lost, or after the last
+        self._step, self._command_waits = None, False
         try:
-            if step(now, period):
-                self._step = step
-            else:
-                self._over.set_result(None)
+            if not step(now, period):
+                over.set_result(None)
+                return
         except BaseException as error:  # noqa: BLE001
             # The event loop would only log the exception, but a bug in a step must end the process.
-            self._over.set_exception(error)
-
-    def expect(self, *, early: bool, retry_ns: Ns | None, period_ended: bool) -> None:
-        """Say at the end of a step which events may run another one before the period ends.
-
-        Args:
-            early: the next command does.
-            retry_ns: when the command that waits can be sent, or None without one.
-            period_ended: this step was a period's, so the next stop runs a step at once.
-        """
+            over.set_exception(error)
+            return
+        self._step = step
+        retry_ns = pace.retry_ns
         if retry_ns is not None and retry_ns != self._alarm_ns:
             self._alarm.set(retry_ns)
         self._alarm_ns = retry_ns
-        if early or period_ended:
+        self._early = early = pace.early
+        if early or period is not NO_PERIOD:
             self._stop_waits = False
-        self._early = early
         if early and self._command_waits:
             self.command()  # it arrived during the step, perhaps too late for it
 
     # Any thread may call the methods below.
 
     def command(self) -> None:
-        """Report a sample that may be a command. The first runs a step if the last said `early`."""
+        """Report a sample that may be a command. The first runs a step if `Pace.early`."""
         self._command_waits = True
         if self._early:
             self._early = False
             os.eventfd_write(self._bell, 1)
 
     def stop(self) -> None:
-        """Report a stop, of which a flood runs one step in each period."""
+        """Report a stop. The first runs a step, further ones after a period or `Pace.early`."""
         if not self._stop_waits:
             self._stop_waits = True
             os.eventfd_write(self._bell, 1)

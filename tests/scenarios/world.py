@@ -75,15 +75,12 @@ class VirtualPort:
         self._opening = (baud_rate, stop, period_ns)
         self._output = SerialOutput(*self._opening)
         self._received: list[Received] = []
-
-    @property
-    def sent_ns(self) -> int:
-        return self._output.sent_ns
+        self.sent_ns = 0
 
     def plug(self, mcu: FakeMcu) -> None:
         self.mcu, self.is_open = mcu, True
         self.opened += 1
-        self._output = SerialOutput(*self._opening)
+        self._output, self.sent_ns = SerialOutput(*self._opening), 0
 
     def unplug(self) -> None:
         self.mcu, self.is_open = None, False
@@ -110,7 +107,9 @@ class VirtualPort:
         part, self.takes = data[: self.takes], None
         self.mcu.receive(now_ns, part)
         self.sent.append((now_ns, part.removeprefix(b"\r\n")))
-        return self._output.record_write(line, data, len(part), now_ns)
+        offered = self._output.record_write(line, data, len(part), now_ns)
+        self.sent_ns = self._output.sent_ns
+        return offered
 
 
 class MemoryBus:
@@ -217,7 +216,6 @@ class World:
         """Maps each source to the time of its last speed."""
         self.steps = 0
         self._alarm_ns: int | None = None
-        self._alarm_set_ns: int | None = None
         """Time to which the alarm was last set. It may have rung since then."""
         self._missed = 0
 
@@ -236,7 +234,7 @@ class World:
     @property
     def _listens(self) -> bool:
         """Whether the daemon handles a command that arrives now immediately, in an extra step."""
-        return self.steps > 0 and self.loop.pace.accepts_early_command
+        return self.steps > 0 and self.loop.pace.early
 
     @property
     def instant(self) -> Instant:
@@ -309,10 +307,7 @@ class World:
         now_ns = self.now_ns
         outputs = self.loop.step(Instant(now_ns, now_ns + self.wall_offset_ns), period)
         self.steps += 1
-        retry_ns = self.loop.retry_ns
-        if retry_ns is not None and retry_ns != self._alarm_set_ns:
-            self._alarm_ns = retry_ns
-        self._alarm_set_ns = retry_ns
+        self._alarm_ns = self.loop.pace.retry_ns
         self.watch(outputs)
 
     # actions of clients

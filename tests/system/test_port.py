@@ -48,7 +48,7 @@ class Line(NamedTuple):
     def port(
         self,
         tell: Callable[[Event], None] = lambda event: None,
-        wake: Callable[[], None] = lambda: None,
+        wake: Callable[[Instant], None] = lambda now: None,
         asleep: SuspendDetector | None = None,
     ) -> SerialPort:
         return SerialPort(self.path, 115200, STOP, PERIOD_NS, wake, tell, asleep)
@@ -221,7 +221,7 @@ async def test_a_port_whose_driver_accepts_no_bytes_is_reported_while_it_still_r
     os.set_blocking(line.board, False)
     os.set_blocking(line.device, False)
     wake, session = asyncio.Event(), McuSession(McuConfig(), 100.0)
-    async with line.port(wake=wake.set) as port:
+    async with line.port(wake=lambda now: wake.set()) as port:
 
         async def blocked(link: str) -> bool:
             """Step until the link is so, and return whether the session calls it blocked."""

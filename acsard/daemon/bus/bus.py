@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from acsard.bus.subscription import direct
 from acsard.bus.zenoh_sessions import daemon_session
 from acsard.core.config.settings import Config
-from acsard.core.incoming.bus_interface import Bus, BusInput, Waker
+from acsard.core.incoming.bus_interface import NO_INPUT, Bus, BusInput, Waker
 from acsard.core.incoming.imu import SIMULATOR_SENDER
 from acsard.core.incoming.queries import Reply
 from acsard.core.messages.frames import FeedbackTopic
@@ -67,7 +67,8 @@ class ZenohBus(Bus):
         return self._outlets.wanted
 
     def take(self, queries: int) -> BusInput:
-        batch = self._inbox.take(queries)
+        inbox = self._inbox
+        batch = inbox.take(queries) if inbox.any else NO_INPUT
         changes = self._links.changes
         if changes.waiting:
             batch = replace(batch, routers=changes.pop())
@@ -91,9 +92,6 @@ class ZenohBus(Bus):
         self._outlets.publish_feedback(topic, estimate)
 
     def flush(self) -> None:
-        # An exception that has ended a thread of the bus must end the daemon too.
-        if self._thread_errors:
-            raise self._thread_errors[0]
         self._outlets.flush()
 
     def reply(self, reply: Reply) -> None:

@@ -16,7 +16,7 @@ from itertools import count
 
 import zenoh
 
-from acsard.core.incoming.bus_interface import NO_INPUT, BusInput, Waker
+from acsard.core.incoming.bus_interface import BusInput, Waker
 from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via, parts
 from acsard.core.incoming.queries import BUSY, BUSY_ENCODING, Query, Reply, most_bytes, refused
 from acsard.core.messages.keys_and_roles import (
@@ -31,6 +31,7 @@ from acsard.core.messages.keys_and_roles import (
     source_keys,
 )
 from acsard.core.ros.transports import Endpoint
+from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.bus_thread import BusThread
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
@@ -114,6 +115,10 @@ MAX_DISPLACED = 16  # senders of displaced commands that `take` returns
 
 GYRO_BUFFER = 64  # samples: 400 Hz fill it if the control loop takes none for 160 ms
 
+# A command like the one before it waits for the next period, unless more time has passed: then the
+# robot may have stopped meanwhile.
+REPEAT_NS = NS_PER_S // 10
+
 # All unconfigured sources share a buffer, so that they cannot displace a configured command.
 OTHER_SOURCES = ""
 
@@ -150,16 +155,16 @@ class Inbox:
         self.own_id: zenoh.TimestampId | None = None
         self._prefix, self._replies, self._sources = prefix, replies, sources
         self._arrivals: dict[str, Mailbox[Arrival]] = {
-            key: Mailbox(
-                max(COMMAND_BUFFER, round(COMMAND_BUFFER * 100.0 / rate_hz)), self._commanded
-            )
+            key: Mailbox(max(COMMAND_BUFFER, round(COMMAND_BUFFER * 100.0 / rate_hz)), self._note)
             for key in (
                 *source_keys(sources),
                 *source_keys(sources, ANY_CERTIFICATE),
                 OTHER_SOURCES,
             )
         }
-        # A gyro sample does not wake the control loop. It waits for the next feedback line.
+        # Only these can be commands. A gyro sample does not wake the control loop: it waits for the
+        # next feedback line.
+        self._newest: dict[str, Arrival | None] = dict.fromkeys(self._arrivals)
         self._arrivals[IMU] = Mailbox(GYRO_BUFFER, self._note)
         self._arrivals[SPEED_LIMIT] = Mailbox(COMMAND_BUFFER, self._note)
         self._stops = Mailbox[Arrival](STOP_BUFFER, self._stopped)
@@ -172,14 +177,12 @@ class Inbox:
         self._lost = dict.fromkeys(self._arrivals, 0)  # displaced samples that `take` has reported
         # The newest displaced command of each sender since the last `take`.
         self._displaced: dict[tuple[str, Via, str, bool], Arrival] = {}
-        self._any = False  # set after the item is in its buffer, so `take` overlooks none
+        self.any = False  # call `take`; set after the item is in its buffer, so it overlooks none
         self._waker = waker
 
     def take(self, queries: int) -> BusInput:
         """Return the samples since the last call, stops first, and up to `queries` queries."""
-        if not self._any:
-            return NO_INPUT
-        self._any = False
+        self.any = False
         arrivals, overrun = list[Arrival](), 0
         for key, box in self._arrivals.items():
             if not box.waiting:
@@ -195,7 +198,7 @@ class Inbox:
         due_queries += _taken_of(self._others, queries - len(due_queries))
         if self._services or self._slow or self._others:
             # The other queries wait for the next step.
-            self._any = True
+            self.any = True
         return BusInput(tuple(arrivals), tuple(due_queries), overrun, tuple(displaced.values()))
 
     # Zenoh's threads call the methods below.
@@ -239,7 +242,8 @@ class Inbox:
         else:
             self._put(self._buffer(key), arrival)
 
-    def _put(self, box: Mailbox[Arrival], arrival: Arrival) -> None:
+    def _put(self, buffer: str, arrival: Arrival) -> None:
+        box = self._arrivals[buffer]
         waiting = box.waiting
         if len(waiting) == waiting.maxlen and parts(arrival.key)[1] in self._sources:
             # With several writers this may miss one of two samples that are displaced at once. The
@@ -247,6 +251,16 @@ class Inbox:
             with suppress(IndexError):
                 self._note_displaced(waiting[0])
         box.put(arrival)
+        if buffer not in self._newest:
+            return
+        last, self._newest[buffer] = self._newest[buffer], arrival
+        if (
+            last is None
+            or arrival.payload != last.payload
+            or arrival.key != last.key
+            or arrival.arrived_ns - last.arrived_ns > REPEAT_NS
+        ):
+            self._waker.command()
 
     def _note_displaced(self, lost: Arrival) -> None:
         # Samples of one program and one key have the same of these values, except that programs
@@ -255,23 +269,17 @@ class Inbox:
         if sender in self._displaced or len(self._displaced) < MAX_DISPLACED:
             self._displaced[sender] = lost
 
-    def _buffer(self, key: str) -> Mailbox[Arrival]:
-        buffer = self._arrivals.get(key)
-        if buffer is None:
-            buffer = self._arrivals.get(
-                f"{key.rpartition('/')[0]}/{ANY_CERTIFICATE}", self._arrivals[OTHER_SOURCES]
-            )
-        return buffer
+    def _buffer(self, key: str) -> str:
+        if key in self._arrivals:
+            return key
+        any_certificate = f"{key.rpartition('/')[0]}/{ANY_CERTIFICATE}"
+        return any_certificate if any_certificate in self._arrivals else OTHER_SOURCES
 
     def _note(self) -> None:
-        self._any = True
-
-    def _commanded(self) -> None:
-        self._any = True
-        self._waker.command()
+        self.any = True
 
     def _stopped(self) -> None:
-        self._any = True
+        self.any = True
         self._waker.stop()
 
     def on_query(self, topic: str, query: zenoh.Query) -> None:
@@ -330,7 +338,7 @@ class Inbox:
             self._replies.retire(ticket)
             return
         waiting.append(item)
-        self._any = True
+        self.any = True
 
 
 def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:

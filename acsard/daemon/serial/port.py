@@ -48,12 +48,12 @@ class SerialPort(Port):
         baud_rate: int,
         stop: bytes,
         period_ns: Ns,
-        wake: Callable[[], None],
+        wake: Callable[[Instant], None],
         log: Callable[[Event], None],
         asleep: SuspendDetector | None = None,
     ) -> None:
-        # `stop` is zeros for all wheels. `wake` is called for data and for a lost port.
-        self.is_open = False
+        # `stop` is zeros for all wheels. `wake` gets the time of data and of the loss of the port.
+        self.is_open, self.sent_ns = False, 0
         self._asleep = asleep or SuspendDetector()
         self.opened = 0
         self._path, self._baud_rate, self._stop = path, baud_rate, stop
@@ -69,10 +69,6 @@ class SerialPort(Port):
         self.trouble = ""
 
     # The control loop calls the methods below, which `Port` describes.
-
-    @property
-    def sent_ns(self) -> Ns:
-        return self._output.sent_ns
 
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
         # After a suspend of the computer, close the port, even if the device still works.
@@ -105,7 +101,9 @@ class SerialPort(Port):
             self._leave(error)
             return "down"
         # The wire is busy from the moment of the write, not from the start of the step.
-        return self._output.record_write(line, data, byte_count, clock.mono_ns())
+        offered = self._output.record_write(line, data, byte_count, clock.mono_ns())
+        self.sent_ns = self._output.sent_ns
+        return offered
 
     # Opening and reopening.
 
@@ -161,7 +159,7 @@ class SerialPort(Port):
             raise OSError(errno.EIO, DRIVER_HUNG) from None
         self._lost.clear()
         self._device, self._fd = device, device.fileno()
-        self._output = SerialOutput(baud_rate, self._stop, self._period_ns)
+        self._output, self.sent_ns = SerialOutput(baud_rate, self._stop, self._period_ns), 0
         self._received.clear()
         asyncio.get_running_loop().add_reader(self._fd, self._readable)
         self.is_open, self.trouble = True, ""
@@ -177,8 +175,9 @@ class SerialPort(Port):
     # Reading and losing the port.
 
     def _readable(self) -> None:
-        if self._read(clock.now()):
-            self._wake()
+        now = clock.now()
+        if self._read(now):
+            self._wake(now)
 
     def _read(self, now: Instant) -> bool:
         # Whether there were bytes.
@@ -208,7 +207,7 @@ class SerialPort(Port):
             self.trouble = f"the serial port {self._path} was lost ({error}); the daemon reopens it"
             self._log(Event("port_lost", self.trouble, "warning"))
         self._lost.set()
-        self._wake()
+        self._wake(clock.now())
 
     # Closing.
 

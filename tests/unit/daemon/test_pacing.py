@@ -29,15 +29,15 @@ class Paced:
     def ticks(self, at_ns: int, missed: int = 0) -> bool:
         """End a period without a new command, and return whether a line was sent."""
         due = self.pace.period_ended(missed)
-        self.pace.record_step(due, due, due, False, False)
         self.sent_ns = at_ns if due else self.sent_ns
+        self.pace.record_step(due, due, due, False, False, self.sent_ns)
         return due
 
     def hears(self, at_ns: int, *, news: bool = True, goes: bool = True) -> bool:
         """Receive a command between two periods. Return whether the loop tried to send a line."""
         due = news and self.at_once(at_ns)
-        self.pace.record_step(False, due, due and goes, news, True)
         self.sent_ns = at_ns if due and goes else self.sent_ns
+        self.pace.record_step(False, due, due and goes, news, True, self.sent_ns)
         return due
 
     def at_once(self, at_ns: int) -> bool:
@@ -45,7 +45,7 @@ class Paced:
 
     @property
     def retry_ns(self) -> int | None:
-        return self.pace.retry_ns(self.sent_ns)
+        return self.pace.retry_ns
 
 
 def ticked() -> Paced:
@@ -69,7 +69,7 @@ def test_an_early_line_keeps_the_minimum_gap() -> None:
 def test_the_minimum_gap_begins_when_the_last_line_is_sent() -> None:
     paced = Paced()
     paced.pace.period_ended(0)
-    paced.pace.record_step(True, True, True, False, False)
+    paced.pace.record_step(True, True, True, False, False, 2 * MS)
     paced.sent_ns = 2 * MS
     assert not paced.at_once(2 * MS + GAP_NS - 1)
     assert paced.at_once(2 * MS + GAP_NS)
@@ -94,16 +94,16 @@ def test_a_failed_early_line_does_not_replace_the_periodic_line() -> None:
     assert paced.hears(6 * MS, goes=False)
     assert not paced.hears(7 * MS), "one try a period"
     assert paced.retry_ns is None
-    assert not paced.pace.accepts_early_command
+    assert not paced.pace.early
     assert paced.ticks(10 * MS)
-    assert paced.pace.accepts_early_command
+    assert paced.pace.early
 
 
 def test_a_command_within_the_minimum_gap_is_sent_as_soon_as_the_gap_has_passed() -> None:
     paced = ticked()
     assert not paced.hears(1 * MS)
     assert paced.retry_ns == GAP_NS
-    assert not paced.pace.accepts_early_command, "the retry sends the newest command anyway"
+    assert not paced.pace.early, "the retry sends the newest command anyway"
     assert paced.hears(GAP_NS)
     assert paced.retry_ns is None
 
@@ -112,18 +112,18 @@ def test_without_a_changed_command_there_is_no_retry() -> None:
     paced = ticked()
     paced.hears(1 * MS, news=False)
     assert paced.retry_ns is None
-    assert paced.pace.accepts_early_command
+    assert paced.pace.early
 
 
 def test_messages_without_effect_wake_the_loop_a_limited_number_of_times_a_period() -> None:
     paced = ticked()
     for _ in range(MAX_IDLE_WAKES):
         paced.hears(5 * MS, news=False)
-        assert paced.pace.accepts_early_command
+        assert paced.pace.early
     paced.hears(5 * MS, news=False)
-    assert not paced.pace.accepts_early_command
+    assert not paced.pace.early
     paced.ticks(10 * MS)
-    assert paced.pace.accepts_early_command
+    assert paced.pace.early
 
 
 def test_the_first_line_needs_no_gap() -> None:
@@ -133,7 +133,7 @@ def test_the_first_line_needs_no_gap() -> None:
 def test_no_early_line_is_scheduled_if_the_next_period_comes_within_the_gap() -> None:
     paced = Paced(period_ns=GAP_NS)
     paced.ticks(0)
-    assert not paced.pace.accepts_early_command
+    assert not paced.pace.early
     assert not paced.hears(GAP_NS)
     assert paced.retry_ns is None
 
@@ -153,9 +153,9 @@ def test_no_traffic_makes_more_lines_than_periods_or_lines_within_the_gap(
         sent_ns = lines[-1] if lines else -GAP_NS
         due = tick or (news and pace.at_once(now_ns, sent_ns))
         sent = due and not blocked and (not lines or now_ns - lines[-1] >= WIRE_NS)
-        pace.record_step(tick, due, sent, news, news)
         lines += [now_ns] * sent
-        retry_ns = pace.retry_ns(lines[-1] if lines else -GAP_NS)
+        pace.record_step(tick, due, sent, news, news, lines[-1] if lines else -GAP_NS)
+        retry_ns = pace.retry_ns
         assert retry_ns is None or retry_ns > now_ns
     assert len(lines) <= periods + 1
     assert all(after - before >= WIRE_NS for before, after in pairwise(lines))

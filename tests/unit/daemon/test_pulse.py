@@ -11,7 +11,7 @@ from threading import Thread
 import pytest
 
 from acsard.core.values import NS_PER_S, Instant
-from acsard.daemon.pacing import NO_PERIOD, Period
+from acsard.daemon.pacing import NO_PERIOD, Pace, Period
 from acsard.daemon.pulse import Pulse
 from acsard.host import clock
 
@@ -27,21 +27,24 @@ class Steps:
     def __init__(self) -> None:
         self.pulse = Pulse()
         self.all: list[tuple[Instant, Period]] = []
-        self.early = self.ends = False
-        self.retry_ns: int | None = None
+        self.pace = Pace(0, 1)
+        self.pace.early = False
         self.work: Callable[[], None] = lambda: None
         """Called in each step."""
 
     def __call__(self, now: Instant, period: Period) -> bool:
         self.all.append((now, period))
         self.work()
-        self.pulse.expect(early=self.early, retry_ns=self.retry_ns, period_ended=self.ends)
         return True
+
+    def wake(self, period: Period = NO_PERIOD) -> None:
+        """Run a step, at the end of a period or not."""
+        self.pulse._run(clock.now(), period)
 
     @asynccontextmanager
     async def running(self, seconds: float, period_ns: int = LONG_NS) -> AsyncIterator[Pulse]:
         """Run the pulse while the body runs, and then for `seconds` s."""
-        running = asyncio.create_task(self.pulse.run(period_ns, self))
+        running = asyncio.create_task(self.pulse.run(period_ns, self, self.pace))
         await asyncio.sleep(0)
         yield self.pulse
         await asyncio.sleep(seconds)
@@ -90,7 +93,7 @@ async def test_after_a_stall_an_event_counts_the_periods_and_the_timer_runs_no_f
     def stall() -> None:
         if len(steps.all) == 1:
             # The loop then finds both the callback and the timer due in the same round.
-            loop.call_soon(steps.pulse)
+            loop.call_soon(lambda: steps.pulse(clock.now()))
             time.sleep(0.0355)
 
     steps.work = stall
@@ -104,28 +107,28 @@ async def test_after_a_stall_an_event_counts_the_periods_and_the_timer_runs_no_f
 @pytest.mark.parametrize("early", [True, False])
 async def test_a_command_runs_a_step_only_if_the_last_step_expects_one(early: bool) -> None:
     steps = Steps()
-    steps.early = early
+    steps.pace.early = early
     async with steps.running(0.1):
-        steps.pulse()
+        steps.wake()
         Thread(target=steps.pulse.command).start()
     assert [period for _, period in steps.all] == [NO_PERIOD] * (1 + early)
 
 
 async def test_a_command_during_a_step_that_expects_early_ones_runs_another_step() -> None:
     steps = Steps()
-    steps.early = True
+    steps.pace.early = True
     steps.work = lambda: steps.pulse.command() if len(steps.all) == 1 else None
     async with steps.running(0.05):
-        steps.pulse()
+        steps.wake()
     assert len(steps.all) == 2
 
 
 async def test_a_flood_of_commands_runs_one_step_until_the_next_is_expected() -> None:
     steps = Steps()
     async with steps.running(0.1):
-        steps.early = True
-        steps.pulse()
-        steps.early = False
+        steps.pace.early = True
+        steps.wake()
+        steps.pace.early = False
         for _ in range(100):
             steps.pulse.command()
             await asyncio.sleep(0)
@@ -139,8 +142,7 @@ async def test_in_a_flood_of_stops_one_step_is_early_and_the_period_takes_the_re
             steps.pulse.stop()
             await asyncio.sleep(0)
         assert len(steps.all) == 1
-        steps.ends = True
-        steps.pulse()  # the period
+        steps.wake(Period(1, 0))
         assert len(steps.all) == 2
         steps.pulse.stop()
         await asyncio.sleep(0.01)
@@ -150,10 +152,10 @@ async def test_in_a_flood_of_stops_one_step_is_early_and_the_period_takes_the_re
 async def test_a_command_that_waits_is_retried_at_its_time_and_only_once() -> None:
     steps = Steps()
     async with steps.running(0.1):
-        steps.retry_ns = at_ns = clock.mono_ns() + 20 * MS
-        steps.pulse()
-        steps.pulse()  # the retry is not set again
-        steps.retry_ns = None
+        steps.pace.retry_ns = at_ns = clock.mono_ns() + 20 * MS
+        steps.wake()
+        steps.wake()  # the retry is not set again
+        steps.pace.retry_ns = None
     assert len(steps.all) == 3
     assert steps.all[2][0].mono_ns - at_ns > -0.1 * MS
 
@@ -161,18 +163,18 @@ async def test_a_command_that_waits_is_retried_at_its_time_and_only_once() -> No
 async def test_a_retry_that_is_no_longer_needed_runs_no_step() -> None:
     steps = Steps()
     async with steps.running(0.05):
-        steps.retry_ns = clock.mono_ns() + 10 * MS
-        steps.pulse()
-        steps.retry_ns = None
-        steps.pulse()  # this step has sent the command
+        steps.pace.retry_ns = clock.mono_ns() + 10 * MS
+        steps.wake()
+        steps.pace.retry_ns = None
+        steps.wake()  # this step has sent the command
     assert len(steps.all) == 2
 
 
 async def test_a_port_that_a_step_finds_lost_runs_no_step_within_the_step() -> None:
     steps = Steps()
-    steps.work = steps.pulse
+    steps.work = lambda: steps.pulse(clock.now())
     async with steps.running(0.02):
-        steps.pulse()
+        steps.wake()
     assert len(steps.all) == 1
 
 
@@ -184,13 +186,12 @@ async def test_an_exception_of_a_step_ends_the_run_and_a_later_event_runs_no_ste
 
     steps.work = fail
     with pytest.raises(ValueError, match="a bug"):
-        await steps.pulse.run(PERIOD_NS, steps)
+        await steps.pulse.run(PERIOD_NS, steps, steps.pace)
     steps.pulse.stop()
-    steps.pulse()
+    steps.wake()
     assert len(steps.all) == 1
 
 
 async def test_the_run_ends_when_a_step_says_so() -> None:
-    pulse = Pulse()
     async with asyncio.timeout(5.0):
-        await pulse.run(PERIOD_NS, lambda now, period: False)
+        await Pulse().run(PERIOD_NS, lambda now, period: False, Pace(0, 1))

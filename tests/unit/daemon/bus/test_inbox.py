@@ -74,6 +74,31 @@ def test_commands_and_stops_wake_the_loop_and_a_gyro_sample_does_not() -> None:
     assert loop.woken == ["command", "stop", "command"]
 
 
+def command(payload: bytes, at_ns: int, key: str = "cmd/app") -> Arrival:
+    return Arrival(key, True, payload, "", at_ns, None, "")
+
+
+@pytest.mark.parametrize(
+    ("after", "wakes"),
+    [
+        (command(b"1", 50_000_000), False),
+        (command(b"2", 50_000_000), True),
+        (command(b"1", 101_000_000), True),
+        (command(b"1", 50_000_000, "cmd/nav"), True),
+        (command(b"1", 50_000_000, "cmd/unlisted"), True),
+    ],
+)
+def test_a_command_that_is_repeated_soon_waits_for_the_next_step(
+    after: Arrival, wakes: bool
+) -> None:
+    inbox, loop = an_inbox()
+    for arrival in (command(b"1", 0), after):
+        inbox._put(inbox._buffer(arrival.key), arrival)
+    assert loop.woken == ["command"] * (1 + wakes)
+    assert inbox.any
+    assert len(inbox.take(8).arrivals) == 2
+
+
 def test_the_loop_finds_the_sample_that_woke_it() -> None:
     key_lists: list[list[str]] = []
     inbox, loop = an_inbox()
@@ -131,7 +156,7 @@ def test_a_loop_that_wakes_up_finds_the_displaced_samples_counted() -> None:
     arrived(inbox, *["cmd/app"] * COMMAND_BUFFER)
     overruns: list[int] = []
     loop.command = lambda: overruns.append(inbox.take(8).overrun)  # type: ignore[method-assign]
-    arrived(inbox, "cmd/app")
+    inbox._put("cmd/app", command(b"another", 0))
     assert overruns == [1]
 
 
