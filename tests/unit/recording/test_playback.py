@@ -112,7 +112,7 @@ def test_forged_numbers_give_an_error_in_words(tape: Tape, tmp_path: Path) -> No
     forged = Tape()
     bad = Command("app", Twist(float("nan"), 0.0), -(1 << 62))
     for n, entry in enumerate(tape.taken[:20]):
-        now = Instant((-1) ** n * (1 << 63 - n), 1 << 62 - n)
+        now = Instant((-1) ** n * (1 << 61 - n), 1 << 62 - n)
         inputs = replace(entry.inputs, now=now, commands=(bad,), missed=1 << 62, late_ns=-(1 << 62))
         forged.taken.append(entry._replace(inputs=inputs))
     path = forged.save(tmp_path / "a")
