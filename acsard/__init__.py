@@ -4,15 +4,14 @@ One process, the daemon, drives the robot with one asyncio event loop. The daemo
 with a microcontroller on a serial port, and messages with clients on a Zenoh bus. It runs a control
 step every 10 ms. A second process, the gateway, terminates TLS connections from the network.
 
-      one task, every 10 ms (earlier if a new command or feedback has arrived)
+ serial -> lines --> robot.hear(now, heard) --> estimates, events, answers --> bus
+ bus ----> decode ->        |
+                            v
+ timer ------------> robot.drive(now) --> line --> guard --> port --> robot.sent(left_ns, line)
 
- serial -> received bytes ---+                          +-> report -> encode -> bus
-                             +-> robot.step(inputs) ----+
- bus -> decode -> commands --+         (pure)           +-> line -> guard -> serial
-
-`Robot.step` updates the odometry from the feedback, chooses one command, checks that the mode
-allows it, limits it, computes the wheel speeds and reports, in this order. No other function
-decides how the robot moves.
+`hear` updates the odometry from the feedback, chooses one command and checks that the mode allows
+it. `drive`, in each control period and at once for a new command, limits it and returns the line
+for the board. `sent` says which line really left. No other function decides how the robot moves.
 
 Where to look: each package may import only the packages below it in this list.
 `pyproject.toml` states this order as contracts, and `lint-imports` checks the contracts.

@@ -15,7 +15,7 @@ from functools import lru_cache
 from msgspec import Struct
 
 from acsard.core.config.settings import Config
-from acsard.core.values import NS_PER_S, Ns, Outputs, Trip
+from acsard.core.values import NS_PER_S, Ns, Status, Trip
 
 Wheels = tuple[int, int, int, int]  # speeds of the motors a to d, in hundredths of rad/s
 
@@ -33,7 +33,7 @@ class Memory(Struct, frozen=True):
     """The state that a guard keeps from one line to the next; a recording stores it for replays."""
 
     last: bytes = b""  # written to the serial port
-    commanded_ns: Ns | None = None  # last step with a fresh command in mode `driving`
+    commanded_ns: Ns | None = None  # last line with a fresh command in mode `driving`
     halted_ns: Ns | None = None  # begin of the present mode of `HALTED`
     # From full speed to rest, the longest under any limits since the robot was last at rest.
     ramp_ns: Ns = 0
@@ -78,23 +78,26 @@ class Guard:
         if self._wheels == _ZERO:
             self._longest = self._ramps
 
-    def check(self, outputs: Outputs) -> tuple[bytes | None, Trip]:
-        """Return the line to send (None if `outputs` has none), and why it is not the robot's."""
-        if outputs.mode == "driving":
-            if self._commanded(outputs):
-                self._commanded_ns = outputs.now.mono_ns
-            self._halted_ns = None
-        elif outputs.mode not in HALTED:
+    def check(
+        self, line: bytes, now_ns: Ns, status: Status, command_ns: Ns | None
+    ) -> tuple[bytes, Trip]:
+        """Return the line to send, and why it is not the robot's.
+
+        `command_ns` is the arrival of the command of `status.source`.
+        """
+        mode = status.mode
+        commanded = mode == "driving" and self._is_fresh(status.source, command_ns, now_ns)
+        if commanded:
+            self._commanded_ns = now_ns
+        if mode not in HALTED:
             self._halted_ns = None
         elif self._halted_ns is None:
-            self._halted_ns = outputs.now.mono_ns
-        line = outputs.line
-        if line is None:
-            return None, ""
-        trip = self._objection(line, outputs, self._wheels or _ZERO)
+            self._halted_ns = now_ns
+        trip = self._objection(line, now_ns, commanded, status.link == "up")
         return (self._stop, trip) if trip else (line, "")
 
-    def _objection(self, line: bytes, outputs: Outputs, before: Wheels) -> Trip:
+    def _objection(self, line: bytes, now_ns: Ns, commanded: bool, linked: bool) -> Trip:
+        before = self._wheels or _ZERO
         wheels = _wheels(line[:31])
         if wheels is None or not (line[31:] == self._stop[31:] or self._sealed(line)):
             return "guard_line_damaged"
@@ -102,16 +105,16 @@ class Guard:
             return ""
         if max(wheels) > self._most or min(wheels) < -self._most:
             return "guard_too_fast"
-        if not outputs.linked:
+        if not linked:
             return "guard_no_link"
         if self._require_check and b"#" not in line:
             return "guard_no_checksum"
         grows = wheels != before and any(
             abs(new) > abs(old) or new * old < 0 for new, old in zip(wheels, before, strict=True)
         )
-        if grows and not self._commanded(outputs):
+        if grows and not commanded:
             return "guard_no_command"
-        if self._late(outputs.now.mono_ns):
+        if self._late(now_ns):
             return "guard_too_long"
         return ""
 
@@ -122,13 +125,13 @@ class Guard:
         halted_ns = self._halted_ns
         return halted_ns is not None and now_ns - halted_ns > stop_ramp_ns + RAMP_MARGIN_NS
 
-    def _commanded(self, outputs: Outputs) -> bool:
-        timeout, arrived = self._timeouts.get(outputs.source), outputs.command_ns
-        if outputs.mode != "driving" or timeout is None or arrived is None:
+    def _is_fresh(self, source: str, command_ns: Ns | None, now_ns: Ns) -> bool:
+        timeout_ns = self._timeouts.get(source)
+        if timeout_ns is None or command_ns is None:
             return False
         # Compare the absolute difference: a command may arrive on Zenoh's thread just after this
         # step read the clock.
-        return abs(outputs.now.mono_ns - arrived) <= timeout
+        return abs(now_ns - command_ns) <= timeout_ns
 
     def _sealed(self, line: bytes) -> bool:
         # The end is: a comma if the board needs one, `#` and the sequence number (two hexadecimal

@@ -1,9 +1,9 @@
-"""The robot as one pure object. `Robot.step(Inputs) -> Outputs` calls all its parts in order.
+"""The robot as one pure object, with three methods that know an order: `hear`, `drive` and `sent`.
 
-A step updates the odometry, chooses one command, checks the mode, limits the command and converts
-it to wheel speeds. `sent` follows each line and says what really left: only then the limiter
-advances, so a line that was lost leaves no trace. The control loop reads and writes the port, and
-`core/guard.py` checks each line.
+`hear` takes what arrived, updates the odometry and the mode, and selects the command to follow.
+`drive` limits this command and returns the line for the board. `sent` says which line really left:
+only then the limiter advances, so a line that was lost leaves no trace. The control loop reads and
+writes the port, and `core/guard.py` checks each line.
 """
 
 from __future__ import annotations
@@ -49,18 +49,20 @@ from acsard.core.values import (
     Command,
     Estimate,
     Event,
-    Inputs,
+    Heard,
     Instant,
     Latches,
+    News,
     Ns,
-    Outputs,
     Plain,
     Pose,
     Refusal,
     Request,
     Snapshot,
     SpeedCap,
+    Status,
     Trip,
+    Twist,
     WheelSpeeds,
 )
 
@@ -90,6 +92,10 @@ INPUT_OF: dict[Code, str] = {
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)  # modes with the stop deceleration
 
+UNLATCHED = (Mode.DRIVING, Mode.READY)  # their reason depends only on the choice and the settings
+
+QUIET = News()
+
 NS_PER_MS = 1_000_000
 
 NOTHING_CHANGED = "nothing changed: all settings already have these values"
@@ -101,7 +107,6 @@ class _Line(NamedTuple):
     # A line that `sent` has not confirmed yet.
     motion: Motion
     speeds: WheelSpeeds
-    tick: bool  # of a control period, not between two of them
 
 
 class Robot:
@@ -125,12 +130,14 @@ class Robot:
         self._cap = SpeedCap(None)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
         self._life = Lifecycle(latches)
-        self._first_event: Event | None = None
+        self._announced: tuple[Event, ...] = ()  # for the next `hear`
         if latches.in_force:
             kind, why = f"start -> {self._life.mode}", self._life.why
-            self._first_event = Event("mode", why.text, "warning", kind=kind, code=why.code)
+            first = Event("mode", why.text, "warning", kind=kind, code=why.code)
+            self._announced = (first,)
         self._choice = Choice()
-        self._speeds = STILL
+        self._limited = False  # a bumper limited it
+        self.speeds = STILL  # of the last line; zero after a press and without a link
         # Of the last line that left: after a press of the emergency stop, the wheels turn so until
         # the zeros are written.
         self._written = STILL
@@ -141,8 +148,8 @@ class Robot:
         # Last line, last one that left, and last press of the emergency stop or a bumper.
         self._made_ns = self._left_ns = self._pressed_ns = 0
         self._trip: Trip = ""  # of the guard, until the next step
-        self._status: tuple[str, Code, str, str, str] = ("", "booting", "", "", "")
-        self._battery_level = ""  # in the previous step
+        self.status = Status("", "booting", "", "")
+        self._battery_level = ""  # with `status`
         # Since the start: `commands` (accepted), `command_<reason>` (refused),
         # `commands_of_new_senders` (not proved yet), lines to the board, and events.
         self.counters: Counter[str] = Counter()
@@ -209,74 +216,91 @@ class Robot:
         return self._life.latches
 
     @property
+    def applied(self) -> Twist:
+        """The twist in the line of `drive`, after all limits; after `sent`, in the last one."""
+        return (self._motion if self._line is None else self._line.motion).twist
+
+    @property
+    def command_ns(self) -> Ns | None:
+        """Arrival of the command that the robot follows."""
+        return self._choice.arrived_ns
+
+    @property
     def travelled(self) -> float:
         """Distance driven since the daemon started, m, forwards plus backwards, by odometry."""
         return self._odometry.travelled
 
-    def step(self, inputs: Inputs) -> Outputs:
-        """Process the inputs since the previous step, and return the decisions of this step."""
-        events = list(inputs.events)
-        self._life.begin(inputs.now, stalled=self._arbiter.begin(inputs.now.mono_ns))
-        if self._first_event is not None:
-            events.append(self._first_event)
-            self._first_event = None
-        if inputs.missed:
-            self.counters["missed_periods"] += inputs.missed
-            events.append(missed(inputs.missed, self.config.period_ns))
-        estimates = self._fold(inputs, events)
-        answers = self._serve(inputs, events)
-        if inputs.speed_cap is not None:
-            self._cap_speed(inputs.speed_cap, events)
-        if inputs.commands or inputs.refusals:
-            self._accept_commands(inputs, events)
-        self._choice = self._arbiter.choose(inputs.now.mono_ns)
-        limiting = self._bumpers.limiting(self.config.safety)
-        if limiting:
-            self._limit_by_bumpers(inputs.now.mono_ns)
-        self._life.command(self._choice.twist is not None)
-        # A line may be sent at once after a new command, a change of the mode, or a press of the
-        # emergency stop or of a bumper.
-        news = (self._choice.arrived_ns, self._life.mode) != self._made_of
-        due = inputs.tick or (inputs.at_once and news)
-        line = self._drive(inputs) if due else None
-        applied = (self._motion if self._line is None else self._line.motion).twist
-        self._odometry.commanded.command(applied)
-        link = self.session.link
-        why = self._reason()
-        if limiting:
-            why = self._with_bumper(why)
-        # Use `_value_`, because the property `value` of an enum runs Python code.
-        status = (self._life.mode._value_, why.code, why.text, link, self._choice.source)
-        battery = self._battery.status
+    def hear(self, now: Instant, heard: Heard) -> News:
+        """Process what arrived since the last call, and return what is to be published."""
+        now_ns, events = now.mono_ns, [*heard.events, *self._announced]
+        self._announced = ()
+        self._life.begin(now, stalled=self._arbiter.begin(now_ns))
+        if heard.missed:
+            self.counters["missed_periods"] += heard.missed
+            events.append(missed(heard.missed, self.config.period_ns))
+        estimates = self._fold(now, heard, events)
+        answers = self._serve(now, heard, events)
+        if heard.speed_cap is not None:
+            self._cap_speed(heard.speed_cap, events)
+        if heard.commands or heard.refusals:
+            self._accept_commands(now_ns, heard, events)
+        limiting, chose = self._bumpers.limiting(self.config.safety), False
+        if now_ns >= self._arbiter.until_ns or limiting or self._limited:
+            self._choose(now_ns, limiting)
+            chose = True
+        mode, battery = self._life.mode, self._battery.status
+        urgent = (self._choice.arrived_ns, mode) != self._made_of
         level = battery.level if battery else ""
-        another = status != self._status or level != self._battery_level
-        self._status, self._battery_level = status, level
-        # If `another` and `news` are false, the mode and the sender that drives are unchanged.
-        if another or news:
-            events += self._told.changes(self._life.mode, self._choice, why)
-        # Pass the arguments by position: eighteen keyword arguments take three times as long.
-        return Outputs(
-            inputs.now,
-            due,
-            line,
-            self._speeds,
-            applied,
-            link == "up",
-            estimates,
-            *status,
-            self._choice.arrived_ns,
-            another,
-            self._tally.lines(events, inputs.now.mono_ns),
-            answers,
-            news,
-            self._life.latches,
-        )
+        changed = False
+        if (
+            chose
+            or events
+            or answers
+            or mode not in UNLATCHED
+            or mode._value_ != self.status.mode
+            or level != self._battery_level
+        ):
+            changed = self._restate(limiting) or level != self._battery_level
+            self._battery_level = level
+        if changed or urgent:
+            why = Reason(self.status.code, self.status.reason)
+            events += self._told.changes(mode, self._choice, why)
+        logged = self._tally.lines(events, now_ns)
+        if not (estimates or answers or logged or urgent or changed):
+            return QUIET
+        return News(estimates, answers, logged, urgent, changed)
+
+    def drive(self, now: Instant) -> bytes | None:
+        """Return the line for the board: in each control period, and at once if `News` is urgent.
+
+        None: no line is due, because the board does not answer. Call `hear` before, and `sent`
+        after each line.
+        """
+        now_ns, twist, limits = now.mono_ns, self._choice.twist, self.config.limits
+        self._made_of, self._made_ns = (self._choice.arrived_ns, self._life.mode), now_ns
+        since = (now_ns - self._left_ns) / NS_PER_S
+        pressed = self._left_ns < self._pressed_ns
+        if pressed or self.session.link != "up" or since > WRITE_PAUSE_S:
+            # The first written line after a press contains zeros, even if the input is already
+            # released and the commands that arrived meanwhile may move the robot.
+            motion = AT_REST
+        elif self._life.mode is Mode.DRIVING and twist is not None:
+            cap = math.inf if self._cap.speed is None else self._cap.speed
+            dt = min(since, self._max_dt)
+            motion = self._motion.follow(twist, dt, limits, self._kinematics, cap)
+        else:
+            motion = self._motion.coast(since, limits, stop=self._life.mode in HALTED)
+        self.speeds = self._kinematics.wheel_speeds(motion.twist)
+        line = self.session.line(now_ns, self.speeds)
+        if line is not None:
+            self._line = _Line(motion, self.speeds)
+            self._odometry.commanded.command(motion.twist)
+        return line
 
     def sent(self, left_ns: Ns, line: bytes | None, trip: Trip = "") -> None:
-        """Record what left of the last step's line, and when: nothing, if `line` is None.
+        """Record what left of the line of `drive`, and when: nothing, if `line` is None.
 
-        `trip` says why the guard replaced it with the stop line. Call this after each line, before
-        the next step.
+        `trip` says why the guard replaced it with the stop line.
         """
         made, self._line = self._line, None
         assert made is not None
@@ -292,16 +316,14 @@ class Robot:
                 self._written = STILL
             else:
                 self._motion, self._written = made.motion, made.speeds
-        elif made.tick and self.session.link != "down":
-            # Count the lines of periods only. If a line between two periods is superseded, the line
-            # of the period still follows.
+        elif self.session.link != "down":
             self.counters["lines_superseded"] += 1
 
     # Feedback.
 
-    def _fold(self, inputs: Inputs, events: list[Event]) -> tuple[Estimate, ...]:
+    def _fold(self, now: Instant, heard: Heard, events: list[Event]) -> tuple[Estimate, ...]:
         session, before = self.session, self.session.link
-        feedback = session.update(inputs.now, inputs.port_open, inputs.opened, inputs.received)
+        feedback = session.update(now, heard.port_open, heard.opened, heard.received)
         link = session.link
         warning = self._answered.check(
             self.counters["lines_sent"], session.good_lines, link == "up"
@@ -314,11 +336,11 @@ class Robot:
                 self.counters["link_lost_host_stall"] += 1
         if link != "up":
             self._forget()
-        self._port_trouble = inputs.port_trouble
+        self._port_trouble = heard.port_trouble
         if session.restarted:
             # No sender drives before the link is up for the first time, so accept a zero that was
             # sent during the start.
-            self._arbiter.require_neutral(inputs.now.mono_ns if self._linked_once else 0)
+            self._arbiter.require_neutral(now.mono_ns if self._linked_once else 0)
         events += session.events
         if session.reopened:
             for part in (self._estop, self._bumpers, self._battery):
@@ -326,23 +348,22 @@ class Robot:
         known = self._estop.state or self._bumpers.state or self._battery.status
         is_blocked = self._unreported or self._battery.refuses_clear
         if session.statuses or known or is_blocked or session.forgot:
-            self._watch_inputs(inputs.now, events)
+            self._watch_inputs(now, events)
         if link != "up":
             # Without a link the daemon cannot ramp, so set the speeds to zero at once. When the
             # link returns, a command from before the loss is too old to follow.
             self._motion = AT_REST
-            self._speeds = STILL
+            self.speeds = STILL
             self._life.link(up=False)
             if link == "down" and before != "down":
-                self._arbiter.require_neutral(inputs.now.mono_ns)
+                self._arbiter.require_neutral(now.mono_ns)
         else:
             self._linked_once = True
             safety = self.config.safety
             missing = self._estop.missing(safety) or self._bumpers.missing(safety)
             self._life.link(up=not missing)
-        now = inputs.now
-        if inputs.gyro:
-            self._odometry.checks.add_samples(inputs.gyro)
+        if heard.gyro:
+            self._odometry.checks.add_samples(heard.gyro)
         if not feedback:
             return ()
         estimates: list[Estimate] = []
@@ -373,7 +394,7 @@ class Robot:
         if estop.pressed_now is not None or bumpers.pressed_now is not None:
             # Do not ramp: the hardware has cut the motors, or the robot touches an obstacle.
             self._motion = AT_REST
-            self._speeds, self._made_of, self._pressed_ns = STILL, None, now.mono_ns
+            self.speeds, self._made_of, self._pressed_ns = STILL, None, now.mono_ns
         if estop.driver_fault:
             self._fault(DRIVER_FAULT_REASON, now, events)
             self._life.caused_again(now.mono_ns)
@@ -412,6 +433,12 @@ class Robot:
             advice = f"wait until the board has reported {INPUT_NAMES[name]}"
             return Reason(cause.code, cause.why, advice, cause.part)
         return None
+
+    def _choose(self, now_ns: Ns, limiting: bool) -> None:
+        self._choice, self._limited = self._arbiter.choose(now_ns), limiting
+        if limiting:
+            self._limit_by_bumpers(now_ns)
+        self._life.command(self._choice.twist is not None)
 
     def _limit_by_bumpers(self, now_ns: Ns) -> None:
         # If no motion remains, each sender must send a zero, or the robot would drive against the
@@ -483,16 +510,16 @@ class Robot:
 
     # Requests.
 
-    def _serve(self, inputs: Inputs, events: list[Event]) -> tuple[Answer, ...]:
+    def _serve(self, now: Instant, heard: Heard, events: list[Event]) -> tuple[Answer, ...]:
         trip, self._trip = self._trip, ""
         if trip:
-            self._fault(reason(trip), inputs.now, events)
-            self._life.caused_again(inputs.now.mono_ns)
-        if inputs.shutting_down and self._life.mode is not Mode.SHUTDOWN:
+            self._fault(reason(trip), now, events)
+            self._life.caused_again(now.mono_ns)
+        if heard.shutting_down and self._life.mode is not Mode.SHUTDOWN:
             self._life.leave()
         answers: tuple[Answer, ...] = ()
-        for request in inputs.requests:
-            answers += (self._answer(request, inputs.now, events),)
+        for request in heard.requests:
+            answers += (self._answer(request, now, events),)
         return answers
 
     def _answer(self, request: Request, now: Instant, events: list[Event]) -> Answer:
@@ -549,7 +576,7 @@ class Robot:
     def _set(self, settings: dict[str, Plain], now_ns: Ns) -> Changes:
         # The robot is at rest only if two lines are zero: the last one that left, which the wheels
         # follow, and the last one that was computed.
-        before, at_rest = self.config, self._speeds == STILL and self._motion.twist == REST
+        before, at_rest = self.config, self.speeds == STILL and self._motion.twist == REST
         try:
             self.config, changes = changed(before, settings, at_rest)
         except ConfigError as error:
@@ -568,16 +595,15 @@ class Robot:
 
     # Commands.
 
-    def _accept_commands(self, inputs: Inputs, events: list[Event]) -> None:
-        now_ns = inputs.now.mono_ns
-        messages: Sequence[Command | Refusal] = inputs.commands
-        senders = {(command.source, command.sender) for command in inputs.commands}
-        if superseded := len(inputs.commands) - len(senders):
+    def _accept_commands(self, now_ns: Ns, heard: Heard, events: list[Event]) -> None:
+        messages: Sequence[Command | Refusal] = heard.commands
+        senders = {(command.source, command.sender) for command in heard.commands}
+        if superseded := len(heard.commands) - len(senders):
             self.counters["commands_superseded"] += superseded
-        if inputs.refusals:
+        if heard.refusals:
             # Process commands and refusals in the order of arrival. A message that is unreadable or
             # was lost may have commanded motion, so it cancels a zero that arrived before it.
-            messages = sorted([*messages, *inputs.refusals], key=lambda message: message.arrived_ns)
+            messages = sorted([*messages, *heard.refusals], key=lambda message: message.arrived_ns)
         for message in messages:
             if isinstance(message, Refusal):
                 self._refuse(message, now_ns, events)
@@ -618,27 +644,17 @@ class Robot:
             return ""
         return f"{cap.speed:.3g} m/s, set by {cap.by}; back to {highest:g} m/s when this limit ends"
 
-    def _drive(self, inputs: Inputs) -> bytes | None:
-        now_ns, twist, limits = inputs.now.mono_ns, self._choice.twist, self.config.limits
-        self._made_of, self._made_ns = (self._choice.arrived_ns, self._life.mode), now_ns
-        since = (now_ns - self._left_ns) / NS_PER_S
-        pressed = self._left_ns < self._pressed_ns
-        if pressed or self.session.link != "up" or since > WRITE_PAUSE_S:
-            # The first written line after a press contains zeros, even if the input is already
-            # released and the commands that arrived meanwhile may move the robot.
-            motion = AT_REST
-        elif self._life.mode is Mode.DRIVING and twist is not None:
-            cap = math.inf if self._cap.speed is None else self._cap.speed
-            dt = min(since, self._max_dt)
-            motion = self._motion.follow(twist, dt, limits, self._kinematics, cap)
-        else:
-            motion = self._motion.coast(since, limits, stop=self._life.mode in HALTED)
-        self._speeds = self._kinematics.wheel_speeds(motion.twist)
-        line = self.session.line(now_ns, self._speeds)
-        self._line = None if line is None else _Line(motion, self._speeds, inputs.tick)
-        return line
-
     # Report.
+
+    def _restate(self, limiting: bool) -> bool:
+        # Returns whether the status has changed.
+        why, before = self._reason(), self.status
+        if limiting:
+            why = self._with_bumper(why)
+        # Use `_value_`, because the property `value` of an enum runs Python code.
+        mode = self._life.mode._value_
+        self.status = Status(mode, why.code, why.text, self.session.link, self._choice.source)
+        return self.status != before
 
     def _with_bumper(self, why: Reason) -> Reason:
         match self._life.mode:

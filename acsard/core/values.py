@@ -409,8 +409,52 @@ class SpeedCap(Struct, frozen=True):
     by: str = ""  # sender, for the log
 
 
+class Heard(Struct, frozen=True, omit_defaults=True):
+    """What arrived since the last wake-up of the control loop.
+
+    - opened: openings of the serial port; a new one is a new session with the board.
+    """
+
+    port_open: bool
+    opened: int = 0
+    port_trouble: str = ""  # why the port is closed
+    received: tuple[Received, ...] = ()
+    commands: tuple[Command, ...] = ()
+    refusals: tuple[Refusal, ...] = ()  # messages that did not become a `Command`
+    requests: tuple[Request, ...] = ()
+    gyro: tuple[GyroSample, ...] = ()
+    events: tuple[Event, ...] = ()  # of other parts, to be logged with the robot's
+    missed: int = 0  # control periods without a wake-up
+    speed_cap: SpeedCap | None = None  # the newest one
+    shutting_down: bool = False  # ramp to zero, and stay there
+
+
+class Status(Struct, frozen=True):
+    mode: str
+    code: Code  # why the robot moves or does not move
+    reason: str  # in words
+    link: str
+    # Selected by the arbiter, which does not always drive: it may need a zero, or a latch holds.
+    source: str = ""
+
+
+class News(Struct, frozen=True):
+    """What the robot makes of what it heard.
+
+    - urgent: the board should get a new line at once, for a new command or mode, or because an
+      input was pressed.
+    - status_changed: `Robot.status` or the battery's level.
+    """
+
+    estimates: tuple[Estimate, ...] = ()
+    answers: tuple[Answer, ...] = ()
+    events: tuple[Event, ...] = ()
+    urgent: bool = False
+    status_changed: bool = False
+
+
 class Inputs(Struct, frozen=True, omit_defaults=True):
-    """The complete input of one control step.
+    """All inputs of one control step as a recording stores them.
 
     - tick: compute the line of a control period.
     - at_once: maybe compute an extra line for a new command or mode.
@@ -440,6 +484,8 @@ class Inputs(Struct, frozen=True, omit_defaults=True):
 
 
 class Outputs(Struct, frozen=True):
+    """All results of one control step, for the recording."""
+
     now: Instant
     due: bool  # this step had to compute a line
     line: bytes | None
@@ -489,7 +535,7 @@ class Recording(Struct, frozen=True):
 
 
 class Snapshot(Struct, frozen=True):
-    """The values for the messages `state` and `diagnostics` that are not in `Outputs`."""
+    """The values for the messages that are not of a feedback line."""
 
     pose: Pose
     measured: Twist | None  # None while the feedback is silent

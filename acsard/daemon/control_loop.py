@@ -1,7 +1,7 @@
-"""Collects the inputs of a control step, calls `Robot.step`, and delivers the outputs of the step.
+"""Runs a wake-up: hear, drive, guard, port, sent, recorder, bus, in this order.
 
-All decisions about the motion are made there. The loop is synchronous, so that the daemon can call
-`step` from one task, and the tests in virtual time.
+The robot makes all decisions about the motion, and the guard checks each line. The loop is
+synchronous, so that the daemon can call `step` from one task, and the tests in virtual time.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from acsard.core.values import (
     Command,
     Event,
     GyroSample,
-    Inputs,
+    Heard,
     Instant,
     Latches,
     Ns,
@@ -58,12 +58,12 @@ from acsard.core.values import (
     Request,
     Snapshot,
     SpeedCap,
-    Trip,
 )
 from acsard.daemon.latch_rules import MAX_ANSWER_DELAY_NS, Handover, LatchKeeper
 from acsard.daemon.latencies import Stopwatch
 from acsard.daemon.pacing import NO_PERIOD, Pace, Period
 from acsard.recording.recorded_steps import StepRecorder
+from acsard.recording.stepped_robot import LineOutcome, inputs_of, outputs_of
 
 # Queries that a step takes, beside one slow one (`set`, ROS parameters). More wait, so that a flood
 # costs no period.
@@ -139,9 +139,7 @@ class ControlLoop:
         self._counters: Counter[str] = Counter()
         self._turn_rates: list[GyroSample] = []  # since the last step
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
-        # For the recording, about the last line: why the guard replaced it; not sent, so a newer
-        # one must replace it; from its step to the write.
-        self._last_line: tuple[Trip, bool, Ns] = ("", False, 0)
+        self._outcome = LineOutcome()  # of the last line
         # Use the longest line of both directions, because answers must not queue in the MCU either.
         line_ns = wire_ns(config.mcu.line_bytes, config.mcu.baud_rate)
         self.pace = Pace(line_ns, config.period_ns)
@@ -181,43 +179,34 @@ class ControlLoop:
             self._stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns, missed)
             self._others += self._handover.take_events()
         commands, refusals, requests = self._from_bus(now)
-        port, pace, (trip, superseded, late_ns) = self._port, self.pace, self._last_line
+        port, pace = self._port, self.pace
         # Call `take` before reading `is_open`. After a suspend of the computer, `take` closes the
         # port.
         received = port.take(now if missed else None)
         # Pass the fields by position: creating a struct by its names takes three times as
         # long.
-        inputs = Inputs(
-            now,
-            ended and pace.period_ended(missed),
+        heard = Heard(
             port.is_open,
             port.opened,
             port.trouble,
             received,
             commands,
+            refusals,
             requests,
             tuple(self._turn_rates),
-            refusals,
-            trip,
-            superseded,
-            missed,
             tuple(self._others),
-            pace.at_once(now.mono_ns, port.sent_ns),
-            self.shutting_down,
-            late_ns,
+            missed,
             self._speed_cap,
+            self.shutting_down,
         )
         self._speed_cap = None
-        if inputs.events:
+        if heard.events:
             self._others.clear()
-        if inputs.gyro:
+        if heard.gyro:
             self._turn_rates.clear()
         before = self._config
-        outputs, was_written = self._decided(inputs)
         has_input = bool(commands or refusals or requests)
-        pace.record_step(
-            inputs.tick, outputs.due, was_written, outputs.news, has_input, port.sent_ns
-        )
+        outputs = self._act(now, heard, ended and pace.period_ended(missed), has_input)
         self._publish(outputs, outputs.answers)
         # `adopted` may change the log's level, so call it after logging this step's events.
         if self._config is not before and self._adopted:
@@ -228,21 +217,52 @@ class ControlLoop:
         self._bus.flush()
         return outputs
 
-    def _decided(self, inputs: Inputs) -> tuple[Outputs, bool]:
-        # Also returns whether the port wrote the line.
+    def _act(self, now: Instant, heard: Heard, tick: bool, has_input: bool) -> Outputs:
+        robot, recorder, before = self.robot, self._recorder, self._outcome
+        at_once = self.pace.at_once(now.mono_ns, self._port.sent_ns)
+        line: bytes | None = None
+        sent: bytes | None = None
+        self._outcome = LineOutcome()
         try:
-            outputs = self.outputs = self.robot.step(inputs)
-            self._handover.take(outputs.latches)
-            if self.robot.config is not self._config:
-                self._adopt(self.robot.config, outputs.answers)
-            line = self._send(outputs, inputs.now)
+            news = robot.hear(now, heard)
+            self._handover.take(robot.latches)
+            if robot.config is not self._config:
+                self._adopt(robot.config, news.answers)
+            due = tick or (at_once and news.urgent)
+            if due:
+                line = robot.drive(now)
+                if line is not None:
+                    sent = self._send(line, now)
         except Exception:
-            if self._recorder is not None:
-                self._recorder.died(inputs)
+            if recorder is not None:
+                recorder.died(inputs_of(now, heard, tick, at_once, before))
             raise
-        if self._recorder is not None:
-            self._recorder.step(inputs, outputs, line, self.robot, self._guard)
-        return outputs, line is not None
+        self.pace.record_step(
+            tick, due, sent is not None, news.urgent, has_input, self._port.sent_ns
+        )
+        outputs = self.outputs = outputs_of(now, robot, news, due, line)
+        if recorder is not None:
+            inputs = inputs_of(now, heard, tick, at_once, before)
+            recorder.step(inputs, outputs, sent, robot, self._guard)
+        return outputs
+
+    def _send(self, line: bytes, now: Instant) -> bytes | None:
+        # None: not written.
+        robot, port, status = self.robot, self._port, self.robot.status
+        line, trip = self._guard.check(line, now.mono_ns, status, robot.command_ns)
+        before_ns, late_ns = port.sent_ns, 0
+        was_written = port.offer(line, now) == "sent"
+        if was_written:
+            self._guard.record_written(line)
+            sent_ns = port.sent_ns
+            if status.mode == "driving":
+                self._stopwatch.line(robot.command_ns, sent_ns, before_ns)
+            late_ns = sent_ns - now.mono_ns
+            late_ns = late_ns if late_ns >= MIN_WRITE_DELAY_NS else 0
+        sent = line if was_written else None
+        robot.sent(now.mono_ns + late_ns, sent, trip)
+        self._outcome = LineOutcome(trip, not was_written, late_ns)
+        return sent
 
     def finish(self, now: Instant) -> None:
         """Store the stops that arrived after the last step, and send the waiting answers."""
@@ -340,25 +360,6 @@ class ControlLoop:
             self._bus.reply(reply)
         self._bus.retire(query.ticket)
         return None
-
-    def _send(self, outputs: Outputs, now: Instant) -> bytes | None:
-        # None: not written.
-        line, trip = self._guard.check(outputs)
-        self._last_line = "", False, 0
-        if line is None:
-            return None
-        before_ns, late_ns = self._port.sent_ns, 0
-        was_written = self._port.offer(line, now) == "sent"
-        if was_written:
-            self._guard.record_written(line)
-            sent_ns = self._port.sent_ns
-            self._stopwatch.line(outputs, sent_ns, before_ns)
-            late_ns = sent_ns - now.mono_ns
-            late_ns = late_ns if late_ns >= MIN_WRITE_DELAY_NS else 0
-        sent = line if was_written else None
-        self.robot.sent(now.mono_ns + late_ns, sent, trip)
-        self._last_line = trip, not was_written, late_ns
-        return sent
 
     def _publish(self, outputs: Outputs, answers: tuple[Answer, ...]) -> None:
         bus, report, wanted = self._bus, self.report, self._bus.wanted_keys

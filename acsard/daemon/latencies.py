@@ -16,7 +16,7 @@ from itertools import accumulate, cycle
 from operator import add
 from typing import Final, Literal, get_args
 
-from acsard.core.values import NS_PER_S, Estimate, Measured, Ns, Outputs, Spread
+from acsard.core.values import NS_PER_S, Estimate, Measured, Ns, Spread
 
 PER_DECADE = 20  # buckets: a percentile is at most 12 % too high
 
@@ -162,10 +162,9 @@ class Stopwatch:
             self._turn_ns = now_ns + TURN_NS
             next(self._turns).sort(now_ns)  # takes about 40 us
 
-    def line(self, outputs: Outputs, sent_ns: Ns, before_ns: Ns) -> None:
+    def line(self, command_ns: Ns | None, sent_ns: Ns, before_ns: Ns) -> None:
         """Record how old the command in a line was when it was written, while the robot drives."""
-        command_ns = outputs.command_ns
-        if command_ns is None or outputs.mode != "driving":
+        if command_ns is None:
             return
         self.figures["command_age"].add(sent_ns - command_ns)
         # A command that is older than the previous line was in that line already, or it had to wait

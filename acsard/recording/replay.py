@@ -1,4 +1,4 @@
-"""Replays steps: runs `Robot.step` with the recorded inputs, and compares the outputs.
+"""Replays steps: gives the recorded inputs to a robot, and compares the outputs.
 
 Behavior depends only on inputs and configuration, so the same ones give every line, mode and pose
 again. With changed code or configuration, the differences show what would have been. `Replay` does
@@ -36,6 +36,8 @@ from acsard.recording.recorded_steps import (
 )
 from acsard.recording.state import State, StateError, adopt, short, thaw
 from acsard.recording.stepped_robot import SteppedRobot
+
+NO_TRIP: Trip = ""
 
 # "sent line" is after the guard, "event" all but text and client. "input names" are compared at the
 # end of a batch.
@@ -127,7 +129,10 @@ class Replay:
         if self.robot.config is not self._config:
             self._config = self.robot.config
             self._guard.use(self._config)
-        line, trip = self._guard.check(outputs)
+        line, trip = outputs.line, NO_TRIP
+        if line is not None:
+            status, at_ns = self.robot.status, outputs.now.mono_ns
+            line, trip = self._guard.check(line, at_ns, status, outputs.command_ns)
         self._checksum = checksum(outputs.estimates, self._checksum)
         self._names = input_names(step.inputs, self._names)
         if step.recorded.sent is not None:

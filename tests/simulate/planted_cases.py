@@ -62,7 +62,7 @@ CASES = (
         "case 6",
         "the guard does not check that a stopped robot comes to rest, and it does not",
         GUARD,
-        "if self._late(outputs.now.mono_ns):",
+        "if self._late(now_ns):",
         "if False:",
         Edit(
             LIMITS,

@@ -609,8 +609,8 @@ FAULTS = (
         "robot unsent",
         "a line that never left counts as obeyed",
         ROBOT,
-        "        if line is not None:\n",
-        "        if True:\n",
+        '        if line is not None:\n            self.counters["lines_sent"]',
+        '        if True:\n            self.counters["lines_sent"]',
     ),
     # session
     fault(
@@ -690,9 +690,8 @@ FAULTS = (
         "loop periods",
         "twice a second no line leaves for 60 ms",
         LOOP,
-        "        if line is None:\n            return None\n        before_ns",
-        "        if line is None or now.mono_ns % 500_000_000 < 60_000_000:\n"
-        "            return None\n        before_ns",
+        "                if line is not None:\n",
+        "                if line is not None and now.mono_ns % 500_000_000 >= 60_000_000:\n",
     ),
     fault(
         "loop end",
@@ -978,7 +977,7 @@ FAULTS = (
         ROBOT,
         "            self._fault(DRIVER_FAULT_REASON, now, events)\n",
         "            self._fault(DRIVER_FAULT_REASON, now, events)\n"
-        "            self._motion = AT_REST\n            self._speeds = STILL\n",
+        "            self._motion = AT_REST\n            self.speeds = STILL\n",
     ),
     fault(
         "estop ramp",
@@ -1004,11 +1003,11 @@ FAULTS = (
     fault(
         "estop late",
         "a pressed emergency stop waits up to 25 ms for its first zero",
-        ROBOT,
-        "        due = inputs.tick or (inputs.at_once and news)\n",
-        "        due = inputs.tick or (inputs.at_once and news)\n"
-        "        late = inputs.now.mono_ns % 10**8 < 25 * 10**6\n"
-        "        due = due and not (self._estop.is_pressed and late)\n",
+        LOOP,
+        "            due = tick or (at_once and news.urgent)\n",
+        "            due = tick or (at_once and news.urgent)\n"
+        "            late = now.mono_ns % 10**8 < 25 * 10**6\n"
+        "            due = due and not (robot._estop.is_pressed and late)\n",
     ),
     fault(
         "estop clear",

@@ -576,7 +576,7 @@ class Product:
             raise CrashError
 
         if way == "crash before the robot":
-            vars(loop.robot)["step"] = broken
+            vars(loop.robot)["hear"] = broken
         else:
             vars(port)["offer"] = broken
         with suppress(CrashError):

@@ -18,7 +18,7 @@ from msgspec import Struct
 from acsard.core.config.settings import CommandsConfig, Source
 from acsard.core.motion.emergency_stop import CATCH_UP_NS, LATE_STEP_NS
 from acsard.core.motion.freshness import MAX_PROOF_NS, Freshness
-from acsard.core.motion.neutral import NEUTRAL_PAUSE_NS, Sender, is_zero
+from acsard.core.motion.neutral import FOREVER_NS, NEUTRAL_PAUSE_NS, Sender, is_zero
 from acsard.core.values import NS_PER_S, REST, Command, Ns, SourceStatus, Twist, Wait
 
 MAX_SENDERS = 16  # of a source; one that may keep control (`Sender.holds`) is never replaced
@@ -164,11 +164,13 @@ class Arbiter:
         self._since_ns = 0
         self._begun_ns = self._watched_ns = 0
         self._freshness = Freshness()
+        self.until_ns = 0  # the last `choose` holds until then, unless another method is called
 
     def use(self, commands: CommandsConfig) -> None:
         """Use other timeouts. Armed senders stay armed."""
         for settings in commands.sources:
             self._sources[settings.name].use(settings)
+        self.until_ns = 0
 
     def require_neutral(self, since_ns: Ns = 0) -> None:
         """Forget all commands: each sender must send a zero that arrives from `since_ns` on.
@@ -181,6 +183,7 @@ class Arbiter:
         for source in self._ranking:
             source.require_neutral()
         self._holder = self._followed = None
+        self.until_ns = 0
 
     def begin(self, now_ns: Ns) -> bool:
         """Begin a control step, and return whether the daemon stood still before (True at first).
@@ -192,6 +195,7 @@ class Arbiter:
         if now_ns - before_ns <= LATE_STEP_NS:
             return False
         self._watched_ns = now_ns if before_ns else now_ns - CATCH_UP_NS
+        self.until_ns = 0
         for source in self._ranking:
             for sender in source.senders.values():
                 sender.resume(before_ns, now_ns)
@@ -199,6 +203,7 @@ class Arbiter:
 
     def accept(self, command: Command) -> Objection | Literal[""]:
         """Process a command. Return "" if it is accepted, otherwise the reason to refuse it."""
+        self.until_ns = 0
         source = self._sources.get(command.source)
         if source is None:
             return "unknown_source"
@@ -234,6 +239,7 @@ class Arbiter:
         It cancels the zero of its own identity only: a program that sends only such messages never
         drives, so it must not keep the others that share the source from being armed.
         """
+        self.until_ns = 0
         known = self._sources.get(source)
         known_sender = None if known is None else known.senders.get(sender)
         if known_sender is not None:
@@ -241,7 +247,11 @@ class Arbiter:
             known_sender.cancel_zero(arrived_ns)
 
     def choose(self, now_ns: Ns) -> Choice:
-        """Return the command that the robot follows now, or the reason why it follows none."""
+        """Return the command that the robot follows now, or the reason why it follows none.
+
+        The result is the same until `until_ns`.
+        """
+        self.until_ns = self._changes_ns(now_ns)
         first: tuple[_Source, Sender] | None = None
         previous = self._followed
         for source in self._ranking:
@@ -281,6 +291,16 @@ class Arbiter:
             )
         return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
 
+    def _changes_ns(self, now_ns: Ns) -> Ns:
+        times = [FOREVER_NS]
+        for source in self._ranking:
+            for sender in source.senders.values():
+                times.append(sender.changes_ns(now_ns))
+                for since_ns in (sender.zeros_ns, sender.speeds_ns):
+                    if since_ns is not None:
+                        times.append(since_ns + _next_report_ns(now_ns - since_ns))
+        return min(times)
+
     def _blocked_source(self, holder: _Source, now_ns: Ns) -> str:
         # The source, or another sender of it, whose speeds have no effect: `holder` sends zeros.
         for source in self._ranking:
@@ -313,6 +333,12 @@ class Arbiter:
         if holder is None or source is holder:
             return Wait("senders", senders=len(present) - 1) if len(present) > 1 else NOTHING
         return Wait("equal" if holder.priority == source.priority else "higher", holder.name)
+
+
+def _next_report_ns(ns: Ns) -> Ns:
+    # The duration at which `_reported_duration_s` gives another result.
+    after = [limit for seconds in REPORTED_DURATIONS_S if (limit := int(seconds * NS_PER_S)) > ns]
+    return after[0] if after else FOREVER_NS
 
 
 def _reported_duration_s(ns: Ns) -> float:

@@ -31,6 +31,8 @@ CANDIDATE_NS = 2 * MAX_PROOF_NS
 # Without a speed, after the zero of a shared identity: longer than the pauses of irregular senders.
 NEUTRAL_PAUSE_NS = NS_PER_S
 
+FOREVER_NS = 1 << 62
+
 
 class Sender:
     """One sender of a command source: its last command, and whether it is armed."""
@@ -118,6 +120,21 @@ class Sender:
     def unlearn(self) -> None:
         """Undo the arming by zeros with unproven stamps, which the network may have delayed."""
         self._armed, self._zero_ns = self._proven_armed, self._proven_zero_ns
+
+    def changes_ns(self, now_ns: Ns) -> Ns:
+        """Return the next time at which a method gives another result without a new message."""
+        times = [FOREVER_NS]
+        if self.arrived_ns is not None:
+            times.append(self.arrived_ns + self._timeout_ns + 1)
+            times.append(self.arrived_ns + CANDIDATE_NS + 1)
+            times.append(self._present_ns + self._timeout_ns + 1)
+        if self._doubted_ns is not None:
+            times.append(self._doubted_ns + self._timeout_ns + 1)
+        if self.disarmed_ns is not None:
+            times.append(self.disarmed_ns + CANDIDATE_NS + 1)
+        if self._zero_ns is not None:
+            times.append(self._zero_ns + NEUTRAL_PAUSE_NS)
+        return min([time for time in times if time > now_ns])
 
     def resume(self, before_ns: Ns, now_ns: Ns) -> None:
         """Continue after the daemon stood still from `before_ns` to `now_ns`.

@@ -67,23 +67,23 @@ class Step(Struct, frozen=True, gc=False):
 
 
 class Commanded(Struct):
-    """The last twist that the motors were commanded."""
+    """The speeds that the motors were commanded, without signs."""
 
-    twist: Twist = REST
-    # Highest speeds since the last line: in a gap, the robot may have driven as fast.
+    speeds: Twist = REST
+    # Since the last line: in a gap, the robot may have driven as fast, or it may still follow the
+    # previous command.
     highest: Twist = REST
-    heard: bool = False  # a line was used since the last command
 
     def command(self, twist: Twist) -> None:
         """Record the twist that the motors are commanded from now on."""
-        if self.heard or twist != self.twist:
-            # The robot may still follow the previous command.
-            highest = self.twist if self.heard else self.highest
-            self.highest = Twist(
-                max(abs(highest.linear), abs(twist.linear)),
-                max(abs(highest.angular), abs(twist.angular)),
-            )
-            self.twist, self.heard = twist, False
+        linear, angular, highest = abs(twist.linear), abs(twist.angular), self.highest
+        self.speeds = Twist(linear, angular)
+        if linear > highest.linear or angular > highest.angular:
+            self.highest = Twist(max(highest.linear, linear), max(highest.angular, angular))
+
+    def begin_line(self) -> None:
+        """Record that a line was used, so that the speeds of the next one begin."""
+        self.highest = self.speeds
 
 
 class Unseen(Struct):
@@ -223,7 +223,8 @@ class Odometry:
         variances = self._twist_variances(twist, feedback, at_rest, turn, slips)
         if turn is not None and dt > 0.0:
             twist = Twist(linear, turn.rate)
-        self.twist, self.speeds, self.commanded.heard = twist, speeds, True
+        self.twist, self.speeds = twist, speeds
+        self.commanded.begin_line()
         checks.finish(turned)
         return Estimate(
             feedback.at,

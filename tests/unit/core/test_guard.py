@@ -47,6 +47,7 @@ from acsard.core.values import (
 )
 from acsard.recording.stepped_robot import SteppedRobot
 from tests.each import each
+from tests.unit.core.guarded import checked
 
 MS = 1_000_000
 NOW_NS = 50_000 * MS
@@ -122,7 +123,7 @@ class Guarded:
         self.trip: Trip = ""
 
     def check(self, result: Outputs) -> bytes | None:
-        line, self.trip = self.guard.check(result)
+        line, self.trip = checked(self.guard, result)
         self._passed = line or self._passed
         return line
 
@@ -402,7 +403,7 @@ class Clocked:
             age_ms=0.0 if fresh else None,
             at_ns=NOW_NS + int(ms * MS),
         )
-        passed, trip = self.guard.check(result)
+        passed, trip = checked(self.guard, result)
         assert passed == (STOP if trip else result.line)
         if passed is not None:
             self.guard.record_written(passed)
@@ -439,7 +440,7 @@ def test_without_a_fresh_command_only_zero_passes_after_the_longest_ramp(
 def test_a_stale_command_in_mode_driving_does_not_keep_the_robot_going() -> None:
     clocked = Clocked()
     stale = outputs(line(10.0), age_ms=251, at_ns=NOW_NS + 2301 * MS)
-    assert clocked.guard.check(stale) == (STOP, LATE)
+    assert checked(clocked.guard, stale) == (STOP, LATE)
 
 
 def test_each_fresh_command_restarts_the_ramp_time() -> None:
@@ -560,7 +561,7 @@ def test_a_guard_continues_from_the_memory_of_another_guard() -> None:
 
 def test_a_line_with_motion_before_any_command_is_late() -> None:
     guard = Guard(STOP, Config(), Memory(line(1.0)))
-    assert guard.check(coasting(line(1.0))) == (STOP, LATE)
+    assert checked(guard, coasting(line(1.0))) == (STOP, LATE)
 
 
 # with a robot

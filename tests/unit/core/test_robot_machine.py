@@ -55,6 +55,7 @@ from acsard.core.values import (
     Verb,
 )
 from acsard.recording.stepped_robot import SteppedRobot
+from tests.unit.core.guarded import checked
 
 MS = 1_000_000
 WALL_NS = 1_800_000_000 * NS_PER_S
@@ -701,7 +702,7 @@ class RobotMachine(RuleBasedStateMachine):
 
     def send(self, outputs: Outputs) -> None:
         """Send the line as `ControlLoop._send` does, and check the bytes on the wire."""
-        line, self.trip = self.guard.check(outputs)
+        line, self.trip = checked(self.guard, outputs)
         assert self.trip == ""
         if line is None:
             self.superseded = False

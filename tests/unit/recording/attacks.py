@@ -155,7 +155,7 @@ BODIES: dict[str, bytes] = {
     "a thing by what says it": text("Robot") + pickle.BINPERSID,
     "a buffer from outside": pickle.NEXT_BUFFER,
     "one that is read only": NOTHING + pickle.READONLY_BUFFER,
-    "a method": named("acsard.core.robot", "Robot.step"),
+    "a method": named("acsard.core.robot", "Robot.hear"),
     "what a room has imported": named("acsard.core.robot", "Counter"),
     "a room's builtins": named("acsard.core.robot", "__builtins__"),
     "a function of a room": named("acsard.core.motion.arbiter_text", "chosen"),
@@ -220,7 +220,7 @@ ATTACKS = {name: whole(body) for name, body in BODIES.items()} | {
 
 def main() -> None:
     copyreg.add_extension("os", "system", EXTENSION)
-    errors, step, modules = {}, Robot.step, set(sys.modules)
+    errors, hear, modules = {}, Robot.hear, set(sys.modules)
     ran: list[str] = []
     os.system = ran.append  # type: ignore[assignment]
     for name, data in ATTACKS.items():
@@ -229,7 +229,7 @@ def main() -> None:
             errors[name] = ""
         except StateError as error:
             errors[name] = str(error)
-        if ran or Robot.step is not step or set(sys.modules) - modules:
+        if ran or Robot.hear is not hear or set(sys.modules) - modules:
             errors[name], modules = "", set(sys.modules)
             ran.clear()
     print(json.dumps(errors))

@@ -22,7 +22,7 @@ from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.incoming.commands import Arrival
 from acsard.core.link.serial_output import Offered
 from acsard.core.robot import Robot
-from acsard.core.values import Event, Inputs, Instant, Latch, Latches, Outputs
+from acsard.core.values import Event, Heard, Instant, Latch, Latches, News
 from acsard.recording import mcap_recorder as module
 from acsard.recording import retention, step_writer
 from acsard.recording.end_record import ending_text, read_end
@@ -405,14 +405,14 @@ def ends_by(bench: Bench, error: Exception) -> list[Path]:
 
 def break_robot(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make the robot raise an error when the next request arrives."""
-    whole = Robot.step
+    whole = Robot.hear
 
-    def step(robot: Robot, inputs: Inputs) -> Outputs:
-        if inputs.requests:
+    def hear(robot: Robot, now: Instant, heard: Heard) -> News:
+        if heard.requests:
             raise ZeroDivisionError(BUG)
-        return whole(robot, inputs)
+        return whole(robot, now, heard)
 
-    monkeypatch.setattr(Robot, "step", step)
+    monkeypatch.setattr(Robot, "hear", hear)
 
 
 @pytest.mark.slow

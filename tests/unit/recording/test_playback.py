@@ -144,5 +144,5 @@ def test_the_step_in_which_the_daemon_failed_is_replayed_too(
     def fail(*_: object) -> None:
         raise BrokenError("y")
 
-    monkeypatch.setattr(Robot, "step", fail)
+    monkeypatch.setattr(Robot, "hear", fail)
     assert "also fails here, with BrokenError: y" in playback.failed_step()

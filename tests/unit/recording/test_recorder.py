@@ -21,7 +21,15 @@ from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.incoming.commands import Arrival
 from acsard.core.link.serial_output import Offered
 from acsard.core.robot import Robot
-from acsard.core.values import NS_PER_S, Event, Inputs, Instant, Latch, Latches, Outputs
+from acsard.core.values import (
+    NS_PER_S,
+    Event,
+    Heard,
+    Instant,
+    Latch,
+    Latches,
+    News,
+)
 from acsard.recording import recorder as module
 from acsard.recording.file import Failure, Head, Recording, listed
 from acsard.recording.recorder import Recorder
@@ -353,14 +361,14 @@ def test_steps_that_a_full_disk_refused_are_counted_exactly(room: int, bench: Be
 
 def break_robot(patched: pytest.MonkeyPatch) -> None:
     """Let each step with a request fail."""
-    step = Robot.step
+    hear = Robot.hear
 
-    def broken(robot: Robot, inputs: Inputs) -> Outputs:
-        if inputs.requests:
+    def broken(robot: Robot, now: Instant, heard: Heard) -> News:
+        if heard.requests:
             raise ZeroDivisionError(BUG)
-        return step(robot, inputs)
+        return hear(robot, now, heard)
 
-    patched.setattr(Robot, "step", broken)
+    patched.setattr(Robot, "hear", broken)
 
 
 def failure_of(paths: list[Path]) -> Failure:

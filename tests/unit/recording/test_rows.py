@@ -43,6 +43,7 @@ from acsard.recording.rows import (
     encode,
     first_of,
 )
+from acsard.recording.stepped_robot import SteppedRobot
 from tests.each import each
 from tests.scenarios.taped import Tape, drive_through_faults
 from tests.scenarios.world import World
@@ -102,7 +103,7 @@ def test_every_field_of_the_inputs_is_recorded() -> None:
 @pytest.mark.slow
 @given(st.lists(INPUTS, min_size=1, max_size=6), st.integers(0, 1 << 40))
 def test_all_inputs_are_read_back(inputs: list[Inputs], first: int) -> None:
-    outputs = Robot(Config()).step(Inputs(Instant(1, 2), True, True))
+    outputs = SteppedRobot(Robot(Config())).step(Inputs(Instant(1, 2), True, True))
     steps = decode(encode(first, [FinishedStep(item, outputs, b"other") for item in inputs]))
     assert [step.inputs for step in steps] == inputs
     assert [step.number for step in steps] == [first + n for n in range(len(inputs))]
@@ -137,7 +138,7 @@ def test_a_second_at_rest_takes_few_bytes() -> None:
 
 def test_steps_with_equal_times_keep_their_order() -> None:
     tick, other = Inputs(Instant(5, 5), True, True), Inputs(Instant(5, 5), False, True)
-    outputs = Robot(Config()).step(tick)
+    outputs = SteppedRobot(Robot(Config())).step(tick)
     for inputs in ([tick, other, other], [other, tick], [tick, other, tick, other]):
         steps = decode(encode(0, [FinishedStep(item, outputs, None) for item in inputs]))
         assert [step.inputs for step in steps] == inputs
@@ -227,7 +228,7 @@ def test_a_batch_with_an_incomplete_first_step_or_too_many_steps_is_refused(
 
 def test_a_line_that_was_not_sent_or_was_replaced_is_read_back() -> None:
     tick = Inputs(Instant(5, 5), True, True)
-    outputs = Robot(Config()).step(tick)
+    outputs = SteppedRobot(Robot(Config())).step(tick)
     sent = [None, b"", outputs.line, b"other"]
     steps = decode(encode(0, [FinishedStep(tick, outputs, left) for left in sent]))
     assert [step.recorded.sent for step in steps] == sent
