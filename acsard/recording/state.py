@@ -19,6 +19,7 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 from msgspec import Meta, Struct
 
+from acsard.core.codes import Code
 from acsard.core.config.contradictions import contradictions
 from acsard.core.config.settings import Config
 from acsard.core.formatting import printable
@@ -33,22 +34,41 @@ from acsard.core.motion.limits import Motion
 from acsard.core.motion.modes import Mode
 from acsard.core.motion.sanity import Sanity
 from acsard.core.robot import Robot
-from acsard.core.values import AcsardError, SpeedCap
+from acsard.core.values import AcsardError, Event, Latch, Ns, SpeedCap, Trip, WheelSpeeds
 from acsard.recording.unpickling import MAX_BYTES, unpickle
 
-# Attributes of a robot without configuration inside. A state is read by their types, and what an
-# older one lacks has its default.
-PARTS: dict[str, type[Struct]] = {
+# Attributes of a robot that are plain data, without configuration inside, with their types.
+PARTS: dict[str, Any] = {
+    "counters": Counter,
     "_motion": Motion,
     "_cap": SpeedCap,
     "_choice": Choice,
+    "_speeds": WheelSpeeds,
+    "_written": WheelSpeeds,
+    "_made_of": tuple[Ns | None, Mode] | None,
+    "_made_ns": Ns,
+    "_left_ns": Ns,
+    "_pressed_ns": Ns,
+    "_trip": Trip,
+    "_first_event": Event | None,
+    "_status": tuple[str, Code, str, str, str],
+    "_battery_level": str,
+    "_refused": str,
+    "_refused_ns": Ns | None,
+    "_unreported": dict[str, Latch],
+    "_asked": tuple[str, str, Ns | None],
+    "_port_trouble": str,
+    "_linked_once": bool,
+    "_sanity": Sanity,
     "_estop": EmergencyStop,
     "_bumpers": Bumpers,
     "_battery": Battery,
-    "_sanity": Sanity,
     "_told": CommandEvents,
     "_tally": EventThrottle,
 }
+
+# Not stored: they follow from the configuration, and no line is pending between two steps.
+DERIVED = ("config", "_kinematics", "_max_dt", "_line")
 
 # A package ends with a dot. The classes need constructors without side effects.
 PART_MODULES = (
@@ -116,18 +136,23 @@ def checkpoint(data: bytes) -> Checkpoint:
 
 def freeze(robot: Robot, memory: Memory) -> bytes:
     """Encode the state of a robot and of its guard, for `thaw`."""
-    rest = dict(vars(robot))
-    config = rest.pop("config")
+    rest = {name: part for name, part in vars(robot).items() if name not in DERIVED}
     parts = {name: msgspec.Raw(msgspec.msgpack.encode(rest.pop(name))) for name in PARTS}
     written = io.BytesIO()
     pickler = pickle.Pickler(written, PICKLE_PROTOCOL)
     pickler.dispatch_table = DISPATCH_TABLE
     pickler.dump(rest)
-    return msgspec.msgpack.encode(Frozen(config, memory, parts, written.getvalue()))
+    return msgspec.msgpack.encode(Frozen(robot.config, memory, parts, written.getvalue()))
 
 
 _frozen = msgspec.msgpack.Decoder(Frozen)
-_parts = {name: msgspec.msgpack.Decoder(part) for name, part in PARTS.items()}
+
+
+def _counter(kind: type, data: object) -> Counter[str]:
+    return kind(msgspec.convert(data, dict[str, int]))  # type: ignore[no-any-return]
+
+
+_parts = {name: msgspec.msgpack.Decoder(part, dec_hook=_counter) for name, part in PARTS.items()}
 
 
 def thaw(data: bytes) -> State:
@@ -150,7 +175,7 @@ def thaw(data: bytes) -> State:
         raise _unreadable(error) from None
     if not isinstance(rest, dict):
         raise StateError("the robot state at the start of the recording is not valid")
-    for name in vars(robot).keys() - PARTS.keys() - {"config"}:
+    for name in vars(robot).keys() - PARTS.keys() - {*DERIVED}:
         # What an older version has not recorded is as in a new robot.
         if name in rest:
             setattr(robot, name, rest[name])
