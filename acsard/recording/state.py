@@ -19,7 +19,6 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 from msgspec import Meta, Struct
 
-from acsard.core.codes import Code
 from acsard.core.config.contradictions import contradictions
 from acsard.core.config.settings import Config
 from acsard.core.formatting import printable
@@ -34,7 +33,7 @@ from acsard.core.motion.limits import Motion
 from acsard.core.motion.modes import Mode
 from acsard.core.motion.sanity import Sanity
 from acsard.core.robot import Robot
-from acsard.core.values import AcsardError, Event, Latch, Ns, SpeedCap, Trip, WheelSpeeds
+from acsard.core.values import AcsardError, Event, Latch, Ns, SpeedCap, Status, Trip, WheelSpeeds
 from acsard.recording.unpickling import MAX_BYTES, unpickle
 
 # Attributes of a robot that are plain data, without configuration inside, with their types.
@@ -43,15 +42,16 @@ PARTS: dict[str, Any] = {
     "_motion": Motion,
     "_cap": SpeedCap,
     "_choice": Choice,
-    "_speeds": WheelSpeeds,
+    "speeds": WheelSpeeds,
+    "_limited": bool,
     "_written": WheelSpeeds,
     "_made_of": tuple[Ns | None, Mode] | None,
     "_made_ns": Ns,
     "_left_ns": Ns,
     "_pressed_ns": Ns,
     "_trip": Trip,
-    "_first_event": Event | None,
-    "_status": tuple[str, Code, str, str, str],
+    "_announced": tuple[Event, ...],
+    "status": Status,
     "_battery_level": str,
     "_refused": str,
     "_refused_ns": Ns | None,
