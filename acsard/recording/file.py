@@ -32,13 +32,13 @@ from acsard.core.values import (
     Inputs,
     Instant,
     Ns,
+    Outputs,
     Received,
     Verb,
     WallNs,
 )
 from acsard.host.errors import MSGSPEC_ERRORS, RecordingError
 from acsard.recording.recorded_steps import (
-    FinishedStep,
     Micropose,
     RecordedOutputs,
     RecordedStep,
@@ -169,7 +169,7 @@ class FrameWriter:
         """Write a record so that it can be read as soon as the file is flushed."""
         self._add(_encode(record))
 
-    def add_steps(self, first: int, steps: Sequence[FinishedStep]) -> None:
+    def add_steps(self, first: int, steps: Sequence[tuple[Inputs, Outputs, bytes | None]]) -> None:
         """Write successive steps, as several records if one would be too large to be read."""
         data = _encode(encode_steps(first, steps))
         if len(data) > MAX_RECORD_BYTES and len(steps) > 1:
@@ -191,7 +191,7 @@ class FrameWriter:
             self._compressor = None
 
 
-def encode_steps(first: int, finished: Sequence[FinishedStep]) -> Steps:
+def encode_steps(first: int, finished: Sequence[tuple[Inputs, Outputs, bytes | None]]) -> Steps:
     """Return successive steps as a record."""
     rows, before, before_ns, crc = [], None, 0, 0
     for inputs, outputs, sent in finished:

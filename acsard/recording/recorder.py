@@ -13,7 +13,9 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
+
+from msgspec import Struct
 
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
@@ -26,7 +28,7 @@ from acsard.host.version import version
 from acsard.host.wait_timer import WaitTimer
 from acsard.recording.directory import RecordingDirectory
 from acsard.recording.file import Failure, FrameWriter, Head
-from acsard.recording.recorded_steps import FinishedStep, StepRecorder
+from acsard.recording.recorded_steps import StepRecorder
 from acsard.recording.state import MAX_ERROR_LENGTH, freeze
 
 MAX_QUEUED_STEPS = 4096  # 10 s at 400 steps a second
@@ -57,7 +59,12 @@ ENDED = (
 CLOSE_S = 0.5  # for the last steps, when the daemon ends
 
 
-class Start(NamedTuple):
+WATCH_STEPS = 8  # between two looks at the disk's time
+
+Step = tuple[Inputs, Outputs, bytes | None]  # with the line on the serial port
+
+
+class Start(Struct, frozen=True):
     """The robot between two steps, for a `Head`."""
 
     number: int  # of the next step
@@ -74,7 +81,7 @@ class Recorder(StepRecorder):
     ) -> None:
         # `report` runs in the thread of the control loop.
         self._report = report
-        self._queue: deque[FinishedStep | Start | Failure] = deque()
+        self._queue: deque[Step | Start | Failure] = deque()
         self._number = 0  # of the next step
         self._head_ns = 0  # when the next head is due
         self._lost = 0  # for a full queue
@@ -107,11 +114,12 @@ class Recorder(StepRecorder):
         if len(queue) >= MAX_QUEUED_STEPS or self._full:
             self._lose()
         else:
-            queue.append(FinishedStep(inputs, outputs, sent))
+            queue.append((inputs, outputs, sent))
         if (writer.wants_head or now.mono_ns >= self._head_ns) and not self._full:
             writer.wants_head, self._head_ns = False, now.mono_ns + HEAD_NS
             queue.append(Start(self._number, now, robot.config, freeze(robot, guard.memory)))
-        self._watch_disk(now.mono_ns)
+        if self._number % WATCH_STEPS == 0:
+            self._watch_disk(now.mono_ns)
 
     def _lose(self) -> None:
         self._lost += 1
@@ -205,9 +213,9 @@ class _Writer:
         self._lost_before = 0  # when the disk began to refuse
         self._text = config, _text(config)  # of the last head
 
-    def write(self, items: list[FinishedStep | Start | Failure], over: bool) -> None:
+    def write(self, items: list[Step | Start | Failure], over: bool) -> None:
         """Write the items of the recorder's queue. The last call ends the file."""
-        steps, written = sum(isinstance(item, FinishedStep) for item in items), 0
+        steps, written = sum(isinstance(item, tuple) for item in items), 0
         if self._pause and not over:
             self._pause -= 1
         else:
@@ -228,12 +236,12 @@ class _Writer:
         elif steps and self._frames is None and not self._pause:
             self.wants_head = True
 
-    def _write(self, items: list[FinishedStep | Start | Failure]) -> int:
+    def _write(self, items: list[Step | Start | Failure]) -> int:
         # Returns the number of steps that were written: those that follow a head.
-        steps: list[FinishedStep] = []
+        steps: list[Step] = []
         written = 0
         for item in items:
-            if isinstance(item, FinishedStep):
+            if isinstance(item, tuple):
                 steps.append(item)
                 continue
             written += self._add(steps)
@@ -244,12 +252,12 @@ class _Writer:
                 _add_failure(self._frames, item)
         return written + self._add(steps)
 
-    def _add(self, steps: list[FinishedStep]) -> int:
+    def _add(self, steps: list[Step]) -> int:
         if not steps or self._frames is None:
             return 0
         self._frames.add_steps(self._number, steps)
         self._number += len(steps)
-        last, now = self._last, steps[-1].inputs.now
+        last, now = self._last, steps[-1][0].now
         if last is not None and abs(_ahead_ns(now) - _ahead_ns(last)) > CLOCK_JUMP_NS:
             self._ends = self.wants_head = True
         self._last = now
