@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from threading import Event, Thread
+from threading import Event
 
 import zenoh
 
@@ -22,6 +22,7 @@ from acsard.core.config.settings import TLS_PREFIX
 from acsard.core.formatting import printable
 from acsard.core.messages.keys_and_roles import key_hint, row_of, unknown
 from acsard.host.errors import UsageError
+from acsard.host.threads import Worker
 
 SEVERAL_IDS = "; several ids separated by commas, or '*' for all robots"
 
@@ -167,7 +168,7 @@ def explained(
             elif not reported:
                 reported = print_reason(ceased())
 
-    Thread(target=print_reasons, name="waiting", daemon=True).start()
+    Worker("waiting", print_reasons).start()
     try:
         yield come.set
         if time.monotonic() - began_s >= timeout_s:

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future
-from threading import Condition, Thread
+from threading import Condition
 from typing import Never
 
 from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, Commander, Wish
 from acsard.host import clock
+from acsard.host.threads import Worker
 
 Put = Callable[[Wish], object]  # sends one command, and may block
 
@@ -28,7 +29,7 @@ class Outbox:
         self._busy = False
         # Gets an exception that ends the thread; otherwise pending.
         self.dead: Future[Never] = Future()
-        Thread(target=self._run, name="outbox", daemon=True).start()
+        Worker("outbox", self._run, self.dead.set_exception).start()
 
     def take(self, commander: Commander, put: Put, wish: Wish) -> None:
         """Queue a sender's command, which the thread sends by `put`."""
@@ -54,11 +55,8 @@ class Outbox:
             )
 
     def _run(self) -> None:
-        try:
-            while True:
-                self._round()
-        except BaseException as error:  # noqa: BLE001 - passed on to the program
-            self.dead.set_exception(error)
+        while True:
+            self._round()
 
     def _round(self) -> None:
         with self._news:

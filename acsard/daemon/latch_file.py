@@ -38,7 +38,7 @@ from acsard.host import clock
 from acsard.host.atomic_file import replace, sync
 from acsard.host.errors import InUseError
 from acsard.host.mailbox import Mailbox
-from acsard.host.threads import NoThreadError, in_thread
+from acsard.host.threads import NoThreadError, Worker, in_thread
 from acsard.host.wait_timer import WaitTimer
 
 # A write or a sync that takes longer is a disk that hangs. At the start, the first read and write
@@ -108,7 +108,7 @@ class LatchFile(LatchKeeper):
         self._write_timer, self._sync_timer = WaitTimer(), WaitTimer()
         self._hangs = False  # at the last `take_events`
         self._renamed = Mailbox[Latches](1)  # in the file, to the syncing thread
-        self._threads: tuple[threading.Thread, ...] = ()  # for writing and syncing, once both run
+        self._threads: tuple[Worker, ...] = ()  # for writing and syncing, once both run
 
     # The start of the daemon calls the methods below.
 
@@ -132,16 +132,16 @@ class LatchFile(LatchKeeper):
                 latches = self._if_unwritable(file_latches, why, now)
             self.keep(latches)
         threads = (
-            threading.Thread(target=self._work, args=(now,), name="latches", daemon=True),
-            threading.Thread(target=self._sync_each, name="latches to disk", daemon=True),
+            Worker("latches", lambda: self._work(now)),
+            Worker("latches to disk", self._sync_each),
         )
         try:
             for thread in threads:
                 thread.start()
-        except RuntimeError as error:
+        except NoThreadError as error:
             # The first thread may run already. Without the second thread, the first one must not
             # write, and must not report a recovery. `_barred` prevents both.
-            self._barred = f"this process cannot start another thread ({error})"
+            self._barred = str(error)
             self._fail(self._barred)
             return self._if_unwritable(latches, self._failed, now)
         self._threads = threads

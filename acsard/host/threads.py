@@ -1,7 +1,7 @@
-"""Runs blocking calls outside the event loop or the main loop of a program.
+"""Runs work that may block in threads of its own, and passes on what ends it.
 
-Each call runs in a new daemon thread and not in the default executor. A call that never returns,
-such as a close that hangs in a driver, must not keep the process from ending.
+All are daemon threads, and none is of the default executor: a call that never returns, such as a
+close that hangs in a driver, must not keep the process from ending.
 """
 
 from __future__ import annotations
@@ -18,6 +18,35 @@ T = TypeVar("T")
 
 class NoThreadError(TimeoutError):
     """The operating system could not start a thread, so the function was not called."""
+
+
+class Worker(threading.Thread):
+    """A thread that works until the process ends, or the error that ends it goes to `failed`."""
+
+    def __init__(
+        self,
+        name: str,
+        work: Callable[[], object],
+        failed: Callable[[BaseException], object] | None = None,
+    ) -> None:
+        # Without `failed`, Python prints the error.
+        super().__init__(name=name, daemon=True)
+        self._work, self._failed = work, failed
+
+    def start(self) -> None:
+        """Start the thread. Raises `NoThreadError`."""
+        try:
+            super().start()
+        except RuntimeError as error:
+            raise NoThreadError(f"this process cannot start another thread ({error})") from None
+
+    def run(self) -> None:
+        try:
+            self._work()
+        except BaseException as error:
+            if self._failed is None:
+                raise
+            self._failed(error)
 
 
 async def in_thread(
@@ -55,7 +84,7 @@ async def in_thread(
             if not delivered:
                 late(result)  # type: ignore[arg-type]
 
-    _start(work, getattr(call, "__name__", "call"))
+    Worker(getattr(call, "__name__", "call"), work).start()
     try:
         # Before Python 3.12 wait_for swallows a cancellation that coincides with the result.
         async with asyncio.timeout(timeout):
@@ -80,12 +109,5 @@ def future_of(call: Callable[[], T], wake: Callable[[], object]) -> Future[T]:
             future.set_exception(error)
         wake()
 
-    _start(work, getattr(call, "__name__", "call"))
+    Worker(getattr(call, "__name__", "call"), work).start()
     return future
-
-
-def _start(work: Callable[[], None], name: str) -> None:
-    try:
-        threading.Thread(target=work, name=name, daemon=True).start()
-    except RuntimeError as error:
-        raise NoThreadError(f"this process cannot start another thread ({error})") from None

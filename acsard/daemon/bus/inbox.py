@@ -32,9 +32,9 @@ from acsard.core.messages.keys_and_roles import (
 )
 from acsard.core.ros.transports import Endpoint
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.bus_thread import BusThread
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
+from acsard.host.threads import Worker
 
 MAX_OPEN_QUERIES = 1024  # a further query is dropped without an answer
 
@@ -70,7 +70,7 @@ class Replies:
 
     def start(self, session: zenoh.Session) -> None:
         """Start the thread that sends the replies, which may be queued already."""
-        BusThread("replies", partial(self._run, session), self._errors).start()
+        Worker("replies", partial(self._run, session), self._errors.append).start()
 
     def stop(self) -> None:
         """Let the thread end after the queued replies, without waiting."""

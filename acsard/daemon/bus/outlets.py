@@ -23,9 +23,9 @@ from acsard.core.messages.frames import FeedbackTopic
 from acsard.core.messages.schema import Message
 from acsard.core.ros.attachments import Attachment
 from acsard.core.values import NS_PER_S, Estimate, Ns
-from acsard.daemon.bus.bus_thread import BusThread
 from acsard.host import clock
 from acsard.host.mailbox import Bell, Mailbox
+from acsard.host.threads import Worker
 
 PUBLISHER_OPTIONS: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.DROP,
@@ -92,7 +92,7 @@ class Outlets:
         self._waiting = self._leaving = self._stuck = False
         self._dropped = 0  # displaced since the last `losses`
         self._began_ns: Ns | None = None  # the thread began to send the waiting messages
-        self._thread = BusThread("outlets", self._run, errors)
+        self._thread = Worker("outlets", self._run, errors.append)
 
     def _count(self, outlet: _Outlet, wanted: bool) -> None:
         # Several threads of Zenoh call this method, so it takes a lock. It replaces the set

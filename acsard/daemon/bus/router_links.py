@@ -10,8 +10,8 @@ import zenoh
 from acsard.bus.tls import host_and_port
 from acsard.core.config.settings import BusConfig
 from acsard.core.values import RoutersStatus
-from acsard.daemon.bus.bus_thread import BusThread
 from acsard.host.mailbox import Mailbox
+from acsard.host.threads import Worker
 
 POLL_S = 0.5  # one poll takes Zenoh 0.1 ms
 
@@ -30,7 +30,7 @@ class RouterLinks:
         self._status: RoutersStatus | None = None
         self.changes = Mailbox[RoutersStatus](1, lambda: None)  # newest state, if it has changed
         self._over = Event()
-        self._thread = BusThread("links", self._run, errors)
+        self._thread = Worker("links", self._run, errors.append)
         self._session: zenoh.Session
 
     def start(self, session: zenoh.Session) -> None:

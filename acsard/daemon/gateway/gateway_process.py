@@ -13,6 +13,7 @@ import resource
 import select
 import signal
 import threading
+from functools import partial
 
 import zenoh
 
@@ -24,6 +25,7 @@ from acsard.host.child import Parent, end_signals, end_with_parent
 from acsard.host.errors import Exit
 from acsard.host.logs import Log
 from acsard.host.systemd import Systemd
+from acsard.host.threads import Worker
 
 CHECK_PERIOD_S = 0.25  # of observations, and of the main thread's check
 
@@ -112,23 +114,23 @@ class GatewayProcess:
         opened_ns = clock.mono_ns()
         self._observed = Observation(opened_ns)
         health = SessionHealth(gateway.most, opened_ns)
-        threading.Thread(target=self._observe, args=(session, health), daemon=True).start()
+        Worker("observe", partial(self._observe, session, health), self._fail).start()
         self._log.info("gateway_open", text=f"listens at {gateway.where}")
         self._manager.status(f"open at {gateway.where}")
         return health
 
     def _observe(self, session: zenoh.Session, health: SessionHealth) -> None:
-        try:
-            pause = threading.Event()
-            while True:
-                observed = self._observed = self._gateway.observe(session)
-                event = health.full_event(observed)
-                if event is not None:
-                    self._log.event(event)
-                self._gateway.report(session, observed, health)
-                pause.wait(CHECK_PERIOD_S)
-        except BaseException as error:  # noqa: BLE001 - raised by `run`, which ends the process
-            self._error = error
+        pause = threading.Event()
+        while True:
+            observed = self._observed = self._gateway.observe(session)
+            event = health.full_event(observed)
+            if event is not None:
+                self._log.event(event)
+            self._gateway.report(session, observed, health)
+            pause.wait(CHECK_PERIOD_S)
+
+    def _fail(self, error: BaseException) -> None:
+        self._error = error  # raised by `run`, which ends the process
 
 
 def _confine() -> None:

@@ -7,7 +7,6 @@ import errno
 import fcntl
 import os
 import termios
-import threading
 from collections.abc import Iterator
 from contextlib import suppress
 
@@ -17,6 +16,7 @@ from acsard.core.values import Ns
 from acsard.host import clock
 from acsard.host.errors import InUseError, MendableError, NoPortError, NotPermittedError
 from acsard.host.processes import holder_of
+from acsard.host.threads import NoThreadError, Worker
 
 _left_open: list[int] = []  # descriptors that `close` had no thread for
 
@@ -117,10 +117,10 @@ def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> 
         return
     os.dup2(null, fd, inheritable=False)
     os.close(null)
-    thread = threading.Thread(target=_end, args=(real,), name="close port", daemon=True)
+    thread = Worker("close port", lambda: _end(real))
     try:
         thread.start()
-    except RuntimeError:
+    except NoThreadError:
         _left_open.append(real)
         return
     thread.join(wait_s)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from acsard.host.threads import NoThreadError, future_of, in_thread
+from acsard.host.threads import NoThreadError, Worker, future_of, in_thread
 
 NO_ROOM = 1 << 46
 """Stack size that no machine can provide, so that a thread with it cannot start."""
@@ -115,5 +115,25 @@ def test_a_future_whose_thread_cannot_be_started_raises_an_error() -> None:
     try:
         with pytest.raises(NoThreadError, match="cannot start another thread"):
             future_of(lambda: 1, lambda: None)
+    finally:
+        threading.stack_size(usual)
+
+
+def test_the_error_that_ends_a_worker_is_passed_on() -> None:
+    def fail() -> None:
+        raise ValueError("no number")
+
+    errors: list[BaseException] = []
+    worker = Worker("worker", fail, errors.append)
+    worker.start()
+    worker.join(5.0)
+    assert [str(error) for error in errors] == ["no number"]
+
+
+def test_a_worker_that_cannot_be_started_raises_an_error() -> None:
+    usual = threading.stack_size(NO_ROOM)
+    try:
+        with pytest.raises(NoThreadError, match="cannot start another thread"):
+            Worker("worker", lambda: None).start()
     finally:
         threading.stack_size(usual)
