@@ -180,8 +180,7 @@ class ControlLoop:
             self._others += self._handover.take_events()
         commands, refusals, requests = self._from_bus(now)
         port, pace = self._port, self.pace
-        # Call `take` before reading `is_open`. After a suspend of the computer, `take` closes the
-        # port.
+        # Call `take` before reading `is_open`: in a late step it may find the port lost.
         received = port.take(now if missed else None)
         # Pass the fields by position: creating a struct by its names takes three times as
         # long.

@@ -2,8 +2,10 @@
 
     python -m tests.bench.by_events --config FILE --port DEVICE
 
-It sends one line in each control period, and a line immediately when a command arrives. A separate
-thread publishes the odometry, so that a locked bus does not delay the loop.
+It sends one line in each control period, and an early line when a command arrives, in place of the
+next period's. It asks for real-time scheduling and leaves the same gap on the wire, as acsard does:
+without them the comparison of latencies would flatter one of the two. A separate thread publishes
+the odometry, so that a locked bus does not delay the loop.
 
 The process wakes up twice in each period: for the kernel timer in asyncio, and for the handover to
 the thread. Each command causes a third wake-up. The polled driver wakes up once in each period. If
@@ -29,9 +31,11 @@ import serial_asyncio
 import zenoh
 
 from acsard.bus.subscription import direct
+from acsard.core.config.wire_time import wire_ns
 from acsard.core.values import NS_PER_S
 from acsard.daemon.daemon import SWITCH_INTERVAL_S
-from acsard.host import clock
+from acsard.daemon.pacing import REPLY_TIME_NS
+from acsard.host import clock, real_time
 from acsard.host.timerfd import TimerFd
 from tests.bench.polled import Robot, session_of
 
@@ -61,25 +65,39 @@ class Sender:
 class Loop(asyncio.Protocol):
     """Writes a line when a period ends or a command arrives, and decodes the feedback."""
 
-    def __init__(self, port: serial.Serial, sender: Sender, period_ns: int) -> None:
+    def __init__(self, port: serial.Serial, sender: Sender, period_ns: int, gap_ns: int) -> None:
         self.robot = Robot()
         self._port, self._sender, self._period_ns = port, sender, period_ns
-        self._timer, self._ahead = TimerFd(), False
-        self._due_ns = clock.mono_ns() + period_ns
-        self._timer.set(self._due_ns)
-        asyncio.get_running_loop().add_reader(self._timer.fileno(), self._tick)
+        self._gap_ns, self._sent_ns, self._ahead = gap_ns, 0, False
+        self._ticks, self._alarm = TimerFd(), TimerFd()
+        loop = asyncio.get_running_loop()
+        loop.add_reader(self._ticks.fileno(), self._tick)
+        loop.add_reader(self._alarm.fileno(), self._alarmed)
+        self._ticks.repeat(period_ns)
 
-    def write(self) -> None:
-        """Write the newest command, in place of the next period's line."""
+    def command(self) -> None:
+        """Write the newest command, once in a period and after the gap on the wire."""
+        if self._ahead:
+            return
+        now_ns, free_ns = clock.mono_ns(), self._sent_ns + self._gap_ns
+        if now_ns < free_ns:
+            self._alarm.set(free_ns)
+        else:
+            self._write()
+            self._ahead = True
+
+    def _write(self) -> None:
         os.write(self._port.fileno(), self.robot.line)
-        self._ahead = True
+        self._sent_ns = clock.mono_ns()
+
+    def _alarmed(self) -> None:
+        if self._alarm.expirations():
+            self.command()
 
     def _tick(self) -> None:
-        self._timer.expirations()
-        self._due_ns += self._period_ns
-        self._timer.set(self._due_ns)
+        self._ticks.expirations()
         if not self._ahead:
-            self.write()
+            self._write()
         self._ahead = False
 
     def data_received(self, data: bytes) -> None:
@@ -93,11 +111,13 @@ async def run(config: dict[str, Any], port: serial.Serial) -> None:
     session, root, source = session_of(config)
     sender = Sender(session.declare_publisher(f"{root}/odom"))
     events = asyncio.get_running_loop()
-    loop = Loop(port, sender, int(NS_PER_S / config["control"]["rate"]))
+    line_ns = wire_ns(len(Robot().line), config["mcu"]["baud_rate"])
+    period_ns = int(NS_PER_S / config["control"]["rate"])
+    loop = Loop(port, sender, period_ns, line_ns + REPLY_TIME_NS)
 
     def on_command(sample: zenoh.Sample) -> None:
         loop.robot.on_command(sample)
-        events.call_soon_threadsafe(loop.write)
+        events.call_soon_threadsafe(loop.command)
 
     subscriber = session.declare_subscriber(f"{root}/cmd/{source}", direct(on_command))
     await serial_asyncio.connection_for_serial(events, lambda: loop, port)
@@ -114,6 +134,7 @@ def main() -> None:
     args = parser.parse_args()
     config = tomllib.loads(args.config.read_text())
     sys.setswitchinterval(SWITCH_INTERVAL_S)
+    real_time.request()
     with serial.Serial(args.port, config["mcu"]["baud_rate"], timeout=0) as port:
         asyncio.run(run(config, port))
 

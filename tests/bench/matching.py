@@ -161,13 +161,21 @@ class Record(Struct, frozen=True):
         return [line for line in lines if first_ns <= line[0] < last_ns]
 
 
-def command_waits(record: Record) -> list[int]:
+def command_waits(record: Record, gap_ns: int = 0) -> list[int]:
     """Return the time from each command to its line on the wire, ns.
 
-    Lost commands have no entry.
+    Lost commands have no entry, and neither have commands that came less than `gap_ns` after a
+    line: their lines had to wait.
     """
-    sent = [(sent.at_ns, sent.line) for sent in record.sent]
-    return commands_to_lines(sent, lines_of(record.seen.from_daemon))
+    lines = lines_of(record.seen.from_daemon)
+    all_ns = [at_ns for at_ns, _ in lines]
+
+    def is_free(at_ns: int) -> bool:
+        place = bisect_right(all_ns, at_ns)
+        return not place or at_ns - all_ns[place - 1] >= gap_ns
+
+    sent = [(sent.at_ns, sent.line) for sent in record.sent if is_free(sent.at_ns)]
+    return commands_to_lines(sent, lines)
 
 
 def feedback_fates(config: Config, record: Record) -> list[MatchedLine]:

@@ -114,6 +114,7 @@ class Rig:
         self._arrived: list[tuple[int, bytes]] = []
         self._sent: list[SentCommand] = []
         self._settled_ns = 0
+        self.started_ns = 0  # when the measured program was started
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
@@ -164,6 +165,7 @@ class Rig:
         # The measured daemon must not leave files behind, so it writes its latches to the temporary
         # directory.
         env["XDG_STATE_HOME"] = str(self._log.parent)
+        self.started_ns = clock.mono_ns()
         with self._log.open("wb") as log:
             self.process = subprocess.Popen(
                 words,
@@ -208,6 +210,11 @@ class Rig:
             raise ChildProcessError(f"the daemon ended with {code}: {self._log.read_text()}")
 
     # Measuring
+
+    @property
+    def first_odometry_ns(self) -> int:
+        """When the first odometry arrived here, which includes the time of our own connection."""
+        return self._arrived[0][0]
 
     def _odometry(self, sample: zenoh.Sample) -> None:
         self._arrived.append((clock.mono_ns(), sample.payload.to_bytes()))

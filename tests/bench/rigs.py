@@ -27,6 +27,8 @@ from acsard.core.config.settings import (
     Source,
 )
 from acsard.core.config.toml_text import document
+from acsard.core.config.wire_time import wire_ns
+from acsard.daemon.pacing import REPLY_TIME_NS
 from tests.bench.matching import Record, command_waits, feedback_fates, staircase
 from tests.bench.rig import ACSARD, Rig
 
@@ -121,9 +123,17 @@ def driven(settings: Config, words: Sequence[str], seconds: float, seed: int) ->
         return running.end()
 
 
-def waits_us(record: Record) -> list[float]:
-    """Return the time from each command to the first byte of its line on the port, in us."""
-    return [wait / 1000 for wait in command_waits(record)]
+def waits_us(record: Record, gap_ns: int = 0) -> list[float]:
+    """Return the time from each command to the first byte of its line on the port, in us.
+
+    Commands that came less than `gap_ns` after a line have no entry.
+    """
+    return [wait / 1000 for wait in command_waits(record, gap_ns)]
+
+
+def gap_ns(settings: Config) -> int:
+    """Return the least time between two lines that the daemon keeps."""
+    return wire_ns(settings.mcu.line_bytes, settings.mcu.baud_rate) + REPLY_TIME_NS
 
 
 def delays_us(settings: Config, record: Record) -> list[float]:

@@ -88,16 +88,16 @@ async def test_the_port_is_reopened_after_a_suspend(line: Line) -> None:
     """The clock simulates the suspend, because this machine cannot be suspended."""
     slept, events = [0], list[Event]()
     async with line.port(events.append, asleep=SuspendDetector(lambda: slept[0])) as port:
-        port.take()
+        assert port.offer(STOP, clock.now()) == "sent"
         assert port.opened == 1
+        await asyncio.sleep(0.01)  # the wire is free again
         slept[0] = 8 * 3600 * 10**9
-        assert port.take() == ()
-        assert not port.is_open
         assert port.offer(GO, clock.now()) == "down"
+        assert not port.is_open
         keeping = asyncio.create_task(port.keep_open())
         while not port.is_open:
             await asyncio.sleep(0.001)
-        port.take()
+        assert port.offer(STOP, clock.now()) == "sent"
         keeping.cancel()
         assert port.opened == 2
     assert "suspended" in next(event.text for event in events if event.name == "port_lost")

@@ -71,11 +71,6 @@ class SerialPort(Port):
     # The control loop calls the methods below, which `Port` describes.
 
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
-        # After a suspend of the computer, close the port, even if the device still works.
-        # `keep_open` then opens the port again, and every sender must send a zero before it can
-        # move the robot.
-        if self._asleep.detect():
-            self._leave(OSError(errno.EIO, "this computer was suspended"))
         if late is not None and self.is_open:
             # Without the waiting bytes, the delay of the step would look like silence of the board.
             self._read(late)
@@ -86,6 +81,11 @@ class SerialPort(Port):
         return pieces
 
     def offer(self, line: bytes, now: Instant) -> Offered:
+        # After a suspend of the computer, close the port instead of writing, even if the device
+        # still works. `keep_open` then opens the port again, and every sender must send a zero
+        # before it can move the robot.
+        if self._asleep.detect():
+            self._leave(OSError(errno.EIO, "this computer was suspended"))
         if not self.is_open:
             return "down"
         # Ask the driver for the unsent bytes before reading the clock, because asking takes time.
