@@ -468,7 +468,7 @@ def row_names() -> list[str]:
         latch_file="",
         board={"emergency_stop": "released"},
     )
-    rows = diagnostics(config, OUTPUTS, snapshot, ("valid", "valid for a year")).status
+    rows = diagnostics(config, OUTPUTS.now, snapshot, ("valid", "valid for a year")).status
     return [row.name for row in rows]
 
 

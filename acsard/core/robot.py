@@ -179,7 +179,7 @@ class Robot:
         self._arbiter.require_neutral()
 
     def snapshot(self, now_ns: Ns) -> Snapshot:
-        """Return what `state` and `diagnostics` need beyond outputs; too slow for every step."""
+        """Return what `state` and `diagnostics` need; too slow for every wake-up."""
         session, since, silent = self.session, self._refused_ns, self.session.silent(now_ns)
         counters = {"lines": session.good_lines} | self._odometry.unseen.counters()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
@@ -188,7 +188,11 @@ class Robot:
         if self._arbiter.clock_adjustment_ns:
             counters["clock_adjustments_ms"] = self._arbiter.clock_adjustment_ns // NS_PER_MS
         checks = self._odometry.checks
+        latch = self._life.latches.in_force
         return Snapshot(
+            status=self.status,
+            latch=0 if latch is None else latch.number,
+            applied=self.applied,
             pose=self._odometry.pose,
             measured=None if silent else self._odometry.twist,
             speeds=None if silent else self._odometry.speeds,

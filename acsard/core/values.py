@@ -423,9 +423,9 @@ class Heard(Struct, frozen=True, omit_defaults=True):
     refusals: tuple[Refusal, ...] = ()  # messages that did not become a `Command`
     requests: tuple[Request, ...] = ()
     gyro: tuple[GyroSample, ...] = ()
+    speed_cap: SpeedCap | None = None  # the newest one
     events: tuple[Event, ...] = ()  # of other parts, to be logged with the robot's
     missed: int = 0  # control periods without a wake-up
-    speed_cap: SpeedCap | None = None  # the newest one
     shutting_down: bool = False  # ramp to zero, and stay there
 
 
@@ -537,6 +537,9 @@ class Recording(Struct, frozen=True):
 class Snapshot(Struct, frozen=True):
     """The values for the messages that are not of a feedback line."""
 
+    status: Status
+    latch: int  # number of the latch that decides the mode; 0 without one
+    applied: Twist  # commanded, after all limits
     pose: Pose
     measured: Twist | None  # None while the feedback is silent
     speeds: WheelSpeeds | None  # None while the feedback is silent

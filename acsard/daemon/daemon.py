@@ -24,11 +24,14 @@ from acsard.core.config.settings import Config
 from acsard.core.incoming.queries import offered_services
 from acsard.core.link.codec import Codec
 from acsard.core.messages.schema import Info
+from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, Event, Instant, Latches, Ns, WallNs
 from acsard.daemon.bus.bus import ZenohBus
 from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_file import LatchFile
+from acsard.daemon.latch_rules import Handover
 from acsard.daemon.pacing import NO_PERIOD, Period
+from acsard.daemon.publication import Publication
 from acsard.daemon.pulse import Pulse
 from acsard.daemon.serial.port import SerialPort
 from acsard.daemon.serial.simulator_pty import Simulated
@@ -138,24 +141,17 @@ async def run(
             simulated.publish_on(bus)
         between = stack.enter_context(ExitStack())
         await stack.enter_async_context(port)
-        control = ControlLoop(
-            config,
-            info,
-            port,
-            bus,
-            start,
-            log.event,
-            clock.mono_ns,
-            ends,
-            events,
-            None if simulated is None else simulated.current,
-            lambda adopted: log.use(adopted.log),
-            recorder,
-            # Read the latches after the bus and the port are open. A second daemon for this robot
-            # then ends before it touches the latch file.
-            Latches() if keeper is None else await keeper.start(clock.now()),
-            keeper,
+        # Read the latches after the bus and the port are open. A second daemon for this robot then
+        # ends before it touches the latch file.
+        latches = Latches() if keeper is None else await keeper.start(clock.now())
+        robot, handover = Robot(config, latches), Handover(latches, keeper)
+        publication = Publication(
+            robot, bus, info, start, log.event, handover, recorder, events, ends
         )
+        publication.adopted = lambda adopted: log.use(adopted.log)
+        if simulated is not None:
+            publication.beside = simulated.current
+        control = ControlLoop(robot, port, publication, handover, start, clock.mono_ns, recorder)
         between.callback(lambda: control.finish(clock.now()))
         after.callback(lambda: control.keep_last_stops(clock.now()))
         stack.callback(lambda: totals.update(control.totals(clock.mono_ns())))
@@ -169,8 +165,8 @@ async def run(
             keep_running(words, events.append, kind) for words, kind in served if words is not None
         ]
         if ends:
-            helpers.append(watch_certificates(config.bus, control.report.certificate_ends))
-        async with _beside([port.keep_open(), _repeat_latched(bus, control), *helpers]):
+            helpers.append(watch_certificates(config.bus, publication.report.certificate_ends))
+        async with _beside([port.keep_open(), _repeat_latched(bus, publication), *helpers]):
             await _control(config, control, departure, pulse, manager)
 
 
@@ -234,9 +230,9 @@ async def _control(
 
     def step(now: Instant, period: Period) -> bool:
         control.shutting_down = departure.begun_ns is not None
-        outputs = control.step(now, period)
-        if period is not NO_PERIOD or outputs.status_changed:
-            manager.step(outputs)
+        changed, robot = control.step(now, period).news.status_changed, control.robot
+        if period is not NO_PERIOD or changed:
+            manager.step(now.mono_ns, robot.status, robot.applied, changed=changed)
         return not (control.shutting_down and departure.over(now.mono_ns, control.at_rest))
 
     try:
@@ -271,9 +267,9 @@ async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator
         task.cancel()
 
 
-async def _repeat_latched(bus: ZenohBus, control: ControlLoop) -> None:
+async def _repeat_latched(bus: ZenohBus, publication: Publication) -> None:
     while True:
-        bus.publish("tf_static", control.report.tf_static())
+        bus.publish("tf_static", publication.report.tf_static())
         await asyncio.sleep(LATCHED_PERIOD_S)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Mapping
 
-from acsard.core.values import NS_PER_S, Outputs
+from acsard.core.values import NS_PER_S, Ns, Status, Twist
 
 FEEDS_PER_WATCHDOG = 4  # within the watchdog's timeout
 
@@ -59,19 +59,18 @@ class Systemd:
     def alive(self) -> None:
         self._send("WATCHDOG=1")
 
-    def step(self, outputs: Outputs) -> None:
+    def step(self, now_ns: Ns, status: Status, applied: Twist, *, changed: bool) -> None:
         """Feed systemd's watchdog if due, and report a changed status, after each control step."""
         if self._socket is None:
             return
-        now_ns = outputs.now.mono_ns
         if self._feed_every_ns and now_ns - self._fed_ns >= self._feed_every_ns:
             self._fed_ns = now_ns
             self.alive()
-        if outputs.status_changed or now_ns - self._status_ns >= NS_PER_S:
+        if changed or now_ns - self._status_ns >= NS_PER_S:
             self._status_ns = now_ns
-            status = status_of(outputs)
-            if status != self._status and self._send(f"STATUS={status}"):
-                self._status = status
+            text = status_text(status, applied)
+            if text != self._status and self._send(f"STATUS={text}"):
+                self._status = text
 
     def close(self) -> None:
         if self._socket is not None:
@@ -89,9 +88,8 @@ class Systemd:
         return True
 
 
-def status_of(outputs: Outputs) -> str:
-    if outputs.mode == "driving":
-        twist = outputs.applied
-        turn = f", {twist.angular:.1f} rad/s" if abs(twist.angular) >= 0.05 else ""
-        return f"driving at {twist.linear:.1f} m/s{turn}, commanded by {outputs.source}"
-    return f"{outputs.mode}: {outputs.reason}"
+def status_text(status: Status, applied: Twist) -> str:
+    if status.mode == "driving":
+        turn = f", {applied.angular:.1f} rad/s" if abs(applied.angular) >= 0.05 else ""
+        return f"driving at {applied.linear:.1f} m/s{turn}, commanded by {status.source}"
+    return f"{status.mode}: {status.reason}"

@@ -23,6 +23,7 @@ from acsard.core.values import NS_PER_S, Command, Instant, Outputs, WallNs
 from acsard.recording.file_replay import PROGRESS_STEPS, Progress, RecordedRun, no_progress
 from acsard.recording.mcap_file import Recording
 from acsard.recording.recorded_steps import RecordedStep
+from acsard.recording.stepped_robot import news_of
 from acsard.recording.time_span import Span
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
 
@@ -101,7 +102,13 @@ class Publisher:
             if static != self._static:
                 self._static = static
                 yield Published(BY_KEY["tf_static"], "", now.wall_ns, static)
-        messages = self._report.due(outputs, self._wanted, lambda: self.robot.snapshot(now.mono_ns))
+        messages = self._report.due(
+            now,
+            news_of(outputs),
+            outputs.applied if outputs.due else None,
+            self._wanted,
+            lambda: self.robot.snapshot(now.mono_ns),
+        )
         for key, message in messages:
             yield Published(BY_KEY[key], "", now.wall_ns, _without_measurements(message))
         yield from self.skip(step)

@@ -62,6 +62,12 @@ def outputs_of(now: Instant, robot: Robot, news: News, due: bool, line: bytes | 
     )
 
 
+def news_of(outputs: Outputs) -> News:
+    return News(
+        outputs.estimates, outputs.answers, outputs.events, outputs.news, outputs.status_changed
+    )
+
+
 class SteppedRobot:
     """A robot that gets recorded steps."""
 
@@ -93,8 +99,8 @@ def heard_of(inputs: Inputs) -> Heard:
         inputs.refusals,
         inputs.requests,
         inputs.gyro,
+        inputs.speed_cap,
         inputs.events,
         inputs.missed,
-        inputs.speed_cap,
         inputs.shutting_down,
     )

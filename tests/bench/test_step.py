@@ -34,7 +34,8 @@ from acsard.core.link.lines import LineReader
 from acsard.core.messages.encodings import encode
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.path import arc
-from acsard.core.values import Instant, Outputs, Pose, PoseCovariance, Received
+from acsard.core.values import Instant, Pose, PoseCovariance, Received
+from acsard.daemon.control_loop import Step
 from acsard.daemon.pacing import NO_PERIOD, Period
 from tests.scenarios.world import World
 
@@ -134,10 +135,10 @@ class Run:
             self.heard.append(received)
             feed(received)
 
-        def timed(now: Instant, period: Period = NO_PERIOD) -> Outputs:
+        def timed(now: Instant, period: Period = NO_PERIOD) -> Step:
             calls, before = self.lines.calls, {name: part.ns for name, part in self.parts.items()}
             began = thread_time_ns()
-            outputs = step(now, period)
+            result = step(now, period)
             ended = thread_time_ns()
             if self.lines.calls > calls:
                 for received in self.heard:
@@ -147,7 +148,7 @@ class Run:
                 for name, part in self.parts.items():
                     self.took[name] += part.ns - before[name]
             self.heard.clear()
-            return outputs
+            return result
 
         setattr(made.port, "feed", hear)  # noqa: B010
         setattr(made.loop, "step", timed)  # noqa: B010

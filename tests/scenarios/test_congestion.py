@@ -147,14 +147,14 @@ def test_a_zero_brakes_immediately_while_the_delay_of_its_sender_is_unproven(way
         world.run(0.06)
         speaker.deliver(message)
         world.run(0.04)
-    assert (outputs := world.loop.outputs) is not None
+    assert (outputs := world.outputs) is not None
     assert outputs.applied.linear == 1.0
     # The delay falls by 60 ms, so the daemon does not know any more whether these are prompt.
     speaker.send(1.0)
     world.run(0.1)
     speaker.send(0.0)
     world.run(0.05)
-    assert (outputs := world.loop.outputs) is not None
+    assert (outputs := world.outputs) is not None
     assert outputs.applied.linear < 1.0
 
 

@@ -18,7 +18,7 @@ def world() -> World:
 
 
 def row(world: World, name: str) -> DiagnosticStatus:
-    message = world.loop.report.current("diagnostics", world.loop._snapshot)
+    message = world.loop.publication.current("diagnostics")
     assert isinstance(message, DiagnosticArray)
     (row_status,) = [status for status in message.status if status.name == f"acsard: {name}"]
     return row_status

@@ -120,7 +120,7 @@ def test_no_wheel_speeds_up_while_the_robot_brakes_out_of_an_arc(world: World) -
 
 def test_a_command_above_the_limits_is_scaled_and_keeps_its_curvature(world: World) -> None:
     world.drive(5.0, 5.0, seconds=2.0)
-    applied = world.loop.outputs
+    applied = world.outputs
     assert applied is not None
     assert applied.applied.linear == pytest.approx(1.0)
     assert applied.applied.angular == pytest.approx(1.0)

@@ -71,7 +71,7 @@ def driven(config: Config) -> tuple[World, Tape]:
     A client has subscribed to every key.
     """
     tape, world = recorded_world(config, wanted=EVERY_KEY)
-    world.bus.publish("tf_static", world.loop.report.tf_static())
+    world.bus.publish("tf_static", world.loop.publication.report.tf_static())
     drive_through_faults(world, 4.0)
     happenings(world, random.Random(1))
     world.call("set", b'{"settings": {"limits.max_linear_velocity": 0.4}}')

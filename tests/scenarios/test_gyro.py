@@ -106,7 +106,7 @@ def test_a_gyro_that_is_40_ms_late_has_a_small_heading_error_too() -> None:
 @pytest.mark.slow
 def test_the_diagnostics_show_the_bias_of_the_gyro() -> None:
     made = world()
-    message = made.loop.report.current("diagnostics", made.loop._snapshot)
+    message = made.loop.publication.current("diagnostics")
     assert isinstance(message, DiagnosticArray)
     (row,) = [status for status in message.status if status.name == "acsard: gyro"]
     values = {pair.key: float(pair.value) for pair in row.values}
@@ -185,6 +185,6 @@ def test_without_the_setting_the_gyro_is_off_and_has_no_diagnostics() -> None:
     made = World()
     made.run(1.0)
     assert made.state.gyro == "off"
-    message = made.loop.report.current("diagnostics", made.loop._snapshot)
+    message = made.loop.publication.current("diagnostics")
     assert isinstance(message, DiagnosticArray)
     assert not [status for status in message.status if "gyro" in status.name]

@@ -249,8 +249,8 @@ def test_a_restarted_robot_stays_stopped_until_clear() -> None:
     first.run(0.2)
     first.drive(0.5, seconds=1.0)
     call(first, "stop", "joe")
-    assert first.loop.outputs is not None
-    latches = first.loop.outputs.latches.after_restart()
+    assert first.outputs is not None
+    latches = first.outputs.latches.after_restart()
     world = World(latches=latches)
     world.run(0.2)
     assert f"was stopped by {JOE} (native) at 2027-01-15 08:00:01 UTC, before the restart" in (

@@ -55,7 +55,7 @@ def moving(lines: list[bytes]) -> list[bytes]:
 
 def check_of(world: World) -> str:
     """Return the current check of the link, as the diagnostics report it."""
-    message = world.loop.report.current("diagnostics", world.loop._snapshot)
+    message = world.loop.publication.current("diagnostics")
     assert isinstance(message, DiagnosticArray)
     (link,) = [status for status in message.status if status.name == "acsard: serial link"]
     return {pair.key: pair.value for pair in link.values}["check"]

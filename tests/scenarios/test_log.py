@@ -127,7 +127,7 @@ def test_a_client_that_repeats_a_stop_pushes_no_other_row_out_of_the_events(worl
     for _ in range(25):
         call(world, "stop", signed("joe"))
         world.run(1.0)
-    events = world.loop.report.current("events", world.loop._snapshot)
+    events = world.loop.publication.current("events")
     assert isinstance(events, Events)
     assert "deactivate" in {row.name for row in events.events}
 

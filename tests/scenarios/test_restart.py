@@ -18,8 +18,9 @@ from acsard.core.incoming.commands import Arrival
 from acsard.core.messages.signature import public_name
 from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, Event, Instant, Latch, Latches
-from acsard.daemon.control_loop import ControlLoop
+from acsard.daemon.intake import Intake
 from acsard.daemon.latch_rules import LatchFileError, decode, encode, stopped, unreadable
+from acsard.daemon.publication import Publication
 from tests.each import each
 from tests.scenarios.speakers import Speaker, moved
 from tests.scenarios.test_diagnostics import row
@@ -317,10 +318,10 @@ def test_a_stop_while_the_bus_closes_is_in_force_at_the_next_start() -> None:
 @pytest.mark.parametrize(
     ("owner", "name", "works"),
     [
-        (ControlLoop, "_note", False),
-        (Robot, "step", False),
-        (Robot, "step", True),
-        (ControlLoop, "_publish", False),
+        (Intake, "_note", False),
+        (Robot, "hear", False),
+        (Robot, "hear", True),
+        (Publication, "publish", False),
     ],
 )
 def test_a_stop_in_a_step_that_raises_is_in_force_at_the_next_start(

@@ -18,6 +18,7 @@ from acsard.core.messages.signature import public_name
 from acsard.core.motion.limits import Motion
 from acsard.core.ros import parameters as rcl
 from acsard.core.values import NS_PER_S, Instant, Outputs, Plain
+from acsard.daemon.control_loop import Step
 from acsard.daemon.pacing import NO_PERIOD, Period
 from tests.each import each
 from tests.scenarios.speakers import Speaker, moved
@@ -277,7 +278,7 @@ def calls_of_longest_step(world: World, service: str, payload: bytes) -> int:
     def count(frame: object, event: str, argument: object) -> None:
         counts[-1] += event in ("call", "c_call")
 
-    def counted(now: Instant, period: Period = NO_PERIOD) -> Outputs:
+    def counted(now: Instant, period: Period = NO_PERIOD) -> Step:
         counts.append(0)
         sys.setprofile(count)
         try:

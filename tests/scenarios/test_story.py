@@ -84,7 +84,9 @@ class Host:
 
     def start(self, wall_ns: int, latches: Latches = Latches()) -> None:  # noqa: B008
         """Start the daemon with a clock that shows `wall_ns`."""
-        self.recorder = Recorder(self.config, lambda event: self.world.loop._others.append(event))
+        self.recorder = Recorder(
+            self.config, lambda event: self.world.loop.publication.intake.events.append(event)
+        )
         self.world = World(self.config, recorder=self.recorder, latches=latches)
         self.world.wall_offset_ns = wall_ns - self.world.now_ns
 

@@ -51,7 +51,7 @@ def off(made: World) -> tuple[float, float]:
 
 
 def row(made: World) -> DiagnosticStatus:
-    message = made.loop.report.current("diagnostics", made.loop._snapshot)
+    message = made.loop.publication.current("diagnostics")
     assert isinstance(message, DiagnosticArray)
     (row_status,) = [status for status in message.status if status.name == "acsard: wheels"]
     return row_status

@@ -25,6 +25,7 @@ from acsard.core.messages.frames import FeedbackTopic
 from acsard.core.messages.keys_and_roles import PUBLISHED
 from acsard.core.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
 from acsard.core.messages.signature import Signature
+from acsard.core.robot import Robot
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.simulated_robot import Observation, WatchedMcu
 from acsard.core.simulator.true_messages import turn_rate
@@ -39,9 +40,11 @@ from acsard.core.values import (
     Received,
 )
 from acsard.daemon.control_loop import ControlLoop
-from acsard.daemon.latch_rules import LatchKeeper
+from acsard.daemon.latch_rules import Handover, LatchKeeper
 from acsard.daemon.pacing import NO_PERIOD, Period
+from acsard.daemon.publication import Publication
 from acsard.recording.recorded_steps import StepRecorder
+from acsard.recording.stepped_robot import outputs_of
 from tests.scenarios.imperfect_gyro import ImperfectGyro
 
 START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
@@ -199,18 +202,14 @@ class World:
         self.events: list[Event] = []
         self.watch: Callable[[Outputs], None] = lambda outputs: None
         info = Info("acsar", "0", 1, "sim", True, self.config.rate_hz, [], [])
+        robot, handover = Robot(self.config, latches), Handover(latches, keeper)
+        start, log = self.instant, self.events.append
+        publication = Publication(robot, self.bus, info, start, log, handover, recorder)
         self.loop = ControlLoop(
-            self.config,
-            info,
-            self.port,
-            self.bus,
-            self.instant,
-            self.events.append,
-            lambda: self.now_ns,
-            recorder=recorder,
-            latches=latches,
-            keeper=keeper,
+            robot, self.port, publication, handover, start, lambda: self.now_ns, recorder
         )
+        self.outputs: Outputs | None = None
+        """Those of the last step."""
         self._queries = 0
         self._moved_ns: dict[str, int] = {}
         """Maps each source to the time of its last speed."""
@@ -305,7 +304,8 @@ class World:
 
     def _step(self, period: Period = NO_PERIOD) -> None:
         now_ns = self.now_ns
-        outputs = self.loop.step(Instant(now_ns, now_ns + self.wall_offset_ns), period)
+        now, news, due, line = self.loop.step(Instant(now_ns, now_ns + self.wall_offset_ns), period)
+        outputs = self.outputs = outputs_of(now, self.loop.robot, news, due, line)
         self.steps += 1
         self._alarm_ns = self.loop.pace.retry_ns
         self.watch(outputs)
@@ -412,13 +412,13 @@ class World:
 
     @property
     def state(self) -> RobotState:
-        message = self.loop.report.current("state", self.loop._snapshot)
+        message = self.loop.publication.current("state")
         assert isinstance(message, RobotState)
         return message
 
     @property
     def odom(self) -> Odometry:
-        message = self.loop.report.current("odom", self.loop._snapshot)
+        message = self.loop.publication.current("odom")
         assert isinstance(message, Odometry)
         return message
 

@@ -64,6 +64,7 @@ WITNESS, ODOMETRY = "core/motion/wheel_witness.py", "core/motion/odometry.py"
 WHEEL_FAULTS = "core/motion/wheel_faults.py"
 PATH = "core/motion/path.py"
 LATCHES, VALUES, LOOP = "daemon/latch_rules.py", "core/values.py", "daemon/control_loop.py"
+PUBLICATION = "daemon/publication.py"
 COMMANDS, KINEMATICS, CODEC = (
     "core/incoming/commands.py",
     "core/motion/kinematics.py",
@@ -697,8 +698,8 @@ FAULTS = (
         "loop end",
         "SIGTERM ends the daemon while the robot moves",
         LOOP,
-        "return outputs is not None and not any(outputs.speeds.as_tuple())",
-        "return outputs is not None",
+        "return self.robot.speeds == STILL",
+        "return True",
     ),
     fault(
         "robot end",
@@ -800,7 +801,7 @@ FAULTS = (
     fault(
         "bus answers",
         "a call that is refused has no answer",
-        LOOP,
+        PUBLICATION,
         "            if reply is not None:\n                self._bus.reply(reply)\n"
         "                self._bus.retire",
         "            if reply is not None and answer.success:\n"

@@ -408,7 +408,7 @@ class Product:
     def shows_state(self) -> bool:
         """Whether the daemon runs and has made its first step, before which it has no `state`."""
         loop = self._world.loop
-        return self.alive and loop.report.current("state", loop._snapshot) is not None
+        return self.alive and loop.publication.current("state") is not None
 
     def state(self) -> dict[str, Any]:
         """Return the present `state`, as a client reads it."""

@@ -61,7 +61,7 @@ from acsard.core.ros.parameters import (
 )
 from acsard.core.ros.shapes import Trigger
 from acsard.core.ros.transports import PARAMETERS_PREFIX, left_out
-from acsard.core.values import ROLES, Answer, Ns, Outputs, Request, Verb, WallNs
+from acsard.core.values import ROLES, Answer, Ns, Request, Status, Verb, WallNs
 
 Current = Callable[[str], Message | None]
 
@@ -118,14 +118,14 @@ class Queries:
         self._waiting: dict[int, _Waiting] = {}
 
     def serve(
-        self, query: Query, current: Current, outputs: Outputs | None
+        self, query: Query, current: Current, wall_ns: WallNs, status: Status
     ) -> list[Reply] | Request:
         """Return the replies to a query (maybe none), or the `Request` of a service call.
 
         Raises `DecodeError` for a ROS request, which the caller answers with `refused`.
         """
         if query.via != "native":
-            return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
+            return self._ros(query, wall_ns)
         try:
             form = _format(query)
             if query.topic in VERBS:
@@ -134,7 +134,7 @@ class Queries:
                 return [_unknown_service(query, form)]
             return [
                 Reply(query.ticket, key, encode(value, form), encoding_name(form, name))
-                for key, name, value in self._values(query, current, outputs)
+                for key, name, value in self._values(query, current, status)
             ]
         except DecodeError as error:
             words = str(error).encode()
@@ -201,7 +201,7 @@ class Queries:
         return replace(request, by=caller_name(query.via, query.attachment))
 
     def _values(
-        self, query: Query, current: Current, outputs: Outputs | None
+        self, query: Query, current: Current, status: Status
     ) -> list[tuple[str, str, object]]:
         topic = query.topic
         if topic == "schema/<Type>":
@@ -212,7 +212,7 @@ class Queries:
             by = caller_name(query.via, query.attachment)
             return [(query.asked, "WhoAmI", WhoAmI(role, by)) for role in roles]
         if topic == "interfaces":
-            return [(topic, "Interfaces", interfaces(self.config, outputs))]
+            return [(topic, "Interfaces", interfaces(self.config, status))]
         if topic == "config":
             return [(topic, "", effective(self.config))]
         if topic in self._fixed:
@@ -362,10 +362,9 @@ def topic_table(config: Config) -> Topics:
     )
 
 
-def interfaces(config: Config, outputs: Outputs | None) -> Interfaces:
+def interfaces(config: Config, status: Status) -> Interfaces:
     """Return the command and state interfaces of the joints, named as in ros2_control."""
-    linked = outputs is not None and outputs.linked
-    claimed = outputs is not None and outputs.mode == "driving"
+    linked, claimed = status.link == "up", status.mode == "driving"
     joints = config.joints.as_tuple()
     return Interfaces(
         [HardwareInterface(f"{j}/velocity", "command", "rad/s", linked, claimed) for j in joints]

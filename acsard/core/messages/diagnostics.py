@@ -31,8 +31,8 @@ from acsard.core.motion.wheel_faults import slow_text
 from acsard.core.values import (
     WHEELS,
     GyroStatus,
+    Instant,
     Measured,
-    Outputs,
     Recording,
     RoutersStatus,
     Snapshot,
@@ -71,7 +71,7 @@ class Row(Struct, frozen=True):
 
 def diagnostics(
     config: Config,
-    outputs: Outputs,
+    now: Instant,
     snapshot: Snapshot,
     certificate: tuple[str, str],
 ) -> DiagnosticArray:
@@ -79,12 +79,13 @@ def diagnostics(
 
     `certificate` is the result of `expiry`, or two "" for no such row.
     """
-    mode = {"mode": outputs.mode, "source": outputs.source}
+    status = snapshot.status
+    mode = {"mode": status.mode, "source": status.source}
     rows = [
-        Row("mode", MODE_LEVELS.get(outputs.mode, OK), outputs.reason, mode),
-        _serial_link(config, outputs, snapshot),
+        Row("mode", MODE_LEVELS.get(status.mode, OK), status.reason, mode),
+        _serial_link(config, snapshot),
         _control_loop(snapshot),
-        _commands(outputs, snapshot),
+        _commands(snapshot),
         _wheels(snapshot.doubt, snapshot.counters),
         *_board(config, snapshot),
         *_battery(config, snapshot),
@@ -95,7 +96,7 @@ def diagnostics(
         *_certificate(*certificate),
     ]
     return DiagnosticArray(
-        Header(Time.from_ns(outputs.now.wall_ns)),
+        Header(Time.from_ns(now.wall_ns)),
         [
             DiagnosticStatus(
                 row.level,
@@ -109,7 +110,7 @@ def diagnostics(
     )
 
 
-def _serial_link(config: Config, outputs: Outputs, snapshot: Snapshot) -> Row:
+def _serial_link(config: Config, snapshot: Snapshot) -> Row:
     mcu = config.mcu
     use = wire_use(config.rate_hz, mcu.baud_rate, mcu.line_bytes)
     named = zip(WHEELS, snapshot.encoders, strict=False)
@@ -117,7 +118,8 @@ def _serial_link(config: Config, outputs: Outputs, snapshot: Snapshot) -> Row:
     if snapshot.feedback_age_s is not None:
         values["feedback_age_s"] = f"{snapshot.feedback_age_s:.2f}"
     values |= {f"counts_{name}": str(counts) for name, counts in named if counts}
-    level, message = OK if outputs.link == "up" else ERROR, outputs.link
+    link = snapshot.status.link
+    level, message = OK if link == "up" else ERROR, link
     if mcu.simulated:
         level, message = max(level, WARN), f"{message}: this is the simulator, no real wheel turns"
     return Row("serial link", level, message, values | _counted(snapshot.counters, "line"))
@@ -140,10 +142,11 @@ def _control_loop(snapshot: Snapshot) -> Row:
     )
 
 
-def _commands(outputs: Outputs, snapshot: Snapshot) -> Row:
+def _commands(snapshot: Snapshot) -> Row:
     values = {s.name: waiting(s.waits_for).text or "driving" for s in snapshot.sources}
     values |= _counted(snapshot.counters, "command")
-    message = f"commanded by {outputs.source}" if outputs.source else "waiting for a command"
+    driver = snapshot.status.source
+    message = f"commanded by {driver}" if driver else "waiting for a command"
     if snapshot.speed_limit:
         message = f"{message}; speed limit: {snapshot.speed_limit}"
     crowded = [s for s in snapshot.sources if s.waits_for.what == "senders"]

@@ -51,8 +51,8 @@ from acsard.core.values import (
     BatteryStatus,
     Estimate,
     Instant,
+    News,
     Ns,
-    Outputs,
     Rad,
     Snapshot,
 )
@@ -62,7 +62,7 @@ from acsard.core.values import Twist as BodyTwist
 GetSnapshot = Callable[[], Snapshot]
 
 # Returns None if there is no message now.
-BuildSummary = Callable[[Outputs, Snapshot], Message | None]
+BuildSummary = Callable[[Instant, Snapshot], Message | None]
 
 UNKNOWN_STATUS, CHARGING, DISCHARGING, NOT_CHARGING = range(4)  # `Battery.power_supply_status`
 
@@ -106,7 +106,7 @@ class Report:
         self._names = list(config.joints.as_tuple())
         self._start, self._version = start, version
         self._estimate: Estimate | None = None
-        self._outputs: Outputs | None = None
+        self._now: Instant | None = None  # of the last wake-up
         self._happened = RecentEvents()
         self._feedback = (
             FeedbackTopic("odom", self._odom, odom_numbers),
@@ -124,18 +124,23 @@ class Report:
         self.config = config  # in force
 
     def due(
-        self, outputs: Outputs, wanted: Collection[str], get_snapshot: GetSnapshot
+        self,
+        now: Instant,
+        news: News,
+        applied: BodyTwist | None,
+        wanted: Collection[str],
+        get_snapshot: GetSnapshot,
     ) -> Iterator[tuple[str, Message]]:
-        """Return an iterator over the keys and messages to publish after this step.
+        """Return an iterator over the keys and messages to publish after this wake-up.
 
         Those of the feedback come first, because `state` takes ten times as long.
         """
         feedback = [
             (topic.key, topic.build(estimate))
-            for estimate in outputs.estimates
+            for estimate in news.estimates
             for topic in self.feedback_due(estimate, wanted)
         ]
-        return chain(feedback, self.others_due(outputs, wanted, get_snapshot))
+        return chain(feedback, self.others_due(now, news, applied, wanted, get_snapshot))
 
     def feedback_due(self, estimate: Estimate, wanted: Collection[str]) -> list[FeedbackTopic]:
         """Return the topics on which a message of this feedback line is to be published."""
@@ -152,41 +157,58 @@ class Report:
         return due
 
     def others_due(
-        self, outputs: Outputs, wanted: Collection[str], get_snapshot: GetSnapshot
+        self,
+        now: Instant,
+        news: News,
+        applied: BodyTwist | None,
+        wanted: Collection[str],
+        get_snapshot: GetSnapshot,
     ) -> Iterator[tuple[str, Message]]:
-        """Return an iterator over the messages that are not of a feedback line."""
-        self._outputs = outputs
-        if outputs.events:
-            self._happened.add(outputs.events, outputs.now)
-        if outputs.estimates:
-            self._estimate = outputs.estimates[-1]
+        """Return an iterator over the messages that are not of a feedback line.
+
+        `applied` is the twist in a line that was due in this wake-up.
+        """
+        self._now = now
+        if news.events:
+            self._happened.add(news.events, now)
+        if news.estimates:
+            self._estimate = news.estimates[-1]
         if (
             not self._summaries.keys().isdisjoint(wanted)
-            or (outputs.due and "cmd_vel_out" in wanted)
-            or (outputs.events and "events" in wanted)
+            or (applied is not None and "cmd_vel_out" in wanted)
+            or (news.events and "events" in wanted)
         ):
-            return self._others_due(outputs, wanted, get_snapshot)
-        # Most steps end here, because no message with a subscriber is due.
+            return self._others_due(now, news, applied, wanted, get_snapshot)
+        # Most wake-ups end here, because no message with a subscriber is due.
         return iter(())
 
     def _others_due(
-        self, outputs: Outputs, wanted: Collection[str], get_snapshot: GetSnapshot
+        self,
+        now: Instant,
+        news: News,
+        applied: BodyTwist | None,
+        wanted: Collection[str],
+        get_snapshot: GetSnapshot,
     ) -> Iterator[tuple[str, Message]]:
-        now_ns, rates, telemetry = outputs.now.mono_ns, self._rates, self.config.rates.telemetry
-        if outputs.due and "cmd_vel_out" in wanted and rates["cmd_vel_out"].due(now_ns, telemetry):
-            yield "cmd_vel_out", self._cmd_vel_out(outputs)
-        if outputs.events and "events" in wanted and (events_message := self._happened.message()):
+        now_ns, rates, telemetry = now.mono_ns, self._rates, self.config.rates.telemetry
+        if (
+            applied is not None
+            and "cmd_vel_out" in wanted
+            and rates["cmd_vel_out"].due(now_ns, telemetry)
+        ):
+            yield "cmd_vel_out", self._cmd_vel_out(now, applied)
+        if news.events and "events" in wanted and (events_message := self._happened.message()):
             yield "events", events_message
         for key, (build, hz) in self._summaries.items():
             most = self.config.rates.at_most(hz)
-            if key in wanted and rates[key].due(now_ns, most, outputs.status_changed):
-                message = build(outputs, get_snapshot())
+            if key in wanted and rates[key].due(now_ns, most, news.status_changed):
+                message = build(now, get_snapshot())
                 if message is not None:
                     yield key, message
 
     def current(self, key: str, get_snapshot: GetSnapshot) -> Message | None:
         """Return the present message of a published key, or None if there is none."""
-        estimate, outputs = self._estimate, self._outputs
+        estimate, now = self._estimate, self._now
         match key:
             case "tf_static":
                 return self.tf_static()
@@ -203,12 +225,12 @@ class Report:
                     else None
                 )
             case "cmd_vel_out":
-                return self._cmd_vel_out(outputs) if outputs else None
+                return self._cmd_vel_out(now, get_snapshot().applied) if now else None
             case "events":
                 return self._happened.message()
             case _:
                 summary = self._summaries.get(key)
-                return summary[0](outputs, get_snapshot()) if summary and outputs else None
+                return summary[0](now, get_snapshot()) if summary and now else None
 
     def tf_static(self) -> TFMessage:
         """Return the transform of the lidar, empty if it is switched off."""
@@ -246,25 +268,26 @@ class Report:
             velocity=list(estimate.speeds.as_tuple()) if live else [],
         )
 
-    def _cmd_vel_out(self, outputs: Outputs) -> TwistStamped:
-        header = Header(Time.from_ns(outputs.now.wall_ns), self.config.odometry.base_frame)
-        return TwistStamped(header, _twist(outputs.applied))
+    def _cmd_vel_out(self, now: Instant, applied: BodyTwist) -> TwistStamped:
+        header = Header(Time.from_ns(now.wall_ns), self.config.odometry.base_frame)
+        return TwistStamped(header, _twist(applied))
 
-    def _state(self, outputs: Outputs, snapshot: Snapshot) -> RobotState:
-        certificate, expiry_text = self._certificate(outputs.now)
+    def _state(self, now: Instant, snapshot: Snapshot) -> RobotState:
+        certificate, expiry_text = self._certificate(now)
+        status = snapshot.status
         return RobotState(
-            stamp=Time.from_ns(outputs.now.wall_ns),
-            mode=outputs.mode,
-            reason=outputs.reason,
-            code=outputs.code,
+            stamp=Time.from_ns(now.wall_ns),
+            mode=status.mode,
+            reason=status.reason,
+            code=status.code,
             x=snapshot.pose.x,
             y=snapshot.pose.y,
             yaw=snapshot.pose.yaw,
             linear=snapshot.measured.linear if snapshot.measured else None,
             angular=snapshot.measured.angular if snapshot.measured else None,
             wheels=list(snapshot.speeds.as_tuple()) if snapshot.speeds else [],
-            link=outputs.link,
-            source=outputs.source,
+            link=status.link,
+            source=status.source,
             sources=[
                 SourceState(
                     s.name, s.priority, s.age_s, waiting(s.waits_for).text, s.waits_for.what
@@ -284,7 +307,7 @@ class Report:
             wheel_fault=snapshot.doubt.text,
             sender=snapshot.sender,
             recording_error=snapshot.recording.trouble,
-            latch=0 if outputs.latches.in_force is None else outputs.latches.in_force.number,
+            latch=snapshot.latch,
             latch_file_error=snapshot.latch_file or "",
             feedback_age=snapshot.feedback_age_s,
             emergency_stop=snapshot.estop,
@@ -292,7 +315,7 @@ class Report:
             battery=_summary(snapshot.battery),
             settings_differ=snapshot.settings_differ,
             speed_limit=snapshot.speed_limit,
-            certificate_days=self._certificate_days(outputs.now),
+            certificate_days=self._certificate_days(now),
             version=self._version,
         )
 
@@ -301,9 +324,9 @@ class Report:
             return None
         return round((first_expiry(self.certificate_ends)[1] - now.wall_ns) / DAY_NS, 2)
 
-    def _battery(self, outputs: Outputs, snapshot: Snapshot) -> Battery | None:
+    def _battery(self, now: Instant, snapshot: Snapshot) -> Battery | None:
         # Stamped with the last report, or now if the reports have stopped.
-        battery, now = snapshot.battery, outputs.now
+        battery = snapshot.battery
         if battery is None:
             return None
         age_ns = 0 if battery.reported_ns is None else now.mono_ns - battery.reported_ns
@@ -325,9 +348,8 @@ class Report:
             return "", ""
         return expiry(self.certificate_ends, now.wall_ns)
 
-    def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
-        certificate = self._certificate(outputs.now)
-        return diagnostics(self.config, outputs, snapshot, certificate)
+    def _diagnostics(self, now: Instant, snapshot: Snapshot) -> DiagnosticArray:
+        return diagnostics(self.config, now, snapshot, self._certificate(now))
 
 
 def _summary(battery: BatteryStatus | None) -> BatterySummary | None:

@@ -28,7 +28,7 @@ from acsard.core.messages import schema
 from acsard.core.messages.encodings import FORMATS, DecodeError, Decoder, Format, encode
 from acsard.core.messages.schema import Header, Imu, Quaternion, Time, Vector3
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.values import NS_PER_S, REST, Command
+from acsard.core.values import NS_PER_S, REST, Command, Status
 from acsard.host import clock
 from acsard.host.errors import ReplyError
 from tests.each import each
@@ -322,7 +322,7 @@ def test_a_service_call_above_the_size_limit_is_refused_at_once_in_the_daemon_s_
         client_of(session).set(largest)
     payload = msgspec.json.encode({"settings": larger})
     query = Query(1, "srv/set", "srv/set", "", payload, "application/json")
-    replies = Queries(Config(), INFO).serve(query, lambda _: None, None)
+    replies = Queries(Config(), INFO).serve(query, lambda _: None, 0, Status("", "booting", "", ""))
     assert isinstance(replies, list)
     (reply,) = replies
     refusal = Decoder(schema.ServiceReply).decode(reply.encoding, reply.payload)

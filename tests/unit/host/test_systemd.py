@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from acsard.core.values import NS_PER_S, Instant, Outputs, Twist, WheelSpeeds
+from acsard.core.values import NS_PER_S, Status, Twist
 from acsard.host.systemd import FEEDS_PER_WATCHDOG, Systemd
 
 PID = 4711
@@ -56,7 +56,8 @@ def systemd(manager: Manager, **more: str) -> Systemd:
     return Systemd({"NOTIFY_SOCKET": manager.address} | more, PID)
 
 
-def outputs(
+def stepped(
+    systemd: Systemd,
     at_ns: int,
     *,
     mode: str = "driving",
@@ -64,23 +65,9 @@ def outputs(
     source: str = "nav",
     applied: Twist = HALF,
     changed: bool = False,
-) -> Outputs:
-    return Outputs(
-        now=Instant(at_ns, at_ns),
-        due=True,
-        line=None,
-        speeds=WheelSpeeds(0.0, 0.0, 0.0, 0.0),
-        applied=applied,
-        linked=True,
-        estimates=(),
-        mode=mode,
-        code="commanded",
-        reason=reason,
-        link="up",
-        source=source,
-        command_ns=None,
-        status_changed=changed,
-    )
+) -> None:
+    status = Status(mode, "commanded", reason, "up", source)
+    systemd.step(at_ns, status, applied, changed=changed)
 
 
 def statuses(manager: Manager) -> list[str]:
@@ -93,7 +80,7 @@ def statuses(manager: Manager) -> list[str]:
 def test_without_a_manager_nothing_happens() -> None:
     nobody = Systemd({}, PID)
     nobody.ready()
-    nobody.step(outputs(NS_PER_S))
+    stepped(nobody, NS_PER_S)
     nobody.stopping()
     nobody.close()
 
@@ -160,7 +147,7 @@ def test_after_close_nothing_is_sent(manager: Manager) -> None:
     there = systemd(manager, WATCHDOG_USEC="200000")
     there.close()
     there.ready()
-    there.step(outputs(NS_PER_S))
+    stepped(there, NS_PER_S)
     there.close()
     assert manager.read_datagrams() == []
 
@@ -173,7 +160,7 @@ def feeds(manager: Manager, there: Systemd, period_ns: int, steps: int) -> list[
     fed = []
     for step in range(1, steps + 1):
         at = NS_PER_S + step * period_ns
-        there.step(outputs(at))
+        stepped(there, at)
         if {"WATCHDOG": "1"} in manager.read_datagrams():
             fed.append(at)
     return fed
@@ -243,26 +230,26 @@ def test_only_a_step_feeds_the_watchdog(manager: Manager) -> None:
 def test_driving_is_shown_by_its_speed_and_source(
     manager: Manager, twist: Twist, text: str
 ) -> None:
-    systemd(manager).step(outputs(NS_PER_S, applied=twist))
+    stepped(systemd(manager), NS_PER_S, applied=twist)
     assert statuses(manager) == [text]
 
 
 def test_any_other_mode_is_shown_by_its_name_and_reason(manager: Manager) -> None:
-    systemd(manager).step(outputs(NS_PER_S, mode="waiting", reason="/dev/acsar is not there"))
+    stepped(systemd(manager), NS_PER_S, mode="waiting", reason="/dev/acsar is not there")
     assert statuses(manager) == ["waiting: /dev/acsar is not there"]
 
 
 def test_the_same_status_is_sent_once(manager: Manager) -> None:
     there = systemd(manager)
     for step in range(1, 1000):
-        there.step(outputs(step * 10 * MS, changed=step % 3 == 0))
+        stepped(there, step * 10 * MS, changed=step % 3 == 0)
     assert statuses(manager) == ["driving at 0.5 m/s, commanded by nav"]
 
 
 def test_a_change_of_mode_is_sent_immediately(manager: Manager) -> None:
     there = systemd(manager)
-    there.step(outputs(NS_PER_S))
-    there.step(outputs(NS_PER_S + 10 * MS, mode="stopped", reason="by teleop", changed=True))
+    stepped(there, NS_PER_S)
+    stepped(there, NS_PER_S + 10 * MS, mode="stopped", reason="by teleop", changed=True)
     assert statuses(manager) == ["driving at 0.5 m/s, commanded by nav", "stopped: by teleop"]
 
 
@@ -270,7 +257,7 @@ def test_a_change_of_speed_is_sent_at_most_once_a_second(manager: Manager) -> No
     there = systemd(manager)
     for step in range(500):
         speed = step / 100
-        there.step(outputs(NS_PER_S + step * 10 * MS, applied=Twist(speed, 0.0)))
+        stepped(there, NS_PER_S + step * 10 * MS, applied=Twist(speed, 0.0))
     assert len(statuses(manager)) == 5
 
 
@@ -280,7 +267,7 @@ def test_a_change_of_speed_is_sent_at_most_once_a_second(manager: Manager) -> No
 def fill(there: Systemd) -> int:
     """Run many steps, which send more messages than the socket can hold. Return their number."""
     for step in range(1, 10_000):
-        there.step(outputs(step * 100 * MS))
+        stepped(there, step * 100 * MS)
     return step
 
 
@@ -292,7 +279,7 @@ def test_a_full_queue_neither_blocks_nor_raises_and_the_watchdog_is_fed_after_it
     steps = fill(there)
     assert time.monotonic() - began < 5.0
     assert 0 < len(manager.read_datagrams()) < steps, "the queue was not full"
-    there.step(outputs(2000 * NS_PER_S))
+    stepped(there, 2000 * NS_PER_S)
     assert {"WATCHDOG": "1"} in manager.read_datagrams()
 
 
@@ -301,7 +288,7 @@ def test_a_manager_that_disappears_causes_no_error(manager: Manager) -> None:
     manager.close()
     os.unlink(manager.address)
     there.ready()
-    there.step(outputs(NS_PER_S))
+    stepped(there, NS_PER_S)
     there.stopping()
     there.close()
 
@@ -310,8 +297,8 @@ def test_a_status_that_a_full_queue_refused_is_sent_later(manager: Manager) -> N
     there = systemd(manager, WATCHDOG_USEC="200000")
     fill(there)
     at = 2000 * NS_PER_S
-    there.step(outputs(at, mode="stopped", reason="by teleop", changed=True))
+    stepped(there, at, mode="stopped", reason="by teleop", changed=True)
     manager.read_datagrams()
     for step in range(1, 30):
-        there.step(outputs(at + step * 100 * MS, mode="stopped", reason="by teleop"))
+        stepped(there, at + step * 100 * MS, mode="stopped", reason="by teleop")
     assert statuses(manager) == ["stopped: by teleop"]

@@ -19,7 +19,7 @@ from acsard.web.socket_sender import Following
 from acsard.web.streams import VIEWER_KEYS as FOLLOWED
 from tests.described import FRAMES, SCHEMAS, is_described_frame, kinds, spoilt
 from tests.each import each
-from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
+from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START, due
 
 GREETING = socket_messages.Greeting(
     "acsar", "1", "operator", "phone/1f", socket_messages.Limits(1.0, 4.0), True, 10.0,
@@ -68,7 +68,7 @@ def test_a_greeting_may_have_only_an_existing_role(role: Role) -> None:
 
 def test_a_message_of_a_key_has_its_type_by_reference() -> None:
     report = Report(Config(), START)
-    list(report.due(OUTPUTS, {"odom"}, lambda: SNAPSHOT))
+    list(due(report, OUTPUTS, {"odom"}, lambda: SNAPSHOT))
     odom = report.current("odom", lambda: SNAPSHOT)
     assert odom is not None
     head = Following("odom", 0.1).head

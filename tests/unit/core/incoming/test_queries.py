@@ -40,14 +40,15 @@ from acsard.core.ros import parameters as rcl
 from acsard.core.ros.attachments import Attachment, unpack
 from acsard.core.ros.shapes import Trigger
 from acsard.core.ros.transports import PARAMETER_SERVICES
-from acsard.core.values import ROLES, Answer, Outputs, Plain, Pose, Request
+from acsard.core.values import ROLES, Answer, Plain, Pose, Request, Status
 from tests.each import each
-from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
+from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START, STATUS, due
 
 NATIVE = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "diagnostics")
 """Published keys whose types are ROS messages and therefore have a CDR form."""
 
 CONFIG = Config(robot=RobotConfig("r7"))
+NOW = OUTPUTS.now.wall_ns, STATUS
 WALL_NS = 1_700_000_000_000_000_000
 NO = rcl.SetParametersResult(
     False, "the payload must begin with the header of plain CDR, not with 00"
@@ -67,7 +68,7 @@ def queries(config: Config = CONFIG) -> Queries:
 
 def report() -> Report:
     made = Report(CONFIG, START)
-    made.due(OUTPUTS, set(), lambda: SNAPSHOT)
+    due(made, OUTPUTS, set(), lambda: SNAPSHOT)
     return made
 
 
@@ -80,15 +81,15 @@ def query(topic: str, asked: str | None = None, fmt: str = "", **changes: Any) -
     return Query(topic=topic, asked=topic if asked is None else asked, fmt=fmt, **fields)
 
 
-def answers(asked: Query, outputs: Outputs | None = OUTPUTS) -> list[Reply]:
+def answers(asked: Query) -> list[Reply]:
     made = report()
-    replies = queries().serve(asked, lambda key: made.current(key, lambda: SNAPSHOT), outputs)
+    replies = queries().serve(asked, lambda key: made.current(key, lambda: SNAPSHOT), *NOW)
     assert isinstance(replies, list)
     return replies
 
 
-def answer(asked: Query, outputs: Outputs | None = OUTPUTS) -> Reply:
-    (reply,) = answers(asked, outputs)
+def answer(asked: Query) -> Reply:
+    (reply,) = answers(asked)
     return reply
 
 
@@ -148,7 +149,7 @@ def test_a_query_for_cdr_of_a_type_that_is_not_a_ros_message_is_refused_with_a_t
 @each("topic", PUBLISHED)
 @each("fmt", ["", "cdr"])
 def test_a_published_key_without_a_value_yet_has_no_answer(topic: Any, fmt: str) -> None:
-    assert queries().serve(query(topic.key, fmt=fmt), nothing, None) == []
+    assert queries().serve(query(topic.key, fmt=fmt), nothing, *NOW) == []
 
 
 @each("asked", ["odom", "**", "*", "acsard/*/odom"])
@@ -285,8 +286,8 @@ def test_without_a_format_the_answer_is_json(key: str) -> None:
 # interfaces
 
 
-def interfaces(config: Config, outputs: Outputs | None) -> list[dict[str, Any]]:
-    replies = queries(config).serve(query("interfaces"), nothing, outputs)
+def interfaces(config: Config, status: Status) -> list[dict[str, Any]]:
+    replies = queries(config).serve(query("interfaces"), nothing, 0, status)
     assert isinstance(replies, list)
     assert replies[0].encoding == encoding_name("json", "Interfaces")
     return [
@@ -297,7 +298,7 @@ def interfaces(config: Config, outputs: Outputs | None) -> list[dict[str, Any]]:
 
 def test_the_base_has_four_command_and_eight_state_interfaces() -> None:
     joints = ("a", "b", "c", "d")
-    rows = interfaces(Config(joints=JointsConfig(*joints)), OUTPUTS)
+    rows = interfaces(Config(joints=JointsConfig(*joints)), STATUS)
     assert [(row["name"], row["kind"], row["unit"]) for row in rows] == [
         *((f"{j}/velocity", "command", "rad/s") for j in joints),
         *(
@@ -309,16 +310,14 @@ def test_the_base_has_four_command_and_eight_state_interfaces() -> None:
 
 
 def test_the_interfaces_are_available_while_the_link_is_up() -> None:
-    assert all(row["available"] for row in interfaces(CONFIG, OUTPUTS))
-    assert not any(row["available"] for row in interfaces(CONFIG, replace(OUTPUTS, linked=False)))
-    assert not any(row["available"] for row in interfaces(CONFIG, None))
+    assert all(row["available"] for row in interfaces(CONFIG, STATUS))
+    assert not any(row["available"] for row in interfaces(CONFIG, replace(STATUS, link="stale")))
 
 
 def test_only_command_interfaces_are_claimed_and_only_while_driving() -> None:
-    claimed = [row["name"] for row in interfaces(CONFIG, OUTPUTS) if row["claimed"]]
+    claimed = [row["name"] for row in interfaces(CONFIG, STATUS) if row["claimed"]]
     assert claimed == [f"{joint}/velocity" for joint in CONFIG.joints.as_tuple()]
-    assert not any(row["claimed"] for row in interfaces(CONFIG, replace(OUTPUTS, mode="ready")))
-    assert not any(row["claimed"] for row in interfaces(CONFIG, None))
+    assert not any(row["claimed"] for row in interfaces(CONFIG, replace(STATUS, mode="ready")))
 
 
 # services
@@ -334,7 +333,7 @@ def payload_for(verb: str) -> bytes:
 
 @each("verb", SERVICES)
 def test_a_service_query_with_its_exact_key_makes_a_request_to_the_robot(verb: Any) -> None:
-    request = queries().serve(query(f"srv/{verb}", payload=payload_for(verb)), nothing, OUTPUTS)
+    request = queries().serve(query(f"srv/{verb}", payload=payload_for(verb)), nothing, *NOW)
     pose = Pose(1.0, 2.0, 3.0) if verb == "set_pose" else None
     values: dict[str, Plain] = {"limits.linear_speed": 0.8, "log.level": "debug"}
     settings = values if verb == "set" else {}
@@ -345,7 +344,7 @@ def test_a_service_query_with_its_exact_key_makes_a_request_to_the_robot(verb: A
 @each("value", [-(1 << 63) - 1, 1 << 63, 10**20, 10**300])
 def test_a_setting_with_an_integer_above_64_bits_is_refused(value: int) -> None:
     asked = query("srv/set", payload=f'{{"settings": {{"rates.odom": {value}}}}}'.encode())
-    replies = queries().serve(asked, nothing, OUTPUTS)
+    replies = queries().serve(asked, nothing, *NOW)
     assert isinstance(replies, list)
     assert "$.settings" in str(replies[0])
 
@@ -354,13 +353,13 @@ def test_a_setting_with_an_integer_above_64_bits_is_refused(value: int) -> None:
 @each("verb", SERVICES)
 def test_a_wildcard_never_runs_a_service(verb: str, asked: str) -> None:
     made = queries()
-    assert made.serve(query(f"srv/{verb}", asked, payload=payload_for(verb)), nothing, None) == []
+    assert made.serve(query(f"srv/{verb}", asked, payload=payload_for(verb)), nothing, *NOW) == []
     assert made.answered(Answer(7, True, "done"), WALL_NS) is None
 
 
 @each("asked", ["srv/stop/", "srv", "/srv/stop", "srv/clear", "SRV/STOP", ""])
 def test_a_service_does_not_run_for_a_key_that_only_resembles_its_own(asked: str) -> None:
-    assert queries().serve(query("srv/stop", asked), nothing, None) == []
+    assert queries().serve(query("srv/stop", asked), nothing, *NOW) == []
 
 
 @each(
@@ -375,7 +374,7 @@ def test_a_service_that_this_daemon_does_not_have_is_refused_in_words(
     verb: str, words: str
 ) -> None:
     made = queries()
-    (reply,) = cast(list[Reply], made.serve(query(f"srv/{verb}", payload=b"{}"), nothing, None))
+    (reply,) = cast(list[Reply], made.serve(query(f"srv/{verb}", payload=b"{}"), nothing, *NOW))
     answer = msgspec.json.decode(reply.payload, type=ServiceReply)
     assert (reply.key, reply.ok, answer.success) == (f"srv/{verb}", True, False)
     assert answer.message.startswith(words)
@@ -393,8 +392,8 @@ def test_info_offers_each_service_with_the_fields_of_its_payload() -> None:
 @pytest.mark.parametrize("success", [True, False])
 def test_the_answer_of_the_robot_goes_back_to_the_caller(success: bool) -> None:
     made = queries()
-    made.serve(query("srv/clear", ticket=12), nothing, None)
-    made.serve(query("srv/stop", ticket=13), nothing, None)
+    made.serve(query("srv/clear", ticket=12), nothing, *NOW)
+    made.serve(query("srv/stop", ticket=13), nothing, *NOW)
     reply = made.answered(Answer(13, success, "because"), WALL_NS)
     assert reply == Reply(
         13,
@@ -406,7 +405,7 @@ def test_the_answer_of_the_robot_goes_back_to_the_caller(success: bool) -> None:
 
 def test_an_answer_goes_back_only_once() -> None:
     made = queries()
-    made.serve(query("srv/stop"), nothing, None)
+    made.serve(query("srv/stop"), nothing, *NOW)
     assert made.answered(Answer(7, True, ""), WALL_NS) is not None
     assert made.answered(Answer(7, True, ""), WALL_NS) is None
 
@@ -437,7 +436,7 @@ def test_a_service_answers_in_the_requested_format_or_else_in_that_of_the_payloa
 ) -> None:
     made = queries()
     asked = query("srv/reset_odometry", fmt=fmt, payload=payload, encoding=encoding)
-    assert isinstance(made.serve(asked, nothing, None), Request)
+    assert isinstance(made.serve(asked, nothing, *NOW), Request)
     reply = made.answered(Answer(7, True, "done"), WALL_NS)
     assert reply is not None
     message = Trigger(True, "done") if form == "cdr" else ServiceReply(True, "done")
@@ -447,7 +446,7 @@ def test_a_service_answers_in_the_requested_format_or_else_in_that_of_the_payloa
 
 def test_a_service_called_in_cdr_answers_like_a_ros_trigger() -> None:
     made = queries()
-    made.serve(query("srv/stop", payload=b"\x00\x01\x00\x00\x00"), nothing, None)
+    made.serve(query("srv/stop", payload=b"\x00\x01\x00\x00\x00"), nothing, *NOW)
     reply = made.answered(Answer(7, True, "ok"), WALL_NS)
     assert reply is not None
     assert reply.payload == bytes.fromhex("00010000 01000000 03000000 6f6b00")
@@ -457,7 +456,7 @@ def test_a_service_called_in_cdr_answers_like_a_ros_trigger() -> None:
     "verb", [verb for verb, service in SERVICES.items() if not service.payload]
 )
 def test_a_service_without_arguments_runs_whatever_the_payload(verb: str) -> None:
-    request = queries().serve(query(f"srv/{verb}", payload=b"\xff nonsense"), nothing, None)
+    request = queries().serve(query(f"srv/{verb}", payload=b"\xff nonsense"), nothing, *NOW)
     assert isinstance(request, Request)
 
 
@@ -479,7 +478,7 @@ def test_an_invalid_pose_is_answered_with_a_text_and_makes_no_request_to_the_rob
     payload: bytes, words: str
 ) -> None:
     made = queries()
-    replies = made.serve(query("srv/set_pose", payload=payload, fmt="json"), nothing, None)
+    replies = made.serve(query("srv/set_pose", payload=payload, fmt="json"), nothing, *NOW)
     assert isinstance(replies, list)
     (reply,) = replies
     assert reply.ok
@@ -510,7 +509,7 @@ def test_a_ros_trigger_makes_a_request_to_the_robot_and_its_answer_is_cdr(
     verb: str, via: str
 ) -> None:
     made = queries()
-    request = made.serve(ros_query(f"srv/{verb}", via), nothing, OUTPUTS)
+    request = made.serve(ros_query(f"srv/{verb}", via), nothing, *NOW)
     by = f"unnamed (rmw {ASKED.gid.hex()})" if via == "rmw" else "unnamed (bridge)"
     assert request == Request(verb, 7, asked_ns=99, by=by)  # type: ignore[arg-type]
     reply = made.answered(Answer(7, True, "done"), WALL_NS)
@@ -521,7 +520,7 @@ def test_a_ros_trigger_makes_a_request_to_the_robot_and_its_answer_is_cdr(
 
 def test_over_rmw_a_reply_has_the_sequence_and_gid_of_the_request_and_its_own_stamp() -> None:
     made = queries()
-    made.serve(ros_query("srv/clear"), nothing, OUTPUTS)
+    made.serve(ros_query("srv/clear"), nothing, *NOW)
     reply = made.answered(Answer(7, False, "no"), WALL_NS)
     assert reply is not None
     assert unpack(reply.attachment) == Attachment(7, WALL_NS, ASKED.gid)
@@ -529,7 +528,7 @@ def test_over_rmw_a_reply_has_the_sequence_and_gid_of_the_request_and_its_own_st
 
 def test_a_reply_through_a_bridge_has_no_attachment() -> None:
     made = queries()
-    made.serve(ros_query("srv/clear", "bridge", attachment=b"rqh" + bytes(17)), nothing, OUTPUTS)
+    made.serve(ros_query("srv/clear", "bridge", attachment=b"rqh" + bytes(17)), nothing, *NOW)
     reply = made.answered(Answer(7, True, ""), WALL_NS)
     assert reply is not None
     assert reply.attachment == b""
@@ -537,7 +536,7 @@ def test_a_reply_through_a_bridge_has_no_attachment() -> None:
 
 @each("payload", [b"", EMPTY[:4], EMPTY, EMPTY + bytes(3)])
 def test_a_ros_trigger_accepts_a_request_of_any_length(payload: bytes) -> None:
-    request = queries().serve(ros_query("srv/stop", "bridge", payload), nothing, OUTPUTS)
+    request = queries().serve(ros_query("srv/stop", "bridge", payload), nothing, *NOW)
     assert isinstance(request, Request)
 
 
@@ -548,7 +547,7 @@ def test_over_rmw_a_request_without_a_valid_attachment_is_not_answered(
 ) -> None:
     made = queries()
     with pytest.raises(DecodeError) as caught:
-        made.serve(ros_query(topic, attachment=attachment), nothing, OUTPUTS)
+        made.serve(ros_query(topic, attachment=attachment), nothing, *NOW)
     assert caught.value.reason == ("bad_attachment" if attachment else "no_attachment")
     assert made.answered(Answer(7, True, ""), WALL_NS) is None
 
@@ -570,7 +569,7 @@ def test_the_parameter_services_return_the_configuration(via: str) -> None:
 def test_an_unreadable_parameter_request_is_answered_with_a_refusal(service: str, via: str) -> None:
     asked = ros_query(f"parameters/{service}", via, payload=b"\x00")
     with pytest.raises(DecodeError) as caught:
-        queries().serve(asked, nothing, OUTPUTS)
+        queries().serve(asked, nothing, *NOW)
     assert caught.value.reason == "malformed"
     reply = refused(asked, str(caught.value), WALL_NS)
     assert reply is not None
@@ -601,7 +600,7 @@ def test_a_parameter_set_twice_in_a_request_is_refused_with_all_its_results(
     with pytest.raises(
         DecodeError, match=r"limits\.linear_speed is in the request twice"
     ) as caught:
-        queries().serve(asked, nothing, OUTPUTS)
+        queries().serve(asked, nothing, *NOW)
     reply = refused(asked, str(caught.value), WALL_NS)
     assert reply is not None
     no = rcl.SetParametersResult(False, str(caught.value))
@@ -620,7 +619,7 @@ def test_a_parameter_request_with_too_many_names_is_refused() -> None:
     for more, reason in ((names + names[:1], "malformed"), (["x" * 20_000], "too_big")):
         payload = Cdr(rcl.Names).encode(rcl.Names(more))[: most_bytes("parameters/") + 1]
         with pytest.raises(DecodeError) as caught:
-            queries().serve(ros_query("parameters/get_parameters", payload=payload), nothing, None)
+            queries().serve(ros_query("parameters/get_parameters", payload=payload), nothing, *NOW)
         assert caught.value.reason == reason
 
 
@@ -652,7 +651,7 @@ def test_a_request_to_set_parameters_goes_to_the_robot_and_returns_its_answer(
         rcl.SetRequest([rcl.Parameter("limits.linear_speed", value)])
     )
     made = queries()
-    request = made.serve(ros_query(f"parameters/{service}", via, payload), nothing, OUTPUTS)
+    request = made.serve(ros_query(f"parameters/{service}", via, payload), nothing, *NOW)
     assert isinstance(request, Request)
     assert (request.verb, request.id, request.settings) == ("set", 7, {"limits.linear_speed": 0.7})
     reply = made.answered(Answer(7, False, "call srv/clear first"), WALL_NS)
@@ -669,15 +668,15 @@ def test_a_request_to_set_parameters_goes_to_the_robot_and_returns_its_answer(
 def test_config_and_the_parameter_services_return_a_changed_setting() -> None:
     made = queries()
     made.config = replace(CONFIG, limits=LimitsConfig(linear_speed=0.7))
-    (config_reply,) = made.serve(query("config"), nothing, OUTPUTS)  # type: ignore[misc]
+    (config_reply,) = made.serve(query("config"), nothing, *NOW)  # type: ignore[misc]
     assert from_builtins(msgspec.json.decode(config_reply.payload)).limits.linear_speed == 0.7
     payload = Cdr(rcl.Names).encode(rcl.Names(["limits.linear_speed"]))
     asked = ros_query("parameters/get_parameters", "bridge", payload)
-    (reply,) = made.serve(asked, nothing, OUTPUTS)  # type: ignore[misc]
+    (reply,) = made.serve(asked, nothing, *NOW)  # type: ignore[misc]
     assert Cdr(rcl.Values).decode(reply.payload).values[0].double_value == 0.7
 
 
 def reply_to(asked: Query) -> list[Reply]:
-    replies = queries().serve(asked, nothing, OUTPUTS)
+    replies = queries().serve(asked, nothing, *NOW)
     assert isinstance(replies, list)
     return replies

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 from msgspec.structs import replace
 
+from acsard.core.messages.report import Report
+from acsard.core.messages.schema import Message
 from acsard.core.values import (
     BatteryStatus,
     Estimate,
@@ -18,11 +21,13 @@ from acsard.core.values import (
     Snapshot,
     SourceStatus,
     Spread,
+    Status,
     Twist,
     TwistVariances,
     Wait,
     WheelSpeeds,
 )
+from acsard.recording.stepped_robot import news_of
 
 START = Instant(100_000_000_000, 1_700_000_000_000_000_000)
 
@@ -54,7 +59,12 @@ OUTPUTS = Outputs(
     events=(Event("stop", "stopped", by="phone"),),
 )
 
+STATUS = Status("driving", "commanded", "commanded by app", "up", "app")
+
 SNAPSHOT = Snapshot(
+    status=STATUS,
+    latch=0,
+    applied=Twist(0.3, 0.9),
     pose=Pose(1.6, -2.6, 0.6),
     measured=Twist(0.26, -0.76),
     speeds=WheelSpeeds(1.1, 2.1, 3.1, 4.1),
@@ -69,6 +79,27 @@ SNAPSHOT = Snapshot(
         "period_lateness": Measured(Spread(1000, 50.0, 400.0, 900.0), Spread(100, 40.0, 80.0, 90.0))
     },
 )
+
+
+def due(
+    report: Report, outputs: Outputs, wanted: Collection[str], get_snapshot: Callable[[], Snapshot]
+) -> Iterator[tuple[str, Message]]:
+    """Return the keys and messages that are due after a step with these outputs."""
+    news = news_of(outputs)
+    return report.due(
+        outputs.now,
+        news,
+        outputs.applied if outputs.due else None,
+        wanted,
+        lambda: with_outputs(get_snapshot(), outputs),
+    )
+
+
+def with_outputs(snapshot: Snapshot, outputs: Outputs) -> Snapshot:
+    status = Status(outputs.mode, outputs.code, outputs.reason, outputs.link, outputs.source)
+    latch = outputs.latches.in_force
+    number = 0 if latch is None else latch.number
+    return replace(snapshot, status=status, latch=number, applied=outputs.applied)
 
 
 def at(instant: Instant, **changes: Any) -> Outputs:

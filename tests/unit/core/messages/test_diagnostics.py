@@ -33,7 +33,7 @@ from acsard.core.values import (
     Wait,
 )
 from tests.each import each
-from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT
+from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, with_outputs
 
 CONFIG = Config(robot=RobotConfig("r7"), mcu=McuConfig(port="/dev/x"))
 BUMPERS = replace(CONFIG, safety=SafetyConfig(bumpers=("front", "rear")))
@@ -43,7 +43,8 @@ NO_CERTIFICATE = ("", "")
 def rows(
     config: Config = CONFIG, outputs: Outputs = OUTPUTS, snapshot: Snapshot = SNAPSHOT
 ) -> list[DiagnosticStatus]:
-    return diagnostics(config, outputs, snapshot, NO_CERTIFICATE).status
+    shot = with_outputs(snapshot, outputs)
+    return diagnostics(config, outputs.now, shot, NO_CERTIFICATE).status
 
 
 def row(name: str, *args: Any, **changes: Any) -> DiagnosticStatus:

@@ -44,7 +44,7 @@ from acsard.core.messages.schema import (
     Vector3,
 )
 from tests.each import each
-from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
+from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START, due
 
 TWIST = Twist(Vector3(0.5), Vector3(z=0.2))
 AS_CDR = b"\x00\x01\x00\x00" + struct.pack("<6d", 0.5, 0, 0, 0, 0, 0.2)
@@ -74,7 +74,7 @@ def grown(value: Any) -> Any:
 
 
 REPORT = Report(Config(), START)
-list(REPORT.due(OUTPUTS, {"state"}, lambda: SNAPSHOT))
+list(due(REPORT, OUTPUTS, {"state"}, lambda: SNAPSHOT))
 MESSAGES = [
     *(REPORT.current(key, lambda: SNAPSHOT) for key in ("odom", "tf", "state", "diagnostics")),
     ServiceReply(True, "done", ReplyData(7, {"rates.odom": Change(1.0, 2.0)})),

@@ -24,7 +24,7 @@ from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.modes import Mode
 from acsard.core.values import GyroDoes, Role
 from tests.each import each
-from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
+from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START, STATUS, due
 
 INCOMING = {
     "Twist", "TwistStampedIn", "JointStateIn", "ImuIn", "SetPose", "Release", "Settings",
@@ -125,7 +125,7 @@ def test_patterns_are_ecmascript_regular_expressions() -> None:
 @each("topic", [t for t in PUBLISHED if not t.simulated])
 def test_a_published_message_is_valid_and_invalid_without_any_of_its_fields(topic: Any) -> None:
     report = Report(Config(), START)
-    list(report.due(OUTPUTS, {topic.key}, lambda: SNAPSHOT))
+    list(due(report, OUTPUTS, {topic.key}, lambda: SNAPSHOT))
     message = report.current(topic.key, lambda: SNAPSHOT)
     assert message is not None
     value = as_json(message)
@@ -138,7 +138,7 @@ def test_a_published_message_is_valid_and_invalid_without_any_of_its_fields(topi
 @each("mode", [*Mode])
 def test_the_schema_of_the_state_accepts_each_mode_and_no_other(mode: str) -> None:
     report = Report(Config(), START)
-    list(report.due(replace(OUTPUTS, mode=mode), {"state"}, lambda: SNAPSHOT))
+    list(due(report, replace(OUTPUTS, mode=mode), {"state"}, lambda: SNAPSHOT))
     message = report.current("state", lambda: SNAPSHOT)
     assert message is not None
     state = as_json(message)
@@ -148,7 +148,7 @@ def test_the_schema_of_the_state_accepts_each_mode_and_no_other(mode: str) -> No
 
 def test_answers_are_valid_by_their_schemas() -> None:
     answers = {
-        "Interfaces": interfaces(Config(), OUTPUTS),
+        "Interfaces": interfaces(Config(), STATUS),
         "Topics": topic_table(Config()),
         "ServiceReply": ServiceReply(True, "stopped"),
         "Info": Info("acsar", "1", 7, "sim", True, 100.0, ["tcp/127.0.0.1:7448"], []),

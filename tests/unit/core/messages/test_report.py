@@ -58,7 +58,7 @@ from acsard.core.values import (
     WheelsStatus,
 )
 from tests.each import each
-from tests.unit.core.messages.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, later
+from tests.unit.core.messages.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, due, later
 
 ALL = {topic.key for topic in PUBLISHED if not topic.simulated}
 """Keys that a report publishes.
@@ -88,7 +88,7 @@ def never() -> Snapshot:
 
 def published(outputs: Outputs = OUTPUTS, config: Config = CONFIG) -> dict[str, Any]:
     """Return the messages, keyed by key, that a new daemon publishes after these outputs."""
-    return dict(Report(config, START).due(outputs, ALL, get_snapshot))
+    return dict(due(Report(config, START), outputs, ALL, get_snapshot))
 
 
 def rates(**hz: float) -> Config:
@@ -101,7 +101,7 @@ def times_of(key: str, config: Config, steps: int = 1000, **changes: Any) -> lis
     return [
         step
         for step in range(steps)
-        for name, _ in report.due(at(later(step / 100), **changes), {key}, get_snapshot)
+        for name, _ in due(report, at(later(step / 100), **changes), {key}, get_snapshot)
         if name == key
     ]
 
@@ -136,7 +136,7 @@ def test_the_frames_are_the_configured_ones() -> None:
 
 def test_each_message_has_the_type_of_its_topic() -> None:
     report = Report(CONFIG, START)
-    list(report.due(OUTPUTS, set(), never))
+    list(due(report, OUTPUTS, set(), never))
     for topic in PUBLISHED:
         if topic.key in ALL:
             assert type(report.current(topic.key, get_snapshot)).__name__ == topic.type
@@ -184,7 +184,7 @@ def test_tf_has_the_same_pose_as_odom() -> None:
 def test_without_publish_tf_only_odom_is_published() -> None:
     config = replace(CONFIG, odometry=replace(FRAMES, publish_tf=False))
     report = Report(config, START)
-    keys = [key for key, _ in report.due(OUTPUTS, ALL, get_snapshot)]
+    keys = [key for key, _ in due(report, OUTPUTS, ALL, get_snapshot)]
     assert "tf" not in keys
     assert "odom" in keys
     assert report.current("tf", never) is None
@@ -296,7 +296,7 @@ def values(status: DiagnosticStatus) -> dict[str, str]:
 
 def test_estimated_encoder_counts_are_in_the_state_and_in_the_row_of_the_link() -> None:
     report = Report(CONFIG, START)
-    list(report.due(OUTPUTS, set(), never))
+    list(due(report, OUTPUTS, set(), never))
 
     def seen() -> Snapshot:
         return replace(SNAPSHOT, encoders=(20, 0, 0, 400))
@@ -332,7 +332,7 @@ def test_a_router_that_is_missing_is_a_warning(
     routers: RoutersStatus, level: int, message: str, fields: dict[str, str]
 ) -> None:
     report = Report(CONFIG, START)
-    list(report.due(OUTPUTS, ALL, get_snapshot))
+    list(due(report, OUTPUTS, ALL, get_snapshot))
     array = report.current("diagnostics", lambda: replace(SNAPSHOT, routers=routers))
     assert isinstance(array, DiagnosticArray)
     (row,) = (status for status in array.status if status.name == "acsard: router")
@@ -348,33 +348,33 @@ def test_a_daemon_without_routers_has_no_router_row() -> None:
 
 @each("wanted", [set(), *({key} for key in ALL), {"odom", "state"}, ALL])
 def test_only_topics_with_subscribers_are_published(wanted: set[str]) -> None:
-    messages = Report(CONFIG, START).due(OUTPUTS, wanted, get_snapshot)
+    messages = due(Report(CONFIG, START), OUTPUTS, wanted, get_snapshot)
     assert sorted(key for key, _ in messages) == sorted(wanted - {"tf_static"})
 
 
 def test_feedback_is_published_before_the_summary_is_built() -> None:
-    due = Report(CONFIG, START).due(OUTPUTS, ALL, never)
-    assert [next(due)[0] for _ in range(3)] == ["odom", "tf", "wheel_states"]
+    messages = due(Report(CONFIG, START), OUTPUTS, ALL, never)
+    assert [next(messages)[0] for _ in range(3)] == ["odom", "tf", "wheel_states"]
 
 
 def test_no_snapshot_is_taken_for_a_summary_without_subscribers() -> None:
-    assert len(list(Report(CONFIG, START).due(OUTPUTS, ALL - SUMMARIES, never))) == 5
+    assert len(list(due(Report(CONFIG, START), OUTPUTS, ALL - SUMMARIES, never))) == 5
 
 
 def test_no_snapshot_is_taken_for_a_summary_that_is_not_due() -> None:
     report = Report(CONFIG, START)
-    list(report.due(at(later(0)), ALL, get_snapshot))
-    assert not list(report.due(at(later(0.01), estimates=()), {"state", "diagnostics"}, never))
+    list(due(report, at(later(0)), ALL, get_snapshot))
+    assert not list(due(report, at(later(0.01), estimates=()), {"state", "diagnostics"}, never))
 
 
 def test_events_are_kept_without_subscribers_and_published_with_earlier_events() -> None:
     report = Report(CONFIG, START)
     assert report.current("events", get_snapshot) is None
     many = tuple(Event("commander", f"the {n}. takes over", by="app", count=2) for n in range(25))
-    assert not list(report.due(replace(OUTPUTS, events=many, due=False), set(), get_snapshot))
-    assert not list(report.due(replace(OUTPUTS, events=()), {"events"}, get_snapshot))
+    assert not list(due(report, replace(OUTPUTS, events=many, due=False), set(), get_snapshot))
+    assert not list(due(report, replace(OUTPUTS, events=()), {"events"}, get_snapshot))
     quiet = replace(OUTPUTS, now=later(7), due=False, estimates=())
-    ((key, message),) = report.due(quiet, {"events"}, never)
+    ((key, message),) = due(report, quiet, {"events"}, never)
     assert isinstance(message, Events)
     assert (key, message.total, len(message.events)) == ("events", 26, 20)
     assert message.events[0].text == "the 6. takes over"
@@ -388,7 +388,7 @@ def test_events_are_kept_without_subscribers_and_published_with_earlier_events()
 def test_a_fault_stays_in_the_list_during_a_repeated_event() -> None:
     report, fault = Report(CONFIG, START), Event("fault", "a wheel is dead", "error")
     for second, event in enumerate([fault, *[missed(3, 10_000_000)] * 100]):
-        list(report.due(replace(OUTPUTS, events=(event,), now=later(second)), set(), get_snapshot))
+        list(due(report, replace(OUTPUTS, events=(event,), now=later(second)), set(), get_snapshot))
     message = report.current("events", never)
     assert isinstance(message, Events)
     assert [(row.name, row.count) for row in message.events] == [
@@ -399,8 +399,8 @@ def test_a_fault_stays_in_the_list_during_a_repeated_event() -> None:
 
 def test_every_sample_of_a_step_is_published_in_order() -> None:
     estimates: list[Estimate] = [replace(ESTIMATE, at=Instant(n, n)) for n in (1_000, 2_000, 3_000)]
-    messages = Report(CONFIG, START).due(
-        replace(OUTPUTS, estimates=tuple(estimates)), {"odom"}, get_snapshot
+    messages = due(
+        Report(CONFIG, START), replace(OUTPUTS, estimates=tuple(estimates)), {"odom"}, get_snapshot
     )
     stamps = [m.header.stamp.nanosec for _, m in messages if isinstance(m, Odometry)]
     assert stamps == [1_000, 2_000, 3_000]
@@ -445,7 +445,7 @@ def test_steps_a_little_early_or_late_do_not_change_the_average(hz: float) -> No
     report, count = Report(rates(odom=hz), START), 0
     for step in range(1000):
         late = (step * 7 % 11 - 5) * 1e-4  # up to half a millisecond early or late
-        count += len(list(report.due(at(later(1.0 + step / 100 + late)), {"odom"}, get_snapshot)))
+        count += len(list(due(report, at(later(1.0 + step / 100 + late)), {"odom"}, get_snapshot)))
     assert abs(count - hz * 10) <= 1
 
 
@@ -456,7 +456,7 @@ def test_steps_a_little_early_or_late_do_not_make_the_intervals_uneven(
     report, indices = Report(rates(odom=hz), START), []
     for step in range(1000):
         late = (5 - step * 7 % 11) * 1e-5  # the first step is the latest of all
-        if list(report.due(at(later(1.0 + step / 100 + late)), {"odom"}, get_snapshot)):
+        if list(due(report, at(later(1.0 + step / 100 + late)), {"odom"}, get_snapshot)):
             indices.append(step)
     assert {b - a for a, b in pairwise(indices)} == {steps}
 
@@ -468,7 +468,7 @@ def test_a_rate_above_the_sample_rate_publishes_every_sample() -> None:
 def test_odom_and_tf_are_published_together_at_a_limited_rate() -> None:
     report = Report(rates(odom=10.0), START)
     for step in range(300):
-        keys = [key for key, _ in report.due(at(later(step / 100)), {"odom", "tf"}, get_snapshot)]
+        keys = [key for key, _ in due(report, at(later(step / 100)), {"odom", "tf"}, get_snapshot)]
         assert keys in ([], ["odom", "tf"])
 
 
@@ -483,7 +483,7 @@ def test_a_change_of_a_setting_makes_no_message_due(key: str, most: int) -> None
     report, count = Report(config, START), 0
     for step in range(1000):
         report.config = config
-        count += len(list(report.due(at(later(step / 100)), {key}, get_snapshot)))
+        count += len(list(due(report, at(later(step / 100)), {key}, get_snapshot)))
     assert abs(count - 10 * most) <= 1
 
 
@@ -492,7 +492,7 @@ def test_a_new_rate_counts_from_the_last_message_on() -> None:
     for step in range(200):
         if step == 30:
             report.config = rates(odom=2.0)
-        if list(report.due(at(later(step / 100)), {"odom"}, get_snapshot)):
+        if list(due(report, at(later(step / 100)), {"odom"}, get_snapshot)):
             steps.append(step)
     assert steps[0] == 0
     assert 48 <= steps[1] <= 50  # a message may come a twentieth of its period early
@@ -501,10 +501,10 @@ def test_a_new_rate_counts_from_the_last_message_on() -> None:
 @pytest.mark.parametrize("key", sorted(SUMMARIES))
 def test_a_change_of_the_status_is_published_immediately(key: str) -> None:
     report = Report(CONFIG, START)
-    list(report.due(at(later(0)), {key}, get_snapshot))
+    list(due(report, at(later(0)), {key}, get_snapshot))
     for step in (1, 2, 3):
         changed = at(later(step / 100), status_changed=True)
-        assert [name for name, _ in report.due(changed, {key}, get_snapshot)] == [key]
+        assert [name for name, _ in due(report, changed, {key}, get_snapshot)] == [key]
 
 
 def test_after_a_change_the_next_state_comes_a_period_later() -> None:
@@ -513,7 +513,7 @@ def test_after_a_change_the_next_state_comes_a_period_later() -> None:
         step
         for step in range(60)
         if list(
-            report.due(at(later(step / 100), status_changed=step == 25), {"state"}, get_snapshot)
+            due(report, at(later(step / 100), status_changed=step == 25), {"state"}, get_snapshot)
         )
     ]
     after = [step for step in steps if step > 25]
@@ -523,9 +523,9 @@ def test_after_a_change_the_next_state_comes_a_period_later() -> None:
 
 def test_no_burst_of_messages_follows_a_pause() -> None:
     report = Report(CONFIG, START)
-    list(report.due(at(later(0)), {"state"}, get_snapshot))
+    list(due(report, at(later(0)), {"state"}, get_snapshot))
     steps = [
-        s for s in range(500, 520) if list(report.due(at(later(s / 100)), {"state"}, get_snapshot))
+        s for s in range(500, 520) if list(due(report, at(later(s / 100)), {"state"}, get_snapshot))
     ]
     assert steps[0] == 500
     assert len(steps) <= 3
@@ -547,14 +547,14 @@ def test_the_static_transforms_are_available_before_the_first_step() -> None:
 @each("key", sorted(ALL - {"tf_static"}))
 def test_the_current_value_equals_the_published_message_even_without_subscribers(key: str) -> None:
     report = Report(CONFIG, START)
-    list(report.due(OUTPUTS, set(), never))
+    list(due(report, OUTPUTS, set(), never))
     assert report.current(key, get_snapshot) == published()[key]
 
 
 def test_the_last_sample_stays_the_current_value_without_new_feedback() -> None:
     report = Report(CONFIG, START)
-    list(report.due(OUTPUTS, set(), never))
-    report.due(at(later(9), estimates=()), set(), never)
+    list(due(report, OUTPUTS, set(), never))
+    due(report, at(later(9), estimates=()), set(), never)
     odom: Message | None = report.current("odom", get_snapshot)
     assert odom == published()["odom"]
 
@@ -562,7 +562,7 @@ def test_the_last_sample_stays_the_current_value_without_new_feedback() -> None:
 @each("key", ["", "alive", "cmd/app", "info", "nonsense"])
 def test_a_topic_that_is_not_published_has_no_current_value(key: str) -> None:
     report = Report(CONFIG, START)
-    report.due(OUTPUTS, ALL, get_snapshot)
+    due(report, OUTPUTS, ALL, get_snapshot)
     assert report.current(key, never) is None
 
 
@@ -571,7 +571,7 @@ def test_state_at_10_hz_has_even_intervals_despite_jitter() -> None:
     steps: list[int] = []
     for step in range(3000):
         late = rnd.uniform(0, 1e-4)
-        if list(report.due(at(later(1.0 + step / 100 + late)), {"state"}, get_snapshot)):
+        if list(due(report, at(later(1.0 + step / 100 + late)), {"state"}, get_snapshot)):
             steps.append(step)
     assert {b - a for a, b in pairwise(steps[2:])} == {10}
 
@@ -580,7 +580,9 @@ def test_state_at_10_hz_has_even_intervals_despite_jitter() -> None:
 
 
 def with_battery(battery: BatteryStatus | None) -> dict[str, Any]:
-    return dict(Report(CONFIG, START).due(OUTPUTS, ALL, lambda: replace(SNAPSHOT, battery=battery)))
+    return dict(
+        due(Report(CONFIG, START), OUTPUTS, ALL, lambda: replace(SNAPSHOT, battery=battery))
+    )
 
 
 def test_the_battery_message_has_the_time_and_values_of_the_boards_report() -> None:
@@ -622,7 +624,7 @@ def test_the_battery_is_published_once_per_second() -> None:
 
 def with_gyro(status: GyroStatus) -> tuple[RobotState, list[DiagnosticStatus]]:
     report = Report(replace(CONFIG, drive=DriveConfig(wheel_separation_multiplier=1.5)), START)
-    list(report.due(OUTPUTS, set(), never))
+    list(due(report, OUTPUTS, set(), never))
 
     def seen() -> Snapshot:
         return replace(SNAPSHOT, gyro=status)
@@ -665,7 +667,7 @@ def test_the_comparison_of_front_and_rear_wheels_is_reported() -> None:
     doubt = WheelsStatus("rear_left is left out", ("rear_left",), ("right",), (0.01, -0.02), slow)
     for status, level in ((WheelsStatus(), 0), (WheelsStatus(slow=slow), 1), (doubt, 1)):
         report, snapshot = Report(CONFIG, START), replace(SNAPSHOT, doubt=status)
-        list(report.due(OUTPUTS, set(), never))
+        list(due(report, OUTPUTS, set(), never))
         provider = partial(replace, snapshot)
         state, array = report.current("state", provider), report.current("diagnostics", provider)
         assert isinstance(state, RobotState)
@@ -704,7 +706,7 @@ DAY_NS = 86400 * 10**9
 def test_a_certificate_that_expires_soon_is_reported(days: int, level: int, words: str) -> None:
     config = replace(CONFIG, bus=BusConfig(tls="/etc/acsard/tls"))
     made = Report(config, START, {"": OUTPUTS.now.wall_ns + days * DAY_NS})
-    made.due(OUTPUTS, set(), lambda: SNAPSHOT)
+    due(made, OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)
     assert state.certificate_expiry.startswith(words)
@@ -717,7 +719,7 @@ def test_a_certificate_that_expires_soon_is_reported(days: int, level: int, word
 
 def test_an_unreadable_certificate_is_reported_with_the_remedy() -> None:
     made = Report(replace(CONFIG, bus=BusConfig(tls="/etc/acsard/tls")), START)
-    made.due(OUTPUTS, set(), lambda: SNAPSHOT)
+    due(made, OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)
     assert "`acsard doctor`" in state.certificate_expiry
@@ -726,7 +728,7 @@ def test_an_unreadable_certificate_is_reported_with_the_remedy() -> None:
 
 def test_without_tls_the_state_has_no_certificate_fields() -> None:
     made = Report(CONFIG, START, {"": 0})
-    made.due(OUTPUTS, set(), lambda: SNAPSHOT)
+    due(made, OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)
     assert (state.certificate_expiry, state.certificate_days) == ("", None)

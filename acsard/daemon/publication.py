@@ -1,0 +1,172 @@
+"""Publishes what the robot reports, answers queries, and writes the events to the log.
+
+The answer to a call waits until the latches would survive a kill of the process.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+from msgspec.structs import replace
+
+from acsard.core.config.live import Difference
+from acsard.core.config.settings import Config
+from acsard.core.formatting import listed
+from acsard.core.incoming.bus_interface import Bus
+from acsard.core.incoming.queries import Queries, Query, refused
+from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.report import Report
+from acsard.core.messages.schema import Info, Message
+from acsard.core.robot import Robot
+from acsard.core.values import (
+    Answer,
+    Event,
+    Instant,
+    News,
+    Recording,
+    Refusal,
+    Request,
+    Snapshot,
+    Twist,
+)
+from acsard.daemon.intake import Intake
+from acsard.daemon.latch_rules import MAX_ANSWER_DELAY_NS, Handover
+from acsard.daemon.latencies import Stopwatch
+from acsard.recording.recorded_steps import StepRecorder
+
+MAX_NAMED = 3  # settings in `settings_differ`
+
+# Added to an answer while a slow disk lacks the newest latches.
+NOT_STORED = (
+    "the new state is not on the disk yet; if the daemon restarts before the disk has this state, "
+    "it may lose a stop"
+)
+
+
+class Publication:
+    def __init__(
+        self,
+        robot: Robot,
+        bus: Bus,
+        info: Info,
+        start: Instant,
+        log: Callable[[Event], None],
+        handover: Handover,
+        recorder: StepRecorder | None = None,
+        events: list[Event] | None = None,
+        certificate_ends: dict[str, int] | None = None,
+    ) -> None:
+        # `events` collects those of other parts.
+        config = robot.config
+        self.report = Report(config, start, certificate_ends, info.version)
+        self.intake = Intake(
+            config, bus, [] if events is None else events, self.report.certificate_ends
+        )
+        self.stopwatch = Stopwatch()
+        # Returns the newest message of a key of another part, such as the simulator.
+        self.beside: Callable[[str], Message | None] = lambda key: None
+        # Gets each new configuration, after the events of its wake-up are in the log.
+        self.adopted: Callable[[Config], None] = lambda config: None
+        self._robot, self._bus, self._log, self._handover = robot, bus, log, handover
+        self._recorder = recorder
+        self._queries = Queries(config, info)
+        # Settings that differ from the start, and their values then.
+        self._differing: dict[str, Difference] = {}
+        # Answers, with the time at which each was queued, until the latches are in their file.
+        self._answers: deque[tuple[int, Answer]] = deque()
+        self._now: Instant = start  # of the present wake-up
+        bus.feedback_sent = self.stopwatch.figures["feedback_to_bus"].add
+
+    def begin(self, now: Instant) -> None:
+        """Begin a wake-up, before its queries are served."""
+        self._now = now
+
+    def publish(self, news: News, applied: Twist | None) -> None:
+        """Publish the messages that are due after this wake-up, and log its events.
+
+        `applied` is the twist in a line that was due.
+        """
+        bus, report, now, config = self._bus, self.report, self._now, self._robot.config
+        is_new = config is not report.config
+        if is_new:
+            self._use(config, news.answers)
+        wanted = bus.wanted_keys
+        for estimate in news.estimates:
+            for topic in report.feedback_due(estimate, wanted):
+                bus.publish_feedback(topic, estimate)
+            self.stopwatch.feedback(estimate)
+        for key, message in report.others_due(now, news, applied, wanted, self._snapshot):
+            bus.publish(key, message)
+        for answer in news.answers:
+            self._answers.append((now.mono_ns, answer))
+        if self._answers:
+            self.answer()
+        for event in news.events:
+            self._log(event)
+        if is_new:
+            self.adopted(config)
+
+    def answer(self, *, last: bool = False) -> None:
+        """Send the answers whose latches are stored, or that wait for too long, or all (`last`)."""
+        is_stored, before_ns = self._handover.is_stored, self._now.mono_ns - MAX_ANSWER_DELAY_NS
+        trouble = "" if is_stored else self._handover.trouble or NOT_STORED
+        while self._answers and (is_stored or last or self._answers[0][0] < before_ns):
+            _, answer = self._answers.popleft()
+            if trouble and answer.success:
+                answer = replace(answer, message=f"{answer.message}; {trouble}")
+            reply = self._queries.answered(answer, self._now.wall_ns)
+            if reply is not None:
+                self._bus.reply(reply)
+                self._bus.retire(reply.ticket)
+
+    def flush(self) -> None:
+        """Let the threads of the bus send."""
+        self._bus.flush()
+
+    def serve(self, query: Query, refusals: list[Refusal]) -> Request | None:
+        """Answer a query, or return the request to the robot that it contains."""
+        wall_ns, status = self._now.wall_ns, self._robot.status
+        try:
+            served = self._queries.serve(query, self.current, wall_ns, status)
+        except DecodeError as error:
+            refusals.append(Refusal(error.reason, f"{query.topic}: {error}"))
+            reply = refused(query, str(error), wall_ns)
+            served = [] if reply is None else [reply]
+        if isinstance(served, Request):
+            return served
+        for reply in served:
+            self._bus.reply(reply)
+        self._bus.retire(query.ticket)
+        return None
+
+    def current(self, key: str) -> Message | None:
+        """Return the present message of a key, or None."""
+        return self.report.current(key, self._snapshot) or self.beside(key)
+
+    def counters(self) -> dict[str, int]:
+        return self._snapshot().counters
+
+    def _snapshot(self) -> Snapshot:
+        now_ns = self._now.mono_ns
+        shot, intake, recorder = self._robot.snapshot(now_ns), self.intake, self._recorder
+        named = [one.describe(key) for key, one in self._differing.items()]
+        return replace(
+            shot,
+            counters=shot.counters | intake.counters,
+            figures=self.stopwatch.measured(now_ns),
+            missed_last_minute=self.stopwatch.missed(now_ns),
+            routers=intake.routers.status,
+            latch_file=self._handover.trouble,
+            recording=Recording() if recorder is None else recorder.status,
+            settings_differ=listed(named, MAX_NAMED),
+        )
+
+    def _use(self, config: Config, answers: tuple[Answer, ...]) -> None:
+        self._queries.config = self.report.config = config
+        for answer in answers:
+            for key, (old, new) in answer.changes.items():
+                earlier = self._differing.pop(key, None)
+                ours = old if earlier is None else earlier.ours
+                if new != ours:
+                    self._differing[key] = Difference(new, ours)
