@@ -63,6 +63,8 @@ class Pulse:
             self._alarm.close()
 
     def __call__(self, now: Instant) -> None:
+        if self._step is None:
+            return  # during a step, which must not take the next period's end, or after the last
         # After a stall, the periods that have ended meanwhile count before this event.
         self._run(now, NO_PERIOD if now.mono_ns < self._next_ns else self._ended(now))
 

@@ -195,3 +195,13 @@ async def test_an_exception_of_a_step_ends_the_run_and_a_later_event_runs_no_ste
 async def test_the_run_ends_when_a_step_says_so() -> None:
     async with asyncio.timeout(5.0):
         await Pulse().run(PERIOD_NS, lambda now, period: False, Pace(0, 1))
+
+
+async def test_an_event_after_the_last_period_runs_no_step() -> None:
+    steps = Steps()
+    async with steps.running(0.0, PERIOD_NS) as pulse:
+        pass
+    count = len(steps.all)
+    time.sleep(2 * PERIOD_NS / NS_PER_S)  # such as for a port that closes late
+    pulse(clock.now())
+    assert len(steps.all) == count
