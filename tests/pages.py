@@ -506,11 +506,10 @@ COMMANDS: dict[str, How] = {
     ),
     "sudo acsard recording": TRANSCRIPT,
     "sudo acsard recording --from yesterday": Elsewhere(
-        LOG, "test_the_list_can_be_restricted_to_a_range_of_time"
+        LOG, "test_the_list_has_a_row_for_each_recording_of_the_range"
     ),
     "sudo acsard recording show --from 14:05": Elsewhere(
-        "tests/unit/cli/test_recording_times.py",
-        "test_a_time_of_day_is_looked_up_before_now_in_the_ring",
+        LOG, "test_the_newest_recording_or_all_of_a_range_are_shown"
     ),
     "sudo acsard recording replay": TRANSCRIPT,
     "sudo acsard recording export 12 drive.mcap": Elsewhere(

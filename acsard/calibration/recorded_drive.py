@@ -11,8 +11,7 @@ from acsard.calibration.solve import Calibration, calibrate
 from acsard.core.config.settings import Config
 from acsard.host.errors import MendableError, RecordingError
 from acsard.recording.export import calibration_csv
-from acsard.recording.mcap_file import Recording
-from acsard.recording.mcap_records import MAGIC
+from acsard.recording.file import MAGIC, Recording
 
 MAX_FILE_BYTES = 1 << 30  # the file is read into memory
 
@@ -44,10 +43,6 @@ def calibrated(log: Path, config: Config, tape: Tape | None) -> Calibration:
 
 def _measured(log: Path) -> bytes:
     try:
-        recording = Recording(log)
-    except RecordingError as error:
-        raise LogError(f"{error}; {CSV_ADVICE}") from None
-    try:
-        return calibration_csv(recording)
+        return calibration_csv(Recording([log]))
     except RecordingError as error:
         raise LogError(str(error)) from None

@@ -69,7 +69,7 @@ _NEVER = Instant(0, 0)  # in `Row.inputs`: the row has the time itself
 
 _MAX_NS = 1 << 62  # the year 2116
 
-_ALWAYS = (-(1 << 63), 1 << 64)
+ALWAYS = (-(1 << 63), 1 << 64)
 
 # Of a file, read to find out when it begins: a head has 40 000, uncompressed.
 _BEGINNING = 1 << 18
@@ -239,6 +239,12 @@ def number_of(path: Path) -> int | None:
     return int(head) if is_number and rest.endswith(SUFFIX) else None
 
 
+def first_head(path: Path) -> Head | None:
+    """Return the head at the beginning of a file, or None if it is damaged. Raises `OSError`."""
+    with path.open("rb") as file:
+        return _head(file.read(_BEGINNING), 0)
+
+
 class Recording:
     """The records of files, in order, from one wall-clock time to another.
 
@@ -247,7 +253,7 @@ class Recording:
     """
 
     def __init__(
-        self, paths: Iterable[Path], begin_ns: WallNs = _ALWAYS[0], end_ns: WallNs = _ALWAYS[1]
+        self, paths: Iterable[Path], begin_ns: WallNs = ALWAYS[0], end_ns: WallNs = ALWAYS[1]
     ) -> None:
         self.paths = list(paths)
         self.begin_ns, self.end_ns = begin_ns, end_ns
@@ -261,7 +267,7 @@ class Recording:
         """Yield each record. Raises `RecordingError` for a file that is not a recording."""
         self.damage = []
         for path in self.paths:
-            for record in _records(path, self.begin_ns, self.end_ns):
+            for record in self._records(path):
                 match record:
                     case Damage():
                         self.damage.append(record)
@@ -269,6 +275,15 @@ class Recording:
                         yield from steps_of(record)
                     case _:
                         yield record
+
+    def _records(self, path: Path) -> Iterator[Record | Damage]:
+        try:
+            yield from _records(path, self.begin_ns, self.end_ns)
+        except RecordingError as error:
+            # One bad file must not hide the others.
+            if len(self.paths) == 1:
+                raise
+            yield Damage(path, 0, path.stat().st_size if path.exists() else 0, str(error))
 
     def steps(self) -> Iterator[RecordedStep]:
         """Yield the steps in the time. Raises `RecordingError` as `records`."""
@@ -289,7 +304,7 @@ _DAMAGE = (zstandard.ZstdError, FrameError, *MSGSPEC_ERRORS)
 
 
 def _records(path: Path, begin_ns: WallNs, end_ns: WallNs) -> Iterator[Record | Damage]:
-    always = (begin_ns, end_ns) == _ALWAYS
+    always = (begin_ns, end_ns) == ALWAYS
     data, at = _content(path, begin_ns, end_ns), 0
     if not MAGIC.startswith(data[:4]) and _next_frame(data, 0) is None:
         raise RecordingError(f"{path} is not a recording of acsard, or its beginning is missing")

@@ -25,12 +25,12 @@ from acsard.core.values import Ns, WallNs
 from acsard.host.errors import RecordingError
 from acsard.recording.end_record import read_end
 from acsard.recording.mcap_file import Recording, event_of
+from acsard.recording.mcap_timeline import TimelineEntry, entry_of
 from acsard.recording.recorded_steps import RecordedStep, UnfinishedError, unfinished
 from acsard.recording.replay import Comparison, Replay
 from acsard.recording.rows import BatchError, decode
 from acsard.recording.state import Checkpoint, State, StateError, adopt, checkpoint, short, thaw
 from acsard.recording.stepped_robot import SteppedRobot
-from acsard.recording.timeline import TimelineEntry, entry_of
 from acsard.recording.unpickling import MAX_BYTES
 
 Progress = Callable[[int], None]  # shows the progress, by the present wall-clock time, ns

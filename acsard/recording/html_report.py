@@ -144,9 +144,9 @@ class Span(Struct):
 
 
 class Drawing:
-    """What a report draws of the messages."""
+    """What a report draws of messages."""
 
-    def __init__(self) -> None:
+    def __init__(self, messages: Iterable[Published]) -> None:
         self.path, self.wheels, self.counters = Rows(), Rows(), Rows(3 * COUNTED_S)
         self.speeds: dict[str, Rows] = defaultdict(Rows)  # m/s and rad/s, by the name of the curve
         self.bands: dict[str, list[Span]] = defaultdict(list)
@@ -155,8 +155,10 @@ class Drawing:
         self.begin = self.end = 0.0  # s since 1970
         self.metres = self.driving_s = self.fastest = 0.0
         self._counted: tuple[float, Row] = (0.0, ())
+        for message in messages:
+            self._add(message)
 
-    def add(self, item: Published) -> None:
+    def _add(self, item: Published) -> None:
         t, message = item.wall_ns / NS_PER_S, item.message
         self.begin, self.end = self.begin or t, t
         match message:
@@ -222,11 +224,8 @@ def _bands(state: RobotState) -> Iterator[tuple[str, str, str, str]]:
         yield source.name, kind, source.wait, source.waits_for
 
 
-def report(messages: Iterable[Published], title: str, notes: Sequence[str]) -> str:
+def page(drawing: Drawing, title: str, notes: Sequence[str]) -> str:
     """Return the HTML file; `title` names the robot, and the notes what is missing."""
-    drawing = Drawing()
-    for message in messages:
-        drawing.add(message)
     figures = [_path(drawing), _diagrams(drawing)]
     pictures = msgspec.json.encode(figures).decode().replace("<", "\\u003c")
     library = PLOTLY.read_text(encoding="utf-8")

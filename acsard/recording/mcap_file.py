@@ -48,10 +48,10 @@ from acsard.recording.end_record import (
     ending_text,
 )
 from acsard.recording.mcap_records import GROWING_HEAD, MAGIC, GrowingChunk, Message, encoded, walk
+from acsard.recording.mcap_timeline import INCIDENT_WORDS, TimelineEntry, is_serious, summary
 from acsard.recording.recorded_steps import Unfinished, UnfinishedError, unfinished
 from acsard.recording.rows import FORMAT, Batch, Row, first_of
 from acsard.recording.state import Checkpoint
-from acsard.recording.timeline import INCIDENT_WORDS, TimelineEntry, is_serious, summary
 
 # Longest time in an MCAP chunk: longer ones save little, and damage to one would destroy more.
 CHUNK_NS = 10 * NS_PER_S

@@ -21,7 +21,7 @@ from acsard.core.config.parsing import ConfigError, parse_recorded
 from acsard.core.config.settings import Config
 from acsard.core.guard import Guard, Memory
 from acsard.core.robot import Robot
-from acsard.core.values import Event, Instant, Outputs, Trip
+from acsard.core.values import Event, Inputs, Instant, Outputs, Trip
 from acsard.host.errors import RecordingError
 from acsard.recording.file import Failure, Head, Recording
 from acsard.recording.recorded_steps import (
@@ -276,18 +276,29 @@ class Playback:
         `Recording.contains` tells them apart.
         """
         for record in self._recording.records():
-            match record:
-                case Head():
-                    self._begin(record)
-                case Failure():
-                    self.failure = record
-                case RecordedStep(number=number) if number == self._next:
-                    assert self.replay is not None
-                    with self.errors():
-                        self.replay.step(record)
-                    self._next, self._last = number + 1, record.inputs.now
-                    assert self.replay.outputs is not None
-                    yield record, self.replay.outputs
+            if (replayed := self.take(record)) is not None:
+                yield replayed
+
+    def take(self, record: Head | RecordedStep | Failure) -> tuple[RecordedStep, Outputs] | None:
+        """Replay the next record; return a step with its outputs, or None."""
+        match record:
+            case Head():
+                self._begin(record)
+            case Failure():
+                self.failure = record
+            case RecordedStep(number=number) if number == self._next:
+                assert self.replay is not None
+                with self.errors():
+                    self.replay.step(record)
+                self._next, self._last = number + 1, record.inputs.now
+                assert self.replay.outputs is not None
+                return record, self.replay.outputs
+        return None
+
+    def tell(self, inputs: Inputs) -> None:
+        """Tell the robot what became of its last line, by the inputs of the next step."""
+        if self.replay is not None:
+            self.replay.stepped.tell(inputs)
 
     def _begin(self, head: Head) -> None:
         before, self.head = self.head, head

@@ -23,12 +23,12 @@ from acsard.host.wait_timer import WaitTimer
 from acsard.recording.mcap_directory import RecordingDirectory, Run, disk_has_room, mark_cut
 from acsard.recording.mcap_file import About, RecordingWriter
 from acsard.recording.mcap_records import MAX_DATA_BYTES
+from acsard.recording.mcap_timeline import entry_of
 from acsard.recording.recorded_steps import FinishedStep, StateBeforeStep, split_at_states
 from acsard.recording.recovery import DISK_FULL
 from acsard.recording.retention import IncidentWindow
 from acsard.recording.rows import encode
 from acsard.recording.state import Checkpoint
-from acsard.recording.timeline import entry_of
 
 RETRY_ROUNDS = 5  # about 1 s each, after an error of the disk
 

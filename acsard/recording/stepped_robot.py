@@ -79,14 +79,18 @@ class SteppedRobot:
     def step(self, inputs: Inputs) -> Outputs:
         """Report the last line as sent or superseded, and return the outputs of the next step."""
         robot, now = self.robot, inputs.now
-        if self._line is not None:
-            line = None if inputs.superseded else self._line
-            robot.sent(self._made_ns + inputs.late_ns, line, inputs.guard_trip)
+        self.tell(inputs)
         news = robot.hear(now, heard_of(inputs))
         due = inputs.tick or (inputs.at_once and news.urgent)
         self._line = robot.drive(now) if due else None
         self._made_ns = now.mono_ns
         return outputs_of(now, robot, news, due, self._line)
+
+    def tell(self, inputs: Inputs) -> None:
+        """Report the last line as sent or superseded, once, by the inputs of the next step."""
+        if self._line is not None:
+            line, self._line = None if inputs.superseded else self._line, None
+            self.robot.sent(self._made_ns + inputs.late_ns, line, inputs.guard_trip)
 
 
 def heard_of(inputs: Inputs) -> Heard:

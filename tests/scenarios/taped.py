@@ -20,11 +20,11 @@ from acsard.core.simulator.faults import Fault
 from acsard.core.values import Inputs, Outputs, Recording
 from acsard.recording.file import FrameWriter, Head, encode_steps
 from acsard.recording.mcap_file import About, RecordingWriter
+from acsard.recording.mcap_timeline import entry_of
 from acsard.recording.recorded_steps import FinishedStep, RecordedStep
 from acsard.recording.replay import Replay
 from acsard.recording.rows import decode, encode
 from acsard.recording.state import Checkpoint, freeze, thaw
-from acsard.recording.timeline import entry_of
 from tests.scenarios.world import START, World
 
 BATCH = 200
@@ -39,16 +39,8 @@ WITH_ARGUMENTS: dict[str, tuple[float, ...]] = {
 """An instance of every fault that needs arguments."""
 
 
-ADDED = {"start", "end", "drive", "reason", "waits", "clock", "continues", "gap", "cut", "board"}
+ADDED = {"start", "continues", "reason", "waits", "clock", "gap", "cut", "failure"}
 """Names of the lines of the log that the export adds to the events of the robot."""
-
-LOSSES = {"link_down", "link_booting", "link_stale", "link_late", "link_heard"}
-"""Events of a lost link. The timeline gives some of them another one of these names."""
-
-
-def plain(name: str) -> str:
-    """Return the name of an event; all losses of the link get the same name."""
-    return "link" if name in LOSSES else name
 
 
 class Tape:

@@ -18,8 +18,8 @@ from acsard.core.values import Event
 from acsard.host.errors import Exit
 from acsard.recording.end_record import read_end
 from acsard.recording.mcap_file import Recording, RecordingWriter, Topic
+from acsard.recording.mcap_timeline import TimelineEntry
 from acsard.recording.rows import NO_OCCASIONAL_FIELDS, Batch, OccasionalFields, Row
-from acsard.recording.timeline import TimelineEntry
 from tests.each import each, more
 from tests.scenarios.taped import happenings, recorded_world
 

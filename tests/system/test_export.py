@@ -13,12 +13,12 @@ import pytest
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tests.scenarios.taped import ADDED, plain
+from tests.scenarios.taped import ADDED
 from tests.system.harness import ROOT, Bus, Daemon, acsard, finish, until
 
 ROS = ("odom", "tf", "joint_states", "cmd_vel_out")
 
-RECORDED = ROOT / "tests" / "recordings" / "quiet.mcap"
+RECORDED = ROOT / "tests" / "recordings" / "quiet.rec.zst"
 
 
 class ExportedFile(NamedTuple):
@@ -142,7 +142,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Any:
     live.displaced = max(
         msgspec.msgpack.decode(raw)["counters"].get("bus_dropped", 0) for raw in live.data["state"]
     )
-    (path,) = (where / "record").glob("*.mcap")
+    (path,) = (where / "record").glob("*.rec.zst")
     ended = finish(acsard("recording", "export", str(path), str(where / "bag"), "--rosbag2"), where)
     assert ended.code == 0, ended
     return live, static, bag(where / "bag")
@@ -173,9 +173,9 @@ def test_every_published_event_is_in_the_exported_log(both: Any) -> None:
     live, _, export = both
     lines = [export.decode("/log", raw) for raw in export.data["/log"]]
     lines = [entry for entry in lines if entry.name not in ADDED]
-    written = [(entry.stamp.sec, entry.stamp.nanosec, plain(entry.name)) for entry in lines]
+    written = [(entry.stamp.sec, entry.stamp.nanosec, entry.name) for entry in lines]
     last = msgspec.msgpack.decode(live.data["events"][-1])
-    live_events = [(*entry["stamp"].values(), plain(entry["name"])) for entry in last["events"]]
+    live_events = [(*entry["stamp"].values(), entry["name"]) for entry in last["events"]]
     assert "stop" in {name for *_, name in live_events}
     indexes = places(live_events, written, "log")
     # Events of the same name that follow each other share a row in `events`.

@@ -13,12 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from acsard.recording.html_report import report
 from tests import pictures
 from tests.pictures import LOOKS
 from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, browsing
 from tests.system.harness import until
-from tests.unit.recording.test_html_report import drive_of_two, evil
+from tests.unit.recording.test_html_report import drive_of_two, evil, report
 
 BROWSER = shutil.which("chromium")
 

@@ -70,7 +70,6 @@ def test_a_verb_may_end_with_any_code(code: Exit) -> None:
     [
         ("recording export 1 --csv cal.csv", "recording export 1 cal.csv --csv"),
         ("recording report 1 --force x.html", "recording report 1 x.html --force"),
-        ("recording recover 1 --force x.mcap", "recording recover 1 x.mcap --force"),
         ("call set_pose --json 1 -2 3", "call set_pose 1 -2 3 --json"),
         ("call set_pose 1 --id r1 -2 --json 3", "call set_pose 1 -2 3 --id r1 --json"),
         ("set limits.linear_speed --json 0.8", "set limits.linear_speed 0.8 --json"),

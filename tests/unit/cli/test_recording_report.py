@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import re
-import shutil
 from functools import lru_cache
 from pathlib import Path
 
 import pytest
 
-from acsard.recording.file_replay import steps
-from acsard.recording.mcap_file import Recording
+from acsard.recording.file import Recording
 from acsard.recording.recorded_steps import US_PER_S
 from tests.system.typed import typed
 from tests.unit.recording.test_html_report import traces
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
-QUIET = RECORDINGS / "quiet.mcap"
+QUIET = RECORDINGS / "quiet.rec.zst"
 
 
 def report(*words: object) -> tuple[int, str, str]:
@@ -27,7 +25,7 @@ def report(*words: object) -> tuple[int, str, str]:
 @lru_cache
 def ends_at() -> tuple[float, float]:
     """Return the robot's last recorded position, m."""
-    poses = [pose for step in steps(Recording(QUIET)) for pose in step.recorded.poses]
+    poses = [pose for step in Recording([QUIET]).steps() for pose in step.recorded.poses]
     return poses[-1][0] / US_PER_S, poses[-1][1] / US_PER_S
 
 
@@ -50,7 +48,7 @@ def test_the_numbers_of_the_file_are_those_of_the_recording(
 def test_an_old_report_is_replaced_only_by_a_complete_new_one(tmp_path: Path) -> None:
     new = tmp_path / "here.html"
     new.write_text("mine")
-    assert report(QUIET, new, "--force", "--from", "9999")[0] == 1
+    assert report(QUIET, new, "--force", "--from", "2000-01-01", "--to", "+1s")[0] == 1
     assert new.read_text() == "mine"
     before = new.stat().st_ino
     assert report(QUIET, new, "--force")[0] == 0
@@ -59,14 +57,14 @@ def test_an_old_report_is_replaced_only_by_a_complete_new_one(tmp_path: Path) ->
     assert [*tmp_path.iterdir()] == [new]
 
 
-def test_a_report_of_a_range_says_that_the_recording_is_truncated(tmp_path: Path) -> None:
-    cut, new = tmp_path / "cut.mcap", tmp_path / "cut.html"
-    shutil.copy(QUIET, cut)
-    cut.write_bytes(cut.read_bytes()[:-4000])
-    code, _, err = report(cut, new, "--from", "1", "--to", "2")
+def test_a_damaged_place_is_left_out_and_named(tmp_path: Path) -> None:
+    bad, new = tmp_path / "bad.rec.zst", tmp_path / "bad.html"
+    data = bytearray(QUIET.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    bad.write_bytes(data)
+    code, _, err = report(bad, new)
     assert code == 0
-    text = new.read_text(encoding="utf-8")
-    assert "no end: it was cut" in err
-    assert re.search(r'<p class="note">.*no end: it was cut', text)
-    times = traces(text, "measured")[0]["x"]
-    assert times[-1] - times[0] == pytest.approx(1000, abs=30)
+    assert "bad.rec.zst: bytes " in err
+    assert re.search(
+        r'<p class="note">bad.rec.zst: bytes .* cannot be read', new.read_text(encoding="utf-8")
+    )

@@ -9,6 +9,7 @@ from their commands, run `pytest --approve tests/unit/cli/test_transcripts.py`, 
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import subprocess
@@ -23,7 +24,7 @@ from acsard.core.messages.signature import Signature
 from acsard.core.values import NS_PER_S, Received
 from acsard.host import config_file
 from acsard.machine.authority import Authority
-from tests.scenarios.taped import Tape, chunks, recorded_world
+from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import World
 from tests.system.typed import typed
 from tests.unit.calibration.bags import write_bag
@@ -45,7 +46,7 @@ VARYING = (
 
 
 def recordings(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make two recordings, of which the second is cut, and one file that is no recording."""
+    """Make two recordings, of which the second is cut and damaged, and one that is none."""
     (where / "ring").mkdir()
     for number, seconds in ((1, 2.0), (2, 4.0)):
         tape = Tape(every=200)
@@ -53,11 +54,14 @@ def recordings(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         world.drive(0.5, seconds=seconds)
         world.call("stop")
         world.run(0.5)
-        tape.write(where / f"ring/00000{number}-20270115T080000Z.mcap", Config())
-    whole = where / "ring/000002-20270115T080000Z.mcap"
-    data = whole.read_bytes()
-    whole.write_bytes(data[: chunks(data)[2][1]])
-    whole.rename(f"{whole}.part")
+        tape.save(where / f"ring/00000{number}-20270115T080000Z.rec.zst")
+    whole = where / "ring/000002-20270115T080000Z.rec.zst"
+    data = bytearray(whole.read_bytes()[:-100])
+    data[len(data) // 2] ^= 0xFF
+    whole.write_bytes(data)
+    (where / "ring/000003-20270115T080000Z.rec.zst").write_bytes(b"no recording")
+    for path in (where / "ring").iterdir():
+        os.utime(path, (1_800_000_010, 1_800_000_010))
 
 
 def logs(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,35 +115,19 @@ def days(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     world.drive(0.5, seconds=0.5)
     world.loop.shutting_down = True
     world.run(0.1)
-    tape.write(where / "day.mcap", config)
-    tape.write(where / "evening.mcap", config, first=2000)
+    tape.save(where / "day.rec.zst", config)
+    tape.save(where / "evening.rec.zst", config, first=2000)
 
 
 def ring(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Record a drive in four files, two runs an hour apart, and a clock that is set back."""
-    for name in ("ring", "runs", "set-back"):
-        (where / name).mkdir()
-    tape, world = recorded_world(every=200)
-    world.run(0.5)
-    world.drive(0.5, seconds=2.0)
-    world.run(1.5)
-    for number in range(4):
-        end = None if number == 3 else 200 * (number + 1)
-        name = f"00000{number + 1}-20270115T080000Z.mcap"
-        tape.write(where / "ring" / name, Config(), 200 * number, end=end)
-    (where / "ring/000005-20270115T080000Z.mcap").write_bytes(b"no recording")
+    """Record two runs an hour apart, of which the first ends suddenly."""
+    (where / "runs").mkdir()
     for number in range(2):
         tape, world = recorded_world()
         world.wall_offset_ns += number * 3600 * NS_PER_S
-        world.run(1.0)
-        tape.write(where / f"runs/00000{number + 1}-20270115T080000Z.mcap", Config())
-    tape, world = recorded_world()
-    world.run(1.0)
-    world.wall_offset_ns -= 3600 * NS_PER_S
-    world.run(0.5)
-    world.call("stop")
-    world.run(0.5)
-    tape.write(where / "set-back/000001-20270115T080000Z.mcap", Config())
+        world.drive(0.5, seconds=1.0)
+        path = tape.save(where / f"runs/00000{number + 1}-20270115T080000Z.rec.zst")
+        os.utime(path, ns=(world.instant.wall_ns, world.instant.wall_ns))
 
 
 SLOW = ("mcu", "recording", "times")

@@ -10,10 +10,12 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from html.parser import HTMLParser
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -21,13 +23,12 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
 from acsard.core.messages.schema import RobotState, Time
-from acsard.core.robot import Robot
 from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG_CHANNEL
 from acsard.core.ros.shapes import LEVELS, Log, command_message
 from acsard.core.values import NS_PER_S, Twist
-from acsard.recording.html_report import MAX_EVENTS, MAX_ROWS, Rows, report
-from acsard.recording.published import Published, Publisher
-from acsard.recording.stepped_robot import SteppedRobot
+from acsard.recording.file import Recording
+from acsard.recording.html_report import MAX_EVENTS, MAX_ROWS, Drawing, Rows, page
+from acsard.recording.published import Published, published
 from tests.scenarios.taped import Tape, two_drivers
 from tests.scenarios.world import World
 
@@ -39,13 +40,12 @@ def drive_of_two() -> tuple[Published, ...]:
     """Return the messages of a drive with two sources."""
     tape = Tape()
     two_drivers(World(Config(), recorder=tape))
-    robot = SteppedRobot(Robot(Config()))
-    publisher = Publisher(robot.robot, 0)
-    return tuple(
-        message
-        for step in tape.steps()
-        for message in publisher.step(step, robot.step(step.inputs))
-    )
+    with tempfile.TemporaryDirectory() as place:
+        return tuple(published(Recording([tape.save(Path(place) / "a.rec.zst")])))
+
+
+def report(messages: Iterable[Published], title: str, notes: Sequence[str]) -> str:
+    return page(Drawing(messages), title, notes)
 
 
 def states() -> list[Published]:

@@ -5,23 +5,24 @@
 
 from __future__ import annotations
 
-import pytest
+import tempfile
+from pathlib import Path
+
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
-from acsard.core.messages.schema import Time
-from acsard.core.robot import Robot
-from acsard.recording.published import MEASURED_ROWS, Published, Publisher
-from acsard.recording.stepped_robot import SteppedRobot
-from acsard.recording.timeline import TimelineWriter
+from acsard.core.ros.shapes import Log
+from acsard.core.values import NS_PER_S
+from acsard.recording.file import Recording
+from acsard.recording.published import MEASURED_ROWS, Published, published
+from acsard.recording.timeline import Timeline
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 
 
 def published_messages(tape: Tape, config: Config) -> list[Published]:
-    robot = SteppedRobot(Robot(config))
-    publisher = Publisher(robot.robot, START.wall_ns)
-    return [m for step in tape.steps() for m in publisher.step(step, robot.step(step.inputs))]
+    with tempfile.TemporaryDirectory() as place:
+        return list(published(Recording([tape.save(Path(place) / "a.rec.zst")]), config))
 
 
 def names(published: list[Published]) -> set[str]:
@@ -83,23 +84,40 @@ def test_values_that_a_recording_lacks_are_not_published() -> None:
     assert all(state.latencies == {} and state.certificate_expiry == "" for state in states)
 
 
-@pytest.mark.slow
-def test_the_log_has_the_same_lines_as_the_timeline() -> None:
-    tape = driven()
-    timeline, steps = TimelineWriter(Config()), tape.steps()
-    entries = [entry for step in steps for entry in timeline.step(step)]
-    lines = [m for m in published_messages(tape, Config()) if m.channel.name == "log"]
-    assert [line.message.name for line in lines] == [entry.name for entry in entries]
-    assert [line.message.msg for line in lines] == [entry.sentence for entry in entries]
-    assert "start" in [line.message.name for line in lines]
+def logs(messages: list[Published]) -> list[Log]:
+    return [m.message for m in messages if isinstance(m.message, Log)]
 
 
-def test_the_lines_after_the_last_step_have_the_drive_and_the_ending() -> None:
-    tape, robot = driven(), SteppedRobot(Robot(Config()))
-    publisher = Publisher(robot.robot, START.wall_ns)
-    for step in tape.steps():
-        list(publisher.step(step, robot.step(step.inputs)))
-    drive, cut = [line.message for line in publisher.end("the disk accepted no more data")]
-    assert (drive.name, drive.msg[:13]) == ("drive", "was driving, ")
-    assert (cut.name, cut.msg, cut.level) == ("cut", "the disk accepted no more data", 30)
-    assert drive.stamp == cut.stamp == Time.from_ns(tape.taken[-1].inputs.now.wall_ns)
+def test_the_log_has_the_same_lines_as_the_timeline(tmp_path: Path) -> None:
+    recording, timeline = Recording([driven().save(tmp_path / "a.rec.zst")]), Timeline()
+    entries = [entry for record in recording.records() for entry in timeline.take(record)]
+    lines = logs(list(published(recording)))
+    assert [line.name for line in lines] == [entry.name for entry in entries]
+    assert [line.msg for line in lines] == [entry.sentence for entry in entries]
+    assert [line.stamp.to_ns() for line in lines] == [entry.wall_ns for entry in entries]
+    assert "start" in [line.name for line in lines]
+
+
+def test_two_runs_of_the_daemon_are_published_one_after_the_other(tmp_path: Path) -> None:
+    path = driven().save(tmp_path / "a.rec.zst")
+    once, twice = (list(published(Recording([path] * n))) for n in (1, 2))
+    # A restarted robot begins at the origin of `odom` again.
+    odom, both = ([m for m in run if m.channel.name == "odom"] for run in (once, twice))
+    assert both == odom * 2
+    assert [line.name for line in logs(twice)].count("start") == 2
+
+
+def test_a_part_has_the_messages_of_its_time_and_says_what_it_continues(tmp_path: Path) -> None:
+    path, begin_ns = driven().save(tmp_path / "a.rec.zst"), START.wall_ns + NS_PER_S // 2
+    part = list(published(Recording([path], begin_ns)))
+    whole = list(published(Recording([path])))
+    first, *rest = logs(part)
+    assert (first.name, first.msg) == (
+        "continues",
+        "the robot is driving (commanded by app), link up (by app)",
+    )
+    assert min(m.wall_ns for m in part) >= begin_ns - 10_000_000
+    steady = {"odom", "cmd_vel_out", "state", "joint_states"}
+    inside = [m for m in whole if m.wall_ns >= begin_ns and m.channel.name in steady]
+    assert [m for m in part if m.channel.name in steady] == inside
+    assert rest == [line for line in logs(whole) if line.stamp.to_ns() >= begin_ns]

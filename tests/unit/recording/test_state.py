@@ -23,10 +23,8 @@ from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, REST, Command, Instant
 from acsard.host.errors import RecordingError
 from acsard.recording import file_replay
-from acsard.recording.export import export
 from acsard.recording.file_replay import replay_file
 from acsard.recording.mcap_file import Recording, RecordingWriter
-from acsard.recording.published import published
 from acsard.recording.rows import encode
 from acsard.recording.state import (
     DERIVED,
@@ -38,7 +36,6 @@ from acsard.recording.state import (
     freeze,
     thaw,
 )
-from acsard.recording.time_span import WHOLE_SPAN
 from acsard.recording.unpickling import MAX_BYTES, MAX_OPCODES
 from tests.each import each
 from tests.scenarios.taped import Tape
@@ -215,8 +212,6 @@ def test_a_robot_with_a_wrong_part_is_refused_with_a_message(
     words = r"spoilt\.mcap: this version of acsard cannot read the robot state at the start of "
     with pytest.raises(RecordingError, match=words):
         replay_file(recording)
-    with pytest.raises(RecordingError, match=words):
-        drawn(recording)
 
 
 def test_a_wrong_part_of_a_state_behind_a_gap_is_reported_with_its_place(
@@ -234,8 +229,6 @@ def test_a_wrong_part_of_a_state_behind_a_gap_is_reported_with_its_place(
     words = r"cannot read the robot state before step 100 of the recording"
     with pytest.raises(RecordingError, match=words):
         replay_file(Recording(path))
-    with pytest.raises(RecordingError, match=words):
-        drawn(Recording(path))
 
 
 def replace_state(tape: Tape, state: bytes) -> Tape:
@@ -243,11 +236,6 @@ def replace_state(tape: Tape, state: bytes) -> Tape:
     other = Tape()
     other.taken, other.states = tape.taken, {100: state}
     return other
-
-
-def drawn(recording: Recording) -> None:
-    """Replay a recording as the drawing of a report does."""
-    list(published(recording, WHOLE_SPAN))
 
 
 @pytest.mark.slow
@@ -263,11 +251,6 @@ def test_a_missing_part_that_a_new_robot_lacks_too_gives_a_message(tmp_path: Pat
     )
     with pytest.raises(RecordingError, match=words):
         replay_file(recording)
-    with pytest.raises(RecordingError, match=words):
-        drawn(recording)
-    with pytest.raises(RecordingError, match=words):
-        export(recording, tmp_path / "new.mcap", "mcap")
-    assert [*tmp_path.iterdir()] == [recording.path]
 
 
 @pytest.mark.slow
@@ -296,7 +279,6 @@ def test_forged_states_after_gaps_take_time_in_proportion_to_the_file(
     writing.finish()
     (gap,) = replay_file(Recording(path)).gaps
     assert gap.skipped == 20
-    drawn(Recording(path))
     assert len(thawed) <= 2 * (MAX_BYTES + 8 * path.stat().st_size) // len(forged.data)
 
 
