@@ -16,16 +16,14 @@ from msgspec.structs import replace
 from acsard.bus.subscription import direct
 from acsard.bus.zenoh_sessions import daemon_session
 from acsard.core.config.settings import Config
-from acsard.core.incoming.bus_interface import NO_INPUT, Bus, BusInput, Waker
+from acsard.core.incoming.bus_interface import NO_INPUT, BusInput, Waker
 from acsard.core.incoming.imu import SIMULATOR_SENDER
 from acsard.core.incoming.queries import Reply
-from acsard.core.messages.frames import FeedbackTopic
 from acsard.core.messages.keys_and_roles import IMU, Topic, full_key, json_key, offered, published
-from acsard.core.messages.schema import Message
 from acsard.core.messages.signature import Signature
 from acsard.core.ros.names import gid
 from acsard.core.ros.transports import Endpoint, claims, endpoints, left_out, node_tokens
-from acsard.core.values import NS_PER_S, Estimate, Ns
+from acsard.core.values import NS_PER_S, Ns
 from acsard.daemon.bus.inbox import Inbox, Replies
 from acsard.daemon.bus.outlets import Outlets
 from acsard.daemon.bus.router_links import RouterLinks
@@ -39,8 +37,11 @@ CLOSE_TIMEOUT_S = 0.3
 TWIN_TIMEOUT_S = 0.5  # for another daemon with this robot id or these ROS names
 
 
-class ZenohBus(Bus):
-    """The robot's keys on the bus, for the duration of an `async with` block."""
+class ZenohBus:
+    """The robot's keys on the bus, for the duration of an `async with` block.
+
+    To the control loop it is a `Bus`.
+    """
 
     def __init__(self, config: Config, waker: Waker) -> None:
         # `waker` wakes the control loop for a command or a stop.
@@ -55,7 +56,10 @@ class ZenohBus(Bus):
         # only. A router, a wildcard or a client without a certificate can lock the session's tables
         # for seconds, and the first put that meets the lock would already cost periods.
         lockable = config.bus.connect or config.bus.insecure or config.access.wildcards
-        self._outlets = Outlets(self._thread_errors, direct=not lockable)
+        outlets = self._outlets = Outlets(self._thread_errors, direct=not lockable)
+        # A method of this class would be one more call for each message and wake-up.
+        self.publish, self.publish_feedback = outlets.publish, outlets.publish_feedback
+        self.flush = outlets.flush
         self._links = RouterLinks(config.bus, self._thread_errors)
         self._session: zenoh.Session
         self._entities: list[object] = []  # Zenoh undeclares an entity when nothing refers to it
@@ -77,9 +81,6 @@ class ZenohBus(Bus):
         dropped, stuck = self._outlets.losses(clock.mono_ns())
         return replace(batch, dropped=dropped, stuck=stuck) if dropped or stuck else batch
 
-    def publish(self, key: str, message: Message) -> None:
-        self._outlets.publish(key, message)
-
     @property
     def feedback_sent(self) -> Callable[[Ns], object]:
         return self._outlets.feedback_sent
@@ -87,12 +88,6 @@ class ZenohBus(Bus):
     @feedback_sent.setter
     def feedback_sent(self, record: Callable[[Ns], object]) -> None:
         self._outlets.feedback_sent = record
-
-    def publish_feedback(self, topic: FeedbackTopic, estimate: Estimate) -> None:
-        self._outlets.publish_feedback(topic, estimate)
-
-    def flush(self) -> None:
-        self._outlets.flush()
 
     def reply(self, reply: Reply) -> None:
         self._replies.send(reply)
