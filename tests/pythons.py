@@ -34,7 +34,7 @@ SECONDS = 600.0
 PLAIN = Config()
 FULL = replace(
     PLAIN,
-    mcu=replace(PLAIN.mcu, link_check="auto", encoder_counts=3200),
+    mcu=replace(PLAIN.mcu, link_check="on", encoder_counts=3200),
     odometry=replace(PLAIN.odometry, gyro=True),
 )
 

@@ -150,13 +150,13 @@ def check(board: Board) -> Finding:
     if not any(reply.reading for reply in _answers(board, board.comma)):
         board.sampled = False
         board.sealed = bool(_answers(board, board.comma))
-    if not board.sealed and wanted == "require":
-        return outcomes.find("checked link: required", {"mcu.link_check": "auto"})
+    if not board.sealed and wanted == "on":
+        return outcomes.find("checked link: missing", {"mcu.link_check": "off"})
     if not board.sealed:
         return outcomes.find("checked link: plain")
-    outcome, use = ("off", "auto") if wanted == "off" else ("in use", wanted)
+    outcome = "off" if wanted == "off" else "in use"
     figure = "checked, with samples" if board.sampled else "checked"
-    return outcomes.find(f"checked link: {outcome}", {"mcu.link_check": use}, figure=figure)
+    return outcomes.find(f"checked link: {outcome}", {"mcu.link_check": "on"}, figure=figure)
 
 
 def rate(board: Board) -> Finding:

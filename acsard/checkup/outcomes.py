@@ -91,9 +91,9 @@ PASS checked link: off | {figure}
     the firmware supports the checked link, but mcu.link_check is off: the lines below switch it on
 SKIPPED? checked link: plain | plain
     the firmware answers without a check, so a damaged line can carry a wrong speed
-FAIL? checked link: required | none
-    the firmware answers without a check, so a damaged line can carry a wrong speed
-    -> write mcu.link_check = "auto", or install firmware that supports the check
+FAIL? checked link: missing | none
+    the firmware answers without a check, but mcu.link_check is on: the robot will not drive
+    -> flash the firmware of deploy/firmware, or write mcu.link_check = "off"
 
 PASS lost lines: none | none of {lines}
 PASS lost lines: few | {lost} of {lines}

@@ -23,7 +23,7 @@ WaitCode = Literal[
 # States of the link.
 LinkCode = Literal[
     "port_closed", "port_trouble", "port_blocked", "booting", "link_up", "link_silent", "host_late",
-    "simulator_fault", "echo", "checksum_lost", "no_checksum", "replies_damaged", "lines_too_rare",
+    "simulator_fault", "echo", "set_points", "no_checksum", "replies_damaged", "lines_too_rare",
     "reply_period", "received_nothing", "received_statuses", "received_cut", "received_foreign",
     "received_garbage", "received_few", "received_sparse",
 ]  # fmt: skip
@@ -201,18 +201,19 @@ port_blocked
     -> unplug the adapter and plug it in again
 echo
     the daemon's own lines come back: TX and RX are connected to each other, or a terminal or the
-    RS-485 adapter echoes, or the board reports the commanded speeds instead of the measured ones;
+    RS-485 adapter echoes;
     -> remove the cause, then unplug the board and plug it in again
-checksum_lost
-    the microcontroller answered with a checksum before and now answers without one:
-    -> either its replies are damaged (check cable and baud rate), or it runs other firmware (then
-    unplug it and plug it in again)
+set_points
+    the board reports the commanded speeds instead of the measured ones, so nothing would show a
+    wheel that does not turn;
+    -> let the firmware report the speeds of the encoders, or write feedback.encoders = false if the
+    robot has none; then start the daemon again
 no_checksum
-    the microcontroller answers without a checksum, but mcu.link_check = "require" lets the robot
-    drive only with one:
-    -> install firmware that supports the checksum, or write mcu.link_check = "auto"
+    the microcontroller answers without a checksum, but mcu.link_check = "on" lets the robot drive
+    only with one:
+    -> flash the firmware of deploy/firmware, or write mcu.link_check = "off"
 replies_damaged
-    the microcontroller's replies arrive damaged, so the daemon asks it for the checksum again;
+    the microcontroller's replies arrive damaged:
     -> check cable and ground
 lines_too_rare
     the microcontroller sends a line only every {apart} s, and no value of mcu.reply_period allows
@@ -224,7 +225,7 @@ reply_period
 received_nothing
     no link to the microcontroller: {received};
     -> does the board have power, is mcu.port its port, is mcu.baud_rate right, are TX and RX
-    swapped? `acsard mcu check` finds out more
+    swapped{firmware}? `acsard mcu check` finds out more
 received_statuses
     no link to the microcontroller: {received};
     -> is TX of this computer connected to RX of the board? `acsard mcu check` finds out more

@@ -1,10 +1,10 @@
 """Checks every outgoing line a second time, with no code of the parts that made it.
 
 It parses the bytes as the MCU does. The format, the checksum and `limits.wheel_speed` must be
-right. No wheel gets faster or turns round without a fresh command, the link and the mode `driving`.
-All wheels are zero without the link, before the first fresh command, and `RAMP_MARGIN_NS` after the
-longest ramp to rest since the last fresh command or since a stop began. Zeros replace a line that
-breaks a rule, and the robot latches a fault.
+right; only a question has no speeds. No wheel gets faster or turns round without a fresh command,
+the link and the mode `driving`. All wheels are zero without the link, before the first fresh
+command, and `RAMP_MARGIN_NS` after the longest ramp to rest since the last fresh command or since a
+stop began. Zeros replace a line that breaks a rule, and the robot latches a fault.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ Wheels = tuple[int, int, int, int]  # speeds of the motors a to d, in hundredths
 
 _ZERO: Wheels = (0, 0, 0, 0)
 _COLUMNS = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
-_SEAL = re.compile(rb"#[0-9A-F]{2}[SH]?\*[0-9A-F]{4}\r\n")
+_SEAL = re.compile(rb"#[0-9A-F]{2}S?\*[0-9A-F]{4}\r\n")
+_QUESTION = b"?\r\n"
 
 HALTED = ("stopped", "fault", "shutdown")  # modes with the stop deceleration
 
@@ -58,7 +59,7 @@ class Guard:
         A moving robot may still brake by the old limits, so until it is at rest the longer braking
         time of both is allowed.
         """
-        self._require_check = config.mcu.link_check == "require"
+        self._require_check = config.mcu.link_check == "on"
         self._most = int(config.limits.wheel_speed * 100 + 1)
         self._timeouts = {s.name: s.timeout * 1e9 for s in config.commands.sources}
         self._ramps = _ramp_ns(config, stop=False), _ramp_ns(config, stop=True)
@@ -74,6 +75,8 @@ class Guard:
 
     def record_written(self, line: bytes) -> None:
         """Record that `line` was written to the serial port."""
+        if line == _QUESTION:
+            return
         self._last, self._wheels = line, _wheels(line[:31])
         if self._wheels == _ZERO:
             self._longest = self._ramps
@@ -93,6 +96,8 @@ class Guard:
             self._halted_ns = None
         elif self._halted_ns is None:
             self._halted_ns = now_ns
+        if line == _QUESTION:
+            return line, ""
         trip = self._objection(line, now_ns, commanded, status.link == "up")
         return (self._stop, trip) if trip else (line, "")
 

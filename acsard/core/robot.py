@@ -114,9 +114,7 @@ class Robot:
         # As after a start of the daemon; `latches` decides the first mode.
         self.config = config  # in force; a `set` replaces it
         longest_s = longest_reply(config.feedback.fault_time)
-        self.session = McuSession(
-            config.mcu, config.rate_hz, config.feedback.wheel_speed, longest_s
-        )
+        self.session = McuSession(config.mcu, config.rate_hz, config.feedback, longest_s)
         self._kinematics = Kinematics(config.drive)
         self._odometry = Odometry(
             config.odometry,
@@ -203,7 +201,7 @@ class Robot:
             feedback_age_s=session.feedback_age_s(now_ns),
             gyro=checks.gyro_status,
             doubt=checks.wheels.status,
-            check=session.negotiation.in_force,
+            check=session.check,
             encoders=session.count_recovery.counts,
             sender=self._choice.sender,
             estop=self._estop.state,
@@ -677,8 +675,7 @@ class Robot:
                 why, limits = chosen(self._choice), self.config.limits
                 if why.code == "commanded" and not (limits.linear_speed or limits.angular_speed):
                     why = sentence("limits_zero", source=self._choice.source)
-                note = self.session.note
-                return Reason(why.code, why.text + note) if note else why
+                return why
             case Mode.WAITING:
                 if self.session.link == "up":
                     if self._estop.missing(self.config.safety):

@@ -55,7 +55,7 @@ ALL = Config(
         distance_scale_std=0.002,
     ),
     sim=SimConfig(encoder_counts=400, track_multiplier=1.6),
-    mcu=McuConfig(encoder_counts=400, link_check="off"),
+    mcu=McuConfig(encoder_counts=400, reply_period=0.01),
 )
 """Every part has work: four parameters, a gyro at 100 Hz, and counts that plain lines show."""
 

@@ -53,9 +53,7 @@ Mcu = Mapping[str, object]
 
 PLAIN: Mcu = {"link_check": "off"}
 
-COUNTS: Mcu = {"link_check": "auto", "encoder_counts": 3200}
-
-STRICT: Mcu = {"link_check": "require", "encoder_counts": 3200}
+CHECKED: Mcu = {"link_check": "on", "encoder_counts": 3200}
 
 LEGS = [(0.6, 0.0), (0.6, 0.9), (0.0, 1.5), (0.8, -0.4), (-0.3, 0.0), (0.0, 0.0)]
 """m/s and rad/s: ramps, arcs, a turn on the spot, back, a stop. They move every wheel forward."""
@@ -235,7 +233,7 @@ def errors(odom: Following, wheels: Following, true: Status) -> Errors:
 # driving
 
 
-@pytest.mark.parametrize("mcu", [PLAIN, COUNTS], ids=["plain", "counts"])
+@pytest.mark.parametrize("mcu", [PLAIN, CHECKED], ids=["plain", "counts"])
 @pytest.mark.parametrize("length_s", [8, pytest.param(60, marks=soak)])
 @pytest.mark.timeout(180)
 def test_every_line_is_executed_and_odometry_agrees_with_the_wheels(
@@ -286,7 +284,7 @@ def test_when_the_daemon_is_killed_the_motors_stop(
     silent, wall = [], []
     for _ in range(times):
         wish = rng.choice([(0.5, 0.0), (-0.3, 0.0), (0.0, 1.5), (0.4, -0.8)])
-        mcu = rng.choice([PLAIN, COUNTS])
+        mcu = rng.choice([PLAIN, CHECKED])
         with running(board, tmp_path, mcu) as (_, daemon, bus), bus.commanding(*wish):
             until(lambda: board.status().running, 5.0, "it drives")
             passes(board, rng.uniform(20.0, 600.0))
@@ -370,12 +368,10 @@ def resets(rig: Rig, how: Callable[[Board], None], unseen: float) -> None:
     assert board.status().wrong == 0
 
 
-MODES = {"off": PLAIN, "auto": COUNTS, "require": STRICT}
+MODES = {"off": PLAIN, "on": CHECKED}
 
 
-@pytest.mark.parametrize(
-    "mode", ["require", pytest.param("off", marks=soak), pytest.param("auto", marks=soak)]
-)
+@pytest.mark.parametrize("mode", ["on", pytest.param("off", marks=soak)])
 def test_a_board_that_is_reset_does_not_move_before_neutral(
     board: Board, tmp_path: Path, mode: str
 ) -> None:
@@ -384,9 +380,7 @@ def test_a_board_that_is_reset_does_not_move_before_neutral(
     assert account(board).reset == "pin"
 
 
-@pytest.mark.parametrize(
-    "mode", ["off", pytest.param("auto", marks=soak), pytest.param("require", marks=soak)]
-)
+@pytest.mark.parametrize("mode", ["off", pytest.param("on", marks=soak)])
 def test_a_board_with_an_unreported_reset_does_not_move_before_neutral(
     board: Board, tmp_path: Path, mode: str
 ) -> None:
@@ -394,9 +388,7 @@ def test_a_board_with_an_unreported_reset_does_not_move_before_neutral(
         resets(rig, unheard, unseen=0.05)
 
 
-@pytest.mark.parametrize(
-    "mode", ["auto", pytest.param("off", marks=soak), pytest.param("require", marks=soak)]
-)
+@pytest.mark.parametrize("mode", ["on", pytest.param("off", marks=soak)])
 def test_a_board_that_hung_does_not_move_before_neutral(
     runner: Path, hanging_firmware: Path, tmp_path: Path, mode: str
 ) -> None:
@@ -429,7 +421,7 @@ def drives_in_the_end(board: Board, bus: Bus, commander: Commander) -> None:
 
 @pytest.mark.parametrize(
     ("mcu", "rate"),
-    [(COUNTS, 100), ({"baud_rate": 9600}, 10)],
+    [(CHECKED, 100), ({"baud_rate": 9600}, 10)],
     ids=["115200 baud", "9600 baud"],
 )
 def test_a_press_at_the_robot_stops_it_and_clear_is_refused_until_the_release(
@@ -480,7 +472,9 @@ def test_a_press_at_the_robot_stops_it_and_clear_is_refused_until_the_release(
 # the wire
 
 
-@pytest.mark.parametrize("mcu", [pytest.param(PLAIN, marks=soak), STRICT], ids=["plain", "checked"])
+@pytest.mark.parametrize(
+    "mcu", [pytest.param(PLAIN, marks=soak), CHECKED], ids=["plain", "checked"]
+)
 @pytest.mark.parametrize("length_s", [1.5, pytest.param(20.0, marks=soak)])
 def test_a_bad_wire_costs_lines_and_no_wheel_a_wrong_speed(
     board: Board, tmp_path: Path, mcu: Mcu, length_s: float
@@ -489,7 +483,7 @@ def test_a_bad_wire_costs_lines_and_no_wheel_a_wrong_speed(
 
     On the checked link the robot drives on and executes no wrong speed.
     """
-    is_checked = mcu is STRICT
+    is_checked = mcu is CHECKED
     with running(board, tmp_path, mcu) as (_, _, bus), bus.commanding(0.5) as commander:
         drives(board)
         for fault in ("noise", "drop"):
@@ -548,7 +542,9 @@ def rejects(bus: Bus) -> dict[str, int]:
     return {name: count for name, count in counters.items() if name.startswith("line_")}
 
 
-@pytest.mark.parametrize("mcu", [pytest.param(PLAIN, marks=soak), STRICT], ids=["plain", "checked"])
+@pytest.mark.parametrize(
+    "mcu", [pytest.param(PLAIN, marks=soak), CHECKED], ids=["plain", "checked"]
+)
 def test_a_lost_link_is_restored_and_the_commander_must_be_neutral_first(
     board: Board, tmp_path: Path, mcu: Mcu
 ) -> None:
@@ -612,7 +608,7 @@ def test_a_lost_link_is_restored_and_the_commander_must_be_neutral_first(
 
 @pytest.mark.parametrize(
     ("mcu", "length_s"),
-    [(COUNTS, 5), pytest.param(COUNTS, 60, marks=soak), pytest.param(PLAIN, 60, marks=soak)],
+    [(CHECKED, 5), pytest.param(CHECKED, 60, marks=soak), pytest.param(PLAIN, 60, marks=soak)],
     ids=["counts-5", "counts-60", "plain-60"],
 )
 @pytest.mark.timeout(180)
@@ -634,5 +630,5 @@ def test_with_counts_the_loss_of_a_fifth_of_the_lines_loses_no_distance(
     print(f"\n{lost:.1%} of {wire.lines} replies lost, link stale {stale} times; {off_by}; "
           f"{skipped(status)}")  # fmt: skip
     assert 0.15 < lost < 0.25
-    if mcu is COUNTS:
+    if mcu is CHECKED:
         assert off_by.worst < 0.001

@@ -19,7 +19,7 @@ HERE = Path(__file__).parent
 PLAIN = Config()
 CHECKED = replace(
     PLAIN,
-    mcu=replace(PLAIN.mcu, link_check="auto", encoder_counts=3200),
+    mcu=replace(PLAIN.mcu, link_check="on", encoder_counts=3200),
     odometry=replace(PLAIN.odometry, gyro=True),
 )
 

@@ -156,8 +156,8 @@ def over(
 
 def moved(world: World, since_ns: int) -> bool:
     """Return whether the daemon has sent a line with a wheel speed since `since_ns`."""
-    still = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
-    return any(at_ns >= since_ns and line != still for at_ns, line in world.port.sent)
+    still = (b"ap00.00,bp00.00,cp00.00,dp00.00\r\n", b"?\r\n")
+    return any(at_ns >= since_ns and line not in still for at_ns, line in world.port.sent)
 
 
 def backlog(dice: random.Random, speaker: Speaker, age: float, span: float, poured: float) -> None:

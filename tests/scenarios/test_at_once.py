@@ -238,7 +238,7 @@ def test_the_reported_latencies_of_a_command_are_the_real_ones(world: World) -> 
 
 
 def test_checked_replies_give_the_round_trip_time_of_the_microcontroller() -> None:
-    world = World(Config(mcu=McuConfig(link_check="require")))
+    world = World(Config(mcu=McuConfig(link_check="on")))
     world.run(1.0)
     round_trip = world.state.latencies["mcu_round_trip"].since_start
     assert round_trip.count > 50

@@ -27,7 +27,7 @@ def drive(seed: int, seconds: float) -> tuple[float, float, int]:
 
     The error and the distance are in m.
     """
-    mcu = McuConfig(link_check="require", encoder_counts=COUNTS)
+    mcu = McuConfig(link_check="on", encoder_counts=COUNTS)
     made = World(Config(sim=SimConfig(encoder_counts=COUNTS), mcu=mcu))
     chance = random.Random(seed)
     made.run(1.5)
@@ -73,12 +73,12 @@ def test_with_the_mcu_s_counts_bursts_of_lost_lines_cost_at_most_a_centimetre(
     assert off <= 0.01
 
 
-@pytest.mark.parametrize("check", ["off", "auto"])
+@pytest.mark.parametrize("check", ["off", "on"])
 @pytest.mark.parametrize("lag_s", [0.05, pytest.param(0.15, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("silence_s", [0.12, 0.15, 0.19, 0.3])
 @pytest.mark.parametrize("fault", ["lines to the host", "all lines", "the board"])
 def test_errors_of_many_equal_silences_add_up_within_the_covariance(
-    fault: str, silence_s: float, lag_s: float, check: Literal["off", "auto"]
+    fault: str, silence_s: float, lag_s: float, check: Literal["off", "on"]
 ) -> None:
     """Each silence has the same cause, so the errors of all have the same sign.
 

@@ -17,7 +17,8 @@ def driven(counts: int, reporting: bool) -> World:
 
     `reporting` selects a free-running board instead of a prompted one.
     """
-    world, dice = World(Config(sim=SimConfig(encoder_counts=counts))), random.Random(4)
+    mcu = McuConfig(reply_period=0.01 if reporting else 0.0)
+    world, dice = World(Config(mcu=mcu, sim=SimConfig(encoder_counts=counts))), random.Random(4)
     with world.mcu.free_running(0.01) if reporting else nullcontext():
         world.run(0.5)
         for _ in range(4):

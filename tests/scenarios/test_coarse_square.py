@@ -27,7 +27,7 @@ class Square:
 
     def __init__(self, link: str, counts: int, stalls: bool, seed: int) -> None:
         mcu = McuConfig(
-            link_check="off" if link == "plain" else "auto",
+            link_check="off" if link == "plain" else "on",
             encoder_counts=counts,
         )
         self.world = world = World(Config(sim=SimConfig(encoder_counts=counts), mcu=mcu))

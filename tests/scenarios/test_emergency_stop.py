@@ -175,7 +175,7 @@ def test_a_press_is_as_fast_in_a_flood_on_a_bad_wire_and_on_a_slow_one(
     if kind == "9600 baud":
         config = Config(mcu=McuConfig(baud_rate=9600), control=ControlConfig(rate=16.0))
     if kind == "checked":
-        config = Config(mcu=McuConfig(link_check="require"))
+        config = Config(mcu=McuConfig(link_check="on"))
     world, dice = World(config), random.Random(count)
     watch, slowest_ns, most_ns = Watch(world), 0, 0
     with world.mcu.estop():
@@ -277,7 +277,7 @@ def test_a_robot_that_needs_the_input_waits_for_it_and_then_becomes_ready() -> N
 
 
 def test_a_link_that_agreed_on_the_check_takes_no_status_line_without_it() -> None:
-    world = World(Config(mcu=McuConfig(link_check="auto")))
+    world = World(Config(mcu=McuConfig(link_check="on")))
     world.run(1.0)
     for word, state, refused in ((b"", "", 1), (b"*F4BC", "pressed", 1)):
         world.port.feed(Received(world.instant, b"!status estop=pressed%b\r\n" % word))

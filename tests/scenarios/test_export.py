@@ -55,7 +55,7 @@ PLAIN = Config(sim=SimConfig(faults=("battery=90:60",)))
 
 CHECKED = replace(
     PLAIN,
-    mcu=replace(Config().mcu, link_check="auto", encoder_counts=3200),
+    mcu=replace(Config().mcu, link_check="on", encoder_counts=3200),
     odometry=replace(Config().odometry, gyro=True),
 )
 

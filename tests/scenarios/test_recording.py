@@ -27,7 +27,7 @@ from tests.unit.core.guarded import checked
 PLAIN = Config()
 FULL = replace(
     PLAIN,
-    mcu=replace(PLAIN.mcu, link_check="auto", encoder_counts=3200),
+    mcu=replace(PLAIN.mcu, link_check="on", encoder_counts=3200),
     odometry=replace(PLAIN.odometry, gyro=True),
 )
 SLOW_LIMITS = replace(PLAIN, limits=replace(PLAIN.limits, linear_speed=0.3))

@@ -76,7 +76,7 @@ class Host:
 
     def __init__(self, where: Path) -> None:
         self.config = replace(
-            Config(mcu=McuConfig(port="/dev/ttyACM0", link_check="auto", encoder_counts=3200)),
+            Config(mcu=McuConfig(port="/dev/ttyACM0", link_check="on", encoder_counts=3200)),
             record=RecordConfig(str(where), 100.0),
             battery=BatteryConfig("percent", warning_below=30.0, stop_below=10.0),
         )

@@ -763,7 +763,7 @@ class Run:
             if witness.linked:  # the daemon that has lost the link believes no line
                 self.echo.line(at_ns + offset, witness.last)
                 if self.half_duplex.on:
-                    self.half_duplex.line(witness.last)
+                    self.half_duplex.line(at_ns + offset, witness.last)
             if any(witness.last):
                 self.moved_ns = at_ns + offset
         driving = snapshot.mode == "driving" and not witness.pending and not self.inputs.limiting

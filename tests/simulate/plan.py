@@ -310,11 +310,11 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
     sim["encoder_counts"] = counts = dice.choice((96, 400, 1024, 3200))
     match dice.randrange(6):
         case 0:
-            mcu["link_check"] = "auto"
+            mcu["link_check"] = "on"
         case 1:
-            mcu.update(link_check="require", encoder_counts=counts)
+            mcu.update(link_check="on", encoder_counts=counts)
         case 2:
-            mcu.update(link_check="auto", encoder_counts=counts)
+            mcu["encoder_counts"] = counts
         case 3:
             mcu["trailing_comma"] = True
             if dice.random() < 0.7:
@@ -387,10 +387,8 @@ def _dialect(dice: random.Random, mcu: dict[str, Any]) -> list[list[Any]]:
     # A board with a reply period ends its lines with a comma in any case.
     if not (mcu.get("trailing_comma") or mcu.get("reply_period")):
         possible.append("trailing_comma")
-    if mcu.get("link_check") == "auto":
-        possible += ["plain_only", "no_check"]
     if mcu.get("encoder_counts"):
-        possible.append("no_sample")
+        possible += ["no_sample"] if "link_check" in mcu else ["plain_only", "no_check"]
     chosen = dice.sample(possible, dice.choice((0, 1, 1, 2)))
     if "no_check" in chosen and "plain_only" in chosen:
         chosen.remove("no_check")

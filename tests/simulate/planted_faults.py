@@ -719,9 +719,9 @@ FAULTS = (
         "session mute",
         "a board that does not answer yet gets no lines",
         SESSION,
-        "        if self.negotiation.asking:\n            return self.negotiation.question(now_ns)",
+        "        if self._echo.due and not self._first",
         "        if self.silent(now_ns):\n            return None\n"
-        "        if self.negotiation.asking:\n            return self.negotiation.question(now_ns)",
+        "        if self._echo.due and not self._first",
     ),
     fault(
         "codec zeros",

@@ -24,15 +24,9 @@ REFUSED_AS = {
 }  # fmt: skip
 """The reason by which each kind of junk is counted."""
 
-ECHO_LINES, ECHO_CHANGE = 40, 6.0
-"""Lines with another speed, and rad/s of change in all, by which an echo is known as one: twice as
-many as the pages say, and three times the change."""
-
-ECHO_BACK = 10
-"""Lines behind the first bend, after which its own line surely came back and was read."""
-
-ECHO_CORNER = 0.025
-"""rad/s by which two changes of speed must differ, because a straight ramp shows no echo."""
+ECHO_LINES, ECHO_NS = 40, 3 * NS // 2
+"""Lines and time after a change of speed, after which an echo must be known: two windows of half a
+second, the question and its return."""
 
 ECHO_WAY = 0.5
 """Way, m, by which the pose may be wrong until an echo beside a board is known."""
@@ -138,10 +132,12 @@ def judge_counts(at_ns: int, state: dict[str, Any], expected: int) -> None:
 
 
 class _Changes:
-    """The changes of speed in the lines that the daemon receives back as echoes."""
+    """The first change of speed in the lines that the daemon receives back as echoes."""
 
     def __init__(self) -> None:
         self.on = False
+        self._last: tuple[float, ...]
+        self._changed_ns: int | None
         self.restart()
 
     def begin(self) -> None:
@@ -151,38 +147,30 @@ class _Changes:
 
     def restart(self) -> None:
         """Restart, because the daemon started or opened its port again."""
-        self._lines, self._change = 0, 0.0
-        self._since_corner = 0
-        """Number of lines since the first bend of the speeds, which may still be on the wire."""
-        self._last: tuple[float, ...] = ()
-        self._slope: list[float] = []
+        self._lines, self._changed_ns = 0, None
+        self._last = ()
 
-    def take(self, wheels: tuple[float, ...]) -> bool:
+    def take(self, at_ns: int, wheels: tuple[float, ...]) -> bool:
         """Add a line. Return whether the daemon must have recognised the echo by now."""
-        last, before = self._last, self._slope
-        if self.on:
-            self._last = wheels
-        if not (self.on and last):
+        if not self.on:
             return False
-        slope = self._slope = [new - old for new, old in zip(wheels, last, strict=True)]
-        bends = [abs(new - old) for new, old in zip(slope, before or slope, strict=True)]
-        self._since_corner += self._since_corner > 0 or max(bends) > ECHO_CORNER
-        self._change += max(map(abs, slope))
-        self._lines += any(wheels) and any(slope)
-        enough = self._lines > ECHO_LINES and self._change > ECHO_CHANGE
-        return enough and self._since_corner > ECHO_BACK
+        if self._last and wheels != self._last and self._changed_ns is None:
+            self._changed_ns = at_ns
+        self._last = wheels
+        self._lines += self._changed_ns is not None
+        return self._lines > ECHO_LINES and at_ns - (self._changed_ns or 0) > ECHO_NS
 
     @property
     def text(self) -> str:
-        return f"{self._lines} changes of speed, {self._change:.1f} rad/s in all, were an echo"
+        return f"{self._lines} lines after a change of speed were an echo"
 
 
 class Echo(_Changes):
     """The lines while TX is joined to RX and no board answers."""
 
     def line(self, at_ns: int, wheels: tuple[float, ...]) -> None:
-        """Check that the daemon stops driving when enough changes of speed have shown the echo."""
-        if self.take(wheels) and any(wheels):
+        """Check that the daemon stops driving soon after a change of speed has shown the echo."""
+        if self.take(at_ns, wheels) and any(wheels):
             raise BrokenError("an echo is no board", at_ns, self.text)
 
 
@@ -200,9 +188,9 @@ class HalfDuplex(_Changes):
         self._way = 0.0
         self._before: tuple[float, ...] | None = None
 
-    def line(self, wheels: tuple[float, ...]) -> None:
+    def line(self, at_ns: int, wheels: tuple[float, ...]) -> None:
         """Add a line that went to the board."""
-        self._known |= self.take(wheels)
+        self._known |= self.take(at_ns, wheels)
 
     def see(self, at_ns: int, mode: str, pose: tuple[float, ...], true: tuple[float, ...]) -> None:
         """Judge a step: compare the pose's distance with the true one since the echo began.

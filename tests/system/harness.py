@@ -503,7 +503,8 @@ class Peer:
             session.raw.append(ReceivedLine(now, data))
             *lines, buffer = (buffer + data).split(b"\n")
             for line in lines:
-                session.lines.append(ReceivedLine(now, line + b"\n"))
+                if line.rstrip(b"\r") != b"?":  # a question moves nothing
+                    session.lines.append(ReceivedLine(now, line + b"\n"))
                 speeds = _speeds(line)
                 if speeds is not None:
                     # Replies that equal the command lines would look like an echo, so the wheels
@@ -537,7 +538,7 @@ while True:
                 says = says[:6] + (b"1" if says[6:7] == b"0" else b"0") + says[7:]
             turning, told = told, line
             os.write(master, says + b"\\n")
-        print(repr(now), line.decode(errors="replace").strip() or "-", flush=True)
+        print(repr(now), line.decode(errors="replace").strip("? \\r") or "-", flush=True)
 """
 
 
@@ -561,7 +562,7 @@ class FarPeer(Program):
 
     @property
     def lines(self) -> list[ReceivedLine]:
-        """Return all lines so far, without their ends; "-" stands for an empty one."""
+        """Return all lines so far, without their ends; "-" is an empty one or a question."""
         return list(self._all())
 
     def since(self, at: float, to: float = float("inf")) -> list[ReceivedLine]:

@@ -380,7 +380,7 @@ while True:
                 says = b"ap99.00,bp99.00,cp99.00,dp99.00\\r"
             turning, told = told, line
             os.write(master, says + b"\\n")
-        print(repr(now), line.decode(errors="replace").strip() or "-", flush=True)
+        print(repr(now), line.decode(errors="replace").strip("? \\r") or "-", flush=True)
 """
 
 
@@ -403,7 +403,7 @@ class Board(Program):
         return self
 
     def since(self, at: float) -> list[ReceivedLine]:
-        """Return the lines after this time without their line ends, and "-" for an empty line."""
+        """Return the lines after this time without their ends; "-" is an empty one or `?`."""
         for text in self.out[1 + len(self._heard) :]:
             stamp, _, line = text.partition(" ")
             self._heard.append(ReceivedLine(float(stamp), line.encode()))

@@ -154,7 +154,7 @@ class McuConfig(Struct, frozen=True):
         float,
         Meta(ge=0.0, le=MAX_REPLY_PERIOD_S, extra={"unit": "s between two lines of the board"}),
     ] = 0.0
-    link_check: Literal["off", "auto", "require"] = "off"
+    link_check: Literal["off", "on"] = "off"
     encoder_counts: EncoderCounts = 0
     wheels: WheelMap = WheelMap()
 
@@ -164,14 +164,19 @@ class McuConfig(Struct, frozen=True):
         return self.port == SIMULATOR
 
     @property
+    def checked(self) -> bool:
+        """True if every line and every reply has a sequence number and a checksum."""
+        return self.link_check == "on"
+
+    @property
     def wants_samples(self) -> bool:
         """True if the daemon asks the board for its encoder counts with every line."""
-        return self.link_check != "off" and self.encoder_counts > 0
+        return self.checked and self.encoder_counts > 0
 
     @property
     def line_bytes(self) -> int:
         """Length of the longest serial line that the daemon or the board may send, bytes."""
-        return line_bytes(self.trailing_comma, self.link_check != "off", self.wants_samples)
+        return line_bytes(self.trailing_comma, self.checked, self.wants_samples)
 
 
 class ControlConfig(Struct, frozen=True):
@@ -206,6 +211,7 @@ class JointsConfig(Struct, frozen=True):
 
 
 class FeedbackConfig(Struct, frozen=True):
+    encoders: bool = True
     wheel_speed: WheelSpeed = 80.0
     response_time: Annotated[float, Meta(ge=0.01, le=5.0, extra={"unit": "s"})] = 0.2
     fault_time: Annotated[float, Meta(ge=0.0, le=10.0, extra={"unit": "s (0 = off)"})] = 0.5

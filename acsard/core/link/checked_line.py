@@ -13,23 +13,27 @@ from __future__ import annotations
 import binascii
 import re
 import struct
+from collections import deque
 
 from msgspec import Struct
 
 from acsard.core.link.codec import FrameError
+from acsard.core.link.link_state import WATCHDOG_NS
+from acsard.core.values import Ns
 
 SEQUENCES = 256  # the number after 255 is 0
 
 SAMPLE_REQUEST = b"S"  # asks for the sample fields
 
-# Ignored by the board; replies have no request letters, so a line with it is an echo.
-ECHO_MARK = b"H"
+# That wait for an answer, far below 256 numbers: no reply can match the wrong line.
+MAX_OPEN_LINES = 64
+
+# A later reply is rejected: a board that got no other line has stopped the motors by then.
+ANSWER_TIMEOUT_NS = WATCHDOG_NS
 
 # The pattern also restricts the characters of the plain part, because the CRC does not detect zero
 # bytes in front of a line.
 _REPLY = re.compile(rb"([a-dnp0-9., ]*)#([0-9A-F]{2})(?:@([0-9A-F]{20}))?\*([0-9A-F]{4})")
-
-_QUESTION = re.compile(rb"[a-dnp0-9., ]*#[0-9A-F]{2}[G-Z]+\*([0-9A-F]{4})")
 
 _SAMPLE = struct.Struct(">5H")
 
@@ -59,15 +63,6 @@ def seal(line: bytes, sequence: int, letters: bytes = b"") -> bytes:
     return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
 
 
-def has_request(line: bytes) -> bool:
-    """Return whether a line without its end is a correct checked line with request letters.
-
-    Only the daemon sends such lines, so a received one is an echo.
-    """
-    match = _QUESTION.fullmatch(line)
-    return match is not None and binascii.crc_hqx(line[:-5], 0) == int(match[1], 16)
-
-
 def unseal(line: bytes) -> Checked:
     """Split a checked reply without its line end into its parts. Raises `FrameError`."""
     match = _REPLY.fullmatch(line)
@@ -83,3 +78,38 @@ def unseal(line: bytes) -> Checked:
 def _reading(sample: bytes) -> Reading:
     mcu_ms, a, b, c, d = _SAMPLE.unpack(binascii.unhexlify(sample))
     return Reading(mcu_ms, (a, b, c, d))
+
+
+class OpenLines:
+    """Numbers the checked lines, and finds the line that a reply answers."""
+
+    def __init__(self) -> None:
+        self._sequence = 0
+        self._open: deque[tuple[int, Ns]] = deque(maxlen=MAX_OPEN_LINES)
+
+    def forget(self) -> None:
+        self._open.clear()
+
+    def next_number(self) -> int:
+        self._sequence = (self._sequence + 1) % SEQUENCES
+        return self._sequence
+
+    def written(self, at_ns: Ns) -> None:
+        """Record that the line with the last number was written."""
+        self._open.append((self._sequence, at_ns))
+
+    def answered(self, reply: Checked, at_ns: Ns) -> Ns:
+        """Return when the line that a correct reply answers was written.
+
+        Raises `FrameError` if no line of the last `ANSWER_TIMEOUT_NS` has its number.
+        """
+        waiting = self._open
+        while waiting and at_ns - waiting[0][1] > ANSWER_TIMEOUT_NS:
+            waiting.popleft()
+        if reply.sequence not in [sequence for sequence, _ in waiting]:
+            raise FrameError("stale_sequence", reply.plain)
+        # The board answers in order, so earlier lines get no more answers.
+        sequence, written_ns = waiting.popleft()
+        while sequence != reply.sequence:
+            sequence, written_ns = waiting.popleft()
+        return written_ns

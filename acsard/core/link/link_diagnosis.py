@@ -16,7 +16,6 @@ from acsard.core.formatting import many, printable_bytes
 from acsard.core.link.codec import TOKENS
 from acsard.core.link.link_state import Link
 from acsard.core.link.link_state import State as LinkState
-from acsard.core.link.negotiation import TROUBLES, Negotiation
 from acsard.core.values import NS_PER_S, Event, Ns
 
 # Share of `Link.quiet_ns` between two steps that makes the second late.
@@ -50,6 +49,8 @@ RECEIVED_CODES: dict[ReceivedClass, LinkCode] = {
     "few": "received_few",
     "sparse": "received_sparse",
 }
+
+CHECKED_FIRMWARE = ', does its firmware support mcu.link_check = "on" (else write "off")'
 
 _RIGHT = re.compile(TOKENS)
 # Only characters that a reply can contain.
@@ -154,13 +155,13 @@ class Heard(Struct):
         last = f", the {which} is `{bad}`" if self.good < self.lines else ""
         return f"{many(self.lines, 'line')} received, {good}{last}"
 
-    @property
-    def diagnosis(self) -> Reason:
-        """The complete diagnosis, for `state`."""
+    def diagnosis(self, checked: bool = False) -> Reason:
+        """Return the complete diagnosis, for `state`; `checked` is `mcu.checked`."""
         if self.looks == "sparse" and self.late_s:
             received = "too few lines for a link"
             return sentence("host_late", seconds=self.late_s, received=received)
-        return sentence(RECEIVED_CODES[self.looks], received=self.counted)
+        firmware = CHECKED_FIRMWARE if checked else ""
+        return sentence(RECEIVED_CODES[self.looks], received=self.counted, firmware=firmware)
 
 
 class SilenceDiagnosis:
@@ -224,34 +225,28 @@ class UnansweredLines:
         )
 
 
-def damaged(link: Link, check: Negotiation) -> bool:
-    """Return whether checked lines are negotiated again because replies were damaged."""
-    return link.damaged and check.asking
-
-
 def describe_link(
     link: Link,
-    check: Negotiation,
     silence: SilenceDiagnosis,
     lateness: Lateness,
     longest_reply: float,
+    checked: bool,
 ) -> Reason:
     """Return a sentence about the link while the port is open.
 
-    `longest_reply` is the highest value that `mcu.reply_period` may have, s.
+    `longest_reply` is the highest value that `mcu.reply_period` may have, s. `checked` is
+    `mcu.checked`.
     """
     if link.state in ("booting", "stale"):
         traffic = silence.heard
-        if check.trouble:
-            return TROUBLES[check.trouble]
         if traffic is not None and not traffic.good:
-            return traffic.diagnosis
-        if damaged(link, check):
+            return traffic.diagnosis(checked)
+        if checked and link.damaged:
             return sentence("replies_damaged")
         if link.sparse_s:
             return _sparse(link.sparse_s, longest_reply)
         if traffic is not None:
-            return traffic.diagnosis
+            return traffic.diagnosis(checked)
     return lateness.describe(link.state)
 
 
@@ -260,17 +255,3 @@ def _sparse(sparse_s: float, longest_reply: float) -> Reason:
     if float(apart) > longest_reply:
         return sentence("lines_too_rare", apart=apart, longest=longest_reply)
     return sentence("reply_period", apart=apart)
-
-
-def check_event(check: Negotiation, wants_samples: bool) -> Event:
-    """Return the event that says whether lines are plain or checked.
-
-    It is a warning without the checksum, or without the counts that `wants_samples` asks for.
-    """
-    fallen = check.state == "plain" or (wants_samples and check.state == "checked")
-    text = f"the lines on the serial port are now {check.in_force}"
-    if check.state == "plain":
-        text += ", because the microcontroller answers without a checksum"
-    elif fallen:
-        text += ", but the microcontroller does not send encoder counts"
-    return Event("link_check", text, "warning" if fallen else "info")

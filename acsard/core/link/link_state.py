@@ -1,10 +1,10 @@
 """Decides, with a state machine, whether the link to the board is good enough to drive.
 
 - down: the port is closed.
-- booting: the port was opened or the board restarted; fewer than GOOD_LINES good lines in a row.
+- booting: the port was opened or the board restarted; too few good lines in a row.
 - up: good lines arrive in time.
 - stale: no good line for `quiet_ns`, BAD_LINES bad ones in a row on a checked link, no line written
-  for `WATCHDOG_S`, or an echo.
+  for `WATCHDOG_S`, or the lines only repeat the daemon's own.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ from typing import Literal
 from acsard.core.values import NS_PER_S, Ns
 
 State = Literal["down", "booting", "up", "stale"]
-Input = Literal["closed", "opened", "restarted", "trusted", "silent", "damaged", "blocked", "echo"]
+Input = Literal[
+    "closed", "opened", "restarted", "trusted", "silent", "damaged", "blocked", "repeated"
+]
 
 # A pair without an entry does not change the state.
 TRANSITIONS: dict[tuple[State, Input], State] = {
@@ -28,7 +30,7 @@ TRANSITIONS: dict[tuple[State, Input], State] = {
     ("up", "silent"): "stale",
     ("up", "damaged"): "stale",
     ("up", "blocked"): "stale",
-    ("up", "echo"): "stale",
+    ("up", "repeated"): "stale",
     ("stale", "closed"): "down",
     ("stale", "opened"): "booting",
     ("stale", "trusted"): "up",
@@ -38,9 +40,10 @@ WATCHDOG_S = 0.3  # without a valid line, the board stops the motors
 
 WATCHDOG_NS = int(WATCHDOG_S * NS_PER_S)
 
-GOOD_LINES = 3  # in a row: a board may print anything after a reset
+# In a row, for a link. A board may print anything after a reset, but a checksum proves a line.
+GOOD_LINES, CHECKED_LINES = 3, 1
 
-BAD_LINES = 5  # in a row on a checked link: the check is negotiated again
+BAD_LINES = 5  # in a row on a checked link: the link is stale
 
 # Silences with one good line between two that show too sparse lines. One shows a lost link.
 SPARSE_SILENCES = 2
@@ -49,8 +52,9 @@ SPARSE_SILENCES = 2
 class Link:
     """The state of the link, which only `apply` changes, and its counts of good and bad lines."""
 
-    def __init__(self, quiet_ns: Ns) -> None:
-        self.quiet_ns = quiet_ns
+    def __init__(self, quiet_ns: Ns, checked: bool = False) -> None:
+        self.quiet_ns, self._checked = quiet_ns, checked
+        self._enough = CHECKED_LINES if checked else GOOD_LINES
         self.state: State = "down"
         self.sparse_s = 0.0  # between the last two good lines, after `SPARSE_SILENCES`; else 0
         self._silences = 0
@@ -114,11 +118,12 @@ class Link:
         if self.state != "up":
             self._good_in_row = 0
 
-    def bad(self) -> bool:
-        """Count a bad line; return True if the check must be negotiated again on a checked link."""
+    def bad(self) -> None:
+        """Count a bad line; enough of them make a checked link stale."""
         self.reset_good_lines()
         self._bad_in_row += 1
-        return self._bad_in_row == BAD_LINES
+        if self._checked and self._bad_in_row == BAD_LINES:
+            self.apply("damaged")
 
     @property
     def damaged(self) -> bool:
@@ -131,5 +136,5 @@ class Link:
         if self.state == "up":
             if silent:
                 self.apply("silent")
-        elif self._good_in_row >= GOOD_LINES and may_rise and not silent:
+        elif self._good_in_row >= self._enough and may_rise and not silent:
             self.apply("trusted")

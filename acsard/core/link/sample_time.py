@@ -2,8 +2,7 @@
 
 An adapter, the scheduler or a stall may delay a line. `FreeRunningTimes` finds the period of a
 board that reports by its own clock, and `PromptedTimes` takes the times of the commands that a
-board answers. After every read of the port, call `process_read` on both, and then `place` for each
-line. `feedback.py` chooses the better one.
+board answers. After every read of the port, call `process_read`, and then `place` for each line.
 """
 
 from __future__ import annotations
@@ -311,8 +310,6 @@ MAX_OPEN_COMMANDS = 64  # replies to them may still come
 # Gain for the usual delay, its spread, the times between commands and batches, and their share.
 FAST_GAIN = 0.05
 
-SLOW_GAIN = 0.0125  # per read, for whether the board itself varies the delay
-
 # Rise of the long-term least delay per reply: an outdated one is forgotten after 500.
 LEAST_DELAY_GAIN = 0.002
 
@@ -334,9 +331,6 @@ MAX_SUPPORT, MIN_SUPPORT = 200, -8
 
 MAX_USB_JITTER_NS = 350_000  # mean deviation of the delay that USB and the scheduler explain
 
-# Above this mean deviation, which USB and the scheduler rarely cause, the board varies it.
-MIN_BOARD_JITTER_NS = 800_000
-
 DELAY_RISE_NS = 20_000  # per read of a batched link, so that an outdated least delay is forgotten
 
 LOSS_GAIN = 0.005  # with 1/20, two lost replies would be enough to reach `LOSSY_FRACTION`
@@ -344,10 +338,6 @@ LOSS_GAIN = 0.005  # with 1/20, two lost replies would be enough to reach `LOSSY
 LOSSY_FRACTION = 0.03  # of lost replies; above it, any reply on a batched link may be missing
 
 BATCH_READ_FRACTION = 0.15  # of reads with several lines: host stalls alone cause fewer
-
-# Share of reads with a varied delay, above which the board varies it. An adapter whose packets fill
-# line by line does so, too, but only for a quarter of a second.
-BOARD_JITTER_FRACTION = 0.6
 
 MIN_ADAPTER_JITTER_NS = 2_000_000  # mean deviation, above which the adapter varies the delay
 
@@ -369,13 +359,6 @@ class PromptedTimes:
     def forget(self) -> None:
         """Forget all commands: no more replies to them will come."""
         self._left.clear()
-        self.restart()
-
-    def restart(self) -> None:
-        """Forget the last answered command and the usual delay, but not the open commands.
-
-        The next reply belongs to the newest command that it can answer.
-        """
         self._delay: float | None = None
         self._first = False  # the usual delay was measured on the first reply alone
         # Mean deviation from the usual delay, and long-term least delay, ns.
@@ -395,12 +378,6 @@ class PromptedTimes:
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
         self._several = 0.0  # share of reads with several lines
         self._batched = False  # an adapter holds replies back
-        self._thinking = 0.0  # reads whose delay varied more than by USB, less than by an adapter
-
-    @property
-    def varies_delay(self) -> bool:
-        """Whether the board varies the delay by more than this computer and its adapter can."""
-        return self._thinking > BOARD_JITTER_FRACTION and not self._batched
 
     @property
     def lossy(self) -> bool:
@@ -427,8 +404,6 @@ class PromptedTimes:
         self._at, self._alone, self._since = at_ns, alone, since
         self._several += FAST_GAIN * ((not alone) - self._several)
         self._batched = self._several > BATCH_READ_FRACTION
-        varies = MIN_BOARD_JITTER_NS < self._spread < MIN_ADAPTER_JITTER_NS and not self._batched
-        self._thinking += SLOW_GAIN * (varies - self._thinking)
         if self._batched:
             self._soon = 0.0
             self._weigh(lines, since, cut)

@@ -1,28 +1,30 @@
 """Exchanges lines with the board on one serial port, which may close, reopen and fall silent.
 
-`negotiation.py` decides whether lines are plain or checked, and `link_state.py` whether the robot
-may drive; the link does not come up while the daemon asks for checked lines. Another board may
-answer after the port was opened again, so fields of the status line that only the previous one
-reported are forgotten after `FORGET_NS`. A board that restarts has the same inputs: a field that it
-no longer reports is a fault.
+`mcu.link_check` declares whether lines are checked, and `link_state.py` decides whether the robot
+may drive. After the first line of a session the daemon sends `QUESTION`, and only later lines bring
+the link up, because a port that returns it has no board. Another board may answer after the port
+was opened again, so fields of the status line that only the previous one reported are forgotten
+after `FORGET_NS`. A board that restarts has the same inputs: a field that it no longer reports is a
+fault.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from typing import Literal
 
 from acsard.core.codes import Reason, sentence
 from acsard.core.config.settings import MAX_REPLY_PERIOD_S, FeedbackConfig, McuConfig
 from acsard.core.link import link_diagnosis
 from acsard.core.link.board_status import STATUS, BoardStatus, decode_status, merged
-from acsard.core.link.checked_line import Reading, unseal
+from acsard.core.link.checked_line import SAMPLE_REQUEST, OpenLines, Reading, seal, unseal
 from acsard.core.link.codec import Codec, FrameError
+from acsard.core.link.echo_check import QUESTION, EchoCheck
 from acsard.core.link.feedback import Feedback, Timeline
 from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import Lateness, SilenceDiagnosis
-from acsard.core.link.link_state import WATCHDOG_NS, WATCHDOG_S, Link
+from acsard.core.link.link_state import GOOD_LINES, WATCHDOG_NS, WATCHDOG_S, Link
 from acsard.core.link.link_state import State as LinkState
-from acsard.core.link.negotiation import SILENT_BOARD_PERIOD_NS, TROUBLES, Negotiation, Throttle
 from acsard.core.link.quantization import CountRecovery
 from acsard.core.values import (
     NS_PER_S,
@@ -50,7 +52,22 @@ LONG_GAP_NS = 1 * NS_PER_S
 # Until then, a pressed emergency stop stays latched while its cable is plugged in again.
 FORGET_NS = 3 * NS_PER_S
 
-IDENTITY = b"!acsard-mcu "  # acsard's firmware, after booting
+QUESTION_LINE = QUESTION + b"\r\n"
+
+IDENTITY = b"!acsard-mcu "  # acsard's firmware, after booting and as the answer to `QUESTION`
+
+REMARKS = (b"!", QUESTION)  # begin of lines that are no reply
+
+# Period of stops to a silent board: enough to wake it, and few collect in buffers.
+SILENT_BOARD_PERIOD_NS = NS_PER_S // 10
+
+NO_SAMPLES = (
+    "mcu.encoder_counts is set, but the microcontroller does not send encoder counts, so a lost "
+    "line loses distance"
+)
+
+# Why no reply is accepted.
+Trouble = Literal["", "echo", "set_points", "no_checksum"]
 
 
 class McuSession:
@@ -63,7 +80,7 @@ class McuSession:
         self,
         mcu: McuConfig,
         rate_hz: float,
-        wheel_speed: float = FeedbackConfig().wheel_speed,
+        feedback: FeedbackConfig = FeedbackConfig(),  # noqa: B008
         longest_reply: float = MAX_REPLY_PERIOD_S,
     ) -> None:
         # `longest_reply` is the highest value that `mcu.reply_period` may have, s.
@@ -71,7 +88,15 @@ class McuSession:
         self._rest = self.codec.stop.rstrip(b",\r\n")  # begin of every line with speed zero
         self._answers = not mcu.reply_period  # sends nothing while it receives no line
         self._lines = LineReader()
-        self._needs_check = mcu.link_check == "require"
+        self._mcu = mcu
+        self._letters = SAMPLE_REQUEST if mcu.wants_samples else b""
+        self._open_lines, self._echo = OpenLines(), EchoCheck(feedback.encoders)
+        self._first = True  # nothing was written since the opening
+        self._moved = False  # the last written line moves a wheel
+        self._last_reply = b""  # last accepted checked line
+        # On a checked link that is not up: valid plain lines, and whether they are the trouble.
+        self._plain_lines, self._unchecked = 0, False
+        self._sampled = False  # the last good line had the board's counts
         self.statuses: list[tuple[int, BoardStatus]] = []  # of the last `update`, with arrival
         self.status = BoardStatus()  # last value of each field, until the session forgets it
         self.status_ns: Ns | None = None  # arrival of the last status line
@@ -83,13 +108,11 @@ class McuSession:
         self.reopened = self.forgot = False  # in the last `update`
         # Silence after which the link is stale.
         self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
-        self.negotiation = Negotiation(mcu, self.codec.stop)
-        self._link = Link(self.quiet_ns)
+        self._link = Link(self.quiet_ns, mcu.checked)
         self.lateness = Lateness(mcu.simulated, self.quiet_ns)
-        self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns, rate_hz)
+        self._timeline = Timeline(mcu, self.codec, feedback.wheel_speed, self.quiet_ns, rate_hz)
         self.count_recovery = CountRecovery(mcu.encoder_counts)
-        self._hearing = SilenceDiagnosis()
-        self._wants_samples, self._longest_reply = mcu.wants_samples, longest_reply
+        self._hearing, self._longest_reply = SilenceDiagnosis(), longest_reply
         self.rejects: Counter[str] = Counter()
         # By reason, in this `update`: their number, and the last line.
         self._rejected: dict[str, tuple[int, bytes]] = {}
@@ -99,10 +122,11 @@ class McuSession:
         self._resumed = False  # the port accepts lines again after `LONG_GAP_NS`
         self.events: list[Event] = []  # of the last `update`, for the log
         self._starting_over = False
-        self._announced: tuple[LinkState, str, bool, bool]
-        self._announced = ("down", self.negotiation.in_force, False, False)
+        self._announced: tuple[LinkState, Trouble, bool] = ("down", "", False)
+        self._says_samples = mcu.wants_samples  # a board without counts has not been reported yet
         self._opened = 0
-        self._blind, self._just_blind = Throttle(), False
+        self._blind_ns: Ns | None = None  # last stop to a silent board
+        self._just_blind = False
         self._made: tuple[bytes, int] | None = None  # last result of `line()`, not yet written
         self._left_ns = 0  # the port last wrote a line or was opened
         self._held_up = False  # the port did not write the last line
@@ -138,7 +162,7 @@ class McuSession:
             more = self._lines.too_long - self.rejects.get("too_long", 0) if received else 0
             if more > 0:
                 self._reject("too_long", more=more)
-                self._bad()
+                self._link.bad()
             if self.lateness.record_step(now.mono_ns, good=bool(feedback)):
                 self._link.reset_silences()
             if 0.0 < self.lateness.step_s < WATCHDOG_S and self._answers and not feedback:
@@ -155,24 +179,27 @@ class McuSession:
     def line(self, now_ns: Ns, speeds: WheelSpeeds) -> bytes | None:
         """Return the line that commands `speeds`, or None if no line is due.
 
-        It is a stop, whatever `speeds` is, while the board does not answer or is asked for the
-        check. The first of these is due immediately, because the board may still execute the
-        previous line.
+        It is a stop, whatever `speeds` is, while the board does not answer. The first of these is
+        due immediately, because the board may still execute the previous line. `QUESTION` takes
+        the place of a line.
         """
         line = self._next_line(now_ns, speeds)
         self._made = None if line is None else (line, now_ns)
         return line
 
     def _next_line(self, now_ns: Ns, speeds: WheelSpeeds) -> bytes | None:
-        if self.negotiation.asking:
-            return self.negotiation.question(now_ns)
+        if self._echo.due and not self._first and (speeds != STILL or not self._moved):
+            return QUESTION_LINE  # but not instead of the line that stops the wheels
         if self.silent(now_ns):
-            self._just_blind = self._blind.lets(now_ns, SILENT_BOARD_PERIOD_NS)
+            last_ns = self._blind_ns
+            self._just_blind = last_ns is None or now_ns - last_ns >= SILENT_BOARD_PERIOD_NS
             if not self._just_blind:
                 return None
             speeds = STILL
         line = self.codec.stop if speeds == STILL else self.codec.encode(speeds)
-        return self.negotiation.seal(line, now_ns)
+        if not self._mcu.checked or self._first:  # the port begins with a plain stop
+            return line
+        return seal(line, self._open_lines.next_number(), self._letters)
 
     def silent(self, now_ns: Ns) -> bool:
         """Return whether the last good line of this session is older than `quiet_ns`, or missing.
@@ -191,15 +218,22 @@ class McuSession:
             return sentence("port_trouble", trouble=port_trouble)
         if self.blocked:
             return link_diagnosis.PORT_BLOCKED
+        if self._trouble and self.link in ("booting", "stale"):
+            return sentence(self._trouble)
         return link_diagnosis.describe_link(
-            self._link, self.negotiation, self._hearing, self.lateness, self._longest_reply
+            self._link, self._hearing, self.lateness, self._longest_reply, self._mcu.checked
         )
 
     @property
-    def note(self) -> str:
-        """The form of the lines, such as " (serial lines checked)"; "" without `mcu.link_check`."""
-        check = self.negotiation
-        return "" if check.state == "off" else f" (serial lines {check.in_force})"
+    def _trouble(self) -> Trouble:
+        return self._echo.trouble or ("no_checksum" if self._unchecked else "")
+
+    @property
+    def check(self) -> str:
+        """The form of the lines, for `diagnostics`."""
+        if not self._mcu.checked:
+            return "plain"
+        return "checked with samples" if self._sampled else "checked"
 
     def sent(self, left_ns: Ns, *, was_written: bool) -> None:
         """Record whether and when the last result of `line()` was written to the port."""
@@ -208,15 +242,23 @@ class McuSession:
             return
         blind, self._made, self._just_blind = self._just_blind, None, False
         line, made_ns = made
-        self.negotiation.settle(was_written, left_ns - made_ns)
         self._held_up = not was_written
-        if was_written:
-            self.negotiation.written(line)
-            self._timeline.written(left_ns, moves=not line.startswith(self._rest))
-            self._resumed = self.blocked and left_ns - self._left_ns >= LONG_GAP_NS
-            self._left_ns = left_ns
-        elif blind and self.link != "down":
-            self._blind.undo()
+        if blind and (was_written or self.link == "down"):
+            self._blind_ns = made_ns
+        if not was_written:
+            return
+        self._resumed = self.blocked and left_ns - self._left_ns >= LONG_GAP_NS
+        self._left_ns, self._first = left_ns, False
+        if line == QUESTION_LINE:
+            self._echo.asks(left_ns)
+            self._blind_ns = None
+            self._link.reset_good_lines()
+            return
+        self._echo.written(line)
+        if b"#" in line:
+            self._open_lines.written(left_ns)
+        self._moved = not line.startswith(self._rest)
+        self._timeline.written(left_ns, moves=self._moved)
 
     # sessions
 
@@ -228,12 +270,13 @@ class McuSession:
         self._opened = opened
         self._left_ns, self._held_up, self.blocked = now_ns, False, False
         if port_open:
-            self._blind = Throttle()
+            self._blind_ns = None
         self._lines.clear()
-        self._timeline.forget()
-        self.count_recovery.forget()
         self._hearing.forget()
-        self.negotiation.begin(fresh=True)
+        self._echo.forget()
+        self._plain_lines, self._unchecked = 0, False
+        self._first, self._says_samples = True, self._mcu.wants_samples
+        self._start_over()
 
     def _restart(self, how: str) -> None:
         # `how` completes "the microcontroller ...".
@@ -241,12 +284,17 @@ class McuSession:
             self.events.append(Event("mcu_restarted", f"the microcontroller {how}", "warning"))
         self._link.apply("restarted")
         self.restarted = self._starting_over = True
+        self._start_over()
+
+    def _start_over(self) -> None:
         self._timeline.forget()
         self.count_recovery.forget()
-        self.negotiation.begin()
+        self._open_lines.forget()
+        self._echo.restart()
+        self._last_reply = b""
 
     def _judge(self, now_ns: Ns) -> None:
-        link, check = self._link, self.negotiation
+        link = self._link
         if not self._held_up:
             self.blocked = False
         elif now_ns - self._left_ns > WATCHDOG_NS and not self.lateness.step_s:
@@ -255,7 +303,12 @@ class McuSession:
         if self.blocked:
             link.apply("blocked")
         # The arbiter must see a lost link first.
-        link.judge(now_ns, may_rise=not self._starting_over)
+        echo = self._echo
+        echo.judge(now_ns, moving=link.state == "up")
+        if echo.trouble:
+            link.apply("repeated")
+        held = self._starting_over or not echo.asked or echo.trouble
+        link.judge(now_ns, may_rise=not held)
         up = link.state == "up"
         if self._awaiting:
             if not up:
@@ -266,14 +319,11 @@ class McuSession:
                 self._awaiting, self.forgot = False, True
                 self.status, self.status_ns = self._reported
         self._judged_ns = now_ns
-        quiet = not up and link.silent(now_ns) and now_ns - check.settled_ns > self.quiet_ns
-        if quiet and (check.state == "plain" or check.checked):
-            check.begin()
-        if check.asking:
-            check.judge(now_ns)
         if up or self.blocked:
             self._hearing.forget()
         elif self._hearing.judge(now_ns, self.lateness.step_s):
+            # The board may answer only plain lines, such as the first one after the opening.
+            self._unchecked = self._unchecked or self._plain_lines > 0
             why = self.describe_link()
             self.events.append(Event(NAMES[self.link], why.text, "warning", code=why.code))
 
@@ -291,45 +341,43 @@ class McuSession:
             )
         self._rejected.clear()
 
-    def _bad(self) -> None:
-        if self._link.bad() and self.negotiation.checked:
-            self._link.apply("damaged")
-            self.negotiation.begin()
-
     def _announce(self) -> None:
-        link, check = self._link.state, self.negotiation
-        before = self._announced
-        self._announced = (link, check.in_force, bool(check.trouble), self.blocked)
+        link, trouble, before = self._link.state, self._trouble, self._announced
+        self._announced = (link, trouble, self.blocked)
         if self._announced == before:
             return
-        if link != before[0] or self.blocked > before[3]:
-            plain = not (self.blocked or link_diagnosis.damaged(self._link, check))
+        if link != before[0] or self.blocked > before[2]:
+            plain = not (self.blocked or self._link.damaged or trouble)
             why = self.lateness.describe(link) if plain else self.describe_link()
             good = link in ("up", "booting") and not self.blocked
             level: Level = "info" if good else "warning"
             self.events.append(Event(NAMES[link], why.text, level, code=why.code))
-        if check.in_force != before[1] and not check.asking:
-            self.events.append(link_diagnosis.check_event(check, self._wants_samples))
-        if check.trouble and not before[2]:
-            trouble = TROUBLES[check.trouble]
-            self.events.append(Event("link_check", trouble.text, "error", code=trouble.code))
+        if trouble and trouble != before[1]:
+            why = sentence(trouble)
+            self.events.append(Event("link_check", why.text, "error", code=why.code))
 
     # lines
 
     def _decode(self, piece: Received) -> list[Feedback]:
         lines, timeline, feedback = self._lines.feed(piece.data), self._timeline, []
         link, data = self._link, piece.data
-        statuses = [line for line, _ in lines if line.startswith(STATUS)]
-        if statuses:
-            # A status line is not a reply, so it is not used for the sample times and the link.
-            lines = [each for each in lines if not each[0].startswith(STATUS)]
-            self._take_statuses(statuses, piece.at.mono_ns)
+        remarks = [line for line, _ in lines if line.startswith(REMARKS)]
+        if remarks:
+            # A remark is not a reply, so it is not used for the sample times and the link.
+            lines = [each for each in lines if not each[0].startswith(REMARKS)]
+            for line in remarks:
+                self._take_remark(line, piece.at.mono_ns)
             data = b"\n".join([line for line, _ in lines])
         if link.state != "up":
             self._hearing.now.take(data)
         if lines:
             timeline.process_read(piece.at, len(piece.data), len(lines), lines[-1][1])
         for line, following in lines:
+            self._echo.received(line)
+            if self._last_reply and line == self._last_reply:
+                self.rejects["repeated"] += 1  # by a hub or a repeater, which is no damage
+                timeline.skip_repeated()
+                continue
             reply = self._line(line, piece.at, following)
             if reply is None:
                 timeline.skip_bad()
@@ -339,52 +387,68 @@ class McuSession:
                 self._hearing.now.line(line, reply is not None)
         return feedback
 
-    def _take_statuses(self, lines: list[bytes], at_ns: Ns) -> None:
-        check = self._needs_check or self.negotiation.checked
-        for line in lines:
-            try:
-                status = decode_status(line, check)
-            except FrameError as error:
-                self._reject(error.reason, line)
-                continue
-            self.status, self.status_ns = merged(self.status, status), at_ns
-            self._reported = merged(self._reported[0], status), at_ns
-            self.statuses.append((at_ns, status))
-            if self._link.state != "up":
-                self._hearing.now.statuses += 1
-
-    def _line(self, line: bytes, read_at: Instant, following: int) -> Feedback | None:
-        if line.startswith(IDENTITY):
+    def _take_remark(self, line: bytes, at_ns: Ns) -> None:
+        if line.startswith(STATUS):
+            self._take_status(line, at_ns)
+            return
+        if line == QUESTION:
+            self._reject("echo")
+            self._echo.returned(at_ns)
+        elif not line.startswith(IDENTITY):
+            self._reject("malformed", line)
+            self._link.bad()
+        elif not self._echo.named(at_ns):
             self._restart(
                 f"has restarted and sent its start line: {line.decode('ascii', 'replace')}"
             )
-            return None
-        check = self.negotiation
-        asking = check.asking
-        if check.echoes or (b"#" in line and check.check_question_echo(line)):
-            self._reject("echo")
+
+    def _take_status(self, line: bytes, at_ns: Ns) -> None:
+        try:
+            status = decode_status(line, self._mcu.checked)
+        except FrameError as error:
+            self._reject(error.reason, line)
+            return
+        self.status, self.status_ns = merged(self.status, status), at_ns
+        self._reported = merged(self._reported[0], status), at_ns
+        self.statuses.append((at_ns, status))
+        if self._link.state != "up":
+            self._hearing.now.statuses += 1
+
+    def _line(self, line: bytes, read_at: Instant, following: int) -> Feedback | None:
+        if self._echo.trouble:
+            self._reject(self._echo.trouble)
             self._link.reset_good_lines()
             return None
         reading, asked_ns = None, None
         try:
-            if check.checked or (asking and b"#" in line):
+            if self._mcu.checked:
                 reply = unseal(line)
                 speeds, reading = self.codec.decode(reply.plain), reply.reading
-                asked_ns = check.answered(reply, read_at.mono_ns)
+                asked_ns = self._open_lines.answered(reply, read_at.mono_ns)
             else:
                 speeds = self.codec.decode(line)
-            if not asking and reading is None and check.check_reply_echo(line, speeds):
-                self._link.apply("echo")
-                self._reject("echo")
-                return None
         except FrameError as error:
-            self._reject(error.reason, line)
-            self._bad()
+            if error.reason != "without_crc" or self._link.state == "up" or not self._plain(line):
+                self._reject(error.reason, line)
+                self._link.bad()
             return None
-        if asked_ns is None and asking:
-            check.record_plain_reply()
-            return None
+        if self._mcu.checked:
+            self._last_reply, self._plain_lines, self._unchecked = line, 0, False
+            self._sampled = reading is not None
+            if self._says_samples and not self._sampled:
+                self._says_samples = False
+                self.events.append(Event("link_check", NO_SAMPLES, "warning"))
         return self._good(speeds, reading, read_at, (following, len(line) + 2), asked_ns)
+
+    def _plain(self, line: bytes) -> bool:
+        # On a checked link that is not up. The first one answers the stop after the opening.
+        try:
+            self.codec.decode(line)
+        except FrameError:
+            return False
+        self._plain_lines += 1
+        self._unchecked = self._unchecked or self._plain_lines >= GOOD_LINES
+        return True
 
     def _good(
         self,

@@ -149,7 +149,7 @@ class Sanity(Struct):
             f"{self.dropped} of {self.lines} lines were dropped, because no wheel can do "
             f"what they report; the last: {why}. If a wheel really does that, raise {setting}. "
             "Otherwise lines arrive damaged: check cable and ground; firmware that "
-            'supports mcu.link_check = "auto" protects each line with a checksum'
+            'supports mcu.link_check = "on" protects each line with a checksum'
         )
 
     def _too_fast(self, line: Feedback, fastest: RadPerS) -> str:

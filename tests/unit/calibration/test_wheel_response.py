@@ -61,9 +61,8 @@ def log(plan: Plan, seconds: float, fastest: float = 99.0) -> Log:
 def measured_response(
     plan: Plan, seconds: float, fastest: float = 99.0, **feedback: float
 ) -> WheelResponse:
-    made = response(
-        log(plan, seconds, fastest).runs, DriveConfig(), FeedbackConfig(**feedback)
-    )  # fmt: skip
+    settings = structs.replace(FeedbackConfig(), **feedback)
+    made = response(log(plan, seconds, fastest).runs, DriveConfig(), settings)
     assert made is not None
     return made
 

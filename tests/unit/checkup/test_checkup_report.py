@@ -64,16 +64,16 @@ def test_only_settings_that_differ_are_proposed() -> None:
 
 
 def test_longer_lines_are_not_proposed_if_the_wire_has_no_room() -> None:
-    wanted = findings_for(link_check="auto", encoder_counts=3200)
+    wanted = findings_for(link_check="on", encoder_counts=3200)
     assert len(checkup_report.changes(wanted, Config())) == 2
     slow = configured(Config(), baud_rate=57600)
-    assert checkup_report.changes(wanted, slow) == {"mcu.link_check": "auto"}
+    assert checkup_report.changes(wanted, slow) == {"mcu.link_check": "on"}
     slower = configured(Config(), baud_rate=38400)
     assert checkup_report.changes(wanted, slower) == {}
 
 
 def test_a_slow_wire_also_changes_the_control_rate() -> None:
-    keys = checkup_report.changes(findings_for(baud_rate=9600, link_check="auto"), Config())
+    keys = checkup_report.changes(findings_for(baud_rate=9600, link_check="on"), Config())
     assert keys == {"mcu.baud_rate": 9600, "control.rate": "auto"}
     config = checkup_report.applied(keys, Config())
     assert config is not None
@@ -81,8 +81,8 @@ def test_a_slow_wire_also_changes_the_control_rate() -> None:
 
 
 def test_settings_in_use_are_not_removed() -> None:
-    text = b'[mcu]\nlink_check = "require"\nencoder_counts = 3200\n'
-    findings = findings_for(baud_rate=38400, link_check="require", encoder_counts=3200)
+    text = b'[mcu]\nlink_check = "on"\nencoder_counts = 3200\n'
+    findings = findings_for(baud_rate=38400, link_check="on", encoder_counts=3200)
     keys = checkup_report.changes(findings, parse(text))
     assert keys == {"mcu.baud_rate": 38400, "control.rate": "auto"}
 

@@ -127,12 +127,12 @@ def test_rare_reports_by_the_boards_own_clock_are_not_taken_for_answers() -> Non
 @each(
     ("faults", "wanted", "verdict", "keys"),
     [
-        ((), "off", "PASS", {"mcu.link_check": "auto"}),
-        ((), "require", "PASS", {"mcu.link_check": "require"}),
-        (("no_sample",), "auto", "PASS", {"mcu.link_check": "auto"}),
+        ((), "off", "PASS", {"mcu.link_check": "on"}),
+        ((), "on", "PASS", {"mcu.link_check": "on"}),
+        (("no_sample",), "on", "PASS", {"mcu.link_check": "on"}),
         (("plain_only",), "off", "SKIPPED", {}),
-        (("no_check",), "auto", "SKIPPED", {}),
-        (("comma_latched",), "require", "FAIL", {"mcu.link_check": "auto"}),
+        (("no_check",), "on", "FAIL", {"mcu.link_check": "off"}),
+        (("comma_latched",), "on", "FAIL", {"mcu.link_check": "off"}),
     ],
 )
 def test_the_link_check_is_used_if_the_board_supports_it(

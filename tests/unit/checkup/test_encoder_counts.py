@@ -52,7 +52,7 @@ def test_too_short_a_turn_gives_no_counts_per_turn() -> None:
 def test_configured_counts_pass_unless_they_differ_from_the_identified_counts(
     configured: int, identified: bool, verdict: str, keys: dict[str, object]
 ) -> None:
-    with Robot(link_check="auto", encoder_counts=configured).board() as board:
+    with Robot(link_check="on", encoder_counts=configured).board() as board:
         check(board)
         if identified:
             identity(board)
@@ -138,7 +138,7 @@ def test_more_counts_than_the_host_accepts_are_a_warning() -> None:
 def test_wrong_configured_counts_are_found_by_the_speeds_and_corrected(
     configured: int, wrong: str
 ) -> None:
-    with Robot("no_sample", link_check="auto", encoder_counts=configured).board() as board:
+    with Robot("no_sample", link_check="on", encoder_counts=configured).board() as board:
         board.sampled = True
         board.replies = replies(3200)
         finding = encoder_counts.finding(board, [0])
@@ -167,7 +167,7 @@ def test_counts_that_do_not_change_while_the_wheels_turn_are_to_be_switched_off(
 def test_if_lines_are_lost_only_configured_or_identified_counts_are_proposed(
     configured: int, verdict: str, keys: dict[str, object]
 ) -> None:
-    with Robot("no_sample", link_check="auto", encoder_counts=configured).board() as board:
+    with Robot("no_sample", link_check="on", encoder_counts=configured).board() as board:
         board.sampled, board.lost = True, line_loss.MAX_LOSS / 4
         board.replies = replies(3200)
         finding = encoder_counts.finding(board, [0])

@@ -41,12 +41,12 @@ def slow(value: object) -> object:
 
 GOOD: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
     "plain": (("plain_only",), {}),
-    "checked": (("no_sample",), {"link_check": "auto"}),
-    "samples": ((), {"link_check": "require", "encoder_counts": 3200}),
+    "checked": (("no_sample",), {"link_check": "on"}),
+    "samples": ((), {"link_check": "on", "encoder_counts": 3200}),
     "old sketch": (("free_running", "plain_only"), {"reply_period": 0.1}),
     "comma sent": ((), {"trailing_comma": True}),
     "status lines": (("plain_only", "estop"), {}),
-    "checked status lines": (("no_sample", "estop"), {"link_check": "auto"}),
+    "checked status lines": (("no_sample", "estop"), {"link_check": "on"}),
 }
 
 
@@ -831,7 +831,7 @@ def test_on_a_late_computer_no_board_is_blamed_and_no_other_setting_is_proposed(
     computer: type[Busy], fault: str, late_s: float, every: int
 ) -> None:
     period = 0.1 if fault == "free_running" else 0.0
-    robot = computer(fault, late_s=late_s, every=every, reply_period=period, link_check="auto")
+    robot = computer(fault, late_s=late_s, every=every, reply_period=period, link_check="on")
     checked = Checked(robot)
     assert checked.failed == []
     assert set(checked.named("WARN")) <= names(checked) | {"reply form"}

@@ -58,8 +58,8 @@ def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     report = json.loads(out)
     assert err == ""
     assert report["passed"] is True
-    assert report["changes"] == {"mcu.link_check": "auto", "mcu.encoder_counts": 3200}
-    assert parse(report["toml"].encode()).mcu.link_check == "auto"
+    assert report["changes"] == {"mcu.link_check": "on", "mcu.encoder_counts": 3200}
+    assert parse(report["toml"].encode()).mcu.link_check == "on"
     assert report["written"] is None
     watchdog = next(finding for finding in report["findings"] if finding["name"] == "watchdog")
     assert (watchdog["verdict"], watchdog["figure"][:2]) == ("PASS", "30")

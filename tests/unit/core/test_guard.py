@@ -114,7 +114,7 @@ class Guarded:
         require_check: bool = False,
     ) -> None:
         config = Config(
-            mcu=McuConfig(link_check="require" if require_check else "off"),
+            mcu=McuConfig(link_check="on" if require_check else "off"),
             limits=LimitsConfig(wheel_speed=wheel_speed),
             commands=CommandsConfig(sources=sources),
         )
@@ -226,6 +226,18 @@ def test_a_guard_for_trailing_commas_passes_only_lines_with_a_trailing_comma() -
     assert guard.check(outputs(line(1.0))) == stop
     assert guard.trip == NOT_A_LINE
     assert guard.check(outputs(b"ap12.50,bn08.75,cp15.00,dn10.25;\r\n")) == stop
+
+
+def test_a_question_passes_in_every_state_and_changes_no_speed(guard: Guarded) -> None:
+    question = b"?\r\n"
+    assert objection(guard, outputs(question, mode="stopped", linked=False, age_ms=None)) == ""
+    guard_after_line(guard, 1.0)
+    assert objection(guard, outputs(question)) == ""
+    guard.note_sent()
+    # Without a fresh command, a wheel may keep its speed but not get faster.
+    assert objection(guard, outputs(line(1.0), age_ms=290)) == ""
+    assert objection(guard, outputs(line(1.1), age_ms=290)) != ""
+    assert objection(guard, outputs(b"?")) == NOT_A_LINE
 
 
 @given(data=st.binary(max_size=40))
@@ -792,6 +804,8 @@ def test_a_healthy_robot_never_trips_the_guard_and_speeds_up_only_by_fresh_comma
         moved += sum(data != STOP for data, _ in loop.wire)
         before = (0.0, 0.0, 0.0, 0.0)
         for data, result in loop.wire:
+            if data == b"?\r\n":
+                continue
             wheels = CODEC.decode(data.rstrip()).as_tuple()
             assert result.linked or not any(wheels)
             arrived_ns = result.command_ns

@@ -134,7 +134,7 @@ class Bench:
 
     def linked(self) -> Bench:
         """Step until the link is up."""
-        for _ in range(3):
+        for _ in range(5):  # a line, the question, and three lines
             self.step()
         assert self.out.link == "up"
         return self
@@ -347,7 +347,7 @@ def test_a_board_that_sends_only_status_lines_is_diagnosed() -> None:
 
 
 def test_a_checked_link_takes_no_status_line_without_a_checksum() -> None:
-    bench = Bench(Config(mcu=McuConfig(link_check="require")))
+    bench = Bench(Config(mcu=McuConfig(link_check="on")))
     bench.reply = OK_LINE
     bench.step()
     assert bench.counters()["line_status_without_crc"] == 1
@@ -859,14 +859,16 @@ def test_without_a_port_the_robot_waits_and_reports_the_reason() -> None:
     assert out.code == "port_closed"
 
 
-def test_after_the_port_opens_three_good_lines_make_the_robot_ready() -> None:
+def test_three_good_lines_after_the_question_make_the_robot_ready() -> None:
     bench = Bench()
-    states = []
-    for _ in range(4):
+    states, lines = [], []
+    for _ in range(6):
         out = bench.step()
         states.append((out.mode, out.link, out.linked))
+        lines.append(out.line)
     booting = ("waiting", "booting", False)
-    assert states == [booting, booting, ("ready", "up", True), ("ready", "up", True)]
+    assert states == [*[booting] * 4, ("ready", "up", True), ("ready", "up", True)]
+    assert lines == [ZERO_LINE, b"?\r\n", *[ZERO_LINE] * 4]
 
 
 def test_a_step_without_a_tick_uses_feedback_and_sends_no_line() -> None:
@@ -972,7 +974,7 @@ def test_lines_and_rejects_by_reason_are_counted_and_zero_counters_are_left_out(
     bench.reply = b"hello\r\n" + bench.codec.stop
     bench.step()
     counters = bench.counters()
-    assert counters["lines"] == 4
+    assert counters["lines"] == 6
     assert counters["line_malformed"] == 1
     assert "line_too_long" not in counters
 
@@ -1040,6 +1042,7 @@ def test_the_first_step_of_a_new_robot_sends_a_zero_line() -> None:
 def test_while_the_link_boots_every_line_is_zero() -> None:
     bench = Bench(Config(commands=CommandsConfig(neutral_first=False)))
     assert bench.step(REST).line == ZERO_LINE
+    assert bench.step(GO).line == b"?\r\n"
     assert bench.step(GO).line == ZERO_LINE
     assert bench.link() == "booting"
 
@@ -1399,7 +1402,7 @@ def test_a_third_impossible_line_is_a_fault_that_brakes_by_the_stop_deceleration
 def test_a_lost_link_resets_the_count_of_impossible_lines() -> None:
     bench = impossible(Bench().driving(), 2)
     bench.unplug().step()
-    impossible(bench.replug(), 3)
+    impossible(bench.replug(), 5)
     assert (bench.link(), bench.mode()) == ("up", "ready")
 
 
@@ -1531,9 +1534,11 @@ def test_a_line_superseded_before_the_port_was_lost_does_not_bring_its_speed_bac
 ) -> None:
     bench = Bench(Config(commands=CommandsConfig(neutral_first))).driving()
     bench.step(GO)  # this line does not leave
-    bench.replug().step(GO, superseded=True)  # zero, which does not leave
+    bench.replug().step(GO, superseded=True)
     assert bench.out.applied == REST
-    bench.reply = bench.codec.stop * 2
+    bench.step(GO)
+    bench.step(GO)
+    bench.reply = bench.codec.stop * 3
     bench.step(GO, superseded=True)
     assert bench.link() == "up"
     assert bench.out.applied.linear <= 0.05
@@ -1546,8 +1551,8 @@ def test_a_superseded_speed_does_not_return_if_the_port_reopened_between_two_tic
     bench = Bench(Config(commands=CommandsConfig(neutral_first))).driving()
     bench.step(GO)  # this line does not leave
     bench.replug()
-    for _ in range(3):
-        bench.step(GO, tick=False)
+    for tick in (True, True, True, False, False):
+        bench.step(GO, tick=tick)
     assert bench.link() == "up"
     assert bench.step(GO, superseded=True).applied.linear <= 0.05
 
@@ -1560,7 +1565,8 @@ def test_the_status_changes_with_mode_reason_link_and_source_and_not_otherwise()
     assert bench.out.status_changed
     assert not bench.unplug().step().status_changed
     bench.replug()
-    assert [bench.step().status_changed for _ in range(4)] == [True, False, True, False]
+    changes = [bench.step().status_changed for _ in range(6)]
+    assert changes == [True, False, False, False, True, False]
     assert bench.step(REST).status_changed  # driven by app
     assert not bench.step(GO).status_changed
     assert bench.step(REST, source="teleop").status_changed

@@ -176,7 +176,7 @@ def situations() -> dict[str, Iterable[Finding]]:
         ),
         "a different file": settings_findings(
             robot=RobotConfig("other"),
-            mcu=McuConfig("/dev/x", 9600, True, 0.1, "auto", 400),
+            mcu=McuConfig("/dev/x", 9600, True, 0.1, "on", 400),
             bus=BusConfig(listen=("tcp/127.0.0.1:1",)),
             drive=DriveConfig(0.06, 0.31, 1.1, 1.01, 0.99),
         ),

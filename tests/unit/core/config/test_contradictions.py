@@ -73,9 +73,9 @@ def test_the_check_refuses_the_addresses_that_the_page_refuses(
         (McuConfig(), 33),
         (McuConfig(encoder_counts=3200), 33),
         (McuConfig(trailing_comma=True), 34),
-        (McuConfig(link_check="auto"), 41),
-        (McuConfig(link_check="require", trailing_comma=True), 42),
-        (McuConfig(link_check="auto", encoder_counts=3200), 62),
+        (McuConfig(link_check="on"), 41),
+        (McuConfig(link_check="on", trailing_comma=True), 42),
+        (McuConfig(link_check="on", encoder_counts=3200), 62),
     ],
 )
 def test_the_line_length_includes_all_fields_that_the_settings_may_request(

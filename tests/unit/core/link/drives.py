@@ -137,7 +137,7 @@ class Host:
         self.case, self.seconds = case, seconds
         self.rng = rng = np.random.default_rng(seed)
         self.path = Path(rng, seconds)
-        self.session = McuSession(McuConfig(), RATE)
+        self.session = McuSession(McuConfig(reply_period=0.0 if case.prompted else PERIOD), RATE)
         self.found = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
         self.floor, self.by_arrival = Arcs(), Arcs()
         """Poses from each line's true time, and from arrival times; `found` is the session's.

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-import random
 from itertools import pairwise
+from typing import Literal
 
 import pytest
 
 from acsard.core.config.settings import McuConfig, WheelMap
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Codec
-from acsard.core.link.feedback import Feedback, ReplyStyle, Timeline
-from acsard.core.link.sample_time import Placed
+from acsard.core.link.feedback import Feedback, Timeline
 from acsard.core.values import Instant, WheelSpeeds
 
 MS = 1_000_000
@@ -27,9 +26,12 @@ DEGREE = math.tau / 360
 class Bench:
     """The sample-time estimation under test, with simulated clocks of the host and the MCU."""
 
-    def __init__(self, wheels: WheelMap | None = None, counts: int = COUNTS) -> None:
+    def __init__(
+        self, wheels: WheelMap | None = None, counts: int = COUNTS, period: float = 0.0
+    ) -> None:
         wheels = wheels or WheelMap()
-        mcu = McuConfig(wheels=wheels, encoder_counts=counts, link_check="auto")
+        check: Literal["off", "on"] = "off" if period else "on"
+        mcu = McuConfig(wheels=wheels, encoder_counts=counts, link_check=check, reply_period=period)
         self.timeline = Timeline(mcu, Codec(wheels), 80.0, 100 * MS, 100.0)
         self.now_ns, self.mcu_ms = 9000 * MS, 500
 
@@ -182,20 +184,20 @@ def read(bench: Bench, ms: float, lines: int, silent: bool = False) -> list[Feed
 
 @pytest.mark.parametrize("lines", [5, 15, 25, 28])
 def test_each_line_that_waited_in_the_kernel_has_its_own_slot(lines: int) -> None:
-    bench = reporting(Bench(counts=0))
+    bench = reporting(Bench(counts=0, period=0.01))
     samples = read(bench, lines * 10, lines, silent=True)
     assert [(f.dt, f.gap, f.bridged) for f in samples] == [(0.01, 0.0, 0.0)] * lines
 
 
 def test_the_time_between_arrivals_is_kept_for_the_wheel_checks() -> None:
-    bench = reporting(Bench(counts=0))
+    bench = reporting(Bench(counts=0, period=0.01))
     samples = read(bench, 250, 25, silent=True)
     assert samples[0].since == 0.0
     assert sum(f.since for f in samples[1:]) == pytest.approx(24 * WIRE_NS / 1e9)
 
 
 def test_stamps_of_lines_that_waited_in_the_kernel_are_a_period_apart() -> None:
-    bench = reporting(Bench(counts=0))
+    bench = reporting(Bench(counts=0, period=0.01))
     samples = read(bench, 250, 25, silent=True)
     stamps = [f.at.mono_ns for f in samples]
     assert [b - a for a, b in pairwise(stamps)] == pytest.approx([10 * MS] * 24, abs=1000)
@@ -204,7 +206,7 @@ def test_stamps_of_lines_that_waited_in_the_kernel_are_a_period_apart() -> None:
 
 
 def test_missing_lines_are_filled_and_are_not_a_gap() -> None:
-    bench = reporting(Bench(counts=0))
+    bench = reporting(Bench(counts=0, period=0.01))
     for ms in range(0, 310, 10):
         bench.timeline.written(bench.now_ns + ms * MS)
     sample = bench.line(ms=310, gap=True)
@@ -214,7 +216,7 @@ def test_missing_lines_are_filled_and_are_not_a_gap() -> None:
 
 
 def test_lines_missing_for_a_second_are_a_gap() -> None:
-    bench = reporting(Bench(counts=0))
+    bench = reporting(Bench(counts=0, period=0.01))
     sample = bench.line(ms=1200, gap=True)
     assert (sample.dt, sample.bridged) == (0.0, 0.0)
     assert sample.gap == pytest.approx(1.2)
@@ -222,7 +224,7 @@ def test_lines_missing_for_a_second_are_a_gap() -> None:
 
 
 def test_in_a_backlog_with_missing_lines_each_dt_is_the_distance_of_the_stamps() -> None:
-    bench = reporting(Bench(counts=0))
+    bench = reporting(Bench(counts=0, period=0.01))
     for ms in range(0, 390, 10):
         bench.timeline.written(bench.now_ns + ms * MS)
     samples = read(bench, 390, 3, silent=True)
@@ -232,7 +234,7 @@ def test_in_a_backlog_with_missing_lines_each_dt_is_the_distance_of_the_stamps()
 
 
 def test_a_backlog_whose_missing_lines_last_for_a_second_begins_with_a_gap() -> None:
-    bench = reporting(Bench(counts=0))
+    bench = reporting(Bench(counts=0, period=0.01))
     for ms in range(0, 1500, 10):
         bench.timeline.written(bench.now_ns + ms * MS)
     first, second = read(bench, 1500, 2, silent=True)
@@ -241,7 +243,7 @@ def test_a_backlog_whose_missing_lines_last_for_a_second_begins_with_a_gap() -> 
 
 
 def test_a_spoilt_line_still_occupies_its_slot() -> None:
-    bench = reporting(Bench(counts=0))
+    bench = reporting(Bench(counts=0, period=0.01))
     bench.now_ns += 10 * MS
     bench.timeline.process_read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
     bench.timeline.skip_bad()
@@ -254,7 +256,6 @@ def test_the_first_prompted_reply_fills_the_time_of_the_ignored_replies(
     ignored: int,
 ) -> None:
     bench = Bench(counts=0)
-    bench.timeline._style.speaks = False
     bench.line()
     for _ in range(ignored):
         bench.now_ns += 50 * MS
@@ -268,7 +269,7 @@ def test_the_first_prompted_reply_fills_the_time_of_the_ignored_replies(
 
 
 def test_without_a_period_the_lines_of_a_read_share_the_time_since_the_last_read() -> None:
-    bench = Bench(counts=0)
+    bench = Bench(counts=0, period=0.01)
     bench.line()
     samples = read(bench, 60, 3)
     assert [f.dt for f in samples] == pytest.approx([0.02] * 3)
@@ -278,7 +279,7 @@ def test_without_a_period_the_lines_of_a_read_share_the_time_since_the_last_read
 
 
 def test_a_new_session_forgets_the_clock_of_the_old_session() -> None:
-    bench = reporting(Bench(counts=0))
+    bench = reporting(Bench(counts=0, period=0.01))
     bench.timeline.forget()
     assert bench.line(ms=20).gap == pytest.approx(0.02)
     assert bench.line(ms=14).dt == pytest.approx(0.014)
@@ -286,7 +287,7 @@ def test_a_new_session_forgets_the_clock_of_the_old_session() -> None:
 
 @pytest.mark.parametrize("period", [20, 50])
 def test_a_board_with_its_own_rate_has_its_own_period(period: int) -> None:
-    bench = Bench(counts=0)
+    bench = Bench(counts=0, period=period / 1000)
     for _ in range(80):
         bench.line(ms=period)
     samples = read(bench, period * 6, 6, silent=True)
@@ -347,7 +348,7 @@ def test_a_stall_counts_once_if_replies_name_their_line_and_many_are_lost() -> N
         left_ns = began_ns + (10 * number + 100 * (number > 100)) * MS
         bench.timeline.written(left_ns)
         if number < 95:
-            # The replies to these lines are lost, so the board seems to report by its own clock.
+            # The replies to these lines are lost.
             bench.timeline.written(left_ns + 3 * MS)
             bench.timeline.written(left_ns + 6 * MS)
         came_ns = bench.now_ns = left_ns + (109 if number == 100 else 9) * MS
@@ -357,19 +358,8 @@ def test_a_stall_counts_once_if_replies_name_their_line_and_many_are_lost() -> N
             assert total == pytest.approx((left_ns - began_ns) / 1e9, abs=0.005), number
 
 
-def test_a_line_whose_two_times_are_a_stall_apart_leaves_their_mean_difference_as_it_is() -> None:
-    timeline = Bench().timeline
-    for later_ms, dt, mean_ms in (
-        (8.0, None, 8.0), (8.0, 0.01, 8.0), (-1100.0, 0.01, 8.0), (6.0, 0.01, 6.0), (6.0, 0.01, 6.0)
-    ):  # fmt: skip
-        slot = Placed("slots", 9000 * MS, dt)
-        timeline._compare(Placed("prompts", slot.due_ns + int(later_ms * MS)), slot)
-        timeline._last_placed = slot
-        assert timeline._late_ns("prompts") == pytest.approx(mean_ms * MS)
-
-
 def test_a_change_of_the_clock_neither_adds_nor_loses_time() -> None:
-    bench = Bench(counts=0)
+    bench = Bench(counts=0, period=0.01)
     began = bench.now_ns + 10 * MS
     total = 0.0
     for number in range(400):
@@ -378,36 +368,12 @@ def test_a_change_of_the_clock_neither_adds_nor_loses_time() -> None:
         total += bench.line(ms=10 + late).dt
         bench.now_ns -= late * MS
         if number % 100 == 70:
+            assert bench.timeline._slots is not None
             bench.timeline._slots.forget()
     assert total == pytest.approx((bench.now_ns - began) / 1e9, abs=0.004)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_a_change_from_slots_to_answers_as_the_clock_keeps_the_elapsed_time(seed: int) -> None:
-    """The estimation changes from sample slots to matched answers while the time goes on.
-
-    A slot is timed with the minimum delay, and an answer with the mean delay.
-    """
-    bench, chance, total = Bench(counts=0), random.Random(seed), 0.0
-    began = bench.now_ns
-    for number in (*range(200), *range(215, 230)):  # the stall reveals that the board answers
-        left_ns = began + number * 10 * MS
-        bench.timeline.written(left_ns)
-        bench.now_ns = left_ns + int(chance.uniform(7.0, 8.2) * MS)
-        at = Instant(bench.now_ns, bench.now_ns)
-        bench.timeline.process_read(at, LENGTH, 1, 0)
-        dt = bench.timeline.place(SPEEDS, None, 0, LENGTH, False).dt
-        total += dt if number >= 150 else 0.0
-    assert bench.timeline._last_placed.clock == "prompts"
-    assert total == pytest.approx(0.8, abs=0.0003)
-
-
 def test_answers_after_a_phase_of_sparse_replies_are_not_matched_to_old_lines() -> None:
-    """While the board answers only every fifth line, it looks like a free-running board.
-
-    The replies of this time are matched to no line. The lines sent in this time must not be matched
-    to later replies.
-    """
     bench = Bench(counts=0)
     timeline = bench.timeline
     for number in range(596):
@@ -415,43 +381,11 @@ def test_answers_after_a_phase_of_sparse_replies_are_not_matched_to_old_lines() 
         bench.now_ns += 10 * MS
         if number % 5 == 0:
             read(bench, 0, 1)
-    assert timeline._style.speaks
     lines = []
     for number in range(60):
         timeline.written(bench.now_ns + 2 * MS)
         bench.now_ns += 10 * MS
         if number >= 7:
             lines += read(bench, 0, 1 if number > 7 else 8)  # the host stood still for eight lines
-    assert timeline._style.speaks is False
     assert max(line.dt for line in lines) <= 0.08  # the duration of the stall
     assert sum(line.dt for line in lines) == pytest.approx(0.6, abs=0.06)
-
-
-@pytest.mark.parametrize(
-    ("configured", "stalls", "speaks"),
-    [
-        pytest.param(False, [(1, 1.0, 1)] * 1000, None, id="we send every period"),
-        pytest.param(False, [(15, 15.2, 1)], True, id="all lines come in our stall"),
-        pytest.param(False, [(12, 15.2, 1)], True, id="most lines come in our stall"),
-        pytest.param(False, [(1, 15.2, 1)], False, id="no line comes in our stall"),
-        pytest.param(False, [(2, 15.2, 1)], False, id="hardly any line comes in our stall"),
-        pytest.param(False, [(3, 3.0, 1)], None, id="a short stall"),
-        pytest.param(False, [(3, 3.0, 1)] * 2, True, id="short stalls tell together"),
-        pytest.param(False, [(13, 15.2, 11)], None, id="neither is clearly nearer"),
-        pytest.param(False, [(13, 15.2, 11), (2, 0.3, 0)], True, id="an adapter held two lines"),
-        pytest.param(False, [(1, 40.0, 13)], None, id="a silence that fits neither"),
-        pytest.param(False, [(15, 15.0, 1), (1, 15.0, 1)], False, id="later evidence counts"),
-        pytest.param(True, [(1, 15.0, 1)], True, id="what is configured is not doubted"),
-        pytest.param(False, [(1, 200.0, 1)], None, id="nothing is expected after long silence"),
-    ],
-)
-def test_a_host_stall_reveals_whether_the_board_reports_by_itself(
-    configured: bool, stalls: list[tuple[int, float, int]], speaks: bool | None
-) -> None:
-    """Each stall has three numbers: received lines, length in periods, and sent lines."""
-    style = ReplyStyle(configured)
-    for lines, periods, left in stalls:
-        for _ in range(left):
-            style.written()
-        style.process_read(lines, periods)
-    assert style.speaks is speaks

@@ -166,8 +166,8 @@ def test_the_diagnosis_says_what_was_received_how_it_looks_and_what_to_do(
     diagnosis = diagnosis_of(data)
     assert diagnosis.looks == looks
     assert counted in diagnosis.counted
-    assert diagnosis.diagnosis.code == f"received_{looks}"
-    assert diagnosis.counted in diagnosis.diagnosis.text
+    assert diagnosis.diagnosis().code == f"received_{looks}"
+    assert diagnosis.counted in diagnosis.diagnosis().text
 
 
 def test_the_diagnosis_comes_after_three_seconds_and_again_only_when_it_changes() -> None:
@@ -204,21 +204,21 @@ def test_a_stall_while_the_link_was_up_does_not_explain_later_sparse_lines() -> 
     for _ in range(11):
         bench.wait(10)
     assert bench.link() == "stale"
-    assert sparse(bench).diagnosis.code == "received_sparse"
+    assert sparse(bench).diagnosis().code == "received_sparse"
 
 
 def test_a_closed_port_is_not_a_host_stall() -> None:
     bench = Bench(McuConfig(port="/dev/board")).up().close()
     for _ in range(500):
         bench.wait(10)
-    assert sparse(bench.open()).diagnosis.code == "received_sparse"
+    assert sparse(bench.open()).diagnosis().code == "received_sparse"
 
 
 def test_a_stall_within_the_time_of_the_sparse_lines_explains_them() -> None:
     bench = Bench(McuConfig(port="/dev/board")).open()
     bench.wait(10)
     bench.wait(800)
-    assert sparse(bench).diagnosis.code == "host_late"
+    assert sparse(bench).diagnosis().code == "host_late"
 
 
 def test_lines_that_came_while_the_output_was_blocked_are_not_counted_afterwards() -> None:

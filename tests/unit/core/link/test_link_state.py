@@ -22,8 +22,8 @@ QUIET_NS = 100 * MS
 class Bench:
     """A link to an MCU that sends a good line every 10 ms."""
 
-    def __init__(self) -> None:
-        self.link, self.now_ns = Link(QUIET_NS), 1000 * MS
+    def __init__(self, checked: bool = False) -> None:
+        self.link, self.now_ns = Link(QUIET_NS, checked), 1000 * MS
         self.link.apply("opened")
 
     def good(self, count: int = 1, ms: float = 10, may_rise: bool = True) -> str:
@@ -62,12 +62,24 @@ def test_lines_further_apart_than_the_silence_limit_are_reported_and_make_no_lin
 
 
 def test_bad_lines_alone_do_not_take_the_link_down_but_are_reported() -> None:
-    bench = Bench()
-    bench.good(GOOD_LINES)
-    assert [bench.link.bad() for _ in range(BAD_LINES + 1)].index(True) == BAD_LINES - 1
-    assert (bench.link.state, bench.link.damaged) == ("up", True)
-    bench.good()
-    assert not bench.link.damaged
+    for checked, state in ((False, "up"), (True, "stale")):
+        bench = Bench(checked)
+        bench.good(GOOD_LINES)
+        for _ in range(BAD_LINES - 1):
+            bench.link.bad()
+        assert (bench.link.state, bench.link.damaged) == ("up", False)
+        bench.link.bad()
+        assert (bench.link.state, bench.link.damaged) == (state, True)
+        assert bench.good() == "up"
+        assert not bench.link.damaged
+
+
+def test_one_good_line_opens_a_checked_link_and_a_bad_one_opens_nothing() -> None:
+    bench = Bench(checked=True)
+    bench.link.bad()
+    bench.link.judge(bench.now_ns, may_rise=True)
+    assert bench.link.state == "booting"
+    assert bench.good() == "up"
 
 
 @pytest.mark.parametrize(

@@ -671,26 +671,6 @@ def test_on_a_lossy_batched_link_an_answer_is_at_most_one_line_off(seed: int) ->
     assert {off - usual for off in offs} <= {-1, 0, 1}
 
 
-def test_a_delay_that_varies_by_4_ms_counts_as_processing_time_of_the_mcu() -> None:
-    bench, chance = Prompted(), random.Random(1)
-    for number in range(300):
-        bench.leave(number * 10)
-        bench.reply(number * 10 + 7.0 + chance.uniform(0.0, 4.0))
-    assert bench.prompts.varies_delay
-
-
-def test_an_early_first_reply_does_not_hide_that_the_delay_varies() -> None:
-    """Compared with the early first reply, every later reply looks delayed by a stall."""
-    bench, chance = Prompted(), random.Random(1)
-    bench.prompts = PromptedTimes(0)
-    bench.leave(0)
-    bench.reply(0.8)
-    for number in range(1, 300):
-        bench.leave(number * 10)
-        bench.reply(number * 10 + 6.5 + chance.uniform(0.0, 4.0))
-    assert bench.prompts.varies_delay
-
-
 def test_a_stall_of_the_board_does_not_change_the_usual_delay() -> None:
     """After the stall the board answers the waiting lines, and each read has one reply."""
     bench = Prompted().talk(200)
@@ -700,11 +680,3 @@ def test_a_stall_of_the_board_does_not_change_the_usual_delay() -> None:
     for number in range(200, 230):
         bench.reply(2300 + (number - 199) * 6, asked_ms=number * 10)
     assert bench.prompts.latest_ns - 2290 * MS == pytest.approx(delay, abs=MS)
-
-
-def test_the_jitter_of_usb_does_not_count_as_processing_time_of_the_mcu() -> None:
-    bench, chance = Prompted(), random.Random(1)
-    for number in range(300):
-        bench.leave(number * 10)
-        bench.reply(number * 10 + 8.0 + chance.uniform(0.0, 1.0) + chance.expovariate(1 / 0.3))
-    assert not bench.prompts.varies_delay

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.link.checked_line import ECHO_MARK, SAMPLE_REQUEST, seal
+from acsard.core.link.checked_line import SAMPLE_REQUEST, seal
 from acsard.core.link.serial_output import SerialOutput
 from tests.each import each
 
@@ -83,7 +83,7 @@ def test_a_line_older_than_a_period_is_not_sent(period_ms: int) -> None:
     assert wire.offer(GO, 300 + period_ms, made_ms=300) == "sent"
 
 
-@each("letters", [None, b"", ECHO_MARK, SAMPLE_REQUEST])
+@each("letters", [None, b"", SAMPLE_REQUEST])
 @each("stop", [STOP, COMMA_STOP])
 def test_a_stop_of_any_form_is_never_too_old(stop: bytes, letters: bytes | None) -> None:
     line = stop if letters is None else seal(stop, 7, letters)

@@ -9,13 +9,14 @@ from itertools import pairwise
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
-from acsard.core.config.settings import McuConfig, WheelMap
+from acsard.core.config.settings import FeedbackConfig, McuConfig, WheelMap
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.link.checked_line import seal
 from acsard.core.link.feedback import MIN_INTERVAL_NS, Feedback
 from acsard.core.link.link_state import BAD_LINES, GOOD_LINES
-from acsard.core.link.session import LONG_GAP_NS, McuSession
+from acsard.core.link.session import LONG_GAP_NS, QUESTION_LINE, McuSession
 from acsard.core.values import NS_PER_S, STILL, Instant, Received, WheelSpeeds
 from tests.each import each
 from tests.vectors.lines import SEED_LINE, SEED_MOTORS, ZERO
@@ -24,6 +25,8 @@ MS = 1_000_000
 GOOD = SEED_LINE + b"\r\n"
 BAD = b"hello\r\n"
 WALL_NS = 1_800_000_000 * NS_PER_S
+CHECKED = McuConfig(link_check="on")
+FREE = McuConfig(reply_period=0.02)
 SLOW = WheelSpeeds(1.0, 1.0, 1.0, 1.0)
 
 
@@ -52,7 +55,6 @@ class Bench:
     def answer(self, line: bytes | None) -> bytes:
         """Return the checked reply to a line from the host."""
         assert line is not None
-        assert b"#" in line
         return seal(GOOD, int(line.partition(b"#")[2][:2], 16))
 
     def talk(self, ms: int = 10, count: int = 1) -> list[Feedback]:
@@ -60,15 +62,17 @@ class Bench:
         samples = []
         for _ in range(count):
             line = self.line()
-            checked = line is not None and b"#" in line
-            samples += self.wait(ms, self.answer(line)) if checked else self.wait(ms)
+            if line is None or line == QUESTION_LINE:
+                samples += self.wait(ms)
+            else:
+                samples += self.wait(ms, self.answer(line) if b"#" in line else ZERO + b"\r\n")
         return samples
 
     def checked(self) -> Bench:
         """Open the port and talk until the link is up and checked."""
         self.open().wait(10)
-        self.talk(count=30)
-        assert (self.link(), self.session.negotiation.state) == ("up", "checked")
+        self.talk(count=3)
+        assert (self.link(), self.session.check) == ("up", "checked")
         return self
 
     def names(self) -> list[str]:
@@ -85,7 +89,15 @@ class Bench:
         return self
 
     def wait(self, ms: float, *reads: bytes) -> list[Feedback]:
-        """Let `ms` pass, then update the session with the bytes that were read just now."""
+        """Let `ms` pass, then update the session with the bytes that were read just now.
+
+        Before that, the stop and the question with which a session begins leave the port.
+        """
+        session = self.session
+        if session._made is None and self.port_open and (session._first or session._echo.due):
+            self.line()
+        if session._made is not None and session._made[0] == QUESTION_LINE:
+            reads = BOOTED, *reads
         self.now_ns += int(ms * MS)
         received = tuple(Received(self.now, data) for data in reads)
         self.session.sent(self.made_ns, was_written=True)
@@ -100,7 +112,7 @@ class Bench:
     def up(self) -> Bench:
         """Open the port and feed good lines until the link is up."""
         self.open().wait(10)
-        for _ in range(GOOD_LINES):
+        for _ in range(1 + GOOD_LINES):
             self.wait(10, GOOD)
         return self
 
@@ -117,13 +129,15 @@ Step = tuple[str, float, bytes, str]
 
 OPENED: list[Step] = [("open", 10, b"", "booting")]
 QUIET: list[Step] = [*[("", 50, b"", "up")] * 2, ("", 50, b"", "stale")]
-UP: list[Step] = [*OPENED, ("", 10, GOOD * 3, "up")]
+ASKED: list[Step] = [*OPENED, ("", 10, GOOD, "booting"), ("", 10, b"", "booting")]
+UP: list[Step] = [*ASKED, ("", 10, GOOD * 3, "up")]
 
 LINKS: dict[str, list[Step]] = {
     "a closed port": [("", 10, b"", "down"), ("", 10, GOOD * 5, "down")],
-    "the third good line": [*OPENED, *[("", 10, GOOD, "booting")] * 2, *[("", 10, GOOD, "up")] * 2],
+    "the third good line": [*ASKED, *[("", 10, GOOD, "booting")] * 2, *[("", 10, GOOD, "up")] * 2],
+    "no good line before the question counts": [*OPENED, ("", 10, GOOD * 9, "booting")],
     "a bad line while booting starts the count again": [
-        *OPENED, ("", 10, GOOD + GOOD + BAD + GOOD + GOOD, "booting"), ("", 10, GOOD, "up"),
+        *ASKED, ("", 10, GOOD + GOOD + BAD + GOOD + GOOD, "booting"), ("", 10, GOOD, "up"),
     ],
     "a line that is too long starts the count again": [*OPENED, *[("", 10, LONG, "booting")] * 4],
     "a board that prints noise": [*OPENED, *[("", 10, NOISE, "booting")] * 100],
@@ -144,7 +158,8 @@ LINKS: dict[str, list[Step]] = {
         *UP, *QUIET, ("close", 10, b"", "down"),
     ],
     "a board that restarts within one read": [
-        *UP, ("", 10, BOOTED + GOOD * 4, "booting"), ("", 10, GOOD, "up"),
+        *UP, ("", 10, BOOTED + GOOD * 4, "booting"), *[("", 10, GOOD, "booting")] * 2,
+        ("", 10, GOOD, "up"),
     ],
 }  # fmt: skip
 
@@ -160,9 +175,11 @@ def test_the_link_state_follows_the_port_and_the_lines(case: str) -> None:
 @each("lines", range(5))
 def test_the_link_of_a_reopened_port_is_booting(lines: int) -> None:
     bench = Bench().open()
+    bench.wait(10, GOOD)
     bench.wait(10, GOOD * lines)
     bench.open().wait(10)
     assert bench.link() == "booting"
+    bench.wait(10, GOOD)
     bench.wait(10, GOOD * 2)
     assert bench.link() == "booting"
     bench.wait(10, GOOD)
@@ -237,7 +254,7 @@ def sampled(bench: Bench, age_ns: int) -> Instant:
 
 
 def test_a_line_at_the_end_of_a_read_has_the_age_of_its_own_wire_time() -> None:
-    bench = Bench().open()
+    bench = Bench(FREE).open()
     (feedback,) = bench.wait(10, GOOD)
     assert feedback.heard_ns == bench.now_ns
     assert feedback.at == sampled(bench, 0)
@@ -246,7 +263,7 @@ def test_a_line_at_the_end_of_a_read_has_the_age_of_its_own_wire_time() -> None:
 
 
 def test_the_bytes_that_followed_a_line_make_it_older_on_both_clocks() -> None:
-    bench = Bench(McuConfig(baud_rate=9600)).open()
+    bench = Bench(replace(FREE, baud_rate=9600)).open()
     first, second = bench.wait(10, GOOD + GOOD + GOOD[:12])
     # At 9600 baud 45 bytes take 46.875 ms, 12 bytes 12.5 ms, and the 33 of the line itself 34.375
     # ms.
@@ -257,20 +274,20 @@ def test_the_bytes_that_followed_a_line_make_it_older_on_both_clocks() -> None:
 
 
 def test_dt_is_the_time_since_the_previous_line() -> None:
-    bench = Bench().open()
+    bench = Bench(FREE).open()
     assert [f.dt for f in bench.wait(10, GOOD)] == [0.0]
     assert [f.dt for f in bench.wait(10, GOOD)] == [0.01]
     assert [f.dt for f in bench.wait(12.5, GOOD)] == [0.0125]
 
 
 def test_lines_read_together_share_the_time_since_the_previous_read() -> None:
-    bench = Bench().up()
+    bench = Bench(FREE).up()
     first, second, third = bench.wait(15, GOOD * 3)
     assert first.dt == second.dt == third.dt == pytest.approx(0.005)
 
 
 def test_a_line_is_never_older_than_the_previous_line() -> None:
-    bench = Bench(McuConfig(baud_rate=9600)).open()
+    bench = Bench(replace(FREE, baud_rate=9600)).open()
     (first,) = bench.wait(10, GOOD)
     (second,) = bench.wait(1, GOOD + GOOD[:20])  # 20.8 ms of wire time within 1 ms
     # The stamps must also differ. A reader of the transforms takes the second of two with one stamp
@@ -289,7 +306,7 @@ def test_a_line_is_never_older_than_the_previous_line() -> None:
 def test_without_gaps_the_dts_add_up_to_the_time_between_first_and_last_line(
     reads: list[tuple[float, int, int]], baud: int
 ) -> None:
-    bench = Bench(McuConfig(baud_rate=115200 if baud == 115200 else 9600)).open()
+    bench = Bench(replace(FREE, baud_rate=115200 if baud == 115200 else 9600)).open()
     samples = bench.wait(10, GOOD)
     for ms, lines, cut in reads:
         data = GOOD * (lines + 1)
@@ -303,14 +320,14 @@ def test_without_gaps_the_dts_add_up_to_the_time_between_first_and_last_line(
 
 
 def test_a_line_split_over_two_reads_has_the_time_of_the_second_read() -> None:
-    bench = Bench().up()
+    bench = Bench(FREE).up()
     bench.wait(5, GOOD[:20])
     (feedback,) = bench.wait(5, GOOD[20:] + GOOD[:3])
     assert feedback.at == sampled(bench, wire_ns(3, 115200))
 
 
 def test_a_step_of_the_wall_clock_changes_no_dt() -> None:
-    session = McuSession(McuConfig(), 100.0)
+    session = McuSession(FREE, 100.0)
     for step in range(1, 10):
         now = Instant(step * 10 * MS, WALL_NS + (-1) ** step * 3600 * NS_PER_S)
         (feedback,) = session.update(now, True, 1, (Received(now, GOOD),))
@@ -323,14 +340,14 @@ def test_a_step_of_the_wall_clock_changes_no_dt() -> None:
 
 
 def test_after_a_gap_dt_is_zero_and_the_length_of_the_gap_is_reported() -> None:
-    bench = Bench().up()
+    bench = Bench(FREE).up()
     bench.wait(200)
     (feedback,) = bench.wait(50, GOOD)
     assert (feedback.dt, feedback.gap) == (0.0, 0.25)
 
 
 def test_a_silence_up_to_the_silence_limit_is_not_a_gap() -> None:
-    bench = Bench().up()
+    bench = Bench(FREE).up()
     (feedback,) = bench.wait(100, GOOD)
     assert (feedback.dt, feedback.gap) == (0.1, 0.0)
     (feedback,) = bench.wait(100.000001, GOOD)
@@ -339,7 +356,7 @@ def test_a_silence_up_to_the_silence_limit_is_not_a_gap() -> None:
 
 
 def test_bad_lines_do_not_fill_a_gap() -> None:
-    bench = Bench().up()
+    bench = Bench(FREE).up()
     for _ in range(15):
         bench.wait(10, BAD)
     (feedback,) = bench.wait(10, GOOD)
@@ -347,14 +364,14 @@ def test_bad_lines_do_not_fill_a_gap() -> None:
 
 
 def test_the_second_line_after_a_gap_has_a_dt_again() -> None:
-    bench = Bench().up()
+    bench = Bench(FREE).up()
     bench.wait(500, GOOD)
     (feedback,) = bench.wait(10, GOOD)
     assert (feedback.dt, feedback.gap) == (0.01, 0.0)
 
 
 def test_the_time_with_a_closed_port_is_always_a_gap() -> None:
-    bench = Bench().up()
+    bench = Bench(FREE).up()
     bench.close().wait(20)
     (feedback,) = bench.open().wait(20, GOOD)
     assert (feedback.dt, feedback.gap) == (0.0, 0.04)
@@ -418,7 +435,7 @@ def test_good_lines_are_counted_and_bad_ones_by_reason() -> None:
     bench.wait(10, b"hello\r\n" + GOOD + b"x" * 200 + b"\n" + b"x\r\n")
     bench.wait(10, b"ap99.999,bp00.00,cp00.00,dp00.00\n" + b"\x00" * 300)
     bench.wait(10, b"\n" + b"ap01.00,ap00.00,cp00.00,dp00.00\n" * 3)
-    assert bench.session.good_lines == GOOD_LINES + 1
+    assert bench.session.good_lines == GOOD_LINES + 2
     assert bench.session.rejects == {
         "malformed": 2,
         "too_long": 2,
@@ -434,7 +451,7 @@ def test_the_line_counters_continue_in_the_next_session() -> None:
     bench.open().wait(10, BAD + b"x" * 200 + b"\n" + GOOD)
     assert bench.session.rejects["malformed"] == 2
     assert bench.session.rejects["too_long"] == 2
-    assert bench.session.good_lines == GOOD_LINES + 1
+    assert bench.session.good_lines == GOOD_LINES + 2
 
 
 def test_the_line_is_read_by_the_wheel_map_of_the_configuration() -> None:
@@ -450,38 +467,84 @@ def test_the_codec_writes_the_dialect_of_the_configuration() -> None:
 
 # the checked link
 
-AUTO = McuConfig(link_check="auto")
-REQUIRE = McuConfig(link_check="require")
+
+@each("mcu", [McuConfig(), CHECKED])
+def test_a_session_begins_with_a_plain_stop_and_the_question_follows_the_first_line(
+    mcu: McuConfig,
+) -> None:
+    bench = Bench(mcu).open()
+    bench.wait(10)
+    lines = [bench.line()]
+    for _ in range(50):
+        bench.wait(10)
+        lines.append(bench.line())
+    assert set(lines) <= {None, ZERO + b"\r\n", *[seal(ZERO, n) for n in range(9)]}
+    assert lines[0] == ZERO + b"\r\n"
+    bench.wait(10, ZERO + b"\r\n")
+    assert bench.line() == b"?\r\n"
+    update(bench, left=False, read=b"")
+    assert bench.line() == b"?\r\n"  # until it has left
+    update(bench, left=True, read=b"")
+    assert bench.line() != b"?\r\n"
 
 
-def test_during_the_negotiation_only_stops_are_sent_and_the_link_is_not_up() -> None:
-    bench = Bench(REQUIRE).open()
+def test_the_first_right_reply_opens_a_checked_link() -> None:
+    bench = Bench(CHECKED).open()
+    bench.wait(10)
+    bench.talk(count=2)
+    assert (bench.link(), bench.session.good_lines) == ("booting", 0)
+    bench.talk()
+    assert (bench.link(), bench.session.good_lines) == ("up", 1)
+
+
+def test_plain_replies_never_open_a_checked_link_and_the_reason_says_what_to_change() -> None:
+    bench, events = Bench(CHECKED).open(), []
     for _ in range(300):
         bench.wait(10, GOOD)
         line = bench.line()
-        assert line is None or line.startswith(ZERO)
+        assert line is None or line.startswith((ZERO, b"?"))
         assert bench.link() == "booting"
+        events += bench.session.events
     assert bench.session.good_lines == 0
+    (outcome,) = [event for event in events if event.name == "link_check"]
+    assert (outcome.level, outcome.code) == ("error", "no_checksum")
+    why = bench.session.describe_link()
+    assert why.code == "no_checksum"
+    assert 'mcu.link_check = "off"' in why.text
+    bench.wait(100)
+    bench.wait(10, bench.answer(bench.line()))  # other firmware was flashed
+    assert bench.link() == "up"
 
 
-def test_the_link_is_up_with_the_third_right_reply() -> None:
-    bench = Bench(AUTO).open()
+def test_a_board_that_ignores_checked_lines_is_known_by_its_reply_to_the_first_stop() -> None:
+    bench = Bench(CHECKED).open()
     bench.wait(10)
-    while bench.session.negotiation.asking:
-        bench.talk()
-    assert (bench.link(), bench.session.good_lines) == ("booting", 1)
-    bench.talk(count=2)
-    assert (bench.link(), bench.session.good_lines) == ("up", 3)
-
-
-def test_an_mcu_without_the_check_is_driven_plainly() -> None:
-    bench = Bench(AUTO).open()
-    for _ in range(40):
-        bench.wait(10, GOOD)
+    bench.wait(10, GOOD)
+    for _ in range(320):
         bench.line()
-    assert (bench.link(), bench.session.negotiation.state) == ("up", "plain")
-    assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
-    assert bench.session.rejects == {}
+        bench.wait(10)
+    assert bench.session.describe_link().code == "no_checksum"
+
+
+def test_a_silent_board_on_a_checked_link_is_told_by_a_reason_with_the_setting() -> None:
+    for mcu, told in ((CHECKED, True), (McuConfig(), False)):
+        bench = Bench(mcu).open()
+        for _ in range(320):
+            bench.line()
+            bench.wait(10)
+        why = bench.session.describe_link()
+        assert why.code == "received_nothing"
+        assert ("mcu.link_check" in why.text) is told
+
+
+@each("counts", [0, 3200])
+def test_a_board_without_counts_is_reported_only_if_counts_are_configured(counts: int) -> None:
+    bench, names = Bench(McuConfig(link_check="on", encoder_counts=counts)).open(), []
+    bench.wait(10)
+    for _ in range(20):
+        bench.talk()
+        names += bench.names()
+    assert names.count("link_check") == bool(counts)
 
 
 @each(
@@ -497,22 +560,27 @@ def test_an_mcu_without_the_check_is_driven_plainly() -> None:
 def test_on_a_checked_link_a_reply_without_a_right_suffix_is_dropped_and_counted(
     line: bytes, reason: str
 ) -> None:
-    bench = Bench(AUTO).checked()
+    bench = Bench(CHECKED).checked()
     bench.session.rejects.clear()
     assert bench.wait(1, line) == []
     assert bench.session.rejects == {reason: 1}
     assert bench.link() == "up"
 
 
-def test_a_repeated_reply_is_accepted_once() -> None:
-    bench = Bench(AUTO).checked()
-    reply = bench.answer(bench.line())
-    assert len(bench.wait(10, reply + reply + reply)) == 1
-    assert bench.session.rejects["stale_sequence"] == 2
+def test_replies_that_arrive_twice_count_once_and_are_no_damage() -> None:
+    bench, samples = Bench(CHECKED).checked(), []
+    for n in range(20):
+        reply = bench.answer(bench.line())
+        samples += bench.wait(10, *([reply * 2] if n % 2 else [reply, reply * 9]))
+        assert bench.names() == []
+    assert len(samples) == 20
+    assert [sample.bridged for sample in samples] == [0.0] * 20
+    assert bench.session.rejects == {"repeated": 10 + 90}
+    assert bench.link() == "up"
 
 
 def test_each_reply_to_pipelined_lines_is_accepted() -> None:
-    bench = Bench(AUTO).checked()
+    bench = Bench(CHECKED).checked()
     replies = []
     for _ in range(4):
         replies.append(bench.answer(bench.line()))
@@ -520,51 +588,41 @@ def test_each_reply_to_pipelined_lines_is_accepted() -> None:
     assert len(bench.wait(1, b"".join(replies))) == 4
 
 
-def test_five_bad_replies_in_a_row_end_the_link_and_restart_the_negotiation() -> None:
-    bench = Bench(AUTO).checked()
+def test_five_bad_replies_in_a_row_end_the_link_until_the_next_right_one() -> None:
+    bench = Bench(CHECKED).checked()
     bench.wait(1, BAD * (BAD_LINES - 1))
     assert bench.link() == "up"
     bench.wait(1, BAD)
-    assert (bench.link(), bench.session.negotiation.asking) == ("stale", True)
+    assert bench.link() == "stale"
     assert bench.session.describe_link().code == "replies_damaged"
-    line = bench.line()
-    assert line is not None
-    assert line.startswith(ZERO + b"#")
-    bench.wait(10, bench.answer(line))
-    bench.talk(count=2)
+    bench.talk()
     assert bench.link() == "up"
-    assert bench.line() is not None
 
 
 def test_bad_replies_among_right_ones_are_only_counted() -> None:
-    bench = Bench(AUTO).checked()
+    bench = Bench(CHECKED).checked()
     for _ in range(50):
         bench.wait(10, BAD * (BAD_LINES - 1) + bench.answer(bench.line()))
     assert bench.link() == "up"
 
 
-def test_a_silence_without_a_right_reply_restarts_the_negotiation() -> None:
-    bench = Bench(AUTO).checked()
+def test_without_a_right_reply_plain_ones_do_not_hold_the_link() -> None:
+    bench = Bench(CHECKED).checked()
     for _ in range(3):
         bench.wait(30, GOOD)
     assert bench.link() == "up"
     bench.wait(11, GOOD)
-    assert (bench.link(), bench.session.negotiation.asking) == ("stale", True)
-
-
-def test_an_mcu_that_answered_with_a_check_is_never_driven_without_it() -> None:
-    bench = Bench(AUTO).checked()
+    assert bench.link() == "stale"
     for _ in range(500):
         bench.wait(10, GOOD)
-        line = bench.line()
-        assert line is None or line.startswith(ZERO) or bench.link() == "up"
-    assert bench.session.negotiation.asking
-    assert bench.session.describe_link().code == "checksum_lost"
+        bench.line()
+        assert bench.link() == "stale"
+    assert bench.session.describe_link().code == "no_checksum"
 
 
-@pytest.mark.parametrize("mcu", [McuConfig(), AUTO], ids=["plain", "checked"])
+@pytest.mark.parametrize("mcu", [McuConfig(), CHECKED], ids=["plain", "checked"])
 def test_an_mcu_that_names_itself_has_restarted(mcu: McuConfig) -> None:
-    bench = Bench(mcu).checked() if mcu is AUTO else Bench(mcu).up()
+    bench = Bench(mcu).checked() if mcu is CHECKED else Bench(mcu).up()
     bench.wait(10, BOOTED)
     assert bench.session.restarted
     assert bench.link() == "booting"
@@ -575,37 +633,102 @@ def test_an_mcu_that_names_itself_has_restarted(mcu: McuConfig) -> None:
 
 
 def test_the_identity_line_of_an_mcu_that_is_still_booting_is_not_a_restart_event() -> None:
-    bench = Bench(AUTO).open()
+    bench = Bench(CHECKED).open()
     bench.wait(10, BOOTED)
     assert bench.names() == ["link_booting"]
     assert bench.session.restarted
 
 
-def test_the_outcome_of_the_negotiation_is_an_event() -> None:
-    bench = Bench(AUTO).open()
-    events = []
-    for _ in range(40):
-        bench.talk()
-        events += bench.session.events
-    (outcome,) = [event for event in events if event.name == "link_check"]
-    assert outcome.level == "info"
+def test_the_name_of_the_board_answers_the_question_and_is_no_restart() -> None:
+    bench = Bench().open()
+    bench.wait(10)
+    bench.wait(10, GOOD)
+    bench.wait(10, GOOD)  # with the name
+    assert not bench.session.restarted
+    bench.wait(10, GOOD + GOOD)
+    assert bench.link() == "up"
+    bench.wait(10, BOOTED)
+    assert bench.session.restarted
 
 
-def test_a_refused_check_is_an_event_and_the_reason_of_the_link() -> None:
-    bench = Bench(REQUIRE).open()
-    events = []
-    for _ in range(100):
-        bench.wait(10, GOOD)
-        bench.line()
-        events += bench.session.events
-    (outcome,) = [event for event in events if event.name == "link_check"]
-    assert outcome.level == "error"
-    assert (bench.session.describe_link().code, outcome.code) == ("no_checksum", "no_checksum")
+# echoes
 
 
-def test_the_note_after_a_reason_names_the_check_in_force() -> None:
-    assert Bench().up().session.note == ""
-    assert Bench(AUTO).checked().session.note == " (serial lines checked)"
+def echoed(bench: Bench, speed: float, count: int, *, board: bytes = b"") -> list[bytes]:
+    """Return each line to the host 10 ms later, behind `board`, and return the lines."""
+    lines = []
+    for _ in range(count):
+        line = bench.line(WheelSpeeds(*[speed if bench.link() == "up" else 0.0] * 4))
+        lines += [line] if line else []
+        bench.wait(10, board + (line or b""))
+    return lines
+
+
+@each("mcu", [McuConfig(), CHECKED, McuConfig(link_check="on", encoder_counts=3200)])
+@each("board", [b"", GOOD])
+def test_a_port_that_returns_the_question_is_never_linked(mcu: McuConfig, board: bytes) -> None:
+    bench = Bench(mcu).open()
+    bench.wait(10)
+    lines = echoed(bench, 1.0, 1000, board=board)
+    assert (bench.link(), bench.session.describe_link().code) == ("booting", "echo")
+    assert all(line.startswith((ZERO, b"?")) for line in lines)
+    bench.checked() if mcu.checked else bench.up()  # until the port is opened again
+
+
+def test_a_returned_question_counts_only_while_an_answer_may_come() -> None:
+    bench = Bench().up()
+    bench.wait(1000, GOOD)
+    bench.wait(10, b"?\r\n")
+    assert bench.link() == "up"
+    assert bench.session.rejects == {"echo": 1}
+
+
+def test_lines_that_return_during_a_drive_raise_the_question_after_a_change_of_speed() -> None:
+    bench = Bench().up()
+    assert b"?\r\n" not in echoed(bench, 0.0, 300)  # every board at rest repeats zeros
+    lines = echoed(bench, 1.0, 100)
+    assert lines.count(b"?\r\n") == 1
+    assert (bench.link(), bench.session.describe_link().code) == ("stale", "echo")
+
+
+@each("encoders", [True, False])
+def test_a_board_that_repeats_commands_but_not_the_question_has_no_encoders(encoders: bool) -> None:
+    bench = Bench()
+    bench.session = McuSession(McuConfig(), 100.0, FeedbackConfig(encoders=encoders))
+    bench.up()
+    for n in range(400):
+        speed = n % 100 / 10
+        line = bench.line(WheelSpeeds(speed, speed, speed, speed))
+        assert line is not None
+        bench.wait(10, *([] if line == b"?\r\n" else [line]))
+        if bench.link() != "up":
+            break
+    assert bench.link() == ("stale" if encoders else "up")
+    if encoders:
+        assert bench.session.describe_link().code == "set_points"
+        assert 150 < n < 300
+
+
+def test_the_question_never_takes_the_place_of_the_line_that_stops_the_wheels() -> None:
+    bench = Bench().up()
+    echoed(bench, 1.0, 47)
+    while not bench.session._echo.due:
+        echoed(bench, 1.1, 1)
+    assert bench.line(STILL) == ZERO + b"\r\n"
+    bench.wait(10, GOOD)
+    assert bench.line(STILL) == b"?\r\n"
+
+
+def test_measured_speeds_raise_no_question() -> None:
+    bench = Bench().up()
+    for n in range(1000):
+        line = bench.line(WheelSpeeds(n / 100, 0.0, 0.0, 0.0))
+        assert line is not None
+        assert line != b"?\r\n"
+        bench.wait(10, line if n % 8 else GOOD)
+
+
+# silence and restarts
 
 
 def test_the_first_stop_of_a_silence_is_sent_without_delay() -> None:
@@ -652,7 +775,7 @@ def test_zero_speeds_are_sent_as_the_stop_line() -> None:
 
 def disbelieved() -> Bench:
     """Return a bench whose configured counts disagree with the speeds that the board reports."""
-    bench, dice = Bench(McuConfig(encoder_counts=20)).up(), random.Random(1)
+    bench, dice = Bench(replace(FREE, encoder_counts=20)).up(), random.Random(1)
     for _ in range(100):
         line = ",".join(f"{motor}p{dice.uniform(20, 60):05.2f}" for motor in "abcd")
         bench.wait(10, line.encode() + b"\r\n")
@@ -704,9 +827,9 @@ WIRE_MS = wire_ns(len(GOOD), 115200) / MS
 @pytest.mark.parametrize(
     "mcu",
     [
-        McuConfig(),
-        McuConfig(trailing_comma=True),
-        McuConfig(wheels=WheelMap("-d", "+c", "-b", "+a")),
+        FREE,
+        replace(FREE, trailing_comma=True),
+        replace(FREE, wheels=WheelMap("-d", "+c", "-b", "+a")),
     ],
 )
 def test_a_line_tells_when_rest_was_commanded_after_the_last_motion(mcu: McuConfig) -> None:
@@ -718,14 +841,14 @@ def test_a_line_tells_when_rest_was_commanded_after_the_last_motion(mcu: McuConf
 
 
 def test_behind_a_stall_the_watchdog_has_stopped_the_motors_before_the_zeros() -> None:
-    bench = Bench(rate_hz=20.0).up()
+    bench = Bench(FREE, rate_hz=20.0).up()
     assert driven_ms(bench, (SLOW, 10), (SLOW, 190), (STILL, 10)) == pytest.approx(200 + WIRE_MS)
     late = driven_ms(bench, (SLOW, 10), (SLOW, 500), (STILL, 10), (STILL, 10))
     assert late == pytest.approx(310 + WIRE_MS)
 
 
 def test_zeros_that_did_not_leave_command_no_rest() -> None:
-    bench = Bench().up()
+    bench = Bench(FREE).up()
     bench.line(SLOW)
     bench.wait(10)
     for left in (False, True):
@@ -736,7 +859,7 @@ def test_zeros_that_did_not_leave_command_no_rest() -> None:
 
 
 def test_a_checked_line_of_zeros_commands_rest() -> None:
-    bench = Bench(McuConfig(link_check="auto")).checked()
+    bench = Bench(McuConfig(link_check="on")).checked()
     line = bench.line(SLOW)
     assert line is not None
     bench.wait(10)
