@@ -44,7 +44,9 @@ Where to look: each package may import only the packages below it in this list.
 Inside `core/`, in the same order:
 
     core/simulator/  the vehicle, the simulated microcontroller and its faults
-    core/robot.py    the order of a step; core/guard.py checks each outgoing line
+    core/robot.py    hear, drive and sent; core/guard.py checks each outgoing line
+    core/reasons.py  the text in `reason`
+    core/board_inputs.py  emergency stop, bumpers and battery, as the board reports them
     core/incoming/   input from the bus: turns samples into commands, and answers queries
     core/ros/        the two ROS transports: names, hashes, tokens, attachments, parameters
     core/messages/   the published structs, the table of keys, encodings, reports, schemas

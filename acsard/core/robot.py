@@ -11,11 +11,12 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import NamedTuple, assert_never
+from typing import assert_never
 
 from msgspec.structs import replace
 
-from acsard.core.codes import Code, Reason, joined, reason, sentence
+from acsard.core.board_inputs import inputs_after
+from acsard.core.codes import Reason, reason
 from acsard.core.config.live import Changes, changed, describe_changes
 from acsard.core.config.motion_rules import longest_reply
 from acsard.core.config.parsing import ConfigError
@@ -26,21 +27,20 @@ from acsard.core.link.link_diagnosis import UnansweredLines
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
-from acsard.core.motion.arbiter_text import OBJECTIONS, CommandEvents, chosen, missed, refused
-from acsard.core.motion.battery import Battery, empty_reason
-from acsard.core.motion.bumpers import Bumpers, missing_reason
+from acsard.core.motion.arbiter_text import OBJECTIONS, CommandEvents, missed, refused
+from acsard.core.motion.battery import empty_reason
 from acsard.core.motion.emergency_stop import (
     DRIVER_FAULT_REASON,
-    MISSING_REASON,
-    EmergencyStop,
 )
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.last_line import LastLine
 from acsard.core.motion.lifecycle import Lifecycle
-from acsard.core.motion.limits import AT_REST, Motion
-from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError
+from acsard.core.motion.limits import AT_REST
+from acsard.core.motion.modes import Mode, RefusedError
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
+from acsard.core.reasons import reason_of
 from acsard.core.values import (
     NS_PER_S,
     REST,
@@ -74,22 +74,6 @@ MAX_DT = 0.05
 # stopped the motors. The margin is for a board whose clock is slightly fast.
 WRITE_PAUSE_S = WATCHDOG_S - 0.05
 
-# Words for "wait until the board has reported ...".
-INPUT_NAMES = {
-    "estop": "its emergency stop",
-    "bumpers": "its bumpers",
-    "driver": "its motor drivers",
-}
-
-# The input that causes a latch.
-INPUT_OF: dict[Code, str] = {
-    "emergency_stop": "estop",
-    "emergency_stop_silent": "estop",
-    "bumper": "bumpers",
-    "bumpers_silent": "bumpers",
-    "driver_fault": "driver",
-}
-
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)  # modes with the stop deceleration
 
 UNLATCHED = (Mode.DRIVING, Mode.READY)  # their reason depends only on the choice and the settings
@@ -101,12 +85,6 @@ NS_PER_MS = 1_000_000
 NOTHING_CHANGED = "nothing changed: all settings already have these values"
 
 MAX_REFUSAL_LENGTH = 200  # characters in `state`: the text may quote the message of a client
-
-
-class _Line(NamedTuple):
-    # A line that `sent` has not confirmed yet.
-    motion: Motion
-    speeds: WheelSpeeds
 
 
 class Robot:
@@ -124,7 +102,6 @@ class Robot:
             self.session.quiet_ns / NS_PER_S,
         )
         self._arbiter = Arbiter(config.commands)
-        self._motion = AT_REST  # of the last line that left
         self._cap = SpeedCap(None)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
         self._life = Lifecycle(latches)
@@ -135,16 +112,7 @@ class Robot:
             self._announced = (first,)
         self._choice = Choice()
         self._limited = False  # a bumper limited it
-        self.speeds = STILL  # of the last line; zero after a press and without a link
-        # Of the last line that left: after a press of the emergency stop, the wheels turn so until
-        # the zeros are written.
-        self._written = STILL
-        # Arrival of the command, and the mode, of the last line. None after a press: a new line is
-        # due.
-        self._made_of: tuple[int | None, Mode] | None = (None, self._life.mode)
-        self._line: _Line | None = None  # until `sent`
-        # Last line, last one that left, and last press of the emergency stop or a bumper.
-        self._made_ns = self._left_ns = self._pressed_ns = 0
+        self._last = LastLine(made_of=(None, self._life.mode))
         self._trip: Trip = ""  # of the guard, until the next step
         self.status = Status("", "booting", "", "")
         self._battery_level = ""  # with `status`
@@ -154,18 +122,7 @@ class Robot:
         self._refused = ""
         self._refused_ns: Ns | None = None
         self._sanity = Sanity()
-        latched = [latch for latch in (latches.fault, latches.stop) if latch is not None]
-        causes = [cause for latch in latched for cause in latch.causes]
-        codes = {cause.code for cause in causes}
-        self._estop = EmergencyStop(unpowered="emergency_stop" in codes)
-        self._bumpers = Bumpers()
-        empty = "battery_empty" in codes and config.battery.stop_below > 0.0
-        self._battery = Battery(known="stop" if empty else "ok")
-        # Inputs that caused a latch in an earlier run, until the board reports them: no `clear`
-        # before.
-        self._unreported = {
-            INPUT_OF[cause.code]: cause for cause in causes if cause.code in INPUT_OF
-        }
+        self._inputs = inputs_after(latches, config)
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         # Verb, client and arrival of the last request: a call of `srv/stop` arrives as two, and the
@@ -204,10 +161,10 @@ class Robot:
             check=session.check,
             encoders=session.count_recovery.counts,
             sender=self._choice.sender,
-            estop=self._estop.state,
-            bumpers=self._bumpers.pressed,
-            bumper=self._bumpers.why(self.config.safety),
-            battery=self._battery.status,
+            estop=self._inputs.estop.state,
+            bumpers=self._inputs.bumpers.pressed,
+            bumper=self._inputs.bumpers.why(self.config.safety),
+            battery=self._inputs.battery.status,
             board=self._board(now_ns),
             speed_limit=self._cap_text,
         )
@@ -220,7 +177,12 @@ class Robot:
     @property
     def applied(self) -> Twist:
         """The twist in the line of `drive`, after all limits; after `sent`, in the last one."""
-        return (self._motion if self._line is None else self._line.motion).twist
+        return self._last.applied
+
+    @property
+    def speeds(self) -> WheelSpeeds:
+        """The wheel speeds in the last line of `drive`; zero after a press and without a link."""
+        return self._last.speeds
 
     @property
     def command_ns(self) -> Ns | None:
@@ -234,35 +196,39 @@ class Robot:
 
     def hear(self, now: Instant, heard: Heard) -> News:
         """Process what arrived since the last call, and return what is to be published."""
-        now_ns, events = now.mono_ns, [*heard.events, *self._announced]
-        self._announced = ()
-        self._life.begin(now, stalled=self._arbiter.begin(now_ns))
+        now_ns, life = now.mono_ns, self._life
+        events, self._announced = [*heard.events, *self._announced], ()
+        if self._arbiter.begin(now_ns):
+            life.begin(now, stalled=True)
         if heard.missed:
             self.counters["missed_periods"] += heard.missed
             events.append(missed(heard.missed, self.config.period_ns))
         estimates = self._fold(now, heard, events)
-        answers = self._serve(now, heard, events)
+        answers: tuple[Answer, ...] = ()
+        if heard.requests or self._trip or heard.shutting_down:
+            answers = self._serve(now, heard, events)
         if heard.speed_cap is not None:
             self._cap_speed(heard.speed_cap, events)
         if heard.commands or heard.refusals:
             self._accept_commands(now_ns, heard, events)
-        limiting, chose = self._bumpers.limiting(self.config.safety), False
-        if now_ns >= self._arbiter.until_ns or limiting or self._limited:
+        inputs, limited = self._inputs, self._limited
+        limiting = inputs.bumpers.state == "pressed" and inputs.bumpers.limiting(self.config.safety)
+        is_chosen = now_ns >= self._arbiter.until_ns or limiting or limited
+        if is_chosen:
             self._choose(now_ns, limiting)
-            chose = True
-        mode, battery = self._life.mode, self._battery.status
-        urgent = (self._choice.arrived_ns, mode) != self._made_of
+        mode, battery, status = life.mode, inputs.battery.status, self.status
+        urgent = (self._choice.arrived_ns, mode) != self._last.made_of
         level = battery.level if battery else ""
         changed = False
         if (
-            chose
+            is_chosen
             or events
             or answers
             or mode not in UNLATCHED
-            or mode._value_ != self.status.mode
+            or mode._value_ != status.mode
             or level != self._battery_level
         ):
-            changed = self._restate(limiting) or level != self._battery_level
+            changed = self._restate() or level != self._battery_level
             self._battery_level = level
         if changed or urgent:
             why = Reason(self.status.code, self.status.reason)
@@ -279,23 +245,24 @@ class Robot:
         after each line.
         """
         now_ns, twist, limits = now.mono_ns, self._choice.twist, self.config.limits
-        self._made_of, self._made_ns = (self._choice.arrived_ns, self._life.mode), now_ns
-        since = (now_ns - self._left_ns) / NS_PER_S
-        pressed = self._left_ns < self._pressed_ns
+        last, mode = self._last, self._life.mode
+        last.made_of, last.made_ns = (self._choice.arrived_ns, mode), now_ns
+        since = (now_ns - last.left_ns) / NS_PER_S
+        pressed = last.left_ns < last.pressed_ns
         if pressed or self.session.link != "up" or since > WRITE_PAUSE_S:
             # The first written line after a press contains zeros, even if the input is already
             # released and the commands that arrived meanwhile may move the robot.
             motion = AT_REST
-        elif self._life.mode is Mode.DRIVING and twist is not None:
+        elif mode is Mode.DRIVING and twist is not None:
             cap = math.inf if self._cap.speed is None else self._cap.speed
             dt = min(since, self._max_dt)
-            motion = self._motion.follow(twist, dt, limits, self._kinematics, cap)
+            motion = last.motion.follow(twist, dt, limits, self._kinematics, cap)
         else:
-            motion = self._motion.coast(since, limits, stop=self._life.mode in HALTED)
-        self.speeds = self._kinematics.wheel_speeds(motion.twist)
-        line = self.session.line(now_ns, self.speeds)
+            motion = last.motion.coast(since, limits, stop=mode in HALTED)
+        speeds = last.speeds = self._kinematics.wheel_speeds(motion.twist)
+        line = self.session.line(now_ns, speeds)
         if line is not None:
-            self._line = _Line(motion, self.speeds)
+            last.waiting = (motion, speeds)
             self._odometry.commanded.command(motion.twist)
         return line
 
@@ -304,20 +271,12 @@ class Robot:
 
         `trip` says why the guard replaced it with the stop line.
         """
-        made, self._line = self._line, None
-        assert made is not None
-        self._trip = trip
+        self._trip, left = trip, line is not None
+        self._last.sent(left=left, replaced=bool(trip))
         # The board must not be expected to answer a line that the guard has replaced.
-        self.session.sent(left_ns, was_written=line is not None and not trip)
-        if trip:
-            self._motion = AT_REST
-        if line is not None:
+        self.session.sent(left_ns, was_written=left and not trip)
+        if left:
             self.counters["lines_sent"] += 1
-            self._left_ns = self._made_ns
-            if trip:
-                self._written = STILL
-            else:
-                self._motion, self._written = made.motion, made.speeds
         elif self.session.link != "down":
             self.counters["lines_superseded"] += 1
 
@@ -326,12 +285,13 @@ class Robot:
     def _fold(self, now: Instant, heard: Heard, events: list[Event]) -> tuple[Estimate, ...]:
         session, before = self.session, self.session.link
         feedback = session.update(now, heard.port_open, heard.opened, heard.received)
-        link = session.link
-        warning = self._answered.check(
-            self.counters["lines_sent"], session.good_lines, link == "up"
-        )
-        if warning is not None:
-            events.append(warning)
+        link, inputs = session.link, self._inputs
+        if feedback or link != "up":
+            warning = self._answered.check(
+                self.counters["lines_sent"], session.good_lines, link == "up"
+            )
+            if warning is not None:
+                events.append(warning)
         if before == "up" != link:
             self.counters["link_lost"] += 1
             if session.lateness.late_s:
@@ -345,25 +305,19 @@ class Robot:
             self._arbiter.require_neutral(now.mono_ns if self._linked_once else 0)
         events += session.events
         if session.reopened:
-            for part in (self._estop, self._bumpers, self._battery):
-                part.reopen()
-        known = self._estop.state or self._bumpers.state or self._battery.status
-        is_blocked = self._unreported or self._battery.refuses_clear
-        if session.statuses or known or is_blocked or session.forgot:
+            inputs.reopen()
+        if inputs.expects_reports(session):
             self._watch_inputs(now, events)
         if link != "up":
             # Without a link the daemon cannot ramp, so set the speeds to zero at once. When the
             # link returns, a command from before the loss is too old to follow.
-            self._motion = AT_REST
-            self.speeds = STILL
+            self._last.cut()
             self._life.link(up=False)
             if link == "down" and before != "down":
                 self._arbiter.require_neutral(now.mono_ns)
         else:
             self._linked_once = True
-            safety = self.config.safety
-            missing = self._estop.missing(safety) or self._bumpers.missing(safety)
-            self._life.link(up=not missing)
+            self._life.link(up=not inputs.missing(self.config.safety))
         if heard.gyro:
             self._odometry.checks.add_samples(heard.gyro)
         if not feedback:
@@ -379,62 +333,30 @@ class Robot:
         self._odometry.checks.wheels.forget()
 
     def _watch_inputs(self, now: Instant, events: list[Event]) -> None:
-        # A press stops the robot even if it began and ended between two steps.
-        estop, bumpers, statuses = self._estop, self._bumpers, self.session.statuses
-        safety = self.config.safety
-        events += estop.process_reports(statuses, now.mono_ns, safety)
+        # A press stops the robot even if it began and ended between two wake-ups.
+        inputs, life, config, now_ns = self._inputs, self._life, self.config, now.mono_ns
+        estop, bumpers = inputs.estop, inputs.bumpers
+        events += inputs.process_reports(self.session, now_ns, config)
         if estop.pressed_now is not None:
             self.counters["emergency_stops"] += 1
-            self._life.press(estop.pressed_now, now)
-        events += bumpers.process_reports(statuses, now.mono_ns, safety)
+            life.press(estop.pressed_now, now)
         if bumpers.pressed_now is not None:
             self.counters["bumper_presses"] += 1
-            if bumpers.latching(safety):
-                self._life.press(bumpers.pressed_now, now)
+            if bumpers.latching(config.safety):
+                life.press(bumpers.pressed_now, now)
             else:
-                self._arbiter.require_neutral(now.mono_ns)
+                self._arbiter.require_neutral(now_ns)
         if estop.pressed_now is not None or bumpers.pressed_now is not None:
             # Do not ramp: the hardware has cut the motors, or the robot touches an obstacle.
-            self._motion = AT_REST
-            self.speeds, self._made_of, self._pressed_ns = STILL, None, now.mono_ns
+            self._last.press(now_ns)
         if estop.driver_fault:
             self._fault(DRIVER_FAULT_REASON, now, events)
-            self._life.caused_again(now.mono_ns)
-        battery, thresholds = self._battery, self.config.battery
-        is_up = self.session.link == "up"
-        events += battery.process_reports(statuses, now.mono_ns, is_up, thresholds)
-        if battery.stopped_now:
-            self._life.press(empty_reason(thresholds), now)
+            life.caused_again(now_ns)
+        if inputs.battery.stopped_now:
+            life.press(empty_reason(config.battery), now)
         if self.session.forgot:
-            estop.forget()
-            bumpers.forget()
-            battery.forget(thresholds)
-            self._unreported = {}
-        refusal = self._awaited_report() if self._unreported else None
-        if estop.is_pressed:
-            refusal = estop.why(safety)
-        elif (objection := bumpers.clear_refusal(safety)) is not None:
-            refusal = objection
-        elif self.session.status.driver_fault:
-            refusal = DRIVER_FAULT_REASON
-        elif battery.refuses_clear:
-            refusal = battery.refusal(thresholds)
-        self._life.refuse_clear(refusal, now.mono_ns)
-
-    def _awaited_report(self) -> Reason | None:
-        # Until the board reports an input that caused a latch in an earlier run, `clear` is
-        # refused.
-        reported = {
-            "estop": self._estop.use(self.config.safety) == "off" or bool(self._estop.state),
-            "bumpers": self._bumpers.use(self.config.safety) == "off" or bool(self._bumpers.state),
-            "driver": self.session.status.driver_fault is not None,
-        }
-        for name in [name for name in self._unreported if reported[name]]:
-            del self._unreported[name]
-        for name, cause in self._unreported.items():
-            advice = f"wait until the board has reported {INPUT_NAMES[name]}"
-            return Reason(cause.code, cause.why, advice, cause.part)
-        return None
+            inputs.forget(config)
+        life.refuse_clear(inputs.clear_refusal(self.session, config), now_ns)
 
     def _choose(self, now_ns: Ns, limiting: bool) -> None:
         self._choice, self._limited = self._arbiter.choose(now_ns), limiting
@@ -448,7 +370,7 @@ class Robot:
         twist = self._choice.twist
         if twist is None:
             return
-        away = self._bumpers.away(twist, self.config.safety)
+        away = self._inputs.bumpers.away(twist, self.config.safety)
         if away is None:
             self._arbiter.require_neutral(now_ns)
             # `require_neutral` has discarded all commands, so the new choice has no twist.
@@ -491,14 +413,15 @@ class Robot:
         wheels = checks.wheels
         # While the emergency stop counts as pressed, the motors may have no power, so wheels that
         # do not follow the commanded speeds are not a sign of a fault.
-        pressed = self._estop.is_pressed or self._estop.pressed_now is not None
+        estop = self._inputs.estop
+        pressed = estop.is_pressed or estop.pressed_now is not None
         if self.session.lateness.step_s > WRITE_PAUSE_S and not pressed:
             # This computer was late, and the board may have stopped the motors meanwhile. So the
             # feedback lines that waited to be read say nothing about faults of the wheels.
             fault = None
             wheels.skip(line.speeds)
         else:
-            fault = wheels.watch(None if pressed else self._written, line.speeds, line.since)
+            fault = wheels.watch(None if pressed else self._last.written, line.speeds, line.since)
         if fault is not None:
             self._fault(fault, now, events)
         if wheels.pushed:
@@ -553,7 +476,7 @@ class Robot:
                     return "nothing to clear: the robot is neither stopped nor in fault"
                 self._forget()
                 if life.latches.stop is None:
-                    self._estop.powered()
+                    self._inputs.estop.powered()
                 self._arbiter.require_neutral(asked_ns)
                 return released
             case "activate":
@@ -578,7 +501,7 @@ class Robot:
     def _set(self, settings: dict[str, Plain], now_ns: Ns) -> Changes:
         # The robot is at rest only if two lines are zero: the last one that left, which the wheels
         # follow, and the last one that was computed.
-        before, at_rest = self.config, self.speeds == STILL and self._motion.twist == REST
+        before, at_rest = self.config, self.speeds == STILL and self._last.motion.twist == REST
         try:
             self.config, changes = changed(before, settings, at_rest)
         except ConfigError as error:
@@ -591,7 +514,7 @@ class Robot:
 
     def _fault(self, why: Reason, now: Instant, events: list[Event]) -> None:
         if self._life.fault(why, now):
-            self._arbiter.require_neutral(self._made_ns)
+            self._arbiter.require_neutral(self._last.made_ns)
             text = f"{why.text}; srv/clear releases it"
             events.append(Event("fault", text, "error", code=why.code))
 
@@ -648,46 +571,14 @@ class Robot:
 
     # Report.
 
-    def _restate(self, limiting: bool) -> bool:
+    def _restate(self) -> bool:
         # Returns whether the status has changed.
-        why, before = self._reason(), self.status
-        if limiting:
-            why = self._with_bumper(why)
+        life, choice, before = self._life, self._choice, self.status
+        why = reason_of(life, choice, self.session, self._inputs, self.config, self._port_trouble)
         # Use `_value_`, because the property `value` of an enum runs Python code.
-        mode = self._life.mode._value_
-        self.status = Status(mode, why.code, why.text, self.session.link, self._choice.source)
+        mode = life.mode._value_
+        self.status = Status(mode, why.code, why.text, self.session.link, choice.source)
         return self.status != before
-
-    def _with_bumper(self, why: Reason) -> Reason:
-        match self._life.mode:
-            case Mode.DRIVING:
-                limit = joined(self._bumpers.limit(self.config.safety))
-                return Reason(limit.code, f"{why.text}; {limit.text}")
-            case Mode.READY:
-                limit = joined(self._bumpers.limit(self.config.safety))
-                return Reason(limit.code, f"{limit.text}; {why.text}")
-            case _:
-                return why
-
-    def _reason(self) -> Reason:
-        match self._life.mode:
-            case Mode.DRIVING | Mode.READY:
-                why, limits = chosen(self._choice), self.config.limits
-                if why.code == "commanded" and not (limits.linear_speed or limits.angular_speed):
-                    why = sentence("limits_zero", source=self._choice.source)
-                return why
-            case Mode.WAITING:
-                if self.session.link == "up":
-                    if self._estop.missing(self.config.safety):
-                        return MISSING_REASON
-                    return missing_reason(self.config.safety)
-                return self.session.describe_link(self._port_trouble)
-            case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
-                return self._life.why
-            case Mode.SHUTDOWN:
-                return SHUTDOWN_REASON
-            case _:
-                assert_never(self._life.mode)
 
 
 def _stop_of(by: str, latches: Latches) -> int:

@@ -19,56 +19,45 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 from msgspec import Meta, Struct
 
+from acsard.core.board_inputs import BoardInputs
 from acsard.core.config.contradictions import contradictions
 from acsard.core.config.settings import Config
 from acsard.core.formatting import printable
 from acsard.core.guard import Memory
 from acsard.core.motion.arbiter import Choice
 from acsard.core.motion.arbiter_text import CommandEvents
-from acsard.core.motion.battery import Battery
-from acsard.core.motion.bumpers import Bumpers
-from acsard.core.motion.emergency_stop import EmergencyStop
 from acsard.core.motion.event_throttle import EventThrottle
-from acsard.core.motion.limits import Motion
+from acsard.core.motion.last_line import LastLine
 from acsard.core.motion.modes import Mode
 from acsard.core.motion.sanity import Sanity
 from acsard.core.robot import Robot
-from acsard.core.values import AcsardError, Event, Latch, Ns, SpeedCap, Status, Trip, WheelSpeeds
+from acsard.core.values import AcsardError, Event, Ns, SpeedCap, Status, Trip
 from acsard.recording.unpickling import MAX_BYTES, unpickle
 
 # Attributes of a robot that are plain data, without configuration inside, with their types.
 PARTS: dict[str, Any] = {
     "counters": Counter,
-    "_motion": Motion,
+    "_last": LastLine,
     "_cap": SpeedCap,
     "_choice": Choice,
-    "speeds": WheelSpeeds,
     "_limited": bool,
-    "_written": WheelSpeeds,
-    "_made_of": tuple[Ns | None, Mode] | None,
-    "_made_ns": Ns,
-    "_left_ns": Ns,
-    "_pressed_ns": Ns,
     "_trip": Trip,
     "_announced": tuple[Event, ...],
     "status": Status,
     "_battery_level": str,
     "_refused": str,
     "_refused_ns": Ns | None,
-    "_unreported": dict[str, Latch],
     "_asked": tuple[str, str, Ns | None],
     "_port_trouble": str,
     "_linked_once": bool,
     "_sanity": Sanity,
-    "_estop": EmergencyStop,
-    "_bumpers": Bumpers,
-    "_battery": Battery,
+    "_inputs": BoardInputs,
     "_told": CommandEvents,
     "_tally": EventThrottle,
 }
 
 # Not stored: they follow from the configuration, and no line is pending between two steps.
-DERIVED = ("config", "_kinematics", "_max_dt", "_line")
+DERIVED = ("config", "_kinematics", "_max_dt")
 
 # A package ends with a dot. The classes need constructors without side effects.
 PART_MODULES = (

@@ -65,6 +65,7 @@ WHEEL_FAULTS = "core/motion/wheel_faults.py"
 PATH = "core/motion/path.py"
 LATCHES, VALUES, LOOP = "daemon/latch_rules.py", "core/values.py", "daemon/control_loop.py"
 PUBLICATION = "daemon/publication.py"
+REASONS, INPUTS = "core/reasons.py", "core/board_inputs.py"
 COMMANDS, KINEMATICS, CODEC = (
     "core/incoming/commands.py",
     "core/motion/kinematics.py",
@@ -160,7 +161,7 @@ FAULTS = (
         "guard and latch",
         "a stopped robot follows commands, and the guard lets it",
         ROBOT,
-        "elif self._life.mode is Mode.DRIVING and twist is not None:",
+        "elif mode is Mode.DRIVING and twist is not None:",
         "elif twist is not None:",
         BLIND_GUARD,
     ),
@@ -588,16 +589,16 @@ FAULTS = (
         "robot limits",
         "set answers, but the old limits stay in force",
         ROBOT,
-        "            motion = self._motion.follow(twist, dt, limits, self._kinematics, cap)\n",
+        "            motion = last.motion.follow(twist, dt, limits, self._kinematics, cap)\n",
         "            self._first = limits = getattr(self, '_first', limits)\n"
-        "            motion = self._motion.follow(twist, dt, limits, self._kinematics, cap)\n",
+        "            motion = last.motion.follow(twist, dt, limits, self._kinematics, cap)\n",
     ),
     fault(
         "robot reason",
         "a robot that stands says `no command`, whatever the cause is",
-        ROBOT,
-        "why, limits = chosen(self._choice), self.config.limits",
-        'why, limits = sentence("no_command"), self.config.limits',
+        REASONS,
+        "why, limits = chosen(choice), config.limits",
+        'why, limits = sentence("no_command"), config.limits',
     ),
     fault(
         "robot waits",
@@ -610,8 +611,8 @@ FAULTS = (
         "robot unsent",
         "a line that never left counts as obeyed",
         ROBOT,
-        '        if line is not None:\n            self.counters["lines_sent"]',
-        '        if True:\n            self.counters["lines_sent"]',
+        "        self._trip, left = trip, line is not None\n",
+        "        self._trip, left = trip, True\n",
     ),
     # session
     fault(
@@ -711,9 +712,9 @@ FAULTS = (
     fault(
         "robot end reason",
         "`state` has no reason while the daemon ends",
-        ROBOT,
-        "                return SHUTDOWN_REASON\n",
-        '                return Reason("shutdown", "")\n',
+        REASONS,
+        "            return SHUTDOWN_REASON\n",
+        '            return Reason("shutdown", "")\n',
     ),
     fault(
         "session mute",
@@ -933,9 +934,9 @@ FAULTS = (
     fault(
         "driver clear",
         "a clear works while a motor driver has a fault",
-        ROBOT,
-        "        elif self.session.status.driver_fault:\n",
-        "        elif self.session.status.driver_fault and estop.is_pressed:\n",
+        INPUTS,
+        "        if session.status.driver_fault:\n",
+        "        if session.status.driver_fault and self.estop.is_pressed:\n",
     ),
     fault(
         "driver without power",
@@ -977,8 +978,7 @@ FAULTS = (
         "a fault of a motor driver stops the robot without a ramp",
         ROBOT,
         "            self._fault(DRIVER_FAULT_REASON, now, events)\n",
-        "            self._fault(DRIVER_FAULT_REASON, now, events)\n"
-        "            self._motion = AT_REST\n            self.speeds = STILL\n",
+        "            self._fault(DRIVER_FAULT_REASON, now, events)\n            self._last.cut()\n",
     ),
     fault(
         "estop ramp",
@@ -991,8 +991,8 @@ FAULTS = (
         "estop latch",
         "a robot drives again as soon as its emergency stop is released",
         ROBOT,
-        "            self._life.press(estop.pressed_now, now)\n",
-        "            self._arbiter.require_neutral(now.mono_ns)\n",
+        "            life.press(estop.pressed_now, now)\n",
+        "            self._arbiter.require_neutral(now_ns)\n",
     ),
     fault(
         "estop short",
@@ -1008,7 +1008,7 @@ FAULTS = (
         "            due = tick or (at_once and news.urgent)\n",
         "            due = tick or (at_once and news.urgent)\n"
         "            late = now.mono_ns % 10**8 < 25 * 10**6\n"
-        "            due = due and not (robot._estop.is_pressed and late)\n",
+        "            due = due and not (robot._inputs.estop.is_pressed and late)\n",
     ),
     fault(
         "estop clear",
@@ -1035,15 +1035,15 @@ FAULTS = (
         "estop needed",
         "a robot is ready before its board has reported the inputs that it needs",
         ROBOT,
-        "            self._life.link(up=not missing)\n",
+        "            self._life.link(up=not inputs.missing(self.config.safety))\n",
         "            self._life.link(up=True)\n",
     ),
     fault(
         "estop state",
         "`state` calls a pressed emergency stop released",
         ROBOT,
-        "            estop=self._estop.state,\n",
-        '            estop="released" if self._estop.state else "",\n',
+        "            estop=self._inputs.estop.state,\n",
+        '            estop="released" if self._inputs.estop.state else "",\n',
     ),
     fault(
         "away towards",
@@ -1086,16 +1086,15 @@ FAULTS = (
         "battery stop",
         "an empty battery does not stop the robot",
         ROBOT,
-        "        if battery.stopped_now:\n",
+        "        if inputs.battery.stopped_now:\n",
         "        if False:\n",
     ),
     fault(
         "battery cut",
         "an empty battery stops the robot without a ramp",
         ROBOT,
-        "            self._life.press(empty_reason(thresholds), now)\n",
-        "            self._life.press(empty_reason(thresholds), now)\n"
-        "            self._motion = AT_REST\n",
+        "            life.press(empty_reason(config.battery), now)\n",
+        "            life.press(empty_reason(config.battery), now)\n            self._last.cut()\n",
     ),
     fault(
         "battery start",
@@ -1107,9 +1106,9 @@ FAULTS = (
     fault(
         "battery clear",
         "a clear works while the battery is empty",
-        ROBOT,
-        "        elif battery.refuses_clear:\n",
-        "        elif False:\n",
+        INPUTS,
+        "if self.battery.refuses_clear else awaited",
+        "if False else awaited",
     ),
     fault(
         "battery level",

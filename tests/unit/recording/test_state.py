@@ -186,7 +186,7 @@ def test_a_state_with_a_configuration_that_a_file_may_not_have_is_refused() -> N
 
 SPOILERS: dict[str, Callable[[Robot], None]] = {
     "a number for the session": lambda robot: setattr(robot, "session", 5),
-    "words for a time": lambda robot: setattr(robot, "_left_ns", "now"),
+    "words for a time": lambda robot: setattr(robot._last, "left_ns", "now"),
     "a list for a counter": lambda robot: setattr(robot, "counters", []),
     "no wheels": lambda robot: setattr(robot._odometry.checks.wheels, "_left", ()),
     "itself, almost": lambda robot: setattr(robot, "_odometry", Robot(Config())),

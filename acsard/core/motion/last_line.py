@@ -1,0 +1,51 @@
+"""The motion in the lines for the board. A line that did not leave has no effect on it."""
+
+from __future__ import annotations
+
+from msgspec import Struct
+
+from acsard.core.motion.limits import AT_REST, Motion
+from acsard.core.motion.modes import Mode
+from acsard.core.values import STILL, Ns, Twist, WheelSpeeds
+
+
+class LastLine(Struct):
+    """The last line that left, and the one that waits for `sent`."""
+
+    motion: Motion = AT_REST  # of the last line that left
+    # Its wheel speeds. After a press of the emergency stop, the wheels turn so until the zeros are
+    # written.
+    written: WheelSpeeds = STILL
+    left_ns: Ns = 0
+    speeds: WheelSpeeds = STILL  # of the last line; zero after a press and without a link
+    made_ns: Ns = 0  # the last line was made
+    # Arrival of the command, and the mode, of the last line. None after a press: a new line is due.
+    made_of: tuple[Ns | None, Mode] | None = None
+    waiting: tuple[Motion, WheelSpeeds] | None = None  # for `sent`
+    pressed_ns: Ns = 0  # last press of the emergency stop or a bumper
+
+    @property
+    def applied(self) -> Twist:
+        return (self.motion if self.waiting is None else self.waiting[0]).twist
+
+    def cut(self) -> None:
+        """Set the speed to zero without a ramp: the motors have stopped."""
+        self.motion, self.speeds = AT_REST, STILL
+
+    def press(self, now_ns: Ns) -> None:
+        """Cut, until a line of zeros has left."""
+        self.cut()
+        self.made_of, self.pressed_ns = None, now_ns
+
+    def sent(self, *, left: bool, replaced: bool) -> None:
+        """Record whether the line left, and whether the guard replaced it with zeros."""
+        waiting, self.waiting = self.waiting, None
+        assert waiting is not None
+        if replaced:
+            self.motion = AT_REST
+        if left:
+            self.left_ns = self.made_ns
+            if replaced:
+                self.written = STILL
+            else:
+                self.motion, self.written = waiting
