@@ -243,7 +243,7 @@ def report(directory: Path) -> list[Path]:
     directory.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as place, browsing() as browser:
         drawn = Path(place) / "drive.html"
-        recorded = _recorded(Path(place) / "drive.mcap")
+        recorded = _recorded(Path(place) / "drive.rec.zst")
         done = finish(acsard("recording", "report", str(recorded), str(drawn)), place)
         assert done.code == 0, done
         browser.ask("Emulation.setScrollbarsHidden", hidden=True)
@@ -265,8 +265,7 @@ def _recorded(path: Path) -> Path:
     two_drivers(world)
     happenings(world, random.Random(1))
     drive_through_faults(world, 100.0)
-    tape.write(path, Config())
-    return path
+    return tape.save(path)
 
 
 def main() -> None:

@@ -24,6 +24,7 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
+from acsard.recording.file import SUFFIX
 from tests.scenarios.taped import Tape, drive_through_faults
 from tests.scenarios.world import World
 
@@ -59,8 +60,8 @@ def record(where: Path, seconds: float) -> list[Path]:
         world = World(config, recorder=tape)
         drive_through_faults(world, seconds)
         for first in (0, *list(tape.states)[:1]):
-            path = where / f"{name}-{first}-{sys.version_info[0]}.{sys.version_info[1]}.mcap"
-            tape.write(path, config, first)
+            path = where / f"{name}-{first}-{sys.version_info[0]}.{sys.version_info[1]}{SUFFIX}"
+            tape.save(path, config, first)
             made.append(path)
     return made
 
@@ -104,7 +105,7 @@ def main() -> int:
     if asked.record:
         record(asked.record, asked.seconds)
         return 0
-    short = sorted(ROOT.glob("tests/recordings/*.mcap"))
+    short = sorted(ROOT.glob(f"tests/recordings/*{SUFFIX}"))
     with tempfile.TemporaryDirectory(prefix="pythons-") as name:
         where = Path(name)
         mine = record(where, asked.seconds)
@@ -123,7 +124,7 @@ def main() -> int:
                 str(asked.seconds),
             )
             print(output, end="")
-            same = replays(sys.executable, sorted(theirs.glob("*.mcap"))) and same
+            same = replays(sys.executable, sorted(theirs.glob(f"*{SUFFIX}"))) and same
     return 0 if same else 1
 
 

@@ -41,7 +41,7 @@ from acsard.host.child import end_signals
 from acsard.host.logs import Log
 from acsard.host.systemd import START_EXTENSION_S, Systemd
 from acsard.host.version import version
-from acsard.recording.mcap_recorder import Recorder
+from acsard.recording.recorder import Recorder
 
 # Longest ramp at the end. Then STOP is sent even if the robot still moves.
 MAX_EXIT_RAMP_S = 0.6

@@ -182,11 +182,14 @@ class Recorder(StepRecorder):
         while not over:
             over = self._over.wait(WRITE_PAUSE_S)
             try:
-                queue = self._queue
-                self._writer.write([queue.popleft() for _ in range(len(queue))], over)
+                self._writer.write(self._take_queue(), over)
             except Exception:
                 self._writer.events.append(Event("recording", ENDED, "error"))
                 raise
+
+    def _take_queue(self) -> list[Step | Start | Failure]:
+        queue = self._queue
+        return [queue.popleft() for _ in range(len(queue))]
 
 
 class _Writer:

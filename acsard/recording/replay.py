@@ -30,7 +30,6 @@ from acsard.recording.recorded_steps import (
     RecordedOutputs,
     RecordedStep,
     checksum,
-    input_names,
     micropose,
     status_of,
 )
@@ -39,8 +38,7 @@ from acsard.recording.stepped_robot import SteppedRobot
 
 NO_TRIP: Trip = ""
 
-# "sent line" is after the guard, "event" all but text and client. "input names" are compared at the
-# end of a batch.
+# "sent line" is after the guard, "event" all but text and client.
 Output = Literal[
     "line",
     "sent line",
@@ -53,7 +51,6 @@ Output = Literal[
     "client",
     "reason",
     "event text",
-    "input names",
 ]
 
 # Texts for people, which another version may word differently.
@@ -107,7 +104,7 @@ class Replay:
         self.outputs: Outputs | None = None  # of the last step
         self.comparison = Comparison()
         self.resume(robot, memory)
-        self._checksum = self._names = 0
+        self._checksum = 0
         self._pose: Micropose = (0, 0, 0)
 
     def resume(self, robot: Robot, memory: Memory | None) -> None:
@@ -123,7 +120,7 @@ class Replay:
     def step(self, step: RecordedStep) -> Difference | None:
         """Replay the next step; return how it differs, or None."""
         if step.begins:
-            self._checksum = self._names = 0
+            self._checksum = 0
         outputs = self.outputs = self.stepped.step(step.inputs)
         # A step that changes a setting gives the robot a new configuration.
         if self.robot.config is not self._config:
@@ -134,7 +131,6 @@ class Replay:
             status, at_ns = self.robot.status, outputs.now.mono_ns
             line, trip = self._guard.check(line, at_ns, status, outputs.command_ns)
         self._checksum = checksum(outputs.estimates, self._checksum)
-        self._names = input_names(step.inputs, self._names)
         if step.recorded.sent is not None:
             # The board obeyed the recorded line, even if the replayed robot decides another line.
             self._guard.record_written(step.recorded.sent)
@@ -178,8 +174,6 @@ class Replay:
         what = tuple([name for name, new, old in pairs if new != old])
         if replayed.events != recorded.events:
             what += _different_parts(replayed.events, recorded.events)
-        if recorded.names not in (None, self._names):
-            what += ("input names",)
         if not what:
             return None
         return Difference(step.number, step.inputs.now, what, recorded, replayed, trip)

@@ -12,10 +12,8 @@ from acsard.core.config.validation import show
 from acsard.core.formatting import listed, many, printable
 from acsard.core.values import NS_PER_S, Event, Ns
 from acsard.recording.file import Damage
-from acsard.recording.file_replay import Gap
 from acsard.recording.recorded_steps import US_PER_S, RecordedOutputs
-from acsard.recording.replay import Comparison, Difference, max_wheel_speed
-from acsard.recording.replay import Gap as Missing
+from acsard.recording.replay import Comparison, Difference, Gap, max_wheel_speed
 
 # Settings that affect the speeds in the lines to the board.
 LINE_SETTINGS = ("limits.", "drive.", "mcu.wheels.")
@@ -51,33 +49,11 @@ def explain_verdict(other: bool) -> str:
         "(The replay computes new outputs "
         f"{computed} from the recorded inputs, and compares them with the recorded outputs: each "
         "line to the board; each odometry pose, rounded to 1 um; the mode, reason, link and source "
-        "of each step; and each event with its text and its client. A checksum verifies the names "
-        "of sources, senders and clients in the inputs.)"
+        "of each step; and each event with its text and its client.)"
     )
 
 
-def describe_gaps(gaps: Sequence[Gap], how: str) -> str:
-    """Return a text with the duration of the gaps and their steps, which begins with `how`."""
-    if not gaps:
-        return ""
-    seconds = sum(gap.end_ns - gap.begin_ns for gap in gaps) / NS_PER_S
-    unreadable, skipped = sum(gap.unreadable for gap in gaps), sum(gap.skipped for gap in gaps)
-    lines = sum(gap.lines for gap in gaps)
-    parts = []
-    if unreadable:
-        parts.append(f"{many(unreadable, 'step')} cannot be read")
-    if skipped:
-        parts.append(
-            f"{many(skipped, 'step')} with {many(lines, 'line')} can be read, but not replayed, "
-            "because the replay resumes only at the robot's next recorded state, which comes later"
-        )
-    if any(gap.end_lost for gap in gaps):
-        parts.append("the end of the recording, which may contain more steps, cannot be read")
-    because = f" ({'; '.join(parts)})" if parts else ""
-    return f"{how}: {seconds:.1f} s in {many(len(gaps), 'damaged place')}{because}"
-
-
-def describe_missing(gaps: Sequence[Missing], damage: Sequence[Damage], how: str) -> list[str]:
+def describe_missing(gaps: Sequence[Gap], damage: Sequence[Damage], how: str) -> list[str]:
     """Return lines about the steps that a recording lacks, the first of which begin with `how`."""
     lines = []
     if gaps:

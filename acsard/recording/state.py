@@ -14,10 +14,10 @@ import io
 import pickle
 import sys
 from collections import Counter, deque
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Struct
 
 from acsard.core.board_inputs import BoardInputs
 from acsard.core.config.contradictions import contradictions
@@ -102,27 +102,6 @@ class Frozen(Struct):
     rest: bytes  # pickled attributes of the robot
 
 
-class Checkpoint(Struct, frozen=True, array_like=True):
-    """A saved state, and the number of the step that follows it, for the channel `state`."""
-
-    number: Annotated[int, Meta(ge=0)]
-    data: bytes  # `freeze`
-
-    def encode(self) -> bytes:
-        return msgspec.msgpack.encode(self)
-
-
-_checkpoint = msgspec.msgpack.Decoder(Checkpoint)
-
-
-def checkpoint(data: bytes) -> Checkpoint:
-    """Decode a message of the channel `state`, without its robot. Raises `StateError`."""
-    try:
-        return _checkpoint.decode(data)
-    except msgspec.MsgspecError as error:
-        raise _unreadable(error) from None
-
-
 def freeze(robot: Robot, memory: Memory) -> bytes:
     """Encode the state of a robot and of its guard, for `thaw`."""
     rest = {name: part for name, part in vars(robot).items() if name not in DERIVED}
@@ -163,7 +142,7 @@ def thaw(data: bytes) -> State:
     except (ValueError, RecursionError) as error:  # msgspec's errors are a `ValueError`
         raise _unreadable(error) from None
     if not isinstance(rest, dict):
-        raise StateError("the robot state at the start of the recording is not valid")
+        raise StateError("the recorded state of the robot is not valid")
     for name in vars(robot).keys() - PARTS.keys() - {*DERIVED}:
         # What an older version has not recorded is as in a new robot.
         if name in rest:
@@ -173,8 +152,7 @@ def thaw(data: bytes) -> State:
 
 def _unreadable(error: Exception) -> StateError:
     return StateError(
-        "this version of acsard cannot read the robot state at the start of the recording: "
-        f"{short(error)}"
+        f"this version of acsard cannot read the recorded state of the robot: {short(error)}"
     )
 
 

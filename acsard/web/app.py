@@ -397,7 +397,7 @@ ROUTES: tuple[Route, ...] = (
         gives={200: Body("A list.", list[Recording])}),
     Route("GET", "/api/recordings/{name}", RECORDINGS_ROLE, Page.recording,
         "one recording as a file",
-        gives={200: Body("MCAP.", media="application/octet-stream")}),
+        gives={200: Body("A file.", media="application/octet-stream")}),
     *values(Page.value),
     *services(Page.service),
     Route("GET", "/metrics", "viewer", Page.metrics,

@@ -14,8 +14,8 @@ from msgspec import Meta, Struct
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.threads import in_thread
-from acsard.recording.end_record import ending_text, read_end
-from acsard.recording.mcap_directory import NAME_TIME_FORMAT, PART_SUFFIX, is_being_recorded, listed
+from acsard.recording.directory import NAME_TIME_FORMAT, is_being_recorded
+from acsard.recording.file import listed
 from acsard.web.answers import READ_TIMEOUT_S, TroubleError
 from acsard.web.callers import RequestRefusedError, is_loopback
 from acsard.web.followed_robot import FollowedRobot
@@ -29,11 +29,9 @@ class Recording(Struct, frozen=True):
 
     name: str
     begin: Annotated[float | None, Meta(description="s since 1970; null if unknown")]
-    seconds: Annotated[
-        float | None, Meta(description="duration; null if the recording has no end marker")
-    ]
+    seconds: Annotated[float | None, Meta(description="until it was last written; null if unknown")]
     bytes: int
-    events: Annotated[str, Meta(description="summary of the recorded events")]
+    being_recorded: bool
 
 
 class BlackBox:
@@ -100,7 +98,7 @@ def rows(directory: Path) -> list[Recording]:
     """Return all recordings in a directory, oldest first. Raises `OSError`."""
     recordings = []
     for path in _files(directory):
-        # The daemon may rename or delete a file meanwhile.
+        # The daemon may delete a file meanwhile.
         with suppress(FileNotFoundError):
             recordings.append(_row(path))
     return recordings
@@ -114,15 +112,11 @@ def _files(directory: Path) -> list[Path]:
 
 
 def _row(path: Path) -> Recording:
-    size, unfinished = path.stat().st_size, path.name.endswith(PART_SUFFIX)
-    last = None if unfinished else read_end(path)
-    if last is None:
-        recorded = unfinished and is_being_recorded(path, time.time())
-        words = "being recorded" if recorded else "cut off: no end marker"
-        return Recording(path.name, _begun(path), None, size, words)
-    events = "; ".join(filter(None, [last.said, ending_text(last.cut, last.why)]))
-    seconds = (last.last_ns - last.wall_ns) / NS_PER_S
-    return Recording(path.name, last.wall_ns / NS_PER_S, round(seconds, 3), size, events)
+    status, begin = path.stat(), _begun(path)
+    # The clock may have been set meanwhile.
+    seconds = None if begin is None else max(0.0, round(status.st_mtime - begin, 3))
+    recorded = is_being_recorded(path, time.time())
+    return Recording(path.name, begin, seconds, status.st_size, recorded)
 
 
 def _begun(path: Path) -> float | None:

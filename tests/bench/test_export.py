@@ -21,9 +21,8 @@ from acsard.core.config.toml_text import document
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.values import Inputs, Instant, Outputs, Recording
-from acsard.recording.mcap_file import About, RecordingWriter
+from acsard.recording.file import FrameWriter, Head
 from acsard.recording.recorded_steps import FinishedStep
-from acsard.recording.rows import encode
 from tests.scenarios.world import START, World
 from tests.system.harness import ROOT, finish
 
@@ -44,8 +43,10 @@ class Streamed:
 
     def __init__(self, path: Path, config: Config, start: Instant) -> None:
         text = "\n".join(document(effective(config))) + "\n"
-        about = About(config.robot.id, "0.1.0", "3.11.0", start.mono_ns, start.wall_ns, text)
-        self.writing = RecordingWriter(path, about)
+        self.file = path.open("wb")
+        self._frames = FrameWriter(self.file)
+        times = start.mono_ns, start.wall_ns
+        self._frames.begin(Head("0.2.0", config.robot.id, 0, *times, text))
         self._taken: list[FinishedStep] = []
         self._number = 0
 
@@ -54,8 +55,7 @@ class Streamed:
     ) -> None:
         self._taken.append(FinishedStep(inputs, outputs, left))
         if len(self._taken) == BATCH:
-            at_ns = self._taken[0].inputs.now.wall_ns
-            self.writing.add("steps", at_ns, encode(self._number, self._taken))
+            self._frames.add_steps(self._number, self._taken)
             self._number += BATCH
             self._taken.clear()
 
@@ -76,7 +76,7 @@ def recorded(path: Path, seconds: float) -> Path:
     while world.now_ns - START.mono_ns < seconds * 1e9:
         for linear, angular in ((0.4, 0.3), (-0.2, 0.5), (0.0, -0.8), (0.5, 0.0)):
             world.hold(linear, angular, seconds=15.0)
-    box.writing.finish()
+    box.file.close()
     return path
 
 
@@ -111,7 +111,7 @@ def cost(*words: str) -> Cost:
 def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Return recordings of a minute and of an hour."""
     where = tmp_path_factory.mktemp("hour")
-    return recorded(where / "minute.mcap", MINUTE_S), recorded(where / "hour.mcap", HOUR_S)
+    return recorded(where / "minute.rec.zst", MINUTE_S), recorded(where / "hour.rec.zst", HOUR_S)
 
 
 @pytest.mark.parametrize("kind", ["mcap", "csv", "rosbag2"])

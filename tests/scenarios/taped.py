@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import random
-import struct
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from acsard.core.config.named_faults import FAULTS
 from acsard.core.config.parsing import effective
@@ -18,13 +19,10 @@ from acsard.core.robot import Robot
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.faults import Fault
 from acsard.core.values import Inputs, Outputs, Recording
-from acsard.recording.file import FrameWriter, Head, encode_steps
-from acsard.recording.mcap_file import About, RecordingWriter
-from acsard.recording.mcap_timeline import entry_of
+from acsard.recording.file import FrameWriter, Head, Steps, encode_steps, steps_of
 from acsard.recording.recorded_steps import FinishedStep, RecordedStep
 from acsard.recording.replay import Replay
-from acsard.recording.rows import decode, encode
-from acsard.recording.state import Checkpoint, freeze, thaw
+from acsard.recording.state import freeze, thaw
 from tests.scenarios.world import START, World
 
 BATCH = 200
@@ -72,49 +70,11 @@ class Tape:
 
     def steps(self, first: int = 0) -> list[RecordedStep]:
         """Return the recorded steps from number `first` on, encoded and decoded again."""
-        starts = range(first, len(self.taken), BATCH)
-        return [s for at in starts for s in decode(encode(at, self.taken[at : at + BATCH]))]
-
-    def write(
-        self,
-        path: Path,
-        config: Config,
-        first: int = 0,
-        apart: bool = True,
-        end: int | None = None,
-    ) -> None:
-        """Write the file that the daemon would write.
-
-        The file begins at the step `first`. Any step but the first one needs a stored state, which
-        the file then contains. The file ends before the step `end`, or with the last step if `end`
-        is None. With `apart` each second has a separate chunk in the file, unlike in a file of the
-        daemon.
-        """
-        now = self.taken[first].inputs.now
-        text = "\n".join(document(effective(config))) + "\n"
-        about = About(
-            config.robot.id,
-            "0.1.0",
-            "3.11.0",
-            now.mono_ns,
-            now.wall_ns,
-            text,
-            started_ns=START.wall_ns,
+        records = (
+            msgspec.msgpack.encode(encode_steps(at, self.taken[at : at + BATCH]))
+            for at in range(first, len(self.taken), BATCH)
         )
-        writing = RecordingWriter(path, about)
-        if first:
-            writing.add("state", now.wall_ns, Checkpoint(first, self.states[first]).encode())
-        steps = self.taken[:end]
-        for at in range(first, len(steps), BATCH):
-            batch = steps[at : at + BATCH]
-            writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch))
-            for _, outputs, _ in batch:
-                for event in outputs.events:
-                    writing.event(entry_of(event, outputs.now.wall_ns))
-            writing.flush()
-            if apart:
-                writing.end_chunk()
-        writing.finish()
+        return [s for data in records for s in steps_of(msgspec.msgpack.decode(data, type=Steps))]
 
     def save(
         self, path: Path, config: Config | None = None, first: int = 0, end: int | None = None
@@ -149,17 +109,6 @@ def recorded_world(
     """Return a recorder in memory, and a new world with these options that it records."""
     tape = Tape(every=every)
     return tape, World(config, recorder=tape, **options)
-
-
-def chunks(data: bytes | bytearray) -> list[tuple[int, int]]:
-    """Return the start and end of each chunk in a file, found by the MCAP format alone."""
-    spans, at = [], 8
-    while at < len(data) - 8:
-        opcode, length = struct.unpack_from("<BQ", data, at)
-        if opcode == 6:
-            spans.append((at, at + 9 + length))
-        at += 9 + length
-    return spans
 
 
 def replayed(tape: Tape, config: Config, first: int = 0) -> Replay:

@@ -48,8 +48,7 @@ def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 assert world.call("set", settings).success
             speed = 0.0 if second % 30 < 5 else dice.uniform(-0.8, 0.8)
             world.hold(speed, dice.uniform(-1.0, 1.0), seconds=1.0)
-            queue = recorder._queue
-            recorder._writer.write([queue.popleft() for _ in range(len(queue))], False)
+            recorder._writer.write(recorder._take_queue(), False)
         recorder.close()
     (path,) = listed(where)
     return path

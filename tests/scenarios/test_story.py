@@ -31,11 +31,10 @@ from acsard.core.incoming.queries import Query
 from acsard.core.simulator import protocol
 from acsard.core.values import NS_PER_S, BatteryLevel, Latch, Latches
 from acsard.host.errors import Exit
-from acsard.recording import mcap_recorder as module
-from acsard.recording.mcap_directory import listed
-from acsard.recording.mcap_recorder import Recorder
+from acsard.recording import recorder as module
+from acsard.recording.file import MAGIC, listed
+from acsard.recording.recorder import Recorder
 from tests.scenarios.speakers import Speaker, over
-from tests.scenarios.taped import chunks
 from tests.scenarios.world import World
 
 pytestmark = pytest.mark.slow
@@ -144,11 +143,9 @@ class Host:
 
     def crash(self) -> None:
         """End the daemon as a crash does, so that only the kernel closes the files."""
-        writer = self.recorder._writer
-        assert writer._writing is not None
-        assert writer._directory is not None
-        writer._writing.close()
-        writer._directory.close()
+        file = self.recorder._writer._file
+        assert file is not None
+        file.close()
 
 
 def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
@@ -457,7 +454,7 @@ class Story(NamedTuple):
 def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
     where, here = tmp_path_factory.mktemp("story") / "record", tmp_path_factory.mktemp("here")
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(module, "SYNC_PAUSE_S", 1000.0)
+        patched.setattr(module, "WRITE_PAUSE_S", 1000.0)
         patched.setattr(module, "CLOSE_S", 20.0)
         patched.setattr(protocol, "identity", identity)
         patched.chdir(here)
@@ -520,9 +517,9 @@ def test_show_and_export_of_a_damaged_recording_have_the_same_lines(
     story: Story, tmp_path: Path
 ) -> None:
     """The export has no messages of the steps after the damage, but it has their events."""
-    bad, new = tmp_path / "bad.mcap", tmp_path / "new.mcap"
+    bad, new = tmp_path / "bad.rec.zst", tmp_path / "new.mcap"
     data = bytearray(listed(story.where)[0].read_bytes())
-    begin, end = chunks(data)[4]
+    _, begin, end, *_ = [found.start() for found in re.finditer(re.escape(MAGIC), data)]
     data[(begin + end) // 2] ^= 0xFF
     bad.write_bytes(data)
     assert main(["recording", "export", str(bad), str(new)]) == Exit.INCOMPLETE

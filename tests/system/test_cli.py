@@ -21,7 +21,6 @@ import pytest
 
 from acsard.bus.robot_discovery import Presence, presence
 from acsard.client import connect
-from acsard.core.config.settings import Config
 from acsard.host.errors import Exit
 from tests.each import each
 from tests.scenarios.taped import Tape
@@ -326,9 +325,9 @@ def test_a_failure_keeps_its_exit_code_when_the_reader_of_the_output_has_left(
 
 def test_a_replay_fails_if_the_reader_of_its_output_has_left(tmp_path: Path) -> None:
     env = {key: value for key, value in environment().items() if key != "PYTHONUNBUFFERED"}
-    tape, path = Tape(), tmp_path / "drive.mcap"
+    tape, path = Tape(), tmp_path / "drive.rec.zst"
     World(recorder=tape).run(0.5)
-    tape.write(path, Config())
+    tape.save(path)
     words = acsard("recording", "replay", str(path))
     assert finish(words, tmp_path, 10.0).code == Exit.OK
     reader, writer = os.pipe()

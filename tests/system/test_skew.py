@@ -369,7 +369,7 @@ def test_the_older_version_reads_the_latches_the_tokens_and_the_recording_of_the
     tokens.write_text(json.dumps([*rows, rows[0] | {"name": "pilot", "role": "pilot"}]))
 
     with ThreadPoolExecutor(3) as at_once:
-        (recording,) = tmp_path.glob("daemon.recordings/*.mcap")
+        (recording,) = tmp_path.glob("daemon.recordings/*.rec.zst")
         out = tmp_path / "out"
         acts = {
             "list": ("recording",),

@@ -27,6 +27,7 @@ import pytest
 
 from acsard.core.values import NS_PER_S
 from acsard.host.child import SILENCE_TIMEOUT_NS
+from acsard.recording.file import MAGIC
 from acsard.web.openapi import KEYS
 from tests import described
 from tests.system.browser import Page, answer, hands, text
@@ -234,11 +235,11 @@ async def test_no_other_page_can_frame_the_page_or_add_scripts_to_it(page: Page)
                 assert answer.headers["X-Content-Type-Options"] == "nosniff"
 
 
-async def test_recordings_are_listed_and_downloaded_as_mcap(page: Page, daemon: Daemon) -> None:
+async def test_recordings_are_listed_and_downloaded(page: Page, daemon: Daemon) -> None:
     async with aiohttp.ClientSession(page.here) as session:
         name = await first_recording(session)
         async with session.get(f"/api/recordings/{name}") as answer:
-            assert (await answer.read()).startswith(b"\x89MCAP")
+            assert (await answer.read()).startswith(MAGIC)
 
 
 @pytest.mark.slow

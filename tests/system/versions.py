@@ -212,39 +212,26 @@ def _record_more(newer: Version) -> None:
     newer.swap(
         "recording/file.py",
         {
-            "    started_ns: Ns = 0  # start of the daemon,": """\
+            "    started_ns: WallNs = 0  # start of the daemon\n": """\
+    started_ns: WallNs = 0
     later: str = "later"
-    started_ns: Ns = 0  # start of the daemon,"""
-        },
-    )
-    newer.swap(
-        "recording/rows.py",
-        {
-            "    events_out: tuple[Event, ...] = ()\n": """\
-    events_out: tuple[Event, ...] = ()
-    later: tuple[str, ...] = ()
 """,
-            "            events_out=outputs.events,\n": """\
-            events_out=outputs.events,
-            later=("later",),
-""",
-            "    rare: OccasionalFields | None  # None: all absent or unchanged\n": """\
-    rare: OccasionalFields | None
+            "    events: tuple[Event, ...]\n": """\
+    events: tuple[Event, ...]
     later: int = 1
 """,
-            " None in older files\n": " None in older files\n    later: int = 1\n",
+            " wheel angles (`recorded_steps.checksum`)\n": """\
+ wheel angles
+    later: dict[str, int] = {}
+""",
         },
     )
     newer.swap(
         "recording/state.py",
-        {"    data: bytes  # `freeze`\n": "    data: bytes\n    later: int = 1\n"},
-    )
-    newer.swap(
-        "recording/end_record.py",
         {
-            "    serious: bool = False  # `timeline.is_serious`\n": """\
-    serious: bool = False
-    later: str = "later"
+            "    rest: bytes  # pickled attributes of the robot\n": """\
+    rest: bytes
+    later: int = 1
 """
         },
     )

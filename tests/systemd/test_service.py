@@ -160,7 +160,7 @@ TLS = "/root/tls"
 """A robot's certificate, for clients from other hosts."""
 
 STATE = "/var/lib/private/acsard"
-FORMER = "000001-20260101T000000Z.kept.mcap"
+FORMER = "000001-20260101T000000Z.rec.zst"
 
 
 def recorded_before(container: Container) -> bytes:
@@ -168,12 +168,12 @@ def recorded_before(container: Container) -> bytes:
 
     That version's files belong to a user id that systemd assigned for one run.
     """
-    (recording, *_) = sorted(RECORDINGS.glob("*.mcap"), key=lambda path: path.stat().st_size)
+    (recording, *_) = sorted(RECORDINGS.glob("*.rec.zst"), key=lambda path: path.stat().st_size)
     container.run("sh", "-c", f"rm -rf {STATE} && install -d -m 700 {STATE.rpartition('/')[0]}")
     place = container.path(f"{STATE}/record")
     place.mkdir(parents=True)
     (place / FORMER).write_bytes(recording.read_bytes())
-    for path, mode in ((place.parent, 0o750), (place, 0o750), (place / FORMER, 0o640)):
+    for path, mode in ((place.parent, 0o750), (place, 0o750), (place / FORMER, 0o644)):
         os.chown(path, 61999, 61999)
         path.chmod(mode)
     container.run("ln", "-sfn", "private/acsard", "/var/lib/acsard")
@@ -209,7 +209,6 @@ print(json.dumps({
     "remove": came_of(lambda: os.unlink(one)),
     "rename": came_of(lambda: os.rename(one, f"{place}/other")),
     "chmod": came_of(lambda: os.chmod(one, 0o600)),
-    "hold": came_of(lambda: open(f"{place}/.lock", "rb").close()),
     "signal": came_of(lambda: os.kill(daemon, 0)),
     "environment": came_of(lambda: open(f"/proc/{daemon}/environ").close()),
     "private": sorted(os.listdir("/var/lib/private")),
@@ -227,7 +226,11 @@ def test_the_service_s_page_lists_and_serves_recordings_and_cannot_change_them(
     done = bare.run(ACSARD, "service", "install")
     assert done.code == 0, done.err + bare.messages()
     until(lambda: FORMER in asks(bare, "/api/recordings"), 20.0, "what was recorded before")
-    until(lambda: "being recorded" in asks(bare, "/api/recordings"), 20.0, "what is recorded now")
+    until(
+        lambda: 'being_recorded":true' in asks(bare, "/api/recordings"),
+        20.0,
+        "what is recorded now",
+    )
     fetched = f"http://127.0.0.1:8080/api/recordings/{FORMER}"
     digest = bare.run("python3", "-c", FETCHED, fetched).out.strip()
     assert digest == hashlib.sha256(recording).hexdigest()

@@ -136,7 +136,7 @@ class Robot(NamedTuple):
         return {name: digest for digest, name in (line.split() for line in listed.splitlines())}
 
     def recordings(self) -> set[str]:
-        """Return the numbers of the recordings. Their names change when they end."""
+        """Return the numbers of the recordings."""
         names = self.container.run("ls", "/var/lib/private/acsard/record").out.split()
         return {name.partition("-")[0] for name in names}
 

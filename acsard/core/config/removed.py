@@ -16,7 +16,7 @@ REMOVED = {
     "battery.return_below": "remove the key: use battery.warning_below",
     "battery.hysteresis": "remove the key: a level ends 0.5 V or % above its threshold",
     "commands.neutral_pause": "remove the key: the pause is 1 s",
-    "record.days": "remove the key: recordings are kept for 14 days, and record.megabytes counts",
+    "record.days": "remove the key: only record.megabytes limits the recordings",
     "log.format": "remove the key: the format follows from the terminal, the journal or a pipe",
     "footprint": "remove this table, and give the URDF a fixed joint base_link -> base_footprint",
     "lidar.lidar_z_offset": _LIDAR,

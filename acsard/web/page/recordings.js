@@ -25,7 +25,7 @@ export class Recordings {
   }
 
   #row(one, barred) {
-    const about = made("div", "quiet", [began(one.begin), lasted(one.seconds), one.events].filter(Boolean).join(" · "));
+    const about = made("div", "quiet", [began(one.begin), lasted(one.seconds), one.being_recorded && "being recorded"].filter(Boolean).join(" · "));
     if (barred) return made("li", "", made("span", "", one.name), about, made("div", "quiet", `the download is ${barred}`));
     const link = made("a", "", one.name);
     link.href = `api/recordings/${encodeURIComponent(one.name)}`;

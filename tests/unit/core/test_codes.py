@@ -10,8 +10,7 @@ from typing import get_args
 
 import acsard
 from acsard.core.codes import CODES, Code, StateCode, WaitCode, joined, reason, sentence
-from acsard.recording.file_replay import steps
-from acsard.recording.mcap_file import Recording
+from acsard.recording.file import SUFFIX, Recording
 from tests import recordings
 
 PACKAGE = Path(acsard.__file__).parent
@@ -59,8 +58,8 @@ def test_the_page_lists_the_codes_of_the_sources_with_the_first_words_of_their_t
 
 def test_the_recordings_publish_only_codes_of_the_table() -> None:
     seen = set()
-    for path in Path(recordings.__file__).parent.glob("*.mcap"):
-        for step in steps(Recording(path)):
+    for path in Path(recordings.__file__).parent.glob(f"*{SUFFIX}"):
+        for step in Recording([path]).steps():
             code = step.recorded.status[4]
             assert code in get_args(StateCode)
             seen.add(code)

@@ -17,20 +17,23 @@ from acsard.daemon.daemon import Departure, _control, _recorder
 from acsard.daemon.pulse import Pulse
 from acsard.host.logs import Log
 from acsard.host.systemd import Systemd
-from acsard.recording import mcap_recorder as recorder
-from acsard.recording.end_record import read_end
+from acsard.recording import recorder
+from acsard.recording.file import Failure, Recording
 from tests.scenarios.world import World
 
 
 @pytest.mark.parametrize(
-    ("error", "cut"),
+    ("error", "why"),
     [
-        (ExceptionGroup("of tasks", [ValueError("a fault of our own")]), "bug"),
+        (
+            ExceptionGroup("of tasks", [ValueError("a fault of our own")]),
+            "ValueError: a fault of our own",
+        ),
         (asyncio.CancelledError(), ""),
     ],
 )
 def test_the_recording_ends_with_the_error_of_the_daemon_and_the_error_is_raised(
-    error: BaseException, cut: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    error: BaseException, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder, "CLOSE_S", 20.0)
     config = replace(Config(), record=RecordConfig(str(tmp_path)))
@@ -42,10 +45,10 @@ def test_the_recording_ends_with_the_error_of_the_daemon_and_the_error_is_raised
 
     with pytest.raises(type(error)) as raised:
         asyncio.run(run())
-    assert cut == "" or raised.value is error
-    last = read_end(next(tmp_path.glob("*.mcap")))
-    assert last is not None
-    assert (last.cut, last.why) == (cut, "ValueError: a fault of our own" if cut else "")
+    assert why == "" or raised.value is error
+    (path,) = tmp_path.iterdir()
+    *_, last = Recording([path]).records()
+    assert (last.why if isinstance(last, Failure) else "") == why
 
 
 def test_systemd_receives_stopping_before_the_daemon_cleans_up_after_an_error(

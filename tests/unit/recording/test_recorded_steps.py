@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-import pytest
 from msgspec.structs import replace
 
 from acsard.core.values import Estimate, Pose
-from acsard.recording.recorded_steps import (
-    Unfinished,
-    UnfinishedError,
-    checksum,
-    micropose,
-    unfinished,
-)
-from tests.scenarios.taped import Tape, recorded_world
+from acsard.recording.recorded_steps import checksum, micropose
+from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 
 
@@ -37,17 +30,3 @@ def test_a_checksum_continues_and_covers_every_bit() -> None:
     assert checksum([*every[:-1], nudged], 0) != checksum(every, 0)
     turned = replace(last, positions=(0.0, *last.positions[1:]))
     assert checksum([*every[:-1], turned], 0) != checksum(every, 0)
-
-
-def test_the_inputs_of_an_unfinished_step_are_read_back() -> None:
-    tape, world = recorded_world()
-    world.drive(0.5, 0.2, seconds=0.5)
-    world.call("stop")
-    for number, entry in enumerate(tape.taken):
-        step = Unfinished(number, entry.inputs)
-        assert unfinished(step.encode()) == step
-    for data in (b"", b"none", Unfinished(1, entry.inputs).encode()[:-1]):
-        with pytest.raises(
-            UnfinishedError, match="the step in which the daemon failed cannot be read"
-        ):
-            unfinished(data)

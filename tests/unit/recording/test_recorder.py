@@ -63,8 +63,7 @@ class Bench:
 
     def write(self) -> None:
         """Do the work that the recorder's thread does once a second."""
-        queue = self.recorder._queue
-        self.recorder._writer.write([queue.popleft() for _ in range(len(queue))], False)
+        self.recorder._writer.write(self.recorder._take_queue(), False)
 
     def drive(self, seconds: float) -> None:
         """Continue the drive for this time, and let the recorder write after each second."""

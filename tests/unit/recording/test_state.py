@@ -22,25 +22,20 @@ from acsard.core.motion.freshness import Freshness
 from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, REST, Command, Instant
 from acsard.host.errors import RecordingError
-from acsard.recording import file_replay
-from acsard.recording.file_replay import replay_file
-from acsard.recording.mcap_file import Recording, RecordingWriter
-from acsard.recording.rows import encode
+from acsard.recording.file import Recording
+from acsard.recording.replay import Playback
 from acsard.recording.state import (
     DERIVED,
     PARTS,
-    Checkpoint,
-    State,
     StateError,
     adopt,
     freeze,
     thaw,
 )
-from acsard.recording.unpickling import MAX_BYTES, MAX_OPCODES
 from tests.each import each
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
-from tests.unit.recording.attacks import state_with, whole
+from tests.unit.recording.attacks import state_with
 
 
 def test_a_robot_is_read_back_unchanged() -> None:
@@ -110,6 +105,13 @@ def test_with_any_bit_flipped_the_bytes_are_a_robot_or_refused() -> None:
     assert all(words.isprintable() for words in refused)
 
 
+def played(recording: Recording) -> Playback:
+    playback = Playback(recording)
+    for _ in playback.steps():
+        pass
+    return playback
+
+
 def of_older_code(path: Path, forget: Callable[[Robot], None]) -> Recording:
     """Record a drive from its middle. `forget` removes attributes from the saved robot.
 
@@ -120,8 +122,7 @@ def of_older_code(path: Path, forget: Callable[[Robot], None]) -> Recording:
     robot, memory = thaw(tape.states[first])
     forget(robot)
     tape.states[first] = freeze(robot, memory)
-    tape.write(path, Config(), first)
-    return Recording(path)
+    return Recording([tape.save(path, first=first)])
 
 
 @pytest.mark.slow
@@ -130,8 +131,7 @@ def test_attributes_that_an_older_robot_lacks_come_from_a_new_robot(tmp_path: Pa
         for side in robot._odometry.checks.wheels._sides:
             del side.late
 
-    recording = of_older_code(tmp_path / "old.mcap", forget)
-    assert replay_file(recording).comparison.same
+    assert played(of_older_code(tmp_path / "old", forget)).comparison.same
 
 
 def structs(kind: inspect.Type, found: set[type[Struct]]) -> set[type[Struct]]:
@@ -207,28 +207,9 @@ def test_a_robot_with_a_wrong_part_is_refused_with_a_message(
     robot, memory = thaw(taped.states[100])
     SPOILERS[how](robot)
     spoilt = replace_state(taped, freeze(robot, memory))
-    spoilt.write(path := tmp_path / "spoilt.mcap", Config(), 100)
-    recording = Recording(path)
-    words = r"spoilt\.mcap: this version of acsard cannot read the robot state at the start of "
-    with pytest.raises(RecordingError, match=words):
-        replay_file(recording)
-
-
-def test_a_wrong_part_of_a_state_behind_a_gap_is_reported_with_its_place(
-    taped: Tape, tmp_path: Path
-) -> None:
-    robot, memory = thaw(taped.states[100])
-    SPOILERS["a number for the session"](robot)
-    taped.write(tmp_path / "whole.mcap", Config())
-    about = Recording(tmp_path / "whole.mcap").about
-    writing = RecordingWriter(path := tmp_path / "spoilt.mcap", about)
-    writing.add("steps", about.wall_ns, encode(0, taped.taken[:50]))
-    writing.add("state", about.wall_ns, Checkpoint(100, freeze(robot, memory)).encode())
-    writing.add("steps", about.wall_ns, encode(100, taped.taken[100:]))
-    writing.finish()
-    words = r"cannot read the robot state before step 100 of the recording"
-    with pytest.raises(RecordingError, match=words):
-        replay_file(Recording(path))
+    path = spoilt.save(tmp_path / "spoilt", first=100)
+    with pytest.raises(RecordingError, match=r"this acsard cannot replay spoilt, which acsard "):
+        played(Recording([path]))
 
 
 def replace_state(tape: Tape, state: bytes) -> Tape:
@@ -244,42 +225,9 @@ def test_a_missing_part_that_a_new_robot_lacks_too_gives_a_message(tmp_path: Pat
         for sender in robot._arbiter._sources["app"].senders.values():
             del sender.arrived_ns
 
-    recording = of_older_code(tmp_path / "old.mcap", forget)
-    words = (
-        r"old\.mcap: this version of acsard cannot read the robot state at the start of the "
-        r"recording: .*'arrived_ns'.* replay it: acsard"
-    )
-    with pytest.raises(RecordingError, match=words):
-        replay_file(recording)
-
-
-@pytest.mark.slow
-def test_forged_states_after_gaps_take_time_in_proportion_to_the_file(
-    taped: Tape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each state compresses to a few bytes and takes 0.2 s to restore.
-
-    A gap precedes each state.
-    """
-    thawed: list[bytes] = []
-
-    def counted(data: bytes) -> State:
-        thawed.append(data)
-        return thaw(data)
-
-    monkeypatch.setattr(file_replay, "thaw", counted)
-    taped.write(tmp_path / "whole.mcap", Config())
-    about = Recording(tmp_path / "whole.mcap").about
-    writing = RecordingWriter(path := tmp_path / "forged.mcap", about)
-    writing.add("steps", about.wall_ns, encode(0, taped.taken[:1]))
-    for number in range(10, 210, 10):
-        forged = Checkpoint(number, state_with(whole(b"(" + b"K\x01" * (MAX_OPCODES - 5) + b"t")))
-        writing.add("state", about.wall_ns, forged.encode())
-        writing.add("steps", about.wall_ns, encode(number, taped.taken[1:2]))
-    writing.finish()
-    (gap,) = replay_file(Recording(path)).gaps
-    assert gap.skipped == 20
-    assert len(thawed) <= 2 * (MAX_BYTES + 8 * path.stat().st_size) // len(forged.data)
+    recording = of_older_code(tmp_path / "old", forget)
+    with pytest.raises(RecordingError, match=r"cannot replay old, which acsard .*'arrived_ns'"):
+        played(recording)
 
 
 PLAIN = Config()

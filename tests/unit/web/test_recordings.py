@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +18,24 @@ def test_a_robot_that_has_just_started_has_no_recordings(tmp_path: Path) -> None
     assert rows(tmp_path / "record") == []
 
 
-def test_a_file_that_the_daemon_renames_meanwhile_does_not_hide_the_others(
+def test_a_file_that_the_daemon_deletes_meanwhile_does_not_hide_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    names = ["000001-20261121T070027Z.mcap", "000002-20261121T070127Z.mcap.part"]
-    for name in names:
-        (tmp_path / name).write_bytes(b"")
+    names = ["000001-20261121T070027Z.rec.zst", "000002-20261121T070127Z.rec.zst"]
+    (tmp_path / names[1]).write_bytes(b"")
     monkeypatch.setattr(recordings, "listed", lambda place: [place / name for name in names])
-    (tmp_path / names[1]).rename(tmp_path / "000002-20261121T070127Z.mcap")
-    assert [row.name for row in rows(tmp_path)] == names[:1]
+    assert [row.name for row in rows(tmp_path)] == names[1:]
+
+
+def test_a_recording_is_listed_with_its_beginning_and_its_duration(tmp_path: Path) -> None:
+    path = tmp_path / "000001-20261121T070027Z.rec.zst"
+    path.write_bytes(b"1234")
+    begin = 1_795_244_427.0
+    os.utime(path, (begin, begin + 60.0))
+    assert rows(tmp_path) == [Recording(path.name, begin, 60.0, 4, being_recorded=False)]
+    os.utime(path)
+    (row,) = rows(tmp_path)
+    assert row.being_recorded
 
 
 def test_a_file_in_place_of_the_directory_is_an_error(tmp_path: Path) -> None:
