@@ -52,18 +52,18 @@ class BoardInputs(Struct):
     def expects_reports(self, session: McuSession) -> bool:
         """Return whether `process_reports` has something to do."""
         return bool(
-            session.statuses
+            session.status.new
             or self.estop.state
             or self.bumpers.state
             or self.battery.status
             or self.unreported
-            or session.forgot
+            or session.status.forgot
             or self.battery.refuses_clear
         )
 
     def process_reports(self, session: McuSession, now_ns: Ns, config: Config) -> list[Event]:
         """Process the status lines of the last update, and return the events of changes."""
-        statuses, safety, up = session.statuses, config.safety, session.link == "up"
+        statuses, safety, up = session.status.new, config.safety, session.link == "up"
         return [
             *self.estop.process_reports(statuses, now_ns, safety),
             *self.bumpers.process_reports(statuses, now_ns, safety),
@@ -85,7 +85,7 @@ class BoardInputs(Struct):
         objection = self.bumpers.clear_refusal(safety)
         if objection is not None:
             return objection
-        if session.status.driver_fault:
+        if session.status.last.driver_fault:
             return DRIVER_FAULT_REASON
         return self.battery.refusal(config.battery) if self.battery.refuses_clear else awaited
 
@@ -97,7 +97,7 @@ class BoardInputs(Struct):
         reported = {
             "estop": self.estop.use(safety) == "off" or bool(self.estop.state),
             "bumpers": self.bumpers.use(safety) == "off" or bool(self.bumpers.state),
-            "driver": session.status.driver_fault is not None,
+            "driver": session.status.last.driver_fault is not None,
         }
         for name in [name for name in self.unreported if reported[name]]:
             del self.unreported[name]

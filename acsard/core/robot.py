@@ -354,7 +354,7 @@ class Robot:
             life.caused_again(now_ns)
         if inputs.battery.stopped_now:
             life.press(empty_reason(config.battery), now)
-        if self.session.forgot:
+        if self.session.status.forgot:
             inputs.forget(config)
         life.refuse_clear(inputs.clear_refusal(self.session, config), now_ns)
 
@@ -379,11 +379,11 @@ class Robot:
             self._choice = replace(self._choice, twist=away)
 
     def _board(self, now_ns: Ns) -> dict[str, str]:
-        status_ns = self.session.status_ns
+        status_ns = self.session.status.last_ns
         if status_ns is None:
             return {}
         age_s = (now_ns - status_ns) / NS_PER_S
-        return as_text(self.session.status) | {"age_s": f"{age_s:.1f}"}
+        return as_text(self.session.status.last) | {"age_s": f"{age_s:.1f}"}
 
     def _plausible(self, line: Feedback, now: Instant, events: list[Event]) -> list[Feedback]:
         # A line after a long gap may wait for one that confirms its speeds.

@@ -154,8 +154,8 @@ FAULTS = (
         "guard samples",
         "the guard refuses lines that ask for a sample",
         GUARD,
-        "{2}[SH]?",
-        "{2}H?",
+        "{2}S?",
+        "{2}",
     ),
     fault(
         "guard and latch",
@@ -663,14 +663,14 @@ FAULTS = (
         "session deaf",
         "behind a damaged line the next five lines are ignored",
         SESSION,
-        "        if line.startswith(IDENTITY):",
+        "        if self._echo.trouble:\n            self._reject",
         "        self._deaf = getattr(self, '_deaf', 0) - 1\n"
         "        if self._deaf > 0:\n            return None\n"
-        "        if line.startswith(IDENTITY):",
+        "        if self._echo.trouble:\n            self._reject",
         Edit(
             SESSION,
-            "            self._reject(error.reason, line)\n            self._bad()",
-            "            self._reject(error.reason, line)\n            self._bad()\n"
+            "                self._reject(error.reason, line)\n                self._link.bad()",
+            "                self._reject(error.reason, line)\n                self._link.bad()\n"
             "            self._deaf = 6",
         ),
     ),
@@ -935,8 +935,8 @@ FAULTS = (
         "driver clear",
         "a clear works while a motor driver has a fault",
         INPUTS,
-        "        if session.status.driver_fault:\n",
-        "        if session.status.driver_fault and self.estop.is_pressed:\n",
+        "        if session.status.last.driver_fault:\n",
+        "        if session.status.last.driver_fault and self.estop.is_pressed:\n",
     ),
     fault(
         "driver without power",

@@ -18,8 +18,13 @@ from msgspec import Struct
 from msgspec.structs import astuple
 
 from acsard.core.link.codec import FrameError
+from acsard.core.values import NS_PER_S, Ns
 
 STATUS = b"!status"  # no other line begins like this
+
+# Time with the link up and without late steps, in which a board reports each field at least once.
+# Until then, a pressed emergency stop stays latched while its cable is plugged in again.
+FORGET_NS = 3 * NS_PER_S
 
 _LINE = re.compile(STATUS + rb"((?: [a-z]+=[^ *]+)+)(?:\*([0-9A-F]{4}))?")
 
@@ -50,6 +55,50 @@ def merged(status: BoardStatus, newer: BoardStatus) -> BoardStatus:
     """Return `status` with those fields of `newer` that are not None."""
     pairs = zip(astuple(status), astuple(newer), strict=True)
     return BoardStatus(*[old if new is None else new for old, new in pairs])
+
+
+class StatusReports:
+    """The fields that the board on this port has reported.
+
+    Another board may answer after the port was opened again, so the fields that only the previous
+    one reported are forgotten after `FORGET_NS`. A board that restarts has the same inputs: a field
+    that it no longer reports is a fault.
+    """
+
+    def __init__(self) -> None:
+        self.new: list[tuple[Ns, BoardStatus]] = []  # of the last update, with arrival
+        self.last = BoardStatus()  # last value of each field, until it is forgotten
+        self.last_ns: Ns | None = None  # arrival of the last line
+        self.forgot = False  # in the last update
+        # Both of these since the last opening, and how long the link was up; None: forgotten.
+        self._since_opening: tuple[BoardStatus, Ns | None] = (BoardStatus(), None)
+        self._up_ns: Ns | None = 0
+        self._judged_ns = 0
+
+    def begin_update(self) -> None:
+        self.forgot = False
+        if self.new:
+            self.new = []
+
+    def reopen(self) -> None:
+        self._since_opening, self._up_ns = (BoardStatus(), None), 0
+
+    def take(self, line: bytes, check: bool, at_ns: Ns) -> None:
+        """Take a status line, as `decode_status`. Raises `FrameError`."""
+        status = decode_status(line, check)
+        self.last, self.last_ns = merged(self.last, status), at_ns
+        self._since_opening = merged(self._since_opening[0], status), at_ns
+        self.new.append((at_ns, status))
+
+    def judge(self, now_ns: Ns, up: bool, late: bool) -> None:
+        """Forget the fields of another board, if the link was up long enough without late steps."""
+        passed_ns, self._judged_ns = now_ns - self._judged_ns, now_ns
+        if self._up_ns is None:
+            return
+        self._up_ns = 0 if not up else self._up_ns + (0 if late else passed_ns)
+        if self._up_ns >= FORGET_NS:
+            self._up_ns, self.forgot = None, True
+            self.last, self.last_ns = self._since_opening
 
 
 def as_text(status: BoardStatus) -> dict[str, str]:

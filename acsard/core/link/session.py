@@ -2,10 +2,7 @@
 
 `mcu.link_check` declares whether lines are checked, and `link_state.py` decides whether the robot
 may drive. After the first line of a session the daemon sends `QUESTION`, and only later lines bring
-the link up, because a port that returns it has no board. Another board may answer after the port
-was opened again, so fields of the status line that only the previous one reported are forgotten
-after `FORGET_NS`. A board that restarts has the same inputs: a field that it no longer reports is a
-fault.
+the link up, because a port that returns it has no board.
 """
 
 from __future__ import annotations
@@ -16,7 +13,7 @@ from typing import Literal
 from acsard.core.codes import Reason, sentence
 from acsard.core.config.settings import MAX_REPLY_PERIOD_S, FeedbackConfig, McuConfig
 from acsard.core.link import link_diagnosis
-from acsard.core.link.board_status import STATUS, BoardStatus, decode_status, merged
+from acsard.core.link.board_status import STATUS, StatusReports
 from acsard.core.link.checked_line import SAMPLE_REQUEST, OpenLines, Reading, seal, unseal
 from acsard.core.link.codec import Codec, FrameError
 from acsard.core.link.echo_check import QUESTION, EchoCheck
@@ -47,10 +44,6 @@ NAMES: dict[LinkState, EventName] = {
 
 # Without a line from the board or to the port, the MCU may have been reset: a new session begins.
 LONG_GAP_NS = 1 * NS_PER_S
-
-# Time with the link up and without late steps, in which a board reports each field at least once.
-# Until then, a pressed emergency stop stays latched while its cable is plugged in again.
-FORGET_NS = 3 * NS_PER_S
 
 QUESTION_LINE = QUESTION + b"\r\n"
 
@@ -97,15 +90,8 @@ class McuSession:
         # On a checked link that is not up: valid plain lines, and whether they are the trouble.
         self._plain_lines, self._unchecked = 0, False
         self._sampled = False  # the last good line had the board's counts
-        self.statuses: list[tuple[int, BoardStatus]] = []  # of the last `update`, with arrival
-        self.status = BoardStatus()  # last value of each field, until the session forgets it
-        self.status_ns: Ns | None = None  # arrival of the last status line
-        # Both of these, since the last opening of the port.
-        self._reported: tuple[BoardStatus, int | None] = (BoardStatus(), None)
-        # Until the fields of another board are forgotten; how long the link was up without late
-        # steps, ns; the last update.
-        self._awaiting, self._settled_ns, self._judged_ns = True, 0, 0
-        self.reopened = self.forgot = False  # in the last `update`
+        self.status = StatusReports()
+        self.reopened = False  # in the last `update`
         # Silence after which the link is stale.
         self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
         self._link = Link(self.quiet_ns, mcu.checked)
@@ -150,9 +136,8 @@ class McuSession:
         """
         self.restarted, self._resumed = self._resumed, False
         self._starting_over, self.events = False, []
-        self.reopened = self.forgot = False
-        if self.statuses:
-            self.statuses = []
+        self.reopened = False
+        self.status.begin_update()
         feedback = []
         if not port_open or opened != self._opened:
             self._begin(port_open, opened, now.mono_ns)
@@ -266,7 +251,7 @@ class McuSession:
         self._link.apply("opened" if port_open else "closed")
         self.restarted = self.reopened = opened != self._opened
         if self.reopened:
-            self._reported, self._awaiting = (BoardStatus(), None), True
+            self.status.reopen()
         self._opened = opened
         self._left_ns, self._held_up, self.blocked = now_ns, False, False
         if port_open:
@@ -310,15 +295,7 @@ class McuSession:
         held = self._starting_over or not echo.asked or echo.trouble
         link.judge(now_ns, may_rise=not held)
         up = link.state == "up"
-        if self._awaiting:
-            if not up:
-                self._settled_ns = 0
-            elif not self.lateness.step_s:
-                self._settled_ns += now_ns - self._judged_ns
-            if self._settled_ns >= FORGET_NS:
-                self._awaiting, self.forgot = False, True
-                self.status, self.status_ns = self._reported
-        self._judged_ns = now_ns
+        self.status.judge(now_ns, up, late=self.lateness.step_s > 0.0)
         if up or self.blocked:
             self._hearing.forget()
         elif self._hearing.judge(now_ns, self.lateness.step_s):
@@ -404,13 +381,10 @@ class McuSession:
 
     def _take_status(self, line: bytes, at_ns: Ns) -> None:
         try:
-            status = decode_status(line, self._mcu.checked)
+            self.status.take(line, self._mcu.checked, at_ns)
         except FrameError as error:
             self._reject(error.reason, line)
             return
-        self.status, self.status_ns = merged(self.status, status), at_ns
-        self._reported = merged(self._reported[0], status), at_ns
-        self.statuses.append((at_ns, status))
         if self._link.state != "up":
             self._hearing.now.statuses += 1
 
