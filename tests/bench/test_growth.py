@@ -2,8 +2,9 @@
 
     pytest -s -m bench tests/bench/test_growth.py
 
-Each case runs at the same time as the polled program at 100 Hz with one subscriber, so that other
-programs of the machine slow both equally. Only ratios and counts are asserted.
+Each case runs at the same time as the polled program, which has as many subscribers and senders and
+always 100 Hz, so that other programs of the machine slow both equally. Only ratios and counts are
+asserted.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import NamedTuple
 import pytest
 from msgspec.structs import replace
 
+from acsard.bus.subscription import direct
 from acsard.bus.zenoh_sessions import client_session
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.messages.encodings import encode, encoding_name
@@ -31,10 +33,9 @@ from acsard.host.own_identity import sender_id
 from tests.bench.matching import staircase
 from tests.bench.rig import ACSARD
 from tests.bench.rigs import POLLED, config, delays_us, gap_ns, rig, share, sibling, waits_us
-from tests.bench.test_transports import listening
 from tests.system.harness import resident_kb
 
-pytestmark = [pytest.mark.bench, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.bench, pytest.mark.timeout(600)]
 
 SECONDS, ROUNDS = 4.0, 3
 
@@ -62,6 +63,17 @@ CASES = {
     "recording": Case(record=True),
     "free-running board": Case(reply_period=0.01),
 }
+
+
+@contextmanager
+def following(settings: Config, subscribers: int) -> Iterator[None]:
+    """Run this number of clients that subscribe to the odometry, each with its own connection."""
+    with ExitStack() as stack:
+        for _ in range(subscribers):
+            session = client_session(settings.bus.listen[0])
+            stack.callback(session.close)
+            session.declare_subscriber(full_key(settings.robot.id, "odom"), direct(lambda _: None))
+        yield
 
 
 @contextmanager
@@ -104,12 +116,13 @@ def costs_of(case: Case, where: Path) -> Costs:
         settings = replace(settings, record=RecordConfig(str(where)))
     with ExitStack() as stack:
         ours = stack.enter_context(rig(settings, ACSARD, free_running=case.reply_period))
-        theirs = stack.enter_context(rig(sibling(config(), 1), POLLED))
-        key = full_key(settings.robot.id, "odom")
-        stack.enter_context(listening(settings, (key,), case.subscribers - 1))
-        stack.enter_context(commanding(settings, case.senders - 1))
+        polled = sibling(config(), 1)
+        theirs = stack.enter_context(rig(polled, POLLED))
+        for each in (settings, polled):
+            stack.enter_context(following(each, case.subscribers - 1))
+            stack.enter_context(commanding(each, case.senders - 1))
         with ThreadPoolExecutor(2) as pool:
-            runs = [pool.submit(each.command, SECONDS, staircase) for each in (ours, theirs)]
+            runs = [pool.submit(one.command, SECONDS, staircase) for one in (ours, theirs)]
         own, other = (run.result() for run in runs)
         return Costs(own / other, own, resident_kb(ours.process.pid))
 
