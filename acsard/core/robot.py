@@ -123,7 +123,7 @@ class Robot:
         self._refused_ns: Ns | None = None
         self._sanity = Sanity()
         self._inputs = inputs_after(latches, config)
-        self._answered = UnansweredLines(config.mcu.reply_period)
+        self._answered = UnansweredLines()
         self._tally = EventThrottle()
         # Verb, client and arrival of the last request: a call of `srv/stop` arrives as two, and the
         # second, which leads to the reply, is not logged.
@@ -288,7 +288,10 @@ class Robot:
         link, inputs = session.link, self._inputs
         if feedback or link != "up":
             warning = self._answered.check(
-                self.counters["lines_sent"], session.good_lines, link == "up"
+                self.counters["lines_sent"],
+                session.good_lines,
+                link == "up",
+                self.config.mcu.reply_period,
             )
             if warning is not None:
                 events.append(warning)

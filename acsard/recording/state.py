@@ -24,6 +24,7 @@ from acsard.core.config.contradictions import contradictions
 from acsard.core.config.settings import Config
 from acsard.core.formatting import printable
 from acsard.core.guard import Memory
+from acsard.core.link.link_diagnosis import UnansweredLines
 from acsard.core.motion.arbiter import Choice
 from acsard.core.motion.arbiter_text import CommandEvents
 from acsard.core.motion.event_throttle import EventThrottle
@@ -50,6 +51,7 @@ PARTS: dict[str, Any] = {
     "_asked": tuple[str, str, Ns | None],
     "_port_trouble": str,
     "_linked_once": bool,
+    "_answered": UnansweredLines,
     "_sanity": Sanity,
     "_inputs": BoardInputs,
     "_told": CommandEvents,

@@ -589,9 +589,9 @@ FAULTS = (
         "robot limits",
         "set answers, but the old limits stay in force",
         ROBOT,
-        "            motion = last.motion.follow(twist, dt, limits, self._kinematics, cap)\n",
-        "            self._first = limits = getattr(self, '_first', limits)\n"
-        "            motion = last.motion.follow(twist, dt, limits, self._kinematics, cap)\n",
+        "        now_ns, twist, limits = now.mono_ns, self._choice.twist, self.config.limits\n",
+        "        now_ns, twist, limits = now.mono_ns, self._choice.twist, self.config.limits\n"
+        "        limits = self.__dict__.setdefault('_old_limits', limits)\n",
     ),
     fault(
         "robot reason",

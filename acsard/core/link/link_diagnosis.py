@@ -189,7 +189,7 @@ class SilenceDiagnosis:
         return before is None or before.looks != self.heard.looks
 
 
-class UnansweredLines:
+class UnansweredLines(Struct):
     """Warns that the board does not answer all lines while the link is up.
 
     After every `WINDOW_LINES`, the lines sent and received are compared. A warning is repeated only
@@ -197,24 +197,25 @@ class UnansweredLines:
     it, too, without `mcu.reply_period`.
     """
 
-    def __init__(self, reply_period: float) -> None:
-        self._own_clock = reply_period > 0.0
-        self._since: tuple[int, int] | None = None
-        self._told = False
+    since: tuple[int, int] | None = None  # lines sent and received at the last comparison
+    told: bool = False
 
-    def check(self, sent: int, good: int, linked: bool) -> Event | None:
-        """Return the warning if it is due; `sent` and `good` lines are since the start."""
-        if not linked or self._own_clock:
-            self._since, self._told = None, False
+    def check(self, sent: int, good: int, linked: bool, reply_period: float) -> Event | None:
+        """Return the warning if it is due; `sent` and `good` lines are since the start.
+
+        A board with a `reply_period` answers no line, so none is missing.
+        """
+        if not linked or reply_period:
+            self.since, self.told = None, False
             return None
-        if self._since is None:
-            self._since = sent, good
-        lines, answers = sent - self._since[0], good - self._since[1]
+        if self.since is None:
+            self.since = sent, good
+        lines, answers = sent - self.since[0], good - self.since[1]
         if lines < WINDOW_LINES:
             return None
-        self._since = sent, good
-        warned, self._told = self._told, answers < (1.0 - MAX_UNANSWERED_FRACTION) * lines
-        if warned or not self._told:
+        self.since = sent, good
+        warned, self.told = self.told, answers < (1.0 - MAX_UNANSWERED_FRACTION) * lines
+        if warned or not self.told:
             return None
         return Event(
             "lines_lost",

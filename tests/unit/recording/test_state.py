@@ -155,9 +155,9 @@ def test_a_part_that_is_plain_data_has_no_configuration_inside(part: Any) -> Non
     assert not [name for name in modules if name.startswith("acsard.core.config")]
 
 
-def test_only_five_parts_are_pickled() -> None:
+def test_only_four_parts_are_pickled() -> None:
     pickled = vars(Robot(PLAIN)).keys() - PARTS.keys() - {*DERIVED}
-    assert pickled == {"session", "_odometry", "_arbiter", "_life", "_answered"}
+    assert pickled == {"session", "_odometry", "_arbiter", "_life"}
 
 
 @each(
@@ -264,6 +264,6 @@ def test_configured_values_change_and_values_of_the_drive_stay() -> None:
 
 def test_a_part_that_the_state_lacks_comes_from_a_new_robot() -> None:
     robot = driven()
-    del robot._answered
+    del robot._life
     adopt(robot, Robot(PLAIN), Robot(PLAIN))
-    assert vars(robot._answered) == vars(Robot(PLAIN)._answered)
+    assert vars(robot._life) == vars(Robot(PLAIN)._life)

@@ -230,9 +230,9 @@ def test_lines_that_came_while_the_output_was_blocked_are_not_counted_afterwards
 
 def events_of(every: int, windows: int = 3, period: float = 0.0, linked: bool = True) -> list[str]:
     """Return the events of a link that loses every n-th line."""
-    answered = UnansweredLines(period)
+    answered = UnansweredLines()
     events = [
-        answered.check(sent, sent - sent // every if every else sent, linked)
+        answered.check(sent, sent - sent // every if every else sent, linked, period)
         for sent in range(windows * WINDOW_LINES + 1)
     ]
     return [event.text for event in events if event is not None]
@@ -252,7 +252,7 @@ def test_losses_are_not_judged_for_a_free_running_board_or_without_a_link() -> N
 
 
 def test_losses_are_reported_again_after_the_link_was_down() -> None:
-    answered, events = UnansweredLines(0.0), []
+    answered, events = UnansweredLines(), []
     for sent in range(3 * WINDOW_LINES):
-        events.append(answered.check(sent, sent // 2, sent != WINDOW_LINES + 10))
+        events.append(answered.check(sent, sent // 2, sent != WINDOW_LINES + 10, 0.0))
     assert len([event for event in events if event]) == 2
