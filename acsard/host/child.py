@@ -31,7 +31,9 @@ HEARTBEAT_S = 0.5  # longest pause between two signs of life, and between two ch
 # The TLS gateway ends itself after 1 s without progress, so this is for a process that cannot.
 SILENCE_TIMEOUT_NS = 3 * NS_PER_S
 
-START_TIMEOUT_NS = 15 * NS_PER_S  # Python starts slowly on a busy machine
+# Long, because a child that needs longer is killed and started again and again. On a busy computer
+# the page took half a minute.
+START_TIMEOUT_NS = 60 * NS_PER_S
 
 
 class Silence:

@@ -245,6 +245,11 @@ def test_a_silence_is_too_long_when_it_exceeds_the_limit() -> None:
     assert [silence.too_long(False, S // 2) for _ in range(7)] == [False] * 6 + [True]
 
 
+def test_a_start_may_take_half_a_minute() -> None:
+    silence = Silence(module.START_TIMEOUT_NS)
+    assert not any(silence.too_long(False, S // 2) for _ in range(60))
+
+
 def test_a_sign_of_life_restarts_the_time_limit_of_the_silence() -> None:
     silence = Silence(MOST)
     for _ in range(5):
