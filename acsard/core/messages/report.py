@@ -72,6 +72,9 @@ BATTERY_HZ = 1.0
 
 NEVER_NS = -(1 << 62)
 
+# Topics whose messages are not of a feedback line, nor latched.
+_OTHERS = frozenset({"cmd_vel_out", "events", "state", "diagnostics", "battery"})
+
 
 class _Rate:
     # Messages of one key. A change of its rate must not make one due, so the last one counts.
@@ -173,13 +176,11 @@ class Report:
             self._happened.add(news.events, now)
         if news.estimates:
             self._estimate = news.estimates[-1]
-        if (
-            not self._summaries.keys().isdisjoint(wanted)
-            or (applied is not None and "cmd_vel_out" in wanted)
-            or (news.events and "events" in wanted)
+        # Bytes alone make no message due: a summary waits for the next line.
+        if (applied is not None or news.events or news.status_changed) and not _OTHERS.isdisjoint(
+            wanted
         ):
             return self._others_due(now, news, applied, wanted, get_snapshot)
-        # Most wake-ups end here, because no message with a subscriber is due.
         return iter(())
 
     def _others_due(
