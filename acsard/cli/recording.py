@@ -27,8 +27,8 @@ from acsard.recording.directory import is_being_recorded
 from acsard.recording.export import ENDINGS, Kind, export, replacing
 from acsard.recording.file import (
     ALWAYS,
-    Failure,
     Head,
+    ReadRecord,
     Recording,
     first_head,
     listed,
@@ -377,7 +377,7 @@ def _clock(wall_ns: WallNs) -> str:
 class _ShownRecording(Recording):
     # Shows on a terminal the time of the step that is read.
 
-    def records(self) -> Iterator[Head | RecordedStep | Failure]:
+    def records(self) -> Iterator[ReadRecord]:
         for number, record in enumerate(super().records()):
             if number % PROGRESS_RECORDS == 0 and isinstance(record, RecordedStep):
                 at = _clock(record.inputs.now.wall_ns)

@@ -27,7 +27,7 @@ from acsard.core.link.link_diagnosis import UnansweredLines
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
-from acsard.core.motion.arbiter_text import OBJECTIONS, CommandEvents, missed, refused
+from acsard.core.motion.arbiter_text import OBJECTIONS, CommandEvents, missed, refused, waiting
 from acsard.core.motion.battery import empty_reason
 from acsard.core.motion.emergency_stop import (
     DRIVER_FAULT_REASON,
@@ -168,6 +168,15 @@ class Robot:
             board=self._board(now_ns),
             speed_limit=self._cap_text,
         )
+
+    def waits(self, now_ns: Ns) -> dict[str, Reason]:
+        """Return what each source that sends, but does not drive, waits for."""
+        sources = self._arbiter.sources(now_ns)
+        return {
+            source.name: waiting(source.waits_for)
+            for source in sources
+            if source.waits_for.what not in ("nothing", "command")
+        }
 
     @property
     def latches(self) -> Latches:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import stat
 import struct
 import zlib
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO, get_args
 
@@ -24,6 +24,7 @@ import zstandard
 from msgspec import Struct
 from msgspec.structs import replace
 
+from acsard.core.codes import Reason
 from acsard.core.formatting import printable
 from acsard.core.values import (
     NS_PER_S,
@@ -121,6 +122,17 @@ class Steps(Struct, frozen=True, tag="steps"):
     checksum: int  # of exact poses, twists and wheel angles (`recorded_steps.checksum`)
 
 
+class Waits(Struct, frozen=True, tag="waits"):
+    """What sources wait for while another one drives, when it has changed."""
+
+    at: Instant
+    reasons: dict[str, tuple[str, str]]  # code and text by source
+
+    @classmethod
+    def of(cls, at: Instant, reasons: Mapping[str, Reason]) -> Waits:
+        return cls(at, {source: (why.code, why.text) for source, why in reasons.items()})
+
+
 class Failure(Struct, frozen=True, tag="failure"):
     """The step in which the daemon failed, as the last record of its run."""
 
@@ -142,7 +154,9 @@ class Damage(Struct, frozen=True):
         return f"{self.path.name}: {what} cannot be read: {self.why}"
 
 
-Record = Head | Steps | Failure
+Record = Head | Steps | Waits | Failure
+
+ReadRecord = Head | RecordedStep | Waits | Failure
 
 _decoder: msgspec.msgpack.Decoder[Record] = msgspec.msgpack.Decoder(Record)
 _encode = msgspec.msgpack.Encoder().encode
@@ -263,7 +277,7 @@ class Recording:
         """Return whether a step at this time was asked for."""
         return self.begin_ns <= at.wall_ns <= self.end_ns
 
-    def records(self) -> Iterator[Head | RecordedStep | Failure]:
+    def records(self) -> Iterator[ReadRecord]:
         """Yield each record. Raises `RecordingError` for a file that is not a recording."""
         self.damage = []
         for path in self.paths:

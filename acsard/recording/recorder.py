@@ -11,7 +11,7 @@ import errno
 import os
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import BinaryIO
 
@@ -27,7 +27,7 @@ from acsard.core.values import NS_PER_S, Event, Inputs, Instant, Ns, Outputs, Re
 from acsard.host.version import version
 from acsard.host.wait_timer import WaitTimer
 from acsard.recording.directory import RecordingDirectory
-from acsard.recording.file import Failure, FrameWriter, Head
+from acsard.recording.file import Failure, FrameWriter, Head, Waits
 from acsard.recording.recorded_steps import StepRecorder
 from acsard.recording.state import MAX_ERROR_LENGTH, freeze
 
@@ -81,9 +81,11 @@ class Recorder(StepRecorder):
     ) -> None:
         # `report` runs in the thread of the control loop.
         self._report = report
-        self._queue: deque[Step | Start | Failure] = deque()
+        self._queue: deque[Step | Start | Waits | Failure] = deque()
         self._number = 0  # of the next step
         self._head_ns = 0  # when the next head is due
+        self._waits: Mapping[str, str] = {}  # codes of what sources wait for, in this drive
+        self._waits_ns = 0  # when they are due; once a second
         self._lost = 0  # for a full queue
         self._full = False  # until half of the queue is free again
         self._slow = False  # a slow disk was reported
@@ -118,8 +120,19 @@ class Recorder(StepRecorder):
         if (writer.wants_head or now.mono_ns >= self._head_ns) and not self._full:
             writer.wants_head, self._head_ns = False, now.mono_ns + HEAD_NS
             queue.append(Start(self._number, now, robot.config, freeze(robot, guard.memory)))
+        if outputs.mode != "driving":
+            self._waits = {}
+        elif now.mono_ns >= self._waits_ns:
+            self._take_waits(now, robot)
         if self._number % WATCH_STEPS == 0:
             self._watch_disk(now.mono_ns)
+
+    def _take_waits(self, now: Instant, robot: Robot) -> None:
+        reasons = robot.waits(now.mono_ns)
+        codes = {source: why.code for source, why in reasons.items()}
+        if codes != self._waits and not self._full:
+            self._queue.append(Waits.of(now, reasons))
+        self._waits, self._waits_ns = codes, now.mono_ns + NS_PER_S
 
     def _lose(self) -> None:
         self._lost += 1
@@ -187,7 +200,7 @@ class Recorder(StepRecorder):
                 self._writer.events.append(Event("recording", ENDED, "error"))
                 raise
 
-    def _take_queue(self) -> list[Step | Start | Failure]:
+    def _take_queue(self) -> list[Step | Start | Waits | Failure]:
         queue = self._queue
         return [queue.popleft() for _ in range(len(queue))]
 
@@ -216,7 +229,7 @@ class _Writer:
         self._lost_before = 0  # when the disk began to refuse
         self._text = config, _text(config)  # of the last head
 
-    def write(self, items: list[Step | Start | Failure], over: bool) -> None:
+    def write(self, items: Sequence[Step | Start | Waits | Failure], over: bool) -> None:
         """Write the items of the recorder's queue. The last call ends the file."""
         steps, written = sum(isinstance(item, tuple) for item in items), 0
         if self._pause and not over:
@@ -239,7 +252,7 @@ class _Writer:
         elif steps and self._frames is None and not self._pause:
             self.wants_head = True
 
-    def _write(self, items: list[Step | Start | Failure]) -> int:
+    def _write(self, items: Sequence[Step | Start | Waits | Failure]) -> int:
         # Returns the number of steps that were written: those that follow a head.
         steps: list[Step] = []
         written = 0
@@ -251,7 +264,9 @@ class _Writer:
             steps = []
             if isinstance(item, Start):
                 self._begin(item)
-            elif self._frames is not None:
+            elif isinstance(item, Waits) and self._frames is not None:
+                self._frames.add(item)
+            elif isinstance(item, Failure) and self._frames is not None:
                 _add_failure(self._frames, item)
         return written + self._add(steps)
 

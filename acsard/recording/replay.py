@@ -23,7 +23,7 @@ from acsard.core.guard import Guard, Memory
 from acsard.core.robot import Robot
 from acsard.core.values import Event, Inputs, Instant, Outputs, Trip
 from acsard.host.errors import RecordingError
-from acsard.recording.file import Failure, Head, Recording
+from acsard.recording.file import Failure, Head, ReadRecord, Recording
 from acsard.recording.recorded_steps import (
     US_PER_S,
     Micropose,
@@ -273,7 +273,7 @@ class Playback:
             if (replayed := self.take(record)) is not None:
                 yield replayed
 
-    def take(self, record: Head | RecordedStep | Failure) -> tuple[RecordedStep, Outputs] | None:
+    def take(self, record: ReadRecord) -> tuple[RecordedStep, Outputs] | None:
         """Replay the next record; return a step with its outputs, or None."""
         match record:
             case Head():

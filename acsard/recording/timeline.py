@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from acsard.core.formatting import lasting, many
 from acsard.core.values import NS_PER_S, Event, Instant, Level, Ns, WallNs
-from acsard.recording.file import Failure, Head
+from acsard.recording.file import Failure, Head, ReadRecord, Waits
 from acsard.recording.recorded_steps import RecordedStep
 
 MIN_REASON_NS = NS_PER_S  # between two reasons: sources that alternate would fill the timeline
@@ -45,15 +45,21 @@ class Timeline:
     def __init__(self) -> None:
         self._head: Head | None = None
         self._last: RecordedStep | None = None  # of this run
+        self._waits: dict[str, str] = {}  # codes by source, in this drive
         self._shown = ("", "", "")  # mode, code and source of the last reason
         self._reason_ns: Ns = -MIN_REASON_NS  # when it was reported
 
-    def take(self, record: Head | RecordedStep | Failure) -> Iterator[TimelineEntry]:
+    def take(self, record: ReadRecord) -> Iterator[TimelineEntry]:
         match record:
             case Head():
                 yield from self._begin(record)
             case RecordedStep():
                 yield from self._step(record)
+            case Waits():
+                for source, (code, text) in record.reasons.items():
+                    if self._waits.get(source) != code:
+                        yield TimelineEntry(record.at.wall_ns, "waits", text, by=source)
+                self._waits = {source: code for source, (code, _) in record.reasons.items()}
             case Failure(why=why):
                 wall_ns = self._last.inputs.now.wall_ns if self._last else 0
                 yield TimelineEntry(wall_ns, "failure", f"the daemon failed: {why}", "error")
@@ -81,6 +87,8 @@ class Timeline:
             text = f"the robot is {mode} ({reason}), link {link}"
             yield TimelineEntry(now.wall_ns, "continues", text, by=source)
         self._last = step
+        if mode != "driving":
+            self._waits = {}
         for event in step.recorded.events:
             yield _entry_of(event, now)
         yield from self._reason(step)

@@ -211,7 +211,9 @@ def test_the_curves_are_the_messages() -> None:
     place = [item for item in drive_of_two() if item.channel.native == "odom"][-1].message
     assert path["x"][-1] == pytest.approx(place.pose.pose.position.x, abs=1e-5)
     assert len(wheel["y"]) > 300
-    assert traces(text, "lines received")[0]["y"][1:] == pytest.approx([100.0] * 3, abs=2)
+    received = traces(text, "lines received")[0]["y"][1:]
+    assert received == pytest.approx([100.0] * len(received), abs=2)
+    assert len(received) >= 3
 
 
 def test_the_bands_say_who_drives_and_why_another_waits() -> None:

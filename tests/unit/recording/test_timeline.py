@@ -8,8 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, McuConfig
-from acsard.recording.file import Failure, Head, Recording
-from acsard.recording.recorded_steps import RecordedStep
+from acsard.recording.file import Failure, Head, ReadRecord, Recording, Waits
 from acsard.recording.timeline import Timeline, TimelineEntry
 from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import START
@@ -21,7 +20,7 @@ def head(number: int = 0, started_ns: int = 0) -> Head:
     return Head("0.2.0", "acsar", number, 0, 0, started_ns=started_ns)
 
 
-def entries_of(*records: Head | RecordedStep | Failure) -> list[TimelineEntry]:
+def entries_of(*records: ReadRecord) -> list[TimelineEntry]:
     timeline = Timeline()
     return [entry for record in records for entry in timeline.take(record)]
 
@@ -149,6 +148,16 @@ def test_a_link_that_is_lost_has_the_reason_of_its_event_only() -> None:
     entries = story(tape)
     assert texts(entries, "link_stale")
     assert texts(entries, "reason") == []
+
+
+def test_a_source_that_waits_has_an_entry_once_in_a_drive() -> None:
+    steps = driven().steps()
+    waits = Waits(steps[100].inputs.now, {"nav": ("source_priority", "app has priority")})
+    other = Waits(steps[150].inputs.now, {"nav": ("source_first", "app came first")})
+    entries = entries_of(head(), *steps[:100], waits, *steps[100:150], waits, other)
+    assert texts(entries, "waits") == ["app has priority (by nav)", "app came first (by nav)"]
+    again = entries_of(head(), *steps[:100], waits, *steps[100:], waits)
+    assert texts(again, "waits") == ["app has priority (by nav)"] * 2
 
 
 def test_the_records_of_a_file_have_the_same_entries(tmp_path: Path) -> None:
