@@ -38,10 +38,9 @@ class BoardInputs(Struct):
 
     def missing(self, safety: SafetyConfig) -> bool:
         """Return whether the robot needs an input that the board has not reported."""
-        estop, bumpers = self.estop, self.bumpers
-        if not (estop.awaited or bumpers.awaited):
+        if not (safety.bumpers or safety.estop == "required"):
             return False
-        return estop.missing(safety) or bumpers.missing(safety)
+        return self.estop.missing(safety) or self.bumpers.missing(safety)
 
     def reopen(self) -> None:
         """Record that the port was opened: another board may answer from now on."""
@@ -58,7 +57,7 @@ class BoardInputs(Struct):
             or self.battery.status
             or self.unreported
             or session.status.forgot
-            or self.battery.refuses_clear
+            or self.battery.known == "stop"
         )
 
     def process_reports(self, session: McuSession, now_ns: Ns, config: Config) -> list[Event]:

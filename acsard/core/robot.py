@@ -20,7 +20,7 @@ from acsard.core.codes import Reason, reason
 from acsard.core.config.live import Changes, changed, describe_changes
 from acsard.core.config.motion_rules import longest_reply
 from acsard.core.config.parsing import ConfigError
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import Config, LimitsConfig
 from acsard.core.link.board_status import as_text
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.link_diagnosis import UnansweredLines
@@ -36,7 +36,7 @@ from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.last_line import LastLine
 from acsard.core.motion.lifecycle import Lifecycle
-from acsard.core.motion.limits import AT_REST
+from acsard.core.motion.limits import AT_REST, Motion
 from acsard.core.motion.modes import Mode, RefusedError
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
@@ -113,8 +113,11 @@ class Robot:
         self._choice = Choice()
         self._limited = False  # a bumper limited it
         self._last = LastLine(made_of=(None, self._life.mode))
+        # Motion, twist, limits and cap with which the motion does not change; its wheel speeds.
+        self._steady: tuple[Motion, Twist, LimitsConfig, float] | None = None
+        self._steady_speeds = STILL
         self._trip: Trip = ""  # of the guard, until the next step
-        self.status = Status("", "booting", "", "")
+        self.status = Status("", "booting", "", "down")
         self._battery_level = ""  # with `status`
         # Since the start: `commands` (accepted), `command_<reason>` (refused),
         # `commands_of_new_senders` (not proved yet), lines to the board, and events.
@@ -242,7 +245,9 @@ class Robot:
         if changed or urgent:
             why = Reason(self.status.code, self.status.reason)
             events += self._told.changes(mode, self._choice, why)
-        logged = self._tally.lines(events, now_ns)
+        logged: tuple[Event, ...] = ()
+        if events or self._tally.held:
+            logged = self._tally.lines(events, now_ns)
         if not (estimates or answers or logged or urgent or changed):
             return QUIET
         return News(estimates, answers, logged, urgent, changed)
@@ -261,14 +266,22 @@ class Robot:
         if pressed or self.session.link != "up" or since > WRITE_PAUSE_S:
             # The first written line after a press contains zeros, even if the input is already
             # released and the commands that arrived meanwhile may move the robot.
-            motion = AT_REST
+            motion, speeds = AT_REST, STILL
         elif mode is Mode.DRIVING and twist is not None:
             cap = math.inf if self._cap.speed is None else self._cap.speed
-            dt = min(since, self._max_dt)
-            motion = last.motion.follow(twist, dt, limits, self._kinematics, cap)
+            wanted = (last.motion, twist, limits, cap)
+            if wanted == self._steady:
+                motion, speeds = last.motion, self._steady_speeds
+            else:
+                dt = min(since, self._max_dt)
+                motion = last.motion.follow(twist, dt, limits, self._kinematics, cap)
+                speeds = self._kinematics.wheel_speeds(motion.twist)
+                if motion is last.motion:
+                    self._steady, self._steady_speeds = wanted, speeds
         else:
             motion = last.motion.coast(since, limits, stop=mode in HALTED)
-        speeds = last.speeds = self._kinematics.wheel_speeds(motion.twist)
+            speeds = self._kinematics.wheel_speeds(motion.twist)
+        last.speeds, last.applied = speeds, motion.twist
         line = self.session.line(now_ns, speeds)
         if line is not None:
             last.waiting = (motion, speeds)
@@ -292,7 +305,7 @@ class Robot:
     # Feedback.
 
     def _fold(self, now: Instant, heard: Heard, events: list[Event]) -> tuple[Estimate, ...]:
-        session, before = self.session, self.session.link
+        session, before = self.session, self.status.link
         feedback = session.update(now, heard.port_open, heard.opened, heard.received)
         link, inputs = session.link, self._inputs
         if feedback or link != "up":

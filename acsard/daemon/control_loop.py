@@ -12,7 +12,7 @@ from typing import NamedTuple
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.guard import Guard
 from acsard.core.link.serial_output import Port
-from acsard.core.robot import Robot
+from acsard.core.robot import QUIET, Robot
 from acsard.core.values import NS_PER_S, STILL, Heard, Instant, Latches, News, Ns
 from acsard.daemon.latch_rules import Handover
 from acsard.daemon.pacing import NO_PERIOD, Pace, Period
@@ -22,6 +22,8 @@ from acsard.recording.stepped_robot import LineOutcome, inputs_of, outputs_of
 
 # Least delay of a line; less is reported as 0, as the estimated sample times are less exact.
 MIN_WRITE_DELAY_NS = 1_000_000
+
+NO_LINE = LineOutcome()
 
 
 class Step(NamedTuple):
@@ -54,7 +56,7 @@ class ControlLoop:
         mcu = robot.config.mcu
         self.pace = Pace(wire_ns(mcu.line_bytes, mcu.baud_rate), robot.config.period_ns)
         self._start_ns, self._mono_ns = start.mono_ns, mono_ns
-        self._outcome = LineOutcome()  # of the last line
+        self._outcome = NO_LINE  # of the last line
         if recorder is not None and robot.latches != Latches():
             # Without this record, a replay would start with a robot that has no latches.
             recorder.begins(robot, self._guard)
@@ -76,20 +78,20 @@ class ControlLoop:
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Step:
         """Run one wake-up. `period` says how many periods have ended."""
         robot, publication, pace = self.robot, self.publication, self.pace
-        missed = max(0, period.expired - 1)
-        before, self._outcome = self._outcome, LineOutcome()
+        port, handover, recorder = self._port, self._handover, self._recorder
+        before, self._outcome = self._outcome, NO_LINE
         heard: Heard | None = None
-        tick = at_once = False
+        tick = due = False
         line: bytes | None = None
         sent: bytes | None = None
-        publication.begin(now)
+        publication.now = now
         try:
-            heard = self._heard(now, period, missed)
-            tick = period.expired > 0 and pace.period_ended(missed)
-            at_once = pace.at_once(now.mono_ns, self._port.sent_ns)
+            heard = self._heard(now, period)
+            tick = period is not NO_PERIOD and pace.period_ended(heard.missed)
             news = robot.hear(now, heard)
-            self._handover.take(robot.latches)
-            due = tick or (at_once and news.urgent)
+            if robot.latches is not handover.latches:
+                handover.take(robot.latches)
+            due = tick or (news.urgent and pace.at_once(now.mono_ns, port.sent_ns))
             if due:
                 line = robot.drive(now)
                 if line is not None:
@@ -97,33 +99,34 @@ class ControlLoop:
         except Exception:
             # Store the stops that this wake-up has taken from the bus. The exception may have come
             # before the robot processed them.
-            self._handover.take_stops(robot.latches, publication.intake.taken_stops(), now)
-            if self._recorder is not None and heard is not None:
-                self._recorder.died(inputs_of(now, heard, tick, at_once, before))
+            handover.take_stops(robot.latches, publication.intake.taken_stops(), now)
+            if recorder is not None and heard is not None:
+                recorder.died(inputs_of(now, heard, tick, not tick, before))
             raise
         had_input = bool(heard.commands or heard.refusals or heard.requests)
-        pace.record_step(tick, due, sent is not None, news.urgent, had_input, self._port.sent_ns)
-        if self._recorder is not None:
-            inputs = inputs_of(now, heard, tick, at_once, before)
+        pace.record_step(tick, due, sent is not None, news.urgent, had_input, port.sent_ns)
+        if recorder is not None:
+            inputs = inputs_of(now, heard, tick, due and not tick, before)
             outputs = outputs_of(now, robot, news, due, line)
-            self._recorder.step(inputs, outputs, sent, robot, self._guard)
-        publication.publish(news, robot.applied if due else None)
+            recorder.step(inputs, outputs, sent, robot, self._guard)
+        if due or news is not QUIET:
+            publication.publish(news, robot.applied if due else None)
         publication.stopwatch.figures["step_time"].add(self._mono_ns() - now.mono_ns)
         # Flush last, because the threads that send need this core and Python's interpreter lock,
         # which are free only while this loop waits.
-        publication.flush()
+        publication.bus.flush()
         return Step(now, news, due, line)
 
-    def _heard(self, now: Instant, period: Period, missed: int) -> Heard:
-        port, intake = self._port, self.publication.intake
+    def _heard(self, now: Instant, period: Period) -> Heard:
+        port, publication = self._port, self.publication
+        intake, missed = publication.intake, 0
         events = intake.events
-        if period.expired:
-            late_ns = now.mono_ns - period.due_ns
-            self.publication.stopwatch.period(now.mono_ns, late_ns, missed)
+        if period is not NO_PERIOD:
+            missed = period.expired - 1
+            publication.stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns, missed)
             events += self._handover.take_events()
-        taken = intake.take(self.publication.serve)
         # Call `take` before reading `is_open`: in a late wake-up it may find the port lost.
-        received = port.take(now if missed else None)
+        taken, received = intake.take(publication.serve), port.take(now if missed else None)
         # Pass the fields by position: creating a struct by its names takes three times as long.
         heard = Heard(
             port.is_open,
@@ -135,16 +138,18 @@ class ControlLoop:
             missed,
             self.shutting_down,
         )
-        events.clear()
+        if events:
+            events.clear()
         return heard
 
     def _write(self, line: bytes, now: Instant) -> bytes | None:
         # Returns the line on the port: the guard may replace it, and the port may drop it (None).
-        robot, port, guard, status = self.robot, self._port, self._guard, self.robot.status
+        robot, port, guard = self.robot, self._port, self._guard
+        status, command_ns = robot.status, robot.command_ns
         if robot.config is not self._config:
             self._config = robot.config
             guard.use(robot.config)
-        line, trip = guard.check(line, now.mono_ns, status, robot.command_ns)
+        line, trip = guard.check(line, now.mono_ns, status, command_ns)
         before_ns = port.sent_ns
         if port.offer(line, now) != "sent":
             robot.sent(now.mono_ns, None, trip)
@@ -152,20 +157,21 @@ class ControlLoop:
             return None
         guard.record_written(line)
         if status.mode == "driving":
-            self.publication.stopwatch.line(robot.command_ns, port.sent_ns, before_ns)
+            self.publication.stopwatch.line(command_ns, port.sent_ns, before_ns)
         late_ns = port.sent_ns - now.mono_ns
         late_ns = late_ns if late_ns >= MIN_WRITE_DELAY_NS else 0
         robot.sent(now.mono_ns + late_ns, line, trip)
-        self._outcome = LineOutcome(trip, late_ns=late_ns)
+        if trip or late_ns:
+            self._outcome = LineOutcome(trip, late_ns=late_ns)
         return line
 
     def finish(self, now: Instant) -> None:
         """Store the stops that arrived after the last wake-up, and send the waiting answers."""
         self.keep_last_stops(now)
         self._handover.wait()
-        self.publication.begin(now)
+        self.publication.now = now
         self.publication.answer(last=True)
-        self.publication.flush()
+        self.publication.bus.flush()
 
     def keep_last_stops(self, now: Instant) -> None:
         """Store the stops that arrived after the last wake-up, which none will process."""

@@ -68,26 +68,22 @@ class Publication:
         self.beside: Callable[[str], Message | None] = lambda key: None
         # Gets each new configuration, after the events of its wake-up are in the log.
         self.adopted: Callable[[Config], None] = lambda config: None
-        self._robot, self._bus, self._log, self._handover = robot, bus, log, handover
+        self._robot, self.bus, self._log, self._handover = robot, bus, log, handover
         self._recorder = recorder
         self._queries = Queries(config, info)
         # Settings that differ from the start, and their values then.
         self._differing: dict[str, Difference] = {}
         # Answers, with the time at which each was queued, until the latches are in their file.
         self._answers: deque[tuple[int, Answer]] = deque()
-        self._now: Instant = start  # of the present wake-up
+        self.now = start  # of the present wake-up
         bus.feedback_sent = self.stopwatch.figures["feedback_to_bus"].add
-
-    def begin(self, now: Instant) -> None:
-        """Begin a wake-up, before its queries are served."""
-        self._now = now
 
     def publish(self, news: News, applied: Twist | None) -> None:
         """Publish the messages that are due after this wake-up, and log its events.
 
         `applied` is the twist in a line that was due.
         """
-        bus, report, now, config = self._bus, self.report, self._now, self._robot.config
+        bus, report, now, config = self.bus, self.report, self.now, self._robot.config
         is_new = config is not report.config
         if is_new:
             self._use(config, news.answers)
@@ -109,24 +105,20 @@ class Publication:
 
     def answer(self, *, last: bool = False) -> None:
         """Send the answers whose latches are stored, or that wait for too long, or all (`last`)."""
-        is_stored, before_ns = self._handover.is_stored, self._now.mono_ns - MAX_ANSWER_DELAY_NS
+        is_stored, before_ns = self._handover.is_stored, self.now.mono_ns - MAX_ANSWER_DELAY_NS
         trouble = "" if is_stored else self._handover.trouble or NOT_STORED
         while self._answers and (is_stored or last or self._answers[0][0] < before_ns):
             _, answer = self._answers.popleft()
             if trouble and answer.success:
                 answer = replace(answer, message=f"{answer.message}; {trouble}")
-            reply = self._queries.answered(answer, self._now.wall_ns)
+            reply = self._queries.answered(answer, self.now.wall_ns)
             if reply is not None:
-                self._bus.reply(reply)
-                self._bus.retire(reply.ticket)
-
-    def flush(self) -> None:
-        """Let the threads of the bus send."""
-        self._bus.flush()
+                self.bus.reply(reply)
+                self.bus.retire(reply.ticket)
 
     def serve(self, query: Query, refusals: list[Refusal]) -> Request | None:
         """Answer a query, or return the request to the robot that it contains."""
-        wall_ns, status = self._now.wall_ns, self._robot.status
+        wall_ns, status = self.now.wall_ns, self._robot.status
         try:
             served = self._queries.serve(query, self.current, wall_ns, status)
         except DecodeError as error:
@@ -136,8 +128,8 @@ class Publication:
         if isinstance(served, Request):
             return served
         for reply in served:
-            self._bus.reply(reply)
-        self._bus.retire(query.ticket)
+            self.bus.reply(reply)
+        self.bus.retire(query.ticket)
         return None
 
     def current(self, key: str) -> Message | None:
@@ -148,7 +140,7 @@ class Publication:
         return self._snapshot().counters
 
     def _snapshot(self) -> Snapshot:
-        now_ns = self._now.mono_ns
+        now_ns = self.now.mono_ns
         shot, intake, recorder = self._robot.snapshot(now_ns), self.intake, self._recorder
         named = [one.describe(key) for key, one in self._differing.items()]
         return replace(

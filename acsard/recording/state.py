@@ -59,7 +59,7 @@ PARTS: dict[str, Any] = {
 }
 
 # Not stored: they follow from the configuration, and no line is pending between two steps.
-DERIVED = ("config", "_kinematics", "_max_dt")
+DERIVED = ("config", "_kinematics", "_max_dt", "_steady", "_steady_speeds")
 
 # A package ends with a dot. The classes need constructors without side effects.
 PART_MODULES = (

@@ -803,11 +803,11 @@ FAULTS = (
         "bus answers",
         "a call that is refused has no answer",
         PUBLICATION,
-        "            if reply is not None:\n                self._bus.reply(reply)\n"
-        "                self._bus.retire",
+        "            if reply is not None:\n                self.bus.reply(reply)\n"
+        "                self.bus.retire",
         "            if reply is not None and answer.success:\n"
-        "                self._bus.reply(reply)\n"
-        "                self._bus.retire",
+        "                self.bus.reply(reply)\n"
+        "                self.bus.retire",
     ),
     fault(
         "commands raise",
@@ -1005,8 +1005,8 @@ FAULTS = (
         "estop late",
         "a pressed emergency stop waits up to 25 ms for its first zero",
         LOOP,
-        "            due = tick or (at_once and news.urgent)\n",
-        "            due = tick or (at_once and news.urgent)\n"
+        "            due = tick or (news.urgent and pace.at_once(now.mono_ns, port.sent_ns))\n",
+        "            due = tick or (news.urgent and pace.at_once(now.mono_ns, port.sent_ns))\n"
         "            late = now.mono_ns % 10**8 < 25 * 10**6\n"
         "            due = due and not (robot._inputs.estop.is_pressed and late)\n",
     ),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 from acsard.core.values import NS_PER_S, Ns
 
 BITS_PER_BYTE = 10  # 8N1: a start bit, eight data bits and a stop bit
@@ -23,6 +25,7 @@ FIELD_VALUES = 65536  # of a sample field with four hexadecimal digits
 COMFORTABLE_USE = 0.8
 
 
+@lru_cache(256)
 def wire_ns(count: int, baud_rate: int) -> Ns:
     """Return how long `count` bytes take on the wire."""
     return count * BITS_PER_BYTE * NS_PER_S // baud_rate

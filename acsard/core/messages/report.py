@@ -169,7 +169,8 @@ class Report:
     ) -> Iterator[tuple[str, Message]]:
         """Return an iterator over the messages that are not of a feedback line.
 
-        `applied` is the twist in a line that was due in this wake-up.
+        `applied` is the twist in a line that was due in this wake-up: the others have no message,
+        unless something has happened.
         """
         self._now = now
         if news.events:
@@ -191,18 +192,17 @@ class Report:
         wanted: Collection[str],
         get_snapshot: GetSnapshot,
     ) -> Iterator[tuple[str, Message]]:
-        now_ns, rates, telemetry = now.mono_ns, self._rates, self.config.rates.telemetry
+        now_ns, rates, limits = now.mono_ns, self._rates, self.config.rates
         if (
             applied is not None
             and "cmd_vel_out" in wanted
-            and rates["cmd_vel_out"].due(now_ns, telemetry)
+            and rates["cmd_vel_out"].due(now_ns, limits.telemetry)
         ):
             yield "cmd_vel_out", self._cmd_vel_out(now, applied)
         if news.events and "events" in wanted and (events_message := self._happened.message()):
             yield "events", events_message
         for key, (build, hz) in self._summaries.items():
-            most = self.config.rates.at_most(hz)
-            if key in wanted and rates[key].due(now_ns, most, news.status_changed):
+            if key in wanted and rates[key].due(now_ns, limits.at_most(hz), news.status_changed):
                 message = build(now, get_snapshot())
                 if message is not None:
                     yield key, message

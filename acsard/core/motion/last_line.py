@@ -6,7 +6,7 @@ from msgspec import Struct
 
 from acsard.core.motion.limits import AT_REST, Motion
 from acsard.core.motion.modes import Mode
-from acsard.core.values import STILL, Ns, Twist, WheelSpeeds
+from acsard.core.values import REST, STILL, Ns, Twist, WheelSpeeds
 
 
 class LastLine(Struct):
@@ -18,19 +18,16 @@ class LastLine(Struct):
     written: WheelSpeeds = STILL
     left_ns: Ns = 0
     speeds: WheelSpeeds = STILL  # of the last line; zero after a press and without a link
+    applied: Twist = REST  # after `sent`, in the last line that left
     made_ns: Ns = 0  # the last line was made
     # Arrival of the command, and the mode, of the last line. None after a press: a new line is due.
     made_of: tuple[Ns | None, Mode] | None = None
     waiting: tuple[Motion, WheelSpeeds] | None = None  # for `sent`
     pressed_ns: Ns = 0  # last press of the emergency stop or a bumper
 
-    @property
-    def applied(self) -> Twist:
-        return (self.motion if self.waiting is None else self.waiting[0]).twist
-
     def cut(self) -> None:
         """Set the speed to zero without a ramp: the motors have stopped."""
-        self.motion, self.speeds = AT_REST, STILL
+        self.motion, self.speeds, self.applied = AT_REST, STILL, REST
 
     def press(self, now_ns: Ns) -> None:
         """Cut, until a line of zeros has left."""
@@ -41,11 +38,9 @@ class LastLine(Struct):
         """Record whether the line left, and whether the guard replaced it with zeros."""
         waiting, self.waiting = self.waiting, None
         assert waiting is not None
-        if replaced:
-            self.motion = AT_REST
         if left:
             self.left_ns = self.made_ns
-            if replaced:
-                self.written = STILL
-            else:
-                self.motion, self.written = waiting
+            self.motion, self.written = (AT_REST, STILL) if replaced else waiting
+        elif replaced:
+            self.motion = AT_REST
+        self.applied = self.motion.twist
