@@ -159,9 +159,11 @@ class Root:
 
     def run(self, command: str, within: float = 900.0) -> str:
         """Run a shell command inside, and return its output. Fail if it fails."""
+        # At a timeout all programs end that the command has started.
+        words = ["unshare", "--pid", "--fork", "--kill-child", *self.words("sh", "-c", command)]
         done = subprocess.run(
-            self.words("sh", "-c", command), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT, text=True, timeout=within,
+            words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            text=True, timeout=within,
         )  # fmt: skip
         assert done.returncode == 0, f"{command}\n{done.stdout}"
         return done.stdout
