@@ -149,6 +149,11 @@ def contradictions(config: Config) -> list[str]:
     return mistakes(RULES, config)
 
 
+def live_contradictions(config: Config) -> list[str]:
+    """Return those to which a setting belongs that may change while the daemon runs."""
+    return mistakes(LIVE_RULES, config)
+
+
 def _wire_problems(config: Config) -> list[str]:
     mcu, rate = config.mcu, config.rate_hz
     count = mcu.line_bytes
@@ -422,3 +427,5 @@ RULES: tuple[Rule, ...] = (
     _ros_problems,
     *named_faults.RULES,
 )
+
+LIVE_RULES: tuple[Rule, ...] = (_rate_problems, *motion_rules.RULES, _source_problems)

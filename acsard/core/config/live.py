@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeVar
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.core.config.contradictions import contradictions
+from acsard.core.config.contradictions import live_contradictions
 from acsard.core.config.nearest import hint
 from acsard.core.config.parsing import ConfigError, effective
 from acsard.core.config.removed import why_removed
@@ -145,7 +145,7 @@ def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tupl
     fixed = [key for key in new if find_live_setting(key) is None or before[key] is None]
     if fixed:
         more = [f"and {len(fixed) - 1} more of these keys cannot be set"] if len(fixed) > 1 else []
-        raise ConfigError([_refusal(fixed[0], new[fixed[0]], dict(flat(tables))), *more])
+        raise ConfigError([_refusal(fixed[0], new[fixed[0]], tables), *more])
     problems: list[str] = []
     made = config
     for key, value in new.items():
@@ -154,7 +154,7 @@ def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tupl
         raise ConfigError(problems)
     after = effective(made)
     changes = {key: (_plain(before[key]), _plain(_in_force(after, key))) for key in new}
-    problems = contradictions(made)
+    problems = live_contradictions(made)
     if not at_rest:
         problems += [line for key in changes if (line := _must_stand(key, *changes[key]))]
     if problems:
@@ -210,8 +210,8 @@ def _same(before: object, value: object) -> bool:
     return before == value and isinstance(before, bool) == isinstance(value, bool)
 
 
-def _refusal(key: str, value: object, known: Mapping[str, object]) -> str:
-    if key in known:
+def _refusal(key: str, value: object, tables: Mapping[str, object]) -> str:
+    if _in_force(tables, key) is not None:
         return (
             f"{key} = {show(value)}: this key is read only when the daemon starts: change it in "
             "acsard.toml and restart acsard (`acsard set` lists the keys that can change "
@@ -224,6 +224,7 @@ def _refusal(key: str, value: object, known: Mapping[str, object]) -> str:
             "use_sim_time: the daemon does not support this ROS parameter, because it always uses "
             "the clock of its host; leave use_sim_time false in the nodes that use this robot"
         )
+    known = dict(flat(tables))
     return f"{show(key)}: unknown key; {hint(key, known, '`acsard set` lists the settings')}"
 
 

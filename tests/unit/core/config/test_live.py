@@ -12,9 +12,17 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from acsard.core.config.contradictions import LIVE_RULES, RULES
 from acsard.core.config.live import LIVE, changed, describe_changes, find_live_setting, flat
 from acsard.core.config.parsing import ConfigError, effective, parse
-from acsard.core.config.settings import Config, LimitsConfig, RobotConfig
+from acsard.core.config.partial import Rule, view_without
+from acsard.core.config.settings import (
+    Config,
+    LimitsConfig,
+    RobotConfig,
+    SafetyConfig,
+    SimConfig,
+)
 from acsard.core.config.toml_text import document
 from acsard.core.config.validation import show
 from tests.each import each
@@ -112,6 +120,15 @@ def test_whole_numbers_are_accepted_as_floats() -> None:
 )
 def test_setting_a_key_to_its_present_value_changes_nothing(wishes: dict[str, object]) -> None:
     assert changed(CONFIG, wishes, False) == (CONFIG, {})
+
+
+@pytest.mark.parametrize("rule", [rule for rule in RULES if rule not in LIVE_RULES])
+def test_a_rule_that_a_change_skips_reads_no_setting_that_may_change(rule: Rule) -> None:
+    # One rule reads `commands.sources`, but only the names.
+    live = {key for key in KEYS if find_live_setting(key) and not key.startswith("commands.")}
+    safety, sim = SafetyConfig(bumpers=("front",)), SimConfig(faults=("stuck_encoder",))
+    config = replace(CONFIG, safety=safety, sim=sim)
+    rule(view_without(config, live))  # raises an error if it reads one
 
 
 VALUES: dict[str, list[object]] = {
