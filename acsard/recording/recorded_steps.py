@@ -71,12 +71,6 @@ class RecordedStep(Struct, frozen=True):
     recorded: RecordedOutputs
     begins: bool = False  # first of a record: the checksum restarts at 0
 
-    @property
-    def places(self) -> bool:
-        """Whether a request sets the pose, after the poses of this step."""
-        verbs = [request.verb for request in self.inputs.requests]
-        return "set_pose" in verbs or "reset_odometry" in verbs
-
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:
     """Return the CRC-32 of all bits of a record's poses, twists and angles, up to this step."""

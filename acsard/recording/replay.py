@@ -53,9 +53,6 @@ Output = Literal[
     "event text",
 ]
 
-# Texts for people, which another version may word differently.
-TEXT_OUTPUTS: frozenset[Output] = frozenset({"reason", "event text"})
-
 
 class Difference(Struct, frozen=True):
     number: int  # from 0 at the daemon's start
@@ -92,11 +89,6 @@ class Comparison(Struct):
     def same(self) -> bool:
         """Whether every output is equal, poses in um and urad."""
         return self.first is None
-
-    @property
-    def only_words(self) -> bool:
-        """Whether only texts of reasons and events differ."""
-        return not self.same and self.first_by_output.keys() <= TEXT_OUTPUTS
 
 
 class Replay:
