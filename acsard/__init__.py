@@ -54,7 +54,7 @@ Inside `core/`, in the same order:
     core/link/       the serial line: codec, checksum, question, sample times, link state
     core/config/     turns acsard.toml into one frozen Config, or into errors that name the key
                      and the remedy
-    core/values.py   the values in SI units: Instant, Twist, Pose, Command, Inputs, Outputs
+    core/values.py   the values in SI units: Instant, Twist, Pose, Command, Heard, News
     core/formatting.py  safe text, numbers, durations and counts for every message
 
 Three invariants hold, and each is tested:

@@ -37,7 +37,7 @@ def test_a_recording_replays_with_the_same_result(path: Path) -> None:
     assert [step.number for step in steps] == list(range(len(steps)))
     for output, first in comparison.first_by_output.items():
         if output not in ("reason", "event text"):
-            pytest.fail("\n".join(describe_difference(first, steps[0].inputs.now.mono_ns)))
+            pytest.fail("\n".join(describe_difference(first, steps[0].now.mono_ns)))
     assert comparison.lines == comparison.lines_same > 100
     assert comparison.modes_same == comparison.steps
     assert comparison.exact, "an estimate is another in its last bits"

@@ -200,7 +200,7 @@ def main(args: argparse.Namespace) -> int:
 def main_show(args: argparse.Namespace) -> int:
     recording, timeline, is_empty = _recording(args), Timeline(), True
     for record in recording.records():
-        if not isinstance(record, RecordedStep) or recording.contains(record.inputs.now):
+        if not isinstance(record, RecordedStep) or recording.contains(record.now):
             for entry in timeline.take(record):
                 is_empty = False
                 _print_entry(entry, args.json)
@@ -380,7 +380,7 @@ class _ShownRecording(Recording):
     def records(self) -> Iterator[ReadRecord]:
         for number, record in enumerate(super().records()):
             if number % PROGRESS_RECORDS == 0 and isinstance(record, RecordedStep):
-                at = _clock(record.inputs.now.wall_ns)
+                at = _clock(record.now.wall_ns)
                 print(f"\r{at}", end="", file=sys.stderr, flush=True)
             yield record
         print("\r\x1b[K", end="", file=sys.stderr, flush=True)

@@ -453,63 +453,6 @@ class News(Struct, frozen=True):
     status_changed: bool = False
 
 
-class Inputs(Struct, frozen=True, omit_defaults=True):
-    """All inputs of one control step as a recording stores them.
-
-    - tick: compute the line of a control period.
-    - at_once: maybe compute an extra line for a new command or mode.
-    - opened: openings of the serial port; a new one is a new session with the board.
-    """
-
-    now: Instant
-    tick: bool
-    port_open: bool
-    opened: int = 0
-    port_trouble: str = ""  # why the port is closed
-    received: tuple[Received, ...] = ()
-    commands: tuple[Command, ...] = ()
-    requests: tuple[Request, ...] = ()
-    gyro: tuple[GyroSample, ...] = ()
-    refusals: tuple[Refusal, ...] = ()  # messages that did not become a `Command`
-    # Why the guard replaced the last line: the robot latches a fault.
-    guard_trip: Trip = ""
-    superseded: bool = False  # the previous line was not written
-    missed: int = 0  # control periods without a step since the previous one
-    events: tuple[Event, ...] = ()  # of other parts, to be logged with the robot's
-    at_once: bool = False
-    shutting_down: bool = False  # ramp to zero, and stay there
-    # Time from the previous step to the write of its line, from 1 ms on: the process has stalled.
-    late_ns: Ns = 0
-    speed_cap: SpeedCap | None = None  # newest one since the previous step
-
-
-class Outputs(Struct, frozen=True):
-    """All results of one control step, for the recording."""
-
-    now: Instant
-    due: bool  # this step had to compute a line
-    line: bytes | None
-    # Speeds of the last computed line; 0 if the speed was cut since, as by a lost link.
-    speeds: WheelSpeeds
-    applied: Twist  # after all limits, like `speeds`
-    linked: bool  # otherwise the guard lets no wheel move
-    estimates: tuple[Estimate, ...]
-    mode: str
-    code: Code  # why the robot moves or does not move
-    reason: str  # in words
-    link: str
-    # Selected by the arbiter, which does not always drive: it may need a zero, or a latch holds.
-    source: str
-    command_ns: Ns | None  # arrival of the selected command
-    status_changed: bool  # mode, reason, link, source or battery level
-    events: tuple[Event, ...] = ()
-    answers: tuple[Answer, ...] = ()
-    # The board should get a new line at once: a new command or mode, or a pressed input. If this
-    # step has computed it, `due` is true too.
-    news: bool = False
-    latches: Latches = Latches()  # another object if one has changed
-
-
 class Spread(Struct, frozen=True):
     """Statistics of `count` measurements, in their unit."""
 

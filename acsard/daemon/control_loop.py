@@ -13,17 +13,19 @@ from acsard.core.config.wire_time import wire_ns
 from acsard.core.guard import Guard
 from acsard.core.link.serial_output import Port
 from acsard.core.robot import QUIET, Robot
-from acsard.core.values import NS_PER_S, STILL, Heard, Instant, Latches, News, Ns
+from acsard.core.values import NS_PER_S, STILL, Heard, Instant, Latches, News, Ns, Trip
 from acsard.daemon.latch_rules import Handover
 from acsard.daemon.pacing import NO_PERIOD, Pace, Period
 from acsard.daemon.publication import Publication
 from acsard.recording.recorded_steps import StepRecorder
-from acsard.recording.stepped_robot import LineOutcome, inputs_of, outputs_of
 
 # Least delay of a line; less is reported as 0, as the estimated sample times are less exact.
 MIN_WRITE_DELAY_NS = 1_000_000
 
-NO_LINE = LineOutcome()
+# The line on the port, why the guard replaced the robot's, and how late it was written.
+Left = tuple[bytes | None, Trip, Ns]
+
+NOTHING_LEFT: Left = None, "", 0
 
 
 class Step(NamedTuple):
@@ -56,7 +58,6 @@ class ControlLoop:
         mcu = robot.config.mcu
         self.pace = Pace(wire_ns(mcu.line_bytes, mcu.baud_rate), robot.config.period_ns)
         self._start_ns, self._mono_ns = start.mono_ns, mono_ns
-        self._outcome = NO_LINE  # of the last line
         if recorder is not None and robot.latches != Latches():
             # Without this record, a replay would start with a robot that has no latches.
             recorder.begins(robot, self._guard)
@@ -79,11 +80,10 @@ class ControlLoop:
         """Run one wake-up. `period` says how many periods have ended."""
         robot, publication, pace = self.robot, self.publication, self.pace
         port, handover, recorder = self._port, self._handover, self._recorder
-        before, self._outcome = self._outcome, NO_LINE
         heard: Heard | None = None
         tick = due = False
         line: bytes | None = None
-        sent: bytes | None = None
+        left = NOTHING_LEFT
         publication.now = now
         try:
             heard = self._heard(now, period)
@@ -95,20 +95,19 @@ class ControlLoop:
             if due:
                 line = robot.drive(now)
                 if line is not None:
-                    sent = self._write(line, now)
+                    left = self._write(line, now)
         except Exception:
             # Store the stops that this wake-up has taken from the bus. The exception may have come
             # before the robot processed them.
             handover.take_stops(robot.latches, publication.intake.taken_stops(), now)
             if recorder is not None and heard is not None:
-                recorder.died(inputs_of(now, heard, tick, not tick, before))
+                recorder.died(now, heard)
             raise
         had_input = bool(heard.commands or heard.refusals or heard.requests)
-        pace.record_step(tick, due, sent is not None, news.urgent, had_input, port.sent_ns)
+        pace.record_step(tick, due, left[0] is not None, news.urgent, had_input, port.sent_ns)
         if recorder is not None:
-            inputs = inputs_of(now, heard, tick, due and not tick, before)
-            outputs = outputs_of(now, robot, news, due, line)
-            recorder.step(inputs, outputs, sent, robot, self._guard)
+            step = now, heard, due, line, *left, news, robot.status
+            recorder.step(step, robot, self._guard)
         if due or news is not QUIET:
             publication.publish(news, robot.applied if due else None)
         publication.stopwatch.figures["step_time"].add(self._mono_ns() - now.mono_ns)
@@ -142,8 +141,8 @@ class ControlLoop:
             events.clear()
         return heard
 
-    def _write(self, line: bytes, now: Instant) -> bytes | None:
-        # Returns the line on the port: the guard may replace it, and the port may drop it (None).
+    def _write(self, line: bytes, now: Instant) -> Left:
+        # The guard may replace the line, and the port may drop it.
         robot, port, guard = self.robot, self._port, self._guard
         status, command_ns = robot.status, robot.command_ns
         if robot.config is not self._config:
@@ -153,17 +152,14 @@ class ControlLoop:
         before_ns = port.sent_ns
         if port.offer(line, now) != "sent":
             robot.sent(now.mono_ns, None, trip)
-            self._outcome = LineOutcome(trip, superseded=True)
-            return None
+            return None, trip, 0
         guard.record_written(line)
         if status.mode == "driving":
             self.publication.stopwatch.line(command_ns, port.sent_ns, before_ns)
         late_ns = port.sent_ns - now.mono_ns
         late_ns = late_ns if late_ns >= MIN_WRITE_DELAY_NS else 0
         robot.sent(now.mono_ns + late_ns, line, trip)
-        if trip or late_ns:
-            self._outcome = LineOutcome(trip, late_ns=late_ns)
-        return line
+        return line, trip, late_ns
 
     def finish(self, now: Instant) -> None:
         """Store the stops that arrived after the last wake-up, and send the waiting answers."""

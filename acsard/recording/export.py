@@ -19,9 +19,10 @@ import msgspec
 from msgspec import Struct
 
 from acsard.core.config.settings import Config
+from acsard.core.robot import Robot
 from acsard.core.ros.channels import ENCODING, SCHEMA_ENCODING, Channel
 from acsard.core.ros.names import TYPE_HASHES, Qos
-from acsard.core.values import NS_PER_S, Estimate, GyroSample, Instant, Outputs, WallNs
+from acsard.core.values import NS_PER_S, Estimate, GyroSample, Instant, News, Twist, WallNs
 from acsard.host.errors import RecordingError
 from acsard.host.version import version
 from acsard.recording.file import SUFFIX, Recording
@@ -246,29 +247,31 @@ Cells = tuple[str, ...]
 def table(recording: Recording, other: Config | None = None) -> Iterator[Cells]:
     """Yield the header and the rows of the table of a recording. Raises `RecordingError`."""
     yield MEASURED_COLUMNS + OUTPUT_COLUMNS
-    for step, outputs in Playback(recording, other).steps():
-        if recording.contains(step.inputs.now):
-            yield from _rows(step, outputs)
+    playback = Playback(recording, other)
+    for step, news in playback.steps():
+        if recording.contains(step.now):
+            yield from _rows(step, news, playback.robot)
 
 
-def _rows(step: RecordedStep, outputs: Outputs) -> Iterator[Cells]:
-    for sample in step.inputs.gyro:
-        yield gyro_cells(sample, step.inputs.now) + ("",) * len(OUTPUT_COLUMNS)
-    for estimate in outputs.estimates:
+def _rows(step: RecordedStep, news: News, robot: Robot) -> Iterator[Cells]:
+    for sample in step.heard.gyro:
+        yield gyro_cells(sample, step.now) + ("",) * len(OUTPUT_COLUMNS)
+    status = robot.status
+    for estimate in news.estimates:
         pose, twist = estimate.pose, estimate.twist
         yield (
-            *feedback_cells(estimate, outputs),
+            *feedback_cells(estimate, robot.applied),
             *[f"{value:.6f}" for value in (pose.x, pose.y, pose.yaw)],
             *[f"{value:.6g}" for value in (twist.linear, twist.angular)],
-            outputs.mode, outputs.link, outputs.source,
+            status.mode, status.link, status.source,
         )  # fmt: skip
 
 
-def feedback_cells(estimate: Estimate, outputs: Outputs) -> Cells:
+def feedback_cells(estimate: Estimate, applied: Twist) -> Cells:
     """Return the `MEASURED_COLUMNS` of a feedback line."""
     wheels = [f"{speed:.6g}" for speed in estimate.speeds.as_tuple()]
-    applied = f"{outputs.applied.linear:.6g}", f"{outputs.applied.angular:.6g}"
-    return (_seconds(estimate.at.wall_ns), *wheels, "", *applied)
+    speeds = f"{applied.linear:.6g}", f"{applied.angular:.6g}"
+    return (_seconds(estimate.at.wall_ns), *wheels, "", *speeds)
 
 
 def gyro_cells(sample: GyroSample, now: Instant) -> Cells:
@@ -289,13 +292,13 @@ def calibration_csv(recording: Recording) -> bytes:
     """
     rows: list[Cells] = [MEASURED_COLUMNS]
     playback, has_gyro = Playback(recording), False
-    for step, outputs in playback.steps():
+    for step, news in playback.steps():
         if playback.gaps:
             # A calibration compares whole drives, and part of this drive is missing.
             break
-        rows += [gyro_cells(sample, step.inputs.now) for sample in step.inputs.gyro]
-        rows += [feedback_cells(estimate, outputs) for estimate in outputs.estimates]
-        has_gyro = has_gyro or bool(step.inputs.gyro)
+        rows += [gyro_cells(sample, step.now) for sample in step.heard.gyro]
+        rows += [feedback_cells(estimate, playback.robot.applied) for estimate in news.estimates]
+        has_gyro = has_gyro or bool(step.heard.gyro)
     if not has_gyro:
         names = ", ".join([path.name for path in recording.paths])
         raise RecordingError(

@@ -30,23 +30,23 @@ from acsard.core.values import (
     NS_PER_S,
     AcsardError,
     Event,
-    Inputs,
+    Heard,
     Instant,
     Ns,
-    Outputs,
     Received,
+    Status,
+    Trip,
     Verb,
     WallNs,
 )
 from acsard.host.errors import MSGSPEC_ERRORS, RecordingError
 from acsard.recording.recorded_steps import (
     Micropose,
+    PlainStep,
     RecordedOutputs,
     RecordedStep,
-    Status,
     checksum,
     micropose,
-    status_of,
 )
 
 SUFFIX = ".rec.zst"
@@ -65,8 +65,6 @@ _PARAMETERS = zstandard.ZstdCompressionParameters.from_level(3, window_log=WINDO
 _PIECE = 1024
 
 _PREFIX = struct.Struct("<II")  # length and CRC-32 of a record
-
-_NEVER = Instant(0, 0)  # in `Row.inputs`: the row has the time itself
 
 _MAX_NS = 1 << 62  # the year 2116
 
@@ -100,7 +98,7 @@ class Read(Struct, frozen=True, array_like=True):
 
 
 class Row(Struct, frozen=True, array_like=True):
-    """One step: its inputs, and those of its outputs that a replay compares.
+    """A `RecordedStep`.
 
     Differences of times compress better than times: a recording is a third smaller.
     """
@@ -108,9 +106,12 @@ class Row(Struct, frozen=True, array_like=True):
     since_ns: Ns  # the row before; of the first row, the monotonic time
     ahead_ns: Ns  # wall clock minus monotonic clock
     reads: tuple[Read, ...]
-    inputs: Inputs  # without its times and `received`
+    heard: Heard  # without `received`
+    driven: bool
     line: bytes | None
     sent: bytes | None
+    trip: Trip
+    late_ns: Ns
     status: Status | None  # None: as in the row before
     poses: tuple[Micropose, ...]
     events: tuple[Event, ...]
@@ -138,7 +139,8 @@ class Failure(Struct, frozen=True, tag="failure"):
 
     number: int
     why: str  # the exception
-    inputs: Inputs | None = None  # None if the daemon failed elsewhere
+    now: Instant | None = None  # None if the daemon failed elsewhere
+    heard: Heard | None = None
 
 
 class Damage(Struct, frozen=True):
@@ -183,7 +185,7 @@ class FrameWriter:
         """Write a record so that it can be read as soon as the file is flushed."""
         self._add(_encode(record))
 
-    def add_steps(self, first: int, steps: Sequence[tuple[Inputs, Outputs, bytes | None]]) -> None:
+    def add_steps(self, first: int, steps: Sequence[PlainStep]) -> None:
         """Write successive steps, as several records if one would be too large to be read."""
         data = _encode(encode_steps(first, steps))
         if len(data) > MAX_RECORD_BYTES and len(steps) > 1:
@@ -205,26 +207,29 @@ class FrameWriter:
             self._compressor = None
 
 
-def encode_steps(first: int, finished: Sequence[tuple[Inputs, Outputs, bytes | None]]) -> Steps:
+def encode_steps(first: int, steps: Sequence[PlainStep]) -> Steps:
     """Return successive steps as a record."""
     rows, before, before_ns, crc = [], None, 0, 0
-    for inputs, outputs, sent in finished:
-        now, status = inputs.now.mono_ns, status_of(outputs)
-        reads = [Read(now - r.at.mono_ns, _ahead(r.at), r.data) for r in inputs.received]
+    for now, heard, driven, line, sent, trip, late_ns, news, status in steps:
+        now_ns = now.mono_ns
+        reads = [Read(now_ns - r.at.mono_ns, _ahead(r.at), r.data) for r in heard.received]
         rows.append(
             Row(
-                now - before_ns,
-                _ahead(inputs.now),
+                now_ns - before_ns,
+                _ahead(now),
                 tuple(reads),
-                replace(inputs, now=_NEVER, received=()),
-                outputs.line,
+                replace(heard, received=()) if reads else heard,
+                driven,
+                line,
                 sent,
+                trip,
+                late_ns,
                 None if status == before else status,
-                tuple(map(micropose, outputs.estimates)),
-                outputs.events,
+                tuple(map(micropose, news.estimates)),
+                news.events,
             )
         )
-        before, before_ns, crc = status, now, checksum(outputs.estimates, crc)
+        before, before_ns, crc = status, now_ns, checksum(news.estimates, crc)
     return Steps(first, tuple(rows), crc)
 
 
@@ -302,7 +307,7 @@ class Recording:
     def steps(self) -> Iterator[RecordedStep]:
         """Yield the steps in the time. Raises `RecordingError` as `records`."""
         for record in self.records():
-            if isinstance(record, RecordedStep) and self.contains(record.inputs.now):
+            if isinstance(record, RecordedStep) and self.contains(record.now):
                 yield record
 
     def head(self) -> Head | None:
@@ -424,22 +429,25 @@ def _skipped(data: bytes, at: int, begin_ns: WallNs, end_ns: WallNs) -> int | No
 
 def steps_of(steps: Steps) -> Iterator[RecordedStep]:
     """Yield the steps of a record."""
-    status: Status = ("", "", "", "", "")
+    status = Status("", "booting", "", "")
     now_ns, last = 0, len(steps.rows) - 1
     for index, row in enumerate(steps.rows):
         now_ns += row.since_ns
         status = row.status or status
         reads = [Received(_instant(now_ns - r.age_ns, r.ahead_ns), r.data) for r in row.reads]
-        inputs = replace(
-            row.inputs,
-            now=_instant(now_ns, row.ahead_ns),
-            received=tuple(reads),
-            # Another version may have more services.
-            requests=tuple([one for one in row.inputs.requests if one.verb in _VERBS]),
-        )
+        # Another version may have more services.
+        requests = [request for request in row.heard.requests if request.verb in _VERBS]
         crc = steps.checksum if index == last else None
-        outputs = RecordedOutputs(row.line, row.sent, status, row.poses, row.events, crc)
-        yield RecordedStep(steps.first + index, inputs, outputs, begins=index == 0)
+        yield RecordedStep(
+            steps.first + index,
+            _instant(now_ns, row.ahead_ns),
+            replace(row.heard, received=tuple(reads), requests=tuple(requests)),
+            row.driven,
+            row.trip,
+            row.late_ns,
+            RecordedOutputs(row.line, row.sent, status, row.poses, row.events, crc),
+            begins=index == 0,
+        )
 
 
 def _instant(mono_ns: Ns, ahead_ns: Ns) -> Instant:

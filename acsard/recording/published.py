@@ -8,7 +8,6 @@ daemon's measurements of itself, which are not recorded. Messages on `log` are t
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from itertools import chain
 from typing import Any, NamedTuple
 
 from msgspec.structs import replace
@@ -20,11 +19,10 @@ from acsard.core.robot import Robot
 from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG_CHANNEL, Channel
 from acsard.core.ros.shapes import LEVELS, Log, command_message
 from acsard.core.ros.transports import left_out
-from acsard.core.values import Command, Instant, Outputs, WallNs
+from acsard.core.values import Command, Instant, News, WallNs
 from acsard.recording.file import Recording
 from acsard.recording.recorded_steps import RecordedStep
 from acsard.recording.replay import Playback
-from acsard.recording.stepped_robot import news_of
 from acsard.recording.timeline import Timeline, TimelineEntry
 
 # Rows of `diagnostics` that are not recorded.
@@ -49,25 +47,16 @@ def published(
     """
     playback, timeline = Playback(recording, other), Timeline()
     publisher: Publisher | None = None
-    replayed: tuple[RecordedStep, Outputs] | None = None
-    entries: list[TimelineEntry] = []
-    for record in chain(recording.records(), [None]):
-        # First the messages of the record before: they follow its line, whose fate stands in the
-        # next step.
-        if replayed is not None and publisher is not None:
-            with playback.errors():
-                if isinstance(record, RecordedStep) and record.number == replayed[0].number + 1:
-                    playback.tell(record.inputs)
-                yield from publisher.messages(*replayed, recording)
-        yield from map(_line, entries)
-        if record is None:
-            return
+    for record in recording.records():
         replayed = playback.take(record)
-        if replayed is not None and (publisher is None or publisher.robot is not playback.robot):
-            started_ns = playback.head.started_ns if playback.head else 0
-            publisher = Publisher(playback.robot, started_ns, keys)
-        is_inside = not isinstance(record, RecordedStep) or recording.contains(record.inputs.now)
-        entries = list(timeline.take(record)) if is_inside else []
+        if replayed is not None:
+            if publisher is None or publisher.robot is not playback.robot:
+                started_ns = playback.head.started_ns if playback.head else 0
+                publisher = Publisher(playback.robot, started_ns, keys)
+            with playback.errors():
+                yield from publisher.messages(*replayed, recording)
+        if not isinstance(record, RecordedStep) or recording.contains(record.now):
+            yield from map(_line, timeline.take(record))
 
 
 class Publisher:
@@ -83,13 +72,11 @@ class Publisher:
     def _config(self) -> Config:
         return self.robot.config
 
-    def messages(
-        self, step: RecordedStep, outputs: Outputs, recording: Recording
-    ) -> Iterator[Published]:
+    def messages(self, step: RecordedStep, news: News, recording: Recording) -> Iterator[Published]:
         """Yield the messages of a step that was just replayed, if it is in the recording's time."""
         # The steps before that time determine when messages are due.
-        messages = list(self._messages(step, outputs))
-        if recording.contains(step.inputs.now):
+        messages = list(self._messages(step, news))
+        if recording.contains(step.now):
             yield from self._transforms(step)
             yield from messages
 
@@ -99,16 +86,16 @@ class Publisher:
             self._static = self._report.config = self._config
             if "tf_static" not in left_out(self._config):
                 message = self._report.tf_static()
-                yield Published(BY_KEY["tf_static"], "", step.inputs.now.wall_ns, message)
+                yield Published(BY_KEY["tf_static"], "", step.now.wall_ns, message)
 
-    def _messages(self, step: RecordedStep, outputs: Outputs) -> Iterator[Published]:
-        robot, now = self.robot, step.inputs.now
+    def _messages(self, step: RecordedStep, news: News) -> Iterator[Published]:
+        robot, now = self.robot, step.now
         self._report.config = robot.config
-        for command in step.inputs.commands:
+        for command in step.heard.commands:
             yield self._received(command, now)
-        applied = robot.applied if outputs.due else None
+        applied = robot.applied if step.driven else None
         for key, message in self._report.due(
-            now, news_of(outputs), applied, self._keys, lambda: robot.snapshot(now.mono_ns)
+            now, news, applied, self._keys, lambda: robot.snapshot(now.mono_ns)
         ):
             yield Published(BY_KEY[key], "", now.wall_ns, _without_measurements(message))
 

@@ -23,12 +23,12 @@ from acsard.core.config.toml_text import document
 from acsard.core.formatting import many
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
-from acsard.core.values import NS_PER_S, Event, Inputs, Instant, Ns, Outputs, Recording, WallNs
+from acsard.core.values import NS_PER_S, Event, Heard, Instant, Ns, Recording, WallNs
 from acsard.host.version import version
 from acsard.host.wait_timer import WaitTimer
 from acsard.recording.directory import RecordingDirectory
 from acsard.recording.file import Failure, FrameWriter, Head, Waits
-from acsard.recording.recorded_steps import StepRecorder
+from acsard.recording.recorded_steps import PlainStep, StepRecorder
 from acsard.recording.state import MAX_ERROR_LENGTH, freeze
 
 MAX_QUEUED_STEPS = 4096  # 10 s at 400 steps a second
@@ -61,8 +61,6 @@ CLOSE_S = 0.5  # for the last steps, when the daemon ends
 
 WATCH_STEPS = 8  # between two looks at the disk's time
 
-Step = tuple[Inputs, Outputs, bytes | None]  # with the line on the serial port
-
 
 class Start(Struct, frozen=True):
     """The robot between two steps, for a `Head`."""
@@ -81,7 +79,7 @@ class Recorder(StepRecorder):
     ) -> None:
         # `report` runs in the thread of the control loop.
         self._report = report
-        self._queue: deque[Step | Start | Waits | Failure] = deque()
+        self._queue: deque[PlainStep | Start | Waits | Failure] = deque()
         self._number = 0  # of the next step
         self._head_ns = 0  # when the next head is due
         self._waits: Mapping[str, str] = {}  # codes of what sources wait for, in this drive
@@ -90,7 +88,7 @@ class Recorder(StepRecorder):
         self._full = False  # until half of the queue is free again
         self._slow = False  # a slow disk was reported
         self._waited_ns = self._lost_before = 0  # at the last step; `_lost` when the disk hung
-        self._failed: Inputs | None = None  # of the step in which the daemon failed
+        self._failed: tuple[Instant, Heard] | None = None  # in the step in which the daemon failed
         self._first = config, b""  # configuration and state before the first step
         self._writer = _Writer(config, started_ns)
         self._over = threading.Event()
@@ -103,10 +101,8 @@ class Recorder(StepRecorder):
         # Without this call, a replay begins with a new robot and guard.
         self._first = robot.config, freeze(robot, guard.memory)
 
-    def step(
-        self, inputs: Inputs, outputs: Outputs, sent: bytes | None, robot: Robot, guard: Guard
-    ) -> None:
-        now, writer, queue = inputs.now, self._writer, self._queue
+    def step(self, step: PlainStep, robot: Robot, guard: Guard) -> None:
+        now, writer, queue = step[0], self._writer, self._queue
         if writer.events:
             self._report(writer.events.popleft())
         if self._number == 0:
@@ -116,11 +112,11 @@ class Recorder(StepRecorder):
         if len(queue) >= MAX_QUEUED_STEPS or self._full:
             self._lose()
         else:
-            queue.append((inputs, outputs, sent))
+            queue.append(step)
         if (writer.wants_head or now.mono_ns >= self._head_ns) and not self._full:
             writer.wants_head, self._head_ns = False, now.mono_ns + HEAD_NS
             queue.append(Start(self._number, now, robot.config, freeze(robot, guard.memory)))
-        if outputs.mode != "driving":
+        if robot.status.mode != "driving":
             self._waits = {}
         elif now.mono_ns >= self._waits_ns:
             self._take_waits(now, robot)
@@ -158,9 +154,9 @@ class Recorder(StepRecorder):
             self._slow, self._lost_before = True, self._lost
             self._report(Event("recording", f"{SLOW_DISK}; driving goes on", "warning"))
 
-    def died(self, inputs: Inputs) -> None:
+    def died(self, now: Instant, heard: Heard) -> None:
         # Recorded by `close`.
-        self._failed = inputs
+        self._failed = now, heard
 
     @property
     def status(self) -> Recording:
@@ -181,8 +177,8 @@ class Recorder(StepRecorder):
             with suppress(Exception):
                 why = f"{why}: {error}"[:MAX_ERROR_LENGTH].encode(errors="replace").decode()
             if self._number == 0 and self._failed is not None:
-                self._queue.append(Start(0, self._failed.now, *self._first))
-            self._queue.append(Failure(self._number, why, self._failed))
+                self._queue.append(Start(0, self._failed[0], *self._first))
+            self._queue.append(Failure(self._number, why, *(self._failed or ())))
         self._over.set()
         self._thread.join(CLOSE_S)
         while self._writer.events:
@@ -200,7 +196,7 @@ class Recorder(StepRecorder):
                 self._writer.events.append(Event("recording", ENDED, "error"))
                 raise
 
-    def _take_queue(self) -> list[Step | Start | Waits | Failure]:
+    def _take_queue(self) -> list[PlainStep | Start | Waits | Failure]:
         queue = self._queue
         return [queue.popleft() for _ in range(len(queue))]
 
@@ -229,7 +225,7 @@ class _Writer:
         self._lost_before = 0  # when the disk began to refuse
         self._text = config, _text(config)  # of the last head
 
-    def write(self, items: Sequence[Step | Start | Waits | Failure], over: bool) -> None:
+    def write(self, items: Sequence[PlainStep | Start | Waits | Failure], over: bool) -> None:
         """Write the items of the recorder's queue. The last call ends the file."""
         steps, written = sum(isinstance(item, tuple) for item in items), 0
         if self._pause and not over:
@@ -252,9 +248,9 @@ class _Writer:
         elif steps and self._frames is None and not self._pause:
             self.wants_head = True
 
-    def _write(self, items: Sequence[Step | Start | Waits | Failure]) -> int:
+    def _write(self, items: Sequence[PlainStep | Start | Waits | Failure]) -> int:
         # Returns the number of steps that were written: those that follow a head.
-        steps: list[Step] = []
+        steps: list[PlainStep] = []
         written = 0
         for item in items:
             if isinstance(item, tuple):
@@ -270,12 +266,12 @@ class _Writer:
                 _add_failure(self._frames, item)
         return written + self._add(steps)
 
-    def _add(self, steps: list[Step]) -> int:
+    def _add(self, steps: list[PlainStep]) -> int:
         if not steps or self._frames is None:
             return 0
         self._frames.add_steps(self._number, steps)
         self._number += len(steps)
-        last, now = self._last, steps[-1][0].now
+        last, now = self._last, steps[-1][0]
         if last is not None and abs(_ahead_ns(now) - _ahead_ns(last)) > CLOCK_JUMP_NS:
             self._ends = self.wants_head = True
         self._last = now

@@ -8,7 +8,6 @@ so for steps, and `Playback` for a recording, whose robot begins at a `Head`.
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -21,7 +20,7 @@ from acsard.core.config.parsing import ConfigError, parse_recorded
 from acsard.core.config.settings import Config
 from acsard.core.guard import Guard, Memory
 from acsard.core.robot import Robot
-from acsard.core.values import Event, Inputs, Instant, Outputs, Trip
+from acsard.core.values import Event, Instant, News, Trip
 from acsard.host.errors import RecordingError
 from acsard.recording.file import Failure, Head, ReadRecord, Recording
 from acsard.recording.recorded_steps import (
@@ -31,10 +30,8 @@ from acsard.recording.recorded_steps import (
     RecordedStep,
     checksum,
     micropose,
-    status_of,
 )
 from acsard.recording.state import State, StateError, adopt, short, thaw
-from acsard.recording.stepped_robot import SteppedRobot
 
 NO_TRIP: Trip = ""
 
@@ -93,7 +90,7 @@ class Comparison(Struct):
 
 class Replay:
     def __init__(self, robot: Robot, memory: Memory | None = None) -> None:
-        self.outputs: Outputs | None = None  # of the last step
+        self.news = News()  # of the last step
         self.comparison = Comparison()
         self.resume(robot, memory)
         self._checksum = 0
@@ -101,36 +98,37 @@ class Replay:
 
     def resume(self, robot: Robot, memory: Memory | None) -> None:
         """Go on with another robot, for example after missing steps, and its guard's memory."""
-        self.stepped = SteppedRobot(robot)
+        self.robot = robot
         self._config = robot.config
         self._guard = Guard(robot.session.codec.stop, robot.config, memory)
-
-    @property
-    def robot(self) -> Robot:
-        return self.stepped.robot
 
     def step(self, step: RecordedStep) -> Difference | None:
         """Replay the next step; return how it differs, or None."""
         if step.begins:
             self._checksum = 0
-        outputs = self.outputs = self.stepped.step(step.inputs)
+        robot, guard, now, recorded = self.robot, self._guard, step.now, step.recorded
+        news = robot.hear(now, step.heard)
         # A step that changes a setting gives the robot a new configuration.
-        if self.robot.config is not self._config:
-            self._config = self.robot.config
-            self._guard.use(self._config)
-        line, trip = outputs.line, NO_TRIP
+        if robot.config is not self._config:
+            self._config = robot.config
+            guard.use(self._config)
+        line = robot.drive(now) if step.driven else None
+        status, sent, trip = robot.status, line, NO_TRIP
         if line is not None:
-            status, at_ns = self.robot.status, outputs.now.mono_ns
-            line, trip = self._guard.check(line, at_ns, status, outputs.command_ns)
-        self._checksum = checksum(outputs.estimates, self._checksum)
-        if step.recorded.sent is not None:
+            sent, trip = guard.check(line, now.mono_ns, status, robot.command_ns)
+        if recorded.sent is not None:
             # The board obeyed the recorded line, even if the replayed robot decides another line.
-            self._guard.record_written(step.recorded.sent)
-        poses = tuple([micropose(estimate) for estimate in outputs.estimates])
-        sent = line if step.recorded.sent is not None else None
-        replayed = RecordedOutputs(outputs.line, sent, status_of(outputs), poses, outputs.events)
+            guard.record_written(recorded.sent)
+        else:
+            sent = None
+        if line is not None:
+            robot.sent(now.mono_ns + step.late_ns, sent, step.trip)
+        self.news = news
+        self._checksum = checksum(news.estimates, self._checksum)
+        poses = tuple([micropose(estimate) for estimate in news.estimates])
+        replayed = RecordedOutputs(line, sent, status, poses, news.events)
         difference = self._compare(step, replayed, trip)
-        self._count(step, outputs, replayed)
+        self._count(step, bool(poses), replayed)
         if difference is not None:
             self._keep(difference)
         return difference
@@ -140,7 +138,7 @@ class Replay:
         comparison.first = comparison.first or difference
         for output in difference.what:
             comparison.first_by_output.setdefault(output, difference)
-        if difference.replayed.status[0] == "fault" != difference.recorded.status[0]:
+        if difference.replayed.status.mode == "fault" != difference.recorded.status.mode:
             comparison.fault = comparison.fault or difference
 
     def _compare(
@@ -149,38 +147,35 @@ class Replay:
         recorded = step.recorded
         exact = recorded.checksum is None or recorded.checksum == self._checksum
         self.comparison.exact = self.comparison.exact and exact
-        mode, reason, link, source, code = replayed.status
-        recorded_mode, recorded_reason, recorded_link, recorded_source, recorded_code = (
-            recorded.status
-        )
+        now, before = replayed.status, recorded.status
         pairs: tuple[tuple[Output, object, object], ...] = (
             ("line", replayed.line, recorded.line),
             ("sent line", replayed.sent, recorded.sent),
-            ("mode", mode, recorded_mode),
-            ("link", link, recorded_link),
-            ("source", source, recorded_source),
-            ("code", code, recorded_code),
+            ("mode", now.mode, before.mode),
+            ("link", now.link, before.link),
+            ("source", now.source, before.source),
+            ("code", now.code, before.code),
             ("pose", replayed.poses, recorded.poses),
-            ("reason", reason, recorded_reason),
+            ("reason", now.reason, before.reason),
         )
         what = tuple([name for name, new, old in pairs if new != old])
         if replayed.events != recorded.events:
             what += _different_parts(replayed.events, recorded.events)
         if not what:
             return None
-        return Difference(step.number, step.inputs.now, what, recorded, replayed, trip)
+        return Difference(step.number, step.now, what, recorded, replayed, trip)
 
-    def _count(self, step: RecordedStep, outputs: Outputs, replayed: RecordedOutputs) -> None:
+    def _count(self, step: RecordedStep, has_poses: bool, replayed: RecordedOutputs) -> None:
         comparison, recorded = self.comparison, step.recorded
         comparison.steps += 1
         if recorded.line is not None or replayed.line is not None:
             comparison.lines += 1
             comparison.lines_same += recorded.line == replayed.line
-        mode, reason, link, source, _ = map(operator.eq, replayed.status, recorded.status)
-        comparison.modes_same += mode
-        comparison.reasons_same += reason
-        comparison.links_same += link
-        comparison.sources_same += source
+        now, before = replayed.status, recorded.status
+        comparison.modes_same += now.mode == before.mode
+        comparison.reasons_same += now.reason == before.reason
+        comparison.links_same += now.link == before.link
+        comparison.sources_same += now.source == before.source
         for new, old in zip_longest(replayed.events, recorded.events):
             comparison.events += 1
             comparison.events_same += new == old
@@ -192,7 +187,7 @@ class Replay:
             max(recorded_speed, max_wheel_speed(recorded.line)),
             max(replayed_speed, max_wheel_speed(replayed.line)),
         )
-        if outputs.estimates:
+        if has_poses:
             self._pose = replayed.poses[-1]
         if recorded.poses:
             pose = recorded.poses[-1]
@@ -255,8 +250,8 @@ class Playback:
     def comparison(self) -> Comparison:
         return Comparison() if self.replay is None else self.replay.comparison
 
-    def steps(self) -> Iterator[tuple[RecordedStep, Outputs]]:
-        """Replay each step in turn, and yield it with its outputs. Raises `RecordingError`.
+    def steps(self) -> Iterator[tuple[RecordedStep, News]]:
+        """Replay each step in turn, and yield it with its news. Raises `RecordingError`.
 
         The steps of a frame that precede the time of the recording come, too:
         `Recording.contains` tells them apart.
@@ -265,8 +260,8 @@ class Playback:
             if (replayed := self.take(record)) is not None:
                 yield replayed
 
-    def take(self, record: ReadRecord) -> tuple[RecordedStep, Outputs] | None:
-        """Replay the next record; return a step with its outputs, or None."""
+    def take(self, record: ReadRecord) -> tuple[RecordedStep, News] | None:
+        """Replay the next record; return a step with its news, or None."""
         match record:
             case Head():
                 self._begin(record)
@@ -276,15 +271,9 @@ class Playback:
                 assert self.replay is not None
                 with self.errors():
                     self.replay.step(record)
-                self._next, self._last = number + 1, record.inputs.now
-                assert self.replay.outputs is not None
-                return record, self.replay.outputs
+                self._next, self._last = number + 1, record.now
+                return record, self.replay.news
         return None
-
-    def tell(self, inputs: Inputs) -> None:
-        """Tell the robot what became of its last line, by the inputs of the next step."""
-        if self.replay is not None:
-            self.replay.stepped.tell(inputs)
 
     def _begin(self, head: Head) -> None:
         before, self.head = self.head, head
@@ -338,13 +327,14 @@ class Playback:
         failure, replay = self.failure, self.replay
         if failure is None:
             return ""
-        if failure.inputs is None:
+        if failure.now is None or failure.heard is None:
             return f"the recorded daemon failed: {failure.why}"
         name = f"step {failure.number}, in which the recorded daemon failed ({failure.why}),"
         if replay is None or self._next != failure.number:
             return f"{name} was not replayed, because the step before it is missing"
         try:
-            replay.stepped.step(failure.inputs)
+            replay.robot.hear(failure.now, failure.heard)
+            replay.robot.drive(failure.now)
         except Exception as error:  # noqa: BLE001 - the failure may be any exception
             return f"{name} also fails here, with {type(error).__name__}: {short(error)}"
         return f"{name} does not fail in this version of acsard"

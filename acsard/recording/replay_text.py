@@ -81,7 +81,9 @@ def _seconds(difference: Difference, began_ns: Ns) -> float:
 
 
 def _side(name: str, outputs: RecordedOutputs) -> list[str]:
-    mode, why, link, source, code = map(printable, outputs.status)
+    status = outputs.status
+    words = status.mode, status.code, status.reason, status.link, status.source
+    mode, code, why, link, source = map(printable, words)
     line = (
         "no line"
         if outputs.line is None
@@ -127,7 +129,8 @@ def explain_settings(
     if fault is not None:
         rows.append(
             "the replayed robot is in the mode fault from "
-            f"t = {_seconds(fault, began_ns):.3f} s onward: {printable(fault.replayed.status[1])}"
+            f"t = {_seconds(fault, began_ns):.3f} s onward: "
+            f"{printable(fault.replayed.status.reason)}"
         )
         if first is not None and first.number < fault.number:
             rows.append(

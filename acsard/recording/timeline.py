@@ -61,7 +61,7 @@ class Timeline:
                         yield TimelineEntry(record.at.wall_ns, "waits", text, by=source)
                 self._waits = {source: code for source, (code, _) in record.reasons.items()}
             case Failure(why=why):
-                wall_ns = self._last.inputs.now.wall_ns if self._last else 0
+                wall_ns = self._last.now.wall_ns if self._last else 0
                 yield TimelineEntry(wall_ns, "failure", f"the daemon failed: {why}", "error")
 
     def _begin(self, head: Head) -> Iterator[TimelineEntry]:
@@ -71,13 +71,14 @@ class Timeline:
         if before.started_ns == head.started_ns and head.number > last.number:
             return
         self._last = None
-        if last.recorded.status[0] != "shutdown":
+        if last.recorded.status.mode != "shutdown":
             text = "the recording of this run ends without the daemon's shutdown"
-            yield TimelineEntry(last.inputs.now.wall_ns, "cut", text, "warning")
+            yield TimelineEntry(last.now.wall_ns, "cut", text, "warning")
 
     def _step(self, step: RecordedStep) -> Iterator[TimelineEntry]:
-        last, now = self._last, step.inputs.now
-        mode, reason, link, source, _ = step.recorded.status
+        last, now = self._last, step.now
+        status = step.recorded.status
+        mode, reason, link, source = status.mode, status.reason, status.link, status.source
         if last is not None:
             yield from _between(last, step)
         elif step.number == 0:
@@ -94,8 +95,9 @@ class Timeline:
         yield from self._reason(step)
 
     def _reason(self, step: RecordedStep) -> Iterator[TimelineEntry]:
-        mode, text, _, source, code = step.recorded.status
-        now, shown = step.inputs.now, (mode, code, source if mode == "ready" else "")
+        status = step.recorded.status
+        mode, text, source, code = status.mode, status.reason, status.source, status.code
+        now, shown = step.now, (mode, code, source if mode == "ready" else "")
         if shown == self._shown:
             return
         codes = [event.code for event in step.recorded.events]
@@ -115,7 +117,7 @@ def _entry_of(event: Event, now: Instant) -> TimelineEntry:
 
 
 def _between(last: RecordedStep, step: RecordedStep) -> Iterator[TimelineEntry]:
-    before, now = last.inputs.now, step.inputs.now
+    before, now = last.now, step.now
     missing = step.number - last.number - 1
     passed_ns = now.mono_ns - before.mono_ns
     if missing > 0:

@@ -20,9 +20,9 @@ from acsard.core.config.settings import Config
 from acsard.core.config.toml_text import document
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
-from acsard.core.values import Inputs, Instant, Outputs, Recording
+from acsard.core.values import Heard, Instant, Recording
 from acsard.recording.file import FrameWriter, Head
-from acsard.recording.recorded_steps import FinishedStep
+from acsard.recording.recorded_steps import PlainStep
 from tests.scenarios.world import START, World
 from tests.system.harness import ROOT, finish
 
@@ -47,13 +47,11 @@ class Streamed:
         self._frames = FrameWriter(self.file)
         times = start.mono_ns, start.wall_ns
         self._frames.begin(Head("0.2.0", config.robot.id, 0, *times, text))
-        self._taken: list[FinishedStep] = []
+        self._taken: list[PlainStep] = []
         self._number = 0
 
-    def step(
-        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, guard: Guard
-    ) -> None:
-        self._taken.append(FinishedStep(inputs, outputs, left))
+    def step(self, step: PlainStep, robot: Robot, guard: Guard) -> None:
+        self._taken.append(step)
         if len(self._taken) == BATCH:
             self._frames.add_steps(self._number, self._taken)
             self._number += BATCH
@@ -61,7 +59,7 @@ class Streamed:
 
     def begins(self, robot: Robot, guard: Guard) -> None: ...
 
-    def died(self, inputs: Inputs) -> None: ...
+    def died(self, now: Instant, heard: Heard) -> None: ...
 
 
 def recorded(path: Path, seconds: float) -> Path:

@@ -13,8 +13,9 @@ from acsard.core.incoming.commands import Arrival, Via
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Header, Time, Twist, TwistStamped, Vector3
 from acsard.core.ros.attachments import Attachment
-from acsard.core.values import NS_PER_S, Outputs
+from acsard.core.values import NS_PER_S
 from tests.scenarios.world import World
+from tests.stepped import Outputs
 
 Way = Literal["client", "signed", "rmw", "header", "zenoh", "routed", "plain", "bridge"]
 FOREIGN: tuple[Way, ...] = ("signed", "rmw", "header", "zenoh")

@@ -18,9 +18,9 @@ from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.faults import Fault
-from acsard.core.values import Inputs, Outputs, Recording
+from acsard.core.values import Heard, Instant, Recording
 from acsard.recording.file import FrameWriter, Head, Steps, encode_steps, steps_of
-from acsard.recording.recorded_steps import FinishedStep, RecordedStep
+from acsard.recording.recorded_steps import FinishedStep, PlainStep, RecordedStep
 from acsard.recording.replay import Replay
 from acsard.recording.state import freeze, thaw
 from tests.scenarios.world import START, World
@@ -56,17 +56,15 @@ class Tape:
         self.cut = False
         self.status = Recording("memory")
 
-    def step(
-        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, guard: Guard
-    ) -> None:
-        self.taken.append(FinishedStep(inputs, outputs, left))
+    def step(self, step: PlainStep, robot: Robot, guard: Guard) -> None:
+        self.taken.append(FinishedStep(*step))
         if self.cut or (self._every and len(self.taken) % self._every == 0):
             self.cut = False
             self.states[len(self.taken)] = freeze(robot, guard.memory)
 
     def begins(self, robot: Robot, guard: Guard) -> None: ...
 
-    def died(self, inputs: Inputs) -> None: ...
+    def died(self, now: Instant, heard: Heard) -> None: ...
 
     def steps(self, first: int = 0) -> list[RecordedStep]:
         """Return the recorded steps from number `first` on, encoded and decoded again."""
@@ -91,7 +89,7 @@ class Tape:
             frames = FrameWriter(file)
             begins = sorted({first, *[n for n in self.states if first < n < len(steps)]})
             for begin, after in pairwise([*begins, len(steps)]):
-                now, state = steps[begin].inputs.now, self.states.get(begin, b"")
+                now, state = steps[begin].now, self.states.get(begin, b"")
                 assert state or not begin
                 times = now.mono_ns, now.wall_ns
                 frames.begin(

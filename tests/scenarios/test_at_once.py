@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from acsard.core.config.settings import CommandsConfig, Config, McuConfig, Source
 from acsard.core.incoming.queries import Query
-from acsard.core.values import Outputs
 from acsard.daemon.pacing import MAX_IDLE_WAKES
 from tests.scenarios.world import World
+from tests.stepped import Outputs
 
 MS = 1_000_000
 GAP_NS = 3_864_583

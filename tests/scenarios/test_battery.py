@@ -100,7 +100,7 @@ def test_a_recording_replays_a_battery_that_runs_empty() -> None:
         world.run(20.0)
         world.call("clear")
         world.drive(0.3, seconds=1.0)
-    assert {"driving", "stopped", "ready"} <= {step.outputs.mode for step in tape.taken}
+    assert {"driving", "stopped", "ready"} <= {step.status.mode for step in tape.taken}
     for first in (0, middle):
         comparison = replayed(tape, DRAINED, first).comparison
         assert comparison.first is None

@@ -15,10 +15,10 @@ from acsard.core.config.settings import (
     SafetyConfig,
     SimConfig,
 )
-from acsard.core.values import Outputs
 from tests.scenarios.taped import Tape, replayed
 from tests.scenarios.test_emergency_stop import MOST, Watch, out_of
 from tests.scenarios.world import World
+from tests.stepped import Outputs
 
 PLACES: tuple[Place, ...] = ("front", "rear", "left", "right")
 STOP = Config(safety=SafetyConfig(bumpers=PLACES))
@@ -236,7 +236,7 @@ def test_a_recording_replays_presses_and_releases(config: Config) -> None:
     while world.state.latch and not world.call("clear").success:
         world.run(0.2)
     world.drive(0.5, seconds=1.0)
-    names = {event.name for step in tape.taken for event in step.outputs.events}
+    names = {event.name for step in tape.taken for event in step.news.events}
     assert {"bumper_pressed", "bumper_released"} <= names
     for first in (0, middle):
         comparison = replayed(tape, config, first).comparison

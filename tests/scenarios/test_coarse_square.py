@@ -14,9 +14,10 @@ import pytest
 
 from acsard.core.config.settings import Config, McuConfig, SimConfig
 from acsard.core.motion.path import Path
-from acsard.core.values import Outputs, Pose
+from acsard.core.values import Pose
 from tests.each import more
 from tests.scenarios.world import World
+from tests.stepped import Outputs
 
 
 class Square:

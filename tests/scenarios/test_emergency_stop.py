@@ -18,10 +18,11 @@ from acsard.core.config.settings import (
 )
 from acsard.core.incoming.queries import Query
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.values import NS_PER_S, Latches, Outputs, Received
+from acsard.core.values import NS_PER_S, Latches, Received
 from tests.each import each
 from tests.scenarios.taped import Tape, replayed
 from tests.scenarios.world import SIGNED, World
+from tests.stepped import Outputs
 
 ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00"
 MOST = [25, pytest.param(1000, marks=[pytest.mark.soak, pytest.mark.timeout(3600)])]
@@ -379,7 +380,7 @@ def test_a_recording_replays_a_press_and_its_release() -> None:
     world.drive(0.5, seconds=1.5)
     assert world.call("clear").success
     world.drive(0.5, seconds=1.0)
-    assert {"driving", "stopped", "ready"} <= {step.outputs.mode for step in tape.taken}
+    assert {"driving", "stopped", "ready"} <= {step.status.mode for step in tape.taken}
     for first in (0, middle):
         comparison = replayed(tape, config, first).comparison
         assert comparison.first is None

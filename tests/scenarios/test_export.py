@@ -215,10 +215,11 @@ def test_every_event_is_a_line_of_the_log(both: Any) -> None:
 def test_every_line_reason_of_the_log_is_a_reason_that_the_state_has(both: Any) -> None:
     _, tape, exports = both
     lines = [line for line in exports[LOG_CHANNEL.native] if line.name == "reason"]
-    steps = {step.inputs.now.wall_ns: step.recorded.status for step in tape.steps()}
+    steps = {step.now.wall_ns: step.recorded.status for step in tape.steps()}
     assert lines
     for line in lines:
-        mode, reason, _, _, _ = steps[line.stamp.to_ns()]
+        status = steps[line.stamp.to_ns()]
+        mode, reason = status.mode, status.reason
         assert line.msg.partition(" (by ")[0] == f"{mode}: {reason}"
 
 
@@ -226,9 +227,9 @@ def test_every_command_is_exported_under_its_source_with_its_arrival_time(both: 
     _, tape, exports = both
     offset_ns = {}
     arrivals: Said = defaultdict(list)
-    for inputs, _, _ in tape.taken:
-        offset_ns = inputs.now.wall_ns - inputs.now.mono_ns
-        for command in inputs.commands:
+    for entry in tape.taken:
+        offset_ns = entry.now.wall_ns - entry.now.mono_ns
+        for command in entry.heard.commands:
             arrivals[f"cmd/{command.source}"].append(
                 (command.arrived_ns + offset_ns, command.twist.linear, command.twist.angular)
             )
@@ -253,9 +254,9 @@ def replay_file(world: World, tape: Tape) -> Said:
     messages: Said = defaultdict(list)
     for key in BY_KEY:
         messages[BY_KEY[key].topic("")] = [_exportable(item) for item in world.bus.published[key]]
-    for inputs, _, _ in tape.taken:
-        for item in inputs.commands:
-            arrived = item.arrived_ns + inputs.now.wall_ns - inputs.now.mono_ns
+    for entry in tape.taken:
+        for item in entry.heard.commands:
+            arrived = item.arrived_ns + entry.now.wall_ns - entry.now.mono_ns
             asked = Twist(Vector3(x=item.twist.linear), Vector3(z=item.twist.angular))
             stamped = TwistStamped(Header(Time.from_ns(arrived), "base_link"), asked)
             messages[commanded(item.source)].append(stamped)

@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.values import Outputs
 from tests.scenarios.world import World
+from tests.stepped import Outputs
 
 GOLDEN = Path(__file__).parent.parent / "vectors" / "golden_hour.json"
 SHORT, SLOW, LONG = 2, 10, 60

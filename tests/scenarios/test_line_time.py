@@ -13,8 +13,9 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config, McuConfig, SimConfig
 from acsard.core.messages.schema import JointState, RobotState
 from acsard.core.motion.path import Path
-from acsard.core.values import Estimate, Outputs, Pose
+from acsard.core.values import Estimate, Pose
 from tests.scenarios.world import World
+from tests.stepped import Outputs
 
 FINE = SimConfig(encoder_counts=20_000)
 """Fine encoders, so that the two decimals of a line limit its accuracy."""

@@ -30,9 +30,10 @@ from acsard.core.link.lines import LineReader
 from acsard.core.messages.schema import DiagnosticArray
 from acsard.core.simulator import protocol
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.values import NS_PER_S, Instant, Outputs, Received
+from acsard.core.values import NS_PER_S, Instant, Received
 from tests.each import each
 from tests.scenarios.world import VirtualPort, World
+from tests.stepped import Outputs
 from tests.unit.core.link.test_damage import drive as replies_of_a_drive
 
 MS = 1_000_000

@@ -11,7 +11,7 @@ from acsard.core.config.settings import Config
 from acsard.core.link.serial_output import Offered
 from acsard.core.robot import Robot
 from acsard.core.values import Instant
-from acsard.recording.replay import Replay
+from acsard.recording.replay import Replay, max_wheel_speed
 from acsard.recording.state import adopt, thaw
 from tests.scenarios.taped import (
     INPUTS,
@@ -22,7 +22,6 @@ from tests.scenarios.taped import (
     replayed,
 )
 from tests.scenarios.world import World
-from tests.unit.core.guarded import checked
 
 PLAIN = Config()
 FULL = replace(
@@ -45,9 +44,9 @@ def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) ->
     assert comparison.exact
     assert comparison.steps == comparison.modes_same == len(tape.taken) - first
     steps = tape.taken[first:]
-    lines = sum(step.outputs.line is not None for step in steps)
+    lines = sum(step.line is not None for step in steps)
     assert comparison.lines == comparison.lines_same == lines >= least
-    poses = sum(len(step.outputs.estimates) for step in steps)
+    poses = sum(len(step.news.estimates) for step in steps)
     assert comparison.poses == comparison.poses_same == poses >= least
     assert comparison.end is not None
     assert comparison.end[0] == comparison.end[1]
@@ -70,11 +69,10 @@ def test_a_recording_that_begins_in_a_ramp_stores_when_the_ramp_was_commanded(af
     lives_again(tape, PLAIN, first)
     assert thaw(tape.states[first]).memory.commanded_ns is not None
     late = replayed(tape, PLAIN, first)
-    guard = late._guard
-    assert late.outputs is not None
-    moving = replace(late.outputs, line=b"ap01.00,bp01.00,cp01.00,dp01.00\r\n")
-    guard.record_written(b"ap01.00,bp01.00,cp01.00,dp01.00\r\n")
-    assert checked(guard, moving)[1] == "guard_too_long"
+    guard, robot, now_ns = late._guard, late.robot, tape.taken[-1].now.mono_ns
+    moving = b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
+    guard.record_written(moving)
+    assert guard.check(moving, now_ns, robot.status, robot.command_ns)[1] == "guard_too_long"
 
 
 @pytest.mark.slow
@@ -89,9 +87,9 @@ def test_a_drive_through_every_fault_is_replayed_to_the_last_bit(config: Config)
     tape, world = recorded_world(config)
     # `test_emergency_stop.py` and `test_bumpers.py` replay the inputs.
     assert {*drive_through_faults(world, 45.0)} == {*FAULTS, *WITH_ARGUMENTS} - INPUTS
-    inputs = [record.inputs for record in tape.taken]
-    for has in ("superseded", "missed", "refusals", "requests", "port_trouble", "commands"):
-        assert any(getattr(step, has) for step in inputs), has
+    for has in ("missed", "refusals", "requests", "port_trouble", "commands"):
+        assert any(getattr(step.heard, has) for step in tape.taken), has
+    assert any(step.line is not None and step.sent is None for step in tape.taken)
     lives_again(tape, config)
 
 
@@ -107,8 +105,8 @@ def test_settings_that_were_changed_during_the_recording_are_replayed_too() -> N
     world.call("clear")
     (first,) = tape.states
     world.drive(2.5, seconds=4.0)
-    fastest = max(max(map(abs, t.outputs.speeds.as_tuple())) for t in tape.taken)
-    assert fastest > PLAIN.limits.wheel_speed
+    fastest = max(max_wheel_speed(step.line) for step in tape.taken)
+    assert fastest > PLAIN.limits.wheel_speed * 100
     lives_again(tape, PLAIN)
     lives_again(tape, PLAIN, first)
 
@@ -144,7 +142,7 @@ def test_a_recording_that_begins_in_a_drive_is_replayed_from_its_first_state(
     tape.cut = True
     world.hold(0.6, -0.4, seconds=3.0)
     (first,) = tape.states
-    assert tape.taken[first].outputs.mode == "driving"
+    assert tape.taken[first].status.mode == "driving"
     lives_again(tape, config, first)
 
 
@@ -176,24 +174,24 @@ def test_a_line_that_differs_is_reported_with_the_inputs_of_both_sides() -> None
     tape = Tape()
     World(recorder=tape).drive(0.5, 0.2, seconds=1.0)
     number = len(tape.taken) - 3
-    while tape.taken[number].outputs.line is None:
+    while tape.taken[number].line is None:
         number -= 1
     step = tape.taken[number]
-    other = replace(step.outputs, line=b"ap01.00,bp01.00,cp01.00,dp01.00\r\n")
-    tape.taken[number] = step._replace(outputs=other)
+    other = step._replace(line=b"ap01.00,bp01.00,cp01.00,dp01.00\r\n")
+    tape.taken[number] = other
     first = replayed(tape, PLAIN).comparison.first
     assert first is not None
     assert (first.number, first.what) == (number, ("line",))
-    assert (first.recorded.line, first.replayed.line) == (other.line, step.outputs.line)
+    assert (first.recorded.line, first.replayed.line) == (other.line, step.line)
 
 
 def test_a_replay_without_one_recorded_command_differs() -> None:
     tape = Tape()
     World(recorder=tape).drive(0.5, 0.2, seconds=1.0)
-    moves = [n for n, t in enumerate(tape.taken) for c in t.inputs.commands if c.twist.linear]
+    moves = [n for n, t in enumerate(tape.taken) for c in t.heard.commands if c.twist.linear]
     number = moves[0]
     step = tape.taken[number]
-    tape.taken[number] = step._replace(inputs=replace(step.inputs, commands=()))
+    tape.taken[number] = step._replace(heard=replace(step.heard, commands=()))
     first = replayed(tape, PLAIN).comparison.first
     assert first is not None
     assert number <= first.number <= number + 1
@@ -203,11 +201,11 @@ def test_a_replay_without_one_recorded_command_differs() -> None:
 def test_a_pose_that_differs_in_one_bit_is_the_same_but_not_exact() -> None:
     tape = Tape()
     World(recorder=tape).drive(0.5, 0.2, seconds=1.0)
-    number = max(n for n, t in enumerate(tape.taken) if t.outputs.estimates)
+    number = max(n for n, t in enumerate(tape.taken) if t.news.estimates)
     step = tape.taken[number]
-    (estimate,) = step.outputs.estimates
+    (estimate,) = step.news.estimates
     nudged = replace(estimate, pose=replace(estimate.pose, x=estimate.pose.x + 1e-15))
-    tape.taken[number] = step._replace(outputs=replace(step.outputs, estimates=(nudged,)))
+    tape.taken[number] = step._replace(news=replace(step.news, estimates=(nudged,)))
     comparison = replayed(tape, PLAIN).comparison
     assert (comparison.same, comparison.exact) == (True, False)
 
@@ -222,7 +220,7 @@ def test_a_replay_with_other_limits_reports_the_first_line_that_differs() -> Non
     first = comparison.first
     assert first is not None
     assert first.what == ("line", "sent line")
-    assert first.recorded.status[0] == first.replayed.status[0] == "driving"
+    assert first.recorded.status.mode == first.replayed.status.mode == "driving"
     assert comparison.max_wheel_speeds == (1000, 600)  # 0.5 and 0.3 m/s on wheels of 0.05 m
 
 

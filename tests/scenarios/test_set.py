@@ -17,12 +17,13 @@ from acsard.core.messages.schema import ServiceReply
 from acsard.core.messages.signature import public_name
 from acsard.core.motion.limits import Motion
 from acsard.core.ros import parameters as rcl
-from acsard.core.values import NS_PER_S, Instant, Outputs, Plain
+from acsard.core.values import NS_PER_S, Instant, Plain
 from acsard.daemon.control_loop import Step
 from acsard.daemon.pacing import NO_PERIOD, Period
 from tests.each import each
 from tests.scenarios.speakers import Speaker, moved
 from tests.scenarios.world import World
+from tests.stepped import Outputs
 
 
 @pytest.fixture

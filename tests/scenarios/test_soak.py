@@ -21,10 +21,11 @@ import pytest
 
 from acsard.core.config.settings import CommandsConfig, Config, ControlConfig, McuConfig, Source
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.values import NS_PER_S, Outputs
+from acsard.core.values import NS_PER_S
 from tests.each import more
 from tests.scenarios.speakers import FOREIGN, SHARED, STAMPED, Speaker, Way, backlog, moved
 from tests.scenarios.world import World
+from tests.stepped import Outputs
 
 ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 DAY_NS = 86_400 * NS_PER_S

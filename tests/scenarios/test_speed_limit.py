@@ -10,11 +10,12 @@ import pytest
 
 from acsard.core.config.settings import Config
 from acsard.core.messages.schema import ServiceReply
-from acsard.core.values import Outputs, Plain
+from acsard.core.values import Plain
 from tests.each import each
 from tests.scenarios.taped import Tape, replayed
 from tests.scenarios.test_restart import MemoryFile
 from tests.scenarios.world import START, World
+from tests.stepped import Outputs
 
 
 @pytest.fixture

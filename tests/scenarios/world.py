@@ -35,7 +35,6 @@ from acsard.core.values import (
     Event,
     Instant,
     Latches,
-    Outputs,
     Pose,
     Received,
 )
@@ -44,8 +43,8 @@ from acsard.daemon.latch_rules import Handover, LatchKeeper
 from acsard.daemon.pacing import NO_PERIOD, Period
 from acsard.daemon.publication import Publication
 from acsard.recording.recorded_steps import StepRecorder
-from acsard.recording.stepped_robot import outputs_of
 from tests.scenarios.imperfect_gyro import ImperfectGyro
+from tests.stepped import Outputs, outputs_of
 
 START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
 

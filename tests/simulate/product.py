@@ -28,7 +28,7 @@ from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.simulated_robot import WatchedMcu
 from acsard.core.values import Estimate as Measured
-from acsard.core.values import Event, Inputs, Instant, Latches, Outputs, Received, Recording
+from acsard.core.values import Event, Heard, Instant, Latches, Received, Recording
 from acsard.daemon.latch_rules import (
     LatchFileError,
     after_failed_write,
@@ -41,11 +41,12 @@ from acsard.daemon.latch_rules import (
 )
 from acsard.daemon.pacing import Period
 from acsard.recording.file import Steps, encode_steps, steps_of
-from acsard.recording.recorded_steps import FinishedStep
+from acsard.recording.recorded_steps import PlainStep
 from acsard.recording.replay import Replay
 from acsard.recording.state import freeze, thaw
 from tests.scenarios.world import START, World
 from tests.simulate.gyro_faults import FaultyGyro, GyroFaults
+from tests.stepped import Outputs
 
 START_NS = START.mono_ns
 WALL_OFFSET_NS = START.wall_ns - START.mono_ns
@@ -194,22 +195,20 @@ class Tape:
         self.difference = ""
         """The first step whose replay has another result, and the outputs that differ."""
         self.status = Recording()
-        self._steps: list[FinishedStep] = []
+        self._steps: list[PlainStep] = []
         self._number = 0
         self._replay = Replay(*thaw(freeze(robot, guard.memory)))
 
     def begins(self, robot: Robot, guard: Guard) -> None: ...
 
-    def step(
-        self, inputs: Inputs, outputs: Outputs, sent: bytes | None, robot: Robot, guard: Guard
-    ) -> None:
-        self._steps.append(FinishedStep(inputs, outputs, sent))
+    def step(self, step: PlainStep, robot: Robot, guard: Guard) -> None:
+        self._steps.append(step)
         if len(self._steps) == BATCH:
             self.replay()
             if self._number % FILE == 0:
                 self._replay.resume(*thaw(freeze(robot, guard.memory)))
 
-    def died(self, inputs: Inputs) -> None: ...
+    def died(self, now: Instant, heard: Heard) -> None: ...
 
     def replay(self) -> None:
         """Replay the steps that have not been replayed yet."""

@@ -51,7 +51,7 @@ def last_s(where: Path, path: Path) -> float:
     code = (
         "import sys, pathlib; from acsard.recording.file import Recording;"
         "recording = Recording([pathlib.Path(sys.argv[1])]);"
-        "print(max(step.inputs.now.wall_ns for step in recording.steps()))"
+        "print(max(step.now.wall_ns for step in recording.steps()))"
     )
     return int(finish([sys.executable, "-c", code, str(path)], where).out) / 1e9
 

@@ -17,7 +17,6 @@ from acsard.cli.recording import SERVICE_DIRECTORY
 from acsard.core.values import Event
 from acsard.host.errors import Exit
 from acsard.recording.file import MAGIC
-from acsard.recording.recorded_steps import FinishedStep
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 from tests.system.typed import typed
@@ -51,7 +50,7 @@ def where(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number in range(5):
         end = None if number == 4 else (number + 1) * STEPS
         path = tape.save(where / name(number + 1), first=number * STEPS, end=end)
-        last = tape.taken[(end or len(tape.taken)) - 1].inputs.now
+        last = tape.taken[(end or len(tape.taken)) - 1].now
         os.utime(path, ns=(last.wall_ns, last.wall_ns))
     return where
 
@@ -162,9 +161,9 @@ def test_a_file_that_is_no_recording_does_not_hide_the_others(where: Path, tmp_p
 def test_recorded_texts_cannot_send_control_characters_to_the_terminal(tmp_path: Path) -> None:
     tape = Tape()
     World(recorder=tape).run(0.3)
-    inputs, outputs, left = tape.taken[5]
+    step = tape.taken[5]
     event = Event("stop", "\x1b[2J\u202egone", by="\x1b]0;title\x07")
-    tape.taken[5] = FinishedStep(inputs, replace(outputs, events=(event,)), left)
+    tape.taken[5] = step._replace(news=replace(step.news, events=(event,)))
     tape.save(tmp_path / name(1))
     for words in (("show", "1"), ("show", "1", "--json")):
         code, out, _ = log(tmp_path, *words)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from acsard.core.guard import Guard
-from acsard.core.values import Outputs, Status, Trip
+from acsard.core.values import Status, Trip
+from tests.stepped import Outputs
 
 
 def checked(guard: Guard, outputs: Outputs) -> tuple[bytes | None, Trip]:

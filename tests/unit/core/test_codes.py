@@ -60,7 +60,7 @@ def test_the_recordings_publish_only_codes_of_the_table() -> None:
     seen = set()
     for path in Path(recordings.__file__).parent.glob(f"*{SUFFIX}"):
         for step in Recording([path]).steps():
-            code = step.recorded.status[4]
+            code = step.recorded.status.code
             assert code in get_args(StateCode)
             seen.add(code)
             assert {event.code for event in step.recorded.events} <= {"", *CODES}

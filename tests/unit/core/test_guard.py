@@ -34,9 +34,7 @@ from acsard.core.values import (
     REST,
     STILL,
     Command,
-    Inputs,
     Instant,
-    Outputs,
     Plain,
     Received,
     Request,
@@ -45,8 +43,8 @@ from acsard.core.values import (
     Verb,
     WheelSpeeds,
 )
-from acsard.recording.stepped_robot import SteppedRobot
 from tests.each import each
+from tests.stepped import Inputs, Outputs, SteppedRobot
 from tests.unit.core.guarded import checked
 
 MS = 1_000_000

@@ -35,11 +35,9 @@ from acsard.core.values import (
     Command,
     Event,
     GyroSample,
-    Inputs,
     Instant,
     Latch,
     Latches,
-    Outputs,
     Plain,
     Pose,
     Received,
@@ -51,8 +49,8 @@ from acsard.core.values import (
     Verb,
     WheelSpeeds,
 )
-from acsard.recording.stepped_robot import SteppedRobot
 from tests.each import each
+from tests.stepped import Inputs, Outputs, SteppedRobot
 
 MS = 1_000_000
 WALL_NS = 1_800_000_000 * NS_PER_S

@@ -41,11 +41,9 @@ from acsard.core.values import (
     REST,
     Answer,
     Command,
-    Inputs,
     Instant,
     Latch,
     Latches,
-    Outputs,
     Plain,
     Pose,
     Received,
@@ -54,7 +52,7 @@ from acsard.core.values import (
     Twist,
     Verb,
 )
-from acsard.recording.stepped_robot import SteppedRobot
+from tests.stepped import Inputs, Outputs, SteppedRobot
 from tests.unit.core.guarded import checked
 
 MS = 1_000_000

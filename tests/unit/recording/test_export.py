@@ -23,7 +23,7 @@ from acsard.calibration.log_table import read
 from acsard.core.config.settings import Config, SimConfig
 from acsard.core.ros.channels import BY_KEY, CHANNELS, CMD_VEL_IN
 from acsard.core.ros.names import Qos
-from acsard.core.values import NS_PER_S, GyroSample, Instant, Ns
+from acsard.core.values import NS_PER_S, REST, GyroSample, Instant, Ns
 from acsard.host.errors import RecordingError
 from acsard.recording.export import (
     BagTopic,
@@ -259,8 +259,8 @@ def test_the_table_has_a_row_for_each_feedback_line_and_each_gyro_sample(
     tape: Tape, drive: Recording
 ) -> None:
     header, *rows = table(drive)
-    estimates = [e for t in tape.taken for e in t.outputs.estimates]
-    reports = [sample for t in tape.taken for sample in t.inputs.gyro]
+    estimates = [e for t in tape.taken for e in t.news.estimates]
+    reports = [sample for t in tape.taken for sample in t.heard.gyro]
     assert {len(row) for row in rows} == {len(header)}
     assert len(estimates) == sum(row[1] != "" for row in rows) > 100
     assert len(reports) == sum(row[5] != "" for row in rows) > 100
@@ -276,15 +276,15 @@ def test_calibration_reads_the_same_from_the_table_and_from_the_recording(
     assert list(tables[0].columns) == ["t", "fr", "fl", "rl", "rr", "yaw_rate", *commands]
     for name, values in tables[0].columns.items():
         np.testing.assert_array_equal(values, tables[1].columns[name])
-    speeds = [e.speeds.front_right for t in tape.taken for e in t.outputs.estimates]
+    speeds = [e.speeds.front_right for t in tape.taken for e in t.news.estimates]
     fr = tables[0].columns["fr"]
     np.testing.assert_allclose(fr[~np.isnan(fr)], speeds, rtol=1e-5)
 
 
 def test_the_times_in_the_table_are_those_of_the_samples(tape: Tape) -> None:
-    outputs = next(step.outputs for step in reversed(tape.taken) if step.outputs.estimates)
-    wall_ns = outputs.estimates[0].at.wall_ns
-    cells = feedback_cells(outputs.estimates[0], outputs)
+    *_, estimate = [estimate for step in tape.taken for estimate in step.news.estimates]
+    wall_ns = estimate.at.wall_ns
+    cells = feedback_cells(estimate, REST)
     assert cells[0] == f"{wall_ns // 10**9}.{wall_ns % 10**9 // 1000:06}"
     now = Instant(START.mono_ns + 50, START.wall_ns + 50)
     arrived = GyroSample(START.mono_ns + 2_000_050, None, 0.25)

@@ -31,11 +31,13 @@ from tests.each import each
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 
+Taken = list[FinishedStep]
+
 SECOND = 200  # steps in a record of these tests
 
 
 @pytest.fixture(scope="module")
-def taken() -> list[FinishedStep]:
+def taken() -> Taken:
     tape = Tape()
     world = World(recorder=tape)
     world.drive(0.5, 0.3, 3.0)
@@ -48,13 +50,13 @@ def head(number: int, at: Instant) -> Head:
     return Head("0.2.0", "acsar", number, at.mono_ns, at.wall_ns, "[robot]\n", b"state")
 
 
-def write(taken: list[FinishedStep], seconds_per_frame: int = 2) -> bytes:
+def write(taken: Taken, seconds_per_frame: int = 2) -> bytes:
     """Return the content of a file with these steps."""
     file = io.BytesIO()
     frames = FrameWriter(file)
     for count, at in enumerate(range(0, len(taken), SECOND)):
         if count % seconds_per_frame == 0:
-            frames.begin(head(at, taken[at].inputs.now))
+            frames.begin(head(at, taken[at].now))
         frames.add(encode_steps(at, taken[at : at + SECOND]))
     frames.end()
     return file.getvalue()
@@ -87,30 +89,32 @@ def frames_in(data: bytes) -> list[int]:
     return found
 
 
-def test_every_step_is_read_as_it_was_written(taken: list[FinishedStep], tmp_path: Path) -> None:
+def test_every_step_is_read_as_it_was_written(taken: Taken, tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(write(taken))
     recording = Recording([path])
     steps = list(recording.steps())
     assert recording.damage == []
-    assert [step.inputs for step in steps] == [entry.inputs for entry in taken]
-    assert [step.recorded.line for step in steps] == [entry.outputs.line for entry in taken]
+    assert [step.now for step in steps] == [entry.now for entry in taken]
+    assert [step.heard for step in steps] == [entry.heard for entry in taken]
+    assert [step.driven for step in steps] == [entry.driven for entry in taken]
+    assert [step.recorded.line for step in steps] == [entry.line for entry in taken]
     assert [step.recorded.sent for step in steps] == [entry.sent for entry in taken]
-    assert [step.recorded.status[0] for step in steps] == [entry.outputs.mode for entry in taken]
-    assert [step.recorded.events for step in steps] == [entry.outputs.events for entry in taken]
+    assert [step.recorded.status.mode for step in steps] == [entry.status.mode for entry in taken]
+    assert [step.recorded.events for step in steps] == [entry.news.events for entry in taken]
     assert [step.number for step in steps if step.begins] == list(range(0, len(taken), SECOND))
-    assert recording.head() == head(0, taken[0].inputs.now)
+    assert recording.head() == head(0, taken[0].now)
 
 
 def test_a_file_that_was_cut_off_at_any_byte_has_every_complete_second(
-    taken: list[FinishedStep], tmp_path: Path
+    taken: Taken, tmp_path: Path
 ) -> None:
     data = write(taken)
     file = io.BytesIO()
     frames, ends = FrameWriter(file), []
     for count, at in enumerate(range(0, len(taken), SECOND)):
         if count % 2 == 0:
-            frames.begin(head(at, taken[at].inputs.now))
+            frames.begin(head(at, taken[at].now))
         frames.add(encode_steps(at, taken[at : at + SECOND]))
         ends.append(len(file.getvalue()))
     for cut in range(0, len(data), 61):
@@ -120,9 +124,7 @@ def test_a_file_that_was_cut_off_at_any_byte_has_every_complete_second(
         assert recording.damage == [], cut
 
 
-def test_damage_costs_the_rest_of_its_frame_and_is_said(
-    taken: list[FinishedStep], tmp_path: Path
-) -> None:
+def test_damage_costs_the_rest_of_its_frame_and_is_said(taken: Taken, tmp_path: Path) -> None:
     data, dice = write(taken), random.Random(1)
     starts = [*frames_in(data), len(data)]
     for _ in range(60):
@@ -137,7 +139,7 @@ def test_damage_costs_the_rest_of_its_frame_and_is_said(
         assert recording.damage or len(numbers) == len(taken), at
 
 
-def test_a_missing_frame_is_a_gap_in_the_numbers(taken: list[FinishedStep], tmp_path: Path) -> None:
+def test_a_missing_frame_is_a_gap_in_the_numbers(taken: Taken, tmp_path: Path) -> None:
     data = write(taken)
     first, second, third = frames_in(data)[:3]
     numbers, recording = read(tmp_path / "a", data[first:second] + data[third:])
@@ -193,9 +195,7 @@ def test_a_frame_that_would_need_much_memory_is_refused(tmp_path: Path) -> None:
         assert "memory" in str(damage) or "record has" in str(damage)
 
 
-def test_a_newer_version_may_add_fields_and_services(
-    taken: list[FinishedStep], tmp_path: Path
-) -> None:
+def test_a_newer_version_may_add_fields_and_services(taken: Taken, tmp_path: Path) -> None:
     row = msgspec.to_builtins(encode_steps(0, taken[:1]).rows[0], builtin_types=(bytes,))
     row[3] |= {"added": 1, "requests": [{"verb": "dance"}, {"verb": "stop", "loudly": True}]}
     beginning = msgspec.to_builtins(head(0, Instant(0, 0)), builtin_types=(bytes,))
@@ -205,27 +205,27 @@ def test_a_newer_version_may_add_fields_and_services(
     recording = Recording([path])
     (step,) = recording.steps()
     assert recording.damage == []
-    assert step.inputs.requests == (Request("stop"),)
+    assert step.heard.requests == (Request("stop"),)
 
 
 def test_an_older_version_may_lack_fields(tmp_path: Path) -> None:
-    rows = [[5, 7, [], {"now": {"mono_ns": 0, "wall_ns": 0}, "tick": True, "port_open": True},
-             None, None, ["ready", "why", "up", "", "idle"], [], []]]  # fmt: skip
+    status = {"mode": "ready", "code": "no_command", "reason": "why", "link": "up"}
+    rows = [[5, 7, [], {"port_open": True}, True, None, None, "", 0, status, [], []]]
     begin = {"type": "head", "version": "0.2.0", "robot": "r", "number": 0, "mono_ns": 0}
     path = tmp_path / "a"
     steps = {"type": "steps", "first": 0, "rows": rows, "checksum": 0}
     path.write_bytes(content(begin | {"wall_ns": 0}, steps))
     (step,) = Recording([path]).steps()
-    assert step.inputs.now == Instant(5, 12)
-    assert step.recorded.status[0] == "ready"
+    assert step.now == Instant(5, 12)
+    assert step.recorded.status.mode == "ready"
 
 
 def test_the_step_in_which_the_daemon_failed_is_the_last_record(
-    taken: list[FinishedStep], tmp_path: Path
+    taken: Taken, tmp_path: Path
 ) -> None:
-    failure = Failure(0, "ZeroDivisionError: division by zero", taken[0].inputs)
+    failure = Failure(0, "ZeroDivisionError: division by zero", taken[0].now, taken[0].heard)
     path = tmp_path / "a"
-    path.write_bytes(content(head(0, taken[0].inputs.now), failure))
+    path.write_bytes(content(head(0, taken[0].now), failure))
     *_, last = Recording([path]).records()
     assert last == failure
 
@@ -234,10 +234,8 @@ def numbers_between(paths: list[Path], begin_ns: int, end_ns: int) -> list[int]:
     return [step.number for step in Recording(paths, begin_ns, end_ns).steps()]
 
 
-def test_steps_between_two_times_are_found_over_all_files(
-    taken: list[FinishedStep], tmp_path: Path
-) -> None:
-    walls = [entry.inputs.now.wall_ns for entry in taken]
+def test_steps_between_two_times_are_found_over_all_files(taken: Taken, tmp_path: Path) -> None:
+    walls = [entry.now.wall_ns for entry in taken]
     half = 2 * SECOND
     paths = [tmp_path / "1", tmp_path / "2"]
     for path, part in zip(paths, (taken[:half], taken[half:]), strict=True):
@@ -253,10 +251,10 @@ def test_steps_between_two_times_are_found_over_all_files(
             assert numbers_between(paths, *at) == expected, (begin, end)
 
 
-def test_a_frame_outside_the_time_is_not_read(taken: list[FinishedStep], tmp_path: Path) -> None:
+def test_a_frame_outside_the_time_is_not_read(taken: Taken, tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(write(taken, 1))
-    begin = taken[2 * SECOND + 50].inputs.now.wall_ns
+    begin = taken[2 * SECOND + 50].now.wall_ns
     heads = [r.number for r in Recording([path], begin, begin + 1).records() if isinstance(r, Head)]
     assert heads == [2 * SECOND]
     whole = [
@@ -265,12 +263,10 @@ def test_a_frame_outside_the_time_is_not_read(taken: list[FinishedStep], tmp_pat
     assert len(whole) == SECOND
 
 
-def test_a_file_that_ended_before_the_time_is_not_read(
-    taken: list[FinishedStep], tmp_path: Path
-) -> None:
+def test_a_file_that_ended_before_the_time_is_not_read(taken: Taken, tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(write(taken))
-    last = taken[-1].inputs.now.wall_ns
+    last = taken[-1].now.wall_ns
     os.utime(path, ns=(last, last))
     assert list(Recording([path], last + 2 * NS_PER_S).records()) == []
     # A copy, by another clock.
@@ -292,6 +288,6 @@ def test_the_files_of_a_directory_are_ordered_by_their_numbers(tmp_path: Path) -
     ]
 
 
-def test_steps_are_a_struct_of_plain_data(taken: list[FinishedStep]) -> None:
+def test_steps_are_a_struct_of_plain_data(taken: Taken) -> None:
     steps = encode_steps(7, taken[:50])
     assert msgspec.msgpack.decode(msgspec.msgpack.encode(steps), type=Steps) == steps

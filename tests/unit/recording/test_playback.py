@@ -57,8 +57,8 @@ def test_a_replay_goes_on_after_damage_at_the_next_state(tape: Tape, tmp_path: P
     assert playback.comparison.same
     (gap,) = playback.gaps
     assert gap.steps == 200
-    assert gap.begin == tape.taken[199].inputs.now
-    assert gap.end == tape.taken[400].inputs.now
+    assert gap.begin == tape.taken[199].now
+    assert gap.end == tape.taken[400].now
     assert len(recording.damage) == 1
 
 
@@ -91,10 +91,10 @@ def test_another_configuration_changes_the_lines(tape: Tape, tmp_path: Path) -> 
 
 def test_steps_outside_the_time_are_told_apart(tape: Tape, tmp_path: Path) -> None:
     path = tape.save(tmp_path / "a")
-    times = tape.taken[450].inputs.now.wall_ns, tape.taken[460].inputs.now.wall_ns
+    times = tape.taken[450].now.wall_ns, tape.taken[460].now.wall_ns
     recording = Recording([path], *times)
     playback = Playback(recording)
-    numbers = [s.number for s, _ in playback.steps() if recording.contains(s.inputs.now)]
+    numbers = [s.number for s, _ in playback.steps() if recording.contains(s.now)]
     assert numbers == list(range(450, 461))
     assert playback.comparison.steps == 200
     assert playback.comparison.same
@@ -113,8 +113,8 @@ def test_forged_numbers_give_an_error_in_words(tape: Tape, tmp_path: Path) -> No
     bad = Command("app", Twist(float("nan"), 0.0), -(1 << 62))
     for n, entry in enumerate(tape.taken[:20]):
         now = Instant((-1) ** n * (1 << 61 - n), 1 << 62 - n)
-        inputs = replace(entry.inputs, now=now, commands=(bad,), missed=1 << 62, late_ns=-(1 << 62))
-        forged.taken.append(entry._replace(inputs=inputs))
+        heard = replace(entry.heard, commands=(bad,), missed=1 << 62)
+        forged.taken.append(entry._replace(now=now, heard=heard, late_ns=-(1 << 62)))
     path = forged.save(tmp_path / "a")
     try:
         played(path)
@@ -132,10 +132,11 @@ def test_the_step_in_which_the_daemon_failed_is_replayed_too(
     path = tape.save(tmp_path / "a", end=200)
     with path.open("ab") as file:
         frames = FrameWriter(file)
-        at, state = tape.taken[200].inputs.now, tape.states[200]
+        at, state = tape.taken[200].now, tape.states[200]
         started_ns = START.wall_ns
         frames.begin(Head("0.2.0", "acsar", 200, at.mono_ns, at.wall_ns, "", state, started_ns))
-        frames.add(Failure(200, "BrokenError: x", tape.taken[200].inputs))
+        failed = tape.taken[200]
+        frames.add(Failure(200, "BrokenError: x", failed.now, failed.heard))
         frames.end()
     _, playback, _ = played(path)
     assert "(BrokenError: x), does not fail in this version" in playback.failed_step()

@@ -13,7 +13,7 @@ from tests.scenarios.world import World
 def estimates() -> list[Estimate]:
     tape = Tape()
     World(recorder=tape).drive(0.5, 0.2, seconds=0.5)
-    return [estimate for step in tape.taken for estimate in step.outputs.estimates]
+    return [estimate for step in tape.taken for estimate in step.news.estimates]
 
 
 def test_poses_are_rounded_to_millionths() -> None:

@@ -399,9 +399,9 @@ def test_a_bug_of_the_daemon_is_recorded_with_the_inputs_of_the_failed_step(
     failure = failure_of([path])
     assert failure.number == bench.world.steps
     assert failure.why == f"ZeroDivisionError: {BUG}"
-    assert failure.inputs is not None
+    assert failure.heard is not None
     # The bus delivers a called stop as an arrival and as a query.
-    assert [request.verb for request in failure.inputs.requests] == ["stop", "stop"]
+    assert [request.verb for request in failure.heard.requests] == ["stop", "stop"]
     playback = played([path])
     assert playback.comparison.steps == failure.number
     assert "does not fail in this version" in playback.failed_step()
@@ -431,10 +431,10 @@ def test_inputs_that_cannot_be_encoded_are_left_out(bench: Bench) -> None:
     bench.world.run(1.0)
     tape = Tape()
     World(recorder=tape).run(0.1)
-    bench.recorder.died(replace(tape.taken[0].inputs, missed=1 << 80))
+    bench.recorder.died(tape.taken[0].now, replace(tape.taken[0].heard, missed=1 << 80))
     bench.recorder.close(OverflowError("a name that is none: \udc80" + "x" * 1000))
     failure = failure_of(listed(bench.where))
-    assert failure.inputs is None
+    assert failure.heard is None
     assert failure.why.startswith("OverflowError: a name that is none: ")
     assert len(failure.why) < 300
     played(listed(bench.where))
@@ -455,7 +455,7 @@ def test_an_internal_error_that_ends_the_recorder_is_logged_at_once(
     tape = Tape()
     World(recorder=tape).run(0.1)
     step = tape.taken[0]
-    bench.recorder._queue.append(step._replace(inputs=replace(step.inputs, missed=1 << 80)))
+    bench.recorder._queue.append(step._replace(heard=replace(step.heard, missed=1 << 80)))
     bench.recorder._over.set()
     bench.recorder._thread.join(20.0)
     bench.world.run(0.1)
@@ -498,14 +498,14 @@ def test_the_control_loop_only_appends_to_the_queue(
     world.drive(0.5, seconds=0.5)
     step = tape.taken[-1]
     recorder = Recorder(config(tmp_path), lambda event: None)
-    recorder.step(*step, world.loop.robot, world.loop._guard)
+    recorder.step(step, world.loop.robot, world.loop._guard)
     assert asked.wait(20.0)
     before = len(recorder._queue)
     for _ in range(1000):
-        recorder.step(*step, world.loop.robot, world.loop._guard)
+        recorder.step(step, world.loop.robot, world.loop._guard)
     hung = not goes.is_set()
     assert (len(recorder._queue) - before, thread_names, hung) == (1000, {"record"}, True)
-    assert recorder._queue[-1][0] is step.inputs  # type: ignore[index]
+    assert recorder._queue[-1] is step
     goes.set()
     recorder.close()
     assert len(numbers_of(listed(tmp_path))) == 1001

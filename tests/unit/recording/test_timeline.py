@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -43,7 +44,7 @@ def texts(entries: list[TimelineEntry], name: str) -> list[str]:
 
 def test_each_event_has_an_entry_with_its_time_its_level_and_its_client() -> None:
     tape = driven()
-    events = [(o.now.wall_ns, e) for _, o, _ in tape.taken for e in o.events]
+    events = [(step.now.wall_ns, e) for step in tape.taken for e in step.news.events]
     first, *entries = story(tape)
     assert (first.name, first.wall_ns) == ("start", START.wall_ns)
     assert first.text == "the daemon starts (acsard 0.2.0)"
@@ -65,7 +66,7 @@ def test_a_recording_that_continues_another_begins_with_what_the_robot_does() ->
     steps = driven().steps()
     entry, *others = entries_of(head(150), *steps[150:])
     assert entry.name == "continues"
-    assert entry.wall_ns == steps[150].inputs.now.wall_ns
+    assert entry.wall_ns == steps[150].now.wall_ns
     assert entry.sentence == "the robot is driving (commanded by app), link up (by app)"
     assert "continues" not in {other.name for other in others}
 
@@ -88,7 +89,7 @@ def test_a_run_that_ends_without_a_shutdown_is_reported_before_the_next_start() 
     names = [entry.name for entry in entries]
     cut = names.index("cut")
     assert names[cut + 1] == "start"
-    assert entries[cut].wall_ns == steps[-1].inputs.now.wall_ns
+    assert entries[cut].wall_ns == steps[-1].now.wall_ns
 
 
 def test_a_run_that_ends_with_its_shutdown_was_not_cut() -> None:
@@ -107,7 +108,7 @@ def test_a_failure_of_the_daemon_is_reported() -> None:
     last = entries_of(head(), *steps, Failure(len(steps), "ValueError: seven"))[-1]
     assert (last.name, last.level) == ("failure", "error")
     assert last.text == "the daemon failed: ValueError: seven"
-    assert last.wall_ns == steps[-1].inputs.now.wall_ns
+    assert last.wall_ns == steps[-1].now.wall_ns
 
 
 def stopped_by_neutral_first() -> Tape:
@@ -132,11 +133,11 @@ def test_a_new_reason_of_the_same_mode_has_an_entry_with_its_source() -> None:
 def test_reasons_that_alternate_in_every_step_make_an_entry_a_second() -> None:
     steps = []
     for step in driven().steps()[:201]:
-        _, _, link, source, _ = step.recorded.status
-        code = f"code{step.number % 2}"
-        status = ("ready", f"reason {step.number}", link, source, code)
+        code: Any = f"code{step.number % 2}"
+        words = {"code": code, "reason": f"reason {step.number}"}
+        status = replace(step.recorded.status, mode="ready", **words)
         steps.append(replace(step, recorded=replace(step.recorded, status=status, events=())))
-    seconds = (steps[-1].inputs.now.mono_ns - steps[0].inputs.now.mono_ns) / 1e9
+    seconds = (steps[-1].now.mono_ns - steps[0].now.mono_ns) / 1e9
     assert len(texts(entries_of(head(), *steps), "reason")) == pytest.approx(seconds, abs=1)
 
 
@@ -152,8 +153,8 @@ def test_a_link_that_is_lost_has_the_reason_of_its_event_only() -> None:
 
 def test_a_source_that_waits_has_an_entry_once_in_a_drive() -> None:
     steps = driven().steps()
-    waits = Waits(steps[100].inputs.now, {"nav": ("source_priority", "app has priority")})
-    other = Waits(steps[150].inputs.now, {"nav": ("source_first", "app came first")})
+    waits = Waits(steps[100].now, {"nav": ("source_priority", "app has priority")})
+    other = Waits(steps[150].now, {"nav": ("source_first", "app came first")})
     entries = entries_of(head(), *steps[:100], waits, *steps[100:150], waits, other)
     assert texts(entries, "waits") == ["app has priority (by nav)", "app came first (by nav)"]
     again = entries_of(head(), *steps[:100], waits, *steps[100:], waits)

@@ -15,7 +15,6 @@ from acsard.core.values import (
     Event,
     Instant,
     Measured,
-    Outputs,
     Pose,
     PoseCovariance,
     Snapshot,
@@ -27,7 +26,7 @@ from acsard.core.values import (
     Wait,
     WheelSpeeds,
 )
-from acsard.recording.stepped_robot import news_of
+from tests.stepped import Outputs, news_of
 
 START = Instant(100_000_000_000, 1_700_000_000_000_000_000)
 

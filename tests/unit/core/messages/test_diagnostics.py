@@ -25,7 +25,6 @@ from acsard.core.values import (
     BatteryStatus,
     GyroStatus,
     Measured,
-    Outputs,
     RoutersStatus,
     Snapshot,
     SourceStatus,
@@ -33,6 +32,7 @@ from acsard.core.values import (
     Wait,
 )
 from tests.each import each
+from tests.stepped import Outputs
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, with_outputs
 
 CONFIG = Config(robot=RobotConfig("r7"), mcu=McuConfig(port="/dev/x"))

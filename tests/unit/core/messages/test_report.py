@@ -52,12 +52,12 @@ from acsard.core.values import (
     GyroDoes,
     GyroStatus,
     Instant,
-    Outputs,
     RoutersStatus,
     Snapshot,
     WheelsStatus,
 )
 from tests.each import each
+from tests.stepped import Outputs
 from tests.unit.core.messages.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, due, later
 
 ALL = {topic.key for topic in PUBLISHED if not topic.simulated}
