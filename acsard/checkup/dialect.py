@@ -44,7 +44,7 @@ def baud(board: Board) -> Finding:
                 heard=data.counted,
             )
     board.open(configured)
-    finding = outcomes.find(f"baud rate: {data.looks}", heard=data.counted, configured=configured)
+    finding = outcomes.find(f"baud rate: {data.code}", heard=data.counted, configured=configured)
     raise StoppedError(finding)
 
 

@@ -19,31 +19,31 @@ PASS baud rate: right | {rate} baud
 FAIL baud rate: other | {rate}, not {configured} baud
     {heard} at the configured {configured} baud; good lines at {rate}
     -> write mcu.baud_rate = {rate}; the check goes on with it
-FAIL baud rate: nothing | nothing received
+FAIL baud rate: received_nothing | nothing received
     {heard} at {configured} baud, and no good line at any other rate
     -> is this the right port (`acsard ports`), does the board have power, does its firmware answer,
     are TX and RX swapped?
-FAIL baud rate: cut | pieces of lines
+FAIL baud rate: received_cut | pieces of lines
     at {configured} baud {heard}; no good line at any other rate
     -> the firmware cuts its replies short or omits the line end: it must send all four values and
     Serial.println() in one reply; is its send buffer too small, or does it restart while it writes?
-FAIL baud rate: foreign | other bytes in the lines
+FAIL baud rate: received_foreign | other bytes in the lines
     at {configured} baud {heard}; no good line at any other rate
     -> the baud rate is right, but other bytes are on the line: a debug print of the firmware, or
     writes of a second program to this port. If it is neither, it is noise: use one ground for board
     and computer, and a short cable away from the motors' leads
-FAIL baud rate: garbage | only garbage
+FAIL baud rate: received_garbage | only garbage
     at {configured} baud {heard}; no good line at any other rate
     -> does the firmware send at 9600 to 115200 baud, at TTL level and not RS-232? is this the right
     port (`acsard ports`), and is the board's ground connected to the computer's?
-FAIL baud rate: few | few good lines
+FAIL baud rate: received_few | few good lines
     at {configured} baud {heard}; fewer good lines at any other rate
     -> use a short cable away from the motors' leads, a common ground, or a lower baud rate at both
     ends
-FAIL baud rate: statuses | only status lines
+FAIL baud rate: received_statuses | only status lines
     at {configured} baud {heard}; no good line at any other rate
     -> the board hears nothing: connect this computer's TX to the board's RX
-FAIL baud rate: sparse | good lines, but too seldom
+FAIL baud rate: received_sparse | good lines, but too seldom
     at {configured} baud {heard}; no good line at any other rate
     -> the board must answer each line, or report by its own clock at least every 0.25 s; does
     delay() or a slow print block its loop?

@@ -97,6 +97,7 @@ class Run:
         self.pose = PoseWitness(plan["config"])
         self.spread, self.log_lines = Spread(self.witness), LogLines()
         self.reports, self.echo, self.damage = Reports(), Echo(), Damage()
+        self._asked_ns: int | None = None  # the daemon asked the board for its name
         self.half_duplex = HalfDuplex()
         self.followed, self.course = Followed(self.witness), Course(self.witness)
         self.counts: Counter[str] = self.witness.counts
@@ -630,7 +631,10 @@ class Run:
     def _fed(self, at_ns: int, data: bytes) -> None:
         before, self._ended = self._ended, data[-1:]
         if b"!acsard-mcu " in data and b"\n!acsard-mcu " in before + data and data.endswith(b"\n"):
-            self._disarmed(at_ns - START_NS + self.slept_ns)  # the board says that it has started
+            named_ns, asked_ns = at_ns - START_NS + self.slept_ns, self._asked_ns
+            self._asked_ns = None
+            if asked_ns is None or named_ns - asked_ns > NS // 2:
+                self._disarmed(named_ns)  # the board says that it has started
         if b"!acsard-mcu" in data:
             self.liveness.event()  # also as the first bytes of all, and if the line is damaged
         if self._plain:
@@ -757,6 +761,8 @@ class Run:
         witness.cut |= not witness.linked
         self._whole = bool(snapshot.lines) and snapshot.lines[-1][1].endswith(b"\n")
         for at_ns, line in snapshot.lines:
+            if line == b"?\r\n":
+                self._asked_ns = true_ns
             before = witness.last
             witness.line(at_ns + offset, line, self._fed_ns, snapshot.decided_ns + offset)
             self.followed.line(true_ns, before, witness.last)

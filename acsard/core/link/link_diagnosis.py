@@ -11,7 +11,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.core.codes import CODES, LinkCode, Reason, sentence
+from acsard.core.codes import CODES, Reason, sentence
 from acsard.core.formatting import many, printable_bytes
 from acsard.core.link.codec import TOKENS
 from acsard.core.link.link_state import Link
@@ -38,17 +38,10 @@ MAX_SHOWN_BYTES = 64  # a complete line and some noise
 # statuses: only status lines. cut: pieces of valid lines, or no line ends. foreign: valid lines
 # within other bytes. garbage: nothing like a line. few: good lines, and bad ones. sparse: too few
 # lines.
-ReceivedClass = Literal["nothing", "statuses", "cut", "foreign", "garbage", "few", "sparse"]
-
-RECEIVED_CODES: dict[ReceivedClass, LinkCode] = {
-    "nothing": "received_nothing",
-    "statuses": "received_statuses",
-    "cut": "received_cut",
-    "foreign": "received_foreign",
-    "garbage": "received_garbage",
-    "few": "received_few",
-    "sparse": "received_sparse",
-}
+ReceivedCode = Literal[
+    "received_nothing", "received_statuses", "received_cut", "received_foreign",
+    "received_garbage", "received_few", "received_sparse",
+]  # fmt: skip
 
 CHECKED_FIRMWARE = ', does its firmware support mcu.link_check = "on" (else write "off")'
 
@@ -123,16 +116,16 @@ class Heard(Struct):
             self.last = line
 
     @property
-    def looks(self) -> ReceivedClass:
+    def code(self) -> ReceivedCode:
         if self.statuses and not self.lines:
-            return "statuses"
+            return "received_statuses"
         if not self.size:
-            return "nothing"
+            return "received_nothing"
         if self.good:
-            return "few" if self.good < self.lines else "sparse"
+            return "received_few" if self.good < self.lines else "received_sparse"
         if self.lines and _RIGHT.search(self.last):
-            return "foreign"
-        return "cut" if _PIECE.fullmatch(self.last) else "garbage"
+            return "received_foreign"
+        return "received_cut" if _PIECE.fullmatch(self.last) else "received_garbage"
 
     @property
     def counted(self) -> str:
@@ -157,11 +150,11 @@ class Heard(Struct):
 
     def diagnosis(self, checked: bool = False) -> Reason:
         """Return the complete diagnosis, for `state`; `checked` is `mcu.checked`."""
-        if self.looks == "sparse" and self.late_s:
+        if self.code == "received_sparse" and self.late_s:
             received = "too few lines for a link"
             return sentence("host_late", seconds=self.late_s, received=received)
         firmware = CHECKED_FIRMWARE if checked else ""
-        return sentence(RECEIVED_CODES[self.looks], received=self.counted, firmware=firmware)
+        return sentence(self.code, received=self.counted, firmware=firmware)
 
 
 class SilenceDiagnosis:
@@ -186,7 +179,7 @@ class SilenceDiagnosis:
             return False
         before, self.heard = self.heard, self.now
         self.now, self._since_ns = Heard(), now_ns
-        return before is None or before.looks != self.heard.looks
+        return before is None or before.code != self.heard.code
 
 
 class UnansweredLines(Struct):

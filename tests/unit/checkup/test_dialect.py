@@ -11,7 +11,7 @@ from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.outcomes import find
 from acsard.core.config.settings import Config, McuConfig
-from acsard.core.link.link_diagnosis import ReceivedClass
+from acsard.core.link.link_diagnosis import ReceivedCode
 from tests.each import each
 from tests.unit.checkup.robots import Checked, Robot
 
@@ -47,9 +47,9 @@ def test_a_board_that_sends_status_lines_but_receives_nothing_has_its_own_outcom
 
 
 def test_every_diagnosis_of_the_received_bytes_has_an_outcome_of_its_own() -> None:
-    for look in get_args(ReceivedClass):
-        finding = find(f"baud rate: {look}", heard="2 lines", configured=115200)
-        assert finding.verdict == "FAIL", look
+    for code in get_args(ReceivedCode):
+        finding = find(f"baud rate: {code}", heard="2 lines", configured=115200)
+        assert finding.verdict == "FAIL", code
 
 
 def test_a_board_passes_with_and_without_an_identification() -> None:

@@ -15,7 +15,6 @@ from acsard.core.link.link_diagnosis import (
     WINDOW_LINES,
     Heard,
     Lateness,
-    ReceivedClass,
     SilenceDiagnosis,
     UnansweredLines,
 )
@@ -26,7 +25,7 @@ QUIET_NS = 100 * MS
 
 STILL = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 
-HEARD: dict[str, tuple[bytes, ReceivedClass, str]] = {
+HEARD: dict[str, tuple[bytes, str, str]] = {
     "mute": (b"", "nothing", "nothing was received"),
     "half lines": (
         b"ap00.00,bp00.00,c" * 9,
@@ -161,10 +160,10 @@ def diagnosis_of(data: bytes) -> Heard:
 
 @pytest.mark.parametrize(("data", "looks", "counted"), HEARD.values(), ids=HEARD)
 def test_the_diagnosis_says_what_was_received_how_it_looks_and_what_to_do(
-    data: bytes, looks: ReceivedClass, counted: str
+    data: bytes, looks: str, counted: str
 ) -> None:
     diagnosis = diagnosis_of(data)
-    assert diagnosis.looks == looks
+    assert diagnosis.code == f"received_{looks}"
     assert counted in diagnosis.counted
     assert diagnosis.diagnosis().code == f"received_{looks}"
     assert diagnosis.counted in diagnosis.diagnosis().text
@@ -178,8 +177,8 @@ def test_the_diagnosis_comes_after_three_seconds_and_again_only_when_it_changes(
             hearing.now.take(b"\x00")
         if hearing.judge(now_ns):
             assert hearing.heard is not None
-            reports.append((tick, hearing.heard.looks))
-    assert reports == [(10, "nothing"), (60, "garbage")]
+            reports.append((tick, hearing.heard.code))
+    assert reports == [(10, "received_nothing"), (60, "received_garbage")]
     hearing.forget()
     assert hearing.heard is None
     assert not hearing.judge(10 * FIRST_DIAGNOSIS_NS)
@@ -191,7 +190,7 @@ def sparse(bench: Bench) -> Heard:
         bench.wait(10, *([GOOD] if tick % 20 == 1 and tick < 50 else []))
     diagnosis = bench.session._hearing.heard
     assert diagnosis is not None
-    assert diagnosis.looks == "sparse"
+    assert diagnosis.code == "received_sparse"
     return diagnosis
 
 
