@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from msgspec.structs import replace
 
@@ -92,6 +93,24 @@ def sibling(settings: Config, number: int) -> Config:
     return replace(settings, robot=name, bus=bus)
 
 
+# Settings that the polled program and the event loop read, so their defaults are written too.
+READ = {("mcu", "baud_rate"), ("control", "rate")}
+
+
+def chosen(settings: Config) -> dict[str, Any]:
+    """Return the settings that are not the defaults: another checkout may not know the others."""
+    usual: dict[str, Any] = effective(Config())
+    tables: dict[str, Any] = effective(settings)
+    return {
+        name: {
+            key: value
+            for key, value in table.items()
+            if (name, key) in READ or value != usual[name][key]
+        }
+        for name, table in tables.items()
+    }
+
+
 @contextmanager
 def rig(
     settings: Config,
@@ -104,7 +123,7 @@ def rig(
     """Start a program and a simulated board. The body runs when the link between them is up."""
     with TemporaryDirectory(prefix="acsard-bench-") as where:
         file = Path(where) / "acsard.toml"
-        file.write_text("\n".join(document(effective(settings))) + "\n", encoding="utf-8")
+        file.write_text("\n".join(document(chosen(settings))) + "\n", encoding="utf-8")
         with Rig(
             settings,
             file,
