@@ -103,7 +103,6 @@ class Robot:
         )
         self._arbiter = Arbiter(config.commands)
         self._cap = SpeedCap(None)
-        self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
         self._life = Lifecycle(latches)
         self._announced: tuple[Event, ...] = ()  # for the next `hear`
         if latches.in_force:
@@ -111,19 +110,15 @@ class Robot:
             first = Event("mode", why.text, "warning", kind=kind, code=why.code)
             self._announced = (first,)
         self._choice = Choice()
-        self._limited = False  # a bumper limited it
         self._last = LastLine(made_of=(None, self._life.mode))
         # Motion, twist, limits and cap with which the motion does not change; its wheel speeds.
-        self._steady: tuple[Motion, Twist, LimitsConfig, float] | None = None
-        self._steady_speeds = STILL
-        self._trip: Trip = ""  # of the guard, until the next step
+        self._steady: tuple[tuple[Motion, Twist, LimitsConfig, float] | None, WheelSpeeds]
+        self._steady = (None, STILL)
         self.status = Status("", "booting", "", "down")
-        self._battery_level = ""  # with `status`
         # Since the start: `commands` (accepted), `command_<reason>` (refused),
         # `commands_of_new_senders` (not proved yet), lines to the board, and events.
         self.counters: Counter[str] = Counter()
-        self._refused = ""
-        self._refused_ns: Ns | None = None
+        self._refused: tuple[str, Ns] | None = None  # the last command, and when
         self._sanity = Sanity()
         self._inputs = inputs_after(latches, config)
         self._answered = UnansweredLines()
@@ -132,13 +127,13 @@ class Robot:
         # second, which leads to the reply, is not logged.
         self._asked: tuple[str, str, int | None] = ("", "", None)
         self._told = CommandEvents(self._life.mode)
-        self._port_trouble = ""
         self._linked_once = False
         self._arbiter.require_neutral()
 
     def snapshot(self, now_ns: Ns) -> Snapshot:
         """Return what `state` and `diagnostics` need; too slow for every wake-up."""
-        session, since, silent = self.session, self._refused_ns, self.session.silent(now_ns)
+        session, silent = self.session, self.session.silent(now_ns)
+        refused, since_ns = self._refused or ("", None)
         counters = {"lines": session.good_lines} | self._odometry.unseen.counters()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
         if session.count_recovery.coarse_lines:
@@ -156,8 +151,8 @@ class Robot:
             speeds=None if silent else self._odometry.speeds,
             sources=self._arbiter.sources(now_ns),
             counters=counters | self.counters,
-            refused=self._refused,
-            refused_age_s=None if since is None else (now_ns - since) / NS_PER_S,
+            refused=refused,
+            refused_age_s=None if since_ns is None else (now_ns - since_ns) / NS_PER_S,
             feedback_age_s=session.feedback_age_s(now_ns),
             gyro=checks.gyro_status,
             doubt=checks.wheels.status,
@@ -217,31 +212,27 @@ class Robot:
             events.append(missed(heard.missed, self.config.period_ns))
         estimates = self._fold(now, heard, events)
         answers: tuple[Answer, ...] = ()
-        if heard.requests or self._trip or heard.shutting_down:
+        if heard.requests or self._last.trip or heard.shutting_down:
             answers = self._serve(now, heard, events)
         if heard.speed_cap is not None:
             self._cap_speed(heard.speed_cap, events)
         if heard.commands or heard.refusals:
             self._accept_commands(now_ns, heard, events)
-        inputs, limited = self._inputs, self._limited
-        limiting = inputs.bumpers.state == "pressed" and inputs.bumpers.limiting(self.config.safety)
-        is_chosen = now_ns >= self._arbiter.until_ns or limiting or limited
+        is_chosen = now_ns >= self._arbiter.until_ns
         if is_chosen:
-            self._choose(now_ns, limiting)
-        mode, battery, status = life.mode, inputs.battery.status, self.status
+            self._choose(now_ns)
+        mode, status = life.mode, self.status
         urgent = (self._choice.arrived_ns, mode) != self._last.made_of
-        level = battery.level if battery else ""
-        changed = False
         if (
             is_chosen
             or events
             or answers
             or mode not in UNLATCHED
             or mode._value_ != status.mode
-            or level != self._battery_level
+            or self._inputs.battery.level != status.battery
         ):
-            changed = self._restate() or level != self._battery_level
-            self._battery_level = level
+            self._restate(heard.port_trouble)
+        changed = self.status is not status
         if changed or urgent:
             why = Reason(self.status.code, self.status.reason)
             events += self._told.changes(mode, self._choice, why)
@@ -270,14 +261,15 @@ class Robot:
         elif mode is Mode.DRIVING and twist is not None:
             cap = math.inf if self._cap.speed is None else self._cap.speed
             wanted = (last.motion, twist, limits, cap)
-            if wanted == self._steady:
-                motion, speeds = last.motion, self._steady_speeds
+            steady, speeds = self._steady
+            if wanted == steady:
+                motion = last.motion
             else:
-                dt = min(since, self._max_dt)
+                dt = min(since, max(MAX_DT, 1.5 / self.config.rate_hz))
                 motion = last.motion.follow(twist, dt, limits, self._kinematics, cap)
                 speeds = self._kinematics.wheel_speeds(motion.twist)
                 if motion is last.motion:
-                    self._steady, self._steady_speeds = wanted, speeds
+                    self._steady = (wanted, speeds)
         else:
             motion = last.motion.coast(since, limits, stop=mode in HALTED)
             speeds = self._kinematics.wheel_speeds(motion.twist)
@@ -293,8 +285,8 @@ class Robot:
 
         `trip` says why the guard replaced it with the stop line.
         """
-        self._trip, left = trip, line is not None
-        self._last.sent(left=left, replaced=bool(trip))
+        left = line is not None
+        self._last.sent(left, trip)
         # The board must not be expected to answer a line that the guard has replaced.
         self.session.sent(left_ns, was_written=left and not trip)
         if left:
@@ -323,7 +315,6 @@ class Robot:
                 self.counters["link_lost_host_stall"] += 1
         if link != "up":
             self._forget()
-        self._port_trouble = heard.port_trouble
         if session.restarted:
             # No sender drives before the link is up for the first time, so accept a zero that was
             # sent during the start.
@@ -361,7 +352,10 @@ class Robot:
         # A press stops the robot even if it began and ended between two wake-ups.
         inputs, life, config, now_ns = self._inputs, self._life, self.config, now.mono_ns
         estop, bumpers = inputs.estop, inputs.bumpers
-        events += inputs.process_reports(self.session, now_ns, config)
+        changes = inputs.process_reports(self.session, now_ns, config)
+        if changes or self.session.status.new:
+            self._arbiter.until_ns = 0  # bumpers limit the choice
+        events += changes
         if estop.pressed_now is not None:
             self.counters["emergency_stops"] += 1
             life.press(estop.pressed_now, now)
@@ -383,9 +377,9 @@ class Robot:
             inputs.forget(config)
         life.refuse_clear(inputs.clear_refusal(self.session, config), now_ns)
 
-    def _choose(self, now_ns: Ns, limiting: bool) -> None:
-        self._choice, self._limited = self._arbiter.choose(now_ns), limiting
-        if limiting:
+    def _choose(self, now_ns: Ns) -> None:
+        self._choice = self._arbiter.choose(now_ns)
+        if self._inputs.bumpers.limiting(self.config.safety):
             self._limit_by_bumpers(now_ns)
         self._life.command(self._choice.twist is not None)
 
@@ -461,7 +455,7 @@ class Robot:
     # Requests.
 
     def _serve(self, now: Instant, heard: Heard, events: list[Event]) -> tuple[Answer, ...]:
-        trip, self._trip = self._trip, ""
+        trip, self._last.trip = self._last.trip, ""
         if trip:
             self._fault(reason(trip), now, events)
             self._life.caused_again(now.mono_ns)
@@ -576,7 +570,7 @@ class Robot:
             self.counters["commands_of_new_senders"] += 1
             return
         self.counters[f"command_{refusal.reason}"] += 1
-        self._refused_ns, self._refused = now_ns, refusal.text[:MAX_REFUSAL_LENGTH]
+        self._refused = (refusal.text[:MAX_REFUSAL_LENGTH], now_ns)
 
     # Limits and kinematics.
 
@@ -596,14 +590,14 @@ class Robot:
 
     # Report.
 
-    def _restate(self) -> bool:
-        # Returns whether the status has changed.
-        life, choice, before = self._life, self._choice, self.status
-        why = reason_of(life, choice, self.session, self._inputs, self.config, self._port_trouble)
+    def _restate(self, port_trouble: str) -> None:
+        life, choice, session, inputs = self._life, self._choice, self.session, self._inputs
+        why = reason_of(life, choice, session, inputs, self.config, port_trouble)
         # Use `_value_`, because the property `value` of an enum runs Python code.
-        mode = life.mode._value_
-        self.status = Status(mode, why.code, why.text, self.session.link, choice.source)
-        return self.status != before
+        mode, level = life.mode._value_, inputs.battery.level
+        status = Status(mode, why.code, why.text, session.link, choice.source, level)
+        if status != self.status:
+            self.status = status
 
 
 def _stop_of(by: str, latches: Latches) -> int:

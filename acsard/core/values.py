@@ -436,6 +436,7 @@ class Status(Struct, frozen=True):
     link: str
     # Selected by the arbiter, which does not always drive: it may need a zero, or a latch holds.
     source: str = ""
+    battery: BatteryLevel | Literal[""] = ""  # "" if the board does not report it
 
 
 class News(Struct, frozen=True):
@@ -443,7 +444,7 @@ class News(Struct, frozen=True):
 
     - urgent: the board should get a new line at once, for a new command or mode, or because an
       input was pressed.
-    - status_changed: `Robot.status` or the battery's level.
+    - status_changed: there is another `Robot.status`.
     """
 
     estimates: tuple[Estimate, ...] = ()

@@ -32,7 +32,7 @@ from acsard.core.motion.last_line import LastLine
 from acsard.core.motion.modes import Mode
 from acsard.core.motion.sanity import Sanity
 from acsard.core.robot import Robot
-from acsard.core.values import AcsardError, Event, Ns, SpeedCap, Status, Trip
+from acsard.core.values import AcsardError, Event, Ns, SpeedCap, Status
 from acsard.recording.unpickling import MAX_BYTES, unpickle
 
 # Attributes of a robot that are plain data, without configuration inside, with their types.
@@ -41,15 +41,10 @@ PARTS: dict[str, Any] = {
     "_last": LastLine,
     "_cap": SpeedCap,
     "_choice": Choice,
-    "_limited": bool,
-    "_trip": Trip,
     "_announced": tuple[Event, ...],
     "status": Status,
-    "_battery_level": str,
-    "_refused": str,
-    "_refused_ns": Ns | None,
+    "_refused": tuple[str, Ns] | None,
     "_asked": tuple[str, str, Ns | None],
-    "_port_trouble": str,
     "_linked_once": bool,
     "_answered": UnansweredLines,
     "_sanity": Sanity,
@@ -59,7 +54,7 @@ PARTS: dict[str, Any] = {
 }
 
 # Not stored: they follow from the configuration, and no line is pending between two steps.
-DERIVED = ("config", "_kinematics", "_max_dt", "_steady", "_steady_speeds")
+DERIVED = ("config", "_kinematics", "_steady")
 
 # A package ends with a dot. The classes need constructors without side effects.
 PART_MODULES = (

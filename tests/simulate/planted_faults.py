@@ -425,7 +425,7 @@ FAULTS = (
         "limits stall",
         "the robot leaps after a stall",
         ROBOT,
-        "dt = min(since, self._max_dt)",
+        "dt = min(since, max(MAX_DT, 1.5 / self.config.rate_hz))",
         "dt = since",
     ),
     fault(
@@ -611,8 +611,8 @@ FAULTS = (
         "robot unsent",
         "a line that never left counts as obeyed",
         ROBOT,
-        "        self._trip, left = trip, line is not None\n",
-        "        self._trip, left = trip, True\n",
+        "        left = line is not None\n",
+        "        left = True\n",
     ),
     # session
     fault(

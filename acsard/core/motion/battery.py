@@ -10,7 +10,7 @@ falls slowly.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import get_args
+from typing import Literal, get_args
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -92,6 +92,10 @@ class Battery(Struct):
     since_ns: Ns = 0  # first report since the last silence
     mean_ns: Ns = 0  # newest report in `mean`
     stood_ns: Ns = 0  # sum of the weights in `mean`
+
+    @property
+    def level(self) -> BatteryLevel | Literal[""]:
+        return "" if self.status is None else self.status.level
 
     @property
     def refuses_clear(self) -> bool:

@@ -6,7 +6,7 @@ from msgspec import Struct
 
 from acsard.core.motion.limits import AT_REST, Motion
 from acsard.core.motion.modes import Mode
-from acsard.core.values import REST, STILL, Ns, Twist, WheelSpeeds
+from acsard.core.values import REST, STILL, Ns, Trip, Twist, WheelSpeeds
 
 
 class LastLine(Struct):
@@ -23,6 +23,7 @@ class LastLine(Struct):
     # Arrival of the command, and the mode, of the last line. None after a press: a new line is due.
     made_of: tuple[Ns | None, Mode] | None = None
     waiting: tuple[Motion, WheelSpeeds] | None = None  # for `sent`
+    trip: Trip = ""  # why the guard replaced the last line, until the robot has latched the fault
     pressed_ns: Ns = 0  # last press of the emergency stop or a bumper
 
     def cut(self) -> None:
@@ -34,13 +35,13 @@ class LastLine(Struct):
         self.cut()
         self.made_of, self.pressed_ns = None, now_ns
 
-    def sent(self, *, left: bool, replaced: bool) -> None:
-        """Record whether the line left, and whether the guard replaced it with zeros."""
-        waiting, self.waiting = self.waiting, None
+    def sent(self, left: bool, trip: Trip) -> None:
+        """Record whether the line left, and why the guard replaced it with zeros."""
+        waiting, self.waiting, self.trip = self.waiting, None, trip
         assert waiting is not None
         if left:
             self.left_ns = self.made_ns
-            self.motion, self.written = (AT_REST, STILL) if replaced else waiting
-        elif replaced:
+            self.motion, self.written = (AT_REST, STILL) if trip else waiting
+        elif trip:
             self.motion = AT_REST
         self.applied = self.motion.twist
