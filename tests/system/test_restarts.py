@@ -46,14 +46,14 @@ CYCLE_S = 1.0
 CRASH = """\
 import os, signal
 from acsard.core.robot import Robot
-whole, crashes = Robot.step, []
+whole, crashes = Robot.hear, []
 signal.signal(signal.SIGUSR2, lambda *_: crashes.append(1))
-def step(robot, inputs):
-    outputs = whole(robot, inputs)
+def hear(robot, now, heard):
+    news = whole(robot, now, heard)
     if crashes:
         raise ZeroDivisionError("a bug")
-    return outputs
-Robot.step = step
+    return news
+Robot.hear = hear
 """
 """Put into the daemon: SIGUSR2 makes the next control step raise an exception."""
 
