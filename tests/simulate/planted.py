@@ -98,7 +98,7 @@ def plant(fault: Fault, tree: Path) -> None:
     shutil.copytree(ROOT / "acsard", tree / "acsard", ignore=ignored)
     shutil.copytree(ROOT / "tests" / "simulate", tree / "tests" / "simulate", ignore=ignored)
     (tree / "tests" / "scenarios").mkdir()
-    helpers = ("scenarios/world.py", "scenarios/imperfect_gyro.py", "noise.py")
+    helpers = ("scenarios/world.py", "scenarios/imperfect_gyro.py", "noise.py", "stepped.py")
     for name in ("__init__.py", "scenarios/__init__.py", *helpers):
         shutil.copy(ROOT / "tests" / name, tree / "tests" / name)
     for module, text in edited(fault).items():
