@@ -759,6 +759,8 @@ class Run:
         # Lines without the check that the configuration requires make no link.
         self._linked |= witness.linked
         witness.cut |= not witness.linked
+        calm_ns = max(self._stalled_ns, self._blocked_ns) - offset
+        self.plugging.see(true_ns, snapshot, self.product, calm_ns)
         self._whole = bool(snapshot.lines) and snapshot.lines[-1][1].endswith(b"\n")
         for at_ns, line in snapshot.lines:
             if line == b"?\r\n":
@@ -778,7 +780,8 @@ class Run:
         self.course.step(true_ns, driven, witness.last, whole)
         self.liveness.judge(true_ns)
         self.reasons.judge(true_ns, self._stalled_ns)
-        if self._plain and not self.echo.on:
+        # The daemon that has found an echo hears no line until the port is opened again.
+        if self._plain and not (self.echo.on or self.half_duplex.on):
             self.damage.judge(true_ns, self._lines, self._stalled_ns == true_ns)
         if snapshot.estimates:
             lies, truth = self._names, self.product.truth()
@@ -796,10 +799,8 @@ class Run:
         if self.pose.end_step():
             self.spread.forget()
         self.log_lines.see(true_ns, snapshot)
-        calm_ns = max(self._stalled_ns, self._blocked_ns) - offset
         calm = snapshot.decided_ns - calm_ns > 3 * witness.period_ns
         self.inputs.step(true_ns, snapshot, offset, calm, self.product.state)
-        self.plugging.see(true_ns, snapshot, self.product, calm_ns)
         if self.log is not None:
             self.log(
                 {

@@ -559,9 +559,6 @@ class Inputs:
         if not self._reports:
             return
         witness, moving = self._witness, self._moving(snapshot.lines)
-        if self._away and self.bumpers.is_known and b"X" in self.bumpers.marks:
-            self._drives_away(true_ns, moving)
-            self._pushes(snapshot.decided_ns + offset)
         for name, pressed_ns in self._stopping():
             since = f"pressed since {pressed_ns / NS:.3f} s"
             if moving:
@@ -575,6 +572,9 @@ class Inputs:
             raise BrokenError("a press stops the robot, however short", true_ns, text)
         if self._fresh and moving:
             raise BrokenError("a press is a zero at once", true_ns, str(moving))
+        if self._away and self.bumpers.is_known and b"X" in self.bumpers.marks:
+            self._drives_away(true_ns, moving)
+            self._pushes(snapshot.decided_ns + offset)
         if not self._mode and self._estopped and "emergency_stop" in snapshot.causes:
             # A new daemon knows a stop of the emergency stop from its latch file. Only `clear` ends
             # it, also if a full disk has lost the `clear` of the daemon before.

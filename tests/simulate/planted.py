@@ -3,10 +3,10 @@
     python -m tests.simulate.planted [--jobs 2] [--only NAME] [--missing] [--again]
 
 Each fault is planted alone into a copy of this tree. A process plays seeds there until a promise
-breaks or the time limit is reached. A finding counts only if the same seed breaks no promise
-without the fault. `PLANTED.md` stores the results; a run replaces the rows of the faults that it
-played. `--again` plays only the recorded seed of each row, which takes seconds, and changes no
-file.
+breaks or the time limit is reached: first the seeds that find other faults, because `.ci/run` plays
+each seed of the table. A finding counts only if the same seed breaks no promise without the fault.
+`PLANTED.md` stores the results; a run replaces the rows of the faults that it played. `--again`
+plays only the recorded seed of each row, which takes seconds, and changes no file.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -27,8 +28,9 @@ from pathlib import Path
 from threading import Lock
 from typing import NamedTuple
 
-from tests.simulate.actors import played
-from tests.simulate.plan import make_plan
+from tests.simulate import board_inputs
+from tests.simulate.actors import REPLAYED, played
+from tests.simulate.plan import Plan, make_plan
 from tests.simulate.planted_cases import CASES
 from tests.simulate.planted_faults import FAULTS, Fault
 
@@ -37,8 +39,6 @@ TABLE = Path(__file__).with_name("PLANTED.md")
 
 FAULT_MINUTES, CASE_MINUTES = 10.0, 30.0
 """Core-minutes within which a fault and a case must be found."""
-
-FIRST_SEED = 1
 
 MEASURED_WITH = (
     "plan", "roads", "actors", "ages", "bad_moments", "board_inputs", "course", "damage",
@@ -49,19 +49,20 @@ MEASURED_WITH = (
 
 CHILD = """
 import json, sys
-from tests.simulate.actors import REPLAYED, collect_seldom, played
-from tests.simulate.board_inputs import kinds
+from itertools import chain, count
+from tests.simulate.actors import collect_seldom, played
 from tests.simulate.plan import make_plan
+from tests.simulate.planted import kinds
 collect_seldom()
-seed, left, kind = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
-while left > 0.0:
+first, left, kind = json.loads(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
+for seed in chain(first, (seed for seed in count(1) if seed not in first)):
     plan = make_plan(seed)
-    recorded = "" if seed % REPLAYED else "recorded"
-    if not kind or kind in kinds(plan) | {plan.get("moment", ""), recorded}:
+    if not kind or kind in kinds(plan):
         result = played(plan)
         left -= result.cpu_s
         print(json.dumps([seed, result.promise, result.cpu_s, result.simulated_s]), flush=True)
-    seed += 1
+    if left <= 0.0:
+        break
 """
 
 
@@ -125,19 +126,14 @@ def edited(fault: Fault) -> dict[str, str]:
 
 def hunt(fault: Fault, minutes: float) -> Row:
     """Plant the fault and play seeds until one finds it or the time limit is reached."""
-    seed, cpu_s, simulated_s = FIRST_SEED, 0.0, 0.0
+    cpu_s, simulated_s = 0.0, 0.0
     with tempfile.TemporaryDirectory() as name:
         plant(fault, Path(name))
-        while cpu_s < 60 * minutes:
-            promise = ""
-            for play in plays(Path(name), seed, 60 * minutes - cpu_s, fault.kind):
-                cpu_s += play.cpu_s
-                simulated_s += play.simulated_s
-                seed, promise = play.seed + 1, play.promise
-                if promise:
-                    break
-            if promise and not sound_finding(seed - 1):
-                return _row(fault, promise, str(seed - 1), cpu_s, simulated_s)
+        for play in plays(Path(name), seeds(), 60 * minutes, fault.kind):
+            cpu_s += play.cpu_s
+            simulated_s += play.simulated_s
+            if play.promise and not sound_finding(play.seed):
+                return _row(fault, play.promise, str(play.seed), cpu_s, simulated_s)
     return _row(fault, "not found", "", cpu_s, simulated_s)
 
 
@@ -152,7 +148,7 @@ def broken_again(fault: Fault, row: Row) -> str:
     with tempfile.TemporaryDirectory() as name:
         plant(fault, Path(name))
         # The process plays one seed at least, however short its time.
-        (play,) = plays(Path(name), seed, 0.001)
+        (play,) = plays(Path(name), [seed], 0.001)
     if not play.promise:
         return "breaks no promise"
     return sound_finding(seed) and f"also breaks one without the fault: {sound_finding(seed)}"
@@ -164,6 +160,16 @@ def sound_finding(seed: int) -> str:
     return played(make_plan(seed)).finding
 
 
+def kinds(plan: Plan) -> set[str]:
+    """Return the kinds of a plan, by which `Fault.kind` chooses it."""
+    names = board_inputs.kinds(plan) | {plan.get("moment", "")}
+    names |= {"recorded"} if plan["seed"] % REPLAYED == 0 else set()
+    for event in plan["events"]:
+        names |= {*event, event["do"], *event.get("fault", ())[:1]}
+        names |= {key.partition(".")[0] for key in event.get("settings", ())}
+    return names
+
+
 class Play(NamedTuple):
     """The result of playing one seed with a fault."""
 
@@ -173,15 +179,15 @@ class Play(NamedTuple):
     simulated_s: float
 
 
-def plays(tree: Path, seed: int, seconds: float, kind: str = "") -> Iterator[Play]:
-    """Yield the results of consecutive seeds, played on the code in `tree`.
+def plays(tree: Path, first: list[int], seconds: float, kind: str = "") -> Iterator[Play]:
+    """Yield the results of seeds, played on the code in `tree`: these first, then from 1 on.
 
-    With a `kind`, only plans with these inputs or this moment are played. It ends when the time is
-    over, or early if another program ends the process.
+    With a `kind`, only plans of this kind are played (`Fault.kind`). It ends when the time is over,
+    or early if another program ends the process.
     """
     environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
     child = subprocess.Popen(
-        [sys.executable, "-c", CHILD, str(seed), str(seconds), kind],
+        [sys.executable, "-c", CHILD, json.dumps(first), str(seconds), kind],
         stdout=subprocess.PIPE, text=True, cwd=tree, env=environment,
     )  # fmt: skip
     assert child.stdout is not None
@@ -198,16 +204,13 @@ def plays(tree: Path, seed: int, seconds: float, kind: str = "") -> Iterator[Pla
 HEAD = """# Planted faults
 
 `python -m tests.simulate.planted` writes this page. Each fault is planted alone into a copy of the
-product, and the simulator plays seeds from {seed} on until a promise breaks. A seed that also
-breaks a promise of the sound product does not count. Core-minutes are the processor time of the
-process that plays, on a machine that other work kept busy.
+product, and the simulator plays seeds until a promise breaks: first the seeds of other rows, so
+that few seeds find all faults, then from 1 on. A seed that also breaks a promise of the sound
+product does not count; `.ci/run` plays all {seeds} seeds on the sound product. Core-minutes are the
+processor time of the process that plays, on a machine that other work kept busy.
 
-For a fault of the emergency stop, of bumpers that let the robot drive away, of a motor driver, or
-of the battery, only plans with this input are played, about one in fifteen. For a fault that only
-a late step with several events shows, only plans with such a step are played, about one in twenty.
-For `freshness halves` and `freshness budget`, only plans with new senders whose commands are held
-back, or with delays that rise in steps, are played, about one in sixty. For a fault that only a
-replay shows, only plans that are recorded are played, one in ten. A fault must be found within
+For some faults only plans of one kind are played, for example with an emergency stop
+(`PLANS_OF_FAULT` in `planted_faults.py`). A fault must be found within
 {fault:g} core-minutes, a case within {case:g}. A row keeps its last measurement. Its last column is
 the version of the simulator that measured it: a digest of the modules that make, play and judge
 plans. With the present plans, another seed may find an older row's fault. `--again` prints the
@@ -231,10 +234,18 @@ def read() -> dict[str, Row]:
     return {row[0]: Row(*row) for row in rows if len(row) == len(Row._fields)}
 
 
+def seeds() -> list[int]:
+    """Return the seeds of the table, those that find the most faults first."""
+    found = Counter(row.seed for row in read().values() if row.seed.isdigit())
+    return [int(seed) for seed, _ in found.most_common()]
+
+
 def text_of(rows: dict[str, Row]) -> str:
     """Return the text of `PLANTED.md` with these rows, in the order of the faults' definitions."""
     minutes = {"fault": FAULT_MINUTES, "case": CASE_MINUTES}
-    text = HEAD.format(seed=FIRST_SEED, **minutes)
+    text = HEAD.format(
+        seeds=len({row.seed for row in rows.values() if row.seed.isdigit()}), **minutes
+    )
     for title, faults in (("Faults", FAULTS), ("Cases that were once true", CASES)):
         known = [rows[fault.name] for fault in faults if fault.name in rows]
         text += f"\n## {title}\n{COLUMNS}"

@@ -26,7 +26,12 @@ PLANS_OF_FAULT = {
     "wheel press": "behind a press", "wheel counts": "coarse encoders",
     "wheel waited": "late lines", "limits saturated": "wheel limit",
     "freshness halves": "backlogs of newcomers", "freshness budget": "later and later",
-    "replay": "recorded",
+    "replay": "recorded", "lines endless": "endless", "sanity blind": "reversed_motor",
+    "session gap": "mute", "session stale": "mute", "odometry silent": "mute",
+    "odometry gap": "mute",
+    "loop end": "restart", "robot end": "restart", "gate late": "stall in step",
+    "session echo": "half_duplex", "case 11": "echo", "limits clock": "wall",
+    "robot unsent": "block", "robot limits": "limits", "lifecycle number": "typed",
 }  # fmt: skip
 """Kinds of plans by the name of a fault, or by the first word of its name."""
 
@@ -43,7 +48,8 @@ class Fault(NamedTuple):
     def kind(self) -> str:
         """The kind of plans that can find the fault, or "" for all plans.
 
-        It is a kind of inputs, a moment of `bad_moments.py`, or "recorded".
+        It is a kind of inputs, an event or one of its values, a fault of the board, a table of
+        settings that a call changes, a moment of `bad_moments.py`, or "recorded".
         """
         first = self.name.split()[0]
         return PLANS_OF_FAULT.get(self.name) or PLANS_OF_FAULT.get(first, "")
@@ -521,6 +527,14 @@ FAULTS = (
         "    if False and jerk and abs(target) > abs(speed):",
     ),
     fault(
+        "limits clock",
+        "a step of the wall clock stops a ramp, or makes it leap",
+        ROBOT,
+        "        since = (now_ns - last.left_ns) / NS_PER_S\n",
+        "        since = (now.wall_ns - getattr(self, '_wall_ns', 0)) / NS_PER_S\n"
+        "        self._wall_ns = now.wall_ns\n",
+    ),
+    fault(
         "limits saturated",
         "a robot that turns harder at the limit of its wheels brakes harder than it may",
         LIMITS,
@@ -623,6 +637,13 @@ FAULTS = (
         "NS_PER_S * max(1.0, 4 / rate_hz",
     ),
     fault(
+        "session stale",
+        "a robot whose board is silent gets zeros and says `driving`",
+        ROBOT,
+        "self._life.link(up=False)",
+        'self._life.link(up=link == "stale")',
+    ),
+    fault(
         "session gap",
         "a gap of the feedback asks no sender for a zero",
         SESSION,
@@ -696,6 +717,13 @@ FAULTS = (
         "                if line is not None and now.mono_ns % 500_000_000 >= 60_000_000:\n",
     ),
     fault(
+        "loop disk",
+        "no line leaves while the latch file cannot be written",
+        LOOP,
+        'if port.offer(line, now) != "sent":',
+        'if self._handover.trouble or port.offer(line, now) != "sent":',
+    ),
+    fault(
         "loop end",
         "SIGTERM ends the daemon while the robot moves",
         LOOP,
@@ -746,6 +774,26 @@ FAULTS = (
         "            speeds = STILL\n",
         "            speeds = WheelSpeeds(0.1, 0.1, 0.1, 0.1)\n",
         BLIND_GUARD,
+    ),
+    fault(
+        "output first",
+        "the first line to a board that was plugged in is that of the robot, which moves",
+        "core/link/serial_output.py",
+        "goes = self._stop if self._first else line",
+        "goes = line",
+        Edit(
+            SESSION,
+            "            speeds = STILL\n",
+            "            speeds = WheelSpeeds(0.1, 0.1, 0.1, 0.1)\n",
+        ),
+        BLIND_GUARD,
+    ),
+    fault(
+        "session echo",
+        "an echo beside the replies of a board is not noticed",
+        "core/link/echo_check.py",
+        "least, changes = min(self._lines, RETURNED_FRACTION * self._written_lines), self._changes",
+        "least, changes = self._lines, self._changes",
     ),
     # log
     fault(
@@ -1081,6 +1129,15 @@ FAULTS = (
         BUMPERS,
         'return self.state == "silent" or not _drives_away(safety)',
         "return not _drives_away(safety)",
+    ),
+    fault(
+        "away ramp",
+        "a bumper that lets the robot drive away stops it with a ramp",
+        ROBOT,
+        "if estop.pressed_now is not None or bumpers.pressed_now is not None:",
+        "if estop.pressed_now is not None or (\n"
+        "            bumpers.pressed_now is not None and bumpers.latching(safety)\n"
+        "        ):",
     ),
     fault(
         "battery stop",
