@@ -106,7 +106,7 @@ def test_a_busy_machine_beside_a_quiet_one(real_time: bool, tmp_path: Path) -> N
         ):
             running.command(SECONDS, staircase, 1)
             record = running.end()
-        assert any((tmp_path / name).glob("*.mcap*")) == record_too
+        assert any((tmp_path / name).glob("*.rec.zst")) == record_too
         waits, delays = waits_us(record), delays_us(settings, record)
         cells = [f"{share(values, p):9.0f}" for values in (waits, delays) for p in (0.5, 0.99, 1.0)]
         print(f"{name:26}{''.join(cells[:3])}   {''.join(cells[3:])}", flush=True)

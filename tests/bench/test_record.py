@@ -58,7 +58,7 @@ def processor_s(pid: int) -> float:
 
 
 def size(where: Path) -> int:
-    return sum(path.stat().st_size for path in where.rglob("*.mcap*"))
+    return sum(path.stat().st_size for path in where.rglob("*.rec.zst"))
 
 
 def cost(where: Path, records: bool) -> Cost:
