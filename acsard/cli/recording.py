@@ -200,7 +200,7 @@ def main(args: argparse.Namespace) -> int:
 def main_show(args: argparse.Namespace) -> int:
     recording, timeline, is_empty = _recording(args), Timeline(), True
     for record in recording.records():
-        if not isinstance(record, RecordedStep) or recording.contains(record.now):
+        if recording.includes(record):
             for entry in timeline.take(record):
                 is_empty = False
                 _print_entry(entry, args.json)
@@ -227,10 +227,10 @@ def main_replay(args: argparse.Namespace) -> int:
     """
     other = None if args.config is None else load(args.config)[1]
     recording = _with_progress(args)
-    playback = Playback(recording, other)
+    playback, head = Playback(recording, other), recording.head()
     for _ in playback.steps():
         pass
-    comparison, head = playback.comparison, recording.head()
+    comparison = playback.comparison
     if head is None or not comparison.steps:
         raise _nothing(args)
     print(f"{verdict(comparison)}\n{explain_verdict(other is not None)}")

@@ -282,6 +282,15 @@ class Recording:
         """Return whether a step at this time was asked for."""
         return self.begin_ns <= at.wall_ns <= self.end_ns
 
+    def includes(self, record: ReadRecord) -> bool:
+        """Return whether a record is in the time; a head and a failure always are."""
+        match record:
+            case RecordedStep():
+                return self.contains(record.now)
+            case Waits():
+                return self.contains(record.at)
+        return True
+
     def records(self) -> Iterator[ReadRecord]:
         """Yield each record. Raises `RecordingError` for a file that is not a recording."""
         self.damage = []

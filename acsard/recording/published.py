@@ -55,7 +55,7 @@ def published(
                 publisher = Publisher(playback.robot, started_ns, keys)
             with playback.errors():
                 yield from publisher.messages(*replayed, recording)
-        if not isinstance(record, RecordedStep) or recording.contains(record.now):
+        if recording.includes(record):
             yield from map(_line, timeline.take(record))
 
 

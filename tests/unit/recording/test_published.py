@@ -10,10 +10,12 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
+from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
+from acsard.core.config.toml_text import document
 from acsard.core.ros.shapes import Log
 from acsard.core.values import NS_PER_S
-from acsard.recording.file import Recording
+from acsard.recording.file import FrameWriter, Head, Recording, Waits
 from acsard.recording.published import MEASURED_ROWS, Published, published
 from acsard.recording.timeline import Timeline
 from tests.scenarios.taped import Tape
@@ -105,6 +107,20 @@ def test_two_runs_of_the_daemon_are_published_one_after_the_other(tmp_path: Path
     odom, both = ([m for m in run if m.channel.name == "odom"] for run in (once, twice))
     assert both == odom * 2
     assert [line.name for line in logs(twice)].count("start") == 2
+
+
+def test_what_sources_waited_for_before_a_part_is_not_in_its_log(tmp_path: Path) -> None:
+    tape, path = driven(), tmp_path / "a.rec.zst"
+    steps = tape.taken
+    start, middle = steps[0].now, steps[len(steps) // 2].now
+    with path.open("wb") as file:
+        frames = FrameWriter(file)
+        text = "\n".join(document(effective(Config()))) + "\n"
+        frames.begin(Head("0.2.0", "acsar", 0, start.mono_ns, start.wall_ns, text))
+        frames.add(Waits(start, {"nav": ("higher", "early")}))
+        frames.add(Waits(middle, {"nav": ("equal", "late")}))
+    part = published(Recording([path], START.wall_ns + 1))
+    assert [line.msg for line in logs(list(part))] == ["late (by nav)"]
 
 
 def test_a_part_has_the_messages_of_its_time_and_says_what_it_continues(tmp_path: Path) -> None:
