@@ -37,7 +37,7 @@ def test_the_progress_is_shown_on_a_terminal(
         *([] if verb == "replay" else [str(tmp_path / "new")]),
     ]
     output = on_terminal(80, lambda: main(words), monkeypatch)
-    assert re.match(r"(\r2027-01-15 \d\d:00:0\d){2}", output)
+    assert re.match(r"(\r2027-01-15 \d\d:00:0\d)+", output)
     assert output.endswith("\r\x1b[K")
 
 
