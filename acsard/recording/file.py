@@ -341,7 +341,10 @@ def _records(path: Path, begin_ns: WallNs, end_ns: WallNs) -> Iterator[Record | 
             if not always and (after := _skipped(data, at, begin_ns, end_ns)):
                 at = after
                 continue
-            at = yield from _frame(data, at)
+            end = yield from _frame(data, at)
+            if end is None and _next_frame(data, at + 1) is not None:
+                raise FrameError("a frame has no end")
+            at = len(data) if end is None else end
         except _DAMAGE as error:
             begin, at = at, _next_frame(data, at + 1) or len(data)
             yield Damage(path, begin, at, printable(str(error))[:200])
@@ -373,8 +376,9 @@ def _content(path: Path, begin_ns: WallNs, end_ns: WallNs) -> bytes:
         ) from None
 
 
-def _frame(data: bytes, at: int) -> Generator[Record, None, int]:
-    # Yields the records of the frame at this offset, and returns that of its end. Raises `_DAMAGE`.
+def _frame(data: bytes, at: int) -> Generator[Record, None, int | None]:
+    # Yields the records of the frame at this offset, and returns that of its end, or None if the
+    # data ends before. Raises `_DAMAGE`.
     decompressor = zstandard.ZstdDecompressor(max_window_size=1 << WINDOW_LOG).decompressobj()
     plain, is_first = bytearray(), True
     while at < len(data) and not decompressor.eof:
@@ -385,6 +389,8 @@ def _frame(data: bytes, at: int) -> Generator[Record, None, int]:
                 raise FrameError("a frame does not have one head, at its beginning")
             is_first = False
             yield record
+    if not decompressor.eof:
+        return None
     return min(at, len(data)) - len(decompressor.unused_data)
 
 

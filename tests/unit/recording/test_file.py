@@ -139,6 +139,18 @@ def test_damage_costs_the_rest_of_its_frame_and_is_said(taken: Taken, tmp_path: 
         assert recording.damage or len(numbers) == len(taken), at
 
 
+def test_a_damaged_length_costs_only_its_frame(taken: Taken, tmp_path: Path) -> None:
+    """The second frame seems to have a block that reaches beyond the end of the file."""
+    data = bytearray(write(taken))
+    starts = frames_in(bytes(data))
+    block = starts[1] + len(MAGIC) + 2
+    data[block : block + 3] = (131_000 << 3 | 2 << 1).to_bytes(3, "little")
+    assert len(data) < 131_000
+    numbers, recording = read(tmp_path / "a", bytes(data))
+    assert numbers == [n for n in range(len(taken)) if not 2 * SECOND <= n < 4 * SECOND]
+    assert len(recording.damage) == 1
+
+
 def test_a_missing_frame_is_a_gap_in_the_numbers(taken: Taken, tmp_path: Path) -> None:
     data = write(taken)
     first, second, third = frames_in(data)[:3]
