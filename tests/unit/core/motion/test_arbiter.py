@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import random
 
 import pytest
 
 from acsard.core.config.settings import CommandsConfig, Source
-from acsard.core.motion.arbiter import Choice
-from acsard.core.values import REST, Command, SourceStatus, Twist, Wait
+from acsard.core.motion.arbiter import Arbiter, Choice
+from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
 from tests.each import each
 from tests.unit.core.motion.commanders import BACK, GO, HIGH, LEFT, LOW, MS, RIGHT, SLOW, Bench
 
@@ -702,3 +703,33 @@ def test_the_delay_that_is_forgiven_to_an_adjusted_clock_is_counted() -> None:
     for number in range(60):
         bench.wait(50).stamped(HIGH, min(10.0 * number, 300.0), twist=REST)
     assert bench.arbiter.clock_adjustment_ns == pytest.approx(300 * MS, rel=0.1)
+
+
+# the time until which a choice holds
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_choice_holds_until_the_time_that_the_arbiter_names(seed: int) -> None:
+    dice, now_ns, followed = random.Random(seed), 10 * NS_PER_S, Choice()
+    commands = CommandsConfig(sources=(HIGH, LOW, SLOW))
+    each_time, at_deadlines = Arbiter(commands), Arbiter(commands)
+    next_ns, kept = now_ns, 0
+    for _ in range(4000):
+        now_ns += dice.choice((1, MS, 7 * MS, 10 * MS))
+        for arbiter in (each_time, at_deadlines):
+            arbiter.begin(now_ns)
+        if now_ns >= next_ns:
+            next_ns = now_ns + dice.choice((1, 20 * MS, 50 * MS, 260 * MS, 3100 * MS))
+            twist, source = dice.choice((REST, REST, GO)), dice.choice(("high", "low", "slow"))
+            sender, stamp = f"s{dice.randrange(3)}", None
+            if dice.random() < 0.5:
+                stamp = now_ns - dice.choice((0, 0, 0, 400 * MS))
+            shared = dice.random() < 0.3
+            command = Command(source, twist, now_ns, stamp, sender, sender, shared=shared)
+            assert each_time.accept(command) == at_deadlines.accept(command)
+        if now_ns >= at_deadlines.until_ns:
+            followed = at_deadlines.choose(now_ns)
+        else:
+            kept += 1
+        assert each_time.choose(now_ns) == followed
+    assert kept > 1000
