@@ -711,7 +711,7 @@ def test_the_delay_that_is_forgiven_to_an_adjusted_clock_is_counted() -> None:
 @pytest.mark.parametrize("seed", range(6))
 def test_a_choice_holds_until_the_time_that_the_arbiter_names(seed: int) -> None:
     dice, now_ns, followed = random.Random(seed), 10 * NS_PER_S, Choice()
-    commands = CommandsConfig(sources=(HIGH, LOW, SLOW))
+    commands = CommandsConfig(sources=(HIGH, LOW, Source("long", 5, timeout=3.0)))
     each_time, at_deadlines = Arbiter(commands), Arbiter(commands)
     next_ns, kept = now_ns, 0
     for _ in range(4000):
@@ -720,11 +720,11 @@ def test_a_choice_holds_until_the_time_that_the_arbiter_names(seed: int) -> None
             arbiter.begin(now_ns)
         if now_ns >= next_ns:
             next_ns = now_ns + dice.choice((1, 20 * MS, 50 * MS, 260 * MS, 3100 * MS))
-            twist, source = dice.choice((REST, REST, GO)), dice.choice(("high", "low", "slow"))
+            twist, source = dice.choice((REST, REST, GO)), dice.choice(("high", "low", "long"))
             sender, stamp = f"s{dice.randrange(3)}", None
             if dice.random() < 0.5:
                 stamp = now_ns - dice.choice((0, 0, 0, 400 * MS))
-            shared = dice.random() < 0.3
+            shared = source == "long"
             command = Command(source, twist, now_ns, stamp, sender, sender, shared=shared)
             assert each_time.accept(command) == at_deadlines.accept(command)
         if now_ns >= at_deadlines.until_ns:
