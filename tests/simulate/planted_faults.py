@@ -32,6 +32,7 @@ PLANS_OF_FAULT = {
     "loop end": "restart", "robot end": "restart", "gate late": "stall in step",
     "session echo": "half_duplex", "case 11": "echo", "limits clock": "wall",
     "robot unsent": "block", "robot limits": "limits", "lifecycle number": "typed",
+    "lifecycle fault": "driver_fault",
 }  # fmt: skip
 """Kinds of plans by the name of a fault, or by the first word of its name."""
 
@@ -511,6 +512,13 @@ FAULTS = (
         LIFECYCLE,
         "        if not (named and asked_ns <= self._stop_asked_ns):\n",
         "        if latch is None:\n",
+    ),
+    fault(
+        "lifecycle fault",
+        "a clear that names no latch releases a fault at once",
+        LIFECYCLE,
+        "self._require_latch_was_seen(was, _in_force(latches), set_ns,",
+        "latches.fault or self._require_latch_was_seen(was, _in_force(latches), set_ns,",
     ),
     fault(
         "lifecycle off",
