@@ -24,6 +24,7 @@ from acsard.core.formatting import many
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, Event, Heard, Instant, Ns, Recording, WallNs
+from acsard.host.threads import Worker
 from acsard.host.version import version
 from acsard.host.wait_timer import WaitTimer
 from acsard.recording.directory import RecordingDirectory
@@ -92,7 +93,7 @@ class Recorder(StepRecorder):
         self._first = config, b""  # configuration and state before the first step
         self._writer = _Writer(config, started_ns)
         self._over = threading.Event()
-        self._thread = threading.Thread(target=self._work, name="record", daemon=True)
+        self._thread = Worker("record", self._work)
         self._thread.start()
 
     # The control loop calls these methods.
@@ -128,7 +129,8 @@ class Recorder(StepRecorder):
         codes = {source: why.code for source, why in reasons.items()}
         if codes != self._waits and not self._full:
             self._queue.append(Waits.of(now, reasons))
-        self._waits, self._waits_ns = codes, now.mono_ns + NS_PER_S
+            self._waits = codes
+        self._waits_ns = now.mono_ns + NS_PER_S
 
     def _lose(self) -> None:
         self._lost += 1

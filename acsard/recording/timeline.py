@@ -60,8 +60,10 @@ class Timeline:
                     if self._waits.get(source) != code:
                         yield TimelineEntry(record.at.wall_ns, "waits", text, by=source)
                 self._waits = {source: code for source, (code, _) in record.reasons.items()}
-            case Failure(why=why):
-                wall_ns = self._last.now.wall_ns if self._last else 0
+            case Failure(why=why, now=at):
+                if at is None and self._last is not None:
+                    at = self._last.now
+                wall_ns = 0 if at is None else at.wall_ns
                 yield TimelineEntry(wall_ns, "failure", f"the daemon failed: {why}", "error")
 
     def _begin(self, head: Head) -> Iterator[TimelineEntry]:

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
+from acsard.core.codes import Reason
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.incoming.commands import Arrival
 from acsard.core.link.serial_output import Offered
@@ -31,7 +32,7 @@ from acsard.core.values import (
     News,
 )
 from acsard.recording import recorder as module
-from acsard.recording.file import Failure, Head, Recording, listed
+from acsard.recording.file import Failure, Head, Recording, Waits, listed
 from acsard.recording.recorder import Recorder
 from acsard.recording.replay import Playback
 from tests.scenarios.taped import Tape, recorded_world
@@ -213,6 +214,22 @@ def test_if_the_queue_is_full_steps_are_lost_and_counted_and_the_loop_never_wait
     playback = played(paths)
     assert playback.comparison.steps == bench.world.steps - missing
     assert [gap.steps for gap in playback.gaps] == [missing]
+
+
+def test_what_sources_wait_for_is_recorded_as_soon_as_the_queue_has_room(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "MAX_QUEUED_STEPS", 1000)
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    while bench.recorder.status.missing == 0:
+        bench.world.hold(0.5, 0.2, seconds=1.0)
+    waits = {"teleop": Reason("higher", "app has priority")}
+    monkeypatch.setattr(Robot, "waits", lambda *_: waits)
+    bench.world.hold(0.5, 0.2, seconds=2.0)
+    bench.drive(3.0)
+    records = Recording(bench.end()).records()
+    (recorded,) = [record for record in records if isinstance(record, Waits)]
+    assert recorded.reasons == {"teleop": ("higher", "app has priority")}
 
 
 @contextmanager

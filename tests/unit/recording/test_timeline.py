@@ -109,6 +109,9 @@ def test_a_failure_of_the_daemon_is_reported() -> None:
     assert (last.name, last.level) == ("failure", "error")
     assert last.text == "the daemon failed: ValueError: seven"
     assert last.wall_ns == steps[-1].now.wall_ns
+    now = steps[0].now
+    (first,) = entries_of(head(), Failure(0, "ValueError: seven", now, steps[0].heard))
+    assert first.wall_ns == now.wall_ns  # in the first step, too
 
 
 def stopped_by_neutral_first() -> Tape:
