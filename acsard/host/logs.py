@@ -13,7 +13,6 @@ import os
 import queue
 import socket
 import sys
-import threading
 from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import Any, Literal, TextIO, cast
@@ -23,6 +22,7 @@ from acsard.core.formatting import printable
 from acsard.core.values import Event, EventName
 from acsard.host import clock
 from acsard.host.terminal_modes import may_use_color
+from acsard.host.threads import Worker
 
 # structlog imports rich to draw tracebacks, but this log contains no tracebacks. The daemon's
 # modules take 39 MB without rich and 44 MB with it, so rich is hidden while structlog is imported.
@@ -108,7 +108,7 @@ class Writer:
         # once (`event_throttle.py`).
         self._lines: queue.Queue[str | None] = queue.Queue(1000)
         self._parts = 0  # written so far
-        self._thread = threading.Thread(target=self._work, name="log", daemon=True)
+        self._thread = Worker("log", self._work)
         self._thread.start()
 
     def write(self, text: str) -> int:
