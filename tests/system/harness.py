@@ -78,10 +78,18 @@ def twist(linear: float, angular: float = 0.0) -> dict[str, dict[str, float]]:
 
 
 def free_endpoint() -> str:
-    """Return a loopback address on which no program listens."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    """Return a loopback address on which no program listens, another one at each call."""
+    while True:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+        if port not in _given_ports:
+            _given_ports.add(port)
+            return f"tcp/127.0.0.1:{port}"
+
+
+# The kernel may choose the port of a closed socket again.
+_given_ports = set[int]()
 
 
 def environment(**more: str) -> dict[str, str]:

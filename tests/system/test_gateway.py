@@ -148,7 +148,7 @@ def test_no_gateway_that_hangs_outlives_its_daemon(robot: Open) -> None:
     os.kill(gateway, signal.SIGSTOP)
     robot.daemon.signal(signal.SIGTERM)
     begun = time.monotonic()
-    assert robot.daemon.ended(2.0) == 0
+    assert robot.daemon.ended(2.0) == 0, robot.daemon
     until(
         lambda: has_ended(gateway), 1.0, f"gone, {time.monotonic() - begun:.1f} s after the signal"
     )
