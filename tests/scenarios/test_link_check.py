@@ -660,6 +660,20 @@ def test_an_echo_that_begins_during_a_drive_ends_the_link_when_the_speed_changes
     assert moving([line for _, line in list(world.port.sent)[sent:]]) == []
 
 
+@pytest.mark.parametrize("kind", [Echo, HalfDuplex])
+@pytest.mark.parametrize(("check", "counts"), [("off", 0), ("on", 0), ("on", 3200)])
+def test_an_echo_that_begins_during_a_steady_drive_ends_the_link(
+    check: str, counts: int, kind: type[FakeMcu]
+) -> None:
+    world = World(config(check, counts))
+    world.run(0.5)
+    world.drive(0.3, seconds=3.0)
+    world.mcu.__class__ = kind  # TX now touches RX
+    world.hold(0.3, seconds=1.5)
+    assert (world.state.link, world.state.code) == ("stale", "echo")
+    assert moving([world.port.sent[-1][1]]) == []
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("speeds", [4, pytest.param(40, marks=pytest.mark.nightly)])
 @each("period", [0.0, 0.05])

@@ -4,7 +4,7 @@ TX and RX are joined, or the board reports its commands: equal bytes cannot tell
 the question. The daemon sends `QUESTION` after the first line of a session, and when the lines of
 half a second were lines that it had sent. An echo returns it, and a board answers with its name or
 not at all. At rest every board repeats the line of zeros, so a link that is up is asked only if the
-repeated speeds changed.
+repeated speeds changed, or once when the lines of a steady drive begin to be repeated.
 """
 
 from __future__ import annotations
@@ -31,8 +31,12 @@ SET_POINT_WINDOWS = 3
 
 _SPEEDS = 31  # bytes of a line without its checksum
 
+_NO_SPEED = b"abcdpn0.,"  # of these bytes is the line of zeros
+
 
 class EchoCheck:
+    _steady = False  # also of an older recording
+
     def __init__(self, encoders: bool) -> None:
         self._encoders = encoders  # `feedback.encoders`
         self.forget()
@@ -45,6 +49,7 @@ class EchoCheck:
         self._written: deque[bytes] = deque(maxlen=COMPARED_LINES)
         self._speeds = b""  # of the last repeated line
         self._windows = 0  # in a row, of repeated lines with other speeds
+        self._steady = False  # the last window had repeated lines of a moving robot
         self._begin(0)
         self.restart()
 
@@ -91,18 +96,20 @@ class EchoCheck:
     def judge(self, now_ns: Ns, moving: bool) -> None:
         """Ask, or find a board without encoders, at the end of a window.
 
-        If `moving`, only a change of the speeds is a reason.
+        If `moving`, repeated zeros are no reason, and an equal speed is one only at first: a motor
+        may be that steady.
         """
         if now_ns - self._since_ns < WINDOW_NS:
             return
         least, changes = min(self._lines, RETURNED_FRACTION * self._written_lines), self._changes
         suspect = 0 < least <= self._repeated
         self._begin(now_ns)
+        known, self._steady = self._steady, suspect and bool(self._speeds.strip(_NO_SPEED))
         if not suspect:
             self._windows = 0
             return
         self._windows += changes > 0
-        if self.trouble or (moving and not changes):
+        if self.trouble or (moving and not changes and (known or not self._steady)):
             return
         if self._windows < SET_POINT_WINDOWS or self._asked_ns is None:
             self.due = True
