@@ -58,7 +58,7 @@ class EchoCheck:
         self.due = self.asked = False  # in this session
 
     def _begin(self, now_ns: Ns) -> None:
-        self._since_ns = now_ns
+        self.since_ns = now_ns  # begin of the window
         self._written_lines = self._lines = self._repeated = self._changes = 0
 
     def asks(self, at_ns: Ns) -> None:
@@ -93,14 +93,12 @@ class EchoCheck:
     def _answers(self, at_ns: Ns) -> bool:
         return self._asked_ns is not None and at_ns - self._asked_ns <= ANSWER_NS
 
-    def judge(self, now_ns: Ns, moving: bool) -> None:
-        """Ask, or find a board without encoders, at the end of a window.
+    def end_window(self, now_ns: Ns, moving: bool) -> None:
+        """Ask, or find a board without encoders, `WINDOW_NS` or more after the window began.
 
         If `moving`, repeated zeros are no reason, and an equal speed is one only at first: a motor
         may be that steady.
         """
-        if now_ns - self._since_ns < WINDOW_NS:
-            return
         least, changes = min(self._lines, RETURNED_FRACTION * self._written_lines), self._changes
         suspect = 0 < least <= self._repeated
         self._begin(now_ns)

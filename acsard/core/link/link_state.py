@@ -88,7 +88,8 @@ class Link:
         """Count a good line, and return the time since the previous one, None for the first one."""
         since_ns = None if self._heard_ns is None else at_ns - self._heard_ns
         if not self.silent(at_ns):
-            self.reset_silences()
+            if self._silences:
+                self.reset_silences()
         else:
             self.reset_good_lines()
             if since_ns is not None:

@@ -16,7 +16,7 @@ from acsard.core.link import link_diagnosis
 from acsard.core.link.board_status import STATUS, StatusReports
 from acsard.core.link.checked_line import SAMPLE_REQUEST, OpenLines, Reading, seal, unseal
 from acsard.core.link.codec import Codec, FrameError
-from acsard.core.link.echo_check import QUESTION, EchoCheck
+from acsard.core.link.echo_check import QUESTION, WINDOW_NS, EchoCheck
 from acsard.core.link.feedback import Feedback, Timeline
 from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import Lateness, SilenceDiagnosis
@@ -81,7 +81,7 @@ class McuSession:
         self._rest = self.codec.stop.rstrip(b",\r\n")  # begin of every line with speed zero
         self._answers = not mcu.reply_period  # sends nothing while it receives no line
         self._lines = LineReader()
-        self._mcu = mcu
+        self._mcu, self._checked = mcu, mcu.checked
         self._letters = SAMPLE_REQUEST if mcu.wants_samples else b""
         self._open_lines, self._echo = OpenLines(), EchoCheck(feedback.encoders)
         self._first = True  # nothing was written since the opening
@@ -95,6 +95,7 @@ class McuSession:
         # Silence after which the link is stale.
         self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
         self._link = Link(self.quiet_ns, mcu.checked)
+        self.link: LinkState = "down"  # after the last `update`; the robot drives only while `up`
         self.lateness = Lateness(mcu.simulated, self.quiet_ns)
         self._timeline = Timeline(mcu, self.codec, feedback.wheel_speed, self.quiet_ns, rate_hz)
         self.count_recovery = CountRecovery(mcu.encoder_counts)
@@ -118,11 +119,6 @@ class McuSession:
         self._held_up = False  # the port did not write the last line
         self.blocked = False  # the open port's driver has accepted no line for `WATCHDOG_NS`
 
-    @property
-    def link(self) -> LinkState:
-        """The state of the link. The robot may drive only while this is `up`."""
-        return self._link.state
-
     def update(
         self,
         now: Instant,
@@ -135,9 +131,11 @@ class McuSession:
         `opened` counts the openings of the port.
         """
         self.restarted, self._resumed = self._resumed, False
-        self._starting_over, self.events = False, []
-        self.reopened = False
-        self.status.begin_update()
+        self._starting_over = self.reopened = False
+        if self.events:
+            self.events = []
+        if self.status.new or self.status.forgot:
+            self.status.begin_update()
         feedback = []
         if not port_open or opened != self._opened:
             self._begin(port_open, opened, now.mono_ns)
@@ -158,7 +156,8 @@ class McuSession:
             self._judge(now.mono_ns)
         if self._rejected:
             self._announce_rejects()
-        self._announce()
+        if (self._link.state, self._trouble, self.blocked) != self._announced:
+            self._announce()
         return feedback
 
     def line(self, now_ns: Ns, speeds: WheelSpeeds) -> bytes | None:
@@ -182,7 +181,7 @@ class McuSession:
                 return None
             speeds = STILL
         line = self.codec.stop if speeds == STILL else self.codec.encode(speeds)
-        if not self._mcu.checked or self._first:  # the port begins with a plain stop
+        if not self._checked or self._first:  # the port begins with a plain stop
             return line
         return seal(line, self._open_lines.next_number(), self._letters)
 
@@ -206,7 +205,7 @@ class McuSession:
         if self._trouble and self.link in ("booting", "stale"):
             return sentence(self._trouble)
         return link_diagnosis.describe_link(
-            self._link, self._hearing, self.lateness, self._longest_reply, self._mcu.checked
+            self._link, self._hearing, self.lateness, self._longest_reply, self._checked
         )
 
     @property
@@ -216,7 +215,7 @@ class McuSession:
     @property
     def check(self) -> str:
         """The form of the lines, for `diagnostics`."""
-        if not self._mcu.checked:
+        if not self._checked:
             return "plain"
         return "checked with samples" if self._sampled else "checked"
 
@@ -249,6 +248,7 @@ class McuSession:
 
     def _begin(self, port_open: bool, opened: int, now_ns: Ns) -> None:
         self._link.apply("opened" if port_open else "closed")
+        self.link = self._link.state
         self.restarted = self.reopened = opened != self._opened
         if self.reopened:
             self.status.reopen()
@@ -265,7 +265,7 @@ class McuSession:
 
     def _restart(self, how: str) -> None:
         # `how` completes "the microcontroller ...".
-        if self.link == "up":
+        if self._link.state == "up":
             self.events.append(Event("mcu_restarted", f"the microcontroller {how}", "warning"))
         self._link.apply("restarted")
         self.restarted = self._starting_over = True
@@ -288,16 +288,18 @@ class McuSession:
         if self.blocked:
             link.apply("blocked")
         # The arbiter must see a lost link first.
-        echo = self._echo
-        echo.judge(now_ns, moving=link.state == "up")
+        echo, was_up = self._echo, link.state == "up"
+        if now_ns - echo.since_ns >= WINDOW_NS:
+            echo.end_window(now_ns, moving=was_up)
         if echo.trouble:
             link.apply("repeated")
         held = self._starting_over or not echo.asked or echo.trouble
         link.judge(now_ns, may_rise=not held)
-        up = link.state == "up"
+        self.link, up = link.state, link.state == "up"
         self.status.judge(now_ns, up, late=self.lateness.step_s > 0.0)
         if up or self.blocked:
-            self._hearing.forget()
+            if self.blocked or not was_up:  # the diagnosis of a link that stays up is empty
+                self._hearing.forget()
         elif self._hearing.judge(now_ns, self.lateness.step_s):
             # The board may answer only plain lines, such as the first one after the opening.
             self._unchecked = self._unchecked or self._plain_lines > 0
@@ -321,8 +323,6 @@ class McuSession:
     def _announce(self) -> None:
         link, trouble, before = self._link.state, self._trouble, self._announced
         self._announced = (link, trouble, self.blocked)
-        if self._announced == before:
-            return
         if link != before[0] or self.blocked > before[2]:
             plain = not (self.blocked or self._link.damaged or trouble)
             why = self.lateness.describe(link) if plain else self.describe_link()
@@ -338,13 +338,11 @@ class McuSession:
     def _decode(self, piece: Received) -> list[Feedback]:
         lines, timeline, feedback = self._lines.feed(piece.data), self._timeline, []
         link, data = self._link, piece.data
-        remarks = [line for line, _ in lines if line.startswith(REMARKS)]
-        if remarks:
-            # A remark is not a reply, so it is not used for the sample times and the link.
-            lines = [each for each in lines if not each[0].startswith(REMARKS)]
-            for line in remarks:
-                self._take_remark(line, piece.at.mono_ns)
-            data = b"\n".join([line for line, _ in lines])
+        for line, _ in lines:
+            if line.startswith(REMARKS):
+                lines = self._without_remarks(lines, piece.at.mono_ns)
+                data = b"\n".join([line for line, _ in lines])
+                break
         if link.state != "up":
             self._hearing.now.take(data)
         if lines:
@@ -364,6 +362,15 @@ class McuSession:
                 self._hearing.now.line(line, reply is not None)
         return feedback
 
+    def _without_remarks(
+        self, lines: list[tuple[bytes, int]], at_ns: Ns
+    ) -> list[tuple[bytes, int]]:
+        # A remark is not a reply, so it is not used for the sample times and the link.
+        for line, _ in lines:
+            if line.startswith(REMARKS):
+                self._take_remark(line, at_ns)
+        return [each for each in lines if not each[0].startswith(REMARKS)]
+
     def _take_remark(self, line: bytes, at_ns: Ns) -> None:
         if line.startswith(STATUS):
             self._take_status(line, at_ns)
@@ -381,7 +388,7 @@ class McuSession:
 
     def _take_status(self, line: bytes, at_ns: Ns) -> None:
         try:
-            self.status.take(line, self._mcu.checked, at_ns)
+            self.status.take(line, self._checked, at_ns)
         except FrameError as error:
             self._reject(error.reason, line)
             return
@@ -395,7 +402,7 @@ class McuSession:
             return None
         reading, asked_ns = None, None
         try:
-            if self._mcu.checked:
+            if self._checked:
                 reply = unseal(line)
                 speeds, reading = self.codec.decode(reply.plain), reply.reading
                 asked_ns = self._open_lines.answered(reply, read_at.mono_ns)
@@ -406,7 +413,7 @@ class McuSession:
                 self._reject(error.reason, line)
                 self._link.bad()
             return None
-        if self._mcu.checked:
+        if self._checked:
             self._last_reply, self._plain_lines, self._unchecked = line, 0, False
             self._sampled = reading is not None
             if self._says_samples and not self._sampled:
