@@ -322,7 +322,8 @@ class Robot:
         events += session.events
         if session.reopened:
             inputs.reopen()
-        if inputs.expects_reports(session):
+        is_watched, safety = inputs.expects_reports(session), self.config.safety
+        if is_watched:
             self._watch_inputs(now, events)
         if link != "up":
             # Without a link the daemon cannot ramp, so set the speeds to zero at once. When the
@@ -331,9 +332,10 @@ class Robot:
             self._life.link(up=False)
             if link == "down" and before != "down":
                 self._arbiter.require_neutral(now.mono_ns)
-        else:
+        elif before != "up" or is_watched or safety.bumpers or safety.estop == "required":
+            # Nothing else changes whether an input is missing.
             self._linked_once = True
-            self._life.link(up=not inputs.missing(self.config.safety))
+            self._life.link(up=not inputs.missing(safety))
         if heard.gyro:
             self._odometry.checks.add_samples(heard.gyro)
         if not feedback:

@@ -70,9 +70,10 @@ class StatusReports:
         self.last = BoardStatus()  # last value of each field, until it is forgotten
         self.last_ns: Ns | None = None  # arrival of the last line
         self.forgot = False  # in the last update
-        # Both of these since the last opening, and how long the link was up; None: forgotten.
+        # Both of these since the last opening, and how long the link was up: None after the fields
+        # of another board were forgotten, and then `judge` has nothing to do.
         self._since_opening: tuple[BoardStatus, Ns | None] = (BoardStatus(), None)
-        self._up_ns: Ns | None = 0
+        self.up_ns: Ns | None = 0
         self._judged_ns = 0
 
     def begin_update(self) -> None:
@@ -81,7 +82,7 @@ class StatusReports:
             self.new = []
 
     def reopen(self) -> None:
-        self._since_opening, self._up_ns = (BoardStatus(), None), 0
+        self._since_opening, self.up_ns = (BoardStatus(), None), 0
 
     def take(self, line: bytes, check: bool, at_ns: Ns) -> None:
         """Take a status line, as `decode_status`. Raises `FrameError`."""
@@ -92,12 +93,12 @@ class StatusReports:
 
     def judge(self, now_ns: Ns, up: bool, late: bool) -> None:
         """Forget the fields of another board, if the link was up long enough without late steps."""
-        passed_ns, self._judged_ns = now_ns - self._judged_ns, now_ns
-        if self._up_ns is None:
+        if self.up_ns is None:
             return
-        self._up_ns = 0 if not up else self._up_ns + (0 if late else passed_ns)
-        if self._up_ns >= FORGET_NS:
-            self._up_ns, self.forgot = None, True
+        passed_ns, self._judged_ns = now_ns - self._judged_ns, now_ns
+        self.up_ns = 0 if not up else self.up_ns + (0 if late else passed_ns)
+        if self.up_ns >= FORGET_NS:
+            self.up_ns, self.forgot = None, True
             self.last, self.last_ns = self._since_opening
 
 

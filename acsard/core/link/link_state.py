@@ -43,6 +43,8 @@ WATCHDOG_NS = int(WATCHDOG_S * NS_PER_S)
 # In a row, for a link. A board may print anything after a reset, but a checksum proves a line.
 GOOD_LINES, CHECKED_LINES = 3, 1
 
+NEVER_HEARD: Ns = -1  # before the time of any step
+
 BAD_LINES = 5  # in a row on a checked link: the link is stale
 
 # Silences with one good line between two that show too sparse lines. One shows a lost link.
@@ -60,6 +62,7 @@ class Link:
         self._silences = 0
         self._good_in_row = self._bad_in_row = 0
         self._heard_ns: Ns | None = None
+        self.silent_ns: Ns = NEVER_HEARD  # later, the link is silent
         # The board may answer late until then; `wait` was called since the last good line.
         self._waits_until_ns, self._waited = 0, False
 
@@ -70,7 +73,7 @@ class Link:
             return
         self._good_in_row = 0
         if trigger in ("closed", "opened", "restarted"):
-            self._heard_ns = None
+            self._heard_ns, self.silent_ns = None, NEVER_HEARD
         if trigger in ("closed", "opened"):
             self._bad_in_row = 0
             self.reset_silences()
@@ -80,14 +83,12 @@ class Link:
 
         The result is False during the time that `wait` adds.
         """
-        if self._heard_ns is None:
-            return True
-        return now_ns - self._heard_ns > self.quiet_ns and now_ns > self._waits_until_ns
+        return now_ns > self.silent_ns
 
     def good(self, at_ns: Ns) -> int | None:
         """Count a good line, and return the time since the previous one, None for the first one."""
         since_ns = None if self._heard_ns is None else at_ns - self._heard_ns
-        if not self.silent(at_ns):
+        if at_ns <= self.silent_ns:
             if self._silences:
                 self.reset_silences()
         else:
@@ -98,6 +99,7 @@ class Link:
         self._good_in_row += 1
         self._bad_in_row = 0
         self._heard_ns, self._waited = at_ns, False
+        self.silent_ns = max(at_ns + self.quiet_ns, self._waits_until_ns)
         return since_ns
 
     def wait(self, now_ns: Ns) -> None:
@@ -109,6 +111,7 @@ class Link:
         if self.state == "up" and not self._waited:
             self._waited = True
             self._waits_until_ns = now_ns + self.quiet_ns // 3
+            self.silent_ns = max(self.silent_ns, self._waits_until_ns)
 
     def reset_silences(self) -> None:
         """Reset the silences in a row: a line came in time, or the board is not the cause."""

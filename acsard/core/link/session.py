@@ -294,9 +294,11 @@ class McuSession:
         if echo.trouble:
             link.apply("repeated")
         held = self._starting_over or not echo.asked or echo.trouble
-        link.judge(now_ns, may_rise=not held)
+        if link.state != "up" or now_ns > link.silent_ns:
+            link.judge(now_ns, may_rise=not held)
         self.link, up = link.state, link.state == "up"
-        self.status.judge(now_ns, up, late=self.lateness.step_s > 0.0)
+        if self.status.up_ns is not None:
+            self.status.judge(now_ns, up, late=self.lateness.step_s > 0.0)
         if up or self.blocked:
             if self.blocked or not was_up:  # the diagnosis of a link that stays up is empty
                 self._hearing.forget()

@@ -97,10 +97,12 @@ class Sanity(Struct):
         speeds, last = feedback.speeds, self.last
         wheels = speeds.as_tuple()
         change = 0.0 if last is None else max(map(abs, map(sub, wheels, last.as_tuple())))
-        most = self._most(self.since, longest)
         why = ""
-        if max(map(abs, wheels)) > fastest or change > most:
+        # Every wheel can change by `SPEED_MARGIN` at once.
+        sudden = change > SPEED_MARGIN
+        if max(map(abs, wheels)) > fastest or (sudden and change > self._most(self.since, longest)):
             # Only few lines need the quantization steps.
+            most = self._most(self.since, longest)
             why = self._too_fast(feedback, fastest)
             if not why and last is not None:
                 why = self._jump(feedback, last, most)
@@ -116,7 +118,8 @@ class Sanity(Struct):
             return why
         # If this line is damaged, the speeds change back by `change` in the next line. Every next
         # line may at least change by as much as a wheel can in half of `_longest`.
-        self.trusted = last is not None and change <= self._most(0.0, self.longest)
+        small = not sudden or change <= self._most(0.0, self.longest)
+        self.trusted = last is not None and small
         self.last, self.since, self.count = speeds, 0.0, 0
         if self.rejected:
             self.rejected.clear()
