@@ -35,8 +35,6 @@ _NO_SPEED = b"abcdpn0.,"  # of these bytes is the line of zeros
 
 
 class EchoCheck:
-    _steady = False  # also of an older recording
-
     def __init__(self, encoders: bool) -> None:
         self._encoders = encoders  # `feedback.encoders`
         self.forget()
