@@ -1091,7 +1091,7 @@ FAULTS = (
         "estop needed",
         "a robot is ready before its board has reported the inputs that it needs",
         ROBOT,
-        "            self._life.link(up=not inputs.missing(self.config.safety))\n",
+        "            self._life.link(up=not inputs.missing(safety))\n",
         "            self._life.link(up=True)\n",
     ),
     fault(
