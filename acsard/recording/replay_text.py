@@ -70,8 +70,8 @@ def describe_difference(difference: Difference, began_ns: Ns) -> list[str]:
         f"the first difference is in step {difference.number}, "
         f"{_seconds(difference, began_ns):.3f} s after the "
         f"beginning of the recording: {what}",
-        *_side("recorded", difference.recorded),
-        *_side("replayed", difference.replayed),
+        *_side("recorded", difference.recorded, difference.what),
+        *_side("replayed", difference.replayed, difference.what),
         *([f"            {reason(difference.trip).text}"] if difference.trip else []),
     ]
 
@@ -80,7 +80,7 @@ def _seconds(difference: Difference, began_ns: Ns) -> float:
     return (difference.at.mono_ns - began_ns) / NS_PER_S
 
 
-def _side(name: str, outputs: RecordedOutputs) -> list[str]:
+def _side(name: str, outputs: RecordedOutputs, what: Sequence[str]) -> list[str]:
     status = outputs.status
     words = status.mode, status.code, status.reason, status.link, status.source
     mode, code, why, link, source = map(printable, words)
@@ -94,6 +94,7 @@ def _side(name: str, outputs: RecordedOutputs) -> list[str]:
         f"  {name:8}  {line}",
         f"            mode {mode} ({code}: {why}), link {link}, source {source or 'none'}",
         *[f"            pose x {x} y {y} yaw {yaw}" for x, y, yaw in poses],
+        *(["            no pose"] if "pose" in what and not poses else []),
         *[f"            event {_event(event)}" for event in outputs.events],
     ]
 

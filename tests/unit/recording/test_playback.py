@@ -13,6 +13,7 @@ from acsard.core.values import Command, Instant, Twist
 from acsard.host.errors import RecordingError
 from acsard.recording.file import MAGIC, Failure, FrameWriter, Head, Recording
 from acsard.recording.replay import Playback
+from acsard.recording.replay_text import describe_difference
 from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import START
 
@@ -147,3 +148,14 @@ def test_the_step_in_which_the_daemon_failed_is_replayed_too(
 
     monkeypatch.setattr(Robot, "hear", fail)
     assert "also fails here, with BrokenError: y" in playback.failed_step()
+
+
+def test_a_difference_names_the_side_without_a_pose(tape: Tape, tmp_path: Path) -> None:
+    config = Config()
+    checked = replace(config, mcu=replace(config.mcu, link_check="on"))
+    _, playback, _ = played(tape.save(tmp_path / "a"), other=checked)
+    first = playback.comparison.first_by_output["pose"]
+    recorded, replayed = "\n".join(describe_difference(first, 0)).split("  replayed")
+    assert "pose x 0.000000" in recorded
+    assert "no pose" in replayed
+    assert "no pose" not in recorded
