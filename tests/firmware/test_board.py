@@ -234,6 +234,7 @@ def test_after_a_boot_the_board_refuses_every_line_until_a_stop(board: Board, ho
     assert stays_off(board, 50).on_ns == 0
     host.stop()
     host.drive(DRIVE, 0.2)
+    host.identity()  # Its answer says that no line is on its way any more, to be refused too.
     board.command("reset")
     assert host.says(b"acsard") == BY_PIN
     host.send(checked(speeds_line(DRIVE), 1, "S"))
