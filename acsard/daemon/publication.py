@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
-from acsard.core.config.live import Difference
+from acsard.core.config.live import Difference, place
 from acsard.core.config.settings import Config
 from acsard.core.formatting import listed
 from acsard.core.incoming.bus_interface import Bus
@@ -162,3 +162,4 @@ class Publication:
                 ours = old if earlier is None else earlier.ours
                 if new != ours:
                     self._differing[key] = Difference(new, ours)
+        self._differing = dict(sorted(self._differing.items(), key=lambda item: place(item[0])))

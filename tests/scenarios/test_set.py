@@ -70,6 +70,21 @@ def test_state_names_the_settings_that_were_changed_since_the_start(world: World
         assert world.state.settings_differ == text
 
 
+def test_changed_settings_are_named_in_the_order_of_the_file(world: World) -> None:
+    for key, value in (
+        ("rates__telemetry", 7.5),
+        ("rates__odom", 50.0),
+        ("commands__sources__app__timeout", 0.4),
+        ("limits__linear_speed", 0.4),
+    ):
+        assert sets(world, **{key: value}).success
+    world.run(0.2)
+    assert world.state.settings_differ == (
+        "limits.linear_speed = 0.4, not 1.0, commands.sources.app.timeout = 0.4, not 0.25, "
+        "rates.odom = 50.0, not 0.0, and 1 more"
+    )
+
+
 def test_a_lowered_limit_is_reached_by_the_deceleration_and_never_by_a_jump(world: World) -> None:
     world.drive(1.0, seconds=2.0)
     speeds = applied(world)

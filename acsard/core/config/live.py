@@ -38,7 +38,7 @@ class Live(Struct, frozen=True):
     what: str
 
 
-# Settings by dotted key; "*" is the name of a command source.
+# Settings by dotted key, in the order of the file; "*" is the name of a command source.
 LIVE: dict[str, Live] = {
     "limits.linear_speed": Live("always", "highest speed, forwards and backwards"),
     "limits.angular_speed": Live("always", "highest turn rate"),
@@ -77,10 +77,20 @@ LIVE: dict[str, Live] = {
 
 def find_live_setting(key: str) -> Live | None:
     """Return the entry of a dotted key in `LIVE`, or None."""
+    return LIVE.get(_row(key))
+
+
+def place(key: str) -> int:
+    """Return a number by which live settings have the order of the file."""
+    return list(LIVE).index(_row(key))
+
+
+def _row(key: str) -> str:
+    # The key in `LIVE`, if it is a live setting.
     parts = key.split(".")
     if parts[:2] == ["commands", "sources"] and len(parts) == 4:
         parts[2] = "*"
-    return LIVE.get(".".join(parts))
+    return ".".join(parts)
 
 
 def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:

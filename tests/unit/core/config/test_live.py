@@ -13,7 +13,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.core.config.contradictions import LIVE_RULES, RULES
-from acsard.core.config.live import LIVE, changed, describe_changes, find_live_setting, flat
+from acsard.core.config.live import LIVE, changed, describe_changes, find_live_setting, flat, place
 from acsard.core.config.parsing import ConfigError, effective, parse
 from acsard.core.config.partial import Rule, view_without
 from acsard.core.config.settings import (
@@ -61,9 +61,10 @@ def by_file(wishes: dict[str, object]) -> Config | list[str]:
 
 
 def test_every_live_setting_is_a_key_and_every_source_has_a_live_timeout() -> None:
-    keys = {key for key in KEYS if find_live_setting(key)}
+    keys = [key for key in KEYS if find_live_setting(key)]
+    assert keys == sorted(keys, key=place)  # the order of the file
     sources = {f"commands.sources.{source.name}.timeout" for source in CONFIG.commands.sources}
-    assert keys == {key for key in LIVE if "*" not in key} | sources
+    assert set(keys) == {key for key in LIVE if "*" not in key} | sources
     assert all(row.what for row in LIVE.values())
 
 
