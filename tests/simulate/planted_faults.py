@@ -999,7 +999,7 @@ FAULTS = (
         "a pressed emergency stop latches a fault of the motor drivers",
         ROBOT,
         "        if estop.driver_fault:\n",
-        "        if any(status.driver_fault for _, status in statuses):\n",
+        "        if any(status.driver_fault for _, status in self.session.status.new):\n",
     ),
     fault(
         "driver release",
@@ -1144,7 +1144,7 @@ FAULTS = (
         ROBOT,
         "if estop.pressed_now is not None or bumpers.pressed_now is not None:",
         "if estop.pressed_now is not None or (\n"
-        "            bumpers.pressed_now is not None and bumpers.latching(safety)\n"
+        "            bumpers.pressed_now is not None and bumpers.latching(config.safety)\n"
         "        ):",
     ),
     fault(

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -31,6 +34,18 @@ ADDED = [fault for fault in ALL if not all(edit.old for edit in fault.edits)]
 def test_a_fault_fits_the_product_and_is_still_a_program(fault: Fault) -> None:
     for text in edited(fault).values():
         ast.parse(text)
+
+
+def test_faults_use_only_names_that_exist(tmp_path: Path) -> None:
+    """Otherwise each seed finds the fault, because the planted product raises `NameError`."""
+    for fault in ALL:
+        for module, text in edited(fault).items():
+            path = tmp_path / fault.name / module
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+    ruff = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F821", str(tmp_path)]
+    checked = subprocess.run(ruff, capture_output=True, text=True, timeout=60)
+    assert checked.returncode == 0, checked.stdout
 
 
 @pytest.mark.parametrize("fault", ADDED, ids=lambda fault: fault.name)
