@@ -306,7 +306,7 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_restarts_it(
             def listed() -> bool:
                 """Return whether the page lists a recording."""
                 status, content = asyncio.run(answer(f"{url}api/recordings"))
-                return status == 200 and ".mcap" in content
+                return status == 200 and ".rec.zst" in content
 
             until(listed, START_S, "what the option has recorded is listed")
             (first,) = daemon.page()

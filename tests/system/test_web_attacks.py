@@ -145,7 +145,7 @@ ASKS: dict[str, tuple[str, str, dict[str, Any], int, str]] = {
         "away", "/api/srv/clear", {"token": "viewer", "method": "POST"}, 403, "role"),
     "a viewer at the settings": ("away", "/api/config", {"token": "viewer"}, 403, "role"),
     "a viewer at a recording": (
-        "away", "/api/recordings/x.mcap", {"token": "viewer"}, 403, "role"),
+        "away", "/api/recordings/1-x.rec.zst", {"token": "viewer"}, 403, "role"),
     "another page's socket": ("here", "/ws", {"headers": UPGRADE | EVIL}, 403, "origin"),
     "another page's socket, with a token": (
         "away", "/ws", {"token": "viewer", "headers": UPGRADE | EVIL}, 403, "origin"),
