@@ -8,6 +8,7 @@ the older one does not know (`versions.py`).
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,6 +18,7 @@ from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 import pytest
+import zstandard
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
@@ -368,26 +370,36 @@ def test_the_older_version_reads_the_latches_the_tokens_and_the_recording_of_the
     assert rows[0]["later"] == 1
     tokens.write_text(json.dumps([*rows, rows[0] | {"name": "pilot", "role": "pilot"}]))
 
+    (recording,) = tmp_path.glob("daemon.recordings/*.rec.zst")
+    with zstandard.open(recording) as file:
+        assert b"later" in file.read()
     with ThreadPoolExecutor(3) as at_once:
-        (recording,) = tmp_path.glob("daemon.recordings/*.rec.zst")
         out = tmp_path / "out"
         acts = {
-            "list": ("recording",),
+            "list": ("recording", "--directory", str(recording.parent)),
             "show": ("recording", "show", str(recording)),
             "report": ("recording", "report", str(recording), str(out.with_suffix(".html"))),
             "export": ("recording", "export", str(recording), str(out.with_suffix(".mcap"))),
             "replay": ("recording", "replay", str(recording)),
-            "tokens": ("web", "--tokens"),
+            "tokens": ("web", "--tokens", *config),
         }
         runs = {
-            name: at_once.submit(finish, [older.acsard, *words, *config], tmp_path, 40, env)
+            name: at_once.submit(finish, [older.acsard, *words], tmp_path, 40, env)
             for name, words in acts.items()
         }
     ended = {name: run.result() for name, run in runs.items()}
+    replay = ended.pop("replay")
     assert {name: end for name, end in ended.items() if end.code} == {}
+    # The older version has no such service, so its replay lacks that one event and nothing else.
+    assert (replay.code, replay.err) == (1, "")
+    same = re.findall(r"(\d+) of (\d+) (\w+)", replay.out.partition("\n")[0])
+    missing = {what: int(of) - int(count) for count, of, what in same if count != of}
+    assert missing == {"events": 1}, replay
+    assert f"event {VERB}: dances" in replay.out
     assert "stopped by" in ended["show"].out
     assert f"{VERB}: dances" in ended["show"].out
-    assert "damaged" not in ended["show"].err
+    assert ended["show"].err == ""
+    assert recording.name in ended["list"].out
     assert "tv" in ended["tokens"].out
 
     with daemon_of(older, tmp_path, port=peer.path) as daemon, Bus(daemon.endpoint) as bus:

@@ -103,7 +103,7 @@ def _run(*words: str) -> None:
 def grow(newer: Version) -> None:
     """Make an installed version the newer one."""
     (newer.package / "core/messages/later.py").write_text(LATER)
-    for file in ("daemon/bus/outlets.py", "core/incoming/queries.py"):
+    for file in ("daemon/bus/outlets.py", "core/messages/frames.py", "core/incoming/queries.py"):
         path = newer.package / file
         path.write_text(
             f"{path.read_text()}\nfrom acsard.core.messages.later import encode  # noqa\n"
@@ -127,11 +127,11 @@ def _say_more(newer: Version) -> None:
     newer.swap(
         "core/messages/report.py",
         {
-            "            mode=outputs.mode,": f"""\
-            mode="{MODE}" if outputs.mode == "ready" else outputs.mode,""",
-            "            reason=outputs.reason,\n            code=outputs.code,": f"""\
-            reason="{REASON}" if outputs.code == "no_command" else outputs.reason,
-            code="{CODE}" if outputs.code == "no_command" else outputs.code,""",
+            "            mode=status.mode,": f"""\
+            mode="{MODE}" if status.mode == "ready" else status.mode,""",
+            "            reason=status.reason,\n            code=status.code,": f"""\
+            reason="{REASON}" if status.code == "no_command" else status.reason,
+            code="{CODE}" if status.code == "no_command" else status.code,""",
         },
     )
     newer.swap(
@@ -209,21 +209,27 @@ def _grown(content):
 
 
 def _record_more(newer: Version) -> None:
+    # A field in each struct: at the end of a row, and first in a map.
     newer.swap(
         "recording/file.py",
         {
-            "    started_ns: WallNs = 0  # start of the daemon\n": """\
-    started_ns: WallNs = 0
-    later: str = "later"
-""",
-            "    events: tuple[Event, ...]\n": """\
-    events: tuple[Event, ...]
-    later: int = 1
-""",
-            " wheel angles (`recorded_steps.checksum`)\n": """\
- wheel angles
-    later: dict[str, int] = {}
-""",
+            "_encode = msgspec.msgpack.Encoder().encode\n": """\
+
+
+def _encode(record):
+    plain = msgspec.to_builtins(record, builtin_types=(bytes,))
+    for row in plain.get("rows", ()):
+        row[2] = [[*read, 1] for read in row[2]]
+        row.append({"later": 1})
+    return msgspec.msgpack.encode(_grown(plain))
+
+
+def _grown(part):
+    if isinstance(part, dict):
+        grown = {key: _grown(value) for key, value in part.items() if key != "reasons"}
+        return {"later": [1]} | part | grown
+    return [_grown(item) for item in part] if isinstance(part, list | tuple) else part
+"""
         },
     )
     newer.swap(
@@ -233,16 +239,5 @@ def _record_more(newer: Version) -> None:
     rest: bytes
     later: int = 1
 """
-        },
-    )
-    newer.swap(
-        "recording/timeline.py",
-        {
-            "class TimelineEntry(Struct, frozen=True, omit_defaults=True):": "class TimelineEntry("
-            "Struct, frozen=True):",
-            "    count: int = 1  # equal events in this entry\n": """\
-    count: int = 1
-    later: int = 1
-""",
         },
     )
