@@ -350,7 +350,10 @@ def test_messages_that_are_slow_to_decode_cost_no_periods_and_a_stop_still_latch
     )
     assert called == 1000
     assert refused > 100
-    assert "64" in after["refused"]
+    # A step answers one call, so the last ones may be refused after the last put.
+    texts = " ".join({entry.value.get("refused", "") for entry in states.seen})
+    assert "at most 64 are" in texts
+    assert "at most 256 are" in texts
     assert periods.missed <= 0.03 * periods.elapsed + waited / TICK_S
     assert stopped.at - sent < 0.2 + lost(sent, stopped.at)
     assert flooded.process.poll() is None
