@@ -143,7 +143,9 @@ def test_doctor_uses_the_running_daemon_s_values_and_reports_where_the_file_diff
         assert f"pid {daemon.pid}" in other["text"]
         assert not any("simulator" in finding["text"] for finding in findings["port"])
         assert any(str(peer.path) in finding["text"] for finding in findings["port"])
-        assert worst(findings["link"])["level"] == "ok"
+        # On a busy machine the board may have to wait, and doctor then rightly says so.
+        with Bus(daemon.endpoint) as bus:
+            assert worst(findings["link"])["level"] == "ok" or bus.count("link_lost"), findings
 
 
 @pytest.mark.nightly
