@@ -711,9 +711,8 @@ def test_a_board_that_repeats_commands_but_not_the_question_has_no_encoders(enco
 
 def test_the_question_never_takes_the_place_of_the_line_that_stops_the_wheels() -> None:
     bench = Bench().up()
-    echoed(bench, 1.0, 47)
-    while not bench.session._echo.due:
-        echoed(bench, 1.1, 1)
+    echoed(bench, 1.0, 46)
+    assert bench.session._echo.due
     assert bench.line(STILL) == ZERO + b"\r\n"
     bench.wait(10, GOOD)
     assert bench.line(STILL) == b"?\r\n"
