@@ -222,6 +222,11 @@ FAULTS = (
         NEUTRAL,
         "return self.arrived_ns is not None and now_ns - self.arrived_ns <= self._timeout_ns",
         "return self.arrived_ns is not None",
+        Edit(
+            NEUTRAL,
+            "            now_ns - arrived_ns <= timeout_ns\n",
+            "            True\n",
+        ),
     ),
     fault(
         "arbiter notice",
@@ -273,6 +278,11 @@ FAULTS = (
         NEUTRAL,
         "now_ns - self.arrived_ns <= self._timeout_ns",
         "now_ns - self.arrived_ns <= 2 * self._timeout_ns",
+        Edit(
+            NEUTRAL,
+            "            now_ns - arrived_ns <= timeout_ns\n",
+            "            now_ns - arrived_ns <= 2 * timeout_ns\n",
+        ),
     ),
     fault(
         "neutral speeds",
