@@ -49,6 +49,11 @@ def wheels(line: bytes) -> tuple[float, ...]:
     )
 
 
+def lines_of(world: World) -> list[bytes]:
+    """Return the lines of the daemon that command speeds: not the link's question."""
+    return [line for _, line in world.port.sent if line[:1] != b"?"]
+
+
 def speed(line: bytes) -> float:
     """Return the fastest wheel of a line, rad/s, without its sign."""
     return max(map(abs, wheels(line)))
@@ -92,6 +97,8 @@ def silence(world: World, dice: random.Random, timeout: float) -> float:
         world.run(min(0.04, (end_ns - world.now_ns) / NS_PER_S + 1e-9))
     before = 0.0
     for at_ns, line in world.port.sent:
+        if line[:1] == b"?":
+            continue
         if speed(line) < before:
             took = (at_ns - last_ns) / NS_PER_S
             break
@@ -196,7 +203,7 @@ def test_the_robot_does_not_move_before_neutral_after_any_kind_of_restart(count:
         world.port.sent.clear()
         hz = dice.choice((5.0, 10.0, 20.0, 50.0))
         world.hold(linear, dice.uniform(-1, 1), 1.5, source, hz)
-        lines = [line for _, line in world.port.sent]
+        lines = lines_of(world)
         still = len(lines) > 100 and lines[0] == ZERO and set(lines) == {ZERO}
         waiting = world.state.mode == "ready" and world.state.code == "neutral"
         successes += still and waiting
@@ -255,7 +262,7 @@ def blackhole(dice: random.Random, slow: bool, seconds: float) -> tuple[int, int
             if world.now_ns >= end_ns and not queue and not drained_ns:
                 drained_ns = world.now_ns
         world.run((max(next_ns, world.now_ns) - world.now_ns) / NS_PER_S + 1e-9)
-    backward = sum(min(wheels(line)) < 0 for _, line in world.port.sent)
+    backward = sum(min(wheels(line)) < 0 for line in lines_of(world))
     assert world.state.mode == "driving"  # by the fresh commands
     return stale, backward, accepted
 
@@ -576,7 +583,8 @@ def stale_moves(world: World, speaker: Speaker, cut: float) -> bool:
         speaker.deliver(message)
         world.run(0.001)
     world.run(0.1)
-    return any(at >= since_ns and min(wheels(line)) < 0 for at, line in world.port.sent)
+    sent = [(at, line) for at, line in world.port.sent if line[:1] != b"?"]
+    return any(at >= since_ns and min(wheels(line)) < 0 for at, line in sent)
 
 
 def stepped(dice: random.Random, way: Way, ahead: float, step: float) -> str:

@@ -64,7 +64,7 @@ def test_an_attack_is_refused_with_a_message_and_has_no_effect(
     name: str, said: dict[str, str]
 ) -> None:
     words = said[name]
-    assert "the robot state at the start" in words
+    assert "the recorded state of the robot" in words
     assert words.isprintable()
     assert len(words) < 300
 
