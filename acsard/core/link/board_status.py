@@ -92,9 +92,11 @@ class StatusReports:
         self.new.append((at_ns, status))
 
     def judge(self, now_ns: Ns, up: bool, late: bool) -> None:
-        """Forget the fields of another board, if the link was up long enough without late steps."""
-        if self.up_ns is None:
-            return
+        """Forget the fields of another board, if the link was up long enough without late steps.
+
+        Call it while `up_ns` is known.
+        """
+        assert self.up_ns is not None
         passed_ns, self._judged_ns = now_ns - self._judged_ns, now_ns
         self.up_ns = 0 if not up else self.up_ns + (0 if late else passed_ns)
         if self.up_ns >= FORGET_NS:

@@ -297,7 +297,7 @@ class McuSession:
         if link.state != "up" or now_ns > link.silent_ns:
             link.judge(now_ns, may_rise=not held)
         self.link, up = link.state, link.state == "up"
-        if self.status.up_ns is not None:
+        if self.status.up_ns is not None:  # else nothing is to be forgotten
             self.status.judge(now_ns, up, late=self.lateness.step_s > 0.0)
         if up or self.blocked:
             if self.blocked or not was_up:  # the diagnosis of a link that stays up is empty

@@ -1762,3 +1762,10 @@ def test_stamps_that_a_router_replaced_are_counted() -> None:
     command = Command("app", REST, bench.now_ns, stamp_replaced=True)
     bench.stepped.step(Inputs(bench.now, True, True, bench.opened, commands=(command,)))
     assert bench.counters()["stamps_replaced"] == 1
+
+
+def test_each_source_that_sends_and_does_not_drive_has_what_it_waits_for() -> None:
+    bench = Bench().driving()
+    bench.step(GO, source="teleop")
+    waits = bench.robot.waits(bench.now_ns)
+    assert {name: why.code for name, why in waits.items()} == {"teleop": "neutral", "app": "higher"}
