@@ -12,10 +12,10 @@ from textwrap import wrap
 from rich.cells import cell_len
 from rich.text import Text
 
-from acsard.core.formatting import rough, signed
+from acsard.core.formatting import signed
 from acsard.core.messages.schema import RobotState
 from acsard.daemon.latencies import NAMES
-from acsard.top.text import ScreenData, clean, count, flow, rule
+from acsard.top.text import ScreenData, clean, count, flow, rule, seen
 from acsard.top.wide_screen import (
     board,
     certificate,
@@ -71,7 +71,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
         mark = "▶ " if drives(source, state) else "  "
         name = Text(clean(source.name))
         name.truncate(13, overflow="ellipsis", pad=True)
-        rows = [Text(f"{mark}{name.plain} {count(source.priority):>8}  {rough(source.age)}")]
+        rows = [Text(f"{mark}{name.plain} {count(source.priority):>8}  {seen(source.age)}")]
         rows += folded(f"status: {waits(source, state)}", width, 4)
         if len(lines) > 1 and len(lines) + len(rows) > room:
             break

@@ -13,7 +13,7 @@ from msgspec import Struct
 from rich.cells import cell_len
 from rich.text import Text
 
-from acsard.core.formatting import printable
+from acsard.core.formatting import printable, rough
 from acsard.core.messages.schema import Info, RobotState
 
 # Styles in the notation of rich.
@@ -58,6 +58,11 @@ def count(number: int) -> str:
     if abs(number) < 10**10:
         return f"{number:,}"
     return f"{float(max(-(10**300), min(10**300, number))):.1e}"
+
+
+def seen(age: float | None) -> str:
+    """Format the age of a source's last command, s; "-" if none counts, such as after a `clear`."""
+    return "-" if age is None else rough(age)
 
 
 def rate(later: int, earlier: int, seconds: float) -> str:

@@ -16,7 +16,7 @@ from acsard.core.messages.short_texts import power
 from acsard.core.motion.gyro import STATUS_TEXTS
 from acsard.core.values import NS_PER_S
 from acsard.daemon.latencies import NAMES
-from acsard.top.text import ScreenData, bar, clean, count, rate, row, rule
+from acsard.top.text import ScreenData, bar, clean, count, rate, row, rule, seen
 
 # Widest screen: longer lines are harder to read.
 MAX_COLUMNS = 116
@@ -123,7 +123,7 @@ def _source(source: SourceState, state: RobotState, room: int) -> Text:
     mark, style = ("▶ ", "bold green") if drive else ("  ", "" if live else "dim")
     name = Text(clean(source.name))
     name.truncate(room, overflow="ellipsis", pad=True)
-    figures = f"{count(source.priority):>8}  {rough(source.age):<7}"
+    figures = f"{count(source.priority):>8}  {seen(source.age):<7}"
     return Text(f"{mark}{name.plain} {figures}{waits(source, state)}", style)
 
 

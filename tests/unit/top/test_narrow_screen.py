@@ -31,7 +31,7 @@ def test_every_figure_is_on_a_screen_of_any_width(width: int) -> None:
     text, lines = read(width), lines_of(FULL, width, None)
     for figure in (
         "WAITING", REASON, "x +1.250 m", "y -0.500 m", "yaw +57.3°", "forward +0.500 m/s",
-        "turn -0.600 rad/s", "+12.00", "+8.00", "+12.50", "-7.50", "100 never", "50 0.0 s",
+        "turn -0.600 rad/s", "+12.00", "+8.00", "+12.50", "-7.50", "100 -", "50 0.0 s",
         "10 3.0 s", "app has priority: wait until it is silent", "link up",
         "expires in 12 days", "in 100.0/s of 1,300", "out 100.0/s of 1,301", "superseded 12,345",
         "20.0/s of 220", "missed periods 3", "bus overrun 7", "malformed 30", "stale 4",
