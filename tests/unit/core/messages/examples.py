@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from typing import Any
 
 from msgspec.structs import replace
@@ -82,7 +82,7 @@ SNAPSHOT = Snapshot(
 
 def due(
     report: Report, outputs: Outputs, wanted: Collection[str], get_snapshot: Callable[[], Snapshot]
-) -> Iterator[tuple[str, Message]]:
+) -> list[tuple[str, Message]]:
     """Return the keys and messages that are due after a step with these outputs."""
     news = news_of(outputs)
     return report.due(

@@ -352,11 +352,6 @@ def test_only_topics_with_subscribers_are_published(wanted: set[str]) -> None:
     assert sorted(key for key, _ in messages) == sorted(wanted - {"tf_static"})
 
 
-def test_feedback_is_published_before_the_summary_is_built() -> None:
-    messages = due(Report(CONFIG, START), OUTPUTS, ALL, never)
-    assert [next(messages)[0] for _ in range(3)] == ["odom", "tf", "wheel_states"]
-
-
 def test_no_snapshot_is_taken_for_a_summary_without_subscribers() -> None:
     assert len(list(due(Report(CONFIG, START), OUTPUTS, ALL - SUMMARIES, never))) == 5
 
