@@ -29,9 +29,7 @@ from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import OBJECTIONS, CommandEvents, missed, refused, waiting
 from acsard.core.motion.battery import empty_reason
-from acsard.core.motion.emergency_stop import (
-    DRIVER_FAULT_REASON,
-)
+from acsard.core.motion.emergency_stop import DRIVER_FAULT_REASON
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.last_line import LastLine

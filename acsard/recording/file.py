@@ -212,11 +212,11 @@ def encode_steps(first: int, steps: Sequence[PlainStep]) -> Steps:
     rows, before, before_ns, crc = [], None, 0, 0
     for now, heard, driven, line, sent, trip, late_ns, news, status in steps:
         now_ns = now.mono_ns
-        reads = [Read(now_ns - r.at.mono_ns, _ahead(r.at), r.data) for r in heard.received]
+        reads = [Read(now_ns - r.at.mono_ns, ahead_ns(r.at), r.data) for r in heard.received]
         rows.append(
             Row(
                 now_ns - before_ns,
-                _ahead(now),
+                ahead_ns(now),
                 tuple(reads),
                 replace(heard, received=()) if reads else heard,
                 driven,
@@ -233,7 +233,8 @@ def encode_steps(first: int, steps: Sequence[PlainStep]) -> Steps:
     return Steps(first, tuple(rows), crc)
 
 
-def _ahead(at: Instant) -> Ns:
+def ahead_ns(at: Instant) -> Ns:
+    """Return how far the wall clock is ahead of the monotonic clock."""
     return at.wall_ns - at.mono_ns
 
 

@@ -28,7 +28,7 @@ from acsard.host.threads import Worker
 from acsard.host.version import version
 from acsard.host.wait_timer import WaitTimer
 from acsard.recording.directory import RecordingDirectory
-from acsard.recording.file import Failure, FrameWriter, Head, Waits
+from acsard.recording.file import Failure, FrameWriter, Head, Waits, ahead_ns
 from acsard.recording.recorded_steps import PlainStep, StepRecorder
 from acsard.recording.state import MAX_ERROR_LENGTH, freeze
 
@@ -39,7 +39,7 @@ WRITE_PAUSE_S = 0.98  # between two writes: with one, about a second
 SYNC_NS = 10 * NS_PER_S  # between two syncs, at most
 
 # Between two heads. Damage costs this much, a head 15 kB, and the state in it 0.3 ms of the control
-# loop, after it has written its line.
+# loop (with the clocks of 1,024 senders 3 ms), after it has written its line.
 HEAD_NS = 20 * NS_PER_S
 
 FILE_NS = 3600 * NS_PER_S  # of one file
@@ -274,7 +274,7 @@ class _Writer:
         self._frames.add_steps(self._number, steps)
         self._number += len(steps)
         last, now = self._last, steps[-1][0]
-        if last is not None and abs(_ahead_ns(now) - _ahead_ns(last)) > CLOCK_JUMP_NS:
+        if last is not None and abs(ahead_ns(now) - ahead_ns(last)) > CLOCK_JUMP_NS:
             self._ends = self.wants_head = True
         self._last = now
         return len(steps)
@@ -361,7 +361,3 @@ def _add_failure(frames: FrameWriter, failure: Failure) -> None:
 
 def _text(config: Config) -> str:
     return "\n".join(document(effective(config))) + "\n"
-
-
-def _ahead_ns(at: Instant) -> Ns:
-    return at.wall_ns - at.mono_ns

@@ -122,6 +122,7 @@ class Replay:
         else:
             sent = None
         if line is not None:
+            # What the recorded guard decided is an input, as the board obeyed it.
             robot.sent(now.mono_ns + step.late_ns, sent, step.trip)
         self.news = news
         self._checksum = checksum(news.estimates, self._checksum)

@@ -91,7 +91,7 @@ class State(NamedTuple):
 
 
 class Frozen(Struct):
-    """What `freeze` encodes."""
+    """The fields that `freeze` encodes."""
 
     config: Config  # in force
     memory: Memory
