@@ -230,8 +230,10 @@ class Numbered:
     def age(self, entry: ReceivedLine) -> float | None:
         """Return the age in s that the command of this line had when the line appeared.
 
-        Returns None if the line has no command's speed.
+        Returns None if the line has no command's speed, as the question of a new link.
         """
+        if entry.line == b"-":
+            return None
         number = round(wheels(entry.line)[0] * 100) - 200
         if not 0 <= number < self.COUNT:
             return None
