@@ -62,7 +62,7 @@ RefusalCode = Literal[
     "unknown_source", "not_finite", "too_many_senders", "unproven", "stale", "malformed",
     "wrong_shape", "wrong_wheels", "unknown_encoding", "too_big", "not_a_put", "wildcard",
     "displaced", "other_certificate", "second_sender", "no_rate", "out_of_range", "no_attachment",
-    "bad_attachment", "unknown_format",
+    "bad_attachment", "bad_echo", "unknown_format",
 ]  # fmt: skip
 
 Code = Literal[StateCode, RefusalCode]
@@ -291,6 +291,9 @@ no_attachment
     a ROS message has no attachment
 bad_attachment
     a ROS message has a damaged attachment
+bad_echo
+    the echo in the attachment is not a beat
+    -> copy the newest message of the key beat into the field `echo`
 """
 
 

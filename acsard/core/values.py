@@ -106,6 +106,13 @@ class Received(Struct, frozen=True):
     data: bytes
 
 
+class Echo(Struct, frozen=True, gc=False):
+    """The beat that a sender received last: the run of a daemon, and its CLOCK_BOOTTIME."""
+
+    run: int
+    beat_ns: Ns
+
+
 class Command(Struct, frozen=True, omit_defaults=True):
     """A velocity that a sender requests.
 
@@ -132,6 +139,10 @@ class Command(Struct, frozen=True, omit_defaults=True):
     ros: bool = False  # some ROS tools never send a zero, which a text about one mentions
     stamp_replaced: bool = False  # by Zenoh, because the sender's clock is ahead of the daemon's
     steady: bool = False  # the sender declares that its clock is never adjusted
+    echo: Echo | None = None
+    # At `arrived_ns`, the time since the echoed beat; below 0 for a beat from the future. None
+    # without an echo, and for one of another run.
+    age_ns: Ns | None = None
 
 
 Verb = Literal["stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set"]

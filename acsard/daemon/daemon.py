@@ -15,6 +15,7 @@ import signal
 import sys
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Sequence
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
+from secrets import randbits
 from typing import Any, Self
 
 from acsard.bus.certificate_watch import watch_certificates
@@ -146,7 +147,7 @@ async def run(
         latches = Latches() if keeper is None else await keeper.start(clock.now())
         robot, handover = Robot(config, latches), Handover(latches, keeper)
         publication = Publication(
-            robot, bus, info, start, log.event, handover, recorder, events, ends
+            robot, bus, info, start, log.event, handover, recorder, events, ends, randbits(48)
         )
         publication.adopted = lambda adopted: log.use(adopted.log)
         if simulated is not None:

@@ -63,14 +63,19 @@ NOTHING = FromBus()
 
 class Intake:
     def __init__(
-        self, config: Config, bus: Bus, events: list[Event], certificate_ends: dict[str, int]
+        self,
+        config: Config,
+        bus: Bus,
+        events: list[Event],
+        certificate_ends: dict[str, int],
+        run: int,
     ) -> None:
         # `events` collects those of other parts, which the next wake-up logs.
         self.counters: Counter[str] = Counter()  # beside those of the robot
         self.routers = RouterFollower()
         self.events = events
         self._bus, self._certificate_ends = bus, certificate_ends
-        self._receiver = Receiver(config.joints, Kinematics(config.drive))
+        self._receiver = Receiver(config.joints, Kinematics(config.drive), run)
         self._gateway, self._imu = GatewayFollower(), GyroFollower(config.mcu.simulated)
         self._top_speed = config.limits.linear_speed  # at the start
         self._began = False

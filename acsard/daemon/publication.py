@@ -56,12 +56,13 @@ class Publication:
         recorder: StepRecorder | None = None,
         events: list[Event] | None = None,
         certificate_ends: dict[str, int] | None = None,
+        run: int = 0,
     ) -> None:
-        # `events` collects those of other parts.
+        # `events` collects those of other parts, and `run` is that of the beats.
         config = robot.config
         self.report = Report(config, start, certificate_ends, info.version)
         self.intake = Intake(
-            config, bus, [] if events is None else events, self.report.certificate_ends
+            config, bus, [] if events is None else events, self.report.certificate_ends, run
         )
         self.stopwatch = Stopwatch()
         # Returns the newest message of a key of another part, such as the simulator.

@@ -20,13 +20,14 @@ mono_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC
 # The clock of the kernel's timers.
 timer_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC)
 
-_boot_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
+# The clock of the beats, which also runs during a suspend.
+boot_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
 
 
 def asleep_ns() -> Ns:
     """Return the total time for which this computer has been suspended since its start."""
     awake_ns = timer_ns()
-    return _boot_ns() - awake_ns
+    return boot_ns() - awake_ns
 
 
 def steady_ns() -> Ns:

@@ -20,6 +20,7 @@ from acsard.core.messages.encodings import DecodeError, StrictDecoder, decode_cd
 from acsard.core.messages.keys_and_roles import COMMANDS, SERVICES
 from acsard.core.messages.schema import (
     MESSAGES,
+    Beat,
     Header,
     JointState,
     Message,
@@ -30,11 +31,22 @@ from acsard.core.messages.schema import (
     TwistStamped,
     Vector3,
 )
-from acsard.core.messages.signature import public_name
+from acsard.core.messages.signature import claims_echo, public_name
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.ros.attachments import GID_BYTES, unpack
 from acsard.core.ros.transports import Transport
-from acsard.core.values import NS_PER_S, REST, Command, Ns, Pose, Request, Verb, WallNs, WheelSpeeds
+from acsard.core.values import (
+    NS_PER_S,
+    REST,
+    Command,
+    Echo,
+    Ns,
+    Pose,
+    Request,
+    Verb,
+    WallNs,
+    WheelSpeeds,
+)
 from acsard.core.values import Twist as BodyTwist
 
 # Without a command for this time, a sender id may come with another certificate: a program with a
@@ -71,6 +83,8 @@ class Bindings:
         return None
 
 
+NS_PER_US = 1000
+
 MAX_COMMAND_BYTES = 4096  # a TwistStamped in JSON is shorter than 300
 
 # Largest lead of a timestamp over the daemon's clock; Zenoh replaces one that is further ahead.
@@ -94,6 +108,7 @@ class Arrival(Struct, frozen=True):
     attachment: bytes = b""
     # Timestamp of the daemon's own session: there was none, or one too far ahead.
     received_ns: WallNs | None = None
+    boot_ns: Ns = 0  # arrival by CLOCK_BOOTTIME
 
 
 class _TwistPayload(Struct, frozen=True):
@@ -122,7 +137,9 @@ _payloads = {
 class Receiver:
     """Decodes samples into commands, and service queries into requests."""
 
-    def __init__(self, joints: JointsConfig, kinematics: Kinematics) -> None:
+    def __init__(self, joints: JointsConfig, kinematics: Kinematics, run: int = 0) -> None:
+        # `run` is that of the daemon's beats.
+        self._run = run
         self._joints = joints.as_tuple()
         self._kinematics = kinematics
         self._bindings = Bindings()
@@ -140,6 +157,12 @@ class Receiver:
         if len(arrival.payload) > MAX_COMMAND_BYTES:
             raise DecodeError("too_big", f"{len(arrival.payload)} bytes are too many for a command")
         identity = identify(arrival)
+        if arrival.via == "native" and not identity.signed and claims_echo(arrival.attachment):
+            raise DecodeError(
+                "bad_echo",
+                "the attachment has an echo that is not a beat: copy the newest message of the key "
+                "beat into its field `echo`, beside `sender`",
+            )
         stamp_ns, clock = identity.stamp_ns, identity.sender
         if kind == "cmd":
             twist, header, cancelled = self._twist(arrival)
@@ -159,7 +182,8 @@ class Receiver:
                     f"this sender id is already in use {where}: give each program its own "
                     "sender id",
                 )
-        ours = arrival.received_ns
+        ours, beat = arrival.received_ns, identity.echo
+        echo = None if beat is None else Echo(beat.run, beat.boot_us * NS_PER_US)
         return Command(
             source,
             twist,
@@ -173,6 +197,10 @@ class Receiver:
             ros=arrival.via != "native",
             stamp_replaced=bool(ours and stamp_ns and stamp_ns - ours > MAX_TIMESTAMP_LEAD_NS),
             steady=identity.steady,
+            echo=echo,
+            age_ns=None
+            if echo is None or echo.run != self._run
+            else arrival.boot_ns - echo.beat_ns,
         )
 
     def _twist(self, arrival: Arrival) -> tuple[BodyTwist, Header | None, bool]:
@@ -263,6 +291,7 @@ class Identity(Struct, frozen=True):
     shared: bool = False  # several programs may share it
     steady: bool = False  # the clock of the stamps is never adjusted
     signed: str = ""  # public name of the sender id of a native command, without the certificate
+    echo: Beat | None = None
 
 
 # The results are cached, because each command needs the parts of its key twice, and commands arrive
@@ -305,6 +334,7 @@ def identify(arrival: Arrival) -> Identity:
         signed.sequence,
         steady=signed.steady and signed.stamp is not None,
         signed=public_name(signed.sender) if kind in COMMANDS else "",
+        echo=signed.echo,
     )
 
 

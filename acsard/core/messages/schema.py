@@ -622,6 +622,18 @@ class Topics(Message, frozen=True):
     topics: list[TopicInfo]
 
 
+class Beat(Message, frozen=True):
+    """The time of the daemon, which a program copies into its commands as their `echo`.
+
+    The numbers are below 2^53, so JavaScript represents them exactly.
+    """
+
+    run: Annotated[int, Meta(ge=0, lt=1 << 48)]
+    """A random number, which is new at each start of the daemon."""
+    boot_us: Annotated[int, Meta(ge=0, lt=1 << 53)]
+    """The time since the start of the daemon's computer (CLOCK_BOOTTIME), in us."""
+
+
 class WhoAmI(Message, frozen=True):
     """The role and the name of the client that sent the query."""
 

@@ -1,10 +1,12 @@
 """Decodes the attachment of a command or a service call, which names the sending program.
 
-    {"sender": "joystick/8Xg2kq0vRw-1yEJc7hPzUA", "stamp": 1795154884365624370, "sequence": 12}
+    {"sender": "joystick/8Xg2kq0vRw-1yEJc7hPzUA", "stamp": 1795154884365624370, "sequence": 12,
+     "echo": {"run": 181349028416577, "boot_us": 83214500123}}
 
 It is a map in JSON or msgpack. Only the program and the daemon know the sender id `NAME/SECRET`, so
 it proves which program sends. Only the `public_name` is published, from which nobody can compute
-it. An attachment of any other form is ignored.
+it. `echo` is a copy of the message on the key `beat` that the program received last. An attachment
+of any other form is ignored, but a command with a wrong `echo` is refused.
 """
 
 from __future__ import annotations
@@ -15,6 +17,8 @@ from typing import Annotated
 
 import msgspec
 from msgspec import Meta, Struct
+
+from acsard.core.messages.schema import Beat
 
 MAX_INT64 = (1 << 63) - 1
 
@@ -36,6 +40,7 @@ class Signature(Struct, frozen=True, omit_defaults=True):
     stamp: Annotated[int, Meta(gt=0, le=MAX_INT64)] | None = None
     sequence: Annotated[int, Meta(ge=0, le=MAX_INT64)] | None = None  # grows by 1 with each command
     steady: bool = False  # the clock of `stamp` is never adjusted: an old stamp proves a delay
+    echo: Beat | None = None
 
     def pack(self) -> bytes:
         """Encode the attachment in msgpack."""
@@ -44,6 +49,7 @@ class Signature(Struct, frozen=True, omit_defaults=True):
 
 _json = msgspec.json.Decoder(Signature)
 _msgpack = msgspec.msgpack.Decoder(Signature)
+_UNREADABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 
 
 def unpack(attachment: bytes) -> Signature | None:
@@ -52,9 +58,18 @@ def unpack(attachment: bytes) -> Signature | None:
         return None
     try:
         return (_json if attachment[:1] == b"{" else _msgpack).decode(attachment)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+    except _UNREADABLE:
         # An unknown field may be nested too deeply.
         return None
+
+
+def claims_echo(attachment: bytes) -> bool:
+    """Return whether an attachment, maybe not a valid signature, is a map with the field `echo`."""
+    try:
+        fields = (msgspec.json if attachment[:1] == b"{" else msgspec.msgpack).decode(attachment)
+    except _UNREADABLE:
+        return False
+    return isinstance(fields, dict) and "echo" in fields
 
 
 # Each command needs the public name. Hashing takes 7 us, and a look-up in the cache 0.15 us.

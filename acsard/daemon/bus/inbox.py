@@ -216,7 +216,7 @@ class Inbox:
         self._arrived(sample, native, endpoint.encoding, endpoint.transport)
 
     def _arrived(self, sample: zenoh.Sample, key: str, encoding: str, via: Via) -> None:
-        arrived = clock.now()
+        arrived, boot_ns = clock.now(), clock.boot_ns()
         put = sample.kind == zenoh.SampleKind.PUT
         stamp, stamp_ns, sender, received_ns = sample.timestamp, None, "", None
         if stamp is not None:
@@ -236,6 +236,7 @@ class Inbox:
             via,
             _bytes(sample.attachment, MAX_ATTACHMENT_BYTES),
             received_ns,
+            boot_ns,
         )
         if key == "stop" and put:
             self._stops.put(arrival)

@@ -35,7 +35,7 @@ from acsard.core.messages.signature import HASH_DIGITS, MAX_NAME_LENGTH, public_
 from acsard.core.motion.arbiter import Arbiter
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.ros.attachments import Attachment
-from acsard.core.values import Command, Pose, Request, Twist, Verb, WheelSpeeds
+from acsard.core.values import Command, Echo, Pose, Request, Twist, Verb, WheelSpeeds
 from tests.each import each
 
 KINEMATICS = Kinematics(DriveConfig())
@@ -903,6 +903,56 @@ def test_a_sample_gives_its_sender_clock_and_stamp(case: str) -> None:
 def test_an_attachment_without_a_stamp_uses_the_stamp_of_zenoh() -> None:
     result = command(twist(), attachment=signed(sequence=3), sender="z1", stamp_ns=5)
     assert (result.stamp_ns, result.sequence) == (5, 3)
+
+
+# the echo of a beat
+
+RUN, BEAT_US = 181_349_028_416_577, 83_214_500_123
+BEAT = {"run": RUN, "boot_us": BEAT_US}
+
+
+@each("form", [msgspec.json.encode, msgspec.msgpack.encode])
+def test_the_age_of_a_command_with_an_echo_is_its_arrival_minus_the_beat(form: Any) -> None:
+    receiver = Receiver(JointsConfig(), KINEMATICS, RUN)
+    attachment = form({"sender": "joystick/s3cret", "echo": BEAT})
+    boot_ns = (BEAT_US + 7) * 1000
+    sample = arrival(written(twist(), "json"), attachment=attachment, boot_ns=boot_ns)
+    result = receiver.command(sample)
+    assert (result.echo, result.age_ns) == (Echo(RUN, BEAT_US * 1000), 7000)
+    other_run = Receiver(JointsConfig(), KINEMATICS, RUN + 1).command(sample)
+    assert (other_run.echo, other_run.age_ns) == (result.echo, None)
+    plain = receiver.command(replace(sample, attachment=form({"sender": "joystick/s3cret"})))
+    assert (plain.echo, plain.age_ns) == (None, None)
+
+
+@each("form", [msgspec.json.encode, msgspec.msgpack.encode])
+@each(
+    "echo",
+    [
+        BEAT | {"run": str(RUN)},
+        BEAT | {"run": -1},
+        BEAT | {"run": 1 << 48},
+        BEAT | {"boot_us": 1.5},
+        BEAT | {"boot_us": True},
+        BEAT | {"boot_us": 1 << 53},
+        {"run": RUN},
+        [RUN, BEAT_US],
+        BEAT_US,
+        {},
+    ],
+)
+def test_a_command_whose_echo_is_not_a_beat_is_refused(form: Any, echo: object) -> None:
+    attachment = form({"sender": "joystick/s3cret", "echo": echo})
+    with pytest.raises(DecodeError, match="copy the newest message") as raised:
+        RECEIVER.command(arrival(written(twist(), "json"), attachment=attachment))
+    assert raised.value.reason == "bad_echo"
+    assert caller_name("native", attachment) == "unnamed (native)"  # a stop still stops
+
+
+def test_an_echo_without_a_sender_is_refused() -> None:
+    sample = arrival(written(twist(), "json"), attachment=msgspec.json.encode({"echo": BEAT}))
+    with pytest.raises(DecodeError, match="beside `sender`"):
+        RECEIVER.command(sample)
 
 
 # certificates

@@ -9,10 +9,12 @@ import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acsard.core.messages.schema import Beat
 from acsard.core.messages.signature import (
     HASH_DIGITS,
     MAX_NAME_LENGTH,
     Signature,
+    claims_echo,
     public_name,
     unpack,
 )
@@ -23,7 +25,7 @@ WHOLE = {"sender": "joystick-7", "stamp": 1_795_154_884_365_624_370, "sequence":
 
 
 def test_a_packed_signature_is_unpacked_unchanged() -> None:
-    signature = Signature("laptop/12/ab", 5, 1)
+    signature = Signature("laptop/12/ab", 5, 1, echo=Beat((1 << 48) - 1, (1 << 53) - 1))
     assert unpack(signature.pack()) == signature
 
 
@@ -62,8 +64,9 @@ def test_any_other_attachment_is_not_a_signature(attachment: bytes) -> None:
 
 @given(st.binary(max_size=80))
 def test_unpacking_any_bytes_raises_no_error(attachment: bytes) -> None:
-    unpack(attachment)
-    unpack(b"{" + attachment)
+    for received in (attachment, b"{" + attachment):
+        unpack(received)
+        claims_echo(received)
 
 
 @each(
