@@ -110,12 +110,12 @@ def _commands() -> Iterator[Try]:
                 "cmd/**", "cmd/ap$*", "cmd/app/**", "cmd/app/*", "cmd/*/operator")  # fmt: skip
     yield from (Try(f"{ME}/{key}", NOBODY, TWIST_JSON) for key in unlisted)
     yield from (Try(f"{ME}/wheel_cmd/{key}", NOBODY, WHEELS_JSON) for key in ("ghost", "*", "**"))
-    wild = ("*", "**", "*/app", "sto$*", "stop/**")
-    yield from (Try(f"{ME}/{key}", NOBODY, TWIST_JSON) for key in wild)
-    # A client on the robot's machine may stop all robots at once. Over TLS only exact keys pass.
-    yield Try("acsard/*/stop", HERE)
-    wilder = ("acsard/*/cmd/app", "acsard/**", "**/stop", "**")
-    yield from (Try(key, NOBODY, TWIST_JSON) for key in wilder)
+    yield from (Try(key, NOBODY, TWIST_JSON) for key in (f"{ME}/*/app", "acsard/*/cmd/app"))
+    # A PUT of a client on the robot's machine stops the robot if it reaches the key `stop`. Over
+    # TLS only exact keys pass.
+    own = (f"{ME}/*", f"{ME}/**", f"{ME}/sto$*", f"{ME}/stop/**")
+    for key in ("acsard/*/stop", "acsard/**/stop", "acsard/**", "**/stop", "**", *own):
+        yield Try(key, HERE, TWIST_JSON)
     others = (f"{OTHER}/cmd/app", f"{OTHER}/stop", f"{OTHER}/**")
     yield from (Try(key, NOBODY, TWIST_JSON) for key in others)
     unwritten = (*VALUES, "alive", "config", "info", "srv/stop", "odo$*")

@@ -237,12 +237,24 @@ def test_set_pose_and_reset_odometry_move_the_pose_of_every_key(bus: Bus) -> Non
 
 
 @pytest.mark.variations(3)
-@pytest.mark.parametrize("payload", [b"", b"now!", b"\xff" * 5000])
-def test_a_put_with_any_payload_on_stop_latches(bus: Bus, payload: bytes) -> None:
+@pytest.mark.parametrize(
+    ("key", "payload"),
+    [
+        ("acsard/acsar/stop", b""),
+        ("acsard/acsar/stop", b"now!"),
+        ("acsard/acsar/stop", b"\xff" * 65_000),
+        ("acsard/*/stop", b""),
+        ("acsard/**/stop", b""),
+        ("acsard/acsar/*", b"{}"),
+        ("acsard/acsar/sto$*", b""),
+        ("**", b""),
+    ],
+)
+def test_a_put_that_reaches_the_stop_key_latches(bus: Bus, key: str, payload: bytes) -> None:
     with restored(bus), bus.follow("state") as states:
         x = bus.state()["x"]
         sent = time.monotonic()
-        bus.session.put("acsard/acsar/stop", payload)
+        bus.session.put(key, payload)
         entry = states.find(lambda state: state["mode"] == "stopped", 2.0, "stopped", after=sent)
         assert entry.at - sent < 0.2 + lost(sent, entry.at)
         with bus.commanding(0.3):

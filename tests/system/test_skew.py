@@ -366,9 +366,11 @@ def test_the_older_version_reads_the_latches_the_tokens_and_the_recording_of_the
     assert LATCH_CODE in text
     assert "later" in text
     tokens = tmp_path / "acsard-web/tokens.json"
-    rows = json.loads(tokens.read_text())
+    content = json.loads(tokens.read_text())
+    rows = content["tokens"]
     assert rows[0]["later"] == 1
-    tokens.write_text(json.dumps([*rows, rows[0] | {"name": "pilot", "role": "pilot"}]))
+    rows.append(rows[0] | {"name": "pilot", "role": "pilot"})
+    tokens.write_text(json.dumps(content))
 
     (recording,) = tmp_path.glob("daemon.recordings/*.rec.zst")
     with zstandard.open(recording) as file:

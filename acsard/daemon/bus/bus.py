@@ -159,7 +159,8 @@ class ZenohBus:
         for topic in offered(self._config):
             key = full_key(self._id, topic.pattern)
             if topic.direction == "in":
-                self._entities.append(session.declare_subscriber(key, direct(inbox.on_sample)))
+                received = inbox.on_stop if topic.key == "stop" else inbox.on_sample
+                self._entities.append(session.declare_subscriber(key, direct(received)))
             elif topic.key not in ("alive", json_key("<key>")):
                 on_query = direct(partial(inbox.on_query, topic.key))
                 self._entities.append(session.declare_queryable(key, on_query))

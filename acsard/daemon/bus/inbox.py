@@ -25,7 +25,6 @@ from acsard.core.messages.keys_and_roles import (
     JSON_TREE,
     SPEED_LIMIT,
     VERBS,
-    full_key,
     is_service,
     service_key,
     source_keys,
@@ -135,7 +134,6 @@ QUERY_QUEUE = 256
 MAX_ATTACHMENT_BYTES = 1024
 
 STOP, SET = service_key("stop"), service_key("set")
-STOP_ALL = full_key("*", "stop")
 
 
 class Inbox:
@@ -204,10 +202,12 @@ class Inbox:
     # Zenoh's threads call the methods below.
 
     def on_sample(self, sample: zenoh.Sample) -> None:
-        key = str(sample.key_expr)
-        # A stop for all robots arrives with the wildcard in its key.
-        key = "stop" if key == STOP_ALL else key.removeprefix(self._prefix)
+        key = str(sample.key_expr).removeprefix(self._prefix)
         self._arrived(sample, key, str(sample.encoding), "native")
+
+    def on_stop(self, sample: zenoh.Sample) -> None:
+        """Queue a sample of the subscriber to `stop`: a stop, whatever its key expression says."""
+        self._arrived(sample, "stop", str(sample.encoding), "native")
 
     def on_ros_sample(self, endpoint: Endpoint, sample: zenoh.Sample) -> None:
         """Queue a ROS sample like one on `endpoint.native`, with the endpoint's encoding."""

@@ -46,7 +46,7 @@ def arrived(inbox: Inbox, *keys: str) -> None:
             timestamp=None,
             attachment=None,
         )
-        inbox.on_sample(sample)
+        (inbox.on_stop if key == "stop" else inbox.on_sample)(sample)
 
 
 def an_inbox(rate_hz: float = 100.0) -> tuple[Inbox, Loop]:
