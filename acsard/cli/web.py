@@ -193,7 +193,7 @@ def _list(vault: Vault) -> int:
     # would use 5 MB of memory while the server runs.
     from acsard.terminal.output import show, table
 
-    tokens, now_s = vault.all(), time.time()
+    tokens, now_s = vault.all(), vault.now_s()
 
     def until(ends: int) -> str:
         left = f"{lasting(60 * round((ends - now_s) / 60))} left" if ends > now_s else "ended"

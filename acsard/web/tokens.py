@@ -13,7 +13,7 @@ import os
 import secrets
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,8 @@ SERVICE_DIRECTORY = Path("/var/lib/acsard-web")
 # of one robot
 MAX_TOKENS = 200
 
+WRITE_INTERVAL_S = 60  # of the time in the token file: more writes would wear out an SD card
+
 
 class Token(Struct, frozen=True):
     """The stored record of a token."""
@@ -46,48 +48,66 @@ class Token(Struct, frozen=True):
     robot: str  # whose page it opens
 
 
+class _File(Struct, frozen=True):
+    tokens: list[Token]
+    newest: int = 0  # the newest time that a server has seen, s since 1970
+
+
 class Vault:
-    """The access tokens of one robot. The token file also contains tokens of other robots."""
+    """The access tokens of one robot. The token file also contains tokens of other robots.
+
+    The clock of a robot without a battery begins in 1970 at each start. An expired token stays
+    expired, because the time is the clock's or the newest in the file, whichever is later.
+    """
 
     def __init__(self, directory: Path, robot: str) -> None:
         self.path, self.robot = directory / FILE, robot
-        # The stamp of the file (mtime ns, inode) when it was read, and its tokens: a tuple, because
-        # several threads replace them.
-        self._read: tuple[tuple[int, int] | None, list[Token]] = None, []
+        # The stamp of the file (mtime ns, inode) when it was read, and its content: a tuple,
+        # because several threads replace them.
+        self._read: tuple[tuple[int, int] | None, _File] = None, _File([])
+
+    def now_s(self) -> float:
+        """Return the time of the tokens, s, as of the last call that read the token file."""
+        return max(time.time(), self._read[1].newest)
 
     def find_owner(self, text: str) -> AdmittedClient | None:
         """Return the owner of a valid token, as of the last call that read the token file."""
-        return owner_in(self._own(self._read[1]), text)
+        return owner_in(self._own(self._read[1].tokens), text, self.now_s())
 
     def left_s(self, digest: str) -> int:
         """Return the time until a token expires; 0 if it has expired or is unknown."""
         ends = [token.ends for token in self.all() if token.digest == digest]
-        return max(0, int(max(ends, default=0) - time.time()))
+        return max(0, int(max(ends, default=0) - self.now_s()))
 
     def all(self) -> list[Token]:
         """Return this robot's tokens, also expired ones; [] if the file cannot be read."""
-        return self._own(self._shared())
+        return self._own(self._shared().tokens)
 
     def _own(self, tokens: list[Token]) -> list[Token]:
         return [token for token in tokens if token.robot == self.robot]
 
-    def _shared(self) -> list[Token]:
+    def _shared(self) -> _File:
         try:
             status = self.path.stat()
             stamp = status.st_mtime_ns, status.st_ino
             read = self._read
             if stamp != read[0]:
-                read = stamp, msgspec.json.decode(self.path.read_bytes(), type=list[Token])
+                read = stamp, msgspec.json.decode(self.path.read_bytes(), type=_File)
         except (OSError, *MSGSPEC_ERRORS):
             # The file is missing or unreadable. A token that cannot be checked must not be
             # accepted.
-            read = None, []
+            read = None, _File([])
         self._read = read
         return read[1]
 
     def valid_digests(self) -> frozenset[str]:
-        now_s = time.time()
-        return frozenset(token.digest for token in self.all() if token.ends > now_s)
+        """Return the digests of the tokens that are valid now, and store the time if it is due."""
+        tokens, now_s = self.all(), self.now_s()
+        if tokens and now_s >= self._read[1].newest + WRITE_INTERVAL_S:
+            # Without room on the disk, the tokens expire by the clock alone.
+            with suppress(MendableError, NotPermittedError, UsageError), self._changing():
+                pass
+        return frozenset(token.digest for token in tokens if token.ends > now_s)
 
     def unknown_to(self, service: Path = SERVICE_DIRECTORY) -> str:
         """Return a warning if the service `acsard-web` reads another token file, else ""."""
@@ -104,7 +124,7 @@ class Vault:
         Expired tokens are deleted. Raises `UsageError` for a name in use, or for too many tokens.
         """
         with self._changing() as tokens:
-            now_s = int(time.time())
+            now_s = int(self.now_s())
             tokens[:] = [record for record in tokens if record.ends > now_s]
             ours = self._own(tokens)
             if any(record.name == name for record in ours):
@@ -145,12 +165,15 @@ class Vault:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX)
                 data = self._load()
-                tokens = self._decoded(data)
+                file = self._decoded(data)
+                self._read = None, file
+                tokens = list(file.tokens)
                 yield tokens
                 # A field that only a later version knows may limit its token, so it is kept.
-                stored = {row["digest"]: row for row in msgspec.json.decode(data)}
+                raw = msgspec.json.decode(data)
+                stored = {row["digest"]: row for row in raw["tokens"]}
                 rows = [stored.get(token.digest, {}) | asdict(token) for token in tokens]
-                self._write(rows)
+                self._write(raw | {"tokens": rows, "newest": int(self.now_s())})
             finally:
                 os.close(handle)
         except PermissionError:
@@ -164,23 +187,23 @@ class Vault:
         try:
             return self.path.read_bytes()
         except FileNotFoundError:
-            return b"[]"
+            return b'{"tokens":[]}'
 
-    def _decoded(self, data: bytes) -> list[Token]:
+    def _decoded(self, data: bytes) -> _File:
         try:
-            return msgspec.json.decode(data, type=list[Token])
+            return msgspec.json.decode(data, type=_File)
         except MSGSPEC_ERRORS as error:
             raise UsageError(
                 f"{self.path} is not a list of tokens ({error}): correct it, or move it away "
                 "and invite all users again"
             ) from None
 
-    def _write(self, rows: list[dict[str, Any]]) -> None:
+    def _write(self, content: dict[str, Any]) -> None:
         # If root writes the file, give it to the directory's owner, because the service reads it as
         # its own user.
         directory = self.path.parent.stat()
         owner = (directory.st_uid, directory.st_gid) if os.geteuid() == 0 else None
-        replace(self.path, msgspec.json.encode(rows), mode=0o600, owner=owner)
+        replace(self.path, msgspec.json.encode(content), mode=0o600, owner=owner)
 
 
 def place() -> Path:
@@ -193,15 +216,15 @@ def place() -> Path:
     return Path(base) / "acsard-web"
 
 
-def owner_in(tokens: Sequence[Token], text: str) -> AdmittedClient | None:
-    """Return the owner of a token that is in `tokens` and has not expired."""
+def owner_in(tokens: Sequence[Token], text: str, now_s: float) -> AdmittedClient | None:
+    """Return the owner of a token that is in `tokens` and has not expired by `now_s`."""
     if not text or len(text) > 200:
         return None
     digest, match = _digest(text), None
     for token in tokens:
         if hmac.compare_digest(token.digest, digest):
             match = token
-    if match is None or match.ends <= time.time():
+    if match is None or match.ends <= now_s:
         return None
     role = next((role for role in ROLES if role == match.role), None)
     return role and AdmittedClient(role, match.name, match.digest)

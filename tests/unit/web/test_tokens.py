@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import stat
+import time
 from pathlib import Path
 
 import msgspec
@@ -18,17 +19,22 @@ from acsard.web.callers import AdmittedClient
 from acsard.web.tokens import Token, Vault, owner_in
 
 
+def owner(vault: Vault, text: str) -> AdmittedClient | None:
+    """Return the owner of a token by the file as it is now."""
+    return owner_in(vault.all(), text, vault.now_s())
+
+
 def test_a_token_is_valid_until_it_is_revoked(tmp_path: Path) -> None:
     keeper, server = Vault(tmp_path / "state", "robot1"), Vault(tmp_path / "state", "robot1")
     assert server.all() == []
     text, _ = keeper.invite("operator", "phone", 30)
-    owner = owner_in(server.all(), text)
-    assert owner is not None
-    assert (owner.role, owner.name) == ("operator", "phone")
-    assert owner.token in server.valid_digests()
+    found = owner(server, text)
+    assert found is not None
+    assert (found.role, found.name) == ("operator", "phone")
+    assert found.token in server.valid_digests()
     keeper.revoke("phone")
-    assert owner_in(server.all(), text) is None
-    assert owner.token not in server.valid_digests()
+    assert owner(server, text) is None
+    assert found.token not in server.valid_digests()
 
 
 def test_the_token_itself_is_not_stored_on_the_disk(tmp_path: Path) -> None:
@@ -43,8 +49,9 @@ def test_the_token_itself_is_not_stored_on_the_disk(tmp_path: Path) -> None:
 def test_an_expired_token_is_not_valid(tmp_path: Path) -> None:
     vault = Vault(tmp_path, "robot1")
     text, token = vault.invite("viewer", "tv", 1)
-    vault.path.write_bytes(msgspec.json.encode([replace(token, ends=token.made - 1)]))
-    assert owner_in(vault.all(), text) is None
+    ended = {"tokens": [replace(token, ends=token.made - 1)]}
+    vault.path.write_bytes(msgspec.json.encode(ended))
+    assert owner(vault, text) is None
     assert token.digest not in vault.valid_digests()
 
 
@@ -52,7 +59,7 @@ def test_an_expired_token_is_not_valid(tmp_path: Path) -> None:
 def test_an_unknown_token_is_not_valid(tmp_path: Path, text: str) -> None:
     vault = Vault(tmp_path, "robot1")
     vault.invite("viewer", "tv", 1)
-    assert owner_in(vault.all(), text) is None
+    assert owner(vault, text) is None
 
 
 def test_with_a_damaged_file_no_token_is_valid(tmp_path: Path) -> None:
@@ -61,7 +68,7 @@ def test_with_a_damaged_file_no_token_is_valid(tmp_path: Path) -> None:
     whole = vault.path.read_bytes()
     for damaged in (whole[:-3], whole.replace(b'"me"', '"mü"'.encode("latin-1")), b"[" * 100_000):
         vault.path.write_bytes(damaged)
-        assert owner_in(vault.all(), text) is None
+        assert owner(vault, text) is None
         assert vault.valid_digests() == frozenset()
         with pytest.raises(UsageError, match="is not a list of tokens"):
             vault.invite("viewer", "tv", 1)
@@ -71,15 +78,77 @@ def test_a_role_and_a_field_of_a_later_version_leave_the_other_tokens_valid(tmp_
     vault = Vault(tmp_path, "acsar")
     text, token = vault.invite("operator", "phone", 1)
     pilot, other = vault.invite("viewer", "pilot", 1)
-    rows = json.loads(vault.path.read_bytes())
-    rows[0]["later"], rows[1]["role"] = 1, "pilot"
-    vault.path.write_text(json.dumps(rows))
+    content = json.loads(vault.path.read_bytes())
+    rows = content["tokens"]
+    rows[0]["later"], rows[1]["role"], content["later"] = 1, "pilot", 2
+    vault.path.write_text(json.dumps(content))
     assert vault.valid_digests() == {token.digest, other.digest}
     assert vault.find_owner(text) == AdmittedClient("operator", "phone", token.digest)
     assert vault.find_owner(pilot) is None
     vault.revoke("pilot")
-    (row,) = json.loads(vault.path.read_bytes())
-    assert (row["name"], row["later"]) == ("phone", 1)
+    content = json.loads(vault.path.read_bytes())
+    (row,) = content["tokens"]
+    assert (row["name"], row["later"], content["later"]) == ("phone", 1, 2)
+
+
+DAY_S = 86_400
+
+
+def test_an_expired_token_stays_expired_after_a_start_without_the_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 1_800_000_000.0
+    monkeypatch.setattr(time, "time", lambda: now_s)
+    text, token = Vault(tmp_path, "robot1").invite("maintainer", "me", 1)
+    other, _ = Vault(tmp_path, "robot1").invite("viewer", "tv", 30)
+    server = Vault(tmp_path, "robot1")
+    for _ in range(DAY_S // 60 + 2):
+        assert (token.digest in server.valid_digests()) is (now_s < token.ends)
+        now_s += 60.0
+    now_s = 5.0  # a clock without a battery begins in 1970
+    server = Vault(tmp_path, "robot1")
+    assert owner(server, text) is None
+    assert token.digest not in server.valid_digests()
+    assert server.left_s(token.digest) == 0
+    # A robot without a network never learns the time, and its valid tokens still work.
+    assert owner(server, other) is not None
+    # A new token counts from the newest known time, so it is valid now.
+    late, _ = Vault(tmp_path, "robot1").invite("operator", "phone", 1)
+    assert owner(server, late) is not None
+
+
+def test_the_time_is_written_each_minute_at_most_and_only_beside_tokens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 1_800_000_000.0
+    monkeypatch.setattr(time, "time", lambda: now_s)
+    server = Vault(tmp_path, "robot1")
+    for _ in range(100):
+        server.valid_digests()
+        now_s += 1.0
+    assert not server.path.exists()
+    Vault(tmp_path, "robot1").invite("viewer", "tv", 1)
+    contents = set[bytes]()
+    for _ in range(600):
+        server.valid_digests()
+        contents.add(server.path.read_bytes())
+        now_s += 1.0
+    assert len(contents) == 10
+
+
+def test_a_disk_that_cannot_store_the_time_leaves_the_tokens_valid(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vault = Vault(tmp_path, "robot1")
+    _, token = vault.invite("viewer", "tv", 1)
+    now_s = time.time() + 3600.0
+    monkeypatch.setattr(time, "time", lambda: now_s)
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(tokens, "replace", full)
+    assert vault.valid_digests() == {token.digest}
 
 
 def test_a_damaged_file_is_not_written_over(tmp_path: Path) -> None:
@@ -132,9 +201,9 @@ def test_robots_that_share_the_file_know_their_own_tokens_alone(tmp_path: Path) 
     first, second = Vault(tmp_path, "robot1"), Vault(tmp_path, "robot2")
     ours, _ = first.invite("operator", "phone", 1)
     theirs, token = second.invite("viewer", "phone", 1)
-    assert owner_in(first.all(), ours) is not None
-    assert owner_in(second.all(), ours) is None
-    assert owner_in(first.all(), theirs) is None
+    assert owner(first, ours) is not None
+    assert owner(second, ours) is None
+    assert owner(first, theirs) is None
     assert [entry.robot for entry in second.all()] == ["robot2"]
     assert second.valid_digests() == {token.digest}
     assert first.left_s(token.digest) == 0
