@@ -35,6 +35,7 @@ PROMISED = (
     Promise("state", "out", "RobotState", "viewer"),
     Promise("diagnostics", "out", "DiagnosticArray", "viewer", "diagnostics"),
     Promise("events", "out", "Events", "viewer"),
+    Promise("beat", "out", "Beat", "viewer"),
     Promise("sim/pose", "out", "PoseStamped", "viewer", always=False),
     Promise("json/<key>", "out", "JSON", "viewer"),
     Promise("cmd/<source>", "in", "Twist or TwistStamped", None),

@@ -26,6 +26,7 @@ RadPerS = float
 Metres = float
 
 NS_PER_S = 1_000_000_000
+NS_PER_US = 1000
 
 ROOT_KEY = "acsard"  # of every native (non-ROS) key: `acsard/<robot.id>/...`
 

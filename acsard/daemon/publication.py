@@ -16,14 +16,17 @@ from acsard.core.formatting import listed
 from acsard.core.incoming.bus_interface import Bus
 from acsard.core.incoming.queries import Queries, Query, refused
 from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.keys_and_roles import BEAT
 from acsard.core.messages.report import Report
-from acsard.core.messages.schema import Info, Message
+from acsard.core.messages.schema import Beat, Info, Message
 from acsard.core.robot import Robot
 from acsard.core.values import (
+    NS_PER_US,
     Answer,
     Event,
     Instant,
     News,
+    Ns,
     Recording,
     Refusal,
     Request,
@@ -33,6 +36,7 @@ from acsard.core.values import (
 from acsard.daemon.intake import Intake
 from acsard.daemon.latch_rules import MAX_ANSWER_DELAY_NS, Handover
 from acsard.daemon.latencies import Stopwatch
+from acsard.host import clock
 from acsard.recording.recorded_steps import StepRecorder
 
 MAX_NAMED = 3  # settings in `settings_differ`
@@ -57,13 +61,15 @@ class Publication:
         events: list[Event] | None = None,
         certificate_ends: dict[str, int] | None = None,
         run: int = 0,
+        boot_ns: Callable[[], Ns] = clock.boot_ns,
     ) -> None:
-        # `events` collects those of other parts, and `run` is that of the beats.
+        # `events` collects those of other parts. `run` and `boot_ns` are those of the beats.
         config = robot.config
         self.report = Report(config, start, certificate_ends, info.version)
         self.intake = Intake(
             config, bus, [] if events is None else events, self.report.certificate_ends, run
         )
+        self._run, self._boot_ns = run, boot_ns
         self.stopwatch = Stopwatch()
         # Returns the newest message of a key of another part, such as the simulator.
         self.beside: Callable[[str], Message | None] = lambda key: None
@@ -89,6 +95,8 @@ class Publication:
         if is_new:
             self._use(config, news.answers)
         wanted = bus.wanted_keys
+        if report.beat_due(now.mono_ns, wanted):
+            bus.publish_beat(self._beat())
         for estimate in news.estimates:
             for topic in report.feedback_due(estimate, wanted):
                 bus.publish_feedback(topic, estimate)
@@ -135,7 +143,12 @@ class Publication:
 
     def current(self, key: str) -> Message | None:
         """Return the present message of a key, or None."""
+        if key == BEAT:
+            return self._beat()
         return self.report.current(key, self._snapshot) or self.beside(key)
+
+    def _beat(self) -> Beat:
+        return Beat(self._run, self._boot_ns() // NS_PER_US)
 
     def counters(self) -> dict[str, int]:
         return self._snapshot().counters

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from acsard.core.values import NS_PER_S, Instant, Ns
+from acsard.core.values import NS_PER_S, NS_PER_US, Instant, Ns
 
 # A `partial`, because a Python function would be slower.
 mono_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC_RAW)
@@ -41,9 +41,6 @@ def steady_s() -> float:
     With a clock that stands still, those from before a suspend would seem fresh.
     """
     return steady_ns() / NS_PER_S
-
-
-NS_PER_US = 1000
 
 
 def now() -> Instant:

@@ -15,7 +15,7 @@ from acsard.core.config.settings import (
     McuConfig,
     WheelMap,
 )
-from acsard.core.messages.schema import JointState, TFMessage, TwistStamped
+from acsard.core.messages.schema import Beat, JointState, TFMessage, TwistStamped
 from acsard.core.values import NS_PER_S
 from tests.scenarios.world import World
 
@@ -80,6 +80,20 @@ def test_every_message_of_a_sample_has_its_stamp(world: World) -> None:
         assert isinstance(wheels, JointState)
         stamp = msgspec.structs.asdict(odom)["header"].stamp
         assert tf.transforms[0].header.stamp == stamp == wheels.header.stamp
+
+
+def test_a_beat_has_the_time_of_each_twentieth_of_a_second_while_somebody_subscribes(
+    world: World,
+) -> None:
+    world.run(1.0)
+    assert "beat" not in world.bus.published
+    world.bus.wanted_keys.add("beat")
+    began_us = world.now_ns // 1000
+    world.run(1.0)
+    beats = [beat.boot_us for beat in world.bus.published["beat"] if isinstance(beat, Beat)]
+    expected = [beats[0] + 50_000 * number for number in range(20)]
+    assert beats == pytest.approx(expected, abs=3000)
+    assert beats[0] - began_us <= 10_000
 
 
 def test_the_applied_speed_ramps_by_the_acceleration(world: World) -> None:

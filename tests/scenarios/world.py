@@ -23,7 +23,7 @@ from acsard.core.link.serial_output import Offered, SerialOutput
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.frames import FeedbackTopic
 from acsard.core.messages.keys_and_roles import PUBLISHED
-from acsard.core.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
+from acsard.core.messages.schema import Beat, Info, Message, Odometry, RobotState, ServiceReply
 from acsard.core.messages.signature import Signature
 from acsard.core.robot import Robot
 from acsard.core.simulator.fake_mcu import FakeMcu
@@ -149,6 +149,9 @@ class MemoryBus:
     def publish_feedback(self, topic: FeedbackTopic, estimate: Estimate) -> None:
         self.publish(topic.key, topic.build(estimate))
 
+    def publish_beat(self, beat: Beat) -> None:
+        self.publish("beat", beat)
+
     def flush(self) -> None: ...
 
     def reply(self, reply: Reply) -> None:
@@ -203,7 +206,9 @@ class World:
         info = Info("acsar", "0", 1, "sim", True, self.config.rate_hz, [], [])
         robot, handover = Robot(self.config, latches), Handover(latches, keeper)
         start, log = self.instant, self.events.append
-        publication = Publication(robot, self.bus, info, start, log, handover, recorder)
+        publication = Publication(
+            robot, self.bus, info, start, log, handover, recorder, boot_ns=lambda: self.now_ns
+        )
         self.loop = ControlLoop(
             robot, self.port, publication, handover, start, lambda: self.now_ns, recorder
         )

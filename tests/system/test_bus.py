@@ -39,6 +39,7 @@ PUBLISHED = {row.key: row.type for row in promised.PUBLISHED}
 """The type of each key that a simulated robot publishes without a URDF file."""
 
 FIELDS = {
+    "beat": {"run", "boot_us"},
     "odom": {"header", "child_frame_id", "pose", "twist"},
     "tf": {"transforms"},
     "tf_static": {"transforms"},

@@ -12,7 +12,7 @@ from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query, Reply
 from acsard.core.messages.encodings import DecodeError, StrictDecoder
 from acsard.core.messages.frames import FeedbackTopic
-from acsard.core.messages.schema import GatewayState, Message
+from acsard.core.messages.schema import Beat, GatewayState, Message
 from acsard.core.values import Estimate, Event, Ns, RoutersStatus
 
 
@@ -63,6 +63,9 @@ class Bus(Protocol):
 
     def publish_feedback(self, topic: FeedbackTopic, estimate: Estimate) -> None:
         """Queue the message of a feedback line, which the next `flush` sends."""
+
+    def publish_beat(self, beat: Beat) -> None:
+        """Queue a beat, which the next `flush` sends."""
 
     def flush(self) -> None:
         """Send the queued messages, or start to send them, without waiting.

@@ -37,6 +37,7 @@ from acsard.core.ros.attachments import GID_BYTES, unpack
 from acsard.core.ros.transports import Transport
 from acsard.core.values import (
     NS_PER_S,
+    NS_PER_US,
     REST,
     Command,
     Echo,
@@ -82,8 +83,6 @@ class Bindings:
             del self._seen[next(iter(self._seen))]
         return None
 
-
-NS_PER_US = 1000
 
 MAX_COMMAND_BYTES = 4096  # a TwistStamped in JSON is shorter than 300
 

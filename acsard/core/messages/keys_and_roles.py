@@ -95,6 +95,8 @@ PLAIN_SERVICES = tuple(
     verb for verb, service in SERVICES.items() if service.optional or not service.payload
 )
 
+BEAT, BEAT_HZ = "beat", 20.0
+
 IMU = "imu"  # samples of the real or simulated gyro
 
 SPEED_LIMIT = "speed_limit"  # lowers the highest speed, for example by Nav2's speed filter
@@ -179,6 +181,7 @@ TOPICS: tuple[Topic, ...] = (
     _out("state", "RobotState", "10 Hz, on change", "mode, reason, pose, link, counters"),
     _out("diagnostics", "DiagnosticArray", "1 Hz, on change", "health of every part"),
     _out("events", "Events", "on change", "the last 20 events with time, text and caller"),
+    _out(BEAT, "Beat", "20 Hz", "time of the daemon, which a program copies into its commands"),
     _out(
         "sim/pose", "PoseStamped", "100 Hz", "the true pose, only with the simulator",
         simulated=True,

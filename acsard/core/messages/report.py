@@ -18,6 +18,7 @@ from acsard.core.messages.frames import (
     tf_numbers,
     wheel_states_numbers,
 )
+from acsard.core.messages.keys_and_roles import BEAT, BEAT_HZ
 from acsard.core.messages.recent_events import RecentEvents
 from acsard.core.messages.schema import (
     Battery,
@@ -121,7 +122,7 @@ class Report:
             "diagnostics": (self._diagnostics, DIAGNOSTICS_HZ),
             "battery": (self._battery, BATTERY_HZ),
         }
-        limited = ("odom", "wheel_states", "cmd_vel_out", *self._summaries)
+        limited = (BEAT, "odom", "wheel_states", "cmd_vel_out", *self._summaries)
         self._rates = {key: _Rate() for key in limited}
         self.config = config  # in force
 
@@ -140,6 +141,10 @@ class Report:
             for topic in self.feedback_due(estimate, wanted)
         ]
         return feedback + self.others_due(now, news, applied, wanted, get_snapshot)
+
+    def beat_due(self, now_ns: Ns, wanted: Collection[str]) -> bool:
+        """Return whether a beat is to be published."""
+        return BEAT in wanted and self._rates[BEAT].due(now_ns, BEAT_HZ)
 
     def feedback_due(self, estimate: Estimate, wanted: Collection[str]) -> list[FeedbackTopic]:
         """Return the topics on which a message of this feedback line is to be published."""

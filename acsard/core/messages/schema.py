@@ -668,6 +668,7 @@ MESSAGES: dict[str, type[Message]] = {
         Interfaces,
         Topics,
         WhoAmI,
+        Beat,
     )
 }
 """Maps the name of each complete message type to the type. Types that are only parts of messages

@@ -59,7 +59,7 @@ class ZenohBus:
         outlets = self._outlets = Outlets(self._thread_errors, direct=not lockable)
         # A method of this class would be one more call for each message and wake-up.
         self.publish, self.publish_feedback = outlets.publish, outlets.publish_feedback
-        self.flush = outlets.flush
+        self.publish_beat, self.flush = outlets.publish_beat, outlets.flush
         self._links = RouterLinks(config.bus, self._thread_errors)
         self._session: zenoh.Session
         self._entities: list[object] = []  # Zenoh undeclares an entity when nothing refers to it

@@ -3,8 +3,8 @@
 A topic has native keys (msgpack, JSON) and perhaps ROS keys, each with a publisher, its outlet. A
 message is encoded once per encoding that is latched or has a subscriber. The control loop only puts
 it into the topic's bounded slot, and a thread sends it: a bus that blocks costs messages, but no
-control period. The messages of feedback lines are sent by the control loop itself if no client can
-block the session, while no put is slow.
+control period. Beats and the messages of feedback lines are sent by the control loop itself if no
+client can block the session, while no put is slow.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ import zenoh.ext
 from acsard.bus.subscription import direct
 from acsard.core.messages.encodings import Format, encode, encoding_name
 from acsard.core.messages.frames import FeedbackTopic
-from acsard.core.messages.schema import Message
+from acsard.core.messages.keys_and_roles import BEAT
+from acsard.core.messages.schema import Beat, Message
 from acsard.core.ros.attachments import Attachment
 from acsard.core.values import NS_PER_S, Estimate, Ns
 from acsard.host import clock
@@ -44,7 +45,7 @@ BLOCKED_AFTER_NS = NS_PER_S // 4
 # that was stopped at most 0.09 ms, because Zenoh drops the sample.
 SLOW_PUT_NS = NS_PER_S // 2000
 
-# Feedback messages of one step that the control loop sends itself; after a stall there are more.
+# Messages of one step that the control loop sends itself; after a stall there are more.
 MAX_DIRECT = 6
 
 # Heartbeat of latched ROS topics, as in rmw_zenoh.
@@ -85,9 +86,9 @@ class Outlets:
         # Native keys with a subscriber or a latched publisher.
         self.wanted: frozenset[str] = frozenset()
         self._slots: dict[str, Mailbox[_Send]] = {}
-        self._feedback: list[tuple[FeedbackTopic, Estimate]] = []  # of this step
+        self._queued: list[tuple[str, _Send]] = []  # for `flush`, by topic
         self.feedback_sent: Callable[[Ns], object] = _ignore
-        self._slow: set[str] = set()  # feedback topics whose last put was slow
+        self._slow: set[str] = set()  # topics of the control loop whose last put was slow
         self._bell = Bell()  # one for all slots, because a step fills several
         self._waiting = self._leaving = self._stuck = False
         self._dropped = 0  # displaced since the last `losses`
@@ -113,30 +114,34 @@ class Outlets:
 
     def publish_feedback(self, topic: FeedbackTopic, estimate: Estimate) -> None:
         """Queue the message of a feedback line for `flush`."""
-        self._feedback.append((topic, estimate))
+        self._queued.append((topic.key, partial(self._send_feedback, topic, estimate)))
+
+    def publish_beat(self, beat: Beat) -> None:
+        """Queue a beat for `flush`."""
+        self._queued.append((BEAT, partial(self._send_beat, beat)))
 
     def flush(self) -> None:
-        """Send the messages of feedback lines, and wake the thread that sends the others.
+        """Send the beat and the messages of feedback lines, and wake the thread for the others.
 
         Raises the exception that has ended a thread of the bus: it must end the daemon too.
         """
         if self._errors:
             raise self._errors[0]
-        feedback = self._feedback
-        if feedback:
-            direct = self._direct and len(feedback) <= MAX_DIRECT
-            for topic, estimate in feedback:
+        queued = self._queued
+        if queued:
+            direct = self._direct and len(queued) <= MAX_DIRECT
+            for topic, send in queued:
                 # Look for waiting messages first: the thread sets `_began_ns` before it takes one.
                 if (
                     direct
-                    and not self._slots[topic.key].waiting
+                    and not self._slots[topic].waiting
                     and self._began_ns is None
                     and self._slow.isdisjoint(self.wanted)
                 ):
-                    self._send_feedback(topic, estimate)
+                    send()
                 else:
-                    self._store(topic.key, partial(self._send_feedback, topic, estimate))
-            feedback.clear()
+                    self._store(topic, send)
+            queued.clear()
         if self._waiting:
             self._waiting = False
             self._bell.ring()
@@ -188,11 +193,19 @@ class Outlets:
                 # Two outlets with one encoding are rare, and a frame is filled in 3 us.
                 outlet.put(topic.encode(estimate, outlet.form))
         now_ns = clock.mono_ns()
-        if now_ns - began_ns > SLOW_PUT_NS:
-            self._slow.add(topic.key)
-        else:
-            self._slow.discard(topic.key)
+        self._note_put(topic.key, now_ns - began_ns)
         self.feedback_sent(now_ns - estimate.heard_ns)
+
+    def _send_beat(self, beat: Beat) -> None:
+        began_ns = clock.mono_ns()
+        self._send(BEAT, beat)
+        self._note_put(BEAT, clock.mono_ns() - began_ns)
+
+    def _note_put(self, topic: str, took_ns: Ns) -> None:
+        if took_ns > SLOW_PUT_NS:
+            self._slow.add(topic)
+        else:
+            self._slow.discard(topic)
 
     def _send(self, topic: str, message: Message) -> None:
         payloads: dict[Format, bytes] = {}

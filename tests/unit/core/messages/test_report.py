@@ -20,7 +20,7 @@ from acsard.core.config.settings import (
     RatesConfig,
     RobotConfig,
 )
-from acsard.core.messages.keys_and_roles import PUBLISHED
+from acsard.core.messages.keys_and_roles import BEAT, PUBLISHED
 from acsard.core.messages.report import Report, from_yaw
 from acsard.core.messages.schema import (
     Battery,
@@ -60,10 +60,11 @@ from tests.each import each
 from tests.stepped import Outputs
 from tests.unit.core.messages.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, due, later
 
-ALL = {topic.key for topic in PUBLISHED if not topic.simulated}
+ALL = {topic.key for topic in PUBLISHED if not topic.simulated} - {BEAT}
 """Keys that a report publishes.
 
-The simulator publishes the true values of a simulated robot itself.
+The simulator publishes the true values of a simulated robot itself. A beat has the time of a clock
+that a report cannot read.
 """
 SUMMARIES = ALL - {
     "odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "events",

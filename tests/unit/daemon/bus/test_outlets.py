@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import AccessConfig, BusConfig, Config
 from acsard.core.messages.frames import EXAMPLE, FeedbackTopic
-from acsard.core.messages.schema import Twist, Vector3
+from acsard.core.messages.schema import Beat, Twist, Vector3
 from acsard.core.values import NS_PER_S, Estimate
 from acsard.daemon.bus.bus import ZenohBus
 from acsard.daemon.bus.outlets import (
@@ -280,3 +280,26 @@ def test_the_delay_of_feedback_includes_sending_it(direct: bool) -> None:
     feedback.outlets.stop(WAIT_S)
     assert len(delays) == 1
     assert 0.02 * NS_PER_S <= delays[0] < 1.0 * NS_PER_S
+
+
+def test_a_beat_is_sent_by_the_control_loop_itself_unless_a_put_was_slow(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    puts, publisher, sent = Puts(monkeypatch), Publisher(), list[tuple[Beat, bool]]()
+    outlets = Outlets([], direct=True)
+
+    def put(payload: bytes) -> None:
+        beat = msgspec.msgpack.decode(payload, type=Beat)
+        sent.append((beat, threading.current_thread() is threading.main_thread()))
+
+    monkeypatch.setattr(publisher, "put", put)
+    outlets.declare(cast(zenoh.Session, publisher), "beat", "beat", "msgpack", "Beat")
+    outlets.start()
+    for number, took_ns in enumerate((0, 2 * SLOW_PUT_NS, 0, 0)):
+        puts.took_ns = took_ns
+        outlets.publish_beat(Beat(7, number))
+        outlets.flush()
+        wait_until(lambda: len(sent) == number + 1)  # noqa: B023
+        wait_until(lambda: outlets._began_ns is None)
+    outlets.stop(WAIT_S)
+    assert sent == [(Beat(7, 0), True), (Beat(7, 1), True), (Beat(7, 2), False), (Beat(7, 3), True)]
