@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from msgspec import Struct
 
-from acsard.core.messages.schema import RobotState, SourceState
+from acsard.core.messages.schema import Beat, RobotState, SourceState
 from acsard.core.messages.signature import Signature
 from acsard.core.values import NS_PER_S, REST, Ns, Twist
 
@@ -51,6 +51,7 @@ class Wish(Struct, frozen=True):
     twist: Twist
     stamp_ns: Ns | None = None
     steady: bool = False  # nothing adjusts that clock
+    echo: Beat | None = None  # the newest beat that the person's program had received
 
 
 class Commander:
@@ -128,7 +129,7 @@ class Commander:
         stamp_ns = self._last.stamp_ns
         if stamp_ns is not None and self._came_ns is not None:
             stamp_ns += at_ns - self._came_ns
-        return Wish(REST, stamp_ns, self._last.steady)
+        return Wish(REST, stamp_ns, self._last.steady, self._last.echo)
 
     @property
     def last_is_nonzero(self) -> bool:
@@ -140,7 +141,9 @@ class CommandSigner:
     def __init__(self, sender_id: str) -> None:
         self._id, self._sequence, self._newest_ns = sender_id, 0, 0
 
-    def sign(self, stamp_ns: Ns | None, *, steady: bool, zero: bool = False) -> Signature:
+    def sign(
+        self, stamp_ns: Ns | None, *, steady: bool, zero: bool = False, echo: Beat | None = None
+    ) -> Signature:
         """Return the signature of the next command, with its sequence number.
 
         A zero gets a later stamp of this sender, so that it is not refused as older. `steady` says
@@ -152,7 +155,7 @@ class CommandSigner:
         if stamp_ns is not None:
             newest_ns = max(stamp_ns, self._newest_ns)
             self._newest_ns, stamp_ns = newest_ns, newest_ns if zero else stamp_ns
-        return Signature(self._id, stamp_ns, self._sequence, steady)
+        return Signature(self._id, stamp_ns, self._sequence, steady, echo)
 
 
 def objection(state: RobotState, source: str, sender: str) -> str:

@@ -21,6 +21,7 @@ from acsard.bus.robot_discovery import NO_BATTERY, explain_silence, presence
 from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.bus.tls import shown_at
 from acsard.bus.zenoh_sessions import client_session
+from acsard.client.beats import Beats
 from acsard.client.commander import (
     MAX_SOURCE_TIMEOUT_S,
     MIN_SPACING_S,
@@ -42,6 +43,7 @@ from acsard.core.messages.encodings import (
     encoding_name,
 )
 from acsard.core.messages.keys_and_roles import (
+    BEAT,
     VERBS,
     by_key,
     command_key,
@@ -216,6 +218,7 @@ class Client:
         self._secret = new_secret()
         whole = sender_id(f"{platform.node()[:32]}/{os.getpid()}")
         self._sender = CommandSigner(whole)
+        self._beats = Beats(session, self.key(BEAT))
         # `state.sender` while this client drives.
         self.sender = public_name(whole, self.certificate)
         # Compute stamps from the steady clock. If the stamps came from the wall clock, and a
@@ -250,15 +253,20 @@ class Client:
     def send(self, linear: float, angular: float = 0.0) -> None:
         """Send one command: `linear` m/s, `angular` rad/s (left is +).
 
-        Repeat the call to keep the robot moving. The first call sends a zero (a command with the
-        speed 0) instead, because the daemon requires a zero before it follows a sender.
+        Repeat the call to keep the robot moving. Until the daemon's first beat has arrived, after
+        about 0.05 s, nothing is sent. The first command is a zero (the speed 0) instead, because
+        the daemon requires a zero before it follows a sender.
         """
+        # The echo shows how old the wish is, so copy the beat before the command waits.
+        echo = self._beats.newest()
+        if echo is None:
+            return
         with self._spacing.wait():
             if self._opened:
-                self._put(linear, angular)
+                self._put(linear, angular, echo)
             else:
                 self._opened = True
-                self._put(0.0, 0.0)
+                self._put(0.0, 0.0, echo)
 
     def end(self) -> None:
         """Close the connection, as `connect` does at the end of its `with` block.
@@ -472,7 +480,7 @@ class Client:
             timestamp=self.session.new_timestamp(),
         )
 
-    def _put(self, linear: float, angular: float) -> None:
+    def _put(self, linear: float, angular: float, echo: schema.Beat) -> None:
         if self._spacing.ending and (linear or angular):
             raise NoAnswerError("the connection to the daemon is being closed: connect again")
         stamp_ns = clock.steady_ns() + self._wall_offset_ns
@@ -480,7 +488,8 @@ class Client:
             schema.Header(schema.Time.from_ns(stamp_ns)),
             schema.Twist(schema.Vector3(x=linear), schema.Vector3(z=angular)),
         )
-        self._publish(message, self._sender.sign(stamp_ns, steady=True), self.source)
+        signature = self._sender.sign(stamp_ns, steady=True, echo=echo)
+        self._publish(message, signature, self.source)
         if linear or angular:
             self._spacing.moving[self] = clock.steady_s()
         else:

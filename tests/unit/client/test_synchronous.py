@@ -26,14 +26,15 @@ from acsard.core.incoming.imu import reading
 from acsard.core.incoming.queries import Queries, Query
 from acsard.core.messages import schema
 from acsard.core.messages.encodings import FORMATS, DecodeError, Decoder, Format, encode
-from acsard.core.messages.schema import Header, Imu, Quaternion, Time, Vector3
+from acsard.core.messages.schema import Beat, Header, Imu, Quaternion, Time, Vector3
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.values import NS_PER_S, REST, Command, Status
+from acsard.core.values import NS_PER_S, REST, Command, Echo, Status
 from acsard.host import clock
 from acsard.host.errors import ReplyError
 from tests.each import each
 
 RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
+BEAT = schema.Beat(7, 1000)
 INFO = schema.Info("acsar", "1.2.3", 42, "sim", True, 100.0, [], [])
 
 
@@ -51,8 +52,17 @@ class Session:
     def is_closed(self) -> bool:
         return self.closed
 
-    def declare_subscriber(self, *_: Any) -> None:
-        raise zenoh.ZError("session closed")
+    def declare_subscriber(self, key: str, take: Any) -> Any:
+        if self.closed or not key.endswith("/beat"):
+            raise zenoh.ZError("session closed")
+        self.publish, self.beat_key = take, key
+        self.beat(BEAT)
+        return take
+
+    def beat(self, beat: Beat) -> None:
+        """Let a beat arrive at the client."""
+        payload = SimpleNamespace(to_bytes=lambda: encode(beat, "msgpack"))
+        self.publish(SimpleNamespace(encoding="", payload=payload, key_expr=self.beat_key))
 
     def zid(self) -> str:
         return self._zid
@@ -95,6 +105,23 @@ def test_each_command_has_its_sender_its_sequence_number_and_its_time(session: S
     assert before_ns <= stamps[0] + 1_000_000
     assert stamps == sorted(stamps)
     assert stamps[-1] <= time.time_ns() + 1_000_000
+
+
+def test_each_command_echoes_the_newest_beat_and_none_is_sent_before_the_first(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "beat", lambda _: None)
+    client = client_of(session)
+    client.send(0.5)
+    assert session.heard == []
+    monkeypatch.undo()
+    for number in range(3):
+        session.beat(Beat(BEAT.run, number))
+        client.send(0.5)
+    assert [command.echo for command in session.heard] == [
+        Echo(BEAT.run, number * 1000) for number in range(3)
+    ]
+    assert [command.twist.linear for command in session.heard] == [0.0, 0.5, 0.5]
 
 
 def test_two_clients_of_one_connection_keep_the_spacing_between_commands(session: Session) -> None:
