@@ -14,6 +14,7 @@ from msgspec import Meta, Struct
 
 from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.keys_and_roles import FOLLOWED
+from acsard.core.messages.schema import Beat
 from acsard.web import socket_messages
 from acsard.web.routes import Body, Problem, Route
 from acsard.web.socket_messages import MESSAGE_TYPES
@@ -88,6 +89,7 @@ def document(version: str, routes: Sequence[Route]) -> Described:
     for kind in MESSAGE_TYPES.values():
         schemas[kind.__name__]["x-least-role"] = kind.least
     messages, of_the_socket = _messages(), _of_the_socket(refs)
+    del schemas[Beat.__name__]  # `messages` has it, too
     assert not (schemas | of_the_socket).keys() & messages.keys(), "two types have the same name"
     paths: Described = {}
     for row in described:

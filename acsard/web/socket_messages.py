@@ -15,6 +15,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from acsard.core.messages.permissions import COMMAND_ROLE
+from acsard.core.messages.schema import Beat
 from acsard.core.messages.signature import MAX_INT64
 from acsard.core.values import AcsardError, Role
 from acsard.web.last_minute import Plotted
@@ -90,6 +91,8 @@ class Command(_Frame, frozen=True):
     """True if `stamp` is from a clock that is never adjusted, such as `performance.now()`."""
     source: Short = DEFAULT_SOURCE
     """Name of one of the robot's command sources."""
+    echo: Beat | None = None
+    """The value of the key `beat` that the client received last."""
 
     @property
     def stamp_ns(self) -> int:

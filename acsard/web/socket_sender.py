@@ -1,6 +1,8 @@
 """Sends messages and the values of subscribed keys to the client of one WebSocket.
 
-While the client does not read, the server skips new values of the keys instead of queueing them.
+While the client does not read, the server skips new values of the keys instead of queueing them. A
+beat is sent as soon as it arrives, ahead of everything else: its delay adds to the age of the
+client's commands.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import aiohttp
 import msgspec
 from aiohttp import web
 
+from acsard.core.messages.keys_and_roles import BEAT
 from acsard.host import clock
 from acsard.host.rate_limits import Buckets, Rate
 from acsard.web.answers import cut
@@ -39,6 +42,11 @@ class Following:
         self.sent = 0
         self.due = 0.0
 
+    def next(self, stream: Stream) -> bytes:
+        """Return the message with the newest value."""
+        self.sent, value, age = stream.value()
+        return b'%b%b,"age":%.1f}' % (self.head, value, age)
+
 
 class Outgoing:
     """Sends the messages and the values of subscribed keys to the client of one WebSocket."""
@@ -52,7 +60,7 @@ class Outgoing:
         # The queue is limited, because the client may have stopped reading.
         self._out: deque[bytes] = deque(maxlen=200)
         self._pong: bytes | None = None  # payload of the newest unanswered ping
-        self._news = asyncio.Event()
+        self._news, self._loop = asyncio.Event(), asyncio.get_running_loop()
         self._reports = Buckets(REPORT_RATE)
         self._closing = False
 
@@ -63,6 +71,10 @@ class Outgoing:
 
     def wake(self) -> None:
         self._news.set()
+
+    def wake_from_thread(self) -> None:
+        with suppress(RuntimeError):  # the event loop may have ended
+            self._loop.call_soon_threadsafe(self._news.set)
 
     def refuse(self, what: str, reason: Reason, text: str) -> None:
         """Count a refused message, and report it to the client within `REPORT_RATE`."""
@@ -76,10 +88,11 @@ class Outgoing:
         After each round, `look_around` gets the time of the event loop's clock and returns its next
         one.
         """
-        loop = asyncio.get_running_loop()
+        loop = self._loop
         try:
             while True:
                 self._news.clear()
+                await self._send_beat()
                 await self._send_what_waits()
                 now = loop.time()
                 due = [
@@ -123,8 +136,17 @@ class Outgoing:
         self._news.set()
 
     async def _send(self, data: bytes, kind: aiohttp.WSMsgType = aiohttp.WSMsgType.TEXT) -> None:
+        await self._send_beat()
+        await self._send_frame(data, kind)
+
+    async def _send_frame(self, data: bytes, kind: aiohttp.WSMsgType) -> None:
         if not self._closing:  # no data may follow a close frame
             await self._socket.send_frame(data, kind)
+
+    async def _send_beat(self) -> None:
+        beats = self.following.get(BEAT)
+        if beats is not None and beats.stream is not None and beats.stream.number != beats.sent:
+            await self._send_frame(beats.next(beats.stream), aiohttp.WSMsgType.TEXT)
 
     async def _send_what_waits(self) -> None:
         if self._pong is not None:
@@ -135,7 +157,7 @@ class Outgoing:
 
     async def _send_due(self, subscription: Following, now: float) -> float:
         stream = subscription.stream
-        if stream is None:
+        if stream is None or subscription.name == BEAT:
             return now + subscription.period  # `Keys._join` wakes the task when the stream exists
         if subscription.due > now:
             return subscription.due
@@ -145,9 +167,7 @@ class Outgoing:
             if self._unread() > MAX_UNREAD_BYTES:
                 self._counts.add("frames_left_out")
             else:
-                subscription.sent, value, age = stream.value()
-                frame = b'%b%b,"age":%.1f}' % (subscription.head, value, age)
-                await self._send(frame)
+                await self._send(subscription.next(stream))
         return subscription.due
 
     def _unread(self) -> int:
@@ -209,6 +229,7 @@ class Keys:
 
     def _leave(self, subscription: Following) -> None:
         if subscription.stream is not None:
+            subscription.stream.wakes.discard(self._out.wake_from_thread)
             self._robot.streams.leave(subscription.name)
 
     async def _join(self, subscription: Following) -> None:
@@ -221,6 +242,8 @@ class Keys:
             self._robot.streams.leave(subscription.name)
             return
         subscription.stream = stream
+        if subscription.name == BEAT:
+            stream.wakes.add(self._out.wake_from_thread)
         self._out.wake()
 
     async def _follow(self, subscription: Following) -> Stream | None:

@@ -43,6 +43,7 @@ class Stream:
         self._text: tuple[int, bytes] = (0, b"null")
         self.declared: Any = None
         self.users = 0
+        self.wakes: set[Callable[[], object]] = set()  # called for each message, in any thread
         self.lock = asyncio.Lock()
 
     @property
@@ -58,6 +59,8 @@ class Stream:
     def take(self, sample: zenoh.Sample) -> None:
         with self._taking:
             self._newest = (self._newest[0] + 1, sample, clock.steady_ns())
+        for wake in tuple(self.wakes):
+            wake()
 
     def answered(self, sample: zenoh.Sample) -> None:
         """Store the answer to a query, unless a message has arrived, which may be newer."""

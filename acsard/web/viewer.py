@@ -97,7 +97,10 @@ class ViewerCommands:
                     schema.Vector3(x=wish.twist.linear), schema.Vector3(z=wish.twist.angular)
                 )
                 zero = wish.twist == REST
-                signature = sender.sign(wish.stamp_ns, steady=wish.steady, zero=zero)
+                # An echo of this server would hide how late the viewer's command is.
+                signature = sender.sign(
+                    wish.stamp_ns, steady=wish.steady, zero=zero, echo=wish.echo
+                )
                 client.put(twist, signature, source)
                 self._counts.add("commands")
                 return
@@ -255,7 +258,8 @@ class Viewer:
             )
             return
         self._stamp_ns = stamp_ns
-        wish = Wish(Twist(frame.cmd.linear_x, frame.cmd.angular_z), stamp_ns, frame.steady)
+        twist = Twist(frame.cmd.linear_x, frame.cmd.angular_z)
+        wish = Wish(twist, stamp_ns, frame.steady, frame.echo)
         commander = self._commanders.setdefault(frame.source, Commander())
         owner = self.who.token or self.sender
         if not self._commands.give(owner, frame.source, commander, self._sender, wish):

@@ -19,6 +19,7 @@ export class Link extends EventTarget {
   #shut = false; // closed for good
   open = false;
   way = null; // round trip, ms
+  beat = null; // the newest beat of the daemon on this connection; each command echoes it
 
   /** `refused()` is called when the robot rejects a connection. It resolves to true if another attempt is pointless. */
   constructor(refused) {
@@ -85,6 +86,7 @@ export class Link extends EventTarget {
     socket.onopen = () => {
       clearTimeout(given);
       this.open = true;
+      this.beat = null;
       this.#tries = 0;
       this.#heard = performance.now();
       this.#asked = null;
@@ -111,6 +113,7 @@ export class Link extends EventTarget {
       this.way = performance.now() - this.#asked;
       this.#asked = null;
     } else if ("answer" in message) this.#answer(message);
+    else if (message.key === "beat") this.beat = message.value;
     else if ("key" in message) this.#tell(`key:${message.key}`, message);
     else for (const kind of ["hello", "path", "minute", "refused", "gone"]) if (kind in message) this.#tell(kind, message);
   }

@@ -196,7 +196,7 @@ function forgotten() {
 
 /** Disable the stick while a push would not move the robot, and show the reason beside it. */
 function readied() {
-  const fresh = link.open && performance.now() - heard <= 2 * lasts();
+  const fresh = link.beat && performance.now() - heard <= 2 * lasts(); // without a beat to echo, no command counts
   drive.barred = link.open ? still(fresh ? state : null, SOURCE, hello?.sender) : "No connection.";
   const off = !drive.allowed || Boolean(drive.barred);
   $("stick").setAttribute("aria-disabled", String(off));
@@ -292,6 +292,7 @@ function greeted({ detail }) {
   camera.show(hello.camera);
   drive.limits = hello.limits;
   drive.allowed = !barred(hello, "drive");
+  if (drive.allowed) link.subscribe("beat", 20);
   permitted();
   $("limit").max = String(hello.limits.linear);
   limited();

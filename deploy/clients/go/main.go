@@ -3,11 +3,13 @@ package main
 
 import (
 	"context"
+	"encoding/json"
 	"fmt"
 	"log"
 	"net/http"
 	"os"
 	"strings"
+	"sync/atomic"
 	"time"
 
 	"github.com/coder/websocket"
@@ -16,9 +18,12 @@ import (
 
 const period = 50 * time.Millisecond
 
+// The newest beat of the robot, by which it knows how old a command is.
+var beat atomic.Pointer[json.RawMessage]
+
 type message struct {
 	Key     string
-	Value   odometry
+	Value   json.RawMessage
 	Refused string
 	Reason  string
 }
@@ -47,7 +52,11 @@ func main() {
 	}
 	socket.SetReadLimit(1 << 20)
 	go show(ctx, socket)
+	say(ctx, socket, map[string]any{"subscribe": "beat"})
 	say(ctx, socket, map[string]any{"subscribe": "odom", "rate": 10})
+	for beat.Load() == nil {
+		time.Sleep(10 * time.Millisecond)
+	}
 	drive(ctx, socket, 0, 750*time.Millisecond) // the robot follows a new sender only after some zeros
 	drive(ctx, socket, 0.2, 2*time.Second)
 	drive(ctx, socket, 0, time.Second)
@@ -65,6 +74,7 @@ func drive(ctx context.Context, socket *websocket.Conn, speed float64, lasting t
 		say(ctx, socket, map[string]any{
 			"cmd":   map[string]float64{"linear_x": speed, "angular_z": 0},
 			"stamp": float64(time.Now().UnixMicro()) / 1000,
+			"echo":  beat.Load(),
 		})
 	}
 }
@@ -78,9 +88,16 @@ func show(ctx context.Context, socket *websocket.Conn) {
 		if said.Refused != "" {
 			log.Printf("%s was refused: %s", said.Refused, said.Reason)
 		}
+		if said.Key == "beat" {
+			beat.Store(&said.Value)
+		}
 		if said.Key == "odom" {
-			at := said.Value.Pose.Pose.Position
-			speed := said.Value.Twist.Twist.Linear.X
+			var value odometry
+			if err := json.Unmarshal(said.Value, &value); err != nil {
+				log.Fatal(err)
+			}
+			at := value.Pose.Pose.Position
+			speed := value.Twist.Twist.Linear.X
 			fmt.Printf("x %.3f m, y %.3f m, %.3f m/s\n", at.X, at.Y, speed)
 		}
 	}

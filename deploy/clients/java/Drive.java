@@ -17,14 +17,22 @@ public class Drive implements WebSocket.Listener {
         "\"key\":\"odom\".*?\"position\":\\{\"x\":" + NUMBER + ",\"y\":" + NUMBER
         + ".*\"linear\":\\{\"x\":" + NUMBER);
 
+    private static final Pattern BEAT = Pattern.compile("\"key\":\"beat\",\"value\":(\\{[^}]*\\})");
+
+    // The newest beat of the robot, by which it knows how old a command is.
+    private static volatile String beat = null;
+
     private final StringBuilder text = new StringBuilder();
 
     @Override
     public CompletionStage<?> onText(WebSocket socket, CharSequence part, boolean last) {
         text.append(part);
         if (last) {
+            Matcher beats = BEAT.matcher(text);
             Matcher found = ODOMETRY.matcher(text);
-            if (found.find()) {
+            if (beats.find()) {
+                beat = beats.group(1);
+            } else if (found.find()) {
                 // One println writes the whole line, even if the program ends at this moment.
                 System.out.println(String.format(Locale.ROOT, "x %.3f m, y %.3f m, %.3f m/s",
                     Double.valueOf(found.group(1)), Double.valueOf(found.group(2)),
@@ -41,8 +49,8 @@ public class Drive implements WebSocket.Listener {
     private static void drive(WebSocket socket, double speed, double seconds) throws InterruptedException {
         for (int sent = 0; sent < seconds * 1000 / PERIOD_MS; sent++) {
             String command = String.format(Locale.ROOT,
-                "{\"cmd\": {\"linear_x\": %f, \"angular_z\": 0}, \"stamp\": %d}",
-                speed, System.currentTimeMillis());
+                "{\"cmd\": {\"linear_x\": %f, \"angular_z\": 0}, \"stamp\": %d, \"echo\": %s}",
+                speed, System.currentTimeMillis(), beat);
             socket.sendText(command, true).join();
             Thread.sleep(PERIOD_MS);
         }
@@ -63,7 +71,11 @@ public class Drive implements WebSocket.Listener {
             System.exit(1);
             return;
         }
+        socket.sendText("{\"subscribe\": \"beat\"}", true).join();
         socket.sendText("{\"subscribe\": \"odom\", \"rate\": 10}", true).join();
+        while (beat == null) {
+            Thread.sleep(10);
+        }
         drive(socket, 0.0, 0.75); // the robot follows a new sender only after some zeros
         drive(socket, 0.2, 2.0);
         drive(socket, 0.0, 1.0);

@@ -10,11 +10,12 @@ const socket = new WebSocket(
 );
 const say = (message) => socket.send(JSON.stringify(message));
 const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+let echo; // the newest beat of the robot, by which it knows how old a command is
 
 async function drive(speed, seconds) {
   for (let sent = 0; sent < (seconds * 1000) / PERIOD_MS; sent++) {
     const stamp = performance.timeOrigin + performance.now();
-    say({ cmd: { linear_x: speed, angular_z: 0 }, stamp });
+    say({ cmd: { linear_x: speed, angular_z: 0 }, stamp, echo });
     await pause(PERIOD_MS);
   }
 }
@@ -22,6 +23,7 @@ async function drive(speed, seconds) {
 socket.onmessage = ({ data }) => {
   const { key, value, refused, reason } = JSON.parse(data);
   if (refused) console.error(`${refused} was refused: ${reason}`);
+  if (key === "beat") echo = value;
   if (key !== "odom") return;
   const { x, y } = value.pose.pose.position;
   const speed = value.twist.twist.linear.x;
@@ -37,7 +39,9 @@ socket.onerror = () => lost("");
 // A closed socket drops every message without an error.
 socket.onclose = ({ reason }) => lost(reason);
 socket.onopen = async () => {
+  say({ subscribe: "beat" });
   say({ subscribe: "odom", rate: 10 });
+  while (!echo) await pause(10);
   await drive(0, 0.75); // the robot follows a new sender only after some zeros
   await drive(0.2, 2);
   await drive(0, 1);

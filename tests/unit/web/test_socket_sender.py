@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any, cast
+
 import msgspec
 import pytest
 from aiohttp import web
@@ -34,3 +39,46 @@ async def test_a_refusal_is_reported_once_a_second_for_each_kind_of_message_and_
     messages = [msgspec.json.decode(message) for message in out._out]
     assert [message["refused"] for message in messages] == ["subscribe", "cmd", "cmd"]
     assert counts.refused() == {"malformed": 6, "role": 3}
+
+
+class Socket:
+    """A WebSocket that records each frame and then delivers what is due in between."""
+
+    def __init__(self) -> None:
+        self.sent: list[Any] = []
+        self.between: Callable[[], object] = lambda: None
+
+    async def send_frame(self, data: bytes, kind: object) -> None:
+        self.sent.append(msgspec.json.decode(data))
+        self.between()
+
+
+async def test_a_beat_is_sent_as_it_arrives_and_ahead_of_everything_that_waits() -> None:
+    socket: Any = Socket()
+    out = Outgoing(socket, make_mocked_request("GET", "/ws"), Counts(), "")
+    following = out.following["beat"] = Following("beat", 0.05)
+    stream = following.stream = Stream()
+    stream.wakes.add(out.wake_from_thread)
+
+    def arrive(number: int) -> None:
+        payload = SimpleNamespace(to_bytes=lambda: b'{"run":7,"boot_us":%d}' % number)
+        stream.take(cast(Any, SimpleNamespace(encoding="application/json", payload=payload)))
+
+    pump = asyncio.create_task(out.pump(lambda now: now + 60.0))
+    await asyncio.sleep(0)
+    await asyncio.to_thread(arrive, 1)
+    await wait_until(lambda: len(socket.sent) == 1)
+    for number in range(3):
+        out.enqueue({"waits": number})
+    socket.between = lambda: arrive(2) if socket.sent[-1] == {"waits": 1} else None
+    await wait_until(lambda: len(socket.sent) == 5)
+    pump.cancel()
+    kinds = [said.get("waits", said.get("value", {}).get("boot_us")) for said in socket.sent]
+    assert kinds == [1, 0, 1, 2, 2]
+    assert [said.get("key", "") for said in socket.sent] == ["beat", "", "", "beat", ""]
+
+
+async def wait_until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(5.0):
+        while not condition():
+            await asyncio.sleep(0.001)

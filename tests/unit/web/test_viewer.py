@@ -14,7 +14,7 @@ import pytest
 from acsard.bus.address import Address
 from acsard.client import Client
 from acsard.client.commander import Commander, CommandSigner, Wish
-from acsard.core.messages.schema import ServiceReply
+from acsard.core.messages.schema import Beat, ServiceReply
 from acsard.core.messages.signature import unpack
 from acsard.core.values import NS_PER_S, Role, Twist
 from acsard.host import clock
@@ -44,7 +44,7 @@ def test_a_command_that_cannot_be_sent_is_dropped_and_the_next_is_processed() ->
     assert not commands.outbox.dead.done()
 
 
-def test_a_command_is_put_with_the_stamp_and_the_clock_of_its_sender() -> None:
+def test_a_command_is_put_with_the_stamp_the_clock_and_the_echo_of_its_sender() -> None:
     put: list[Any] = []
 
     class Fake:
@@ -56,14 +56,15 @@ def test_a_command_is_put_with_the_stamp_and_the_clock_of_its_sender() -> None:
     counts = Counts()
     commands = ViewerCommands(lambda: fake, counts)
     commander, sender = Commander(), CommandSigner("joe/aa")
-    for stamp_ns in (1000, 2000):
-        wish = Wish(Twist(0.2, -0.5), stamp_ns, steady=True)
+    for stamp_ns, echo in ((1000, Beat(7, 5)), (2000, None)):
+        wish = Wish(Twist(0.2, -0.5), stamp_ns, steady=True, echo=echo)
         assert commands.give("joe", "teleop", commander, sender, wish)
         commands.outbox.flush(PATIENCE_S)
     assert [(x, z) for x, z, _ in put] == [(0.2, -0.5)] * 2
     signed = [item for *_, item in put]
     assert [item.stamp for item in signed] == [1000, 2000]
     assert [item.sequence for item in signed] == [1, 2]
+    assert [item.echo for item in signed] == [Beat(7, 5), None]  # the server adds none
     assert {(item.sender, item.steady) for item in signed} == {("joe/aa", True)}
     assert counts.all() == {"commands": 2}
 
@@ -99,8 +100,9 @@ async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
         def sibling(self, *_: object) -> Fake:
             return self
 
-        def put(self, twist: Any, _: Any, source: str) -> None:
+        def put(self, twist: Any, signature: Any, source: str) -> None:
             put.append((twist.linear.x, source))
+            assert signature.echo == Beat(7, signature.stamp // 1_000_000)
 
     counts = Counts()
     about = About("1", True, 1.0, 4.0, 10.0, "", {"slow": 10.0})
@@ -120,7 +122,8 @@ async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
 
     def drive(speed: float, stamp: float) -> None:
         wish = {"linear_x": speed, "angular_z": 0.0}
-        take({"cmd": wish, "stamp": stamp, "source": "slow"})
+        beat = {"run": 7, "boot_us": int(stamp)}
+        take({"cmd": wish, "stamp": stamp, "source": "slow", "echo": beat})
 
     drive(0.5, 1000.0)
     parts.commands.outbox.flush(PATIENCE_S)
