@@ -29,6 +29,7 @@ from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import OBJECTIONS, CommandEvents, missed, refused, waiting
 from acsard.core.motion.battery import empty_reason
+from acsard.core.motion.consistency import ConsistencyChecks
 from acsard.core.motion.emergency_stop import DRIVER_FAULT_REASON
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.kinematics import Kinematics
@@ -38,6 +39,7 @@ from acsard.core.motion.limits import AT_REST, Motion
 from acsard.core.motion.modes import Mode, RefusedError
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
+from acsard.core.motion.uncertainty import ErrorModel
 from acsard.core.reasons import reason_of
 from acsard.core.values import (
     NS_PER_S,
@@ -92,13 +94,10 @@ class Robot:
         longest_s = longest_reply(config.feedback.fault_time)
         self.session = McuSession(config.mcu, config.rate_hz, config.feedback, longest_s)
         self._kinematics = Kinematics(config.drive)
-        self._odometry = Odometry(
-            config.odometry,
-            self._kinematics,
-            config.mcu.encoder_counts,
-            config.feedback,
-            self.session.quiet_ns / NS_PER_S,
-        )
+        self._errors = self._error_model()
+        self._odometry = Odometry.initial(self._errors)
+        counts = config.mcu.encoder_counts
+        self._checks = ConsistencyChecks(config.odometry, self._kinematics, counts, config.feedback)
         self._arbiter = Arbiter(config.commands)
         self._cap = SpeedCap(None)
         self._life = Lifecycle(latches)
@@ -132,13 +131,13 @@ class Robot:
         """Return what `state` and `diagnostics` need; too slow for every wake-up."""
         session, silent = self.session, self.session.silent(now_ns)
         refused, since_ns = self._refused or ("", None)
-        counters = {"lines": session.good_lines} | self._odometry.unseen.counters()
+        counters = {"lines": session.good_lines} | self._odometry.counters()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
         if session.count_recovery.coarse_lines:
             counters["coarse_encoder_lines"] = session.count_recovery.coarse_lines
         if self._arbiter.clock_adjustment_ns:
             counters["clock_adjustments_ms"] = self._arbiter.clock_adjustment_ns // NS_PER_MS
-        checks = self._odometry.checks
+        checks = self._checks
         latch = self._life.latches.in_force
         return Snapshot(
             status=self.status,
@@ -275,7 +274,6 @@ class Robot:
         line = self.session.line(now_ns, speeds)
         if line is not None:
             last.waiting = (motion, speeds)
-            self._odometry.commanded.command(motion.twist)
         return line
 
     def sent(self, left_ns: Ns, line: bytes | None, trip: Trip = "") -> None:
@@ -335,18 +333,18 @@ class Robot:
             self._linked_once = True
             self._life.link(up=not inputs.missing(safety))
         if heard.gyro:
-            self._odometry.checks.add_samples(heard.gyro)
+            self._checks.add_samples(heard.gyro)
         if not feedback:
             return ()
         estimates: list[Estimate] = []
-        for received in feedback:
-            for line in self._plausible(received, now, events):
+        for line in feedback:
+            if self._is_plausible(line, now, events):
                 estimates.append(self._check_and_integrate(line, now, events))
         return tuple(estimates)
 
     def _forget(self) -> None:
         self._sanity.forget()
-        self._odometry.checks.wheels.forget()
+        self._checks.wheels.forget()
 
     def _watch_inputs(self, now: Instant, events: list[Event]) -> None:
         # A press stops the robot even if it began and ended between two wake-ups.
@@ -404,31 +402,23 @@ class Robot:
         age_s = (now_ns - status_ns) / NS_PER_S
         return as_text(self.session.status.last) | {"age_s": f"{age_s:.1f}"}
 
-    def _plausible(self, line: Feedback, now: Instant, events: list[Event]) -> list[Feedback]:
-        # A line after a long gap may wait for one that confirms its speeds.
+    def _is_plausible(self, line: Feedback, now: Instant, events: list[Event]) -> bool:
         why = self._sanity.impossible(line, self.config.feedback.wheel_speed)
         if self._sanity.warning is not None:
             events.append(self._sanity.warning)
-        if why:
-            self._reject(why, 1, events)
-            self._odometry.skip(line)
-            if self._sanity.doubtful:
-                self._fault(reason("impossible_speeds", cause=why), now, events)
-            return []
-        lines, dropped = self._odometry.confirmed(line)
-        if dropped:
-            which = "this line" if dropped == 1 else "these lines"
-            self._reject(f"later lines contradict the speeds of {which}", dropped, events)
-        return lines
-
-    def _reject(self, why: str, count: int, events: list[Event]) -> None:
-        self.counters["line_implausible"] += count
+        if not why:
+            return True
+        self.counters["line_implausible"] += 1
         events.append(
-            Event("lines_rejected", why, "warning", kind="implausible", count=count, news=False)
+            Event("lines_rejected", why, "warning", kind="implausible", count=1, news=False)
         )
+        self._odometry.skipped.add(line)
+        if self._sanity.doubtful:
+            self._fault(reason("impossible_speeds", cause=why), now, events)
+        return False
 
     def _check_and_integrate(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate:
-        checks = self._odometry.checks
+        checks = self._checks
         wheels = checks.wheels
         # While the emergency stop counts as pressed, the motors may have no power, so wheels that
         # do not follow the commanded speeds are not a sign of a fault.
@@ -446,7 +436,7 @@ class Robot:
         if wheels.pushed:
             self.counters["uncommanded_motion"] += 1
             events.append(Event("uncommanded_motion", wheels.pushed, "warning"))
-        estimate = self._odometry.fold(line)
+        estimate = self._odometry.fold(line, checks, self._errors)
         if wheels.events:
             self.counters["wheel_faults"] += len(wheels.events)
         events += checks.events
@@ -512,8 +502,15 @@ class Robot:
             case _:
                 assert_never(request.verb)
 
+    def _error_model(self) -> ErrorModel:
+        config = self.config
+        return ErrorModel(
+            config.odometry, self._kinematics, config.mcu.encoder_counts, config.limits
+        )
+
     def _place(self, pose: Pose) -> str:
-        self._odometry.set_pose(pose)
+        self._odometry.set_pose(pose, self._errors)
+        self._checks.drop_corrections()
         pose = self._odometry.pose
         return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 
@@ -525,7 +522,7 @@ class Robot:
             self.config, changes = changed(before, settings, at_rest)
         except ConfigError as error:
             raise RefusedError(str(error)) from None
-        self._odometry.use(self.config.odometry)
+        self._errors = self._error_model()
         if self.config.commands != before.commands:
             self._arbiter.use(self.config.commands)
             self._arbiter.require_neutral(now_ns)

@@ -30,6 +30,7 @@ from acsard.core.motion.arbiter_text import CommandEvents
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.last_line import LastLine
 from acsard.core.motion.modes import Mode
+from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
 from acsard.core.robot import Robot
 from acsard.core.values import AcsardError, Event, Ns, SpeedCap, Status
@@ -47,6 +48,7 @@ PARTS: dict[str, Any] = {
     "_asked": tuple[str, str, Ns | None],
     "_linked_once": bool,
     "_answered": UnansweredLines,
+    "_odometry": Odometry,
     "_sanity": Sanity,
     "_inputs": BoardInputs,
     "_told": CommandEvents,
@@ -54,7 +56,7 @@ PARTS: dict[str, Any] = {
 }
 
 # Not stored: they follow from the configuration, and no line is pending between two steps.
-DERIVED = ("config", "_kinematics", "_steady")
+DERIVED = ("config", "_kinematics", "_errors", "_steady")
 
 # A package ends with a dot. The classes need constructors without side effects.
 PART_MODULES = (

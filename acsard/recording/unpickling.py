@@ -39,7 +39,7 @@ MAX_INT_BITS = 128  # sums of times in ns have more than 64
 MAX_KEY_PARTS = 4  # elements of a tuple as a key
 
 # Python hashes tuples of integers without a secret. Below this there are 2^32 of four, and almost
-# none with equal hashes. A real robot has pairs below 10 (`second_order.py`).
+# none with equal hashes.
 MAX_TUPLE_KEY = 256
 
 FindClass = Callable[[str, str], type]  # by module and name; raises `ValueError`

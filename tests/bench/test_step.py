@@ -33,11 +33,11 @@ from acsard.core.link.codec import Codec
 from acsard.core.link.lines import LineReader
 from acsard.core.messages.encodings import encode
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.path import arc
 from acsard.core.values import Instant, Pose, PoseCovariance, Received
 from acsard.daemon.control_loop import Step
 from acsard.daemon.pacing import NO_PERIOD, Period
 from tests.scenarios.world import World
+from tests.unit.core.motion.odometer import arc
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(300)]
 
@@ -50,14 +50,13 @@ ALL = Config(
     odometry=OdometryConfig(
         gyro=True,
         wheel_separation_multiplier_std=0.02,
-        left_wheel_radius_multiplier_std=0.002,
-        right_wheel_radius_multiplier_std=0.002,
+        wheel_radius_ratio_std=0.003,
         distance_scale_std=0.002,
     ),
     sim=SimConfig(encoder_counts=400, track_multiplier=1.6),
     mcu=McuConfig(encoder_counts=400, reply_period=0.01),
 )
-"""Every part has work: four parameters, a gyro at 100 Hz, and counts that plain lines show."""
+"""Every part has work: three parameters, a gyro at 100 Hz, and counts that plain lines show."""
 
 
 class Timed:
@@ -125,9 +124,9 @@ class Run:
         made.bus.publish_feedback = lambda topic, estimate: topic.encode(estimate, "msgpack")  # type: ignore[assignment, method-assign]
         feed, step = made.port.feed, made.loop.step
         robot, self.heard = made.loop.robot, list[Received]()
-        self.lines = Timed(robot._odometry.fold)
+        self.lines = Timed(robot._check_and_integrate)
         self.parts = {"odometry": self.lines, "session": Timed(robot.session.update)}
-        self.parts["gyro"] = Timed(robot._odometry.checks.add_samples)
+        self.parts["gyro"] = Timed(robot._checks.add_samples)
         self.took = dict.fromkeys((*self.parts, "step", "simplest"), 0)
         simplest = Simplest()
 

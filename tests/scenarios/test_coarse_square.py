@@ -13,11 +13,11 @@ import random
 import pytest
 
 from acsard.core.config.settings import Config, McuConfig, SimConfig
-from acsard.core.motion.path import Path
 from acsard.core.values import Pose
 from tests.each import more
 from tests.scenarios.world import World
 from tests.stepped import Outputs
+from tests.unit.core.motion.odometer import arc
 
 
 class Square:
@@ -32,7 +32,7 @@ class Square:
             encoder_counts=counts,
         )
         self.world = world = World(Config(sim=SimConfig(encoder_counts=counts), mcu=mcu))
-        self._counts, self._path, self._before = counts, Path(), [0] * 4
+        self._counts, self._pose, self._before = counts, Pose(), [0] * 4
         self._dice, self._stalls, self._since = random.Random(seed), stalls, 0.0
         if link == "checked":
             with world.mcu.no_sample():
@@ -67,12 +67,12 @@ class Square:
         self._before = counts
         metres = math.tau / self._counts * 0.05
         right, left = (a + d) / 2 * metres, (b + c) / 2 * metres
-        self._path.advance((right + left) / 2, (right - left) / 0.30)
+        self._pose = arc(self._pose, (right + left) / 2, (right - left) / 0.30)
 
     def errors(self) -> tuple[float, float, float, float]:
         """Return the final errors in m and degrees, of the daemon and then of the raw counts."""
         state = self.world.state
-        ours, raw = self._off(Pose(state.x, state.y, state.yaw)), self._off(self._path.pose)
+        ours, raw = self._off(Pose(state.x, state.y, state.yaw)), self._off(self._pose)
         return *ours, *raw
 
     def _off(self, pose: Pose) -> tuple[float, float]:

@@ -12,10 +12,10 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, McuConfig, SimConfig
 from acsard.core.messages.schema import JointState, RobotState
-from acsard.core.motion.path import Path
 from acsard.core.values import Estimate, Pose
 from tests.scenarios.world import World
 from tests.stepped import Outputs
+from tests.unit.core.motion.odometer import arc
 
 FINE = SimConfig(encoder_counts=20_000)
 """Fine encoders, so that the two decimals of a line limit its accuracy."""
@@ -66,13 +66,13 @@ class Drive:
 
         It is valid for a board that reports every 10 ms.
         """
-        path = Path()
+        pose = Pose()
         for line in self.world.bus.published["wheel_states"]:
             assert isinstance(line, JointState)
             front_right, front_left, rear_left, rear_right = line.velocity
             right, left = (front_right + rear_right) / 2 * 0.01, (front_left + rear_left) / 2 * 0.01
-            path.advance((right + left) / 2 * 0.05, (right - left) * 0.05 / 0.30)
-        return self.off(path.pose)
+            pose = arc(pose, (right + left) / 2 * 0.05, (right - left) * 0.05 / 0.30)
+        return self.off(pose)
 
     def off(self, pose: RobotState | Pose) -> float:
         """Return the distance of the pose from the robot's true place, m."""

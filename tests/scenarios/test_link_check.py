@@ -14,6 +14,7 @@ from contextlib import nullcontext
 from itertools import repeat
 
 import pytest
+from msgspec import json
 from msgspec.structs import replace
 
 from acsard.core.config.settings import (
@@ -686,7 +687,6 @@ def test_a_board_whose_motors_lag_by_2_ms_keeps_its_link(
     lag: float, counts: int, period: float, speeds: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("acsard.core.motion.sanity.MAX_WHEEL_ACCELERATION", 1e6)
-    monkeypatch.setattr("acsard.core.motion.gap_filling.MAX_WHEEL_ACCELERATION", 1e6)
     plain = Config(
         sim=SimConfig(motor_time_constant=lag, encoder_counts=counts),
         mcu=McuConfig(reply_period=period),
@@ -708,3 +708,24 @@ def test_a_board_whose_motors_lag_by_2_ms_keeps_its_link(
                 world.hold(round(dice.uniform(-0.9, 0.9), 1), seconds=dice.uniform(0.2, 1.0))
         assert world.state.link == "up"
         assert "line_echo" not in world.state.counters
+
+
+@pytest.mark.parametrize(("before", "after"), [(0.02, 0.3), (0.1, 0.2), (0.2, 0.2), (0.25, 0.1)])
+def test_a_pose_that_is_set_in_a_silence_of_the_board_is_in_its_covariance(
+    before: float, after: float
+) -> None:
+    """The counts that end the silence also have the motion from before the pose was set."""
+    world = started(config(counts=3200))
+    world.drive(0.8, 0.3, seconds=2.0)
+    with world.mcu.mute():
+        world.hold(0.8, 0.3, seconds=before)
+        true = world.mcu.vehicle.pose
+        assert world.call("set_pose", json.encode(true)).success
+        world.run(after)
+    world.run(1.0)
+    pose, p = world.mcu.vehicle.pose, world.odom.pose.covariance
+    for off, variance in (
+        (pose.x - world.state.x, p[0]), (pose.y - world.state.y, p[7]),
+        (math.remainder(pose.yaw - world.state.yaw, math.tau), p[35]),
+    ):  # fmt: skip
+        assert abs(off) < 2.0 * math.sqrt(variance)

@@ -69,7 +69,7 @@ FRESHNESS, LIMITS, LIFECYCLE = (
 MODES, ROBOT, SESSION = "core/motion/modes.py", "core/robot.py", "core/link/session.py"
 WITNESS, ODOMETRY = "core/motion/wheel_witness.py", "core/motion/odometry.py"
 WHEEL_FAULTS = "core/motion/wheel_faults.py"
-PATH = "core/motion/path.py"
+UNCERTAINTY = "core/motion/uncertainty.py"
 LATCHES, VALUES, LOOP = "daemon/latch_rules.py", "core/values.py", "daemon/control_loop.py"
 PUBLICATION = "daemon/publication.py"
 REASONS, INPUTS = "core/reasons.py", "core/board_inputs.py"
@@ -900,37 +900,31 @@ FAULTS = (
     fault(
         "odometry yaw",
         "the pose turns by a fifth too much",
-        PATH,
-        "_wrapped(self.pose.yaw, turn)",
-        "_wrapped(self.pose.yaw, 1.2 * turn)",
+        KINEMATICS,
+        "heading, end = yaw + half, yaw + turn",
+        "heading, end = yaw + half, yaw + 1.2 * turn",
     ),
     fault(
         "odometry set",
         "set_pose takes x for y",
         ODOMETRY,
-        "self._path.set(pose)\n        self._steps.clear()\n        self._uncertainty",
-        "self._path.set(Pose(pose.y, pose.x, pose.yaw))\n        self._steps.clear()\n"
-        "        self._uncertainty",
+        "self.pose = Pose(pose.x, pose.y, math",
+        "self.pose = Pose(pose.y, pose.x, math",
     ),
     fault(
         "odometry gap",
         "a gap while the robot moves does not make the pose less certain",
         ODOMETRY,
-        "        if rolled.unknown > 0.0:\n            self._add_unseen_motion",
-        "        if rolled.unknown > 1e9:\n            self._add_unseen_motion",
-        Edit(
-            ODOMETRY,
-            "            self._uncertainty.doubt(along + by_counts, yaw + turn_by_counts)\n",
-            "",
-        ),
+        "            if gap and not (rested",
+        "            if gap and gap.seconds > 1e9 and not (rested",
     ),
     fault(
         "odometry vague",
         "the covariance of the pose is a hundred times as large as the errors",
-        "core/motion/uncertainty.py",
-        "published = PoseCovariance(xx, xy, xyaw, yy, yyaw, yawyaw)",
-        "published = PoseCovariance(\n"
-        "            *(100.0 * one for one in (xx, xy, xyaw, yy, yyaw, yawyaw))\n        )",
+        UNCERTAINTY,
+        "        self.covariance = p if known else UNKNOWN_POSE\n",
+        "        p = PoseCovariance(*(100.0 * getattr(p, name) for name in p.__struct_fields__))\n"
+        "        self.covariance = p if known else UNKNOWN_POSE\n",
     ),
     fault(
         "odometry silent",
@@ -939,24 +933,26 @@ FAULTS = (
         "        if not feedback:\n            return ()",
         "        if not feedback:\n"
         '            if link != "up" and session.good_lines:\n'
-        "                self._odometry._path.advance(0.01 * self._odometry.twist.linear, 0.0)\n"
+        "                pose, far = self._odometry.pose, 0.01 * self._odometry.twist.linear\n"
+        "                self._odometry.pose = replace(pose, x=pose.x + far)\n"
         "            return ()",
     ),
     fault(
         "odometry endless",
         "the covariance of a robot that has stood for 3 s is infinite",
         ODOMETRY,
-        "        at_rest = self._still > REST_S\n",
-        "        at_rest = self._still > REST_S\n"
-        "        if self._still > 3.0:\n"
-        "            self._uncertainty.doubt(math.inf, math.inf)\n",
+        "        at_rest = self.rested > REST_S\n",
+        "        at_rest = self.rested > REST_S\n"
+        "        if self.rested > 3.0:\n"
+        "            self.uncertainty.doubt(math.inf, math.inf, 0.0, 0.0)\n",
     ),
     fault(
         "odometry leap",
         "a lost line moves the pose by 2 m",
         ODOMETRY,
-        "            self.unseen.filled += bridged\n",
-        "            self.unseen.filled += bridged\n            self._path.advance(2.0, 0.0)\n",
+        "            self.filled += filled\n",
+        "            self.filled += filled\n"
+        "            self.pose = Pose(self.pose.x + 2.0, self.pose.y, self.pose.yaw)\n",
     ),
     # latch file
     fault(
@@ -978,16 +974,18 @@ FAULTS = (
         "replay clock",
         "the pose depends on a clock that the inputs do not have",
         ODOMETRY,
-        "        own = dt - feedback.bridged\n",
-        "        own = dt - feedback.bridged\n"
-        '        self._path.advance(__import__("time").perf_counter_ns() % 2 * 1e-9, 0.0)\n',
+        "        self.travelled += abs(distance)\n",
+        "        self.travelled += abs(distance)\n"
+        '        distance += __import__("time").perf_counter_ns() % 2 * 1e-9\n',
     ),
     fault(
         "replay state",
         "the state at the start of a recording has another heading",
         "recording/state.py",
         "    return State(robot, frozen.memory)\n",
-        "    robot._odometry._path.turn(0.001)\n    return State(robot, frozen.memory)\n",
+        "    pose = robot._odometry.pose\n"
+        "    robot._odometry.pose = type(pose)(pose.x, pose.y, pose.yaw + 0.001)\n"
+        "    return State(robot, frozen.memory)\n",
     ),
     # inputs of the board
     fault(

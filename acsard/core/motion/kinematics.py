@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 
 from acsard.core.config.settings import DriveConfig
-from acsard.core.values import Rad, RadPerS, Twist, WheelSpeeds
+from acsard.core.values import Metres, Rad, RadPerS, Twist, WheelSpeeds
 
 
 class Kinematics:
@@ -82,3 +82,17 @@ class Kinematics:
             if more:
                 share = min(share, (math.copysign(wheel_speed, more) - speed) / more)
         return max(0.0, share)
+
+
+def on_arc(yaw: Rad, distance: Metres, turn: Rad) -> tuple[Metres, Metres, Rad]:
+    """Return x and y of the chord of an arc from the heading `yaw`, and the heading at its end.
+
+    The chord has the length d sin(a / 2) / (a / 2) and the direction yaw + a / 2.
+    """
+    half = turn / 2
+    # sin(h)/h is accurate in doubles down to tiny h. Only h = 0 needs its limit.
+    chord = distance * (math.sin(half) / half if half else 1.0)
+    heading, end = yaw + half, yaw + turn
+    if not -math.pi <= end <= math.pi:
+        end = math.remainder(end, math.tau)
+    return chord * math.cos(heading), chord * math.sin(heading), end

@@ -1,9 +1,15 @@
-"""Computes the covariance of the pose's error e = log(estimate^-1 truth) (`se2.py`), step by step.
+"""The covariance of the pose and the variances of the twist.
 
-Noise is independent from step to step, with the covariance P. The error of a parameter is the same
-in every step: J has for each parameter the error of the pose at one standard deviation. The sum is
-published: to first order it is that of nav_msgs/Odometry, for x and y in the axes of odom. Rotated
-by -yaw it is right even if the possible positions form an arc and not an ellipse.
+The error of a pose, e = log(estimate^-1 truth), is the twist that leads from the estimated to the
+true pose; its axes are those of odom, at the robot. P is its covariance by noise, J has its error
+for one standard deviation of each cause that does not average out (`ErrorModel.effects`), and a
+stretch of the path, with the displacement (dx, dy), moves all of it by F:
+
+    P <- F P F' + G Q G'        J <- F J + G_p        P_total = P + J J' + second order
+
+Q is of distance and turn (Siegwart, Nourbakhsh & Scaramuzza, Autonomous Mobile Robots, 5.2.4).
+`_bend` has the second order: a wrong heading to either side makes the robot get less far, which is
+nearly all of the error along a straight of 60 m.
 """
 
 from __future__ import annotations
@@ -11,235 +17,381 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from acsard.core.motion.error_model import SLIP_FACTOR, Column, ErrorModel
-from acsard.core.motion.se2 import (
-    ORIGIN,
-    Vector,
-    added,
-    carried,
-    difference,
-    plus,
-    seen_from,
-    stepped,
-    total,
+from msgspec import Struct, field
+
+from acsard.core.config.settings import LimitsConfig, OdometryConfig
+from acsard.core.link.sample_time import MAX_FILLED_GAP_S
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.values import (
+    Metres,
+    PoseCovariance,
+    Rad,
+    Seconds,
+    Twist,
+    TwistVariances,
 )
-from acsard.core.motion.second_order import SecondOrder
-from acsard.core.values import PoseCovariance, Rad
 
-MAX_VARIANCE = 1e9  # m2 or rad2: "unknown"
-
-ASSUMED_COUNTS = 400  # per revolution; few encoders have fewer
+UPDATE_S = 0.05  # between two updates; lines that need one at once get it
+BEND_M = 0.2  # rolled, between two updates of the second order
 
 START_VARIANCE = 1e-6  # of x, y (m2) and yaw (rad2) at the start and after the pose was set
-
+MAX_VARIANCE = 1e9  # m2 or rad2, and of the twist: "unknown"
 UNKNOWN_POSE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
+MAX_HEADING_VARIANCE = 1.0  # rad2, of the second order: its series does not converge beyond
 
-# Cause of a motion that the pose may have missed: a gap, or doubtful wheels of a side.
+ASSUMED_COUNTS = 400  # per revolution; few encoders have fewer
+ASSUMED_PERIOD_S = 0.01  # of the lines, before it is known
+SPEED_RESOLUTION = 0.01  # rad/s: a line has two decimals
+LATERAL_VARIANCE = 1e-3  # m2/s2 sideways, which wheels do not measure, while the robot moves
+MIN_TWIST_VARIANCE = 1e-8  # filters that use the published twist treat less as an error
+SLIP_FACTOR = 100.0  # on the variances of a step and of the twist while the wheels slip
+
+# Deviation of a motion that the pose has missed with the probability 1/2.
+MISSED_STD = math.sqrt(0.5)
+
+Vector = tuple[float, float, float]  # x, y (m) and yaw (rad) of an error
+
+# Error of a step for one standard deviation: of the distance per m and per rad, of the turn per m
+# and per rad.
+Effect = tuple[float, float, float, float]
+
+# Causes of an error that do not average out. The motion that the pose may have missed is that of
+# gaps, and of wheels of a side that are in doubt.
 Missed = Literal["gap", "left", "right"]
+RATIO, TRACK, SCALE, GYRO = PARAMETERS = range(4)
+MISSED: dict[Missed, int] = {"gap": 4, "left": 5, "right": 6}
+CAUSES = len(PARAMETERS) + len(MISSED)
 
-NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
 
-UPDATE_DISTANCE = 0.2  # m rolled, between two updates of the second-order terms
+class ErrorModel:
+    """What the configuration says about errors."""
 
+    def __init__(
+        self,
+        odometry: OdometryConfig,
+        kinematics: Kinematics,
+        counts: int = 0,
+        limits: LimitsConfig = LimitsConfig(),  # noqa: B008
+    ) -> None:
+        # `counts` per revolution is 0 if unknown.
+        track, radius = kinematics.track, kinematics.radius
+        self.kinematics, self.track = kinematics, track
+        self.count: Rad = math.tau / counts if counts else 0.0
+        count = radius * math.tau / (counts or ASSUMED_COUNTS)  # m
+        # Counts of both sides that arrive at different times turn the heading by this, to and fro.
+        self.play: Rad = count / track
+        # A wheel at rest rocks between the edges of a count.
+        self.unsettled: Rad = 2 * math.tau / (counts or ASSUMED_COUNTS)
+        # Where in a count each wheel was at the start, and is now.
+        xy, yaw = (count**2 / 24, count**2 / 6 / track**2) if counts else (0.0, 0.0)
+        xy, yaw = START_VARIANCE + xy, START_VARIANCE + yaw
+        self.start = PoseCovariance(xy, 0.0, 0.0, xy, 0.0, yaw)
 
-class PoseUncertainty:
-    """Computes the covariance of the pose, in plain floats, because updates come at 100 Hz.
+        # If errors of the sides, of variance k |m| each, were the only ones, D =
+        # `distance_variance_per_metre` would be k / 2, and Y = `yaw_variance_per_metre` 2 k / L^2.
+        # The rest of D or Y is an error of the robot as a whole.
+        distance, yaw = odometry.distance_variance_per_metre, odometry.yaw_variance_per_metre
+        k = min(2 * distance, yaw * track * track / 2)
+        self.along, self.turning = distance - k / 2, yaw - 2 * k / (track * track)
+        self.of_sides = k / 4, k / (track * track), k / (2 * track)
+        self.skid = odometry.yaw_variance_per_radian
 
-        P <- F P F' + G Q G'
-        J <- F J + G_p
-        P_total = P + J J' + terms of second order (`second_order.py`)
+        ratio, gyro = odometry.wheel_radius_ratio_std, odometry.gyro_scale_std
+        share = odometry.wheel_separation_multiplier_std / kinematics.multipliers[2]
+        scale = (odometry.distance_scale_std, 0.0, 0.0, 0.0)
+        # One radius is larger by half of the ratio's error, the other smaller.
+        longer, none = ratio * track / 4, (0.0, 0.0, 0.0, 0.0)
+        by_wheels = [(0.0, longer, ratio / track, 0.0), (0.0, 0.0, 0.0, -share), scale, none]
+        by_gyro = [(0.0, longer, 0.0, 0.0), none, scale, (0.0, 0.0, 0.0, gyro)]
+        missed = [none] * len(MISSED)
+        self.effects: tuple[list[Effect], list[Effect]] = by_wheels + missed, by_gyro + missed
+        self.bending = [k for k in PARAMETERS if any(by_wheels[k]) or any(by_gyro[k])]
 
-    F moves an error from the position before the step to that after it (`se2.seen_from`), Q is the
-    noise of distance and turn (`error_model.Noise`), G makes an error of the pose of it, along the
-    chord, and G_p has that of each parameter in this step (`error_model.columns`).
-    """
+        # Four independent errors of the speeds; each side is the mean of two wheels.
+        self.of_speed = radius**2 / 48, radius**2 / track**2 / 12
+        self.speed = Twist(limits.linear_speed, limits.angular_speed)
+        self.acceleration = Twist(
+            max(limits.linear_acceleration, limits.linear_deceleration),
+            max(limits.angular_acceleration, limits.angular_deceleration),
+        )
 
-    def __init__(self, model: ErrorModel, counts: int) -> None:
-        self._model = model
-        self._parameters = self._effects = model.columns
-        self._counted = counts > 0
-        count, track = model.radius * math.tau / (counts or ASSUMED_COUNTS), model.track
-        self._play = count / track
-        self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / track**2, 0.0)
-        # Displacement in odom and rolled since the last update of second order, m.
-        self._dx = self._dy = self._rolled = 0.0
-        self.set(0.0)
+    def noise(self, distance: Metres, turn: Rad, turned: Rad) -> Vector:
+        """Return var(d), m2, var(turn), rad2, and cov(d, turn), m rad, of a step.
 
-    def set(self, yaw: Rad) -> None:
-        """Reset the covariance to that of an initial pose with this heading."""
-        self._p = PoseCovariance(START_VARIANCE, 0.0, 0.0, START_VARIANCE, 0.0, START_VARIANCE)
-        self._cos, self._sin = math.cos(yaw), math.sin(yaw)
-        if self._counted:
-            self._p = added(self._p, *self._phase, self._cos, self._sin)
-        self._effects = self._parameters
-        # Of J; those of the gyro's scale and of missed motions come when needed.
-        self._columns: list[Vector] = [ORIGIN for _ in self._effects]
-        self._of_gyro = -1  # index of the gyro's scale, or -1
-        self._of_missed: dict[Missed, int] = {}  # indices of missed motions
-        self._columns_before = self._columns
-        self._turned = self._middle = 0.0
-        self._second = SecondOrder(len(self._effects))
-        self._begin_stretch()
-        self._lost = False
-        self.covariance = self._p  # published, of x, y and yaw in odom
-        self._publish()
-
-    def advance(
-        self, distance: float, turn: float, dx: float, dy: float, heading: float,
-        variance: float | None = None, slips: bool = False,
-    ) -> None:  # fmt: skip
-        """Update the covariance after an arc of `distance` m through `turn` rad.
-
-        `dx` and `dy` are its displacement, m, and `heading` the direction of its chord in odom,
-        rad. A gyro gives `variance` of the turn, rad2, and the parameters then affect only the
-        distance. Wheels that slip have `SLIP_FACTOR` times the noise.
+        `turned` is the part of |turn| that is a real turn and not encoder noise, rad.
         """
-        if self._lost:
-            self._mark_unknown(distance, turn)
+        half = self.track / 2 * turn
+        left, right, path = abs(distance - half), abs(distance + half), abs(distance)
+        along, yaw, both = self.of_sides
+        return (
+            self.along * path + along * (left + right),
+            self.turning * path + yaw * (left + right) + self.skid * turned,
+            both * (right - left),
+        )
+
+    def in_gap(self, seconds: Seconds, period: Seconds) -> tuple[float, float]:
+        """Return the variances of the distance, m2, and the turn, rad2, in a gap of a moving robot.
+
+        Within the limits, a motion between two speeds differs by at most a t^2 / 4 from the
+        trapezoid. The rounding of both speeds is alike for both wheels of a side.
+        """
+        speed, acceleration = self.speed, self.acceleration
+        short = min(seconds, MAX_FILLED_GAP_S)  # then the robot was stopped
+        quantum = 2 * (self.unsettled / 2 / period * short) ** 2
+        along = min(acceleration.linear * short / 4, speed.linear) * short
+        yaw = min(acceleration.angular * short / 4, speed.angular) * short
+        return along**2 + self.of_speed[0] * quantum, yaw**2 + self.of_speed[1] * quantum
+
+
+class Stretch(Struct):
+    """The motion since the last update."""
+
+    distance: Metres = 0.0
+    turn: Rad = 0.0
+    dx: Metres = 0.0
+    dy: Metres = 0.0
+    gyro_variance: float = 0.0  # of the turn, rad2
+    seconds: Seconds = 0.0
+    lines: int = 0
+
+    def add(
+        self, distance: Metres, turn: Rad, dx: Metres, dy: Metres, variance: float, seconds: Seconds
+    ) -> None:
+        self.distance += distance
+        self.turn += turn
+        self.dx += dx
+        self.dy += dy
+        self.gyro_variance += variance
+        self.seconds += seconds
+        self.lines += 1
+
+
+class Bend(Struct):
+    """Second order: since its last update, and the sums."""
+
+    p: PoseCovariance
+    columns: list[Vector]
+    dx: Metres = 0.0
+    dy: Metres = 0.0
+    rolled: Metres = 0.0
+    # xx, xy and yy of the errors [e, n] / 2, which are independent in each stretch.
+    noise: Vector = (0.0, 0.0, 0.0)
+    # x and y of the sums of [J_i, W_k] / 2, m, for all causes i and parameters k.
+    of_causes: list[tuple[float, float]] = field(
+        default_factory=lambda: [(0.0, 0.0)] * (CAUSES * len(PARAMETERS))
+    )
+    added: Vector = (0.0, 0.0, 0.0)  # to xx, xy and yy of the pose
+
+
+class Uncertainty(Struct):
+    """The uncertainty of pose and twist. `covariance` and `twist` are what is published."""
+
+    p: PoseCovariance
+    covariance: PoseCovariance
+    bend: Bend
+    columns: list[Vector]  # of J
+    stretch: Stretch = field(default_factory=Stretch)
+    twist: TwistVariances = TwistVariances(
+        MIN_TWIST_VARIANCE, MIN_TWIST_VARIANCE, MIN_TWIST_VARIANCE
+    )
+    period: Seconds = ASSUMED_PERIOD_S
+    turned: Rad = 0.0  # in all, and the middle of the play in it
+    middle: Rad = 0.0
+
+    @classmethod
+    def initial(cls, model: ErrorModel) -> Uncertainty:
+        columns = [(0.0, 0.0, 0.0)] * CAUSES
+        return cls(model.start, model.start, Bend(model.start, columns), columns)
+
+    def update(self, model: ErrorModel, yaw: Rad, *, slips: bool, by_gyro: bool) -> None:
+        """End the stretch, at the end of which the robot has the heading `yaw`."""
+        stretch, self.stretch = self.stretch, Stretch()
+        distance, turn, dx, dy = stretch.distance, stretch.turn, stretch.dx, stretch.dy
+        if stretch.lines and stretch.seconds:
+            self.period = stretch.seconds / stretch.lines
+        if not (distance or turn or dx or dy) or self._is_lost():
             return
-        c, s = self._cos, self._sin = math.cos(heading), math.sin(heading)
-        along, yaw, both = self._model.noise.of(distance, turn, self._beyond_play(turn))
+        heading = yaw - turn / 2
+        c, s = math.cos(heading), math.sin(heading)
+        along, turning, both = model.noise(distance, turn, self._beyond_play(model, turn))
         if slips:
-            along, yaw, both = SLIP_FACTOR * along, SLIP_FACTOR * yaw, SLIP_FACTOR * both
-        if variance is not None:
-            yaw, both = variance, 0.0
-        scale = None if variance is None else self._model.settings.gyro_scale_std
-        self._p = stepped(self._p, dx, dy, along, yaw, both, c, s)
-        if scale and self._of_gyro < 0:
-            self._of_gyro = self._widen()
-        if self._effects:
-            self._bend(distance, turn, dx, dy, scale)
-        self._dx += dx
-        self._dy += dy
-        self._rolled += abs(distance) + self._model.track / 2 * abs(turn)
-        if self._rolled > UPDATE_DISTANCE:
-            self._end_stretch()
+            along, turning, both = SLIP_FACTOR * along, SLIP_FACTOR * turning, SLIP_FACTOR * both
+        if by_gyro:
+            turning, both = stretch.gyro_variance, 0.0
+        p = carried(self.p, dx, dy, turning / 2)  # half of the noise of the turn comes before
+        self.p = added(p, along, turning / 2, both, c, s)
+        columns = []
+        # Unpacking into names is faster than indexing tuples.
+        for (x, y, turned), effect in zip(self.columns, model.effects[by_gyro], strict=True):
+            of_distance, of_turn, turn_of_distance, turn_of_turn = effect
+            further = of_distance * distance + of_turn * turn
+            more = turn_of_distance * distance + turn_of_turn * turn
+            lever = turned + more / 2
+            columns.append((x + c * further - dy * lever, y + s * further + dx * lever,
+                            turned + more))  # fmt: skip
+        self.columns, bend = columns, self.bend
+        bend.dx += dx
+        bend.dy += dy
+        bend.rolled += abs(distance) + model.track / 2 * abs(turn)
+        if bend.rolled > BEND_M:
+            self._bend(model)
         self._publish()
 
-    def doubt(self, along: float, yaw: float) -> None:
-        """Add variances of distance, m2, and turn, rad2: the last step filled a gap."""
-        if not self._lost:
-            self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
+    def doubt(self, along: float, yaw: float, aside: float, heading: Rad) -> None:
+        """Add variances of distance, m2, turn, rad2, and of the position sideways, m2."""
+        if not self._is_lost():
+            c, s = math.cos(heading), math.sin(heading)
+            self.p = added(added(self.p, along, yaw, 0.0, c, s), aside, 0.0, 0.0, -s, c)
             self._publish()
 
-    def miss(self, cause: Missed, distance: float, turn: float) -> None:
-        """Add a motion that the pose may have missed in the last step, as standard deviations.
+    def miss(self, cause: Missed, distance: Metres, turn: Rad, heading: Rad) -> None:
+        """Add a motion that the pose may have missed, as standard deviations.
 
-        Those of the same cause add up and do not average out, like the error of a parameter.
+        Those of one cause add up, and those of opposite directions cancel.
         """
-        if self._lost:
+        if self._is_lost():
             return
-        if cause not in self._of_missed:
-            self._of_missed[cause] = self._widen()
-        index, c, s = self._of_missed[cause], self._cos, self._sin
-        self._columns = [*self._columns]
-        self._columns[index] = plus(self._columns[index], (c * distance, s * distance, turn))
+        i = MISSED[cause]
+        x, y, yaw = self.columns[i]
+        c, s = math.cos(heading), math.sin(heading)
+        self.columns = [*self.columns]
+        self.columns[i] = x + c * distance, y + s * distance, yaw + turn
         self._publish()
 
-    def add_gap(self, distance: float, turn: float, along: float, yaw: float) -> None:
-        """Add a gap in which the pose was not updated: probable motion, and its variances."""
-        if self._lost:
-            self._mark_unknown(distance, turn)
-            return
-        self.miss("gap", distance, turn)
-        c, s = self._cos, self._sin
-        # The motion may be an arc to either side, so the position is uncertain sideways too.
-        aside = (distance**2 + along) * min(1.0, (turn**2 + yaw) / 4)
-        way_along, way_yaw, both = self._model.noise.of(distance, turn, abs(turn))
-        p = added(self._p, along + way_along, yaw + way_yaw, both, c, s)
-        self._p = added(p, aside, 0.0, 0.0, -s, c)
-        self._publish()
+    def set_twist(self, model: ErrorModel, twist: Twist, slips: bool, gyro: float | None) -> None:
+        """Set the variances of a moving robot's twist, with those of the gyro's rate, rad2/s2.
 
-    def _widen(self) -> int:
-        self._effects = (*self._effects, NO_EFFECT)
-        self._columns = [*self._columns, ORIGIN]
-        self._columns_before = [*self._columns_before, ORIGIN]
-        self._second.add_parameter()
-        return len(self._columns) - 1
+        A pose that is integrated from twists is as uncertain as that of the odometry. The errors of
+        parameters and of the quantization of the speeds come on top.
+        """
+        linear, angular, period = twist.linear, twist.angular, self.period
+        quantum = max(SPEED_RESOLUTION, model.count / period) ** 2
+        along, yaw, _ = model.noise(linear, angular, abs(angular))
+        along, yaw = along / period, yaw / period
+        for of_distance, of_turn, turn_of_distance, turn_of_turn in model.effects[0]:
+            along += (of_distance * linear + of_turn * angular) ** 2
+            yaw += (turn_of_distance * linear + turn_of_turn * angular) ** 2
+        along, yaw = along + model.of_speed[0] * quantum, yaw + model.of_speed[1] * quantum
+        self._set_twist(along, LATERAL_VARIANCE, yaw, slips, gyro)
 
-    def _mark_unknown(self, distance: float, turn: float) -> None:
-        # Without a motion, nothing changes. The position or the heading is already unknown.
-        if distance or turn:
-            self.covariance = UNKNOWN_POSE
+    def set_rest(self, model: ErrorModel, rested: Seconds, slips: bool, gyro: float | None) -> None:
+        """Set the variances at rest: of a motion that no encoder shows in `rested` s."""
+        quantum = (model.count / rested) ** 2
+        linear, angular = model.of_speed
+        self._set_twist(linear * quantum, MIN_TWIST_VARIANCE, angular * quantum, slips, gyro)
 
-    def _beyond_play(self, turn: float) -> float:
-        # On a straight drive, the counts of both sides arrive at different times, and the heading
-        # turns back and forth by one count. The sum of |dyaw| would count this as turning, and make
-        # the variance of yaw 2 to 4 times too large. Only turns beyond one count add to the noise.
-        self._turned += turn
-        off = self._turned - self._middle
-        if abs(off) <= self._play:
+    def _set_twist(
+        self, linear: float, lateral: float, angular: float, slips: bool, gyro: float | None
+    ) -> None:
+        factor = SLIP_FACTOR if slips else 1.0
+        least, most = MIN_TWIST_VARIANCE, MAX_VARIANCE
+        self.twist = TwistVariances(
+            min(max(factor * linear, least), most),
+            min(factor * lateral, most),
+            min(max(factor * angular if gyro is None else gyro, least), most),
+        )
+
+    def _is_lost(self) -> bool:
+        return self.covariance == UNKNOWN_POSE
+
+    def _beyond_play(self, model: ErrorModel, turn: Rad) -> Rad:
+        # The sum of |turn| of a straight drive would count the play as turning, and make the
+        # variance of yaw 2 to 4 times too large.
+        self.turned += turn
+        off = self.turned - self.middle
+        if abs(off) <= model.play:
             return 0.0
-        beyond = abs(off) - self._play
-        self._middle += math.copysign(beyond, off)
+        beyond = abs(off) - model.play
+        self.middle += math.copysign(beyond, off)
         return beyond
 
-    def _bend(
-        self, distance: float, turn: float, dx: float, dy: float, scale: float | None
-    ) -> None:
-        # J <- F J + G_p; `scale` is None without a gyro.
-        c, s, more = self._cos, self._sin, 0.0
-        columns: list[Vector] = []
-        # Unpacking into names is faster than indexing tuples.
-        for (x, y, yaw), effect in zip(self._columns, self._effects, strict=True):
-            of_distance, of_turn, turn_of_distance, turn_of_turn = effect
-            along = of_distance * distance + of_turn * turn
-            if scale is None:
-                more = turn_of_distance * distance + turn_of_turn * turn
-            else:
-                more = scale * turn if len(columns) == self._of_gyro else 0.0
-            # The direction of the chord is the old heading plus half of the turn.
-            lever = yaw + more / 2
-            columns.append((x + c * along - dy * lever, y + s * along + dx * lever, yaw + more))
-        self._columns = columns
-
-    def _begin_stretch(self) -> None:
-        self._before = self._p
-        self._columns_before = self._columns
-        self._dx = self._dy = self._rolled = 0.0
-
-    def _end_stretch(self) -> None:
-        dx, dy, p = self._dx, self._dy, self._p
-        before = carried(self._before, dx, dy)
-        columns_before = [seen_from(column, dx, dy) for column in self._columns_before]
-        new = [
-            (a[0] - b[0], a[1] - b[1], a[2] - b[2])
-            for a, b in zip(self._columns, columns_before, strict=True)
-        ]
-        self._second.carry(dx, dy)
-        self._p = total(p, self._second.compose(before, difference(p, before), columns_before, new))
-        self._begin_stretch()
+    def _bend(self, model: ErrorModel) -> None:
+        # Composes the error e of the path before a stretch with its own w (Baker, Campbell,
+        # Hausdorff): log(exp(e) exp(w)) = e + w + [e, w] / 2 + ... The bracket has no yaw. Both
+        # have noise, and the effects J and W of the causes, which are the same in each stretch.
+        # Compare equation 55 of Barfoot & Furgale, IEEE Transactions on Robotics 30 (2014).
+        bend, p, columns = self.bend, self.p, self.columns
+        dx, dy = bend.dx, bend.dy
+        before = carried(bend.p, dx, dy, 0.0)
+        j = [(x - dy * yaw, y + dx * yaw, yaw) for x, y, yaw in bend.columns]
+        self.bend = new = Bend(p, columns, 0.0, 0.0, 0.0, bend.noise, bend.of_causes, bend.added)
+        total = _total(before, j)
+        if self.covariance.yawyaw > MAX_HEADING_VARIANCE:
+            return
+        noise_xx, noise_xy, noise_yy = _bracketed(total, _difference(p, before))
+        xx, xy, yy = bend.noise
+        new.noise = xx, xy, yy = xx + noise_xx / 4, xy + noise_xy / 4, yy + noise_yy / 4
+        sums, parameters = bend.of_causes, len(PARAMETERS)
+        mean_x = mean_y = 0.0
+        for k in model.bending:
+            (ax, ay, ayaw), (bx, by, byaw) = columns[k], j[k]
+            wx, wy, wyaw = ax - bx, ay - by, ayaw - byaw
+            for i, (x, y, yaw) in enumerate(j):
+                sum_x, sum_y = sums[parameters * i + k]
+                sum_x += (y * wyaw - yaw * wy) / 2
+                sum_y += (yaw * wx - x * wyaw) / 2
+                sums[parameters * i + k] = sum_x, sum_y
+        # With A_ik, these sums, and independent unit normals p, E[(p' A p)^2] is the square of the
+        # trace, plus the sums of A_ik^2 and of A_ik A_ki.
+        for k in model.bending:
+            for i in range(CAUSES):
+                x, y = sums[parameters * i + k]
+                of_x, of_y = sums[parameters * k + i] if i < parameters else (0.0, 0.0)
+                xx, xy, yy = xx + x * (x + of_x), xy + x * (y + of_y), yy + y * (y + of_y)
+                if i == k:
+                    mean_x, mean_y = mean_x + x, mean_y + y
+        new.added = xx + mean_x * mean_x, xy + mean_x * mean_y, yy + mean_y * mean_y
 
     def _publish(self) -> None:
-        p, second = self._p, self._second
-        xx, xy, yy = p.xx + second.xx, p.xy + second.xy, p.yy + second.yy
-        xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
-        for x, y, yaw in self._columns:
-            xx += x * x
-            xy += x * y
-            xyaw += x * yaw
-            yy += y * y
-            yyaw += y * yaw
-            yawyaw += yaw * yaw
-        published = PoseCovariance(xx, xy, xyaw, yy, yyaw, yawyaw)
-        if self._counted:
-            along, turning, both = self._phase
-            published = added(published, along, turning, both, self._cos, self._sin)
-        if xx >= MAX_VARIANCE or yy >= MAX_VARIANCE or yawyaw >= MAX_VARIANCE:
-            self._lost = True
-            published = _capped(published)
-        self.covariance = published
+        p, (xx, xy, yy) = _total(self.p, self.columns), self.bend.added
+        p = PoseCovariance(p.xx + xx, p.xy + xy, p.xyaw, p.yy + yy, p.yyaw, p.yawyaw)
+        known = p.xx < MAX_VARIANCE and p.yy < MAX_VARIANCE and p.yawyaw < MAX_VARIANCE
+        self.covariance = p if known else UNKNOWN_POSE
 
 
-def _capped(p: PoseCovariance) -> PoseCovariance:
-    x, y, yaw = (
-        min(1.0, math.sqrt(MAX_VARIANCE / max(v, MAX_VARIANCE))) for v in (p.xx, p.yy, p.yawyaw)
-    )
+def carried(p: PoseCovariance, dx: Metres, dy: Metres, turning: float) -> PoseCovariance:
+    """Return `p`, with `turning` more variance of yaw, when the robot has moved by `dx`, `dy`."""
+    xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw + turning
     return PoseCovariance(
-        min(p.xx, MAX_VARIANCE),
-        p.xy * x * y,
-        p.xyaw * x * yaw,
-        min(p.yy, MAX_VARIANCE),
-        p.yyaw * y * yaw,
-        min(p.yawyaw, MAX_VARIANCE),
+        p.xx - 2 * dy * xyaw + dy * dy * yawyaw,
+        p.xy + dx * xyaw - dy * yyaw - dx * dy * yawyaw,
+        xyaw - dy * yawyaw,
+        p.yy + 2 * dx * yyaw + dx * dx * yawyaw,
+        yyaw + dx * yawyaw,
+        yawyaw,
+    )
+
+
+def added(
+    p: PoseCovariance, along: float, yaw: float, both: float, c: float, s: float
+) -> PoseCovariance:
+    """Return `p` plus noise of distance and turn, in the direction of cosine `c` and sine `s`."""
+    cc, cs = along * c, along * s
+    return PoseCovariance(
+        p.xx + cc * c, p.xy + cc * s, p.xyaw + both * c,
+        p.yy + cs * s, p.yyaw + both * s, p.yawyaw + yaw,
+    )  # fmt: skip
+
+
+def _difference(p: PoseCovariance, q: PoseCovariance) -> PoseCovariance:
+    return PoseCovariance(
+        p.xx - q.xx, p.xy - q.xy, p.xyaw - q.xyaw,
+        p.yy - q.yy, p.yyaw - q.yyaw, p.yawyaw - q.yawyaw,
+    )  # fmt: skip
+
+
+def _total(p: PoseCovariance, columns: list[Vector]) -> PoseCovariance:
+    xx, xy, xyaw, yy, yyaw, yawyaw = p.xx, p.xy, p.xyaw, p.yy, p.yyaw, p.yawyaw
+    for x, y, yaw in columns:
+        xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
+        xyaw, yyaw, yawyaw = xyaw + x * yaw, yyaw + y * yaw, yawyaw + yaw * yaw
+    return PoseCovariance(xx, xy, xyaw, yy, yyaw, yawyaw)
+
+
+def _bracketed(p: PoseCovariance, q: PoseCovariance) -> Vector:
+    # The covariance xx, xy, yy of [a, b], of independent a and b with the covariances p and q.
+    return (
+        p.yy * q.yawyaw - 2 * p.yyaw * q.yyaw + p.yawyaw * q.yy,
+        p.yyaw * q.xyaw - p.xy * q.yawyaw - p.yawyaw * q.xy + p.xyaw * q.yyaw,
+        p.yawyaw * q.xx - 2 * p.xyaw * q.xyaw + p.xx * q.yawyaw,
     )

@@ -18,12 +18,14 @@ from acsard.core.codes import Reason, joined, reason
 from acsard.core.config.motion_rules import MIN_EVIDENCE_LINES
 from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.codec import Motors
-from acsard.core.motion.error_model import ASSUMED_PERIOD_S, PERIOD_GAIN
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.suspect_wheel import FAULT_TEXTS, Stuck, Suspect, WheelFault, was_faulty
 from acsard.core.motion.wheel_residual import TIME_CONSTANT_S, Residual
 from acsard.core.motion.wheel_witness import MIN_FAULT_SPEED, WITNESS_CODES, Expected, Witness
 from acsard.core.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
+
+ASSUMED_PERIOD_S = 0.01  # of the feedback lines, before it is measured
+PERIOD_GAIN = 0.05  # small, because several lines may be read at the same time
 
 # rad of one count that is learned if the number of counts is not configured.
 MAX_COUNT_ANGLE, MIN_COUNT_ANGLE = math.tau / 16, math.tau / 2000

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from acsard.core.config.settings import DriveConfig, SimConfig
-from acsard.core.motion.path import arc
+from acsard.core.motion.kinematics import on_arc
 from acsard.core.values import Pose
 
 PUSH_TIME_CONSTANT_S = 0.1  # of the wheel speeds, towards a person's who pushes the robot
@@ -60,4 +60,5 @@ class Vehicle:
         right = self._right_radius * (turned[0] + turned[3]) / 2
         turn = (right - left) / self._track * (1.0 - self.turn_slip)
         self.turned += turn
-        self.pose = arc(self.pose, (left + right) / 2, turn)
+        dx, dy, yaw = on_arc(self.pose.yaw, (left + right) / 2, turn)
+        self.pose = Pose(self.pose.x + dx, self.pose.y + dy, yaw)

@@ -43,8 +43,6 @@ from acsard.calibration.positions import path, wheel_steps
 from acsard.calibration.solve import Calibration, calibrate
 from acsard.core.config.settings import DriveConfig, OdometryConfig
 from acsard.core.link.feedback import Feedback
-from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.odometry import Odometry
 from acsard.core.values import WheelSpeeds
 from acsard.terminal.output import MAX_TEXT_WIDTH, plain
 from tests.unit.calibration.cut import BASE, log_of_runs, table
@@ -59,6 +57,7 @@ from tests.unit.calibration.robots import (
     wander,
 )  # fmt: skip
 from tests.unit.core.motion.nees import AT, errors
+from tests.unit.core.motion.odometer import Odometer
 
 LINES = 5
 """Feedback lines that are joined to one for the odometry, to save time. Noise adds up."""
@@ -225,7 +224,7 @@ def judged(
     These are the squared errors of heading and distance, divided by the variances that the odometry
     states.
     """
-    odom = Odometry(robot[1], Kinematics(robot[0]), counts)
+    odom = Odometer(robot[1], counts, robot[0])
     end = begin + (end - begin) // LINES * LINES
     sides = (side[begin:end].reshape(-1, LINES).mean(axis=1) for side in (trip.left, trip.right))
     for left, right in zip(*sides, strict=True):

@@ -8,7 +8,6 @@ only the configuration with the robot. After every step it compares the outputs 
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Iterator
 
 import msgspec
@@ -32,9 +31,8 @@ from acsard.core.config.settings import (
     Source,
 )
 from acsard.core.guard import Guard
-from acsard.core.link.feedback import MAX_FILLED_GAP_S
+from acsard.core.link.sample_time import MAX_FILLED_GAP_S
 from acsard.core.motion.arbiter_text import waiting
-from acsard.core.motion.odometry import MAX_RECOMPUTED_LINES
 from acsard.core.robot import Robot
 from acsard.core.values import (
     NS_PER_S,
@@ -214,9 +212,6 @@ class RobotMachine(RuleBasedStateMachine):
         self.told_link, self.was_open, self.last_opened = "down", False, 0
         self.pose, self.sampled_ns = Pose(), self.now_ns - NS_PER_S
         self.fastest = 0.0
-        self.steps: deque[float] = deque(maxlen=MAX_RECOMPUTED_LINES + 1)
-        """Largest possible motion of each of the last lines, m."""
-        self.left_out: tuple[str, ...] = ()
         self.lates = 0
         self.clocks_become_known()
         self.step(tick=False)
@@ -674,12 +669,9 @@ class RobotMachine(RuleBasedStateMachine):
 
         The faster wheel speed of both ends of this time counts. Odometry does not fill long
         silences. A line has the time of its sample slot, which may be some periods before its
-        arrival and is never later. Only when odometry excludes a faulty wheel, the pose may move
-        more: it loses the wheel's last lines.
+        arrival and is never later.
         """
         drive, feedback = self.config.drive, self.config.feedback
-        left_out = self.robot.snapshot(self.now_ns).doubt.left_out
-        exclusions, self.left_out = set(left_out) - set(self.left_out), left_out
         for estimate in outputs.estimates:
             fastest = max(map(abs, estimate.speeds.as_tuple())) * drive.wheel_radius
             assert fastest <= feedback.wheel_speed * drive.wheel_radius
@@ -688,8 +680,7 @@ class RobotMachine(RuleBasedStateMachine):
             # Missing lines are filled in, but not more than a second of them.
             dt = min(dt, MAX_FILLED_GAP_S) + 2 * self.period_ms / 1000
             fastest, self.fastest = max(fastest, self.fastest), fastest
-            self.steps.append(fastest * dt)
-            most = sum(self.steps) if exclusions else fastest * dt
+            most = fastest * dt
             x, y = estimate.pose.x - self.pose.x, estimate.pose.y - self.pose.y
             slack = 1e-9 * (1 + abs(self.pose.x) + abs(self.pose.y))
             assert math.hypot(x, y) <= most + slack

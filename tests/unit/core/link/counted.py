@@ -14,12 +14,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from acsard.core.config.settings import DriveConfig, FeedbackConfig, McuConfig, OdometryConfig
+from acsard.core.config.settings import FeedbackConfig, McuConfig
 from acsard.core.link.session import McuSession
-from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
 from acsard.core.values import Instant, Received
+from tests.unit.core.motion.odometer import Odometer
 
 Array = NDArray[np.float64]
 RADIUS, TRACK, PERIOD = 0.05, 0.30, 0.01
@@ -92,7 +91,7 @@ class Host:
         """`counts` is the configured number of counts per turn, or 0 if it is unknown."""
         self.session = McuSession(McuConfig(encoder_counts=counts), 100.0)
         self.sanity, self.fastest = Sanity(), (feedback or FeedbackConfig()).wheel_speed
-        self.odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()), counts)
+        self.odometry = Odometer(counts=counts)
         self.now_ns = 1_000_000_000
         self.lines = self.dropped = 0
         self.why = ""

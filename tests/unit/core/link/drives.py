@@ -6,7 +6,6 @@ the floor, which is the pose if each line had its true time. The seed determines
 
 from __future__ import annotations
 
-import binascii
 import bisect
 import math
 from collections import deque
@@ -16,20 +15,15 @@ from typing import Literal
 import numpy as np
 from msgspec import Struct
 
-from acsard.core.config.settings import DriveConfig, McuConfig, OdometryConfig
+from acsard.core.config.settings import McuConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.session import McuSession
-from acsard.core.motion import path as way
-from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.odometry import Odometry
 from acsard.core.values import NS_PER_S, Instant, Pose, Received, WheelSpeeds
+from tests.unit.core.motion.odometer import Odometer, arc
 
 RATE = 100.0
 PERIOD, DRIFT = 0.01, 2e-4
 """Report period, s, and largest relative drift of an MCU's clock."""
-
-LEAST_WINDOW = 0.004
-"""Time, s, in which the firmware counts before it computes new speeds."""
 
 BYTE = 10 / 115200
 """Time of one byte on the wire, s."""
@@ -123,12 +117,6 @@ class Case(Struct, frozen=True):
     lost: float = 0.0
     burst_every: float = 0.0
     """Mean time between bursts of 0.1 to 0.5 s of lost lines, s; 0 means that there are none."""
-    counts: int = 0
-    """Counts per turn of the encoders; 0 means that they have no steps."""
-    configured: int | None = None
-    """`mcu.encoder_counts`; None means that it is right."""
-    checked: bool = False
-    """Whether commands and replies have a number and a checksum, and replies the counts, too."""
 
 
 class Line(Struct):
@@ -147,18 +135,10 @@ class Host:
         self.case, self.seconds = case, seconds
         self.rng = rng = np.random.default_rng(seed)
         self.path = Path(rng, seconds)
-        configured = case.counts if case.configured is None else case.configured
-        mcu = McuConfig(
-            reply_period=0.0 if case.prompted else PERIOD,
-            encoder_counts=configured,
-            link_check="on" if case.checked else "off",
-        )
-        self.session = McuSession(mcu, RATE)
-        self.found = Odometry(OdometryConfig(), Kinematics(DriveConfig()), configured)
-        self.floor, self.by_arrival, self.counter = Arcs(), Arcs(), Arcs()
-        """Poses from each line's true time, from arrival times, and from the encoders' counts.
-
-        `found` is the session's.
+        self.session = McuSession(McuConfig(reply_period=0.0 if case.prompted else PERIOD), RATE)
+        self.found = Odometer()
+        self.floor, self.by_arrival = Arcs(), Arcs()
+        """Poses from each line's true time, and from arrival times; `found` is the session's.
 
         By arrival times, each line's speed applies since the line before it.
         """
@@ -168,7 +148,6 @@ class Host:
         """Time of the last step, s."""
         self._heard_ns = 0
         self._reported = 0.0
-        self._wheels = self._turned(0.0)
         self._stalls = _times(rng, seconds, case.stall_every, case.stall) if case.stall else []
         self._starts = [start for start, _ in self._stalls]
         every = case.burst_every
@@ -178,55 +157,17 @@ class Host:
 
     # the microcontroller
 
-    def report(self, at: float, nominal: float | None, command: bytes = b"") -> Line:
-        """Make the MCU's next line at time `at`, s, with the mean speeds since its last line.
-
-        If that was less than `LEAST_WINDOW` ago, the line repeats its speeds.
-        """
-        if at - self._reported < LEAST_WINDOW and self.lines:
-            speeds = self.lines[-1].speeds
-            data = self._encoded(speeds, self._reported, self._wheels, command)
-            self.lines.append(Line(at, self._reported, speeds, data))
-            return self.lines[-1]
-        then, now = self._wheels, self._turned(at)
-        self._wheels = now
+    def report(self, at: float, nominal: float | None) -> Line:
+        """Make the MCU's next line at time `at`, s, with the mean speeds since its last line."""
+        now, then = self.path.angles(at), self.path.angles(self._reported)
         dt = at - self._reported if nominal is None else nominal
-        a, b, c, d = (after - before for after, before in zip(now, then, strict=True))
-        speeds = WheelSpeeds(*(round(angle / dt, 2) for angle in (a, b, c, d)))
-        line = Line(at, self._reported, speeds, self._encoded(speeds, at, now, command))
+        left, right = (round((a - b) / dt, 2) for a, b in zip(now, then, strict=True))
+        speeds = WheelSpeeds(right, left, left, right)
+        line = Line(at, self._reported, speeds, _encode(speeds))
         self._reported = at
         self.lines.append(line)
-        right, left = speeds.front_right + speeds.rear_right, speeds.front_left + speeds.rear_left
-        self.floor.roll(left / 2 * dt, right / 2 * dt)
-        self.counter.roll((b + c) / 2, (a + d) / 2)
+        self.floor.roll(left * dt, right * dt)
         return line
-
-    def _turned(self, at: float) -> tuple[float, ...]:
-        """Return the angles of the wheels a to d by their encoders, rad."""
-        left, right = self.path.angles(at)
-        wheels = right, left, left, right
-        if not self.case.counts:
-            return wheels
-        step = math.tau / self.case.counts
-        # The edges of the encoders are not at the same angles.
-        edges = zip(wheels, (0.0, 0.6, 0.1, 0.4), strict=True)
-        return tuple(math.floor(angle / step + edge) * step for angle, edge in edges)
-
-    def _encoded(
-        self, speeds: WheelSpeeds, at: float, wheels: tuple[float, ...], command: bytes
-    ) -> bytes:
-        data = _encode(speeds)
-        if b"#" not in command:
-            return data
-        number, counts = int(command[command.index(b"#") + 1 :][:2], 16), self.case.counts
-        line = b"%b#%02X" % (data.strip(), number)
-        if counts:
-            fields = [
-                int(at * 1000),
-                *(round(angle * counts / math.tau) for angle in wheels),
-            ]
-            line += b"@" + b"".join(b"%04X" % (field % 65536) for field in fields)
-        return b"%b*%04X\r\n" % (line, binascii.crc_hqx(line, 0))
 
     # the path to the host
 
@@ -259,14 +200,14 @@ class Host:
             at = max(self.awake((int(at * RATE + 1e-6) + 1) / RATE), at + 1e-6)
             yield at
 
-    def tick(self, at: float) -> bytes | None:
-        """Run one control step, and return the line that the host sends in it."""
+    def tick(self, at: float) -> bool:
+        """Run one control step, and return whether the host sends a line in it."""
         self.now = at
         now = _instant(at)
         self._update(now, ())
         line = self.session.line(now.mono_ns, ROLLING)
         self.session.sent(now.mono_ns, was_written=True)
-        return line
+        return line is not None
 
     def read(self, at: float, data: bytes) -> None:
         """Let the host read these bytes piece by piece, as an adapter delivers them."""
@@ -286,13 +227,13 @@ class Host:
     # the end of the drive
 
     def errors(self) -> np.ndarray:
-        """Return the final errors, in m and deg, of four poses.
+        """Return the final errors, in m and deg, of three poses.
 
-        They come from the session, true times (the floor), arrival times, and the counts.
+        The poses come from the session, from true times (the floor), and from arrival times.
         """
         truth = self._truth()
         rows = []
-        for odometry in (self.found, self.floor, self.by_arrival, self.counter):
+        for odometry in (self.found, self.floor, self.by_arrival):
             pose = odometry.pose
             turn = math.degrees(math.remainder(pose.yaw - truth.yaw, math.tau))
             rows.append((math.hypot(pose.x - truth.x, pose.y - truth.y), abs(turn)))
@@ -311,14 +252,10 @@ class Arcs:
     """The pose of a robot of default size, computed from the angles that its sides roll, rad."""
 
     def __init__(self) -> None:
-        self._path = way.Path()
+        self.pose = Pose()
 
     def roll(self, left: float, right: float) -> None:
-        self._path.advance((right + left) / 2 * 0.05, (right - left) * 0.05 / 0.30)
-
-    @property
-    def pose(self) -> Pose:
-        return self._path.pose
+        self.pose = arc(self.pose, (right + left) / 2 * 0.05, (right - left) * 0.05 / 0.30)
 
 
 def _instant(at: float) -> Instant:
@@ -382,13 +319,12 @@ def _prompted(host: Host) -> None:
         _read_until(host, arrivals, tick)
         if tick > host.seconds:
             return
-        command = host.tick(tick)
-        if command is None or command.startswith(b"?"):
+        if not host.tick(tick):
             continue
         made = max(
             tick + 0.0001 + 33 * BYTE + 0.001 + host.rng.uniform(0, host.case.thinking), free
         )
-        line = host.report(made, None, command)
+        line = host.report(made, None)
         free = made + len(line.data) * BYTE
         if not host.lost(line):
             last = max(host.delivered(line), last)

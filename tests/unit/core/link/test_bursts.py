@@ -9,10 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acsard.core.config.settings import DriveConfig
 from acsard.core.link.feedback import Feedback
-from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.odometry import Odometry
 from acsard.core.values import STILL
 from tests.unit.core.link.drives import Case, Host, reporting
 from tests.unit.core.motion.nees import (
@@ -26,6 +23,7 @@ from tests.unit.core.motion.nees import (
     nees,
     true_ends,
 )
+from tests.unit.core.motion.odometer import Odometer
 
 BURSTS = Case(burst_every=30.0)
 
@@ -33,7 +31,7 @@ BURSTS = Case(burst_every=30.0)
 def drive(seed: int, seconds: float, model: Model, robots: int) -> Array:
     """Return the NEES of robots that get the same commands and slip differently."""
     host = Host(BURSTS, seed, seconds)
-    host.found = Odometry(model.config(), Kinematics(DriveConfig()))
+    host.found = Odometer(model.config())
     reporting(host)
     path = host.path
     wheels = np.stack([path.left, path.right], axis=1)[:: round(PERIOD / 0.001)]
@@ -42,7 +40,7 @@ def drive(seed: int, seconds: float, model: Model, robots: int) -> Array:
     p = end.covariance
     covariance = [[p.xx, p.xy, p.xyaw], [p.xy, p.yy, p.yyaw], [p.xyaw, p.yyaw, p.yawyaw]]
     pose = np.array([end.pose.x, end.pose.y, end.pose.yaw])
-    assert host.found.unseen.filled > 0.05
+    assert host.found.odometry.filled > 0.05
     return nees(pose, np.array(covariance), ends[:, 0])
 
 

@@ -16,12 +16,11 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from acsard.core.codes import Reason
-from acsard.core.config.settings import DriveConfig, OdometryConfig
+from acsard.core.config.settings import DriveConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.odometry import Odometry
-from acsard.core.motion.path import Path
 from acsard.core.values import Estimate, Instant, Pose, WheelSpeeds
+from tests.unit.core.motion.odometer import Odometer, arc
 
 Array = NDArray[np.float64]
 
@@ -128,11 +127,11 @@ def wishes(speeds: Array) -> list[WheelSpeeds]:
     return [WheelSpeeds(*row) for row in speeds.tolist()]
 
 
-def odometry(counts: int = 0) -> Odometry:
-    return Odometry(OdometryConfig(), Kinematics(DriveConfig()), counts)
+def odometry(counts: int = 0) -> Odometer:
+    return Odometer(counts=counts)
 
 
-def fold(robot: Odometry, line: Feedback, commanded: WheelSpeeds) -> tuple[Estimate, Reason | None]:
+def fold(robot: Odometer, line: Feedback, commanded: WheelSpeeds) -> tuple[Estimate, Reason | None]:
     """Return the estimate after a line, and the wheel fault that it proves."""
     fault = robot.checks.wheels.watch(commanded, line.speeds, line.dt)
     return robot.fold(line), fault
@@ -147,11 +146,7 @@ class Plain:
     """Odometry that integrates the mean of front and rear wheels and excludes no wheel."""
 
     def __init__(self) -> None:
-        self._kinematics, self._path, self._lost = Kinematics(DriveConfig()), Path(), 0.0
-
-    @property
-    def pose(self) -> Pose:
-        return self._path.pose
+        self._kinematics, self.pose, self._lost = Kinematics(DriveConfig()), Pose(), 0.0
 
     def skip(self, line: Feedback) -> None:
         self._lost += line.dt
@@ -160,4 +155,4 @@ class Plain:
         dt, self._lost = self._lost + line.dt, 0.0
         turned = WheelSpeeds(*(speed * dt for speed in line.speeds.as_tuple()))
         twist = self._kinematics.twist(turned)
-        self._path.advance(twist.linear, twist.angular)
+        self.pose = arc(self.pose, twist.linear, twist.angular)

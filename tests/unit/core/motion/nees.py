@@ -18,11 +18,10 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from acsard.core.config.settings import DriveConfig, OdometryConfig
+from acsard.core.config.settings import OdometryConfig
 from acsard.core.link.feedback import Feedback
-from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.odometry import Odometry
 from acsard.core.values import Instant, WheelSpeeds
+from tests.unit.core.motion.odometer import Odometer
 
 Array = NDArray[np.float64]
 
@@ -38,17 +37,18 @@ class Model(Struct, frozen=True):
     distance: float
     yaw: float
     skid: float
-    radius_std: float = 0.0
+    ratio_std: float = 0.0
     track_std: float = 0.0
+    scale_std: float = 0.0
 
     def config(self) -> OdometryConfig:
         return OdometryConfig(
             distance_variance_per_metre=self.distance,
             yaw_variance_per_metre=self.yaw,
             yaw_variance_per_radian=self.skid,
-            left_wheel_radius_multiplier_std=self.radius_std,
-            right_wheel_radius_multiplier_std=self.radius_std,
+            wheel_radius_ratio_std=self.ratio_std,
             wheel_separation_multiplier_std=self.track_std,
+            distance_scale_std=self.scale_std,
         )
 
 
@@ -124,8 +124,10 @@ def true_ends(drives: list[Array], robots: int, model: Model, rng: np.random.Gen
         steps[: len(drive), i] = drive * RADIUS * PERIOD
     k = min(2 * model.distance, model.yaw * TRACK**2 / 2)
     along, yaw = model.distance - k / 2, model.yaw - 2 * k / TRACK**2
-    left_off, right_off = 1 + model.radius_std * rng.standard_normal((2, *shape))
+    ratio = model.ratio_std * rng.standard_normal(shape)
+    left_off, right_off = 1 - ratio / 2, 1 + ratio / 2
     track = TRACK * (1 + model.track_std * rng.standard_normal(shape))
+    scale = 1 + model.scale_std * rng.standard_normal(shape)
     # the same uncertainty as the default at the start
     pose = 1e-3 * rng.standard_normal((3, *shape))
     for step in steps:
@@ -136,7 +138,7 @@ def true_ends(drives: list[Array], robots: int, model: Model, rng: np.random.Gen
         dl = left * left_off + np.sqrt(k * abs(left)) * noise[0]
         dr = right * right_off + np.sqrt(k * abs(right)) * noise[1]
         path, turned = abs(left + right) / 2, abs(right - left) / TRACK
-        d = (dl + dr) / 2 + np.sqrt(along * path) * noise[2]
+        d = (dl + dr) / 2 * scale + np.sqrt(along * path) * noise[2]
         turn = (dr - dl) / track + np.sqrt(yaw * path + model.skid * turned) * noise[3]
         chord, heading = d * np.sinc(turn / math.tau), pose[2] + turn / 2
         pose += chord * np.cos(heading), chord * np.sin(heading), turn
@@ -145,7 +147,7 @@ def true_ends(drives: list[Array], robots: int, model: Model, rng: np.random.Gen
 
 def fold(lines: Iterable[Feedback], model: Model, counts: int = 0) -> tuple[Array, Array]:
     """Return the final pose and covariance of odometry."""
-    robot = Odometry(model.config(), Kinematics(DriveConfig()), counts)
+    robot = Odometer(model.config(), counts)
     for line in lines:
         estimate = robot.fold(line)
     pose, p = estimate.pose, estimate.covariance

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import Struct
 
@@ -16,9 +16,10 @@ from acsard.core.config.settings import DriveConfig, OdometryConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.odometry import Odometry
+from acsard.core.motion.uncertainty import ErrorModel
 from acsard.core.values import NS_PER_S, GyroSample, Instant, Twist, WheelSpeeds
 from tests.unit.core.motion.liars import fold
+from tests.unit.core.motion.odometer import Odometer
 
 KINEMATICS = Kinematics(DriveConfig())
 
@@ -85,7 +86,7 @@ LINES = st.lists(
 def test_the_turn_of_the_wheels_that_a_gyro_gets_is_the_turn_of_the_heading(
     lines: list[Line],
 ) -> None:
-    robot, listening = Odometry(OdometryConfig(), KINEMATICS, 3200), Listening()
+    robot, listening = Odometer(counts=3200), Listening()
     robot.checks.gyro = listening
     for state in lines:
         if state.skipped:
@@ -97,15 +98,15 @@ def test_the_turn_of_the_wheels_that_a_gyro_gets_is_the_turn_of_the_heading(
 
 
 def test_a_gap_before_a_skipped_line_counts_for_the_next_line() -> None:
-    robot = Odometry(OdometryConfig(), KINEMATICS)
+    robot = Odometer()
     robot.fold(feedback_of(Line(10.0, 10.0)))
     robot.skip(feedback_of(Line(10.0, 10.0, gap=0.5)))
     robot.fold(feedback_of(Line(10.0, 10.0)))
-    assert robot.unseen.counters() == {"gaps": 1, "gap_ms": 500}
+    assert robot.odometry.counters() == {"gaps": 1, "gap_ms": 500}
 
 
 def test_the_gyro_is_compared_with_the_wheels_over_no_unknown_distance() -> None:
-    robot, listening = Odometry(OdometryConfig(), KINEMATICS), Listening()
+    robot, listening = Odometer(), Listening()
     robot.checks.gyro = listening
     for state in (Line(9.0, 9.0), Line(9.0, 9.0, bridged=0.3), Line(9.0, 9.0, gap=0.5)):
         robot.fold(feedback_of(state))
@@ -118,7 +119,7 @@ class Turning:
     def __init__(self, scale: float = 1.0) -> None:
         """Start at rest. The gyro reports `scale` times the true turn."""
         self.scale = scale
-        self.gyro, self.robot = Gyro(), Odometry(OdometryConfig(), KINEMATICS, 3200)
+        self.gyro, self.robot = Gyro(), Odometer(counts=3200)
         self.robot.checks.gyro = self.gyro
         self.now_ns, self.true, self.rate = NS_PER_S, 0.0, 0.0
         self.does: list[str] = []
@@ -180,24 +181,6 @@ def test_a_bridged_gap_during_the_gyro_trial_causes_no_heading_error() -> None:
     assert bench.off == pytest.approx(0.0, abs=0.006)  # the robot treats its samples as steps
 
 
-@pytest.mark.slow
-@settings(max_examples=30, deadline=None)
-@given(st.floats(0.0, 0.4), st.floats(0.4, 2.0), st.floats(0.2, 1.0))
-def test_a_wheel_fault_during_the_gyro_trial_is_corrected_only_once(
-    before: float, turning: float, ahead: float
-) -> None:
-    # If the dead wheel should hardly turn, it does not contradict the others.
-    assume(abs(KINEMATICS.wheel_speeds(Twist(ahead, turning)).front_left) > 1.0)
-    bench = Turning()
-    bench.run(1.0, Twist(ahead, 0.0))
-    bench.run(before, Twist(ahead, turning))
-    bench.run(0.3, Twist(ahead, turning), dead=True)
-    assert bench.robot.checks.wheels.status.left_out
-    bench.run(2.0, Twist(ahead, turning), dead=True)
-    assert bench.gyro.status.does == "used"
-    assert bench.off == pytest.approx(0.0, abs=2e-3)
-
-
 def proved(scale: float) -> Turning:
     """Return a robot whose gyro has proved itself, so that odometry uses it from now on."""
     bench = Turning(scale)
@@ -226,7 +209,7 @@ def test_the_heading_of_a_gyro_that_hangs_is_taken_back_or_in_the_covariance(
 @pytest.mark.parametrize("turns", [2, pytest.param(20, marks=pytest.mark.slow)])
 def test_the_error_of_a_gyros_scale_grows_with_the_turns(turns: int, std: float) -> None:
     bench = proved(1 + std)
-    bench.robot.use(OdometryConfig(gyro_scale_std=std))
+    bench.robot.model = ErrorModel(OdometryConfig(gyro_scale_std=std), KINEMATICS, 3200)
     off, variance = bench.off, bench.yaw_variance
     bench.run(turns * math.tau / 2.0, Twist(0.0, 2.0))
     bench.run(1.0, Twist())

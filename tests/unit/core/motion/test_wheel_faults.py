@@ -191,34 +191,12 @@ def test_a_wheel_left_out_as_stuck_is_a_fault_only_while_it_repeats_that_speed(
     assert bench.faults.status.left_out == ("front_right",)
 
 
-def test_the_pose_error_of_a_faulty_wheel_before_its_detection_is_taken_back() -> None:
-    robot, plain = odometry(3200), Plain()
-    for speeds in [TEN] * 200 + [only(0, 0.0)] * 50:
-        fold(robot, Feedback(AT, speeds, PERIOD), TEN)
-        plain.fold(Feedback(AT, speeds, PERIOD))
-    assert abs(plain.pose.yaw) > 0.3
-    assert abs(robot.pose.yaw) < 1e-3
-    assert robot.pose.x == pytest.approx(250 * 10 * PERIOD * 0.05, rel=1e-3)
-
-
 def test_the_wheel_angles_are_those_of_the_encoders_even_if_a_wheel_is_left_out() -> None:
     robot = odometry()
     for speeds in [TEN] * 100 + [only(0, 0.0)] * 100:
         estimate, _ = fold(robot, Feedback(AT, speeds, PERIOD), TEN)
     assert estimate.positions == pytest.approx((10.0, 20.0, 20.0, 20.0))
     assert estimate.speeds == only(0, 0.0)
-
-
-def test_a_pose_that_was_set_after_the_fault_began_is_not_corrected() -> None:
-    robot = odometry(3200)
-    for speeds in [TEN] * 100 + [only(0, 0.0)] * 2:
-        fold(robot, Feedback(AT, speeds, PERIOD), TEN)
-    robot.set_pose(robot.pose)
-    before = robot.pose
-    fold(robot, Feedback(AT, only(0, 0.0), PERIOD), TEN)
-    fold(robot, Feedback(AT, only(0, 0.0), PERIOD), TEN)
-    assert robot.checks.wheels.status.left_out == ("front_right",)
-    assert apart(before, robot.pose)[0] == pytest.approx(0.01, abs=1e-3)
 
 
 # no healthy wheel is left out
@@ -341,8 +319,8 @@ class Fall:
             self.out_s = math.inf if out is None else max(0, out - off + 1) * PERIOD
 
 
-GOAL = 0.05
-"""Largest share of the plain mean's error, for encoders that reveal a failure at once."""
+GOAL = 0.1
+"""Largest share of the plain mean's error: of the lines before the wheel is left out."""
 
 COARSE = {(20, "reversed"): 0.25}
 """Larger share for the case in which many counts must pass before a failure shows."""
@@ -360,7 +338,7 @@ SOAK = [pytest.mark.soak, pytest.mark.timeout(3600)]
     ],
 )
 @pytest.mark.parametrize("kind", list(LIES))
-def test_the_check_reduces_the_pose_error_of_a_faulty_wheel_to_a_twentieth(
+def test_the_check_reduces_the_pose_error_of_a_faulty_wheel_to_a_tenth(
     kind: str, counts: int, count: int
 ) -> None:
     """The drives are random. `COARSE` allows more for coarse encoders."""

@@ -1,0 +1,85 @@
+"""Fills gaps in the feedback: the motion of the wheels from one plausible line to the next.
+
+Each wheel rolls by its encoder counts, by whole counts recovered from the speeds, or by speed times
+time. A time for which no plausible line speaks is filled with the trapezoid of the speeds at its
+ends, if it is shorter than `MAX_FILLED_GAP_S`. Otherwise its motion is unknown, and the pose stays.
+"""
+
+from __future__ import annotations
+
+from msgspec import Struct
+
+from acsard.core.link.codec import Motors
+from acsard.core.link.feedback import Feedback
+from acsard.core.link.sample_time import MAX_FILLED_GAP_S
+from acsard.core.values import Seconds
+
+LONG_S = 0.06  # a line for more than this is judged like a gap
+
+AT_REST: Motors = (0.0, 0.0, 0.0, 0.0)
+
+
+class Skipped(Struct):
+    """The implausible lines since the last plausible one. Only their counts and times are used."""
+
+    lines: int = 0
+    lost: Seconds = 0.0  # without counts
+    unknown: Seconds = 0.0
+    counted: Seconds = 0.0
+    turned: Motors = AT_REST  # in `counted`, rad
+
+    def add(self, line: Feedback) -> None:
+        self.lines += 1
+        if line.turned is None:
+            self.lost += line.dt
+            self.unknown += line.gap
+        else:
+            self.counted += line.dt
+            self.turned = plus(self.turned, line.turned)
+
+
+class Rolled(Struct, frozen=True, gc=False):
+    """The angles that the wheels rolled since the last plausible line, rad."""
+
+    angles: Motors
+    seconds: Seconds  # in which they rolled them
+    filled: Seconds  # part of `seconds` for which no line speaks
+    unknown: Seconds  # in addition to `seconds`
+
+
+def rolled_over(skipped: Skipped, line: Feedback, before: Motors) -> Rolled:
+    """Return the angles since the last plausible line, which had the speeds `before`, rad/s."""
+    speeds = _confirmed(before, line.speeds.as_tuple())
+    if line.turned is not None:
+        seconds, filled, unknown, angles = line.dt, 0.0, 0.0, line.turned
+    else:
+        seconds, filled, unknown = line.dt - line.bridged, line.bridged, line.gap
+        angles = times(speeds, seconds) if line.counted is None else line.counted
+    if skipped.lines:
+        angles = plus(skipped.turned, angles)
+        seconds, filled = seconds + skipped.counted, filled + skipped.lost
+        unknown += skipped.unknown
+    if filled >= MAX_FILLED_GAP_S:
+        filled, unknown = 0.0, unknown + filled
+    if filled:
+        angles = plus(angles, times(plus(before, speeds), filled / 2))
+    return Rolled(angles, seconds + filled, filled, unknown)
+
+
+def _confirmed(before: Motors, after: Motors) -> Motors:
+    # Motion changes both wheels of a side alike, damage one of them. In a usual line it matters
+    # little; here, take the median of each wheel, the other one of its side and its last speed.
+    fr, fl, rl, rr = after
+    was_fr, was_fl, was_rl, was_rr = before
+    return (
+        sorted((fr, rr, was_fr))[1], sorted((fl, rl, was_fl))[1],
+        sorted((rl, fl, was_rl))[1], sorted((rr, fr, was_rr))[1],
+    )  # fmt: skip
+
+
+def plus(a: Motors, b: Motors) -> Motors:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]
+
+
+def times(a: Motors, factor: float) -> Motors:
+    return a[0] * factor, a[1] * factor, a[2] * factor, a[3] * factor

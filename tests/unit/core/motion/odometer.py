@@ -1,0 +1,47 @@
+"""The odometry of a robot with its checks and its configuration, as the robot uses them."""
+
+from __future__ import annotations
+
+import math
+
+from acsard.core.config.settings import DriveConfig, FeedbackConfig, LimitsConfig, OdometryConfig
+from acsard.core.link.feedback import Feedback
+from acsard.core.motion.consistency import ConsistencyChecks
+from acsard.core.motion.kinematics import Kinematics, on_arc
+from acsard.core.motion.odometry import Odometry
+from acsard.core.motion.uncertainty import ErrorModel
+from acsard.core.values import Estimate, Pose
+
+
+class Odometer:
+    def __init__(
+        self,
+        odometry: OdometryConfig = OdometryConfig(),  # noqa: B008
+        counts: int = 0,
+        drive: DriveConfig = DriveConfig(),  # noqa: B008
+    ) -> None:
+        kinematics = Kinematics(drive)
+        self.model = ErrorModel(odometry, kinematics, counts, LimitsConfig())
+        self.checks = ConsistencyChecks(odometry, kinematics, counts, FeedbackConfig())
+        self.odometry = Odometry.initial(self.model)
+
+    @property
+    def pose(self) -> Pose:
+        return self.odometry.pose
+
+    def fold(self, line: Feedback) -> Estimate:
+        return self.odometry.fold(line, self.checks, self.model)
+
+    def skip(self, line: Feedback) -> None:
+        self.odometry.skipped.add(line)
+
+    def set_pose(self, pose: Pose) -> None:
+        self.odometry.set_pose(pose, self.model)
+        self.checks.drop_corrections()
+
+
+def arc(pose: Pose, distance: float, turn: float) -> Pose:
+    """Return the pose at the end of an arc."""
+    yaw = math.remainder(pose.yaw, math.tau)
+    dx, dy, yaw = on_arc(yaw, distance, turn)
+    return Pose(pose.x + dx, pose.y + dy, yaw)
