@@ -8,7 +8,6 @@ the caller uses speed times time. The module also detects a probable restart of 
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 from msgspec import Struct
@@ -16,10 +15,13 @@ from msgspec import Struct
 from acsard.core.config.wire_time import FIELD_VALUES
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
-from acsard.core.link.minimum_delay import MinimumDelay
-from acsard.core.values import NS_PER_S, Ns
+from acsard.core.link.line_times import MAX_CLOCK_ERROR
+from acsard.core.link.link_setup import LinkSetup
+from acsard.core.values import Ns
 
 SLACK_COUNTS = 4  # one count at each end of the interval, and play in the gears
+
+NS_PER_MS = 1_000_000
 
 ROUNDING_MS = 2  # each of the two times is in whole ms
 
@@ -37,45 +39,41 @@ class Turned(Struct, frozen=True):
     dt: float
 
 
-class Encoders:
-    def __init__(self, counts: int, wheel_speed: float, quiet_ns: Ns) -> None:
-        # A delay `quiet_ns` below the least one is a restart. `counts` is per turn, 0 if unknown.
-        self._angle = math.tau / counts if counts else 0.0
-        self._fastest = wheel_speed / math.tau * counts / 1000
-        self._early_ms = quiet_ns * 1000 / NS_PER_S
-        self._last: tuple[Reading, int] | None = None
-        # A restart sets the board's clock, modulo 65536 ms, to 0. It then seems to have jumped
-        # ahead, and the delay of the next reading seems too small.
-        self._promptest = MinimumDelay(most=MAX_DELAY_MS)
+class Encoders(Struct):
+    last: Reading | None = None
+    last_ns: Ns = 0  # its arrival
+    # Delay of the last reading over the least one, ms. A restart sets the board's clock, modulo
+    # 65536 ms, to 0: it then seems to have jumped ahead, and the delay seems too small.
+    late_ms: float = 0.0
 
     def forget(self) -> None:
         """Forget the previous reading, because a new session begins or a line has no reading."""
-        self._last = None
+        self.last = None
 
-    def turned(self, reading: Reading, at_ns: Ns) -> Turned | Unknown:
+    def turned(self, setup: LinkSetup, reading: Reading, at_ns: Ns) -> Turned | Unknown:
         """Return the motion since the previous reading, or why it is unknown.
 
         `at_ns`, the arrival, serves only to detect a restart or a wrapped count.
         """
-        last, self._last = self._last, (reading, at_ns)
-        if last is None:
+        before, self.last = self.last, reading
+        host_ms, self.last_ns = (at_ns - self.last_ns) / NS_PER_MS, at_ns
+        if before is None:
             return "unknown"
-        before, before_ns = last
-        host_ms = (at_ns - before_ns) * 1000 / NS_PER_S
         mcu_ms = (reading.mcu_ms - before.mcu_ms) % FIELD_VALUES
-        if self._promptest.add(host_ms, mcu_ms) < -self._early_ms:
+        late_ms = self.late_ms + host_ms - mcu_ms
+        self.late_ms = min(max(0.0, late_ms - MAX_CLOCK_ERROR * host_ms), MAX_DELAY_MS)
+        if late_ms < -setup.quiet_ns / NS_PER_MS:
             return "restarted"
-        if self._most(max(host_ms, mcu_ms)) >= FIELD_VALUES / 2:
+        if setup.fastest * (max(host_ms, mcu_ms) + ROUNDING_MS) >= FIELD_VALUES / 2 - SLACK_COUNTS:
             return "unknown"
-        pairs = zip(reading.counts, before.counts, strict=True)
-        a, b, c, d = [_signed(now - then) for now, then in pairs]
-        if max(abs(a), abs(b), abs(c), abs(d)) > self._most(mcu_ms):
+        a, b, c, d = reading.counts
+        was_a, was_b, was_c, was_d = before.counts
+        a, b, c, d = _signed(a - was_a), _signed(b - was_b), _signed(c - was_c), _signed(d - was_d)
+        most = setup.fastest * (mcu_ms + ROUNDING_MS) + SLACK_COUNTS
+        if max(a, b, c, d, -a, -b, -c, -d) > most:
             return "leap"
-        angle = self._angle
+        angle = setup.count
         return Turned((a * angle, b * angle, c * angle, d * angle), mcu_ms / 1000)
-
-    def _most(self, ms: float) -> float:
-        return self._fastest * (ms + ROUNDING_MS) + SLACK_COUNTS
 
 
 def _signed(difference: int) -> int:

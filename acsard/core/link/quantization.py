@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
-from acsard.core.link.whole_counts import WholeCounts
+from acsard.core.link.whole_counts import MAX_DOUBT, WholeCounts
 
 MIN_CHANGE = 0.0105  # rad/s; less may be rounding
 
@@ -96,13 +96,14 @@ class Coarseness:
 
 class CountRecovery:
     def __init__(self, counts: int = 0) -> None:
-        self._configured, self._whole = counts, WholeCounts(counts)
+        self._configured, self._whole = counts, WholeCounts()
+        self._angle = math.tau / counts if counts else 0.0
         self.coarse_lines = 0  # with a coarse encoder and no configured counts
         self.forget()
 
     def forget(self) -> None:
         """Forget all earlier lines: the board has restarted or was replaced."""
-        self._whole.forget()
+        self._whole = WholeCounts()
         self._coarseness = Coarseness()
         self._wheels = tuple(Steps() for _ in NO_STEPS)
         self._reported, self._steps = NO_STEPS, NO_STEPS  # learned, and limited by `MAX_STEP_RATIO`
@@ -110,7 +111,7 @@ class CountRecovery:
     @property
     def counts(self) -> tuple[int, ...]:
         """Configured counts per turn; all 0 without them, or if the speeds contradict them."""
-        return (self._configured if self._whole.believed else 0,) * 4
+        return (self._configured if self._whole.doubt < MAX_DOUBT else 0,) * 4
 
     def recover_counts(self, line: Feedback) -> Feedback:
         """Return a good line with `counted`, `steps` and `count`.
@@ -118,13 +119,15 @@ class CountRecovery:
         If the counts include the motion of a missing line before it, `bridged` becomes 0.
         """
         elapsed_s, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
-        if self._whole.angle:
+        if self._angle:
             if line.turned is None and elapsed_s > 0.0:
-                counted = self._whole.turned(speeds, elapsed_s, line.bridged)
+                counted = self._whole.turned(
+                    self._angle, speeds, elapsed_s, line.jitter, line.bridged
+                )
                 if self._whole.covers_gap:
                     line = replace(line, bridged=0.0)
             else:
-                self._whole.pause()
+                self._whole.apart = 0.0
         elif elapsed_s > 0.0 and self._coarseness.add(speeds, elapsed_s):
             self.coarse_lines += 1
         a, b, c, d = self._wheels
@@ -137,4 +140,4 @@ class CountRecovery:
             most = MAX_STEP_RATIO * sorted(reported)[2]
             self._reported = reported
             self._steps = min(a.size, most), min(b.size, most), min(c.size, most), min(d.size, most)
-        return replace(line, counted=counted, steps=self._steps, count=self._whole.angle)
+        return replace(line, counted=counted, steps=self._steps, count=self._angle)

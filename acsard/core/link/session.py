@@ -15,11 +15,12 @@ from acsard.core.config.settings import MAX_REPLY_PERIOD_S, FeedbackConfig, McuC
 from acsard.core.link import link_diagnosis
 from acsard.core.link.board_status import STATUS, StatusReports
 from acsard.core.link.checked_line import SAMPLE_REQUEST, OpenLines, Reading, seal, unseal
-from acsard.core.link.codec import Codec, FrameError
+from acsard.core.link.codec import FrameError
 from acsard.core.link.echo_check import QUESTION, WINDOW_NS, EchoCheck
 from acsard.core.link.feedback import Feedback, Timeline
 from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import Lateness, SilenceDiagnosis
+from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import GOOD_LINES, WATCHDOG_NS, WATCHDOG_S, Link
 from acsard.core.link.link_state import State as LinkState
 from acsard.core.link.quantization import CountRecovery
@@ -77,8 +78,8 @@ class McuSession:
         longest_reply: float = MAX_REPLY_PERIOD_S,
     ) -> None:
         # `longest_reply` is the highest value that `mcu.reply_period` may have, s.
-        self.codec = Codec(mcu.wheels, mcu.trailing_comma)
-        self._rest = self.codec.stop.rstrip(b",\r\n")  # begin of every line with speed zero
+        setup = self._setup = LinkSetup.of(mcu, rate_hz, feedback, longest_reply)
+        self.codec, self._rest = setup.codec, setup.rest
         self._answers = not mcu.reply_period  # sends nothing while it receives no line
         self._lines = LineReader()
         self._mcu, self._checked = mcu, mcu.checked
@@ -92,12 +93,11 @@ class McuSession:
         self._sampled = False  # the last good line had the board's counts
         self.status = StatusReports()
         self.reopened = False  # in the last `update`
-        # Silence after which the link is stale.
-        self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
+        self.quiet_ns = setup.quiet_ns
         self._link = Link(self.quiet_ns, mcu.checked)
         self.link: LinkState = "down"  # after the last `update`; the robot drives only while `up`
         self.lateness = Lateness(mcu.simulated, self.quiet_ns)
-        self._timeline = Timeline(mcu, self.codec, feedback.wheel_speed, self.quiet_ns, rate_hz)
+        self._timeline = Timeline()
         self.count_recovery = CountRecovery(mcu.encoder_counts)
         self._hearing, self._longest_reply = SilenceDiagnosis(), longest_reply
         self.rejects: Counter[str] = Counter()
@@ -242,7 +242,7 @@ class McuSession:
         if b"#" in line:
             self._open_lines.written(left_ns)
         self._moved = not line.startswith(self._rest)
-        self._timeline.written(left_ns, moves=self._moved)
+        self._timeline.written(self._setup, left_ns, moves=self._moved)
 
     # sessions
 
@@ -348,7 +348,7 @@ class McuSession:
         if link.state != "up":
             self._hearing.now.take(data)
         if lines:
-            timeline.process_read(piece.at, len(piece.data), len(lines), lines[-1][1])
+            timeline.process_read(self._setup, piece.at, len(piece.data), len(lines), lines[-1][1])
         for line, following in lines:
             self._echo.received(line)
             if self._last_reply and line == self._last_reply:
@@ -357,7 +357,7 @@ class McuSession:
                 continue
             reply = self._line(line, piece.at, following)
             if reply is None:
-                timeline.skip_bad()
+                timeline.skip_bad(self._setup)
             else:
                 feedback.append(reply)
             if link.state != "up":
@@ -448,7 +448,7 @@ class McuSession:
             self.restarted = True  # even if an earlier update has already reported a restart
         since_ns = self._link.good(read_at.mono_ns)
         silent = since_ns is None or since_ns > self.quiet_ns
-        feedback = self._timeline.place(speeds, reading, *size, silent, asked_ns)
+        feedback = self._timeline.place(self._setup, speeds, reading, *size, silent, asked_ns)
         more = self._timeline.leaps - self.rejects.get("count_leap", 0)
         if more > 0:
             self._reject("count_leap", more=more)

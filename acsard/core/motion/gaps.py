@@ -10,8 +10,7 @@ from __future__ import annotations
 from msgspec import Struct
 
 from acsard.core.link.codec import Motors
-from acsard.core.link.feedback import Feedback
-from acsard.core.link.sample_time import MAX_FILLED_GAP_S
+from acsard.core.link.feedback import MAX_FILLED_GAP_S, Feedback
 from acsard.core.values import Seconds
 
 LONG_S = 0.06  # a line for more than this is judged like a gap

@@ -20,7 +20,7 @@ from typing import Literal
 from msgspec import Struct, field
 
 from acsard.core.config.settings import LimitsConfig, OdometryConfig
-from acsard.core.link.sample_time import MAX_FILLED_GAP_S
+from acsard.core.link.feedback import MAX_FILLED_GAP_S
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import (
     Metres,

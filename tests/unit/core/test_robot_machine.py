@@ -31,7 +31,7 @@ from acsard.core.config.settings import (
     Source,
 )
 from acsard.core.guard import Guard
-from acsard.core.link.sample_time import MAX_FILLED_GAP_S
+from acsard.core.link.feedback import MAX_FILLED_GAP_S
 from acsard.core.motion.arbiter_text import waiting
 from acsard.core.robot import Robot
 from acsard.core.values import (

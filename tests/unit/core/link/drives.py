@@ -6,6 +6,7 @@ the floor, which is the pose if each line had its true time. The seed determines
 
 from __future__ import annotations
 
+import binascii
 import bisect
 import math
 from collections import deque
@@ -24,6 +25,9 @@ from tests.unit.core.motion.odometer import Odometer, arc
 RATE = 100.0
 PERIOD, DRIFT = 0.01, 2e-4
 """Report period, s, and largest relative drift of an MCU's clock."""
+
+LEAST_WINDOW = 0.004
+"""Time, s, in which the firmware counts before it computes new speeds."""
 
 BYTE = 10 / 115200
 """Time of one byte on the wire, s."""
@@ -117,6 +121,12 @@ class Case(Struct, frozen=True):
     lost: float = 0.0
     burst_every: float = 0.0
     """Mean time between bursts of 0.1 to 0.5 s of lost lines, s; 0 means that there are none."""
+    counts: int = 0
+    """Counts per turn of the encoders; 0 means that they have no steps."""
+    configured: int | None = None
+    """`mcu.encoder_counts`; None means that it is right."""
+    checked: bool = False
+    """Whether commands and replies have a number and a checksum, and replies the counts, too."""
 
 
 class Line(Struct):
@@ -135,10 +145,18 @@ class Host:
         self.case, self.seconds = case, seconds
         self.rng = rng = np.random.default_rng(seed)
         self.path = Path(rng, seconds)
-        self.session = McuSession(McuConfig(reply_period=0.0 if case.prompted else PERIOD), RATE)
-        self.found = Odometer()
-        self.floor, self.by_arrival = Arcs(), Arcs()
-        """Poses from each line's true time, and from arrival times; `found` is the session's.
+        configured = case.counts if case.configured is None else case.configured
+        mcu = McuConfig(
+            reply_period=0.0 if case.prompted else PERIOD,
+            encoder_counts=configured,
+            link_check="on" if case.checked else "off",
+        )
+        self.session = McuSession(mcu, RATE)
+        self.found = Odometer(counts=configured)
+        self.floor, self.by_arrival, self.counter = Arcs(), Arcs(), Arcs()
+        """Poses from each line's true time, from arrival times, and from the encoders' counts.
+
+        `found` is the session's.
 
         By arrival times, each line's speed applies since the line before it.
         """
@@ -148,6 +166,7 @@ class Host:
         """Time of the last step, s."""
         self._heard_ns = 0
         self._reported = 0.0
+        self._wheels = self._turned(0.0)
         self._stalls = _times(rng, seconds, case.stall_every, case.stall) if case.stall else []
         self._starts = [start for start, _ in self._stalls]
         every = case.burst_every
@@ -157,17 +176,55 @@ class Host:
 
     # the microcontroller
 
-    def report(self, at: float, nominal: float | None) -> Line:
-        """Make the MCU's next line at time `at`, s, with the mean speeds since its last line."""
-        now, then = self.path.angles(at), self.path.angles(self._reported)
+    def report(self, at: float, nominal: float | None, command: bytes = b"") -> Line:
+        """Make the MCU's next line at time `at`, s, with the mean speeds since its last line.
+
+        If that was less than `LEAST_WINDOW` ago, the line repeats its speeds.
+        """
+        if at - self._reported < LEAST_WINDOW and self.lines:
+            speeds = self.lines[-1].speeds
+            data = self._encoded(speeds, self._reported, self._wheels, command)
+            self.lines.append(Line(at, self._reported, speeds, data))
+            return self.lines[-1]
+        then, now = self._wheels, self._turned(at)
+        self._wheels = now
         dt = at - self._reported if nominal is None else nominal
-        left, right = (round((a - b) / dt, 2) for a, b in zip(now, then, strict=True))
-        speeds = WheelSpeeds(right, left, left, right)
-        line = Line(at, self._reported, speeds, _encode(speeds))
+        a, b, c, d = (after - before for after, before in zip(now, then, strict=True))
+        speeds = WheelSpeeds(*(round(angle / dt, 2) for angle in (a, b, c, d)))
+        line = Line(at, self._reported, speeds, self._encoded(speeds, at, now, command))
         self._reported = at
         self.lines.append(line)
-        self.floor.roll(left * dt, right * dt)
+        right, left = speeds.front_right + speeds.rear_right, speeds.front_left + speeds.rear_left
+        self.floor.roll(left / 2 * dt, right / 2 * dt)
+        self.counter.roll((b + c) / 2, (a + d) / 2)
         return line
+
+    def _turned(self, at: float) -> tuple[float, ...]:
+        """Return the angles of the wheels a to d by their encoders, rad."""
+        left, right = self.path.angles(at)
+        wheels = right, left, left, right
+        if not self.case.counts:
+            return wheels
+        step = math.tau / self.case.counts
+        # The edges of the encoders are not at the same angles.
+        edges = zip(wheels, (0.0, 0.6, 0.1, 0.4), strict=True)
+        return tuple(math.floor(angle / step + edge) * step for angle, edge in edges)
+
+    def _encoded(
+        self, speeds: WheelSpeeds, at: float, wheels: tuple[float, ...], command: bytes
+    ) -> bytes:
+        data = _encode(speeds)
+        if b"#" not in command:
+            return data
+        number, counts = int(command[command.index(b"#") + 1 :][:2], 16), self.case.counts
+        line = b"%b#%02X" % (data.strip(), number)
+        if counts:
+            fields = [
+                int(at * 1000),
+                *(round(angle * counts / math.tau) for angle in wheels),
+            ]
+            line += b"@" + b"".join(b"%04X" % (field % 65536) for field in fields)
+        return b"%b*%04X\r\n" % (line, binascii.crc_hqx(line, 0))
 
     # the path to the host
 
@@ -200,14 +257,14 @@ class Host:
             at = max(self.awake((int(at * RATE + 1e-6) + 1) / RATE), at + 1e-6)
             yield at
 
-    def tick(self, at: float) -> bool:
-        """Run one control step, and return whether the host sends a line in it."""
+    def tick(self, at: float) -> bytes | None:
+        """Run one control step, and return the line that the host sends in it."""
         self.now = at
         now = _instant(at)
         self._update(now, ())
         line = self.session.line(now.mono_ns, ROLLING)
         self.session.sent(now.mono_ns, was_written=True)
-        return line is not None
+        return line
 
     def read(self, at: float, data: bytes) -> None:
         """Let the host read these bytes piece by piece, as an adapter delivers them."""
@@ -227,13 +284,13 @@ class Host:
     # the end of the drive
 
     def errors(self) -> np.ndarray:
-        """Return the final errors, in m and deg, of three poses.
+        """Return the final errors, in m and deg, of four poses.
 
-        The poses come from the session, from true times (the floor), and from arrival times.
+        They come from the session, true times (the floor), arrival times, and the counts.
         """
         truth = self._truth()
         rows = []
-        for odometry in (self.found, self.floor, self.by_arrival):
+        for odometry in (self.found, self.floor, self.by_arrival, self.counter):
             pose = odometry.pose
             turn = math.degrees(math.remainder(pose.yaw - truth.yaw, math.tau))
             rows.append((math.hypot(pose.x - truth.x, pose.y - truth.y), abs(turn)))
@@ -319,12 +376,13 @@ def _prompted(host: Host) -> None:
         _read_until(host, arrivals, tick)
         if tick > host.seconds:
             return
-        if not host.tick(tick):
+        command = host.tick(tick)
+        if command is None or command.startswith(b"?"):
             continue
         made = max(
             tick + 0.0001 + 33 * BYTE + 0.001 + host.rng.uniform(0, host.case.thinking), free
         )
-        line = host.report(made, None)
+        line = host.report(made, None, command)
         free = made + len(line.data) * BYTE
         if not host.lost(line):
             last = max(host.delivered(line), last)

@@ -8,12 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acsard.core.config.settings import FeedbackConfig, McuConfig
 from acsard.core.link.checked_line import Reading
-from acsard.core.link.encoders import (
-    Encoders,
-    Turned,
-    Unknown,
-)
+from acsard.core.link.encoders import Encoders, Turned, Unknown
+from acsard.core.link.link_setup import LinkSetup
 
 MS = 1_000_000
 COUNTS = 3200
@@ -27,7 +25,9 @@ class Bench:
     """The readings of an MCU, and the host's time of each reading."""
 
     def __init__(self, counts: int = COUNTS) -> None:
-        self.encoders = Encoders(counts, FASTEST, 100 * MS)
+        mcu = McuConfig(link_check="on", encoder_counts=counts)
+        self.setup = LinkSetup.of(mcu, 100.0, FeedbackConfig(wheel_speed=FASTEST))
+        self.encoders = Encoders()
         self.mcu_ms, self.at_ms = 60_000.0, 5_000.0
         self.counts = [65_000, 100, 32_768, 0]
 
@@ -40,7 +40,7 @@ class Bench:
         self.counts = [c + m for c, m in zip(self.counts, counts or (0,) * 4, strict=True)]
         a, b, c, d = (count % 65536 for count in self.counts)
         reading = Reading(int(self.mcu_ms) % 65536, (a, b, c, d))
-        return self.encoders.turned(reading, int(self.at_ms * MS))
+        return self.encoders.turned(self.setup, reading, int(self.at_ms * MS))
 
 
 @pytest.fixture
@@ -180,9 +180,9 @@ def test_a_drifting_clock_is_not_a_restart_and_hides_no_later_restart(
 def test_a_restart_is_missed_only_if_the_mcu_clock_happens_to_match(
     old_ms: int, since_ms: int, host_ms: int
 ) -> None:
-    encoders = Encoders(COUNTS, FASTEST, 100 * MS)
-    encoders.turned(Reading(old_ms, (9, 9, 9, 9)), 0)
-    result = encoders.turned(Reading(since_ms, (0, 0, 0, 0)), host_ms * MS)
+    encoders, setup = Encoders(), Bench().setup
+    encoders.turned(setup, Reading(old_ms, (9, 9, 9, 9)), 0)
+    result = encoders.turned(setup, Reading(since_ms, (0, 0, 0, 0)), host_ms * MS)
     missed = (since_ms - old_ms) % 65536 <= host_ms + 100  # it was up for a whole number of 65.5 s
     assert (result == "restarted") is not missed
 

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import random
-from itertools import pairwise
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.core.config.settings import FeedbackConfig, McuConfig, WheelMap
@@ -26,7 +22,7 @@ GOOD = SEED_LINE + b"\r\n"
 BAD = b"hello\r\n"
 WALL_NS = 1_800_000_000 * NS_PER_S
 CHECKED = McuConfig(link_check="on")
-FREE = McuConfig(reply_period=0.02)
+FREE = McuConfig(reply_period=0.01)
 SLOW = WheelSpeeds(1.0, 1.0, 1.0, 1.0)
 
 
@@ -164,128 +160,6 @@ LINKS: dict[str, list[Step]] = {
 }  # fmt: skip
 
 
-@each("case", LINKS)
-def test_the_link_state_follows_the_port_and_the_lines(case: str) -> None:
-    bench = Bench()
-    for port, ms, data, link in LINKS[case]:
-        bench.happen(port, ms, data)
-        assert bench.link() == link
-
-
-@each("lines", range(5))
-def test_the_link_of_a_reopened_port_is_booting(lines: int) -> None:
-    bench = Bench().open()
-    bench.wait(10, GOOD)
-    bench.wait(10, GOOD * lines)
-    bench.open().wait(10)
-    assert bench.link() == "booting"
-    bench.wait(10, GOOD)
-    bench.wait(10, GOOD * 2)
-    assert bench.link() == "booting"
-    bench.wait(10, GOOD)
-    assert bench.link() == "up"
-
-
-def test_half_a_line_of_the_old_session_does_not_spoil_the_first_line_of_the_new_one() -> None:
-    bench = Bench().up()
-    bench.wait(1, GOOD[:10])
-    assert len(bench.open().wait(10, GOOD)) == 1
-
-
-def test_half_a_line_before_the_port_closed_does_not_spoil_the_first_line_afterwards() -> None:
-    bench = Bench().up()
-    bench.wait(1, GOOD[:10])
-    bench.close().wait(10)
-    assert len(bench.open().wait(10, GOOD)) == 1
-
-
-# silence
-
-
-@each(
-    ("rate_hz", "reply_period", "quiet_ms"),
-    [
-        (100.0, 0.0, 100),  # the minimum
-        (40.0, 0.0, 100),  # 4 x 25 ms, which is equal
-        (20.0, 0.0, 200),  # 4 x 50 ms
-        (23.0, 0.0, 173.913),  # 4 / 23 s
-        (100.0, 0.1, 300),  # 3 x 100 ms, for firmware that reports without being asked
-        (10.0, 0.1, 400),  # 4 x 100 ms exceed 3 x 100 ms
-        (10.0, 0.2, 600),  # 3 x 200 ms exceed 4 x 100 ms
-    ],
-)
-def test_the_silence_limit_is_100_ms_or_4_periods_or_3_reply_periods(
-    rate_hz: float, reply_period: float, quiet_ms: float
-) -> None:
-    session = McuSession(McuConfig(reply_period=reply_period), rate_hz)
-    assert session.quiet_ns / MS == pytest.approx(quiet_ms, abs=0.001)
-
-
-def test_the_session_is_silent_until_the_first_good_line() -> None:
-    bench = Bench().open()
-    bench.wait(10, BAD)
-    assert bench.session.silent(bench.now_ns)
-    bench.wait(10, GOOD)
-    assert not bench.session.silent(bench.now_ns)
-
-
-def test_the_session_is_silent_after_the_silence_limit() -> None:
-    bench = Bench().up()
-    assert not bench.session.silent(bench.now_ns + bench.session.quiet_ns)
-    assert bench.session.silent(bench.now_ns + bench.session.quiet_ns + 1)
-
-
-def test_a_new_session_is_silent_even_if_the_old_one_received_lines() -> None:
-    bench = Bench().up()
-    bench.open().wait(10)
-    assert bench.session.silent(bench.now_ns)
-
-
-# the time of a line
-
-
-def sampled(bench: Bench, age_ns: int) -> Instant:
-    """Return the sample time of a line that the host finished reading `age_ns` ago.
-
-    The sample is older by the wire time of the line.
-    """
-    made_ns = bench.now_ns - age_ns - wire_ns(len(GOOD), 115200)
-    return Instant(made_ns, made_ns + WALL_NS)
-
-
-def test_a_line_at_the_end_of_a_read_has_the_age_of_its_own_wire_time() -> None:
-    bench = Bench(FREE).open()
-    (feedback,) = bench.wait(10, GOOD)
-    assert feedback.heard_ns == bench.now_ns
-    assert feedback.at == sampled(bench, 0)
-    assert (feedback.speeds, feedback.dt) == (WheelSpeeds(*SEED_MOTORS), 0.0)
-    assert feedback.steps == (math.inf,) * 4
-
-
-def test_the_bytes_that_followed_a_line_make_it_older_on_both_clocks() -> None:
-    bench = Bench(replace(FREE, baud_rate=9600)).open()
-    first, second = bench.wait(10, GOOD + GOOD + GOOD[:12])
-    # At 9600 baud 45 bytes take 46.875 ms, 12 bytes 12.5 ms, and the 33 of the line itself 34.375
-    # ms.
-    assert bench.now_ns - first.at.mono_ns == 46_875_000 + 34_375_000
-    assert bench.now_ns - second.at.mono_ns == 12_500_000 + 34_375_000
-    assert first.at.wall_ns - first.at.mono_ns == WALL_NS
-    assert second.at.wall_ns - second.at.mono_ns == WALL_NS
-
-
-def test_dt_is_the_time_since_the_previous_line() -> None:
-    bench = Bench(FREE).open()
-    assert [f.dt for f in bench.wait(10, GOOD)] == [0.0]
-    assert [f.dt for f in bench.wait(10, GOOD)] == [0.01]
-    assert [f.dt for f in bench.wait(12.5, GOOD)] == [0.0125]
-
-
-def test_lines_read_together_share_the_time_since_the_previous_read() -> None:
-    bench = Bench(FREE).up()
-    first, second, third = bench.wait(15, GOOD * 3)
-    assert first.dt == second.dt == third.dt == pytest.approx(0.005)
-
-
 def test_a_line_is_never_older_than_the_previous_line() -> None:
     bench = Bench(replace(FREE, baud_rate=9600)).open()
     (first,) = bench.wait(10, GOOD)
@@ -295,35 +169,6 @@ def test_a_line_is_never_older_than_the_previous_line() -> None:
     assert second.at.mono_ns == first.at.mono_ns + MIN_INTERVAL_NS
     assert second.at.wall_ns == first.at.wall_ns + MIN_INTERVAL_NS
     assert second.dt == 0.0
-
-
-@given(
-    reads=st.lists(
-        st.tuples(st.floats(0.0, 90.0), st.integers(0, 4), st.integers(0, 32)), max_size=30
-    ),
-    baud=st.sampled_from([9600, 115200]),
-)
-def test_without_gaps_the_dts_add_up_to_the_time_between_first_and_last_line(
-    reads: list[tuple[float, int, int]], baud: int
-) -> None:
-    bench = Bench(replace(FREE, baud_rate=115200 if baud == 115200 else 9600)).open()
-    samples = bench.wait(10, GOOD)
-    for ms, lines, cut in reads:
-        data = GOOD * (lines + 1)
-        samples += bench.wait(ms, data[: 33 * lines + cut], data[33 * lines + cut :])
-    total = (samples[-1].at.mono_ns - samples[0].at.mono_ns) / NS_PER_S
-    apart = len(samples) * MIN_INTERVAL_NS / NS_PER_S
-    assert sum(f.dt for f in samples) == pytest.approx(total, abs=apart)
-    assert all(f.dt >= 0.0 and f.gap == 0.0 for f in samples)
-    assert all(a.at.mono_ns < b.at.mono_ns for a, b in pairwise(samples))
-    assert all(f.at.mono_ns <= bench.now_ns for f in samples)
-
-
-def test_a_line_split_over_two_reads_has_the_time_of_the_second_read() -> None:
-    bench = Bench(FREE).up()
-    bench.wait(5, GOOD[:20])
-    (feedback,) = bench.wait(5, GOOD[20:] + GOOD[:3])
-    assert feedback.at == sampled(bench, wire_ns(3, 115200))
 
 
 def test_a_step_of_the_wall_clock_changes_no_dt() -> None:
@@ -341,26 +186,23 @@ def test_a_step_of_the_wall_clock_changes_no_dt() -> None:
 
 def test_after_a_gap_dt_is_zero_and_the_length_of_the_gap_is_reported() -> None:
     bench = Bench(FREE).up()
-    bench.wait(200)
+    bench.wait(1200)
     (feedback,) = bench.wait(50, GOOD)
-    assert (feedback.dt, feedback.gap) == (0.0, 0.25)
+    assert (feedback.dt, feedback.gap) == (0.0, 1.25)
 
 
 def test_a_silence_up_to_the_silence_limit_is_not_a_gap() -> None:
     bench = Bench(FREE).up()
     (feedback,) = bench.wait(100, GOOD)
     assert (feedback.dt, feedback.gap) == (0.1, 0.0)
-    (feedback,) = bench.wait(100.000001, GOOD)
-    assert feedback.dt == 0.0
-    assert feedback.gap > 0.1
 
 
-def test_bad_lines_do_not_fill_a_gap() -> None:
+def test_bad_lines_occupy_their_periods() -> None:
     bench = Bench(FREE).up()
     for _ in range(15):
         bench.wait(10, BAD)
     (feedback,) = bench.wait(10, GOOD)
-    assert (feedback.dt, feedback.gap) == (0.0, 0.16)
+    assert (feedback.dt, feedback.bridged, feedback.gap) == (0.16, 0.15, 0.0)
 
 
 def test_the_second_line_after_a_gap_has_a_dt_again() -> None:

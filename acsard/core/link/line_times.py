@@ -1,0 +1,234 @@
+"""Estimates when the board read its encoders (the sample time), for two kinds of boards.
+
+`mcu.reply_period` declares which one it is. A free-running board makes a line in each period of its
+clock (`FreeRunning`). Any other makes one for each command (`Prompted`): its time is that of the
+command, and the part of the reply's delay that is the board's own. Both count whole slots, a period
+or a command, so that an error of one line is undone by the next.
+
+A line is late by so many slots over the least delay. One that is later than usual follows missing
+lines, and one that is too early shows that fewer are missing (`Lateness`).
+"""
+
+from __future__ import annotations
+
+import math
+
+from msgspec import Struct, field
+
+from acsard.core.values import NS_PER_S, Ns
+
+MAX_CLOCK_ERROR = 0.01  # relative; a ceramic resonator reaches half of it
+
+# Mean deviation of the lateness, in slots, without the missing ones. Below it, one late line shows
+# a loss. Above it, an adapter holds lines back, or the board answers at odd times, and only the
+# earliest of some reads shows one, or a line that is later than an adapter can make it.
+NARROW_DEVIATION = 0.17
+
+LOSS_SLOTS, LOST_SLOTS = 0.6, 0.75  # more than usual; of the earliest of `LEAST_READS`
+
+LEAST_READS = 8
+
+MAX_ADAPTER_DELAY_NS = 25_000_000  # an FTDI chip holds a line for 16 ms
+
+EARLY_SLOTS = 0.5  # a line that comes so much too early: a loss that was none
+
+# The same for a command that seemed to have no reply.
+EARLY_REPLY = 0.1
+
+LAG_GAIN = 0.03
+
+WINDOW_NS = NS_PER_S // 2  # of the least delay of a free-running board
+
+MAX_OPEN_COMMANDS = 64  # replies to them may still come
+
+LEAST_DELAY_GAIN = 0.002  # rise of the least delay per reply: an old one is forgotten after 500
+
+# Mean deviation of the delay that USB and the scheduler explain, and above which an adapter is the
+# cause. In between, it is the board's own.
+USB_JITTER_NS, ADAPTER_JITTER_NS = 350_000, 2_500_000
+
+
+class Lateness(Struct):
+    """Tells whether lines are missing, from the lateness of the last line of each read, in slots.
+
+    Each missing line adds 1 to all that follow.
+    """
+
+    usual: float = 0.0
+    deviation: float = 0.0  # mean
+    recent: list[float] = []  # of the last reads, if late
+
+    def missing(self, late: float, lines: int, slot: Ns) -> bool:
+        """Return whether a line is missing before the last line of a read of `lines`."""
+        off, recent = late - self.usual, self.recent
+        if off < LOSS_SLOTS:
+            return False
+        if self.deviation < NARROW_DEVIATION:
+            # A stall of this computer, after which a read has several lines, adds less than 1.
+            lost = lines == 1 or off > 1.0 + LOSS_SLOTS
+        else:
+            lost = late > 1.0 + MAX_ADAPTER_DELAY_NS / slot
+        if not lost:
+            least = min(recent, default=0.0) if len(recent) == LEAST_READS else 0.0
+            lost = min(late, least) > LOST_SLOTS
+        if lost:
+            self.recent = [each - 1.0 for each in recent]
+        return lost
+
+    def follow(self, late: float) -> None:
+        """Follow the lateness of a read before which no line is missing any more."""
+        off = late - self.usual
+        if late > LOST_SLOTS:
+            self.recent.append(late)
+            del self.recent[:-LEAST_READS]
+            off -= round(off)
+        elif self.recent:
+            self.recent.clear()
+        self.usual += LAG_GAIN * off
+        self.deviation += LAG_GAIN * ((-off if off < 0.0 else off) - self.deviation)
+
+
+class Placed(Struct, frozen=True, gc=False):
+    """The time of a line: when it was due here, and the times since the previous one, ns."""
+
+    due_ns: Ns
+    dt_ns: Ns = 0
+    bridged_ns: Ns = 0  # of `dt_ns`, in which lines were lost; it comes first
+    jitter_ns: Ns = 0  # mean error of `dt_ns`
+
+
+class FreeRunning(Struct):
+    """The lines of a board with its own clock, whose period is declared."""
+
+    begun: bool = False
+    late: float = 0.0  # of the last line, in periods
+    lateness: Lateness = field(default_factory=Lateness)
+    # Least lateness in a window, and its beginning: by as much our clock is ahead of the board's.
+    least: float = math.inf
+    window_ns: Ns = 0
+    lost: int = 0  # periods before the next line; negative: lines that were counted before
+
+    def process_read(self, end_ns: Ns, since_ns: Ns, lines: int, drained: bool, period: Ns) -> None:
+        """Process a read; `drained`: the kernel has no more data."""
+        if not self.begun:
+            self.begun, self.window_ns = True, end_ns
+            return
+        passed = since_ns / period
+        late = self.late + passed - lines
+        if late < 0.0:  # the board's clock may be the faster one
+            late = min(0.0, late + MAX_CLOCK_ERROR * passed)
+        if late < -EARLY_SLOTS:
+            early = round(-late)
+            self.lost -= early
+            late += early
+        elif drained:
+            while self.lateness.missing(late, lines, period):
+                self.lost += 1
+                late -= 1.0
+            self.lateness.follow(late)
+        self.late, self.least = late, min(self.least, late)
+        if end_ns - self.window_ns > WINDOW_NS:
+            most = MAX_CLOCK_ERROR * (end_ns - self.window_ns) / period
+            if 0.0 < self.least < EARLY_SLOTS:  # else a line may be missing
+                self.late -= min(self.least, most)
+            self.window_ns, self.least = end_ns, math.inf
+
+    def place(self, end_ns: Ns, behind: int, period: Ns) -> Placed:
+        """Return the time of the next line of the last read, `behind` lines before its end."""
+        lost, self.lost = self.lost, min(0, self.lost + 1)
+        due_ns = end_ns - int((self.late + behind) * period)
+        return Placed(due_ns, max(0, 1 + lost) * period, max(0, lost) * period)
+
+
+class Prompted(Struct):
+    """The lines of a board that answers commands, in their order."""
+
+    left: list[Ns] = []  # commands that wait for a reply
+    newest: Ns = 0  # last one that was written
+    given_up: list[Ns] = []  # older ones, newest last; the reply may still come
+    answered: Ns = 0  # last one
+    sample_ns: Ns = 0  # of the last line, as the time of a command
+    least: float = 0.0  # delay of a reply, ns; 0 if unknown
+    own: float = 0.0  # ns of the last read's delay that is the board's own
+    jitter: float = 0.0  # ns that the delay varies, without the board's own
+    lateness: Lateness = field(default_factory=Lateness)
+
+    def written(self, at_ns: Ns) -> None:
+        self.newest = at_ns
+        self.left.append(at_ns)
+        if len(self.left) > MAX_OPEN_COMMANDS:
+            self.give_up()
+
+    def give_up(self) -> None:
+        """Give up the oldest command: its reply is damaged, or does not come."""
+        if self.left:
+            self.given_up.append(self.left.pop(0))
+            del self.given_up[:-MAX_OPEN_COMMANDS]
+
+    def process_read(self, end_ns: Ns, lines: int, soonest: Ns, apart: Ns) -> None:
+        """Process a read of replies that do not name their commands, which are `apart`."""
+        left, given_up, lateness, last = self.left, self.given_up, self.lateness, lines - 1
+        self.own = 0.0
+        while given_up and len(left) < lines:
+            left.insert(0, given_up.pop())
+        if len(left) < lines:
+            return
+        if not self.least:
+            # The first reply answers the newest command that it can answer.
+            while len(left) > lines and end_ns - left[lines] >= soonest:
+                self.give_up()
+            self.least = float(max(soonest, end_ns - left[last]))
+        late = (end_ns - left[last] - self.least) / apart
+        while given_up and (late < -EARLY_REPLY or end_ns - left[last] < soonest):
+            left.insert(0, given_up.pop())
+            late = (end_ns - left[last] - self.least) / apart
+        possible = end_ns - max(self.least - USB_JITTER_NS, soonest)
+        while (
+            len(left) > lines and left[lines] <= possible and lateness.missing(late, lines, apart)
+        ):
+            self.give_up()
+            late = (end_ns - left[last] - self.least) / apart
+        self.measure(end_ns - left[last], lines, apart)
+
+    def measure(self, delay: Ns, lines: int, apart: Ns) -> None:
+        """Measure the delay of the last reply of a read."""
+        lateness = self.lateness
+        self.least = self.least or float(delay)
+        late = (delay - self.least) / apart
+        if delay < self.least:
+            self.least = float(delay)
+        else:
+            self.least += LEAST_DELAY_GAIN * (min(delay - self.least, apart))
+        off, deviation = late - lateness.usual, lateness.deviation
+        lateness.follow(late)
+        jitter = deviation * apart
+        narrow = deviation < NARROW_DEVIATION and USB_JITTER_NS < jitter < ADAPTER_JITTER_NS
+        self.jitter = USB_JITTER_NS if narrow else jitter
+        if lines == 1 and narrow and abs(off) < 4 * deviation:
+            self.own = off * apart * (1.0 - (USB_JITTER_NS / jitter) ** 2)
+
+    def place(self, end_ns: Ns, asked_ns: Ns | None, apart: Ns) -> Placed:
+        """Return the time of the next reply, to the command of `asked_ns` if it says so."""
+        left, before = self.left, self.sample_ns
+        usual = self.least + self.lateness.usual * apart
+        if asked_ns is not None:
+            while left and left[0] < asked_ns:
+                self.give_up()
+            if left and left[0] == asked_ns:
+                left.pop(0)
+            command = asked_ns
+        elif left:
+            command = left.pop(0)
+        else:
+            # No command waits: this one answers none, or one that was given up.
+            command = end_ns - int(usual)
+            if self.newest:
+                command = min(command, self.newest + apart)
+        lost = self.given_up[-1] if self.given_up else 0
+        bridged_ns = lost - before if before and lost > self.answered else 0
+        self.answered = command
+        sample_ns = self.sample_ns = max(before, command + int(self.own))
+        self.own = 0.0
+        dt_ns = sample_ns - before if before else 0
+        bridged_ns = min(max(bridged_ns, 0), dt_ns)
+        return Placed(sample_ns + int(usual), dt_ns, bridged_ns, int(self.jitter))

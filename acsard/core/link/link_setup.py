@@ -1,0 +1,52 @@
+"""What the configuration declares about the board and its lines, computed once.
+
+The state of the link contains no configuration: each of its functions gets this as an argument.
+"""
+
+from __future__ import annotations
+
+import math
+
+from msgspec import Struct
+
+from acsard.core.config.settings import MAX_REPLY_PERIOD_S, FeedbackConfig, McuConfig
+from acsard.core.config.wire_time import PLAIN_BYTES, wire_ns
+from acsard.core.link.codec import Codec
+from acsard.core.values import NS_PER_S, Ns
+
+
+class LinkSetup(Struct, frozen=True):
+    mcu: McuConfig
+    codec: Codec
+    rest: bytes  # begin of every line with speed zero
+    period_ns: Ns  # of a free-running board; 0: it answers commands
+    apart_ns: Ns  # between two commands
+    soonest_ns: Ns  # a command and its reply on the wire
+    quiet_ns: Ns  # silence after which the link is stale
+    count: float  # rad of one encoder count; 0 if unknown
+    fastest: float  # counts per ms at `feedback.wheel_speed`
+    encoders: bool  # `feedback.encoders`
+    longest_reply: float  # highest value that `mcu.reply_period` may have, s
+
+    @classmethod
+    def of(
+        cls,
+        mcu: McuConfig,
+        rate_hz: float,
+        feedback: FeedbackConfig = FeedbackConfig(),  # noqa: B008
+        longest_reply: float = MAX_REPLY_PERIOD_S,
+    ) -> LinkSetup:
+        codec, counts = Codec(mcu.wheels, mcu.trailing_comma), mcu.encoder_counts
+        return cls(
+            mcu,
+            codec,
+            rest=codec.stop.rstrip(b",\r\n"),
+            period_ns=0 if mcu.checked else round(NS_PER_S * mcu.reply_period),
+            apart_ns=round(NS_PER_S / rate_hz),
+            soonest_ns=wire_ns(2 * PLAIN_BYTES, mcu.baud_rate),
+            quiet_ns=int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period)),
+            count=math.tau / counts if counts else 0.0,
+            fastest=feedback.wheel_speed / math.tau * counts / 1000,
+            encoders=feedback.encoders,
+            longest_reply=longest_reply,
+        )
