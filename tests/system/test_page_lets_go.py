@@ -11,7 +11,9 @@ import base64
 import hashlib
 import itertools
 import os
+import shutil
 import signal
+import socket
 import statistics
 import threading
 import time
@@ -440,6 +442,51 @@ def test_the_robot_brakes_after_every_way_to_release_the_stick(
     if times > 1:
         field.longest_s = 30.0
     report_delays(way.__name__, [field.lets_go(way, number) for number in range(times)])
+
+
+@contextmanager
+def filled_downlink(hosts: Hosts) -> Iterator[None]:
+    """Send from the robot's host as much as a narrow network carries, as a camera may do."""
+    with inside(hosts.robot):
+        listener = socket.create_server((hosts.address, 0))
+    with inside(hosts.stranger):
+        reader = socket.create_connection(listener.getsockname())
+    writer, _ = listener.accept()
+
+    def work(step: Callable[[], object]) -> None:
+        with suppress(OSError):
+            while step():
+                pass
+
+    steps = (lambda: writer.send(bytes(65536)), lambda: reader.recv(65536))
+    threads = [threading.Thread(target=work, args=(step,)) for step in steps]
+    with hosts.narrow(), listener, reader, writer:
+        for thread in threads:
+            thread.start()
+        try:
+            yield
+        finally:
+            for end in (reader, writer):
+                end.shutdown(socket.SHUT_RDWR)
+            for thread in threads:
+                thread.join()
+
+
+@pytest.mark.network
+@pytest.mark.skipif(shutil.which("tc") is None, reason="needs tc, to make a narrow network")
+def test_a_release_slows_the_robot_within_40_ms_while_a_camera_fills_the_downlink(
+    field: Field,
+) -> None:
+    delays = []
+    with filled_downlink(field.hosts):
+        for number in range(5):
+            field.ready()
+            field.hold()
+            with finger_lifted(field, number) as release:
+                took, _ = field.braking(release)
+                delays.append(took - HANDS * lost(release, release + took))
+    print(f"slower after {', '.join(f'{delay * 1e3:.0f}' for delay in delays)} ms")
+    assert statistics.median(delays) < 0.04
 
 
 class Program:
