@@ -1,0 +1,477 @@
+"""Takes the heading from a gyro while the gyro is fresh and agrees with the wheels.
+
+Only the bias is learned, while the robot rests. The wheels give the heading until the gyro has
+turned as they do, while it is silent, and after it hangs: from the first sample on that it repeated.
+If the two turns differ by more than both claim, the gyro is used and their difference becomes
+uncertainty of the heading, because wheels may slip. A gyro that turns the other way, or by a ratio
+that no floor explains, is not used. No turn is taken back.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from msgspec import Struct, field
+
+from acsard.core.config.settings import OdometryConfig
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.values import (
+    NS_PER_S,
+    Event,
+    GyroDoes,
+    GyroSample,
+    GyroStatus,
+    Level,
+    Metres,
+    Ns,
+    Rad,
+    RadPerS,
+    Seconds,
+)
+
+# Rest is a zero command and a motion of each side below two counts, or this angle of its wheels if
+# the counts are unknown. Encoders that stand on an edge and filters that never reach zero rest.
+REST_S = 0.2
+REST_COUNTS, REST_ANGLE = 2, 0.05
+
+LEARNING_TIME_S, NEW_BIAS_TIME_S = 0.5, 1.0  # at rest, until a bias is known, or replaced
+MAX_BIAS = 0.2  # rad/s; a higher rate at rest is a person who turns the robot
+BIAS_RANDOM_WALK = 1e-4  # of a cheap gyro with temperature, rad/s per square root of a second
+MIN_NOISE = 1e-5  # rad/s of a sample: a coarse gyro may repeat one value
+NOISE_GAIN = 0.02  # of the noise, about fifty samples
+MAX_DEVIATIONS, VIBRATION = 5.0, 0.01  # of a sample at rest from the bias: standard deviations, rad/s
+
+SILENCE_TIMEOUT_NS = NS_PER_S // 5  # until then the robot is assumed to turn at the last rate
+MAX_EXTRA_DELAY_NS = NS_PER_S // 4  # above the least one; a later sample says nothing of now
+MAX_RISE = 1e-3  # of the least delay: two clocks drift
+# A clock was set if samples stay late for this time and their delays do not fall by more.
+CLOCK_SET_NS, MAX_DELAY_FALL_NS = NS_PER_S, NS_PER_S // 50
+
+# A larger change of the rate, rad/s, must be confirmed by the next sample, by half at least.
+MAX_JUMP, CONFIRMED = 0.5, 0.5
+
+# A gyro hangs if it repeats one exact rate for `HANG_S`, and never did for half of that. A coarse
+# one repeats some samples by chance: four times its longest series is far beyond chance.
+HANG_S, MIN_CHANGES, REPETITIONS = 0.5, 50, 4
+
+BLOCK_S = 0.2  # of the sums that are compared
+MEMORY_S = 30.0  # of the comparison
+MARGIN = 0.02  # rad, standard deviation of the wheels' turn by encoder counts and vibration
+MAX_DELAY_S = 0.1  # a gyro with this delay does not contradict the wheels
+DEVIATIONS = 3.0  # more is a contradiction
+DISAGREES_S = 5.0  # after a contradiction
+
+# True turn divided by the turn of the wheels, on any floor.
+MIN_RATIO, MAX_RATIO = 0.25, 2.5
+MIN_TURN_RATE = 0.1  # rad/s of the wheels; less may be a count, or unequal tyres on a straight
+# Turns by the wheels, rad, that prove a gyro, and refute it. Wheels that spin on the spot look like
+# a dead gyro, so one that has proved itself is called dead later.
+PROVING_TURN, REFUTING_TURN, DEAD_TURN = 0.1, 0.4, 4.0
+MIN_DEGREES_RATIO, MAX_DEGREES_RATIO = 15.0, 150.0  # 57 without slip and errors
+
+Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not believed"]
+
+
+class Claims(Struct, frozen=True, gc=False):
+    """What the settings say about the turn of the wheels, and the motion of a side at rest."""
+
+    per_metre: float
+    per_radian: float
+    scale: float  # share of a turn, of the track and of the gyro
+    rest: Metres
+    half_track: Metres
+
+
+def claims(odometry: OdometryConfig, kinematics: Kinematics, counts: int) -> Claims:
+    rest = REST_COUNTS * math.tau / counts if counts else REST_ANGLE
+    return Claims(
+        odometry.yaw_variance_per_metre,
+        odometry.yaw_variance_per_radian,
+        math.hypot(odometry.gyro_scale_std, odometry.wheel_separation_multiplier_std),
+        rest * kinematics.radius,
+        kinematics.track / 2,
+    )
+
+
+class Turn(Struct, frozen=True, gc=False):
+    """The turn since the previous line, by the gyro or by the wheels with a correction."""
+
+    angle: Rad
+    variance: float  # rad2, without the error of the gyro's scale
+    rate: RadPerS
+    rate_variance: float  # rad2/s2
+    wheels: Rad | None = None  # of wheels without a fault
+    slips: bool = False
+    doubt: Rad = 0.0  # by which gyro and wheels differ: does not average out
+
+
+class Bias(Struct):
+    """Reading of the gyro at rest, rad/s, with its variance and that of one sample.
+
+    The first estimate is a mean. Then a scalar Kalman filter follows a random walk. Another
+    constant reading at rest replaces it.
+    """
+
+    value: RadPerS = 0.0
+    variance: float = MAX_BIAS**2
+    noise: float = 0.0
+    rested_s: Seconds = 0.0
+    samples: int = 0
+    other: Bias | None = None
+
+    @property
+    def is_known(self) -> bool:
+        return self.rested_s >= LEARNING_TIME_S
+
+    def follow(self, rate: RadPerS, variance: float, span: Seconds) -> bool:
+        """Learn from a sample at rest. Return False if it shows a turn."""
+        if not self.is_known:
+            return self._average(rate, variance, span)
+        error, noise = rate - self.value, max(self.noise, variance, MIN_NOISE**2)
+        limit = MAX_DEVIATIONS * math.sqrt(noise + self.variance) + VIBRATION
+        if abs(error) > limit:
+            return self._replace(rate, variance, span, MAX_DEVIATIONS * math.sqrt(noise) + VIBRATION)
+        self.other = None
+        gain = self.variance / (self.variance + noise)
+        self.value += gain * error
+        self.variance *= 1.0 - gain
+        self.noise += NOISE_GAIN * ((1.0 - gain) * error * error - self.noise)
+        return True
+
+    def _average(self, rate: RadPerS, variance: float, span: Seconds) -> bool:
+        if abs(rate) > MAX_BIAS:
+            return False
+        self.rested_s += span
+        self.samples += 1
+        error = rate - self.value
+        self.value += error / self.samples
+        self.noise += (error * (rate - self.value) - self.noise) / self.samples
+        self.variance = max(self.noise, variance, MIN_NOISE**2) / self.samples
+        return True
+
+    def _replace(self, rate: RadPerS, variance: float, span: Seconds, spread: RadPerS) -> bool:
+        other = self.other = self.other or Bias()
+        if not other._average(rate, variance, span) or math.sqrt(other.noise) > spread:
+            self.other = None
+            return False
+        if other.rested_s < NEW_BIAS_TIME_S:
+            return False
+        self.value, self.variance, self.noise = other.value, other.variance, other.noise
+        self.other = None
+        return True
+
+
+class Compared(Struct):
+    """Sums of lines with turns by both, of which old ones count less."""
+
+    wheels: Rad = 0.0
+    gyro: Rad = 0.0
+    turned: Rad = 0.0  # by the wheels, to either side
+    way: Metres = 0.0
+    seconds: Seconds = 0.0
+
+    def add(self, block: Compared, share: float) -> None:
+        self.wheels = share * self.wheels + block.wheels
+        self.gyro = share * self.gyro + block.gyro
+        self.turned = share * self.turned + abs(block.wheels)
+        self.way = share * self.way + block.way
+        self.seconds = share * self.seconds + block.seconds
+
+
+class Gyro(Struct):
+    """The turns of the robot by the samples of one gyro."""
+
+    does: GyroDoes = "silent"
+    reported: GyroDoes = "silent"
+    verdict: Verdict = "none yet"
+    bias: Bias = field(default_factory=Bias)
+    used: bool = False  # for the last line
+
+    last: GyroSample | None = None  # in use
+    jumped: GyroSample | None = None  # waits for a confirmation of its jump
+    heard_ns: Ns | None = None  # last prompt sample
+    newest: GyroSample | None = None  # late ones, too
+    least_ns: Ns | None = None  # delay of the stamps
+    late_since_ns: Ns | None = None
+    late_ns: Ns = 0  # delay then
+
+    rate: RadPerS = 0.0  # now
+    turned: Rad = 0.0  # by all samples
+    given: Rad = 0.0  # of `turned`, with the assumed turn since the last sample
+    variance: float = 0.0  # of the rest of `turned`
+    # Gyro's minus wheels' turn in lines since the last sample, and since the rate changed.
+    since_sample: Rad = 0.0
+    since_change: Rad = 0.0
+
+    repeats: int = 0
+    repeated_s: Seconds = 0.0
+    longest: int = 0  # series of repeated samples while the gyro did not hang
+    longest_s: Seconds = 0.0
+    changes: int = 0
+    hangs: bool = False
+
+    rest_s: Seconds = 0.0
+    rest_turn: Rad = 0.0  # since the rest began
+    rest_way: Metres = 0.0
+    since_rest_s: Seconds = 0.0
+
+    block: Compared = field(default_factory=Compared)
+    compared: Compared = field(default_factory=Compared)
+    # Turns by the wheels in contradictions, and those by the gyro, positive to the same side.
+    against: Rad = 0.0
+    against_gyro: Rad = 0.0
+    disagrees_s: Seconds = 0.0  # left
+    doubt: Rad = 0.0  # for the next turn
+
+    @property
+    def status(self) -> GyroStatus:
+        return GyroStatus(self.does, self.bias.value if self.bias.is_known else None)
+
+    def event(self) -> Event | None:
+        """Return an event if the status has changed since the last one."""
+        before, does = self.reported, self.does
+        self.reported = does
+        # The text of "waiting for turn" announces the change to "used".
+        if does == before or (before, does) == ("waiting for turn", "used"):
+            return None
+        good = does in ("used", "waiting for rest", "waiting for turn")
+        level: Level = "info" if good else "warning"
+        return Event("gyro", STATUS_TEXTS[does], level, kind=does)
+
+    def forget_doubt(self) -> None:
+        """Forget the uncertainty of turns before now: a new pose was set."""
+        self.doubt = self.since_sample = self.since_change = 0.0
+        self.compared = Compared()
+
+    # Samples.
+
+    def add_samples(self, samples: tuple[GyroSample, ...]) -> None:
+        """Use samples in the order of arrival; one with `anew` (another gyro) begins anew."""
+        for sample in samples:
+            if sample.anew:
+                self._begin()
+            if not self._is_prompt(sample):
+                continue
+            self.heard_ns = sample.at_ns
+            last, jumped, self.jumped = self.last, self.jumped, None
+            if last is not None and jumped is not None:
+                if (sample.rate - last.rate) / (jumped.rate - last.rate) >= CONFIRMED:
+                    self._use(jumped)
+                    last = self.last
+            if last is not None and abs(sample.rate - last.rate) > MAX_JUMP:
+                self.jumped = sample
+            else:
+                self._use(sample)
+
+    def _begin(self) -> None:
+        new = Gyro(does=self.does, reported=self.reported, used=self.used)
+        new.given = new.turned = self.given
+        new.doubt = self.doubt + self.compared.gyro - self.compared.wheels
+        for name in self.__struct_fields__:
+            setattr(self, name, getattr(new, name))
+
+    def _is_prompt(self, sample: GyroSample) -> bool:
+        newest, self.newest, stamp_ns, at_ns = self.newest, sample, sample.stamp_ns, sample.at_ns
+        if stamp_ns is None or newest is None or newest.stamp_ns is None or self.least_ns is None:
+            self.least_ns = None if stamp_ns is None else at_ns - stamp_ns
+            return True
+        delay_ns, passed_ns = at_ns - stamp_ns, at_ns - newest.at_ns
+        self.least_ns = min(delay_ns, self.least_ns + int(MAX_RISE * passed_ns))
+        late = delay_ns - self.least_ns > MAX_EXTRA_DELAY_NS
+        if late and newest.stamp_ns - stamp_ns <= MAX_DELAY_FALL_NS:
+            falls = delay_ns < self.late_ns - MAX_DELAY_FALL_NS
+            if self.late_since_ns is None or falls or passed_ns >= SILENCE_TIMEOUT_NS:
+                self.late_since_ns, self.late_ns = at_ns, delay_ns
+            if at_ns - self.late_since_ns < CLOCK_SET_NS:
+                return False
+        if late:  # the clock was set
+            self.least_ns = delay_ns
+        self.late_since_ns = None
+        return True
+
+    def _use(self, sample: GyroSample) -> None:
+        last, self.last, bias = self.last, sample, self.bias
+        span = 0.0 if last is None else _span(last, sample)
+        if span == 0.0 and (last is None or sample.at_ns - last.at_ns >= SILENCE_TIMEOUT_NS):
+            self.turned, self.rate = self.given, sample.rate - bias.value
+        if last is not None:
+            self._follow_repetition(sample.rate == last.rate, span)
+        bias.variance += BIAS_RANDOM_WALK * BIAS_RANDOM_WALK * span
+        stands = self.rest_s > REST_S and not self.hangs
+        stands = stands and bias.follow(sample.rate, sample.variance, span)
+        before, self.rate = self.rate, 0.0 if stands else sample.rate - bias.value
+        if stands:
+            self.since_rest_s = before = 0.0
+        step, noise = self.rate - before, max(bias.noise, sample.variance)
+        self.turned += (before + self.rate) / 2 * span
+        self.variance += (noise + step * step / 12) * span * span
+        self.since_sample = 0.0
+
+    def _follow_repetition(self, same: bool, span: Seconds) -> None:
+        if same:
+            self.repeats += 1
+            self.repeated_s += span
+            usual = self.longest_s >= HANG_S / 2 or self.changes < MIN_CHANGES
+            enough = self.repeats > REPETITIONS * (self.longest + 1)
+            self.hangs |= self.repeated_s >= HANG_S and enough and not usual
+            return
+        if not self.hangs and self.repeats > self.longest:
+            self.longest, self.longest_s = self.repeats, self.repeated_s
+        self.changes += 1
+        self.repeats, self.repeated_s, self.hangs, self.since_change = 0, 0.0, False, 0.0
+
+    # Lines.
+
+    def turn(
+        self, at_ns: Ns, dt: Seconds, wheels: Rad, way: Metres, idle: bool, claims: Claims
+    ) -> Turn | None:
+        """Return the turn since the previous line, or None if the wheels must provide it.
+
+        `wheels` and `way` are the wheels' turn and distance; `dt` is 0 after a gap, in which they
+        are not known. `idle`: rest was commanded since the previous line.
+        """
+        self._follow_rest(dt, wheels, way, idle, claims)
+        last, heard_ns = self.last, self.heard_ns
+        silent = last is None or heard_ns is None or at_ns - heard_ns >= SILENCE_TIMEOUT_NS
+        ahead_ns = 0 if last is None else min(at_ns - last.at_ns, SILENCE_TIMEOUT_NS)
+        total = self.turned + self.rate * ahead_ns / NS_PER_S
+        angle, self.given = total - self.given, total
+        known = self.bias.is_known
+        if dt > 0.0 and not (silent or self.hangs):
+            block = self.block
+            block.wheels += wheels
+            block.gyro += angle
+            block.way += abs(way)
+            block.seconds += dt
+            if block.seconds >= BLOCK_S * 0.95:
+                self.block = Compared()
+                if self.verdict == "good":
+                    self._compare(block, claims)
+                else:
+                    self._try(block, known)
+        self.disagrees_s = max(0.0, self.disagrees_s - dt)
+        self._judge(silent, known)
+        if self.does not in ("used", "disagrees"):
+            return self._wheels(dt, wheels, claims)
+        self.used = True
+        if dt > 0.0:
+            self.since_sample += angle - wheels
+            self.since_change += angle - wheels
+        # The error of the bias is the same in each line.
+        variance = self.variance + 2.0 * self.bias.variance * self.since_rest_s * dt
+        rate_variance, disagrees = self.bias.noise + self.bias.variance, self.disagrees_s > 0.0
+        if disagrees and dt > 0.0:
+            rate_variance += ((angle - wheels) / dt) ** 2
+        doubt, self.doubt, self.variance = self.doubt, 0.0, 0.0
+        trusted = None if disagrees else angle
+        return Turn(angle, variance, self.rate, rate_variance, trusted, disagrees, doubt)
+
+    def _wheels(self, dt: Seconds, wheels: Rad, claims: Claims) -> Turn | None:
+        self.variance = 0.0
+        if dt <= 0.0 or not (self.used or self.doubt):
+            return None
+        # The gyro has given the turn since its last good sample, and the wheels measured it.
+        off = 0.0
+        if self.used:
+            off = self.since_change if self.hangs else self.since_sample
+        self.used, self.since_sample, self.since_change = False, 0.0, 0.0
+        doubt, self.doubt = self.doubt, 0.0
+        if not (off or doubt):
+            return None
+        self.compared.gyro -= off
+        variance = claims.per_radian * abs(off) + claims.per_radian * abs(wheels)
+        return Turn(wheels - off, variance, wheels / dt, MARGIN**2, doubt=doubt)
+
+    def _follow_rest(
+        self, dt: Seconds, wheels: Rad, way: Metres, idle: bool, claims: Claims
+    ) -> None:
+        self.rest_turn += wheels
+        self.rest_way += way
+        self.rest_s += dt
+        self.since_rest_s += dt
+        moved = abs(self.rest_way) + claims.half_track * abs(self.rest_turn)
+        if not idle or moved > claims.rest:
+            self.rest_s = self.rest_turn = self.rest_way = 0.0
+
+    def _judge(self, silent: bool, known: bool) -> None:
+        if self.verdict not in ("none yet", "good"):
+            self.does = self.verdict
+        elif silent:
+            self.does = "silent"
+        elif self.hangs:
+            self.does = "hangs"
+        elif not known:
+            self.does = "waiting for rest"
+        elif self.verdict == "none yet":
+            self.does = "waiting for turn"
+        else:
+            self.does = "disagrees" if self.disagrees_s > 0.0 else "used"
+
+    # Comparison with the wheels.
+
+    def _try(self, block: Compared, known: bool) -> None:
+        trial = self.compared
+        if abs(block.wheels) < MIN_TURN_RATE * block.seconds or block.wheels * trial.wheels < 0.0:
+            # On a straight, and as the robot begins to turn to the other side, the trial restarts.
+            self.compared = Compared()
+            return
+        trial.add(block, 1.0)
+        ratio = trial.gyro / trial.wheels
+        if MIN_RATIO <= ratio <= MAX_RATIO:
+            verdict: Verdict = "good" if known and trial.turned >= PROVING_TURN else "none yet"
+        else:
+            verdict = _named(ratio) if trial.turned >= REFUTING_TURN else "none yet"
+        if verdict in ("good", "in degrees") or (known and verdict != "none yet"):
+            self.verdict = verdict
+            if verdict != "good":
+                self.compared = Compared()
+
+    def _compare(self, block: Compared, claims: Claims) -> None:
+        if self.rest_s > REST_S and abs(block.gyro) >= MAX_BIAS * block.seconds:
+            return  # a person turns the robot, which the wheels do not measure
+        compared = self.compared
+        compared.add(block, 1.0 - block.seconds / MEMORY_S)
+        variance = (
+            MARGIN**2
+            + claims.per_metre * compared.way
+            + claims.per_radian * compared.turned
+            + (claims.scale * compared.wheels) ** 2
+            + self.bias.variance * compared.seconds**2
+        )
+        off, lag = compared.gyro - compared.wheels, MAX_DELAY_S * abs(block.wheels) / block.seconds
+        if abs(off) <= DEVIATIONS * math.sqrt(variance) + lag:
+            if self.disagrees_s == 0.0:
+                self.against = self.against_gyro = 0.0
+            return
+        self.doubt += off
+        self.disagrees_s = DISAGREES_S
+        self.compared = Compared()
+        opposite = compared.gyro * compared.wheels < 0.0 and abs(compared.wheels) > PROVING_TURN
+        self.against += abs(compared.wheels)
+        self.against_gyro += -abs(compared.gyro) if opposite else abs(compared.gyro)
+        against, gyro = self.against, self.against_gyro
+        if MIN_RATIO * against <= gyro <= MAX_RATIO * against:
+            return
+        dead = abs(gyro) < MIN_RATIO * against
+        if against >= DEAD_TURN if dead else max(against, abs(gyro) / MAX_RATIO) >= REFUTING_TURN:
+            self.verdict = _named(gyro / against if against else math.inf)
+            self.against = self.against_gyro = 0.0
+
+
+def _span(last: GyroSample, sample: GyroSample) -> Seconds:
+    # By stamps, if they advance: arrivals jitter.
+    if sample.stamp_ns is not None and last.stamp_ns is not None:
+        span_ns = sample.stamp_ns - last.stamp_ns
+        if 0 < span_ns < SILENCE_TIMEOUT_NS:
+            return span_ns / NS_PER_S
+    span_ns = sample.at_ns - last.at_ns
+    return span_ns / NS_PER_S if span_ns < SILENCE_TIMEOUT_NS else 0.0
+
+
+def _named(ratio: float) -> Verdict:
+    if MIN_DEGREES_RATIO <= abs(ratio) <= MAX_DEGREES_RATIO:
+        return "in degrees"
+    if -MAX_RATIO <= ratio <= -MIN_RATIO:
+        return "reversed"
+    return "dead" if abs(ratio) < MIN_RATIO else "not believed"

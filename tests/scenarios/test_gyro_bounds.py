@@ -1,0 +1,227 @@
+"""What a gyro with a fault may do to the heading, in the drive of `../shared/cases/gyro_live.py`.
+
+The wheels do not skid, so the heading must stay within three standard deviations and the error that
+a comparison over a second needs to show a contradiction.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import re
+from collections.abc import Callable
+
+import msgspec
+import pytest
+
+from acsard.core.config.settings import Config, McuConfig, OdometryConfig, SimConfig
+from acsard.core.incoming.commands import Arrival
+from acsard.core.simulator.simulated_robot import Observation
+from acsard.core.values import NS_PER_S, Received
+from tests.scenarios.imperfect_gyro import ImperfectGyro
+from tests.scenarios.world import World
+
+DETECTION = math.radians(5.0)
+"""Error of the heading before a contradiction is certain, rad."""
+
+Rate = Callable[[float, float], float]
+
+
+class Bench(World):
+    """A robot on a real port that drives the kit's course. Its gyro is `rate(seconds, true)`."""
+
+    def __init__(self, rate: Rate | None = None, period: int = 1, counts: int = 1440) -> None:
+        super().__init__(
+            Config(
+                mcu=McuConfig(port="/dev/ttyUSB0"),
+                odometry=OdometryConfig(gyro=True),
+                sim=SimConfig(encoder_counts=counts),
+            ),
+            gyro=ImperfectGyro(),
+        )
+        self.dice = random.Random(1)
+        self.rate: Rate = rate or (lambda t, true: true + self.noise())
+        self.others: list[tuple[str, Rate]] = []
+        """Further programs that publish `imu`, each with its frame."""
+        self.first: list[tuple[str, Rate]] = []
+        self.worst = self.heading = 0.0
+        """Of error - 3 standard deviations, and the largest error, rad."""
+        self.does: set[str] = set()
+        self._period, self._begun_ns, self._yaw, self._told = period, self.now_ns, 0.0, 0.0
+        self._mean: list[float] = []
+        self.dither: Callable[[int], list[float]] | None = None
+        self._lines = 0
+        feed = self.port.feed
+        self.port.feed = lambda received: feed(self._dithered(received))  # type: ignore[method-assign]
+
+    def noise(self) -> float:
+        return 0.003 + self.dice.gauss(0.0, 0.004)
+
+    def _see(self, sight: Observation) -> None:
+        self.truth = sight.pose
+        self._mean.append(sight.gyro)
+        if len(self._mean) < self._period:
+            return
+        true, t = sum(self._mean) / len(self._mean), (sight.at_ns - self._begun_ns) / NS_PER_S
+        self._mean.clear()
+        for frame, rate in (*self.first, ("imu_link", self.rate), *self.others):
+            stamp_ns = sight.at_ns + self.wall_offset_ns
+            payload = msgspec.json.encode(
+                {
+                    "header": {
+                        "frame_id": frame,
+                        "stamp": {"sec": stamp_ns // NS_PER_S, "nanosec": stamp_ns % NS_PER_S},
+                    },
+                    "angular_velocity": {"z": rate(t, true)},
+                }
+            )
+            self.bus.arrivals.append(Arrival("imu", True, payload, "", sight.at_ns, None, ""))
+
+    def _dithered(self, received: Received) -> Received:
+        if self.dither is None or not received.data.startswith(b"ap00.0"):
+            return received
+        self._lines += 1
+        speeds = self.dither(self._lines)
+        words = (f"{letter}{'n' if v < 0 else 'p'}{abs(v):05.2f}" for letter, v in zip("abcd", speeds, strict=True))
+        text, count = re.subn(rb"a[pn]00\.0\d,b[pn]00\.0\d,c[pn]00\.0\d,d[pn]00\.0\d", ",".join(words).encode(), received.data)
+        assert count <= 1
+        return Received(received.at, text)
+
+    def leg(self, linear: float, angular: float, seconds: float) -> None:
+        for _ in range(round(seconds * 20)):
+            self.hold(linear, angular, 0.05)
+            yaw, true = self.state.yaw, self.mcu.vehicle.turned
+            self._told += math.remainder(yaw - self._yaw, math.tau)
+            self._yaw = yaw
+            error = abs(self._told - true)
+            self.heading = max(self.heading, error)
+            self.worst = max(self.worst, error - 3 * math.sqrt(self.odom.pose.covariance[35]))
+            self.does.add(self.state.gyro)
+
+    def course(self, corners: int = 3) -> None:
+        self.leg(0.0, 0.0, 4.0)
+        self.leg(0.0, 0.8, 4.0)
+        self.leg(0.0, 0.0, 0.5)
+        self.leg(0.0, -0.8, 4.0)
+        self.leg(0.0, 0.0, 2.0)
+        self.leg(0.3, 0.0, 4.0)
+        for _ in range(corners):
+            self.leg(0.3, 0.0, 3.0)
+            self.leg(0.0, 0.785, 2.0)
+        self.leg(0.0, 0.0, 6.0)
+        error, std = self._told - self.mcu.vehicle.turned, math.sqrt(self.odom.pose.covariance[35])
+        print(
+            f"error {math.degrees(error):.2f} deg, largest {math.degrees(self.heading):.2f}, "
+            f"std {math.degrees(std):.2f}, beyond 3 std {math.degrees(self.worst):.2f}, "
+            f"{self.state.gyro}, {sorted(self.does)}, "
+            f"{ {k: v for k, v in self.state.counters.items() if 'imu' in k} }"
+        )
+
+
+def hanging(at: float, until: float = math.inf) -> Callable[[Bench], Rate]:
+    last = 0.0
+
+    def of(bench: Bench) -> Rate:
+        def rate(t: float, true: float) -> float:
+            nonlocal last
+            if not at < t < until:
+                last = true + bench.noise()
+            return last
+
+        return rate
+
+    return of
+
+
+def scaled(share: float, at: float = 0.0) -> Callable[[Bench], Rate]:
+    return lambda bench: lambda t, true: (share if t >= at else 1.0) * (true + bench.noise())
+
+
+def stepped(bias: float, at: float) -> Callable[[Bench], Rate]:
+    return lambda bench: lambda t, true: true + bench.noise() + (bias if t >= at else 0.0)
+
+
+def single(rate_: float) -> Callable[[Bench], Rate]:
+    return lambda bench: lambda t, true: rate_ if bench.dice.random() < 0.01 else true + bench.noise()
+
+
+# The course: rest until 4.3 s, a turn until 8.5 s, ...
+FAULTS = {
+    "sound": lambda bench: bench.rate,
+    "half the scale": scaled(0.5),
+    "half the scale from 16 s on": scaled(0.5, 16.0),
+    "1.5 times the scale": scaled(1.5),
+    "1.5 times from 16 s on": scaled(1.5, 16.0),
+    "bias +0.05 on the straight": stepped(0.05, 16.0),
+    "bias -0.05 in the first turn": stepped(-0.05, 6.0),
+    "bias +0.15 on the straight": stepped(0.15, 16.0),
+    "reversed": scaled(-1.0),
+    "reversed from 16 s on": scaled(-1.0, 16.0),
+    "degrees": scaled(57.3),
+    "degrees from 16 s on": scaled(57.3, 16.0),
+    "dead": lambda bench: lambda t, true: bench.noise(),
+    "dead from 16 s on": lambda bench: lambda t, true: (true if t < 16.0 else 0.0) + bench.noise(),
+    "hangs on the straight": hanging(18.0),
+    "hangs in a turn": hanging(23.5),
+    "hangs in a turn for 3 s": hanging(23.5, 26.5),
+    "hangs at rest before the drive": hanging(3.0),
+    "single wrong samples": single(-30.0),
+    "single small wrong samples": single(1.5),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("period", [1, 10])
+def test_the_heading_stays_within_its_covariance(fault: str, period: int) -> None:
+    bench = Bench(period=period)
+    bench.rate = FAULTS[fault](bench)
+    bench.course()
+    assert bench.worst < DETECTION
+    if "hangs" in fault:
+        assert bench.heading < DETECTION
+
+
+@pytest.mark.parametrize(
+    "who", ["another frame", "first another frame", "the same frame"]
+)
+def test_two_programs(who: str) -> None:
+    bench = Bench()
+    lidar: Rate = lambda t, true: bench.noise() - 0.003
+    match who:
+        case "another frame":
+            bench.others.append(("lidar_imu", lidar))
+        case "first another frame":
+            bench.first.append(("lidar_imu", lidar))
+        case "the same frame":
+            bench.others.append(("imu_link", lidar))
+    bench.course()
+    assert bench.worst < DETECTION
+    if who == "another frame":
+        assert bench.heading < DETECTION
+        assert bench.state.counters["imu_second_sender"] > 0
+
+
+def one_count(n: int) -> list[float]:
+    return [0.0, 0.0, 0.0, (-1) ** n * 0.44]
+
+
+def both_of_a_side(n: int) -> list[float]:
+    return [0.0, (-1) ** n * 0.44, (-1) ** n * 0.44, 0.0]
+
+
+def one_of_three(n: int) -> list[float]:
+    return [0.0, 0.0, 0.0, 0.05 if n % 3 == 0 else 0.0]
+
+
+def ever(n: int) -> list[float]:
+    return [0.0, 0.02, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("dither", [one_count, both_of_a_side, one_of_three, ever])
+def test_an_encoder_that_dithers_at_rest(dither: Callable[[int], list[float]]) -> None:
+    bench = Bench()
+    bench.dither = dither
+    bench.course()
+    assert "used" in bench.does
+    assert bench.heading < DETECTION
+    assert bench.worst < DETECTION
