@@ -510,7 +510,7 @@ class Robot:
 
     def _place(self, pose: Pose) -> str:
         self._odometry.set_pose(pose, self._errors)
-        self._checks.drop_corrections()
+        self._checks.forget_doubt()
         pose = self._odometry.pose
         return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 

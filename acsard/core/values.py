@@ -323,10 +323,10 @@ class GyroSample(Struct, frozen=True, omit_defaults=True):
     anew: bool = False
 
 
-# The heading is the gyro's in `used` and `disagrees` (the wheels slip), and at rest in `waiting for
-# turn` (not yet agreed with the wheels in a turn); otherwise the wheels'.
+# The heading is the gyro's in `used` and `disagrees` (gyro and wheels turn differently); otherwise
+# the wheels'.
 GyroDoes = Literal[
-    "off", "waiting for rest", "waiting for turn", "used", "silent", "disagrees",
+    "off", "waiting for rest", "waiting for turn", "used", "silent", "hangs", "disagrees",
     "reversed", "in degrees", "dead", "not believed",
 ]  # fmt: skip
 

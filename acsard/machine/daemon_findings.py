@@ -340,8 +340,10 @@ GYRO_MENDS: dict[GyroDoes, str] = {
     "waiting for turn": "",
     "silent": "check that the gyro's driver runs, and that it publishes on the Zenoh key `imu` "
     "(the ROS topic imu/data)",
-    "disagrees": "turn the robot more slowly, or drive on other ground; if that does not help, "
-    "check that the gyro's z axis points up and that its driver sends rad/s",
+    "hangs": "check the gyro's cable and its driver: angular_velocity.z must change in its last "
+    "digits even at rest",
+    "disagrees": "if the wheels do not slip, measure the track with `acsard calibrate`, let the "
+    "robot stand so that it learns the gyro's bias, and check the gyro's scale",
     "reversed": "check with `acsard mcu check` that the wheels turn the right way; if they do, "
     "mount the gyro with its z axis up, or let its driver negate angular_velocity.z",
     "in degrees": "let the gyro's driver send rad/s: divide the degrees per second by 57.3",

@@ -1,9 +1,8 @@
 """Plans whose gyro reports wrong rates, and the simulation of these rates.
 
 `acsard/core/motion/gyro.py` describes how the product handles them, and `pose.py` allows its known
-limits. A wrong sample counts if it differs by at most 2 rad/s from the rate before it. The product
-corrects a rate that hangs only after 1 s of rest. It also accepts two similar wrong samples in a
-row, so no plan contains these.
+limits. A wrong sample counts if it differs by at most 0.5 rad/s from the rate before it. The
+product also accepts two similar wrong samples in a row, so no plan contains these.
 
 These plans have separate random generators, so all other plans stay the same.
 """
@@ -28,7 +27,7 @@ gyros."""
 APART_S = 0.1
 """Shortest time between two wrong samples, s."""
 
-PASSES = 2.1
+PASSES = 0.6
 """A wrong sample that differs by at most this from the true one may count, rad/s."""
 
 

@@ -33,6 +33,7 @@ PLANS_OF_FAULT = {
     "session echo": "half_duplex", "case 11": "echo", "limits clock": "wall",
     "robot unsent": "block", "robot limits": "limits", "lifecycle number": "typed",
     "lifecycle fault": "driver_fault",
+    "gyro hangs": "hangs", "gyro turn": "hangs", "gyro wrong": "wrong",
 }  # fmt: skip
 """Kinds of plans by the name of a fault, or by the first word of its name."""
 
@@ -68,7 +69,7 @@ FRESHNESS, LIMITS, LIFECYCLE = (
 )
 MODES, ROBOT, SESSION = "core/motion/modes.py", "core/robot.py", "core/link/session.py"
 WITNESS, ODOMETRY = "core/motion/wheel_witness.py", "core/motion/odometry.py"
-WHEEL_FAULTS = "core/motion/wheel_faults.py"
+WHEEL_FAULTS, GYRO = "core/motion/wheel_faults.py", "core/motion/gyro.py"
 UNCERTAINTY = "core/motion/uncertainty.py"
 LATCHES, VALUES, LOOP = "daemon/latch_rules.py", "core/values.py", "daemon/control_loop.py"
 PUBLICATION = "daemon/publication.py"
@@ -968,6 +969,28 @@ FAULTS = (
         VALUES,
         "return Latches(stop, fault, inactive)",
         "return Latches(stop, None, inactive)",
+    ),
+    # gyro
+    fault(
+        "gyro hangs",
+        "a gyro that repeats one rate is believed",
+        GYRO,
+        "self.hangs |= share < MAX_REPEATING and",
+        "self.hangs |= share < 0.0 and",
+    ),
+    fault(
+        "gyro turn",
+        "the turn of a gyro that hangs stays in the pose until the hang is certain",
+        GYRO,
+        "            off = self.since_change if self.hangs else self.since_sample\n",
+        "            off = 0.0 if self.hangs else self.since_sample\n",
+    ),
+    fault(
+        "gyro wrong",
+        "a single wrong sample of the gyro turns the pose",
+        GYRO,
+        "                if (sample.rate - last.rate) / jump >= CONFIRMED:\n",
+        "                if (sample.rate - last.rate) / jump >= -1e9:\n",
     ),
     # recording
     fault(

@@ -38,10 +38,6 @@ VAGUE = 0.05
 """Variance, m2, from which on a gap may be lost in it. After a gap that is too long to be filled,
 the pose stays where it was, but the covariance turns with a heading that is nearly unknown."""
 
-PROVED_RAD = 3.0
-"""True turns, rad, within which a gyro has certainly proved itself: a turn of 0.1 rad to one side
-proves it, if its bias is known."""
-
 FRESH_NS = NS // 50
 """Age of a sample up to which the present pose stands for that at the sample. Behind a gap nothing
 is known in between."""
@@ -54,26 +50,15 @@ a line then shows a speed over an inexact time."""
 ROOM_M, ROOM_RAD = 0.02, 0.03
 """Allowed beside the covariance: a sample's time is known to a few ms."""
 
-HANG_REST_NS = 16 * NS // 10
-"""Time at rest after which the turn of a gyro that hangs is certainly taken back. The product does
-so after 1 s, in which the wheels report no motion and the gyro repeats its rate."""
-
-HANG_RATE = 0.1
-"""Rate, rad/s, from which on a gyro that hangs certainly reports more than its bias. A gyro that
-hangs at its bias looks like a sound one at rest. In a turn of up to 5 s, it looks like a sound one
-whose wheels slip."""
-
-CONTRADICTS, CONTRADICTED_NS = 0.5, 13 * NS // 2
-"""Difference of the rates of gyro and robot, rad/s, from which on wheels and gyro certainly
-contradict each other, and the time after which their difference is in the covariance. The product
-believes the gyro for 5 s, because the wheels may slip."""
+HANG_NS = 8 * NS // 10
+"""Time after which the wheels certainly give the turn of a gyro that hangs, also that since the
+hang began. The product needs half a second of exact repetition."""
 
 HANG_GAP_NS = 3 * NS // 20
-"""If estimates are missing for this time, the product may not know whether the gyro hangs."""
+"""If estimates are missing for this time, nothing is known about the turn in it."""
 
-SETTLES_NS, SETTLES_AT_REST_NS = NS // 2, 5 * NS // 2
-"""Time after a hang from which on the pose is judged again. If the product may have learned a wrong
-bias during the hang, the robot must also have stood for the second time."""
+SETTLES_NS = NS // 2
+"""Time after a hang from which on the pose is judged again."""
 
 Pose = tuple[float, float, float]
 
@@ -88,14 +73,9 @@ class Hang:
         """Since it began, nothing else has disturbed the odometry."""
         self.turned = False
         """The true and the estimated heading at its begin, `begun`, are known."""
-        self.begun = self.agreed = 0.0, 0.0
-        """The true and the estimated heading when the hang began, and when wheels and gyro last
-        agreed, rad."""
-        self.begun_ns = self.agreed_ns = self.seen_ns = at_ns
-        self.true_yaw = 0.0
-        """The true heading at the last estimate, rad."""
-        self.taken_back = False
-        """The robot has rested for so long that the product knows that the gyro hangs."""
+        self.begun = 0.0, 0.0
+        """The true and the estimated heading when the hang began, rad."""
+        self.begun_ns = self.seen_ns = at_ns
 
 
 class PoseWitness:
@@ -141,16 +121,10 @@ class PoseWitness:
         self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
         self._anchor: tuple[Pose, Pose] | None = None
         self._gyro = bool(rates.get("gyro"))
-        self._unproved: float | None = None
-        """True turns since the wheels lied, rad, until a gyro has corrected the heading for that.
-        None if no correction is possible."""
         self._hang: Hang | None = None
         """The present hang of the gyro."""
-        self._settles_ns = self._settles_at_rest_ns = 0
-        """The pose is judged again from the first of these times on, if the robot has also stood
-        since the second one for `SETTLES_AT_REST_NS`. The second one is 0 if it need not stand."""
-        self._moved_ns = 0
-        """When the true pose last changed."""
+        self._settles_ns = 0
+        """The pose is judged again from this time on."""
         self._spoiled = self._spoiled_before = 0.0
         """Turn that wrong samples of the gyro may have added up to now, and up to the anchor,
         rad."""
@@ -193,7 +167,6 @@ class PoseWitness:
             self._hang = Hang(now_ns, faults.hung - GYRO_BIAS)
         elif faults.hung is None and self._hang is not None:
             self._settles_ns = now_ns + SETTLES_NS
-            self._settles_at_rest_ns = 0 if self._hang.sure else now_ns
             self._hang = None
             self.doubt()
 
@@ -211,7 +184,7 @@ class PoseWitness:
     def begin(self) -> None:
         """Forget all earlier estimates, because a daemon starts or the pose is set."""
         self.doubt()
-        self._last = self._unproved = None
+        self._last = None
 
     def placed(self, asked: Pose | None = None) -> None:
         """Note that a call sets the pose. The estimates of this step still have the old pose.
@@ -230,16 +203,10 @@ class PoseWitness:
     ) -> None:
         """Judge the estimates of one step."""
         at_ns, x, y, yaw, _ = truth
-        if not self._true or math.dist(self._true[-1][1], (x, y, yaw)) > STANDS / 100:
-            self._moved_ns = now_ns
         self._true.append((at_ns + offset_ns, (x, y, yaw)))
         self._speed = self._present_speed()
         lies = not LIARS.isdisjoint(faults) or now_ns < self._known_ns
         silent_only = not lies or faults & LIARS == {"mute"}
-        if self._gyro and not silent_only:
-            self._unproved = 0.0
-        elif self._unproved is not None and len(self._true) > 1:
-            self._unproved += abs(math.remainder(yaw - self._true[-2][1][2], math.tau))
         if lies:
             self.doubt(silent_only)
         if self._spoils_pose(now_ns):
@@ -323,9 +290,6 @@ class PoseWitness:
                 f"{off:.3f} m off, allowed {allowed:.3f} m",
             )  # fmt: skip
         if abs(dyaw) > SIGMAS * math.sqrt(yawyaw) + room_yaw:
-            if self._unproved is not None and self._unproved < PROVED_RAD:
-                self._unproved = self._anchor = None
-                return
             raise BrokenError(
                 "the pose stays within its covariance", now_ns,
                 f"{dyaw:.3f} rad off, sigma {math.sqrt(yawyaw):.4f}",
@@ -333,13 +297,7 @@ class PoseWitness:
 
     def _spoils_pose(self, now_ns: int) -> bool:
         """Return whether the gyro hangs, or has hung too recently to judge the pose."""
-        if self._hang is not None or now_ns < self._settles_ns:
-            return True
-        rests_ns = self._settles_at_rest_ns
-        if rests_ns and now_ns - max(rests_ns, self._moved_ns) < SETTLES_AT_REST_NS:
-            return True
-        self._settles_at_rest_ns = 0
-        return False
+        return self._hang is not None or now_ns < self._settles_ns
 
     def _hung(
         self, now_ns: int, at_ns: int, pose: Pose, covariance: tuple[float, ...], hang: Hang
@@ -354,23 +312,14 @@ class PoseWitness:
             hang.sure = False
             return
         if not hang.turned:
-            hang.turned, hang.begun, hang.agreed = True, (true[2], yaw), (true[2], yaw)
-        turned = math.remainder(true[2] - hang.true_yaw, math.tau)
-        hang.true_yaw = true[2]
-        if passed_ns > 0 and abs(turned * NS / passed_ns - hang.rate) < CONTRADICTS:
-            hang.agreed_ns, hang.agreed = at_ns, (true[2], yaw)
-        rests = at_ns - max(self._moved_ns, hang.begun_ns) > HANG_REST_NS
-        hang.taken_back |= rests and abs(hang.rate) > HANG_RATE
-        contradicted = at_ns - hang.agreed_ns > CONTRADICTED_NS
-        if not (hang.taken_back or contradicted):
+            hang.turned, hang.begun = True, (true[2], yaw)
+        if at_ns - hang.begun_ns < HANG_NS:
             return
-        true_then, then = hang.begun if hang.taken_back else hang.agreed
-        off = math.remainder(yaw - then - (true[2] - true_then), math.tau)
+        off = math.remainder(yaw - hang.begun[1] - (true[2] - hang.begun[0]), math.tau)
         sigma, room = math.sqrt(covariance[5]), ROOM_RAD + 0.1 * self._speed / self.track
-        name = "taken back" if hang.taken_back else "in the covariance"
         if abs(off) > SIGMAS * sigma + room:
             raise BrokenError(
-                f"the turn of a gyro that hangs is {name}", now_ns,
+                "the wheels give the turn of a gyro that hangs", now_ns,
                 f"{off:.3f} rad off, sigma {sigma:.4f}, the gyro repeats {hang.rate:.3f} rad/s",
             )  # fmt: skip
 

@@ -778,39 +778,8 @@ def test_a_pose_may_not_jump_although_the_encoders_missed_a_part_of_the_drive() 
     pose.see(NS // 5, [(NS // 5, 1.0, 1.0, 0.0, sure, ())], truth, 0, set())
 
 
-@pytest.mark.parametrize(
-    ("gyro", "lied", "swings", "corrected"),
-    [
-        (True, True, 3, True),
-        (False, True, 3, False),
-        (True, False, 3, False),
-        (True, True, 200, False),
-    ],
-)
-def test_only_a_gyro_may_correct_the_heading_once_and_soon_after_a_wheel_fault(
-    gyro: bool, lied: bool, swings: int, corrected: bool
-) -> None:
-    sure, promise = (0.0001, 0.0, 0.0, 0.0001, 0.0, 0.0001), "the pose stays within its covariance"
-    pose, at_ns = PoseWitness({"odometry": {"gyro": gyro}}), 0
-
-    def turned(yaw: float, off: float, faults: set[str]) -> None:
-        nonlocal at_ns
-        at_ns += NS // 100
-        truth = at_ns, 0.0, 0.0, yaw, 0.0
-        pose.see(at_ns, [(at_ns, 0.0, 0.0, yaw + off, sure, ())], truth, 0, faults)
-
-    turned(0.0, 0.0, {"dead_motor"} if lied else set())
-    for swing in range(swings):
-        turned(0.02 * (swing % 2), 0.0, set())
-    if corrected:
-        turned(0.0, 2.0, set())
-        turned(0.0, 2.0, set())
-    with pytest.raises(BrokenError, match=promise):
-        turned(0.0, 1.0, set())
-
-
-def hung(rests_s: float, rate: float, off: float, deviation: float) -> None:
-    """Judge a robot at rest whose gyro hangs at `rate`, and whose heading is wrong by `off`."""
+def hung(seconds: float, off: float, deviation: float) -> None:
+    """Judge a robot whose gyro hangs, and whose heading is then wrong by `off`."""
     pose, gyro = PoseWitness({"odometry": {"gyro": True}}), GyroFaults()
     covariance = (0.0001, 0.0, 0.0, 0.0001, 0.0, deviation**2)
 
@@ -821,48 +790,24 @@ def hung(rests_s: float, rate: float, off: float, deviation: float) -> None:
 
     step(0, 0.0)
     gyro.hanging = True
-    assert gyro.reported(rate) == gyro.reported(0.0) == rate
-    for n in range(1, int(rests_s * 100)):
+    assert gyro.reported(0.5) == gyro.reported(0.0) == 0.5
+    for n in range(1, int(seconds * 100)):
         step(n * NS // 100, off if n > 5 else 0.0)
     gyro.hanging = False
     assert gyro.reported(0.0) == 0.0
-    for n in range(int(rests_s * 100), int(rests_s * 100) + 100):
+    for n in range(int(seconds * 100), int(seconds * 100) + 100):
         step(n * NS // 100, off)
 
 
-def test_the_turn_of_a_gyro_that_hangs_may_stay_only_until_the_robot_has_rested() -> None:
-    with pytest.raises(BrokenError, match="a gyro that hangs is taken back"):
-        hung(1.7, 0.5, 0.3, 0.01)
-    hung(1.5, 0.5, 0.3, 0.01)
-    hung(1.7, 0.5, 0.02, 0.01)
-    hung(1.7, 0.5, 0.3, 0.1)
+def test_the_turn_of_a_gyro_that_hangs_may_stay_only_for_a_moment() -> None:
+    with pytest.raises(BrokenError, match="the wheels give the turn of a gyro that hangs"):
+        hung(0.9, 0.3, 0.01)
+    hung(0.7, 0.3, 0.01)
+    hung(0.9, 0.02, 0.01)
+    hung(0.9, 0.3, 0.1)
 
 
-def test_a_gyro_that_hangs_at_its_bias_may_be_believed() -> None:
-    hung(6.0, 0.05, 0.3, 0.01)
-
-
-def test_a_long_contradiction_of_a_gyro_that_hangs_is_in_the_covariance() -> None:
-    pose, gyro = PoseWitness({"odometry": {"gyro": True}}), GyroFaults()
-    gyro.hanging = True
-    gyro.reported(1.0)
-
-    def turn(seconds: float, deviation: float) -> None:
-        for n in range(int(seconds * 100)):
-            at_ns, covariance = n * NS // 100, (1.0, 0.0, 0.0, 1.0, 0.0, deviation**2)
-            pose.gyro(at_ns, gyro)
-            truth = at_ns, n / 100, 0.0, 0.0, 0.0
-            pose.see(at_ns, [(at_ns, n / 100, 0.0, n / 100, covariance, ())], truth, 0, set())
-
-    turn(6.0, 0.01)
-    pose, at_least = PoseWitness({"odometry": {"gyro": True}}), math.pi / 6.0
-    turn(9.0, at_least)
-    pose = PoseWitness({"odometry": {"gyro": True}})
-    with pytest.raises(BrokenError, match="a gyro that hangs is in the covariance"):
-        turn(7.0, 0.01)
-
-
-@pytest.mark.parametrize(("rate", "allowed"), [(1.5, True), (3.0, False)])
+@pytest.mark.parametrize(("rate", "allowed"), [(0.5, True), (3.0, False)])
 def test_only_a_wrong_sample_near_the_true_rate_may_count(rate: float, allowed: bool) -> None:
     gyro = GyroFaults()
     gyro.spoil(rate)

@@ -1,8 +1,9 @@
 """Decodes samples on the key `imu` into turn rates about the z axis of base_link, or refuses them.
 
 A sample is a sensor_msgs/Imu, of which JSON and msgpack need only `angular_velocity`. z points up,
-so left is positive. Only one gyro is used. After its silence another one may be, whose first sample
-is marked (`GyroSample.anew`), so that the bias of the old one is forgotten.
+so left is positive. Only one gyro is used: one sender, and one frame, because programs without a
+name look alike. After its silence another one may be, whose first sample is marked
+(`GyroSample.anew`), so that the bias of the old one is forgotten.
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ class GyroFollower:
     def __init__(self, own: bool = False) -> None:
         # `own`: accept only the gyro of this daemon's simulator.
         self._own = own
-        self._followed = public_name(SIMULATOR_SENDER) if own else None
+        self._followed: tuple[str | None, str] | None = None
+        if own:
+            self._followed = (public_name(SIMULATOR_SENDER), "")
         self._heard_ns = -SILENCE_TIMEOUT_NS
 
     def receive(
@@ -57,34 +60,38 @@ class GyroFollower:
     ) -> GyroSample | None:
         """Return the turn rate in a sample, or None if it is refused, which is counted."""
         try:
-            sample = reading(arrival)
-            changed = self._follow(claimed_identity(arrival).sender, arrival.arrived_ns)
+            sample, frame = reading(arrival)
+            sender = claimed_identity(arrival).sender
+            changed = self._follow((sender, "" if self._own else frame), arrival.arrived_ns)
         except DecodeError as error:
             counters[f"imu_{error.reason}"] = counters.get(f"imu_{error.reason}", 0) + 1
             events.append(Event("imu_refused", str(error), "warning", kind=error.reason))
             return None
         return replace(sample, anew=True) if changed else sample
 
-    def _follow(self, sender: str, now_ns: Ns) -> bool:
+    def _follow(self, gyro: tuple[str | None, str], now_ns: Ns) -> bool:
         # True: another gyro was used before. Raises `DecodeError` while another gyro sends.
-        other = sender != self._followed
-        if other and (self._own or now_ns - self._heard_ns < SILENCE_TIMEOUT_NS):
+        before, other = self._followed, gyro != self._followed
+        heard = self._own or now_ns - self._heard_ns < SILENCE_TIMEOUT_NS
+        if before is not None and other and heard:
             raise DecodeError(
                 "second_sender",
-                f"{_named(sender)} sends gyro samples, but the daemon already uses those of "
-                f"{_named(self._followed)}: end one of the two programs",
+                f"{_named(*gyro)} sends gyro samples, but the daemon already uses those of "
+                f"{_named(*before)}: end one of the two programs",
             )
-        before, self._followed, self._heard_ns = self._followed, sender, now_ns
+        self._followed, self._heard_ns = gyro, now_ns
         return other and before is not None
 
 
-def _named(sender: str | None) -> str:
-    # A sample on an rmw key without a valid attachment has no sender id.
-    return (sender or "a sender without a name")[:MAX_NAME_LENGTH]
+def _named(sender: str | None, frame: str) -> str:
+    # The name of a sender without an id is "", or its key, which is the same for all.
+    nameless = not sender or sender.endswith("/")
+    name = "a sender without a name" if nameless else str(sender)[:MAX_NAME_LENGTH]
+    return f"{name} (frame {frame[:MAX_NAME_LENGTH]})" if frame else name
 
 
-def reading(arrival: Arrival) -> GyroSample:
-    """Return the turn rate in a sample. Raises `DecodeError`."""
+def reading(arrival: Arrival) -> tuple[GyroSample, str]:
+    """Return the turn rate in a sample, and its frame. Raises `DecodeError`."""
     if not arrival.put:
         raise DecodeError("not_a_put", "a DELETE is not a sample: send a PUT")
     if len(arrival.payload) > MAX_COMMAND_BYTES:
@@ -113,4 +120,6 @@ def reading(arrival: Arrival) -> GyroSample:
             "this limit: send the turn rate in rad/s",
         )
     stamp_ns = message.header.stamp.to_ns()
-    return GyroSample(arrival.arrived_ns, stamp_ns if stamp_ns > 0 else None, rate.z, variances[8])
+    sampled_ns = stamp_ns if stamp_ns > 0 else None
+    sample = GyroSample(arrival.arrived_ns, sampled_ns, rate.z, variances[8])
+    return sample, message.header.frame_id

@@ -10,8 +10,7 @@ from __future__ import annotations
 from acsard.core.config.settings import FeedbackConfig, OdometryConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
-from acsard.core.motion.gaps import AT_REST
-from acsard.core.motion.gyro import Gyro, Turn
+from acsard.core.motion.gyro import Gyro, Turn, claims
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.wheel_faults import WheelFaults
 from acsard.core.values import Event, GyroSample, GyroStatus, Seconds
@@ -30,6 +29,7 @@ class ConsistencyChecks:
         self._kinematics = kinematics
         self.wheels = WheelFaults(kinematics, encoder_counts, feedback)
         self.gyro = Gyro() if odometry.gyro else None
+        self._claims = claims(odometry, kinematics, encoder_counts)
         self.turn: Turn | None = None  # turn of the last line by the gyro; None: use the wheels
         self.slips = False  # the wheels contradict each other or the gyro
         self.events: list[Event] = []  # of the last line
@@ -43,10 +43,10 @@ class ConsistencyChecks:
         if self.gyro is not None:
             self.gyro.add_samples(samples)
 
-    def drop_corrections(self) -> None:
-        """Drop the gyro's pending correction of the heading, because a new pose was set."""
+    def forget_doubt(self) -> None:
+        """Forget the uncertainty of the gyro's turns before now, because a new pose was set."""
         if self.gyro is not None:
-            self.gyro.drop_corrections()
+            self.gyro.forget_doubt()
 
     def check_line(self, line: Feedback, rolled: Motors, seconds: Seconds, *, known: bool) -> None:
         """Check a line, and set `turn`, `slips` and `events`.
@@ -56,11 +56,12 @@ class ConsistencyChecks:
         """
         wheels, gyro, turn, by_gyro = self.wheels, self.gyro, None, None
         if gyro is not None:
-            by_wheels = self._kinematics.moved(wheels.believed(rolled))[1]
-            still = wheels.believed(line.speeds.as_tuple()) == AT_REST
-            turn = gyro.turn(line.at.mono_ns, seconds if known else 0.0, by_wheels, still)
+            way, by_wheels = self._kinematics.moved(wheels.believed(rolled))
+            seconds_known, idle = seconds if known else 0.0, line.driven <= 0.0
+            turn = gyro.turn(line.at.mono_ns, seconds_known, by_wheels, way, idle, self._claims)
             by_gyro = None if turn is None else turn.wheels
         self.turn = turn
         wheels.check_line(rolled, line.speeds, seconds, by_gyro)
         self.slips = wheels.slips or (turn is not None and turn.slips)
-        self.events = wheels.events if gyro is None else gyro.events + wheels.events
+        event = None if gyro is None else gyro.event()
+        self.events = wheels.events if event is None else [event, *wheels.events]

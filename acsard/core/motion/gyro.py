@@ -1,74 +1,80 @@
-"""Takes the heading from a gyro, if there is one. The distance still comes from the wheels.
+"""Takes the heading from a gyro while the gyro is fresh and agrees with the wheels.
 
-In gyrodometry (Borenstein & Feng, Gyrodometry: a new method for combining data from gyros and
-odometry in mobile robots, 1996), skidding does not affect a gyro, nor its bias the wheels. The
-reading at rest is the bias (`gyro_bias.py`), and a comparison gives the ratio of the turns
-(`gyro_match.py`). Until gyro and wheels have agreed in a turn (`gyro_trial.py`), the heading is the
-wheels'; then it is corrected by the difference so far. A gyro that is silent or does not match at
-all is not used.
+Only the bias is learned, while the robot rests. The wheels give the heading until the gyro has
+turned as they do, while it is silent, and if it hangs, from the first sample on that it repeated.
+If the two turns differ by more than both claim, the gyro is used and their difference becomes
+uncertainty of the heading, because wheels may slip. A gyro that turns the other way, or by a ratio
+that no floor explains, is not used.
 """
 
 from __future__ import annotations
 
-from collections import deque
+import math
+from typing import Literal
 
-from msgspec import Struct
+from msgspec import Struct, field
 
-from acsard.core.link.minimum_delay import MinimumDelay
-from acsard.core.motion.gyro_bias import LEARNING_TIME_S, MAX_BIAS, Bias
-from acsard.core.motion.gyro_match import WINDOW_S, Match
-from acsard.core.motion.gyro_trial import TURN_RATIO_RANGE, Trial
-from acsard.core.values import NS_PER_S, Event, GyroDoes, GyroSample, GyroStatus, Level, Ns
+from acsard.core.config.settings import OdometryConfig
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.values import (
+    NS_PER_S,
+    Event,
+    GyroDoes,
+    GyroSample,
+    GyroStatus,
+    Level,
+    Metres,
+    Ns,
+    Rad,
+    RadPerS,
+    Seconds,
+)
 
-REST_S = 0.2  # of zero speeds of all wheels, after which the robot counts as resting
+# Rest is a zero command and a motion of each side below two counts, or this angle of its wheels if
+# the counts are unknown. Encoders that stand on an edge and filters that never reach zero rest.
+REST_S = 0.2
+REST_COUNTS, REST_ANGLE = 2, 0.05
 
-# Age of the last sample of a silent gyro. Until then, the robot is assumed to turn at its rate.
-SILENCE_TIMEOUT_NS = NS_PER_S // 5
+LEARNING_TIME_S, NEW_BIAS_TIME_S = 0.5, 1.0  # at rest, until a bias is known, or replaced
+MAX_BIAS = 0.2  # rad/s; a higher rate at rest is a person who turns the robot
+BIAS_RANDOM_WALK = 1e-4  # of a cheap gyro with temperature, rad/s per square root of a second
+MIN_NOISE = 1e-5  # rad/s of a sample: a coarse gyro may repeat one value
+NOISE_GAIN = 0.02  # of the noise, about fifty samples
+MAX_DEVIATIONS, VIBRATION = (
+    5.0,
+    0.01,
+)  # of a sample at rest from the bias: standard deviations, rad/s
 
-# A delay this far above the least one shows a slow network, or a sender's clock that was set.
-MAX_EXTRA_DELAY_NS = NS_PER_S // 4
+SILENCE_TIMEOUT_NS = NS_PER_S // 5  # until then the robot is assumed to turn at the last rate
+MAX_EXTRA_DELAY_NS = NS_PER_S // 4  # above the least one; a later sample says nothing of now
+MAX_RISE = 1e-3  # of the least delay: two clocks drift
+# A clock was set if samples stay late for this time and their delays do not fall by more.
+CLOCK_SET_NS, MAX_DELAY_FALL_NS = NS_PER_S, NS_PER_S // 50
+MAX_SWAPPED_NS = NS_PER_S // 50  # between the stamps of two samples in the wrong order
 
-# A clock was set if such delays last for the first one and fall by less than the second one. The
-# delays of a backlog fall.
-STEADY_DELAY_NS, MAX_DELAY_FALL_NS = NS_PER_S, NS_PER_S // 50
+# A larger change of the rate, rad/s, must be confirmed by the next sample, by half at least.
+MAX_JUMP, CONFIRMED = 0.5, 0.5
 
-# A stamp this far before the previous one shows a clock that was set back, not swapped samples.
-MIN_SET_BACK_NS = NS_PER_S // 50
+# A gyro hangs if it repeats one exact rate for this time, although at rest it repeats less than
+# this share of its samples, so that such a series has less than this probability.
+HANG_S, MAX_REPEATING, MIN_CHANCE = 0.5, 0.6, 1e-6
 
-# Samples are missing after this number of periods without one. `PERIOD_GAIN`: weight of a new
-# sample in the mean period.
-HOLE_PERIODS, PERIOD_GAIN = 1.5, 0.02
+BLOCK_S, MAX_BLOCK = 0.2, 0.5  # s, or rad of difference: of the sums that are compared
+# Old blocks count less: on straights after this time, and in turns after this angle.
+STRAIGHT_MEMORY_S, TURN_MEMORY = 30.0, 10.0
+AGREES = 0.5  # deviations, below which a short comparison restarts: a new fault then shows at once
+MARGIN = 0.02  # rad, standard deviation of the wheels' turn by encoder counts and vibration
+MAX_DELAY_S = 0.05  # a gyro with this delay does not contradict the wheels
+DEVIATIONS = 3.0  # of what both claim; more is a contradiction
+DISAGREES_S = 5.0  # of driving after a contradiction
 
-# New samples that cover more time than their line, by this ratio, are a backlog after a silence.
-CATCH_UP_SPEED = 1.5
-
-SLIP_S = 0.5  # after they contradicted the gyro, the wheels count as slipping
-
-MAX_SLIP_S = 5.0  # longer than this, the gyro is not used until gyro and wheels agree again
-
-# A larger change of the rate, rad/s, must be confirmed by the next sample. At 100 Hz it is 200
-# rad/s2, a defect or a push; at 10 Hz it is 20 rad/s2, more than usual motors cause.
-MAX_JUMP = 2.0
-
-# With a last sample this old, nobody can tell whether gyro or wheels were right.
-LOST_NS = NS_PER_S
-
-# Largest change of the bias, rad/s, that is learned from one exact rate at rest: coarse gyros and
-# simulated ones repeat rates. A gyro that hangs this close to the bias is not noticed.
-MAX_BIAS_STEP = 0.06
-
-# A gyro that repeats one rate certainly hangs if at rest it usually repeats less than the first
-# fraction of its samples, and if such a series has a probability below the second.
-MAX_REPEATING, MIN_CHANCE = 0.6, 1e-6
-
-# Fraction of a jump that must remain in the next sample: a push lasts for hundredths of a second.
-CONFIRMED_FRACTION = 0.5
-
-# A gyro that repeats one exact rate at rest for this time hangs, as noise changes the last digits.
-# It is less than `NEW_BIAS_TIME_S`, or the rate would become the bias first.
-FROZEN_S = 0.8
-
-TRUSTED_BLOCKS = 20.0  # of 0.1 s with a turn, after which the ratio of the turns is used
+# True turn divided by the turn of the wheels, on any floor.
+MIN_RATIO, MAX_RATIO = 0.25, 2.5
+MIN_TURN_RATE = 0.1  # rad/s of the wheels; less may be a count, or unequal tyres on a straight
+# Turns by the wheels, rad, that prove a gyro, and refute it. Wheels that spin on the spot look like
+# a dead gyro, so one that has proved itself is called dead later.
+PROVING_TURN, REFUTING_TURN, DEAD_TURN = 0.1, 0.4, 4.0
+MIN_DEGREES_RATIO, MAX_DEGREES_RATIO = 15.0, 150.0  # 57 without slip and errors
 
 STATUS_TEXTS: dict[GyroDoes, str] = {
     "off": "",
@@ -78,360 +84,475 @@ STATUS_TEXTS: dict[GyroDoes, str] = {
     "a turn",
     "used": "the heading comes from the gyro",
     "silent": "the gyro is silent: the heading comes from the wheels",
-    "disagrees": "the wheels seem to slip: the gyro measures a different turn than the wheels",
+    "hangs": "the gyro repeats one rate exactly, so it hangs: the heading comes from the wheels",
+    "disagrees": "gyro and wheels measure different turns, and the heading's uncertainty includes "
+    "the difference: do the wheels slip, is the track calibrated, has the gyro's scale or bias "
+    "changed?",
     "reversed": "the gyro is not used, because it reports a left turn of the robot as a right "
     "turn: check how the gyro is mounted",
     "in degrees": "the gyro is not used, because its rate is 57 times too high: it sends degrees "
     "per second, and must send radians per second",
     "dead": "the gyro is not used, because it measures no turn while the wheels turn the robot: "
     "check the gyro",
-    "not believed": "the gyro is not used, because its rate does not match the wheels at all: does "
-    "its z axis point up, and does its rate change?",
+    "not believed": "the gyro is not used, because it measures much larger turns than the wheels: "
+    "does its z axis point up, does it send rad/s, and has its bias changed?",
 }
+
+Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not believed"]
+
+
+class Claims(Struct, frozen=True, gc=False):
+    """What the settings say about the turn of the wheels, and the motion of a side at rest."""
+
+    per_metre: float
+    per_radian: float
+    scale: float  # share of a turn, of the track and of the gyro
+    rest: Metres
+    half_track: Metres
+
+
+def claims(odometry: OdometryConfig, kinematics: Kinematics, counts: int) -> Claims:
+    rest = REST_COUNTS * math.tau / counts if counts else REST_ANGLE
+    return Claims(
+        odometry.yaw_variance_per_metre,
+        odometry.yaw_variance_per_radian,
+        math.hypot(odometry.gyro_scale_std, odometry.wheel_separation_multiplier_std),
+        rest * kinematics.radius,
+        kinematics.track / 2,
+    )
 
 
 class Turn(Struct, frozen=True, gc=False):
-    """The turn since the previous line by a gyro (or the wheels, with a correction), rad.
+    """The turn since the previous line, by the gyro or by the wheels with a correction."""
 
-    `variance`, rad2, is without the error of the gyro's scale, which does not average out
-    (`uncertainty.py`).
+    angle: Rad
+    variance: float  # rad2, without the error of the gyro's scale
+    rate: RadPerS
+    rate_variance: float  # rad2/s2
+    wheels: Rad | None = None  # of wheels without a fault
+    slips: bool = False
+    doubt: Rad = 0.0  # by which gyro and wheels differ: does not average out
+
+
+class Bias(Struct):
+    """Reading of the gyro at rest, rad/s, with its variance and that of one sample.
+
+    The first estimate is a mean. Then a scalar Kalman filter follows a random walk. Another
+    constant reading at rest replaces it.
     """
 
-    angle: float
-    variance: float
-    rate: float  # rad/s, of the last sample or of the wheels
-    rate_variance: float
-    wheels: float | None = None  # rad of wheels without a fault, by the learned ratio
-    slips: bool = False  # the wheels contradicted the gyro within `SLIP_S`
+    value: RadPerS = 0.0
+    variance: float = MAX_BIAS**2
+    noise: float = 0.0
+    rested_s: Seconds = 0.0
+    samples: int = 0
+    other: Bias | None = None
+
+    @property
+    def is_known(self) -> bool:
+        return self.rested_s >= LEARNING_TIME_S
+
+    def follow(self, rate: RadPerS, variance: float, span: Seconds) -> bool:
+        """Learn from a sample at rest. Return False if it shows a turn."""
+        if not self.is_known:
+            return self._average(rate, variance, span)
+        error, noise = rate - self.value, max(self.noise, variance, MIN_NOISE**2)
+        limit = MAX_DEVIATIONS * math.sqrt(noise + self.variance) + VIBRATION
+        if abs(error) > limit:
+            return self._replace(
+                rate, variance, span, MAX_DEVIATIONS * math.sqrt(noise) + VIBRATION
+            )
+        self.other = None
+        gain = self.variance / (self.variance + noise)
+        self.value += gain * error
+        self.variance *= 1.0 - gain
+        self.noise += NOISE_GAIN * ((1.0 - gain) * error * error - self.noise)
+        return True
+
+    def _average(self, rate: RadPerS, variance: float, span: Seconds) -> bool:
+        if abs(rate) > MAX_BIAS:
+            return False
+        self.rested_s += span
+        self.samples += 1
+        error = rate - self.value
+        self.value += error / self.samples
+        self.noise += (error * (rate - self.value) - self.noise) / self.samples
+        self.variance = max(self.noise, variance, MIN_NOISE**2) / self.samples
+        return True
+
+    def _replace(self, rate: RadPerS, variance: float, span: Seconds, spread: RadPerS) -> bool:
+        other = self.other = self.other or Bias()
+        if not other._average(rate, variance, span) or math.sqrt(other.noise) > spread:
+            self.other = None
+            return False
+        if other.rested_s < NEW_BIAS_TIME_S:
+            return False
+        self.value, self.variance, self.noise = other.value, other.variance, other.noise
+        self.other = None
+        return True
 
 
-class Gyro:
-    """Computes the turns of the robot from the samples of one gyro.
+class Compared(Struct):
+    """Sums of lines with turns by both, of which old ones count less."""
 
-    `turn` includes samples up to `SILENCE_TIMEOUT_NS` late, so no turn is lost. While they are
-    later, the wheels provide it, and a backlog (shown only by stamps) changes nothing. Missing
-    samples make the turn uncertain. If a gyro hangs, the wheels' turn replaces its since then.
-    After a contradiction that ends with the gyro unused, the difference is uncertainty.
-    """
+    wheels: Rad = 0.0
+    gyro: Rad = 0.0
+    turned: Rad = 0.0  # by the wheels, to either side
+    way: Metres = 0.0
+    seconds: Seconds = 0.0
 
-    def __init__(self) -> None:
-        self._rest_s = self._since_rest_s = 0.0
-        self.owes = False  # the wheels gave the last turn; the heading will be corrected
-        self._does: GyroDoes = "silent"
-        self.events: list[Event] = []  # of the last `turn`
-        self._doubt = 0.0  # variance that the next turn must add, rad2
-        self._begin()
+    def add(self, block: Compared, share: float) -> None:
+        self.wheels = share * self.wheels + block.wheels
+        self.gyro = share * self.gyro + block.gyro
+        self.turned = share * self.turned + abs(block.wheels)
+        self.way = share * self.way + block.way
+        self.seconds = share * self.seconds + block.seconds
 
-    def _begin(self) -> None:
-        self._bias, self._match, self._trial = Bias(), Match(), Trial()
-        self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)  # unused, with `_time_of`
-        self._promptest = MinimumDelay()
-        self._late_since: tuple[int, float] | None = None  # arrival and first delay, ns
-        self._period_s = 0.0  # mean; 0 before the second sample
-        # Gyro's minus wheels' turn since the last used sample, whose rate is assumed to go on, rad.
-        self._guessed = 0.0
-        self._slipped_before = False  # contradiction at the last used sample
-        self._last: GyroSample | None = None
-        self._told_ns: Ns | None = None  # last used sample
-        self._rate = 0.0
-        self._angle = self._given = 0.0  # rad by all used samples, and returned by `turn`
-        self._variance = 0.0  # of the rest of `_angle`, rad2
-        self._slip_s = self._slipped_s = 0.0
-        self._reading: float | None = None  # rate of the last used sample, rad/s with the bias
-        # Exact repetition of `_reading`; and of it, at rest and not the bias.
-        self._repeated_s = self._rested_s = 0.0
-        self._frozen = False  # the gyro hangs, until its rate changes or becomes the bias
-        self._repeats = 0  # successive repetitions
-        # Samples of the bias at rest, and repetitions among them, while the gyro does not hang.
-        self._usual = self._usual_repeats = 0
-        # Rate that was repeated at rest and may be the new bias, rad/s.
-        self._suspect: float | None = None
-        self._unsure = 0.0  # variance of the bias by `_suspect`, rad2/s2
-        self._noise = 0.0  # variance of the present turn rate, rad2/s2
-        self._hole = False  # samples are missing since the last line, or it found the gyro silent
-        self._contradicted = 0.0  # gyro's minus wheels' turn since the contradiction began, rad
-        self._forget_owed()
-        self._forget_repeated()
+
+class Gyro(Struct):
+    """The turns of the robot by the samples of one gyro."""
+
+    does: GyroDoes = "silent"
+    reported: GyroDoes = "silent"
+    verdict: Verdict = "none yet"
+    bias: Bias = field(default_factory=Bias)
+    used: bool = False  # for the last line
+
+    last: GyroSample | None = None  # in use
+    jumped: GyroSample | None = None  # waits for a confirmation of its jump
+    heard_ns: Ns | None = None  # last prompt sample
+    newest: GyroSample | None = None  # late ones, too
+    newest_ns: Ns = 0  # time of the newest one, by its stamp if it has one
+    sampled_ns: Ns = 0  # of the sample in use
+    least_ns: Ns | None = None  # delay of the stamps
+    late_since_ns: Ns | None = None
+    late_ns: Ns = 0  # delay then
+
+    rate: RadPerS = 0.0  # now
+    turned: Rad = 0.0  # by all samples
+    given: Rad = 0.0  # of `turned`, with the assumed turn since the last sample
+    variance: float = 0.0  # of the rest of `turned`
+    # Gyro's minus wheels' turn in lines since the last sample, and since the rate changed.
+    since_sample: Rad = 0.0
+    since_change: Rad = 0.0
+
+    repeats: int = 0
+    repeated_s: Seconds = 0.0
+    usual: int = 0  # samples at rest while the gyro did not hang
+    usual_repeats: int = 0  # of them
+    hangs: bool = False
+
+    rest_s: Seconds = 0.0
+    rest_turn: Rad = 0.0  # since the rest began
+    rest_way: Metres = 0.0
+    since_rest_s: Seconds = 0.0
+
+    block: Compared = field(default_factory=Compared)
+    straight: Compared = field(default_factory=Compared)
+    short: Compared = field(default_factory=Compared)  # turns; the trial of a gyro, too
+    long: Compared = field(default_factory=Compared)
+    # Turns by the wheels in a contradiction, and by the gyro, positive to the same side.
+    against: Rad = 0.0
+    against_gyro: Rad = 0.0
+    disagrees_s: Seconds = 0.0  # left
+    learn_again: bool = False  # the bias, at the next rest: it may have changed
+    doubt: Rad = 0.0  # for the next turn
 
     @property
     def status(self) -> GyroStatus:
-        return GyroStatus(self._does, self._bias.value if self._bias.is_known else None)
+        return GyroStatus(self.does, self.bias.value if self.bias.is_known else None)
 
-    def add_samples(self, samples: tuple[GyroSample, ...]) -> None:
-        """Store samples in the order of arrival; one with `anew` (another gyro) resets all."""
-        for sample in samples:
-            if sample.anew:
-                self._end_contradiction()
-                self._drop_waiting_correction()
-                self._begin()
-            self._hole |= len(self._heard) == self._heard.maxlen
-            self._heard.append((self._time_of(sample), sample))
+    def event(self) -> Event | None:
+        """Return an event if the status has changed since the last one."""
+        before, does = self.reported, self.does
+        self.reported = does
+        # The text of "waiting for turn" announces the change to "used".
+        if does == before or (before, does) == ("waiting for turn", "used"):
+            return None
+        good = does in ("used", "waiting for rest", "waiting for turn")
+        level: Level = "info" if good else "warning"
+        return Event("gyro", STATUS_TEXTS[does], level, kind=does)
 
-    def turn(self, at_ns: Ns, dt: float, wheels: float, still: bool) -> Turn | None:
-        """Return the gyro's turn since the previous line, `wheels` being the wheels', rad.
+    def forget_doubt(self) -> None:
+        """Forget the uncertainty of turns before now: a new pose was set."""
+        self.doubt = self.since_sample = self.since_change = 0.0
+        self.block = Compared()
+        self._forget_compared()
 
-        Return None if the wheels must provide it. After doubtful turns, the result is the wheels'
-        turn with a correction. `dt` is 0 after a gap, which the result covers. `still` says that
-        all wheels in use report zero.
-        """
-        self.events, self.owes = [], False
-        self._rest_s = self._rest_s + dt if still else 0.0
-        resting = self._rest_s > REST_S
-        told_ns = self._told_ns
-        self._take(at_ns, resting)
-        if self._told_ns != told_ns and not self._hole:
-            self._guessed, self._slipped_before = 0.0, self._slip_s > 0.0
-        ahead = SILENCE_TIMEOUT_NS if self._told_ns is None else at_ns - self._told_ns
-        age_ns = ahead
-        if self._heard and self._told_ns is not None:
-            # A sample that waits for the confirmation of its jump is not used, but not silent.
-            age_ns = min(age_ns, at_ns - self._heard[0][0])
-        # Samples that catch up after a silence have the rates of an earlier motion.
-        passed_ns = 0 if told_ns is None or self._told_ns is None else self._told_ns - told_ns
-        catches_up = self._does == "silent" and passed_ns > CATCH_UP_SPEED * dt * NS_PER_S
-        limit_ns = HOLE_PERIODS * self._period_s * NS_PER_S if catches_up else SILENCE_TIMEOUT_NS
-        silent = age_ns >= min(limit_ns, SILENCE_TIMEOUT_NS)
-        prediction = 0.0 if resting or silent else self._rate * max(0, ahead) / NS_PER_S
-        angle, variance = self._angle + prediction - self._given, self._variance
-        self._given, self._variance = self._angle + prediction, 0.0
-        # The samples that end a silence cover the same turn again, so the wheels also provide the
-        # turn of the next line.
-        lost, self._hole = silent or self._hole, silent
-        self._since_rest_s = 0.0 if resting else self._since_rest_s + dt
-        # The error of the bias is the same in each line, so it does not average out.
-        bias_variance = self._bias.variance + self._unsure
-        variance += 2.0 * bias_variance * self._since_rest_s * dt
-        tried = False if lost else self._try(wheels, angle, variance, dt, resting)
-        if not lost and self._bias.is_known and dt > 0.0 and not self._trial.open:
-            self._compare(wheels, angle, dt)
-        # While the robot rests, a rate that is only the bias counts as 0.
-        if resting and self._rested_s >= FROZEN_S and self._rate != 0.0:
-            self._frozen = True
-        self._judge(silent)
-        ratio = max(TURN_RATIO_RANGE[0], self._match.ratio)
-        noise = self._noise + self._bias.variance
-        if age_ns >= LOST_NS:
-            self._end_contradiction()
-        if lost or tried or self._does not in ("used", "disagrees", "waiting for turn"):
-            return self._doubted(ratio * wheels, dt, noise, lost)
-        self._sum_up(angle, ratio * wheels, dt)
-        rolled = angle / ratio
-        if not self._trial.open:
-            angle, variance = angle + self._owed, variance + self._owed_variance
-            self._forget_owed()
-        variance, self._doubt = variance + self._doubt, 0.0
-        return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
-
-    def drop_corrections(self) -> None:
-        """Drop pending corrections of the heading and its uncertainty: a new pose was set."""
-        self._contradicted = self._doubt = self._guessed = 0.0
-        self._forget_owed()
-        self._forget_repeated()
-
-    def _forget_owed(self) -> None:
-        # Pending correction, rad, for when the gyro is proven, and its variance, rad2.
-        self._owed = self._owed_variance = 0.0
-
-    def _forget_repeated(self) -> None:
-        # Since the rate changed, over lines with the gyro's turn: gyro's minus wheels' turn and
-        # wheels' turn, rad; squared turns in gaps, rad2.
-        self._repeated = self._repeated_wheels = self._repeated_gaps = 0.0
-
-    def undo_recomputation(self, turn: float) -> float:
-        """Return the angle to subtract from the heading after a recomputation without a wheel.
-
-        `turn` is its change in lines with `owes`, rad. A proven gyro has corrected the heading
-        already, so the result is `turn`. On trial, the pending correction changes by -`turn`. A
-        refuted gyro has none.
-        """
-        verdict = self._trial.verdict
-        if verdict == "none yet":
-            self._owed -= turn
-        return turn if verdict == "good" else 0.0
+    def _forget_compared(self) -> None:
+        self.straight, self.short, self.long = Compared(), Compared(), Compared()
 
     # Samples.
 
-    def _time_of(self, sample: GyroSample) -> int:
-        # A backlog gets the times of measurement, so the wheels provide the present turn.
-        last, self._last = self._last, sample
-        if last is None or sample.stamp_ns is None or last.stamp_ns is None:
-            return sample.at_ns
-        late = self._promptest.add(sample.at_ns - last.at_ns, sample.stamp_ns - last.stamp_ns)
-        was_set = self._is_late_for_good(late, sample.at_ns, last.at_ns)
-        if was_set or last.stamp_ns - sample.stamp_ns > MIN_SET_BACK_NS:
-            self._promptest, self._late_since = MinimumDelay(), None
-            return sample.at_ns
-        return sample.at_ns - max(0, int(late))
+    def add_samples(self, samples: tuple[GyroSample, ...]) -> None:
+        """Use samples in the order of arrival; one with `anew` (another gyro) begins anew."""
+        for sample in samples:
+            if sample.anew:
+                self._begin()
+            if not self._is_prompt(sample):
+                continue
+            self.heard_ns = sample.at_ns
+            last, jumped, self.jumped = self.last, self.jumped, None
+            if last is not None and jumped is not None:
+                jump = jumped.rate - last.rate
+                if (sample.rate - last.rate) / jump >= CONFIRMED:
+                    self._use(jumped)
+                    last = jumped
+            if last is not None and abs(sample.rate - last.rate) > MAX_JUMP:
+                self.jumped = sample
+            else:
+                self._use(sample)
 
-    def _is_late_for_good(self, late: float, at_ns: Ns, last_at_ns: Ns) -> bool:
-        if late <= MAX_EXTRA_DELAY_NS:
-            self._late_since = None
+    def _begin(self) -> None:
+        new = Gyro(self.does, self.reported, used=self.used, doubt=self.doubt)
+        new.given = new.turned = self.given
+        for name in self.__struct_fields__:
+            setattr(self, name, getattr(new, name))
+
+    def _is_prompt(self, sample: GyroSample) -> bool:
+        newest, self.newest, stamp_ns, at_ns = self.newest, sample, sample.stamp_ns, sample.at_ns
+        self.newest_ns = at_ns
+        if stamp_ns is None or newest is None or newest.stamp_ns is None or self.least_ns is None:
+            self.least_ns = None if stamp_ns is None else at_ns - stamp_ns
+            return True
+        delay_ns, passed_ns = at_ns - stamp_ns, at_ns - newest.at_ns
+        back_ns = newest.stamp_ns - stamp_ns
+        if 0 < back_ns <= MAX_SWAPPED_NS:
             return False
-        since_ns, first = self._late_since or (at_ns, late)
-        if late < first - MAX_DELAY_FALL_NS or at_ns - last_at_ns >= SILENCE_TIMEOUT_NS:
-            since_ns, first = at_ns, late
-        self._late_since = since_ns, first
-        return at_ns - since_ns >= STEADY_DELAY_NS
+        self.least_ns = min(delay_ns, self.least_ns + int(MAX_RISE * passed_ns))
+        # After a silence, the wheels have measured what a backlog of samples says.
+        silent = self.heard_ns is None or at_ns - self.heard_ns >= SILENCE_TIMEOUT_NS
+        limit_ns = MAX_DELAY_S * NS_PER_S if silent else MAX_EXTRA_DELAY_NS
+        if delay_ns - self.least_ns > limit_ns and back_ns <= 0:
+            falls = delay_ns < self.late_ns - MAX_DELAY_FALL_NS
+            if self.late_since_ns is None or falls or passed_ns >= SILENCE_TIMEOUT_NS:
+                self.late_since_ns, self.late_ns = at_ns, delay_ns
+            if at_ns - self.late_since_ns < CLOCK_SET_NS:
+                return False
+            back_ns = MAX_DELAY_FALL_NS
+        if back_ns > 0:  # the clock was set
+            self.least_ns = delay_ns
+        self.newest_ns, self.late_since_ns = at_ns + self.least_ns - delay_ns, None
+        return True
 
-    def _take(self, until_ns: Ns, resting: bool) -> None:
-        bias, samples = self._bias, self._heard
-        while samples and samples[0][0] <= until_ns:
-            jump = 0.0 if self._reading is None else samples[0][1].rate - self._reading
-            if abs(jump) > MAX_JUMP:
-                if len(samples) == 1:
-                    break
-                remaining = jump + samples[1][1].rate - samples[0][1].rate
-                if remaining / jump < CONFIRMED_FRACTION:
-                    samples.popleft()
-                    continue
-            time_ns, sample = samples.popleft()
-            span_ns = SILENCE_TIMEOUT_NS if self._told_ns is None else time_ns - self._told_ns
-            self._hole |= span_ns >= SILENCE_TIMEOUT_NS
-            self._told_ns = time_ns if self._told_ns is None else max(time_ns, self._told_ns)
-            passed = max(0, span_ns) / NS_PER_S
-            span = passed if span_ns < SILENCE_TIMEOUT_NS else 0.0
-            self._repeated_s += span
-            same = sample.rate == self._reading
-            step = 0.0 if self._reading is None else sample.rate - self._reading
-            if not same:
-                self._end_repetition()
-                self._reading = sample.rate
-            self._repeats += same
-            bias.drift(passed)
-            new = abs(sample.rate - bias.value) < MAX_BIAS_STEP or sample.rate == self._suspect
-            learns = not self._frozen or (new and not self._hangs)
-            stands = resting and learns and bias.update_at_rest(sample.rate, sample.variance, span)
-            if stands:
-                self._unsure, self._rested_s, self._frozen = 0.0, 0.0, False
-                if not self._hangs:
-                    self._usual += 1
-                    self._usual_repeats += same
-            self._rate = 0.0 if stands else sample.rate - bias.value
-            self._rested_s += span if resting and same and not stands else 0.0
-            self._noise = max(bias.noise, sample.variance)
-            self._angle += self._rate * span
-            if not stands:
-                self._variance += self._noise * span * span
-                if span > HOLE_PERIODS * self._period_s > 0.0:
-                    # Samples are missing, so the rate may have changed at any time in this span.
-                    self._variance += step * step / 3.0 * span * span
-            self._period_s += PERIOD_GAIN * (span - self._period_s) if self._period_s else span
+    def _use(self, sample: GyroSample) -> None:
+        last, self.last, bias, self.sampled_ns = self.last, sample, self.bias, self.newest_ns
+        span = 0.0 if last is None else _span(last, sample)
+        if last is None or sample.at_ns - last.at_ns >= SILENCE_TIMEOUT_NS:
+            # The turn was assumed, or the wheels gave it.
+            rate, span = sample.rate - bias.value, 0.0
+            self.variance += ((rate - self.rate) * SILENCE_TIMEOUT_NS / NS_PER_S) ** 2 / 4
+            self.turned, self.rate = self.given, rate
+        if last is not None:
+            self._follow_repetition(sample.rate == last.rate, span)
+        bias.variance += BIAS_RANDOM_WALK * BIAS_RANDOM_WALK * span
+        stands = self.rest_s > REST_S and not self.hangs
+        was, is_new = bias.value, self.learn_again or not bias.is_known
+        if stands and self.learn_again:
+            bias.variance, self.learn_again = (MAX_BIAS / 4) ** 2, False
+        stands = stands and bias.follow(sample.rate, sample.variance, span)
+        if stands and not is_new and abs(bias.value - was) > VIBRATION:
+            # Nobody knows when the bias changed.
+            self.doubt += (bias.value - was) * self.since_rest_s
+        before, self.rate = self.rate, 0.0 if stands else sample.rate - bias.value
+        if self.repeated_s >= HANG_S and self.rest_s > REST_S and abs(self.rate) > MAX_BIAS:
+            self.hangs = True  # no person turns a robot so evenly
+        if stands:
+            self.since_rest_s = 0.0
+        step, noise = self.rate - before, max(bias.noise, sample.variance)
+        self.turned += (before + self.rate) / 2 * span
+        self.variance += (noise + step * step / 12) * span * span
+        self.since_sample = 0.0
 
-    @property
-    def _hangs(self) -> bool:
-        share = (self._usual_repeats + 1) / (self._usual + 1)
-        return share < MAX_REPEATING and share**self._repeats < MIN_CHANCE
+    def _follow_repetition(self, same: bool, span: Seconds) -> None:
+        if same:
+            self.repeats += 1
+            self.repeated_s += span
+            if self.repeated_s >= HANG_S:
+                share = (self.usual_repeats + 1) / (self.usual + 1)
+                self.hangs |= share < MAX_REPEATING and share**self.repeats < MIN_CHANCE
+            return
+        if self.rate == 0.0 and not self.hangs:
+            self.usual += 1 + self.repeats
+            self.usual_repeats += self.repeats
+        self.repeats, self.repeated_s, self.hangs, self.since_change = 0, 0.0, False, 0.0
 
-    def _end_repetition(self) -> None:
-        # A gyro without noise also repeats its rate in an even turn with slipping wheels. Then the
-        # repetition begins with the slip, and the wheels turn more than the robot.
-        gyro = self._repeated + self._repeated_wheels
-        before = self._repeated_s >= self._slipped_s + SLIP_S
-        hung = before or self._hangs or abs(gyro) > abs(self._repeated_wheels)
-        # At the start of a turn, a slow gyro contradicts the wheels for a shorter time.
-        if hung and self._repeated_s >= FROZEN_S and self._slipped_s >= SLIP_S:
-            self._end_contradiction()
-        suspect = self._reading if self._frozen and not self._hangs else None
-        if suspect is not None and abs(suspect) <= MAX_BIAS:
-            # Perhaps the gyro did not hang, but its bias has changed.
-            off = suspect - self._bias.value
-            self._unsure, self._suspect = off * off, suspect
-        self._drop_waiting_correction()
-        self._repeated_s, self._rested_s, self._repeats, self._frozen = 0.0, 0.0, 0, False
-        self._forget_repeated()
+    # Lines.
 
-    def _drop_waiting_correction(self) -> None:
-        # It waits if the line that showed the hanging gyro covers no known time.
-        if self._frozen:
-            self._doubt += self._repeated * self._repeated + self._repeated_gaps
+    def turn(
+        self, at_ns: Ns, dt: Seconds, wheels: Rad, way: Metres, idle: bool, claims: Claims
+    ) -> Turn | None:
+        """Return the turn since the previous line, or None if the wheels must provide it.
+
+        `wheels` and `way` are the wheels' turn and distance; `dt` is 0 after a gap, in which they
+        are not known. `idle`: rest was commanded since the previous line.
+        """
+        self._follow_rest(dt, wheels, way, idle, claims)
+        last, heard_ns = self.last, self.heard_ns
+        silent = last is None or heard_ns is None or at_ns - heard_ns >= SILENCE_TIMEOUT_NS
+        ahead_ns = 0 if last is None else min(at_ns - self.sampled_ns, SILENCE_TIMEOUT_NS)
+        total = self.turned + self.rate * ahead_ns / NS_PER_S
+        angle, self.given = total - self.given, total
+        known = self.bias.is_known
+        if dt > 0.0 and not (silent or self.hangs):
+            block = self.block
+            block.wheels += wheels
+            block.gyro += angle
+            block.way += abs(way)
+            block.seconds += dt
+            off = block.gyro - block.wheels
+            if block.seconds >= BLOCK_S * 0.95 or abs(off) > MAX_BLOCK:
+                self.block = Compared()
+                if self.verdict == "good":
+                    self._compare(block, claims)
+                else:
+                    self._try(block, known)
+        if self.disagrees_s > 0.0 and self.rest_s <= REST_S:
+            self.disagrees_s = max(0.0, self.disagrees_s - dt)
+        self._judge(silent, known)
+        if self.does not in ("used", "disagrees"):
+            return self._wheels(dt, wheels, claims)
+        if not self.used and dt > 0.0:
+            # The first samples may be of the time before, in which the wheels gave the turn.
+            self.used, self.variance = True, (MAX_DELAY_S * self.rate) ** 2
+            return None
+        self.used = True
+        if dt > 0.0:
+            self.since_sample += angle - wheels
+            self.since_change += angle - wheels
+        # The error of the bias is the same in each line.
+        variance = self.variance + 2.0 * self.bias.variance * self.since_rest_s * dt
+        rate_variance, disagrees = self.bias.noise + self.bias.variance, self.disagrees_s > 0.0
+        if disagrees and dt > 0.0:
+            rate_variance += ((angle - wheels) / dt) ** 2
+        doubt, self.doubt, self.variance = self.doubt, 0.0, 0.0
+        trusted = None if disagrees else angle
+        return Turn(angle, variance, self.rate, rate_variance, trusted, disagrees, doubt)
+
+    def _wheels(self, dt: Seconds, wheels: Rad, claims: Claims) -> Turn | None:
+        self.variance = 0.0
+        if dt <= 0.0 or not (self.used or self.doubt):
+            return None
+        # The gyro has given the turn since its last good sample, and the wheels measured it.
+        off = 0.0
+        if self.used:
+            off = self.since_change if self.hangs else self.since_sample
+        self.used, self.since_sample, self.since_change = False, 0.0, 0.0
+        doubt, self.doubt = self.doubt, 0.0
+        if not (off or doubt):
+            return None
+        variance = claims.per_radian * abs(off) + claims.per_radian * abs(wheels)
+        return Turn(wheels - off, variance, wheels / dt, MARGIN**2, doubt=doubt)
+
+    def _follow_rest(
+        self, dt: Seconds, wheels: Rad, way: Metres, idle: bool, claims: Claims
+    ) -> None:
+        self.rest_turn += wheels
+        self.rest_way += way
+        self.rest_s += dt
+        self.since_rest_s += dt
+        moved = abs(self.rest_way) + claims.half_track * abs(self.rest_turn)
+        if not idle or moved > claims.rest:
+            self.rest_s = self.rest_turn = self.rest_way = 0.0
+
+    def _judge(self, silent: bool, known: bool) -> None:
+        verdict = self.verdict
+        if verdict != "none yet" and verdict != "good":
+            self.does = verdict
+        elif silent:
+            self.does = "silent"
+        elif self.hangs:
+            self.does = "hangs"
+        elif not known:
+            self.does = "waiting for rest"
+        elif verdict == "none yet":
+            self.does = "waiting for turn"
+        else:
+            self.does = "disagrees" if self.disagrees_s > 0.0 else "used"
 
     # Comparison with the wheels.
 
-    def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
-        # At rest the gyro provides the turn, because a person may turn the robot.
-        trial, known = self._trial, self._bias.is_known
-        if not trial.open or resting:
-            return False
-        if dt > 0.0:
-            trial.add(wheels, angle, dt, known)
-        if not trial.open:
-            return False
-        if known and trial.verdict == "none yet":
-            self._owed += angle - wheels
-            self._owed_variance += variance
-            self.owes = True
+    def _try(self, block: Compared, known: bool) -> None:
+        trial = self.short
+        if abs(block.wheels) < MIN_TURN_RATE * block.seconds or block.wheels * trial.wheels < 0.0:
+            # On a straight, and as the robot begins to turn to the other side, the trial restarts.
+            self.short = Compared()
+            return
+        trial.add(block, 1.0)
+        ratio = trial.gyro / trial.wheels
+        if MIN_RATIO <= ratio <= MAX_RATIO:
+            if known and trial.turned >= PROVING_TURN:
+                self.verdict, self.against, self.against_gyro = "good", 0.0, 0.0
+        elif trial.turned >= REFUTING_TURN:
+            verdict, self.short = _named(ratio), Compared()
+            if known or verdict == "in degrees":
+                self.verdict = verdict
+
+    def _compare(self, block: Compared, claims: Claims) -> None:
+        if self.rest_s > REST_S and abs(block.gyro) >= MAX_BIAS * block.seconds:
+            return  # a person turns the robot, which the wheels do not measure
+        turned = abs(block.wheels)
+        if turned < MIN_TURN_RATE * block.seconds:
+            compared, lag = self.straight, 0.0
+            compared.add(block, math.exp(-block.seconds / STRAIGHT_MEMORY_S))
         else:
-            self._forget_owed()
-        return True
+            compared, lag = self.long, MAX_DELAY_S * turned / block.seconds
+            compared.add(block, math.exp(-turned / TURN_MEMORY))
+            self.short.add(block, 1.0)
+            off, std = self._difference(self.short, claims)
+            if off <= AGREES * std:
+                self.short = Compared()
+            elif off > DEVIATIONS * std + lag:
+                compared = self.short
+        off, std = self._difference(compared, claims)
+        contradiction = off > DEVIATIONS * std + lag
+        if self.disagrees_s > 0.0:
+            self.doubt += block.gyro - block.wheels
+            self._weigh(block)
+        elif contradiction:
+            self.doubt += compared.gyro - compared.wheels
+            self.against = self.against_gyro = 0.0
+        if contradiction:
+            self.disagrees_s, self.learn_again = DISAGREES_S, True
+            self._forget_compared()
 
-    def _compare(self, wheels: float, angle: float, dt: float) -> None:
-        self._match.add(wheels, angle, dt, self._slip_s > 0.0)
-        noise = 2.0 * self._bias.variance * WINDOW_S * WINDOW_S + self._bias.noise * WINDOW_S * dt
-        if self._match.contradiction(noise):
-            self._slip_s = SLIP_S
-        else:
-            self._slip_s = max(0.0, self._slip_s - dt)
-        self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
+    def _difference(self, compared: Compared, claims: Claims) -> tuple[Rad, Rad]:
+        # Returns the size of the difference of the turns, and the deviation that both claim.
+        variance = (
+            MARGIN**2
+            + claims.per_metre * compared.way
+            + claims.per_radian * compared.turned
+            + (claims.scale * compared.wheels) ** 2
+            + self.bias.variance * compared.seconds**2
+        )
+        return abs(compared.gyro - compared.wheels), math.sqrt(variance)
 
-    def _sum_up(self, angle: float, wheels: float, dt: float) -> None:
-        # `dt` is 0 after a gap, which only the gyro has measured.
-        off = angle - wheels
-        self._repeated_gaps += 0.0 if dt > 0.0 else angle * angle
-        self._repeated += off
-        self._repeated_wheels += wheels
-        self._guessed += off
-        self._contradicted = self._contradicted + off if self._slip_s > 0.0 else 0.0
+    def _weigh(self, block: Compared) -> None:
+        opposite = block.gyro * block.wheels < 0.0 and abs(block.wheels) > MIN_TURN_RATE * BLOCK_S
+        self.against += abs(block.wheels)
+        self.against_gyro += -abs(block.gyro) if opposite else abs(block.gyro)
+        against, gyro = self.against, self.against_gyro
+        if MIN_RATIO * against <= gyro <= MAX_RATIO * against:
+            return
+        dead = abs(gyro) < MIN_RATIO * against
+        if against >= DEAD_TURN if dead else max(against, abs(gyro) / MAX_RATIO) >= REFUTING_TURN:
+            self.verdict = _named(gyro / against if against else math.inf)
+            self._forget_compared()
 
-    def _end_contradiction(self) -> None:
-        # Nobody can tell whether gyro or wheels were right.
-        self._doubt += self._contradicted * self._contradicted
-        self._contradicted = 0.0
 
-    def _doubted(self, wheels: float, dt: float, noise: float, lost: bool) -> Turn | None:
-        # The wheels' turn with a correction, and the uncertainty of earlier turns.
-        if dt <= 0.0:
-            # This line gives no turn, so a correction for a gyro that hangs waits for the next one.
-            if not lost and not self._frozen:
-                self._end_contradiction()
-            return None
-        angle = 0.0
-        if lost:
-            # The wheels also give the turn since the sample before, unless they slipped then.
-            self._doubt += self._guessed * self._guessed
-            if not self._slipped_before:
-                angle, self._contradicted, self._slip_s = -self._guessed, 0.0, 0.0
-            self._guessed = 0.0
-        if self._frozen:
-            # The wheels give the turn since the gyro hangs, except in a gap of the feedback.
-            angle, self._contradicted = -self._repeated, 0.0
-            deviation = self._match.deviation * self._repeated_wheels
-            self._doubt += deviation * deviation + self._repeated_gaps
-            self._forget_repeated()
-        if not lost:
-            self._end_contradiction()
-        if angle == 0.0 and self._doubt == 0.0:
-            return None
-        variance, self._doubt = self._doubt, 0.0
-        return Turn(wheels + angle, variance, wheels / dt, noise)
+def _span(last: GyroSample, sample: GyroSample) -> Seconds:
+    # By stamps, if they advance: arrivals jitter.
+    if sample.stamp_ns is not None and last.stamp_ns is not None:
+        span_ns = sample.stamp_ns - last.stamp_ns
+        if 0 < span_ns < SILENCE_TIMEOUT_NS:
+            return span_ns / NS_PER_S
+    span_ns = sample.at_ns - last.at_ns
+    return span_ns / NS_PER_S if span_ns < SILENCE_TIMEOUT_NS else 0.0
 
-    def _judge(self, silent: bool) -> None:
-        match, before, verdict = self._match, self._does, self._trial.verdict
-        least, most = TURN_RATIO_RANGE
-        wrong = match.blocks >= TRUSTED_BLOCKS and not least <= match.ratio <= most
-        if verdict != "none yet" and verdict != "good":
-            self._does = verdict
-        elif silent:
-            self._does = "silent"
-        elif not self._bias.is_known:
-            self._does = "waiting for rest"
-        elif wrong or self._frozen or self._slipped_s > MAX_SLIP_S:
-            self._does = "not believed"
-        elif self._trial.open:
-            self._does = "waiting for turn"
-        else:
-            self._does = "disagrees" if self._slip_s > 0.0 else "used"
-        # The text of "waiting for turn" announces the change to "used", so no event reports it.
-        if self._does != before and (before, self._does) != ("waiting for turn", "used"):
-            good = self._does in ("used", "waiting for rest", "waiting for turn")
-            level: Level = "info" if good else "warning"
-            self.events.append(Event("gyro", STATUS_TEXTS[self._does], level, kind=self._does))
+
+def _named(ratio: float) -> Verdict:
+    if MIN_DEGREES_RATIO <= abs(ratio) <= MAX_DEGREES_RATIO:
+        return "in degrees"
+    if -MAX_RATIO <= ratio <= -MIN_RATIO:
+        return "reversed"
+    return "dead" if abs(ratio) < MIN_RATIO else "not believed"

@@ -56,10 +56,10 @@ Vector = tuple[float, float, float]  # x, y (m) and yaw (rad) of an error
 Effect = tuple[float, float, float, float]
 
 # Causes of an error that do not average out. The motion that the pose may have missed is that of
-# gaps, and of wheels of a side that are in doubt.
-Missed = Literal["gap", "left", "right"]
+# gaps, of wheels of a side that are in doubt, and the difference of the turns by gyro and wheels.
+Missed = Literal["gap", "left", "right", "gyro"]
 RATIO, TRACK, SCALE, GYRO = PARAMETERS = range(4)
-MISSED: dict[Missed, int] = {"gap": 4, "left": 5, "right": 6}
+MISSED: dict[Missed, int] = {"gap": 4, "left": 5, "right": 6, "gyro": 7}
 CAUSES = len(PARAMETERS) + len(MISSED)
 
 

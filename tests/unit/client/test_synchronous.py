@@ -446,7 +446,7 @@ def test_an_imu_message_is_decoded_from_every_form(form: Format) -> None:
 def test_an_imu_message_needs_only_the_angular_velocity_as_for_the_daemon(payload: bytes) -> None:
     arrival = Arrival("imu", True, payload, "", 0, None, "")
     message = decoder("imu").decode("", payload)
-    assert message.angular_velocity.z == reading(arrival).rate == 0.5
+    assert message.angular_velocity.z == reading(arrival)[0].rate == 0.5
     assert message.angular_velocity_covariance == UNKNOWN
 
 

@@ -57,12 +57,13 @@ def turning(rate: float, at_ns: int = 7, sender: str = "imu") -> Arrival:
 @each("form", FORMATS)
 def test_an_imu_is_read_in_every_encoding(form: Format, named: bool) -> None:
     encoding = encoding_name(form, "Imu") if named else ""
-    sample = reading(arrival(encode(FULL, form), encoding))
+    sample, frame = reading(arrival(encode(FULL, form), encoding))
+    assert frame == "imu_link"
     assert sample == GyroSample(7, 12_000_000_005, 0.75, 4e-4)
 
 
 def test_in_json_only_the_angular_velocity_is_required() -> None:
-    assert reading(turning(-0.5)) == GyroSample(7, None, -0.5, 0.0)
+    assert reading(turning(-0.5)) == (GyroSample(7, None, -0.5, 0.0), "")
 
 
 @given(st.binary(max_size=400))
@@ -76,7 +77,7 @@ def test_any_payload_is_a_sample_or_is_counted_as_refused(payload: bytes) -> Non
 def test_a_turn_rate_beyond_the_maximum_is_refused(rate: float) -> None:
     imu = Imu(Header(), Quaternion(), ZEROS, Vector3(z=rate), ZEROS, Vector3(), ZEROS)
     if abs(rate) <= MAX_RATE:
-        assert reading(arrival(encode(imu, "cdr"))).rate == rate
+        assert reading(arrival(encode(imu, "cdr")))[0].rate == rate
         return
     with pytest.raises(DecodeError) as refused:
         reading(arrival(encode(imu, "cdr")))
@@ -136,6 +137,25 @@ def test_the_first_of_two_gyros_is_followed_until_it_is_silent() -> None:
     assert daemon.counters == {"imu_second_sender": 2}
     assert daemon.hears(0.2, 2 * SILENCE_TIMEOUT_NS, "other")
     assert not daemon.hears(0.1, 2 * SILENCE_TIMEOUT_NS + 1, "one")
+
+
+def test_two_frames_of_senders_without_a_name_are_two_gyros() -> None:
+    gyro, counters, events = GyroFollower(), Counter[str](), list[Event]()
+    used = [
+        gyro.receive(
+            imu_message(at_ns, "", header={"frame_id": frame}, angular_velocity={"z": 0.1}),
+            counters,
+            events,
+        )
+        is not None
+        for at_ns, frame in enumerate(("imu_link", "lidar_imu", "imu_link"))
+    ]
+    assert used == [True, False, True]
+    assert counters == {"imu_second_sender": 1}
+    assert events[0].text == (
+        "a sender without a name (frame lidar_imu) sends gyro samples, but the daemon already uses "
+        "those of a sender without a name (frame imu_link): end one of the two programs"
+    )
 
 
 def test_the_first_sample_of_another_gyro_is_marked_as_new() -> None:

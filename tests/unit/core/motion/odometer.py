@@ -37,7 +37,7 @@ class Odometer:
 
     def set_pose(self, pose: Pose) -> None:
         self.odometry.set_pose(pose, self.model)
-        self.checks.drop_corrections()
+        self.checks.forget_doubt()
 
 
 def arc(pose: Pose, distance: float, turn: float) -> Pose:

@@ -35,6 +35,6 @@ def test_the_true_pose_is_not_in_a_frame_of_the_odometry() -> None:
 @pytest.mark.parametrize("form", FORMATS)
 def test_a_sample_of_the_simulated_gyro_is_read_like_one_of_any_gyro(form: Format) -> None:
     message = turn_rate(SIGHT, "base_link", WALL_NS)
-    sample = reading(Arrival("imu", True, encode(message, form), "", 7, None, ""))
+    sample, _ = reading(Arrival("imu", True, encode(message, form), "", 7, None, ""))
     assert (sample.at_ns, sample.stamp_ns, sample.rate) == (7, WALL_NS, 0.25)
     assert message.orientation_covariance[0] == message.linear_acceleration_covariance[0] == -1.0
