@@ -50,7 +50,7 @@ Inside `core/`, in the same order:
     core/incoming/   input from the bus: turns samples into commands, and answers queries
     core/ros/        the two ROS transports: names, hashes, tokens, attachments, parameters
     core/messages/   the published structs, the table of keys, encodings, reports, schemas
-    core/motion/     kinematics, odometry, consistency checks, arbiter, freshness, limits, modes
+    core/motion/     kinematics, odometry, consistency checks, arbiter, ages, limits, modes
     core/link/       the serial line: codec, checksum, question, sample times, link state
     core/config/     turns acsard.toml into one frozen Config, or into errors that name the key
                      and the remedy

@@ -475,8 +475,6 @@ COMMANDS: dict[str, How] = {
     "ros2 param set /acsard limits.linear_speed 0.8": NO_ROS,
     "ros2 run teleop_twist_keyboard teleop_twist_keyboard --ros-args "
     "-r cmd_vel:=cmd_vel_teleop": NO_ROS,
-    "ros2 topic pub -r 10 -t 10 /cmd_vel_nav geometry_msgs/msg/Twist": NO_ROS,
-    "ros2 topic pub -r 10 -t 10 /cmd_vel geometry_msgs/msg/Twist": NO_ROS,
     'ros2 topic pub --once /speed_limit nav2_msgs/msg/SpeedLimit "{speed_limit: 0.0}"': NO_ROS,
     "ros2 run diagnostic_aggregator aggregator_node --ros-args "
     "--params-file deploy/ros2/diagnostics.yaml": NO_ROS,

@@ -14,10 +14,17 @@ from typing import Literal, get_args
 from msgspec import Struct
 from msgspec.structs import replace
 
+# For which `core/motion/ages.py` refuses a command.
+AgeCode = Literal[
+    "no_echo", "other_run", "from_future", "too_old", "round_trip", "not_newer", "stalled",
+    "unproven", "early", "stale", "set_back", "stamps",
+]  # fmt: skip
+
+ObjectionCode = Literal["unknown_source", "not_finite", "too_many_senders"]
+
 # Conditions that a command source waits for (`values.Wait`)
 WaitCode = Literal[
-    "nothing", "command", "proof", "late", "stalled", "neutral", "zeros", "higher", "equal",
-    "senders",
+    "nothing", "command", AgeCode, "neutral", "zeros", "higher", "equal", "senders",
 ]  # fmt: skip
 
 # States of the link.
@@ -59,7 +66,7 @@ StateCode = Literal[
 
 # Reasons for which a message of a client is refused.
 RefusalCode = Literal[
-    "unknown_source", "not_finite", "too_many_senders", "unproven", "stale", "malformed",
+    ObjectionCode, AgeCode, "malformed",
     "wrong_shape", "wrong_wheels", "unknown_encoding", "too_big", "not_a_put", "wildcard",
     "displaced", "other_certificate", "second_sender", "no_rate", "out_of_range", "no_attachment",
     "bad_attachment", "bad_echo", "unknown_format",
@@ -79,13 +86,42 @@ no_command
 nothing
 command
     a command
-proof
-    {source} is new: the robot follows it when its commands have arrived with steady delays for
-    {seconds:g} s
-late
-    commands of {source} arrive more than {seconds:g} s too late: the network delays them, or the
-    sender's clock was set;
-    -> if this goes on, check the network, then restart the sender
+no_echo
+    a command of {source} has no echo although its sender has echoed before;
+    -> copy the newest message of the key beat into each command
+other_run
+    commands of {source} echo a beat of another run of the daemon;
+    -> copy the newest message of the key beat into each command
+from_future
+    commands of {source} echo a beat that the daemon has not published yet;
+    -> copy the message of the key beat unchanged
+too_old
+    a command of {source} came {note} s after the beat that it echoes, but at most {seconds:g} s
+    count: the network delays it
+round_trip
+    the round trip to {source} takes {note} s, but its timeout allows at most {seconds:g} s;
+    -> raise the timeout of the source in commands.sources, or look for what delays the network
+not_newer
+    a command of {source} is not newer than the last accepted one of its sender: the network
+    repeated or swapped commands, or the sender's stamps or numbers do not rise
+unproven
+    {source} is new: the robot follows it when the delays of its commands have not fallen for
+    {seconds:g} s; this is not an error
+early
+    commands of {source} arrive earlier than ever before, by their stamps: the robot follows it when
+    this has lasted for {seconds:g} s
+stale
+    commands of {source} arrive more than {seconds:g} s later than its earliest ones, by their
+    stamps: the network delays them;
+    -> if this goes on, check the network
+set_back
+    commands of {source} arrive {seconds:g} s later than its earliest ones, by their stamps: the
+    sender's clock was set back, or its commands wait in a queue;
+    -> if the clock was set, restart the sender or call srv/activate; otherwise check the network
+stamps
+    the stamps of {source} do not advance with time ({note});
+    -> is use_sim_time on, or are the stamps copied from another message? Send the time of the
+    command, or no stamp
 stalled
     the daemon stalled: waiting for the next command of {source}
 neutral
@@ -252,14 +288,8 @@ unknown_source
 not_finite
     the command contains NaN or infinity
 too_many_senders
-    {most} other senders of this source are active;
+    {seconds:g} other senders of this source are active;
     -> end one first
-unproven
-    this sender is new: the robot follows a sender only after the sender's commands have arrived
-    with steady delays; this is not an error
-stale
-    the command is older than the source's timeout allows, or older than one that the robot has
-    already accepted: the network delayed it, or the sender's clock was set
 malformed
     the payload is not valid JSON, msgpack or CDR
 wrong_shape

@@ -11,12 +11,12 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import assert_never
+from typing import assert_never, cast
 
 from msgspec.structs import replace
 
 from acsard.core.board_inputs import inputs_after
-from acsard.core.codes import Reason, reason
+from acsard.core.codes import Reason, RefusalCode, reason
 from acsard.core.config.live import Changes, changed, describe_changes
 from acsard.core.config.motion_rules import longest_reply
 from acsard.core.config.parsing import ConfigError
@@ -27,7 +27,7 @@ from acsard.core.link.link_diagnosis import UnansweredLines
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
-from acsard.core.motion.arbiter_text import OBJECTIONS, CommandEvents, missed, refused, waiting
+from acsard.core.motion.arbiter_text import CommandEvents, missed, refused, waiting
 from acsard.core.motion.battery import empty_reason
 from acsard.core.motion.consistency import ConsistencyChecks
 from acsard.core.motion.emergency_stop import DRIVER_FAULT_REASON
@@ -80,8 +80,6 @@ UNLATCHED = (Mode.DRIVING, Mode.READY)  # their reason depends only on the choic
 
 QUIET = News()
 
-NS_PER_MS = 1_000_000
-
 NOTHING_CHANGED = "nothing changed: all settings already have these values"
 
 MAX_REFUSAL_LENGTH = 200  # characters in `state`: the text may quote the message of a client
@@ -98,7 +96,7 @@ class Robot:
         self._odometry = Odometry.initial(self._errors)
         counts = config.mcu.encoder_counts
         self._checks = ConsistencyChecks(config.odometry, self._kinematics, counts, config.feedback)
-        self._arbiter = Arbiter(config.commands)
+        self._arbiter = Arbiter()
         self._cap = SpeedCap(None)
         self._life = Lifecycle(latches)
         self._announced: tuple[Event, ...] = ()  # for the next `hear`
@@ -135,8 +133,6 @@ class Robot:
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
         if session.count_recovery.coarse_lines:
             counters["coarse_encoder_lines"] = session.count_recovery.coarse_lines
-        if self._arbiter.clock_adjustment_ns:
-            counters["clock_adjustments_ms"] = self._arbiter.clock_adjustment_ns // NS_PER_MS
         checks = self._checks
         latch = self._life.latches.in_force
         return Snapshot(
@@ -146,7 +142,7 @@ class Robot:
             pose=self._odometry.pose,
             measured=None if silent else self._odometry.twist,
             speeds=None if silent else self._odometry.speeds,
-            sources=self._arbiter.sources(now_ns),
+            sources=self._arbiter.status(now_ns, self.config.commands),
             counters=counters | self.counters,
             refused=refused,
             refused_age_s=None if since_ns is None else (now_ns - since_ns) / NS_PER_S,
@@ -166,7 +162,7 @@ class Robot:
 
     def waits(self, now_ns: Ns) -> dict[str, Reason]:
         """Return what each source that sends, but does not drive, waits for."""
-        sources = self._arbiter.sources(now_ns)
+        sources = self._arbiter.status(now_ns, self.config.commands)
         return {
             source.name: waiting(source.waits_for)
             for source in sources
@@ -202,7 +198,7 @@ class Robot:
         """Process what arrived since the last call, and return what is to be published."""
         now_ns, life = now.mono_ns, self._life
         events, self._announced = [*heard.events, *self._announced], ()
-        if self._arbiter.begin(now_ns):
+        if self._arbiter.begin(now_ns, self.config.commands):
             life.begin(now, stalled=True)
         if heard.missed:
             self.counters["missed_periods"] += heard.missed
@@ -213,6 +209,8 @@ class Robot:
             answers = self._serve(now, heard, events)
         if heard.speed_cap is not None:
             self._cap_speed(heard.speed_cap, events)
+        if life.mode not in UNLATCHED:
+            self._arbiter.watched_ns = now_ns
         if heard.commands or heard.refusals:
             self._accept_commands(now_ns, heard, events)
         is_chosen = now_ns >= self._arbiter.until_ns
@@ -376,7 +374,7 @@ class Robot:
         life.refuse_clear(inputs.clear_refusal(self.session, config), now_ns)
 
     def _choose(self, now_ns: Ns) -> None:
-        self._choice = self._arbiter.choose(now_ns)
+        self._choice = self._arbiter.choose(now_ns, self.config.commands)
         if self._inputs.bumpers.limiting(self.config.safety):
             self._limit_by_bumpers(now_ns)
         self._life.command(self._choice.twist is not None)
@@ -391,7 +389,7 @@ class Robot:
         if away is None:
             self._arbiter.require_neutral(now_ns)
             # `require_neutral` has discarded all commands, so the new choice has no twist.
-            self._choice = self._arbiter.choose(now_ns)
+            self._choice = self._arbiter.choose(now_ns, self.config.commands)
         elif away != twist:
             self._choice = replace(self._choice, twist=away)
 
@@ -489,8 +487,9 @@ class Robot:
                 self._arbiter.require_neutral(asked_ns)
                 return released
             case "activate":
-                if life.activate(request.latch, asked_ns, now):
-                    self._arbiter.require_neutral(asked_ns)
+                life.activate(request.latch, asked_ns, now)
+                self._arbiter.forget_clocks()
+                self._arbiter.require_neutral(asked_ns)
                 return "active"
             case "deactivate":
                 return life.deactivate(request.by, now)
@@ -524,7 +523,6 @@ class Robot:
             raise RefusedError(str(error)) from None
         self._errors = self._error_model()
         if self.config.commands != before.commands:
-            self._arbiter.use(self.config.commands)
             self._arbiter.require_neutral(now_ns)
         return changes
 
@@ -552,10 +550,12 @@ class Robot:
                 continue
             if message.stamp_replaced:
                 self.counters["stamps_replaced"] += 1
-            code = self._arbiter.accept(message)
-            if code:
-                text = f"source {message.source}: {OBJECTIONS[code]}"
-                self._refuse(Refusal(code, text, message.source, message.sender), now_ns, events)
+            why = self._arbiter.accept(message, self.config.commands)
+            if why is not None:
+                text = f"source {message.source}: {waiting(why).text}"
+                code = cast("RefusalCode", why.what)
+                refusal = Refusal(code, text, message.source, message.sender)
+                self._refuse(refusal, now_ns, events)
             else:
                 self.counters["commands"] += 1
 

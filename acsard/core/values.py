@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
-from acsard.core.codes import Code, GuardCode, Reason, RefusalCode, WaitCode
+from acsard.core.codes import Code, GuardCode, ObjectionCode, Reason, RefusalCode, WaitCode
 
 # The order of every value with one item per wheel.
 WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
@@ -139,7 +139,6 @@ class Command(Struct, frozen=True, omit_defaults=True):
     shared: bool = False
     ros: bool = False  # some ROS tools never send a zero, which a text about one mentions
     stamp_replaced: bool = False  # by Zenoh, because the sender's clock is ahead of the daemon's
-    steady: bool = False  # the sender declares that its clock is never adjusted
     echo: Echo | None = None
     # At `arrived_ns`, the time since the echoed beat; below 0 for a beat from the future. None
     # without an echo, and for one of another run.
@@ -258,14 +257,13 @@ class Wait(Struct, frozen=True):
     - nothing, command: it need not wait; it must send a command.
     - neutral: the source must send a zero and, if its sender's identity may be shared, then no
       speed for `seconds`.
-    - proof, late: the delays of the source must be steady for `seconds`; they are above `seconds`.
-    - stalled: the source has sent no command since the last host stall.
+    - an `AgeCode`: the last command of the source was refused; `seconds` and `kept` are figures.
     - zeros: the source controls the robot, but sends only zeros.
     - higher, equal: the source controls the robot with a higher or an equal priority.
     - senders: some senders of the same source must wait.
     """
 
-    what: WaitCode
+    what: WaitCode | ObjectionCode
     source: str = ""
     seconds: float = 0.0
     senders: int = 0  # that wait while another one of the same source drives
@@ -273,6 +271,7 @@ class Wait(Struct, frozen=True):
     # a few values, so that the text seldom changes.
     lasts: float = 0.0
     # Source, or "another sender of NAME", whose speeds have no effect against zeros of `source`.
+    # Of an `AgeCode`: a figure in words.
     kept: str = ""
     ros: bool = False  # the sender that must send a zero uses ROS
     shared: bool = False  # several programs may share its identity

@@ -25,7 +25,7 @@ from acsard.core.config.settings import Config
 from acsard.core.formatting import printable
 from acsard.core.guard import Memory
 from acsard.core.link.link_diagnosis import UnansweredLines
-from acsard.core.motion.arbiter import Choice
+from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import CommandEvents
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.last_line import LastLine
@@ -42,6 +42,7 @@ PARTS: dict[str, Any] = {
     "_last": LastLine,
     "_cap": SpeedCap,
     "_choice": Choice,
+    "_arbiter": Arbiter,
     "_announced": tuple[Event, ...],
     "status": Status,
     "_refused": tuple[str, Ns] | None,

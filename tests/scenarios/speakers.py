@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections import deque
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import msgspec
 
@@ -19,13 +19,22 @@ from tests.stepped import Outputs
 
 Way = Literal["client", "signed", "rmw", "header", "zenoh", "routed", "plain", "bridge"]
 FOREIGN: tuple[Way, ...] = ("signed", "rmw", "header", "zenoh")
-"""Routes on which messages have wall-clock stamps. Our own client stamps by a steady clock."""
+"""Routes on which messages have stamps of a wall clock. Our own client echoes a beat."""
 STAMPED: tuple[Way, ...] = ("client", *FOREIGN)
 SHARED: tuple[Way, ...] = ("header", "zenoh", "routed", "plain", "bridge")
 """Routes on which a program has no identity of its own, because it sends no sender id or GID."""
 
 AHEAD_NS = NS_PER_S // 2
 """Zenoh replaces a timestamp that is further ahead of the receiver's clock than this."""
+
+
+class Message(NamedTuple):
+    """A command on its way: m/s, stamp by the program's clock, number, and time of its beat."""
+
+    linear: float
+    stamp_ns: int
+    number: int
+    beat_us: int
 
 
 class Speaker:
@@ -52,16 +61,17 @@ class Speaker:
         """The seconds that the program's clock has gained since the last call of `slew`."""
         return (self.rate - 1.0) * (self.world.now_ns - self._slewed_ns) / NS_PER_S
 
-    def message(self, linear: float) -> tuple[float, int, int]:
-        """Create the next message: speed in m/s, stamp by the program's clock in ns, and number."""
+    def message(self, linear: float) -> Message:
+        """Create the next message."""
         self._sent += 1
         world = self.world
         slewed = (self.rate - 1.0) * (world.now_ns - self._slewed_ns)
-        return linear, int(world.instant.wall_ns + self.ahead * NS_PER_S + slewed), self._sent
+        stamp_ns = int(world.instant.wall_ns + self.ahead * NS_PER_S + slewed)
+        return Message(linear, stamp_ns, self._sent, world.now_ns // 1000)
 
-    def deliver(self, message: tuple[float, int, int], angular: float = 0.0) -> None:
+    def deliver(self, message: Message, angular: float = 0.0) -> None:
         """Deliver the message now."""
-        linear, stamp_ns, number = message
+        linear, stamp_ns, number, beat_us = message
         world, way = self.world, self.way
         twist = Twist(Vector3(linear), Vector3(z=angular))
         stamped = TwistStamped(Header(Time.from_ns(stamp_ns)), twist)
@@ -72,9 +82,8 @@ class Speaker:
             attachment = Attachment(number, stamp_ns, self.name.encode().ljust(16)).pack()
         elif way in ("client", "signed"):
             signature = {"sender": self.name, "stamp": stamp_ns, "sequence": number}
-            if way == "client":
-                signature["steady"] = True
-            attachment = msgspec.msgpack.encode(signature)
+            echo = {"echo": {"run": 0, "boot_us": beat_us}} if way == "client" else {}
+            attachment = msgspec.msgpack.encode(signature | echo)
         by_zenoh = way in ("client", "signed", "zenoh", "routed")
         if by_zenoh and stamp_ns - world.instant.wall_ns <= AHEAD_NS:
             sender, told_ns = self.session, stamp_ns
@@ -83,6 +92,7 @@ class Speaker:
         arrival = Arrival(
             self.key, True, payload, encoding, world.now_ns, told_ns, sender, self.via, attachment
         )
+        arrival = msgspec.structs.replace(arrival, boot_ns=world.now_ns)
         if not sender and hasattr(arrival, "received_ns"):
             arrival = msgspec.structs.replace(arrival, received_ns=world.instant.wall_ns)
         world.bus.arrivals.append(arrival)
@@ -118,8 +128,8 @@ def over(
     seconds later, or later still to keep the order. Returns the age on arrival of the oldest speed
     that the robot obeyed, in s, and the number of speeds that it obeyed.
     """
-    start_ns, queue = world.now_ns, deque[tuple[int, tuple[float, int, int]]]()
-    sent: dict[int, tuple[tuple[float, int, int], float]] = {}
+    start_ns, queue = world.now_ns, deque[tuple[int, Message]]()
+    sent: dict[int, tuple[Message, float]] = {}
     oldest, obeyed = 0.0, set[int]()
 
     def watch(outputs: Outputs) -> None:

@@ -201,7 +201,7 @@ def test_state_reports_a_new_sender_and_counts_its_ignored_commands() -> None:
     world.run(0.2)
     client = Speaker(world, "signed", ahead=-3600.0)
     client.hold(0.0, 0.2)
-    assert world.state.code == "proof"
+    assert world.state.code == "unproven"
     assert "app is new" in {s.name: s.waits_for for s in world.state.sources}["app"]
     assert world.state.counters["commands_of_new_senders"] == 4
     # Every sender begins like this: nothing is refused, and no warning is logged.

@@ -9,7 +9,6 @@ import msgspec
 import pytest
 
 from acsard.core.config.settings import (
-    CommandsConfig,
     Config,
     DriveConfig,
     McuConfig,
@@ -168,10 +167,3 @@ def test_slip_is_undone_by_the_wheel_separation_multiplier() -> None:
     world.run(1.0)
     assert world.state.yaw == pytest.approx(math.remainder(3.0, math.tau), abs=0.03)
     assert world.mcu.vehicle.pose.yaw == pytest.approx(world.state.yaw, abs=0.03)
-
-
-def test_neutral_first_can_be_switched_off() -> None:
-    world = World(Config(commands=CommandsConfig(neutral_first=False)))
-    world.run(0.2)
-    world.hold(0.5, seconds=0.5)
-    assert world.state.mode == "driving"

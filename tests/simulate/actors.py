@@ -264,7 +264,9 @@ class Run:
         self.reasons.command(sender, message, command)
         shared = command.clock in self.witness.shared_clocks
         self.reports.command(sender, message, command, at_ns, shared)
-        self.product.deliver(at_ns, command.key, command.payload, **command.options)
+        self.product.deliver(
+            at_ns, command.key, command.payload, boot_ns=true_ns, **command.options
+        )
 
     def _dropped(self, key: str) -> None:
         """Note that the inbox dropped its oldest message of this key unread."""

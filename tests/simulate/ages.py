@@ -1,10 +1,10 @@
 """Judges the age of commands by the true clock, and records the zeros of each sender.
 
 The robot cannot know the true age of a command, because it compares two clocks. This module allows
-the ages that `deploy/clients/README.md` allows, and no more. A command is fresh if its true age
-exceeds the lowest delay that the robot has seen by at most the timeout. For a foreign clock 1 s is
-allowed in addition, and 1 s more for each minute. For a new sender the robot knows no lowest delay,
-so it accepts any delay that has been constant for the proof time.
+the ages that `deploy/clients/README.md` allows, and no more. A command with an echo is fresh if its
+true age exceeds the timeout by at most 50 ms. With a stamp it is fresh if its true age exceeds the
+lowest delay that the robot has seen by at most the timeout, and by 0.5 ms more for each second. For
+a new clock the robot knows no lowest delay, so it accepts any that has not fallen for a timeout.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
-from tests.simulate.roads import FOREIGN, NS, Message, Sample
+from tests.simulate.roads import FOREIGN, NS, STEADY, Message, Sample
 
 MARGIN_NS = 30_000_000
 """Allowed beside a time limit, for a line's way. Where periods matter, a limit allows them too."""
@@ -29,8 +29,11 @@ PAUSE_NS = 2_000_000_000
 STAYS_NS = 4_000_000_000
 """Time after which the daemon surely knows lower delays of a foreign clock."""
 
-REMEMBERED = 1000
-"""Number of new names after which a sender that paused is new. The robot remembers 1024 clocks."""
+SILENT_NS = 101 * NS // 10
+"""After a silence of this length a sender is certainly not armed."""
+
+REMEMBERED = 15
+"""Number of new names after which a sender that paused is new: a source remembers 16 clocks."""
 
 
 class Wish:
@@ -54,6 +57,8 @@ class Sender:
         """Zeros that no speed of a shared identity of the source has followed: when the pause of
         each begins, at the earliest, and its arrival."""
         self.armed_ns = -1
+        self.last_ns = 0
+        """Arrival of its last command."""
 
 
 class Clock:
@@ -64,7 +69,6 @@ class Clock:
         self.lower: tuple[int, int] | None = None
         """Since when all delays of a foreign clock are lower than that, and the lowest of them."""
         self.recent: deque[tuple[int, int]] = deque()
-        self.stamp_ns = 0
         self.constant = False
         """Its delays once looked constant for the time of a proof, so the daemon may know them."""
         self.followed = False
@@ -72,8 +76,8 @@ class Clock:
         self.names = 0
         """Number of clocks that the robot had met at its last command."""
         self.loose = False
-        """It was adjusted, or its sender paused or stamps falsely. The pages promise nothing about
-        the age of its commands."""
+        """It was adjusted, or its sender stamps falsely. The pages promise nothing about the age of
+        its commands."""
 
     def learn(self, age: int, arrived_ns: int, foreign: bool) -> None:
         """Record a true delay.
@@ -119,22 +123,17 @@ class Ages:
             return True
         age = arrived_ns - message.sent_ns
         clock = self.clocks.setdefault(sample.clock, Clock())
+        if sender["way"] in STEADY:
+            return age <= timeout_ns + EARLY_NS + MARGIN_NS
         clock.loose |= loose
         if len(self.clocks) - clock.names > REMEMBERED:
             clock.least_ns, clock.recent, clock.constant = None, deque(), False
         clock.names = len(self.clocks)
         foreign = sender["way"] in FOREIGN
         pause_ns = max(PAUSE_NS, timeout_ns) - NS // 10
-        if foreign and clock.stamp_ns and message.stamp_ns - clock.stamp_ns > pause_ns:
-            clock.loose = True
         if (foreign and sender["clock"]) or sender.get("bad_stamps"):
             clock.loose = True
-        clock.stamp_ns = message.stamp_ns
         recent = clock.recent
-        silent = bool(recent) and arrived_ns - recent[-1][0] > pause_ns
-        if silent and foreign and not clock.followed:
-            # The proof begins again, and the pages promise no more.
-            clock.least_ns, clock.constant = None, False
         least = clock.least_ns
         clock.learn(age, arrived_ns, foreign)
         while recent and recent[0][0] < arrived_ns - max(3 * NS, pause_ns):
@@ -142,14 +141,13 @@ class Ages:
         prompt: int = int(sender["delay"] * NS)
         allowed = timeout_ns + EARLY_NS + MARGIN_NS
         if foreign:
-            minutes = (arrived_ns - self.learned_ns) / NS / 60
-            allowed += int((1.0 + minutes) * NS)
+            allowed += min(timeout_ns, (arrived_ns - self.learned_ns) // 2000)
         if clock.loose or age <= prompt + allowed:
             fresh = True
         elif least is None:
             fresh = False
         else:
-            falls = self._falls(clock, age, arrived_ns, min(timeout_ns, 2 * NS))
+            falls = self._falls(clock, age, arrived_ns, timeout_ns)
             # A delay that the daemon knows is no backlog, also if there were longer ones since.
             fresh = age <= least + allowed and (not falls or (clock.constant and age >= least))
             clock.constant |= not falls

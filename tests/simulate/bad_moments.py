@@ -86,7 +86,6 @@ def _late_step(plan: Plan, dice: random.Random) -> None:
     The sender sends speeds, this one zero, and speeds again.
     """
     config, source = plan["config"], _best(plan)
-    config["commands"]["neutral_first"] = True
     safety = config.setdefault("safety", {})
     if "bumpers" not in safety and dice.random() < 0.5:
         safety.update(bumpers=[dice.choice(PLACES) for _ in range(2)], bumper="away")
@@ -405,7 +404,6 @@ def _set_back(plan: Plan, dice: random.Random) -> None:
 
 def _routed(plan: Plan, dice: random.Random) -> None:
     """Let two programs without an id send through a router that is not linked to the robot."""
-    plan["config"]["commands"]["neutral_first"] = True
     _best(plan)["timeout"] = dice.choice((0.25, 0.5, 1.0))
     first = _alone(plan, dice, [])
     ahead = round(dice.uniform(-0.4, 0.3), 3)
@@ -482,9 +480,8 @@ def _stall_behind_a_zero(plan: Plan, dice: random.Random) -> None:
     Both programs share a sender identity. The daemon takes its first step after the stall before
     the bus delivers the waiting speeds.
     """
-    commands, source = plan["config"]["commands"], _best(plan)
+    source = _best(plan)
     pause_s = 1.0
-    commands["neutral_first"] = True
     source["timeout"] = dice.choice((0.25, 0.5))
     first = _alone(plan, dice, [])
     hz = dice.choice((5.0, 10.0))

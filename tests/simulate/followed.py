@@ -48,9 +48,6 @@ PLACE_NS = 5 * NS // 2
 NUMBERED = ("client", "page", "signed", "rmw")
 """Ways whose messages have numbers."""
 
-KNOWN_NS = 240 * NS
-"""The daemon knows a clock for this time at least."""
-
 Wheels = tuple[float, ...]
 
 Who = tuple[str, str]
@@ -130,10 +127,6 @@ class Followed:
         self._slowest: tuple[float, float] | None = None
         """The lowest speed and turn rate since the followed command is one that a zero overtook,
         None if it is not such a command."""
-        self._zero_ns: dict[Who, int] = {}
-        """When the newest zero of each sender was sent, of those that arrived."""
-        self._before: dict[str, Command] = {}
-        """The newest command of each adjusted clock that was followed."""
         self._armed_since_ns = witness.armed_since_ns
         self._decided_ns = 0
         """Beginning of the step before."""
@@ -165,7 +158,6 @@ class Followed:
         if not (wish.v or wish.w or message.junk):
             self._rests_ns[key] = at_ns
             insort(self._stamps_ns.setdefault(key, []), message.stamp_ns)
-            self._zero_ns[key] = max(message.sent_ns, self._zero_ns.get(key, 0))
         if self._keeper is not None:
             priority = self._witness.priority
             if self._keeper.who == key:
@@ -219,7 +211,7 @@ class Followed:
         if not sample.clock:
             # A zero of a shared identity counts only behind its pause.
             since_ns = max(witness.armed_since_ns, witness.disarmed_ns)
-            armed = not witness.neutral_first or wish.armed_ns > since_ns
+            armed = wish.armed_ns > since_ns
             return wish.certain and (armed or not sample.shared)
         if sample.clock in witness.shared_clocks or not stable(sender):
             return False
@@ -332,8 +324,6 @@ class Followed:
             self._first_keeps(true_ns, decided_ns, command)
             self._highest_wins(true_ns, decided_ns, command)
             self._newest_counts(true_ns, decided_ns, command)
-            if command.clock and not stable(command.sender):
-                self._adjusted_needs_zero(true_ns, command)
             if command.clock in self._runs:
                 run = self._runs[command.clock]
                 run.followed |= command.true_ns >= run.begun_ns
@@ -421,47 +411,4 @@ class Followed:
                 "the newest command is obeyed at once", true_ns,
                 f"{command.who} sent one {(decided_ns - newest.arrived_ns) / NS:.3f} s ago, and "
                 f"that of {(decided_ns - command.arrived_ns) / NS:.3f} s ago is followed",
-            )  # fmt: skip
-
-    def _adjusted_needs_zero(self, true_ns: int, command: Command) -> None:
-        """Check that a sender sends a zero after its foreign clock was stepped.
-
-        Only steps larger than the timeout count. The check is left out if something may hide the
-        step: a longer network delay after a step forwards, a second step, or a sleep of the robot.
-        """
-        witness, sender, message = self._witness, command.sender, command.message
-        before = self._before.get(command.clock)
-        self._before[command.clock] = command
-        if before is None or before.message.sent_ns >= message.sent_ns:
-            return
-        since_ns, slewed_s, steps = before.message.sent_ns, 0.0, []
-        for kind, at_s, *rest in sender["clock"]:
-            if kind == "slew":
-                lasted_ns = min(message.sent_ns, rest[0] * NS) - max(since_ns, at_s * NS)
-                slewed_s += abs(rest[1]) * max(0.0, lasted_ns / NS)
-            elif since_ns < at_s * NS <= message.sent_ns:
-                steps.append((at_s, rest[0]))
-        if (
-            len(steps) != 1
-            or not witness.neutral_first
-            or message.sent_ns - since_ns > KNOWN_NS
-            or before.true_ns < witness.ages.learned_ns
-            or command.clock in witness.shared_clocks
-            or command.who[0] in witness.churned
-        ):
-            return
-        at_s, by_s = steps[0]
-        timeout_s = max(witness.timeout[command.who[0]], NS // 4) / NS
-        late_s = (before.true_ns - since_ns) / NS - sender["delay"]
-        if by_s > 0.0:
-            if sender["congestion"] or sender["jitter"] > EVEN_NS / NS / 2:
-                return
-            late_s = timeout_s
-        if abs(by_s) < timeout_s + max(0.0, late_s) + slewed_s + 0.15:
-            return
-        witness.counts["clocks that jumped"] += 1
-        if self._zero_ns.get(command.who, -1) < at_s * NS:
-            raise BrokenError(
-                "a clock that jumped needs a zero", true_ns,
-                f"{command.who} was set by {by_s:g} s at {at_s:.3f} s and has sent no zero since",
             )  # fmt: skip

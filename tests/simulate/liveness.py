@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 MOST_HELD = 1500
 """Most entries that a container of the daemon may have.
 
-The largest one has the clocks of the last 1024 senders.
+The largest one has the last 1024 sender ids with their certificates.
 """
 
 LONGEST_BUFFER = 1024
@@ -40,6 +40,9 @@ LONGEST_REASON = 4096
 
 SETTLES_NS = 3 * NS
 """After the last event a lawful sender drives within this time."""
+
+SILENT_NS = 99 * NS // 10
+"""After a silence of this length a sender may have to send a zero again."""
 
 PROOF_NS = 2 * NS
 """A new sender shows a steady delay for this time before its commands count."""
@@ -148,6 +151,8 @@ class Liveness:
             return
         wish = self.run.witness.wishes[-1][1]
         before_ns, _ = self._latest.get(name, (0, ""))
+        if wish.arrived_ns - before_ns > SILENT_NS and name in self._armed:
+            self._interrupted[name] = self._armed.pop(name)
         if wish.arrived_ns - before_ns > self._pauses[name]:
             self._since.pop(name, None)
             self._began[name] = wish.arrived_ns
@@ -228,7 +233,8 @@ class Liveness:
         if not QUIET_FAULTS.issuperset(name for name, _ in run.active[len(run.lasting) :]):
             return
         followed_ns = self._followed_ns.get(source, -1)
-        if followed_ns > max(self._disarmed_ns, self._stall[1]) + self._tick_ns:
+        silent = now_ns - followed_ns > SILENT_NS
+        if not silent and followed_ns > max(self._disarmed_ns, self._stall[1]) + self._tick_ns:
             text = f"{source} was followed at {followed_ns / NS:.3f} s; {witness.reason}"
             raise BrokenError("an armed sender stays armed", now_ns, text)
 

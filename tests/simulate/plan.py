@@ -323,7 +323,7 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
             mcu["reply_period"] = 0.1
             extras["board"] = [["free_running", 0.1]]
     commands = config["commands"]
-    commands["neutral_first"] = dice.random() < 0.85
+    dice.random()
     names = [*SOURCES, "twin"]
     commands["sources"] = [
         {

@@ -7,6 +7,7 @@ relevant part.
 from __future__ import annotations
 
 from tests.simulate.planted_faults import (
+    AGES,
     GUARD,
     LIFECYCLE,
     LIMITS,
@@ -16,9 +17,7 @@ from tests.simulate.planted_faults import (
     VALUES,
     WITNESS,
     Edit,
-    Fault,
     fault,
-    judging,
 )
 
 CASES = (
@@ -33,13 +32,15 @@ CASES = (
         "case 2",
         "the first zero of a shared sender arms it",
         NEUTRAL,
-        "            if not command.shared:\n                self._armed = True",
-        "            if True:\n                self._armed = True",
+        "        if not (zero and self.shared):\n            self.armed = True",
+        "        if True:\n            self.armed = True",
     ),
-    Fault(
+    fault(
         "case 3",
         "a congested link is taken for a clock that was adjusted",
-        (judging("self.believe(verdict, clock, at_ns, delay, timeout_ns)"),),
+        AGES,
+        "        if least is None or delay < least - MARGIN_NS:\n",
+        "        if least is None or abs(delay - least) > timeout_ns:\n",
     ),
     fault(
         "case 4",
@@ -48,15 +49,13 @@ CASES = (
         "            self.blocked = True\n",
         "            self.blocked = False\n",
     ),
-    Fault(
+    fault(
         "case 5",
         "an older command after a newer one is obeyed",
-        (
-            judging(
-                '"fresh" if verdict == "stale" and not newer '
-                "and delay <= self.lowest[clock] + timeout_ns else verdict"
-            ),
-        ),
+        AGES,
+        "elif not verdict and stamp_ns <= self.accepted_ns:",
+        "elif False:",
+        Edit(AGES, "<= (self.beat_ns, self.sequence):", "<= (-1, -1):"),
     ),
     fault(
         "case 6",

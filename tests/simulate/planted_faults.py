@@ -22,10 +22,9 @@ PLANS_OF_FAULT = {
     "estop": "estop", "away": "away", "battery": "battery", "driver": "driver_fault",
     "moment": "late step", "robot set": "late step",
     "neutral stall": "stall behind a zero", "neutral place": "doubtful holder",
-    "neutral set": "doubtful holder", "driver release": "behind a press",
+    "driver release": "behind a press",
     "wheel press": "behind a press", "wheel counts": "coarse encoders",
     "wheel waited": "late lines", "limits saturated": "wheel limit",
-    "freshness halves": "backlogs of newcomers", "freshness budget": "later and later",
     "replay": "recorded", "lines endless": "endless", "sanity blind": "reversed_motor",
     "session gap": "mute", "session stale": "mute", "odometry silent": "mute",
     "odometry gap": "mute",
@@ -62,8 +61,8 @@ def fault(name: str, breaks: str, module: str, old: str, new: str, *more: Edit) 
 
 
 GUARD, ARBITER, NEUTRAL = "core/guard.py", "core/motion/arbiter.py", "core/motion/neutral.py"
-FRESHNESS, LIMITS, LIFECYCLE = (
-    "core/motion/freshness.py",
+AGES, LIMITS, LIFECYCLE = (
+    "core/motion/ages.py",
     "core/motion/limits.py",
     "core/motion/lifecycle.py",
 )
@@ -84,53 +83,6 @@ EMERGENCY_STOP, BUMPERS, BATTERY = (
     "core/motion/bumpers.py",
     "core/motion/battery.py",
 )
-
-JUDGING = """
-
-class Freshness(Freshness):
-    def __init__(self):
-        super().__init__()
-        self.lowest, self.newest = {{}}, {{}}
-        self.began, self.late_since, self.believed = {{}}, {{}}, {{}}
-
-    def judge(self, command, timeout_ns):
-        verdict = super().judge(command, timeout_ns)
-        if command.stamp_ns is None:
-            return verdict
-        clock, at_ns = command.clock or command.source, command.arrived_ns
-        delay = at_ns - command.stamp_ns
-        self.lowest[clock] = min(delay, self.lowest.get(clock, delay))
-        newer = command.stamp_ns > self.newest.get(clock, 0)
-        self.newest[clock] = max(command.stamp_ns, self.newest.get(clock, 0))
-        for held in (self.lowest, self.newest, self.began, self.late_since, self.believed):
-            if len(held) > 1000:
-                del held[next(iter(held))]
-        return {rule}
-
-    def proof_time_is_over(self, verdict, clock, at_ns, timeout_ns):
-        if verdict not in ("first", "unproven"):
-            self.began.pop(clock, None)
-            return False
-        return at_ns - self.began.setdefault(clock, at_ns) >= min(timeout_ns, 2_000_000_000)
-
-    def believe(self, verdict, clock, at_ns, delay, timeout_ns):
-        if verdict not in ("stale", "first", "unproven"):
-            self.late_since.pop(clock, None)
-        elif delay <= self.believed.get(clock, delay - timeout_ns - 1) + timeout_ns:
-            return "fresh"
-        elif at_ns - self.late_since.setdefault(clock, at_ns) >= 2_000_000_000:
-            del self.late_since[clock]
-            self.believed[clock] = delay
-            return "set"
-        return verdict
-"""
-"""Code behind the module `FRESHNESS`: it replaces verdicts, however the module reaches them."""
-
-
-def judging(rule: str) -> Edit:
-    """Return an edit that makes the freshness check return the value of this expression."""
-    return Edit(FRESHNESS, "", JUDGING.format(rule=rule))
-
 
 BLIND_GUARD = Edit(GUARD, 'return (self._stop, trip) if trip else (line, "")', 'return line, ""')
 """The guard passes every line."""
@@ -186,29 +138,15 @@ FAULTS = (
         "arbiter priority",
         "the source of the lowest priority wins",
         ARBITER,
-        "key=lambda source: -source.priority",
-        "key=lambda source: source.priority",
+        "                    -settings.priority,\n",
+        "                    settings.priority,\n",
     ),
     fault(
         "arbiter arming",
         "a sender drives without having sent a zero",
         ARBITER,
-        "        if not (armed and sender.is_live(now_ns)):\n",
-        "        if not sender.is_live(now_ns):\n",
-    ),
-    fault(
-        "arbiter stale",
-        "stale commands count",
-        ARBITER,
-        'if verdict == "stale":',
-        'if verdict == "never":',
-    ),
-    fault(
-        "arbiter proof",
-        "the commands of a sender that is new count at once",
-        ARBITER,
-        "sender.take(command, self._since_ns, verdict, self._watched_ns)",
-        'sender.take(command, self._since_ns, "fresh", self._watched_ns)',
+        "if not (armed and sender.is_live(now_ns, timeout_ns(settings))):",
+        "if not sender.is_live(now_ns, timeout_ns(settings)):",
     ),
     fault(
         "arbiter senders",
@@ -221,83 +159,79 @@ FAULTS = (
         "arbiter timeout",
         "a command never times out",
         NEUTRAL,
-        "return self.arrived_ns is not None and now_ns - self.arrived_ns <= self._timeout_ns",
+        "return self.arrived_ns is not None and now_ns - self.arrived_ns <= timeout_ns",
         "return self.arrived_ns is not None",
-        Edit(
-            NEUTRAL,
-            "            now_ns - arrived_ns <= timeout_ns\n",
-            "            True\n",
-        ),
+        Edit(NEUTRAL, "now_ns - self.present_ns <= timeout_ns", "True"),
     ),
     fault(
         "arbiter notice",
         "a zero arms a shared sender although unreadable speeds follow it",
         ARBITER,
-        "            known_sender.cancel_zero(arrived_ns)",
+        "            known.cancel_zero(arrived_ns)",
         "            pass",
     ),
     fault(
         "arbiter equal",
         "of two sources of equal priority the last that came takes the robot",
         ARBITER,
-        "present[0].rank(now_ns) < first[1].rank(now_ns)",
-        "present[0].rank(now_ns) > first[1].rank(now_ns)",
-        Edit(ARBITER, "and previous in present\n", "and False\n"),
+        "                    (settings.name, name) != self.holder,\n"
+        "                    sender.came_ns,\n",
+        "                    -sender.came_ns,\n",
     ),
     fault(
         "arbiter keeps",
         "a source of lower priority keeps the robot from one that comes later",
         ARBITER,
-        "and source.priority == first[0].priority\n",
-        "and source.priority <= first[0].priority\n",
+        "                rank = (\n",
+        "                rank = (\n                    (settings.name, name) != self.holder,\n",
     ),
     # neutral
     fault(
         "moment older",
         "an older demand for a zero takes the place of a newer one that came in the same step",
         ARBITER,
-        "self._since_ns = max(self._since_ns, since_ns)",
-        "self._since_ns = since_ns",
+        "self.since_ns = max(self.since_ns, since_ns)",
+        "self.since_ns = since_ns",
     ),
     fault(
         "neutral pause",
         "a zero of a shared identity arms it after half the pause",
         NEUTRAL,
-        "now_ns - self._zero_ns >= NEUTRAL_PAUSE_NS",
-        "now_ns - self._zero_ns >= NEUTRAL_PAUSE_NS // 2",
+        "now_ns - self.zero_ns >= NEUTRAL_PAUSE_NS",
+        "now_ns - self.zero_ns >= NEUTRAL_PAUSE_NS // 2",
     ),
     fault(
         "neutral again",
         "a sender stays armed when arming is asked for",
         NEUTRAL,
-        "self._armed = self._proven_armed = not self._neutral_first\n\n    def disarm",
-        "self._proven_armed = not self._neutral_first\n\n    def disarm",
+        "        self.arrived_ns = self.zero_ns = self.hint = None\n        self.armed = False\n",
+        "        self.zero_ns = self.hint = None\n",
     ),
     fault(
         "neutral timeout",
         "a command counts for twice its timeout",
         NEUTRAL,
-        "now_ns - self.arrived_ns <= self._timeout_ns",
-        "now_ns - self.arrived_ns <= 2 * self._timeout_ns",
+        "now_ns - self.arrived_ns <= timeout_ns",
+        "now_ns - self.arrived_ns <= 2 * timeout_ns",
         Edit(
             NEUTRAL,
-            "            now_ns - arrived_ns <= timeout_ns\n",
-            "            now_ns - arrived_ns <= 2 * timeout_ns\n",
+            "now_ns - self.present_ns <= timeout_ns",
+            "now_ns - self.present_ns <= 2 * timeout_ns",
         ),
     ),
     fault(
         "neutral speeds",
         "speeds behind the zero of a shared identity do not undo it",
         ARBITER,
-        "            source.cancel_zeros(command.arrived_ns)",
-        "            pass",
+        "                    other.cancel_zero(now_ns)",
+        "                    pass",
     ),
     fault(
         "neutral identities",
         "speeds behind the zero of a shared identity do not undo that of another one",
         ARBITER,
-        "            source.cancel_zeros(command.arrived_ns)",
-        "            known and known.cancel_zero(command.arrived_ns)",
+        "                    other.cancel_zero(now_ns)",
+        "                    sender.cancel_zero(now_ns)",
     ),
     fault(
         "neutral session",
@@ -317,37 +251,30 @@ FAULTS = (
         "neutral never",
         "a zero arms no sender",
         NEUTRAL,
-        "                self._armed = True\n            elif",
-        "                pass\n            elif",
+        "            self.armed = True\n        elif",
+        "            pass\n        elif",
     ),
     fault(
         "neutral newest",
         "a newer command counts only when half of the timeout is over",
         NEUTRAL,
-        "        self.twist, self._doubted_ns = command.twist, None\n",
-        "        if present and now_ns - (self.arrived_ns or 0) < self._timeout_ns // 2:\n        "
-        "    return\n        self.twist, self._doubted_ns = command.twist, None\n",
+        "        self.twist, self.arrived_ns, self.present_ns = command.twist, now_ns, now_ns\n",
+        "        if now_ns - (self.arrived_ns or 0) < timeout_ns // 2:\n            return\n"
+        "        self.twist, self.arrived_ns, self.present_ns = command.twist, now_ns, now_ns\n",
     ),
     fault(
         "neutral stall",
         "a stall of the daemon counts as the pause after a zero",
-        ARBITER,
-        "                sender.resume(before_ns, now_ns)",
-        "                pass",
+        NEUTRAL,
+        "        if self.zero_ns is not None:\n            self.zero_ns = now_ns\n",
+        "",
     ),
     fault(
         "neutral place",
-        "a sender whose stamps are in doubt loses the robot",
+        "after a stall the first sender that is read takes the robot",
         NEUTRAL,
-        "(now_ns - self._present_ns <= timeout_ns and now_ns - arrived_ns <= CANDIDATE_NS)",
-        "False",
-    ),
-    fault(
-        "neutral set",
-        "a sender with a shared identity whose clock was set loses the robot to an equal one",
-        NEUTRAL,
-        "and (waits or self.armed(now_ns))",
-        "and self.armed(now_ns)",
+        "            self.present_ns = now_ns\n",
+        "            pass\n",
     ),
     fault(
         "neutral gap",
@@ -365,78 +292,13 @@ FAULTS = (
         "                    self._arbiter.require_neutral(asked_ns)\n",
     ),
     fault(
-        "neutral expires",
-        "a sender must send a zero again after 20 s",
-        NEUTRAL,
-        "        self._settle(now_ns)\n        return self._armed\n",
-        "        self._settle(now_ns)\n"
-        "        recent = not self._neutral_first or now_ns - self._rested_ns < 20_000_000_000\n"
-        "        return self._armed and recent\n",
-        Edit(
-            NEUTRAL,
-            "        now_ns, zero = command.arrived_ns, is_zero(command)\n",
-            "        now_ns, zero = command.arrived_ns, is_zero(command)\n"
-            "        self._rested_ns = now_ns if zero else getattr(self, '_rested_ns', now_ns)\n",
-        ),
-    ),
-    fault(
-        "neutral overtaken",
-        "a speed that arrives behind a later zero moves the robot",
-        NEUTRAL,
-        "            if self._overtaken(command, self._ended):",
-        "            if False:",
-    ),
-    fault(
         "neutral late",
         "a newer command counts only after 60 ms",
         NEUTRAL,
-        "        self.twist, self._doubted_ns = command.twist, None\n"
-        "        self.arrived_ns = self._present_ns = now_ns\n",
-        "        self._doubted_ns, self._present_ns = None, now_ns\n"
+        "        self.twist, self.arrived_ns, self.present_ns = command.twist, now_ns, now_ns\n",
+        "        self.present_ns = now_ns\n"
         "        if self.arrived_ns is None or now_ns - self.arrived_ns > 60_000_000 or zero:\n"
         "            self.twist, self.arrived_ns = command.twist, now_ns\n",
-    ),
-    # freshness
-    Fault(
-        "freshness age",
-        "commands that are late by twenty timeouts count",
-        (
-            judging(
-                '"fresh" if verdict == "stale" and newer '
-                "and delay <= self.lowest[clock] + 20 * timeout_ns else verdict"
-            ),
-        ),
-    ),
-    Fault(
-        "freshness proof",
-        "the second command of a new sender counts",
-        (judging('"fresh" if verdict == "unproven" else verdict'),),
-    ),
-    Fault(
-        "freshness budget",
-        "a foreign clock may become later by any time every two seconds",
-        (
-            judging(
-                "verdict if command.steady else "
-                "self.believe(verdict, clock, at_ns, delay, timeout_ns)"
-            ),
-        ),
-    ),
-    fault(
-        "freshness drift",
-        "a queue that grows by 5 % looks like the drift of a clock",
-        FRESHNESS,
-        "SECONDS_PER_DRIFT = 5000",
-        "SECONDS_PER_DRIFT = 20",
-    ),
-    Fault(
-        "freshness halves",
-        "delays that still fall pass the proof",
-        (
-            judging(
-                '"fresh" if self.proof_time_is_over(verdict, clock, at_ns, timeout_ns) else verdict'
-            ),
-        ),
     ),
     # limits
     fault(
@@ -616,7 +478,7 @@ FAULTS = (
         "new timeouts ask no sender for a zero",
         ROBOT,
         "            self._arbiter.require_neutral(now_ns)\n        return changes",
-        "        return changes",
+        "            pass\n        return changes",
     ),
     fault(
         "robot limits",
@@ -637,7 +499,7 @@ FAULTS = (
         "robot waits",
         "`state` names no source whose commands are late or not proved yet",
         ARBITER,
-        "return source.doubt_wait(now_ns) or COMMAND",
+        "return self._refused(settings, now_ns) or COMMAND",
         "return COMMAND",
     ),
     fault(
@@ -1159,7 +1021,7 @@ FAULTS = (
         ROBOT,
         "            self._arbiter.require_neutral(now_ns)\n            # `require_neutral` has "
         "discarded all commands, so the new choice has no twist.\n            self._choice = "
-        "self._arbiter.choose(now_ns)\n",
+        "self._arbiter.choose(now_ns, self.config.commands)\n",
         "            self._choice = Choice()\n",
     ),
     fault(

@@ -351,14 +351,16 @@ class Product:
         session: str = "",
         via: Any = "native",
         attachment: bytes = b"",
+        boot_ns: int = 0,
     ) -> None:
         """Deliver a sample to the daemon's inbox. It arrived at `at_ns`, now or earlier."""
         world = self._world
         arrivals = world.bus.arrivals
         received = None if session else self.wall_ns
         arrival = Arrival(
-            key, put, payload, encoding, at_ns, stamp_ns, session, via, attachment, received
-        )
+            key, put, payload, encoding, at_ns, stamp_ns, session, via, attachment, received,
+            boot_ns,
+        )  # fmt: skip
         if key == "stop":
             arrivals.insert(0, arrival)
         else:

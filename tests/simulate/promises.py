@@ -17,7 +17,7 @@ from collections import Counter, deque
 from typing import Any, get_args
 
 from acsard.core.codes import GUARD_CODES, FaultCode, LinkCode, StopCode, WaitCode
-from tests.simulate.ages import MARGIN_NS, Ages, Sender, Wish
+from tests.simulate.ages import MARGIN_NS, SILENT_NS, Ages, Sender, Wish
 from tests.simulate.jerk import STEP, Slope
 from tests.simulate.roads import NS, Message, Sample
 
@@ -123,7 +123,6 @@ class Witness:
         self.file = dict(config["limits"])
         self.limits = dict(config["limits"])
         commands = config["commands"]
-        self.neutral_first = commands.get("neutral_first", True)
         self.priority = {s["name"]: s["priority"] for s in commands["sources"]}
         self.file_timeout = {s["name"]: int(s["timeout"] * NS) for s in commands["sources"]}
         self.file_pause_ns = NS
@@ -276,6 +275,10 @@ class Witness:
             known = self.senders[source, sample.identity] = Sender()
             if sample.shared:
                 self._sharing.setdefault(source, []).append(known)
+        if arrived_ns - known.last_ns > SILENT_NS:
+            known.armed_ns = -1
+            known.zeros.clear()
+        known.last_ns = arrived_ns
         if zero and not sample.shared:
             known.armed_ns = arrived_ns
         elif zero:
@@ -802,15 +805,14 @@ class Witness:
             if not wish.fresh:
                 why = f"{source} by {wish.identity} is stale"
                 continue
-            if self.neutral_first:
-                known = self.senders[source, wish.identity]
-                armed_ns = wish.armed_ns
-                if not wish.v and not wish.w:
-                    self._arm(known, at_ns)
-                    armed_ns = known.armed_ns
-                if armed_ns < self.armed_since_ns:
-                    why = f"{source} by {wish.identity} is not armed"
-                    continue
+            known = self.senders[source, wish.identity]
+            armed_ns = wish.armed_ns
+            if not wish.v and not wish.w:
+                self._arm(known, at_ns)
+                armed_ns = known.armed_ns
+            if armed_ns < self.armed_since_ns:
+                why = f"{source} by {wish.identity} is not armed"
+                continue
             if not grows or "set" in self.pending or self._leads(wish, wheels, before):
                 return wish, ""
             why = f"{source} by {wish.identity} wishes {wish.v:g}, {wish.w:g}"
@@ -827,7 +829,7 @@ class Witness:
         lowest, armed_ns = 0, max(self.armed_since_ns, self.disarmed_ns)
         since_ns = max(armed_ns, *self.pending.values(), 0)
         for source, wish in self.wishes:
-            if self.neutral_first and wish.shared and wish.armed_ns <= armed_ns:
+            if wish.shared and wish.armed_ns <= armed_ns:
                 continue  # a zero of a shared identity counts only behind its pause
             age = at_ns - wish.arrived_ns
             live = 2 * MARGIN_NS < age < self.timeout[source] - self.period_ns - MARGIN_NS

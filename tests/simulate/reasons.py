@@ -16,7 +16,14 @@ from tests.simulate.roads import FOREIGN, NS, Message, Sample
 if TYPE_CHECKING:
     from tests.simulate.actors import Run
 
-KINDS = {"nothing": "", "no_command": "command", "higher": "priority", "equal": "priority"}
+KINDS = {
+    "nothing": "",
+    "no_command": "command",
+    "higher": "priority",
+    "equal": "priority",
+    "unproven": "proof",
+    "early": "proof",
+} | dict.fromkeys(("stale", "set_back", "stamps", "too_old", "round_trip", "not_newer"), "late")
 """The codes whose kind of cause has another name."""
 
 BUMPERS = ("bumper_away", "bumper_blocks")
@@ -243,7 +250,7 @@ class Reasons:
                     causes.add("proof")
             since_ns = max(self._calm_ns, self._dropped_ns.get(source, -1) if sender.shared else -1)
             armed = sender.armed_ns > since_ns and certain
-            if witness.neutral_first and not (armed and sender.own):
+            if not (armed and sender.own):
                 causes.add("neutral")
         if now_ns - self._stalled_ns < timeout_ns + MARGIN_NS and any(
             sender.arrived_ns <= self._stalled_ns for sender in self._heard.get(source, {}).values()

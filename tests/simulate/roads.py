@@ -200,7 +200,7 @@ def sample(
         case "client" | "page" | "signed":
             options["attachment"] = msgspec.msgpack.encode(
                 {"sender": own, "stamp": message.stamp_ns, "sequence": message.number}
-                | ({"steady": True} if way in STEADY else {})
+                | ({"echo": echo(message.sent_ns)} if way in STEADY and stamp_counts else {})
             )
         case "rmw":
             gid = _gid(own)
@@ -226,6 +226,11 @@ def sample(
     options.update(via=via, session=session, stamp_ns=stamp_ns)
     key, payload = _payload(sender, message, config, via, options)
     return Sample(key, payload, options, identity, shared, clock)
+
+
+def echo(sent_ns: int) -> dict[str, int]:
+    """Return the beat that a program has received just now; the daemon's run is always 0."""
+    return {"run": 0, "boot_us": sent_ns // 1000}
 
 
 def _stamper(sender: dict[str, Any], message: Message, own: str) -> str:

@@ -6,11 +6,9 @@ import ast
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from acsard.core.values import REST, Command
 from tests.simulate import planted
 from tests.simulate.planted import (
     CASE_MINUTES,
@@ -24,10 +22,9 @@ from tests.simulate.planted import (
     text_of,
 )
 from tests.simulate.planted_cases import CASES
-from tests.simulate.planted_faults import FAULTS, FRESHNESS, PLANS_OF_FAULT, Fault
+from tests.simulate.planted_faults import FAULTS, PLANS_OF_FAULT, Fault
 
 ALL = (*FAULTS, *CASES)
-ADDED = [fault for fault in ALL if not all(edit.old for edit in fault.edits)]
 
 
 @pytest.mark.parametrize("fault", ALL, ids=lambda fault: fault.name)
@@ -46,14 +43,6 @@ def test_faults_use_only_names_that_exist(tmp_path: Path) -> None:
     ruff = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F821", str(tmp_path)]
     checked = subprocess.run(ruff, capture_output=True, text=True, timeout=60)
     assert checked.returncode == 0, checked.stdout
-
-
-@pytest.mark.parametrize("fault", ADDED, ids=lambda fault: fault.name)
-def test_code_that_a_fault_adds_to_freshness_runs_there(fault: Fault) -> None:
-    names: dict[str, Any] = {"__name__": "planted"}
-    exec(compile(edited(fault)[FRESHNESS], FRESHNESS, "exec"), names)
-    verdict = names["Freshness"]().judge(Command("app", REST, 5, 3, "clock"), 10**9)
-    assert verdict in ("first", "unproven", "fresh")
 
 
 def test_plans_are_chosen_for_faults_that_exist() -> None:

@@ -1005,12 +1005,10 @@ def test_some_plans_have_several_senders_behind_routers_on_one_source() -> None:
     assert together > 3
 
 
-@pytest.mark.parametrize(("names", "obeyed"), [(0, False), (1001, True)])
-def test_a_late_sender_is_new_again_only_after_a_thousand_new_names(
-    names: int, obeyed: bool
-) -> None:
+@pytest.mark.parametrize(("names", "obeyed"), [(0, False), (16, True)])
+def test_a_late_sender_is_new_again_only_after_sixteen_new_names(names: int, obeyed: bool) -> None:
     ages, late_ns = Ages(0), 3 * NS
-    sender = {"way": "client", "delay": 0.001, "clock": []}
+    sender = {"way": "signed", "delay": 0.001, "clock": []}
 
     def fresh(clock: str, at_ns: int, delay_ns: int) -> bool:
         message = Message(at_ns - delay_ns, at_ns, 0.3, 0.0, at_ns - delay_ns, 1, "")
@@ -1027,7 +1025,7 @@ def test_a_late_sender_is_new_again_only_after_a_thousand_new_names(
 
 @pytest.mark.parametrize("known", [True, False])
 def test_a_delay_that_falls_is_a_backlog_unless_the_robot_knew_it_before(known: bool) -> None:
-    ages, sender = Ages(0), {"way": "client", "delay": 0.001, "clock": []}
+    ages, sender = Ages(0), {"way": "signed", "delay": 0.001, "clock": []}
 
     def fresh(at_ms: int, delay_ms: int) -> bool:
         at_ns, delay_ns = at_ms * NS // 1000, delay_ms * NS // 1000
@@ -1067,7 +1065,8 @@ def test_the_robot_knows_a_lower_delay_of_a_foreign_clock_only_when_it_has_staye
     for at_ns in range(2 * NS, until_ns, NS // 20):
         fresh(at_ns, NS // 1000)
     later = [
-        fresh(at_ns, 2 * NS) for at_ns in range(until_ns + 2 * NS, until_ns + 4 * NS, NS // 20)
+        fresh(at_ns, 12 * NS // 10)
+        for at_ns in range(until_ns + 2 * NS, until_ns + 4 * NS, NS // 20)
     ]
     assert all(later) if obeyed else not any(later)
 
@@ -1078,7 +1077,7 @@ def test_a_robot_does_not_learn_the_delay_of_a_command_that_the_inbox_dropped(
 ) -> None:
     witness = witnessed()
     sender = make_plan(1)["senders"][0] | {
-        "way": "client", "source": "app", "id": "ann", "churn": False, "delay": 0.001, "clock": []
+        "way": "signed", "source": "app", "id": "ann", "churn": False, "delay": 0.001, "clock": []
     }  # fmt: skip
 
     def arrives(at_ns: int, delay_ns: int) -> None:
@@ -1624,7 +1623,7 @@ def test_a_sender_that_goes_on_keeps_the_robot_although_its_commands_are_refused
 
 
 @pytest.mark.parametrize(("source", "late_s", "finding"), [
-    ("teleop", 0.01, False), ("teleop", 1.0, False), ("teleop", 2.0, True), ("nav", 0.01, True),
+    ("teleop", 0.01, False), ("teleop", 0.3, False), ("teleop", 2.0, True), ("nav", 0.01, True),
 ])  # fmt: skip
 def test_a_command_of_higher_priority_may_end_the_place_of_the_first_sender(
     source: str, late_s: float, finding: bool
@@ -1734,12 +1733,6 @@ def test_a_command_older_than_one_without_motion_is_not_certain(number: int) -> 
         followed.step(at_ns, at_ns, None, "driving", "up")
         followed.command(sender, message, command, at_ns, wish)
     assert bool(followed._waiting) is (number > 201)
-
-
-def test_a_clock_that_was_set_and_drives_without_a_zero_is_a_finding() -> None:
-    followed_in_turn((4.0, "a", 0.3, -2.0), (7.0, "a", 0.0, -2.0), (7.1, "a", 0.3, -2.0))
-    with pytest.raises(BrokenError, match="a clock that jumped needs a zero"):
-        followed_in_turn((4.0, "a", 0.3, -2.0), (7.1, "a", 0.3, -2.0))
 
 
 def test_a_slope_that_grows_faster_than_the_jerk_is_seen_through_the_rounding() -> None:

@@ -18,12 +18,13 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import pytest
 import zenoh
 
 from acsard.client import Client, connect
+from acsard.core.codes import AgeCode
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,
@@ -259,6 +260,10 @@ def appeared(lines: list[ReceivedLine]) -> list[ReceivedLine]:
     return [b for a, b in itertools.pairwise(lines) if b.line != a.line]
 
 
+def refused_for_age(bus: Bus) -> int:
+    return sum(bus.count(f"command_{code}") for code in get_args(AgeCode))
+
+
 def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
     """Simulate partitions one after the other, and return their results.
 
@@ -282,7 +287,7 @@ def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
         for way, length in ways:
             start = time.monotonic()
             until(lambda: driving(start), 15.0, "it drives")  # noqa: B023
-            refused = bus.count("command_stale")
+            refused = refused_for_age(bus)
             proxy.turn("hole")
             begun = time.monotonic()
             until(lambda: time.monotonic() > begun + length, length + 5, "a hole")  # noqa: B023
@@ -304,7 +309,7 @@ def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
                     way,
                     length,
                     backlog,
-                    bus.count("command_stale") - refused,
+                    refused_for_age(bus) - refused,
                     len(ages),
                     sum(age > bound + HANDS * lost(h.at - age, h.at) for h, age in stale),
                     max(ages),

@@ -15,6 +15,7 @@ REMOVED = {
     "feedback.wheel_acceleration": "remove the key: the bound is 1500 rad/s2",
     "battery.return_below": "remove the key: use battery.warning_below",
     "battery.hysteresis": "remove the key: a level ends 0.5 V or % above its threshold",
+    "commands.neutral_first": 'remove the key: a source may have neutral_first = "pause"',
     "commands.neutral_pause": "remove the key: the pause is 1 s",
     "record.days": "remove the key: only record.megabytes limits the recordings",
     "log.format": "remove the key: the format follows from the terminal, the journal or a pipe",

@@ -274,16 +274,16 @@ class Source(Struct, frozen=True):
     name: Name
     priority: Annotated[int, Meta(ge=0, le=1000, extra={"example": 50})]
     timeout: Annotated[float, Meta(ge=0.02, le=10.0, extra={"unit": "s"})] = 0.25
+    neutral_first: Literal["zero", "pause"] = "zero"
 
 
 class CommandsConfig(Struct, frozen=True):
-    neutral_first: bool = True
     sources: tuple[Source, ...] = (
         Source("teleop", 100),
         Source("app", 50),
         Source("ros2_control", 20),
         Source("dock", 15),
-        Source("nav", 10),
+        Source("nav", 10, neutral_first="pause"),
     )
 
 

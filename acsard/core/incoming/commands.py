@@ -167,7 +167,7 @@ class Receiver:
             twist, header, cancelled = self._twist(arrival)
         else:
             twist, header, cancelled = self._wheel_speeds(arrival)
-        if header is not None and header.stamp.to_ns() > 0 and not identity.steady:
+        if header is not None and header.stamp.to_ns() > 0:
             # The stamps of the header and of the attachment may come from different clocks, so the
             # clock of the header gets its own name.
             stamp_ns = header.stamp.to_ns()
@@ -195,7 +195,6 @@ class Receiver:
             shared=identity.shared,
             ros=arrival.via != "native",
             stamp_replaced=bool(ours and stamp_ns and stamp_ns - ours > MAX_TIMESTAMP_LEAD_NS),
-            steady=identity.steady,
             echo=echo,
             age_ns=None
             if echo is None or echo.run != self._run
@@ -288,7 +287,6 @@ class Identity(Struct, frozen=True):
     stamp_ns: WallNs | None = None  # in the attachment, or else of Zenoh
     sequence: int | None = None
     shared: bool = False  # several programs may share it
-    steady: bool = False  # the clock of the stamps is never adjusted
     signed: str = ""  # public name of the sender id of a native command, without the certificate
     echo: Beat | None = None
 
@@ -315,7 +313,8 @@ def identify(arrival: Arrival) -> Identity:
     """
     if arrival.via == "rmw":
         rmw = unpack(arrival.attachment)
-        return Identity(_by_gid(rmw.gid), rmw.stamp_ns, rmw.sequence)
+        # Only rmw makes GIDs unique; a bridge of one's own may send zeros for all its programs.
+        return Identity(_by_gid(rmw.gid), rmw.stamp_ns, rmw.sequence, shared=not any(rmw.gid))
     if arrival.via == "bridge":
         name = f"bridge/{public_name(arrival.sender)}" if arrival.sender else _by_key(arrival)
         return Identity(name, arrival.stamp_ns, shared=True)
@@ -331,7 +330,6 @@ def identify(arrival: Arrival) -> Identity:
         public_name(signed.sender, certificate),
         arrival.stamp_ns if signed.stamp is None else signed.stamp,
         signed.sequence,
-        steady=signed.steady and signed.stamp is not None,
         signed=public_name(signed.sender) if kind in COMMANDS else "",
         echo=signed.echo,
     )

@@ -301,8 +301,11 @@ class SourceState(Message, frozen=True):
     - nothing: the source need not wait.
     - command: the source has sent no command within its timeout.
     - neutral: a sender of the source must send a zero first.
-    - proof: the sender is new, and its delays are not proved yet.
-    - late: the commands arrive too late.
+    - unproven, early: the clock of the sender is new or was set, and its delays are not proved yet.
+    - stale, set_back, stamps: the stamps show late commands, for long, or are no times.
+    - too_old, round_trip: the echoes show late commands, or such a round trip for long.
+    - no_echo, other_run, from_future: the command has no echo of a beat of this daemon.
+    - not_newer: the command is not newer than the last accepted one of its sender.
     - stalled: the daemon stalled, and waits for the next command.
     - higher, equal: a source of higher or of the same priority controls the robot.
     - senders: other senders of this source wait until the sender that drives falls silent.

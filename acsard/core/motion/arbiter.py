@@ -1,34 +1,33 @@
 """Chooses the command that the robot follows: first the source, then a sender of this source.
 
 A sender is live until its last accepted command is older than the source's timeout. The live source
-of the highest priority wins, among equals the one that began first, until it falls silent; so do
-senders. A source without an armed sender keeps its priority, and the robot stands still: a lower
-one must not drive instead. Zeros alone keep the robot at rest for any time, which `state` and the
-log report. A sender with doubtful stamps is chosen for a short time (`Sender.present`), and the
-robot stands still.
+of the highest priority wins; of its senders, and of sources with the same priority, an armed one,
+and then the one that drives already or that began first, until it falls silent. Without an armed
+sender a source keeps its priority, and the robot stands still: a lower one must not drive instead.
+Zeros alone keep the robot at rest for any time, which `state` and the log report.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Literal
 
-from msgspec import Struct
+from msgspec import Struct, field
 
+from acsard.core.codes import AgeCode
 from acsard.core.config.settings import CommandsConfig, Source
+from acsard.core.motion.ages import MARGIN_NS, Ages, Order
 from acsard.core.motion.emergency_stop import CATCH_UP_NS, LATE_STEP_NS
-from acsard.core.motion.freshness import MAX_PROOF_NS, Freshness
-from acsard.core.motion.neutral import FOREVER_NS, NEUTRAL_PAUSE_NS, Sender, is_zero
+from acsard.core.motion.neutral import FOREVER_NS, NEUTRAL_PAUSE_NS, Hint, Sender, is_zero
 from acsard.core.values import NS_PER_S, REST, Command, Ns, SourceStatus, Twist, Wait
 
-MAX_SENDERS = 16  # of a source; one that may keep control (`Sender.holds`) is never replaced
-
-Objection = Literal["unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
+MAX_SENDERS = 16  # of a source; one that may drive is never replaced
 
 # s of zeros only, or of speeds without being armed, to which `state` rounds down.
 REPORTED_DURATIONS_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
+
+NOBODY = ("", "")
 
 
 class Choice(Struct, frozen=True):
@@ -41,197 +40,122 @@ class Choice(Struct, frozen=True):
     sender: str = ""
 
 
-# No source has sent within its timeout. A command that its stamp made unacceptable has a `wait`.
+# No source has sent within its timeout. A command that was refused for its age has a `wait`.
 IDLE = Choice()
 
 
-class _Source:
-    def __init__(self, settings: Source, neutral_first: bool) -> None:
-        self.name, self.priority = settings.name, settings.priority
-        self.neutral_first = neutral_first
-        self.senders: dict[str, Sender] = {}
-        self.use(settings)
+class SourceSenders(Struct):
+    """The senders of one source, and their clocks."""
 
-    def use(self, settings: Source) -> None:
-        self.timeout_ns = int(settings.timeout * NS_PER_S)
-        self.proof = Wait("proof", settings.name, min(self.timeout_ns, MAX_PROOF_NS) / NS_PER_S)
-        self.late = Wait("late", settings.name, settings.timeout)
-        self.stalled = Wait("stalled", settings.name)
-        for sender in self.senders.values():
-            sender.use(self.timeout_ns)
+    senders: dict[str, Sender] = {}
+    ages: Ages = field(default_factory=Ages)
+    forgot_ns: Ns = 0  # last message of a sender that was replaced
 
-    def add(self, name: str, now_ns: Ns) -> Sender | None:
-        """Return a new sender (it may replace the one of the lowest rank), or None."""
+    def add(self, name: str, now_ns: Ns, timeout_ns: Ns) -> Sender | None:
+        """Return a new sender (it may replace another one), or None."""
         if len(self.senders) >= MAX_SENDERS:
-            least = min(self.senders, key=lambda other: self._account(other, now_ns))
-            if self._account(least, now_ns)[0]:
+            least = min(self.senders.values(), key=lambda other: other.worth(now_ns, timeout_ns))
+            if least.worth(now_ns, timeout_ns)[0]:
                 return None
-            del self.senders[least]
-        added = self.senders[name] = Sender(self.timeout_ns, self.neutral_first)
+            self.forgot_ns = max(self.forgot_ns, least.seen_ns)
+            self.senders = {
+                name: other for name, other in self.senders.items() if other is not least
+            }
+        added = self.senders[name] = Sender(Order(), self.forgot_ns)
         return added
 
-    def _account(self, name: str, now_ns: Ns) -> tuple[bool, bool, int]:
-        sender = self.senders[name]
-        holds = sender.holds(now_ns)
-        return holds, holds or sender.armed(now_ns), sender.noticed_ns
-
-    def cancel_zeros(self, at_ns: Ns) -> None:
-        """Cancel the zeros of identities that several programs share: one may have sent a speed.
-
-        A zero whose neutral pause was over at `at_ns` stays.
-        """
-        for sender in self.senders.values():
-            sender.cancel_zero(at_ns)
-
-    def undo_zeros(self, command: Command, was_set: bool) -> None:
-        """Undo the unaccepted zeros of a sender with a doubtful clock, or all if it was set."""
-        sender = self.senders.get(command.sender)
-        # Behind a bridge, programs with clocks of their own share one identity, so a command to
-        # another source counts only if the same clock stamped the last one to this source.
-        if sender is None or (command.source != self.name and command.clock != sender.clock):
-            return
-        if was_set:
-            sender.disarm(command.arrived_ns)
-        else:
-            sender.unlearn()
-
-    def present(self, now_ns: Ns) -> list[Sender]:
-        """Return the senders that may be chosen: armed, live, others; the oldest first."""
-        present = []
-        for sender in self.senders.values():
-            if sender.present(now_ns):
-                present.append(sender)
-        if len(present) < 2:
-            return present
-        return sorted(
-            present,
-            key=lambda sender: (not sender.armed(now_ns), *sender.rank(now_ns)),
-        )
-
-    def latest_ns(self) -> Ns | None:
-        """Return when the last accepted command since `require_neutral` arrived."""
-        times = [s.arrived_ns for s in self.senders.values() if s.arrived_ns is not None]
-        return max(times, default=None)
-
-    def require_neutral(self) -> None:
-        for sender in self.senders.values():
-            sender.require_neutral()
-
-    def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
-        """Return the `Wait` for a zero; `lasts` is how long the sender has sent only speeds, s."""
-        return Wait(
-            "neutral",
-            self.name,
-            NEUTRAL_PAUSE_NS / NS_PER_S,
-            lasts=lasts,
-            ros=sender.ros,
-            shared=sender.shared,
-        )
-
-    def doubt_wait(self, now_ns: Ns) -> Wait | None:
-        """Return why the newest sender with doubtful stamps does not drive, or None without any."""
-        doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
-        if not doubtful:
-            return None
-        return self.stale_wait(max(doubtful, key=lambda sender: sender.noticed_ns), now_ns)
-
-    def stale_wait(self, sender: Sender, now_ns: Ns) -> Wait:
-        """Return why `sender`, which is not live, does not drive the robot."""
-        if not sender.doubtful(now_ns):
-            return self.stalled
-        if sender.doubt == "stale":
-            return self.late
-        return self.proof if sender.armed(now_ns) else self.neutral(sender)
-
-    def wait_of(self, sender: Sender, now_ns: Ns, lasting: bool = True) -> Wait:
-        """Return why `sender` does not drive; if `lasting`, for how long it has sent speeds."""
-        if not sender.is_live(now_ns):
-            return self.stale_wait(sender, now_ns)
-        since_ns = sender.speeds_ns if lasting else None
-        return self.neutral(
-            sender, 0.0 if since_ns is None else _reported_duration_s(now_ns - since_ns)
-        )
+    def quiet_ns(self, sender: Sender) -> Ns:
+        """Return the last message of a sender, or of all that share an identity."""
+        if not sender.shared:
+            return sender.seen_ns
+        return max(each.seen_ns for each in self.senders.values() if each.shared)
 
 
-class Arbiter:
+class Arbiter(Struct):
     """Stores the latest command of each sender, and chooses the command that the robot follows."""
 
-    def __init__(self, commands: CommandsConfig) -> None:
-        self._sources = {s.name: _Source(s, commands.neutral_first) for s in commands.sources}
-        self._ranking = sorted(self._sources.values(), key=lambda source: -source.priority)
-        self._holder: _Source | None = None
-        self._followed: Sender | None = None
-        self._since_ns = 0
-        self._begun_ns = self._watched_ns = 0
-        self._freshness = Freshness()
-        self.until_ns = 0  # the last `choose` holds until then, unless another method is called
-
-    def use(self, commands: CommandsConfig) -> None:
-        """Use other timeouts. Armed senders stay armed."""
-        for settings in commands.sources:
-            self._sources[settings.name].use(settings)
-        self.until_ns = 0
+    sources: dict[str, SourceSenders] = {}
+    holder: tuple[str, str] = NOBODY  # source that drives or waits, and sender that drives
+    since_ns: Ns = 0  # zeros from then on arm
+    begun_ns: Ns = 0  # last step
+    caught_up_ns: Ns = 0  # until then, commands may arrive that waited during the last stall
+    watched_ns: Ns = 0  # since then the robot could drive, and the daemon has not stood still
+    until_ns: Ns = 0  # the last `choose` holds until then, unless another method is called
 
     def require_neutral(self, since_ns: Ns = 0) -> None:
-        """Forget all commands: each sender must send a zero that arrives from `since_ns` on.
+        """Forget all commands: each sender must be neutral from `since_ns` on.
 
         An older zero, for example from before a stop was cleared, does not show that the sender
-        wants rest now. The latest `since_ns` counts. Without `commands.neutral_first` no zero is
-        needed.
+        wants rest now. The latest `since_ns` counts.
         """
-        self._since_ns = max(self._since_ns, since_ns)
-        for source in self._ranking:
-            source.require_neutral()
-        self._holder = self._followed = None
-        self.until_ns = 0
+        self.since_ns = max(self.since_ns, since_ns)
+        self.watched_ns = max(self.watched_ns, since_ns)
+        for source in self.sources.values():
+            for sender in source.senders.values():
+                sender.require_neutral()
+        self.holder, self.until_ns = NOBODY, 0
 
-    def begin(self, now_ns: Ns) -> bool:
+    def forget_clocks(self) -> None:
+        """Measure the delays of all senders without an echo anew."""
+        for source in self.sources.values():
+            source.ages = Ages()
+
+    def begin(self, now_ns: Ns, commands: CommandsConfig) -> bool:
         """Begin a control step, and return whether the daemon stood still before (True at first).
 
-        After `LATE_STEP_NS`, the bus may not have delivered all commands, so senders stay in the
-        choice for a short time, and a running neutral pause does not advance (`Sender.resume`).
+        After `LATE_STEP_NS`, the bus may not have delivered all commands.
         """
-        before_ns, self._begun_ns = self._begun_ns, now_ns
+        before_ns, self.begun_ns = self.begun_ns, now_ns
         if now_ns - before_ns <= LATE_STEP_NS:
             return False
-        self._watched_ns = now_ns if before_ns else now_ns - CATCH_UP_NS
-        self.until_ns = 0
-        for source in self._ranking:
-            for sender in source.senders.values():
-                sender.resume(before_ns, now_ns)
+        self.watched_ns, self.until_ns = now_ns, 0
+        if before_ns:
+            self.caught_up_ns = now_ns + CATCH_UP_NS
+        for settings in commands.sources:
+            if (source := self.sources.get(settings.name)) is not None:
+                for sender in source.senders.values():
+                    sender.resume(before_ns, now_ns, timeout_ns(settings))
         return True
 
-    def accept(self, command: Command) -> Objection | Literal[""]:
-        """Process a command. Return "" if it is accepted, otherwise the reason to refuse it."""
+    def accept(self, command: Command, commands: CommandsConfig) -> Wait | None:
+        """Process a command. Return None if it is accepted, otherwise why it is refused."""
         self.until_ns = 0
-        source = self._sources.get(command.source)
-        if source is None:
-            return "unknown_source"
-        twist, known = command.twist, source.senders.get(command.sender)
-        if command.shared and not is_zero(command):
-            source.cancel_zeros(command.arrived_ns)
-        if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
+        settings = next((s for s in commands.sources if s.name == command.source), None)
+        if settings is None:
+            return Wait("unknown_source", command.source)
+        if not (math.isfinite(command.twist.linear) and math.isfinite(command.twist.angular)):
             self.notice(command.source, command.sender, command.arrived_ns)
-            return "not_finite"
-        verdict = self._freshness.judge(command, source.timeout_ns)
-        if verdict == "stale":
-            if known is not None:
-                known.refuse(command, verdict)
-            return "stale"
-        sender = known or source.add(command.sender, command.arrived_ns)
+            return Wait("not_finite", command.source)
+        if (source := self.sources.get(command.source)) is None:
+            source = self.sources[command.source] = SourceSenders()
+        now_ns, timeout, zero = command.arrived_ns, timeout_ns(settings), is_zero(command)
+        sender = source.senders.get(command.sender) or source.add(command.sender, now_ns, timeout)
         if sender is None:
-            return "too_many_senders"
-        since_stall_ns = command.arrived_ns - self._watched_ns
-        if since_stall_ns < CATCH_UP_NS and command.stamp_ns is None and not is_zero(command):
-            # The command may have waited during the whole stall, and only a stamp would show that.
-            sender.outdate(command)
-            return "stale"
-        if verdict in ("set", "first"):
-            # The doubt about a clock concerns its stamps on all sources.
-            for other in self._ranking:
-                other.undo_zeros(command, verdict == "set")
-        sender.take(command, self._since_ns, verdict, self._watched_ns)
-        return "" if verdict in ("fresh", "set") else "unproven"
+            return Wait("too_many_senders", command.source, MAX_SENDERS)
+        sender.shared, sender.ros = command.shared, command.ros
+        neutral = zero and now_ns >= self.since_ns
+        if not zero and settings.neutral_first == "pause":
+            quiet_ns = max(source.quiet_ns(sender), self.watched_ns)
+            neutral = now_ns - quiet_ns >= NEUTRAL_PAUSE_NS
+        sender.seen_ns = now_ns
+        if command.shared and not zero:
+            for other in source.senders.values():
+                if other.shared:
+                    other.cancel_zero(now_ns)
+        stalled = not zero and now_ns < self.caught_up_ns
+        verdict = source.ages.judge(command, sender.order, timeout, stalled)
+        if verdict:
+            if neutral and verdict in ("unproven", "early"):
+                _keep_hint(sender, command, timeout)
+            why = _refusal(verdict, command, source.ages, sender.order, settings)
+            sender.refuse(command, why)
+            return why
+        sender.take(command, timeout)
+        if sender.hint is not None:
+            _accept_hint(sender, command, source.ages, timeout)
+        if neutral:
+            sender.neutral(now_ns, zero)
+        return None
 
     def notice(self, source: str, sender: str, arrived_ns: Ns) -> None:
         """Record that a message of a sender was lost or unusable; it may have been a speed.
@@ -241,99 +165,167 @@ class Arbiter:
         only such messages must not keep the others of the source from being armed.
         """
         self.until_ns = 0
-        known = self._sources.get(source)
-        known_sender = None if known is None else known.senders.get(sender)
-        if known_sender is not None:
-            known_sender.noticed_ns = arrived_ns
-            known_sender.cancel_zero(arrived_ns)
+        known_source = self.sources.get(source)
+        known = None if known_source is None else known_source.senders.get(sender)
+        if known is not None:
+            known.seen_ns = max(known.seen_ns, arrived_ns)
+            known.cancel_zero(arrived_ns)
 
-    def choose(self, now_ns: Ns) -> Choice:
+    def choose(self, now_ns: Ns, commands: CommandsConfig) -> Choice:
         """Return the command that the robot follows now, or the reason why it follows none.
 
         The result is the same until `until_ns`.
         """
-        self.until_ns = self._changes_ns(now_ns)
-        first: tuple[_Source, Sender] | None = None
-        previous = self._followed
-        for source in self._ranking:
-            if not source.senders or not (present := source.present(now_ns)):
+        until_ns, best, first = FOREVER_NS, None, None
+        for settings in commands.sources:
+            source = self.sources.get(settings.name)
+            if source is None:
                 continue
-            if first is None or (
-                source.priority == first[0].priority
-                and present[0].rank(now_ns) < first[1].rank(now_ns)
-            ):
-                first = source, present[0]
-            if (
-                previous is not None
-                and previous in present
-                and source.priority == first[0].priority
-                and previous.holds(now_ns)
-            ):
-                # `previous` began later, but `source` may have become armed just now.
-                first = source, previous
-                break
+            timeout = timeout_ns(settings)
+            for name, sender in source.senders.items():
+                until_ns = min(until_ns, _changes_ns(sender, now_ns, timeout))
+                if not sender.is_present(now_ns, timeout):
+                    continue
+                rank = (
+                    -settings.priority,
+                    not sender.is_armed(now_ns),
+                    (settings.name, name) != self.holder,
+                    sender.came_ns,
+                )
+                if best is None or rank < best:
+                    best, first = rank, (settings, name, sender)
+        self.until_ns = until_ns
         if first is None:
-            self._holder = self._followed = None
-            for source in self._ranking:
-                if source.senders and (wait := source.doubt_wait(now_ns)) is not None:
+            self.holder = NOBODY
+            for settings in ranking(commands):
+                if (wait := self._refused(settings, now_ns)) is not None:
                     return Choice(wait=wait)
             return IDLE
-        source, sender = first
-        armed = sender.armed(now_ns)
-        self._holder, self._followed = source, sender if armed or sender is previous else None
-        if not (armed and sender.is_live(now_ns)):
-            return Choice(source.name, None, source.wait_of(sender, now_ns), sender=sender.name)
-        wait = NOTHING
-        if sender.zeros_ns is not None and (
-            lasts := _reported_duration_s(now_ns - sender.zeros_ns)
-        ):
-            wait = Wait(
-                "zeros", source.name, lasts=lasts, kept=self._blocked_source(source, now_ns)
-            )
-        return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
+        settings, name, sender = first
+        armed = sender.is_armed(now_ns)
+        self.holder = settings.name, name if armed else ""
+        if not (armed and sender.is_live(now_ns, timeout_ns(settings))):
+            return Choice(settings.name, None, _wait(sender, settings, now_ns, True), None, name)
+        wait, since_ns = NOTHING, sender.zeros_ns
+        if since_ns is not None and (lasts := _reported_duration_s(now_ns - since_ns)):
+            kept = self._without_effect(now_ns, commands)
+            wait = Wait("zeros", settings.name, lasts=lasts, kept=kept)
+        return Choice(settings.name, sender.twist, wait, sender.arrived_ns, name)
 
-    def _changes_ns(self, now_ns: Ns) -> Ns:
-        times = [FOREVER_NS]
-        for source in self._ranking:
-            for sender in source.senders.values():
-                times.append(sender.changes_ns(now_ns))
-                for since_ns in (sender.zeros_ns, sender.speeds_ns):
-                    if since_ns is not None:
-                        times.append(since_ns + _next_report_ns(now_ns - since_ns))
-        return min(times)
+    def _refused(self, settings: Source, now_ns: Ns) -> Wait | None:
+        # Why the newest command of a source that is not live was refused.
+        senders = self.sources.get(settings.name, SourceSenders()).senders.values()
+        refused = [
+            sender
+            for sender in senders
+            if sender.refused and now_ns - sender.refused_ns <= timeout_ns(settings)
+        ]
+        return max(refused, key=lambda sender: sender.refused_ns).refused if refused else None
 
-    def _blocked_source(self, holder: _Source, now_ns: Ns) -> str:
-        # The source, or another sender of it, whose speeds have no effect: `holder` sends zeros.
-        for source in self._ranking:
-            senders = (each for each in source.present(now_ns) if each is not self._followed)
-            if any(sender.twist != REST for sender in senders):
-                return f"another sender of {source.name}" if source is holder else source.name
+    def _present(self, settings: Source, now_ns: Ns) -> dict[str, Sender]:
+        timeout = timeout_ns(settings)
+        senders = self.sources.get(settings.name, SourceSenders()).senders
+        return {
+            name: sender for name, sender in senders.items() if sender.is_present(now_ns, timeout)
+        }
+
+    def _without_effect(self, now_ns: Ns, commands: CommandsConfig) -> str:
+        # The source, or another sender of it, that sends speeds while the one that drives sends
+        # zeros.
+        for settings in ranking(commands):
+            for name, sender in self._present(settings, now_ns).items():
+                if (settings.name, name) != self.holder and sender.twist != REST:
+                    same = settings.name == self.holder[0]
+                    return f"another sender of {settings.name}" if same else settings.name
         return ""
 
-    @property
-    def clock_adjustment_ns(self) -> Ns:
-        """Sum of the trusted increases of delays that no stamps explain (`freshness.py`)."""
-        return self._freshness.forgiven_ns
-
-    def sources(self, now_ns: Ns) -> tuple[SourceStatus, ...]:
+    def status(self, now_ns: Ns, commands: CommandsConfig) -> tuple[SourceStatus, ...]:
         """Return the status of each source, the highest priority first."""
-        return tuple(self._status(source, now_ns) for source in self._ranking)
+        return tuple(self._status(settings, now_ns, commands) for settings in ranking(commands))
 
-    def _status(self, source: _Source, now_ns: Ns) -> SourceStatus:
-        latest = source.latest_ns()
-        age_s = None if latest is None else max(0, now_ns - latest) / NS_PER_S
-        return SourceStatus(source.name, source.priority, age_s, self._waits_for(source, now_ns))
+    def _status(self, settings: Source, now_ns: Ns, commands: CommandsConfig) -> SourceStatus:
+        senders = self.sources.get(settings.name, SourceSenders()).senders.values()
+        latest_ns = max((s.arrived_ns for s in senders if s.arrived_ns is not None), default=None)
+        age_s = None if latest_ns is None else max(0, now_ns - latest_ns) / NS_PER_S
+        wait = self._waits_for(settings, now_ns, commands)
+        return SourceStatus(settings.name, settings.priority, age_s, wait)
 
-    def _waits_for(self, source: _Source, now_ns: Ns) -> Wait:
-        holder, present = self._holder, source.present(now_ns)
+    def _waits_for(self, settings: Source, now_ns: Ns, commands: CommandsConfig) -> Wait:
+        present, (holder, name) = self._present(settings, now_ns), self.holder
         if not present:
-            return source.doubt_wait(now_ns) or COMMAND
-        first = self._followed if source is holder and self._followed else present[0]
-        if not (first.armed(now_ns) and first.is_live(now_ns)):
-            return source.wait_of(first, now_ns, lasting=False)
-        if holder is None or source is holder:
+            return self._refused(settings, now_ns) or COMMAND
+        first = present.get(name) if holder == settings.name else None
+        first = first or min(
+            present.values(), key=lambda each: (not each.is_armed(now_ns), each.came_ns)
+        )
+        if not (first.is_armed(now_ns) and first.is_live(now_ns, timeout_ns(settings))):
+            return _wait(first, settings, now_ns, False)
+        if holder in ("", settings.name):
             return Wait("senders", senders=len(present) - 1) if len(present) > 1 else NOTHING
-        return Wait("equal" if holder.priority == source.priority else "higher", holder.name)
+        equal = any(s.name == holder and s.priority == settings.priority for s in commands.sources)
+        return Wait("equal" if equal else "higher", holder)
+
+
+def timeout_ns(settings: Source) -> Ns:
+    return int(settings.timeout * NS_PER_S)
+
+
+def ranking(commands: CommandsConfig) -> list[Source]:
+    return sorted(commands.sources, key=lambda settings: -settings.priority)
+
+
+def _keep_hint(sender: Sender, command: Command, timeout: Ns) -> None:
+    # The first one counts, unless a later one shows that it was late.
+    hint, delay = sender.hint, command.arrived_ns - (command.stamp_ns or 0)
+    if hint is None or hint.clock != command.clock or hint.delay - delay > timeout:
+        sender.hint = Hint(is_zero(command), command.arrived_ns, delay, command.clock)
+
+
+def _accept_hint(sender: Sender, command: Command, ages: Ages, timeout: Ns) -> None:
+    # Now the clock is proven, so it is known whether the sender's zero was late.
+    hint, clock = sender.hint, ages.clocks.get(command.clock)
+    sender.hint = None
+    if hint is None or hint.clock != command.clock or clock is None or clock.least is None:
+        return
+    if hint.delay - clock.least <= timeout:
+        sender.neutral(hint.at_ns, hint.zero)
+
+
+def _refusal(
+    verdict: AgeCode, command: Command, ages: Ages, order: Order, settings: Source
+) -> Wait:
+    seconds, note, clock = settings.timeout, "", ages.clocks.get(command.clock)
+    if verdict in ("too_old", "round_trip"):
+        seconds = round((timeout_ns(settings) + MARGIN_NS) / NS_PER_S, 3)
+        note = f"{math.ceil(order.round_trip_ns / NS_PER_S * 10) / 10:g}"
+    elif verdict == "set_back" and clock is not None:
+        seconds = round(clock.behind / NS_PER_S, 1)
+    elif verdict == "stamps" and clock is not None:
+        note = f"by {clock.advance:.1f} s in a second" if clock.advance else "they stand still"
+    return Wait(verdict, settings.name, seconds, kept=note)
+
+
+def _wait(sender: Sender, settings: Source, now_ns: Ns, lasting: bool) -> Wait:
+    # Why a sender that takes part in the choice does not drive; `lasting`: for how long it tries.
+    if not sender.is_live(now_ns, timeout_ns(settings)):
+        return sender.refused or Wait("stalled", settings.name)
+    since_ns = sender.speeds_ns if lasting else None
+    return Wait(
+        "neutral",
+        settings.name,
+        NEUTRAL_PAUSE_NS / NS_PER_S,
+        lasts=0.0 if since_ns is None else _reported_duration_s(now_ns - since_ns),
+        ros=sender.ros,
+        shared=sender.shared,
+    )
+
+
+def _changes_ns(sender: Sender, now_ns: Ns, timeout: Ns) -> Ns:
+    until_ns = sender.changes_ns(now_ns, timeout)
+    for since_ns in (sender.zeros_ns, sender.speeds_ns):
+        if since_ns is not None:
+            until_ns = min(until_ns, since_ns + _next_report_ns(now_ns - since_ns))
+    return until_ns
 
 
 def _next_report_ns(ns: Ns) -> Ns:
@@ -343,6 +335,5 @@ def _next_report_ns(ns: Ns) -> Ns:
 
 
 def _reported_duration_s(ns: Ns) -> float:
-    if ns < REPORTED_DURATIONS_S[0] * NS_PER_S:
-        return 0.0  # Nearly every step ends here.
-    return max(seconds for seconds in REPORTED_DURATIONS_S if ns >= seconds * NS_PER_S)
+    reached = [seconds for seconds in REPORTED_DURATIONS_S if ns >= seconds * NS_PER_S]
+    return reached[-1] if reached else 0.0

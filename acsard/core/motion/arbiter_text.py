@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import get_args
 
 from msgspec import Struct
 
 from acsard.core.codes import Reason, sentence
 from acsard.core.formatting import lasting, many
-from acsard.core.motion.arbiter import MAX_SENDERS, Choice, Objection
+from acsard.core.motion.arbiter import Choice
 from acsard.core.motion.modes import Mode
 from acsard.core.values import NS_PER_S, Event, Ns, Refusal, Wait
 
@@ -63,12 +62,12 @@ def waiting(wait: Wait) -> Reason:
         case "senders":
             return sentence("senders", others=many(wait.senders, "other sender"))
         case _:
-            return sentence(wait.what, source=wait.source, seconds=wait.seconds)
+            return _sentence(wait)
 
 
-OBJECTIONS: dict[str, str] = {
-    code: sentence(code, most=MAX_SENDERS).text for code in get_args(Objection)
-}
+@lru_cache(64)
+def _sentence(wait: Wait) -> Reason:
+    return sentence(wait.what, source=wait.source, seconds=wait.seconds, note=wait.kept)
 
 
 def missed(periods: int, period_ns: Ns) -> Event:

@@ -16,12 +16,12 @@ from tests import recordings
 PACKAGE = Path(acsard.__file__).parent
 
 VALUES = {
-    "source": "app", "seconds": 0.5, "alone": "", "lasts": "", "ros": "", "note": "",
+    "source": "app", "seconds": 0.5, "alone": "", "lasts": "", "ros": "", "note": "2",
     "firmware": "", "others": "2 other senders", "bumpers": "front bumper pressed",
     "direction": "backwards",
     "speed": 0.1, "by": "ann", "cause": "why", "places": "1 place", "dots": ".",
     "threshold": "21 V", "charged": "21.4 V", "wheel": "rear_left", "figures": "(1 rad/s)",
-    "trouble": "why", "received": "nothing", "apart": "0.20", "longest": 0.25, "most": 16,
+    "trouble": "why", "received": "nothing", "apart": "0.20", "longest": 0.25,
     "named": "rain",
 }  # fmt: skip
 """A value for each name in the texts."""

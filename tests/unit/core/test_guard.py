@@ -749,11 +749,6 @@ EACH_CONFIG = pytest.mark.parametrize(
     [
         pytest.param(Config(), id="default"),
         pytest.param(
-            Config(commands=CommandsConfig(neutral_first=False)),
-            id="without neutral first",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
             Config(limits=LimitsConfig(linear_jerk=5.0, angular_jerk=20.0, wheel_speed=20.0)),
             id="jerk",
             marks=pytest.mark.slow,

@@ -452,30 +452,6 @@ def test_a_press_of_the_bumper_in_the_direction_of_the_retreat_ends_the_retreat(
     assert bench.step(GO).applied.linear > 0.0
 
 
-def test_a_command_against_a_bumper_is_ignored_also_without_the_neutral_first_rule() -> None:
-    config = replace(AWAY, commands=CommandsConfig(neutral_first=False))
-    bench = Button(FREE, config)
-    bench.driving()
-    bench.status(FRONT)
-    for _ in range(20):
-        out = bench.step(GO)
-        assert (out.mode, out.line, out.command_ns) == ("ready", ZERO_LINE, None)
-    assert bench.step(BACK).mode == "driving"
-
-
-@pytest.mark.parametrize("marks", [REAR + FREE, REAR])
-def test_the_line_after_a_press_is_zero_even_if_commands_that_came_with_it_may_move_the_robot(
-    marks: bytes,
-) -> None:
-    bench = Button(FREE, replace(AWAY, commands=CommandsConfig(neutral_first=False)))
-    bench.driving()
-    out = bench.status(marks).step(GO)
-    assert (out.applied, out.mode) == (REST, "driving")
-    assert bench.status(FREE).step(GO, superseded=True).applied == REST
-    out = bench.step(GO)
-    assert 0.0 < out.applied.linear < 0.1
-
-
 def test_silent_bumpers_latch_a_stop_also_if_a_press_would_only_limit() -> None:
     bench = Button(FREE, AWAY)
     bench.driving()
@@ -1002,14 +978,6 @@ def test_a_lost_port_clears_every_command() -> None:
     assert {source.age_s for source in sources} == {None}
 
 
-def test_without_neutral_first_no_source_waits_for_a_zero_before_the_port_opens() -> None:
-    bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).unplug()
-    bench.opened = 0  # the port was never open
-    bench.step(GO)
-    waits = {s.name: s.waits_for.what for s in bench.robot.snapshot(bench.now_ns).sources}
-    assert waits["app"] == "nothing"
-
-
 def test_a_silent_mcu_makes_the_link_stale_and_the_speed_zero() -> None:
     bench = Bench().driving()
     bench.reply = None
@@ -1038,7 +1006,7 @@ def test_the_first_step_of_a_new_robot_sends_a_zero_line() -> None:
 
 
 def test_while_the_link_boots_every_line_is_zero() -> None:
-    bench = Bench(Config(commands=CommandsConfig(neutral_first=False)))
+    bench = Bench()
     assert bench.step(REST).line == ZERO_LINE
     assert bench.step(GO).line == b"?\r\n"
     assert bench.step(GO).line == ZERO_LINE
@@ -1164,9 +1132,12 @@ def test_after_an_activation_each_source_must_be_neutral() -> None:
     assert bench.mode() == "driving"
 
 
-def test_activating_an_active_robot_changes_nothing() -> None:
+def test_activating_an_active_robot_asks_each_sender_for_a_zero() -> None:
     bench = Bench().driving()
     bench.step(GO, ask="activate", gyro=0.0)
+    assert bench.mode() == "ready"
+    bench.step(REST)
+    bench.step(GO)
     assert bench.mode() == "driving"
     bench.set({"limits.linear_speed": 0.9})
     assert bench.step(GO).applied == GO
@@ -1496,11 +1467,8 @@ def test_after_a_stall_the_robot_brakes_for_the_whole_elapsed_time() -> None:
     assert bench.step(ms=200).applied.linear == pytest.approx(0.3)
 
 
-@pytest.mark.parametrize("neutral_first", [True, False])
-def test_a_line_superseded_before_the_port_was_lost_does_not_bring_its_speed_back(
-    neutral_first: bool,
-) -> None:
-    bench = Bench(Config(commands=CommandsConfig(neutral_first))).driving()
+def test_a_line_superseded_before_the_port_was_lost_does_not_bring_its_speed_back() -> None:
+    bench = Bench().driving()
     bench.step(GO)  # this line does not leave
     bench.replug().step(GO, superseded=True)
     assert bench.out.applied == REST
@@ -1512,11 +1480,8 @@ def test_a_line_superseded_before_the_port_was_lost_does_not_bring_its_speed_bac
     assert bench.out.applied.linear <= 0.05
 
 
-@pytest.mark.parametrize("neutral_first", [True, False])
-def test_a_superseded_speed_does_not_return_if_the_port_reopened_between_two_ticks(
-    neutral_first: bool,
-) -> None:
-    bench = Bench(Config(commands=CommandsConfig(neutral_first))).driving()
+def test_a_superseded_speed_does_not_return_if_the_port_reopened_between_two_ticks() -> None:
+    bench = Bench().driving()
     bench.step(GO)  # this line does not leave
     bench.replug()
     for tick in (True, True, True, False, False):
@@ -1709,13 +1674,6 @@ def test_first_commands_of_a_new_sender_are_counted_apart_from_refused_ones() ->
     counters = bench.counters()
     assert counters["commands_of_new_senders"] == 1
     assert not [name for name in counters if name.startswith("command_")]
-
-
-def test_adjustments_for_the_clocks_of_senders_are_counted_in_ms() -> None:
-    bench = Bench().linked()
-    for number in range(300):
-        bench.step(REST, late_ms=min(max(0.0, 10.0 * (number - 100)), 300.0), ms=50)
-    assert "clock_adjustments_ms" in bench.counters()
 
 
 def test_lines_that_are_not_answered_are_reported() -> None:

@@ -18,9 +18,8 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
 from acsard.core.guard import Memory
-from acsard.core.motion.freshness import Freshness
 from acsard.core.robot import Robot
-from acsard.core.values import NS_PER_S, REST, Command, Instant
+from acsard.core.values import Instant
 from acsard.host.errors import RecordingError
 from acsard.recording.file import Recording
 from acsard.recording.replay import Playback
@@ -61,18 +60,6 @@ def test_a_robot_with_every_odometry_error_is_read_back() -> None:
     columns = thaw(data).robot._odometry.uncertainty.columns
     assert len([column for column in columns if any(column)]) >= 3
     assert freeze(*thaw(data)) == freeze(*thaw(freeze(*thaw(data))))
-
-
-def test_senders_of_one_command_soon_leave_the_state() -> None:
-    """The control loop saves the state whenever a recording file begins, so it must stay small."""
-    freshness = Freshness()
-    for number in range(5000):
-        stamp_ns = number * NS_PER_S // 1000
-        command = Command("app", REST, stamp_ns, stamp_ns, f"sender {number}")
-        freshness.judge(command, NS_PER_S // 4)
-    later_ns = 8 * NS_PER_S
-    freshness.judge(Command("app", REST, later_ns, later_ns, "me"), NS_PER_S // 4)
-    assert len(pickle.dumps(freshness)) < len(freeze(Robot(Config()), Memory())) / 10
 
 
 @each("value", [1, (1, 2), ("robot", b""), (Instant(1, 2), b"")])
@@ -154,9 +141,9 @@ def test_a_part_that_is_plain_data_has_no_configuration_inside(part: Any) -> Non
     assert not [name for name in modules if name.startswith("acsard.core.config")]
 
 
-def test_only_four_parts_are_pickled() -> None:
+def test_only_three_parts_are_pickled() -> None:
     pickled = vars(Robot(PLAIN)).keys() - PARTS.keys() - {*DERIVED}
-    assert pickled == {"session", "_checks", "_arbiter", "_life"}
+    assert pickled == {"session", "_checks", "_life"}
 
 
 @each(
@@ -216,17 +203,6 @@ def replace_state(tape: Tape, state: bytes) -> Tape:
     other = Tape()
     other.taken, other.states = tape.taken, {100: state}
     return other
-
-
-@pytest.mark.slow
-def test_a_missing_part_that_a_new_robot_lacks_too_gives_a_message(tmp_path: Path) -> None:
-    def forget(robot: Robot) -> None:
-        for sender in robot._arbiter._sources["app"].senders.values():
-            del sender.arrived_ns
-
-    recording = of_older_code(tmp_path / "old", forget)
-    with pytest.raises(RecordingError, match=r"cannot replay old, which acsard .*'arrived_ns'"):
-        played(recording)
 
 
 PLAIN = Config()

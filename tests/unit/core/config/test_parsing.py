@@ -87,6 +87,7 @@ def test_the_reference_file_has_every_key_of_every_table_and_no_other() -> None:
     table = tomllib.loads(REFERENCE.read_text(encoding="utf-8"))
     for source in table["commands"]["sources"]:
         source.setdefault("timeout", 0.25)
+        source.setdefault("neutral_first", "zero")
     assert table == msgspec.json.decode(msgspec.json.encode(effective(Config())))
 
 

@@ -44,7 +44,7 @@ def test_the_defaults_are_those_of_the_original_robot() -> None:
     assert config.odometry.odom_frame == "odom"
     assert config.odometry.base_frame == "base_link"
     assert config.lidar.lidar_frame == "lidar_link"
-    assert config.commands.neutral_first
+    assert {s.name for s in config.commands.sources if s.neutral_first == "pause"} == {"nav"}
 
 
 def test_the_default_limits_are_those_of_the_design() -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import get_args, get_type_hints
+from typing import get_args
 
-from acsard.core.codes import Code, Reason, WaitCode
+from acsard.core.codes import Code, ObjectionCode, Reason, WaitCode
 from acsard.core.motion.arbiter import Choice
 from acsard.core.motion.arbiter_text import (
     MAX_SENDER_LENGTH,
@@ -47,8 +47,8 @@ def test_the_text_of_a_wait_has_the_details_of_the_wait(wait: Wait, text: str) -
     assert waiting(wait).text == text
 
 
-@each("what", get_args(get_type_hints(Wait)["what"]))
-def test_the_reason_of_a_wait_has_the_code_of_the_wait(what: WaitCode) -> None:
+@each("what", (*get_args(WaitCode), *get_args(ObjectionCode)))
+def test_the_reason_of_a_wait_has_the_code_of_the_wait(what: WaitCode | ObjectionCode) -> None:
     assert waiting(Wait(what, "app", 1.0, lasts=3600.0, senders=15)).code == what
 
 
@@ -56,7 +56,7 @@ def test_the_reason_of_a_wait_has_the_code_of_the_wait(what: WaitCode) -> None:
     ("choice", "code"),
     [
         (Choice(), "no_command"),
-        (Choice(wait=Wait("proof", "app", 2.0)), "proof"),
+        (Choice(wait=Wait("unproven", "app", 2.0)), "unproven"),
         (Choice("app", REST, Wait("nothing"), 1), "commanded"),
         (Choice("app", None, Wait("neutral", "app", 0.25)), "neutral"),
     ],
@@ -87,7 +87,7 @@ def test_a_change_of_mode_is_reported_once_with_its_reason() -> None:
     assert reporter.changes(Mode.READY, NOBODY, why("no_command")) == [
         Event("mode", "", kind="waiting -> ready", code="no_command")
     ]
-    assert reporter.changes(Mode.READY, NOBODY, why("late")) == []
+    assert reporter.changes(Mode.READY, NOBODY, why("stale")) == []
 
 
 def test_a_new_commander_is_reported_with_the_mode_and_as_the_commander() -> None:

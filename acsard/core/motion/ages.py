@@ -1,0 +1,191 @@
+"""Judges the age of a command: by the beat that it echoes, else by its stamp, else not at all.
+
+Echo: the daemon measures the age by its own clock, and the echo may be as old as the timeout of the
+source plus `MARGIN_NS`. Stamp: the clock of the sender is not synchronized, so only the rise of the
+delay (arrival minus stamp) above its least value is known. The least delay rises slowly, because
+two clocks drift, and nothing proves it upwards: a clock that was set back, or commands that wait in
+a queue, are refused until `activate` or a new sender id. A refused command changes no timeout.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from msgspec import Struct
+
+from acsard.core.codes import AgeCode
+from acsard.core.values import NS_PER_S, Command, Ns
+
+Verdict = Literal[AgeCode, ""]
+
+MARGIN_NS = NS_PER_S // 20  # distance of two beats, and jitter of the delays on a sound LAN
+
+# The kernel slews a clock by at most 0.5 ms per second for systemd-timesyncd.
+RISE_DIVISOR = 2000
+
+# The least delay rises by at most one timeout in any hour: its lowest values in slots limit it.
+MEMORY_NS, SLOT_NS = 3600 * NS_PER_S, 600 * NS_PER_S
+
+MAX_CLOCKS = 16  # of a source
+
+LASTING_NS = 2 * NS_PER_S  # refusals for this time are no passing state, and their cause is named
+
+SLOWEST, FASTEST = 0.8, 1.25  # stamps that advance by less or more in a second are no clock's
+
+MAX_REPEATED = 3  # commands with one stamp; a network may repeat a command once or twice
+
+# Without an accepted command for this time, a sender is disarmed, and may count from 0 again.
+SILENT_NS = 10 * NS_PER_S
+
+
+class Order(Struct, gc=False):
+    """The last accepted command of a sender, and the refusals for age since then."""
+
+    beat_ns: Ns = -1  # -1: the sender has not echoed
+    sequence: int = -1
+    at_ns: Ns = 0
+    old_ns: Ns | None = None  # first command since then that was too old
+    round_trip_ns: Ns = 0  # least age of these commands
+
+    def judge_echo(self, command: Command, timeout_ns: Ns) -> Verdict:
+        age_ns, at_ns = command.age_ns, command.arrived_ns
+        if command.echo is None:
+            return "no_echo"
+        if age_ns is None:
+            return "other_run"
+        if age_ns < 0:
+            return "from_future"
+        if age_ns > timeout_ns + MARGIN_NS:
+            if self.old_ns is None:
+                self.old_ns, self.round_trip_ns = at_ns, age_ns
+            self.round_trip_ns = min(self.round_trip_ns, age_ns)
+            return "too_old" if at_ns - self.old_ns < LASTING_NS else "round_trip"
+        if (command.echo.beat_ns, number(command)) <= (self.beat_ns, self.sequence):
+            return "not_newer"
+        return ""
+
+    def accept(self, command: Command) -> None:
+        self.sequence, self.at_ns, self.old_ns = number(command), command.arrived_ns, None
+        if command.echo is not None:
+            self.beat_ns = command.echo.beat_ns
+
+
+class Clock(Struct):
+    """The clock of a sender without an echo."""
+
+    at_ns: Ns  # last command
+    stamp_ns: Ns
+    moved_ns: Ns  # first command with this stamp
+    repeated: int = 0  # commands with this stamp since then
+    still_ns: Ns | None = None  # last time when the stamps had stood still for a timeout
+    least: int | None = None  # least delay; None until it is proven
+    lows: list[int] = []  # lowest `least` of the last slots
+    slot_ns: Ns = 0  # begin of the last slot
+    accepted_ns: Ns = 0  # stamp of the last accepted command
+    used_ns: Ns = 0  # arrival of the last accepted command
+    low: int = 0  # lowest delay of a proof
+    since_ns: Ns | None = None  # a proof runs, in which the delay has not fallen since then
+    doubt: tuple[Ns, Ns] | None = None  # arrival and stamp of the first refused command
+    cause: Verdict = ""  # of refusals that last
+    advance: float = 0.0  # of the stamps, s per second, while refusals last
+    behind: int = 0  # delay above the least one
+
+    def judge(self, at_ns: Ns, stamp_ns: Ns, timeout_ns: Ns) -> Verdict:
+        still = self._stands_still(at_ns, stamp_ns, timeout_ns)
+        delay, least = at_ns - stamp_ns, self._risen(at_ns, timeout_ns)
+        self.at_ns, self.stamp_ns, self.least = at_ns, stamp_ns, least
+        verdict: Verdict
+        if least is None or delay < least - MARGIN_NS:
+            verdict = self._prove(at_ns, delay, timeout_ns)
+        else:
+            self.since_ns, self.behind = None, delay - least
+            verdict = "stale" if delay - least > timeout_ns else ""
+        if still:
+            verdict, self.advance = "stamps", 0.0
+        elif not verdict and stamp_ns <= self.accepted_ns:
+            verdict = "not_newer"
+        if verdict:
+            return self._lasting(verdict, at_ns, stamp_ns)
+        self.accepted_ns, self.used_ns, self.doubt, self.cause = stamp_ns, at_ns, None, ""
+        self.least = delay if self.least is None else min(self.least, delay)
+        if not self.lows or at_ns - self.slot_ns >= SLOT_NS:
+            self.lows, self.slot_ns = [*self.lows[-(MEMORY_NS // SLOT_NS) :], self.least], at_ns
+        self.lows[-1] = min(self.lows[-1], self.least)
+        return ""
+
+    def _risen(self, at_ns: Ns, timeout_ns: Ns) -> int | None:
+        if self.least is None or not self.lows:
+            return self.least
+        risen = self.least + (at_ns - self.at_ns) // RISE_DIVISOR
+        return max(self.least, min(risen, min(self.lows) + timeout_ns))
+
+    def _prove(self, at_ns: Ns, delay: int, timeout_ns: Ns) -> Verdict:
+        # A new clock, or a lower delay of a known one: the delays of one timeout must not fall.
+        fallen = self.low - delay
+        if self.since_ns is None or fallen > (at_ns - self.since_ns) // 100 + NS_PER_S // 1000:
+            self.low, self.since_ns = delay, at_ns
+        elif -fallen > timeout_ns:
+            return "stale"
+        elif at_ns - self.since_ns >= timeout_ns:
+            self.least, self.since_ns = min(self.low, delay), None
+            return ""
+        return "unproven" if self.least is None else "early"
+
+    def _stands_still(self, at_ns: Ns, stamp_ns: Ns, timeout_ns: Ns) -> bool:
+        if stamp_ns != self.stamp_ns:
+            self.moved_ns, self.repeated = at_ns, 0
+        else:
+            self.repeated += 1
+            if self.repeated >= MAX_REPEATED and at_ns - self.moved_ns > timeout_ns:
+                self.still_ns = at_ns
+        return self.still_ns is not None and at_ns - self.still_ns <= LASTING_NS
+
+    def _lasting(self, verdict: Verdict, at_ns: Ns, stamp_ns: Ns) -> Verdict:
+        # Name the cause of refusals that go on: it is looked for again every `LASTING_NS`.
+        if self.doubt is None:
+            self.doubt = at_ns, stamp_ns
+        elif (lasted_ns := at_ns - self.doubt[0]) >= LASTING_NS:
+            self.advance = (stamp_ns - self.doubt[1]) / lasted_ns
+            self.doubt = at_ns, stamp_ns
+            if not SLOWEST <= self.advance <= FASTEST:
+                self.cause = "stamps"
+            else:
+                self.cause = "set_back" if verdict == "stale" else ""
+        return self.cause or verdict
+
+
+class Ages(Struct):
+    """The clocks of the senders of one source."""
+
+    clocks: dict[str, Clock] = {}
+
+    def judge(self, command: Command, last: Order, timeout_ns: Ns, stalled: bool) -> Verdict:
+        """Return "" if the command is young enough and newer than the last accepted one.
+
+        `stalled`: the daemon stood still just now, so a command without a stamp may be old.
+        """
+        if command.echo is not None or (last.beat_ns >= 0 and not command.shared):
+            verdict = last.judge_echo(command, timeout_ns)
+        elif command.stamp_ns is not None:
+            clock = self._clock(command.clock, command.arrived_ns, command.stamp_ns)
+            verdict = clock.judge(command.arrived_ns, command.stamp_ns, timeout_ns)
+        elif stalled:
+            verdict = "stalled"
+        else:
+            repeats = 0 <= number(command) <= last.sequence
+            verdict = "not_newer" if repeats and command.arrived_ns - last.at_ns < SILENT_NS else ""
+        if not verdict:
+            last.accept(command)
+        return verdict
+
+    def _clock(self, name: str, at_ns: Ns, stamp_ns: Ns) -> Clock:
+        clock = self.clocks.get(name)
+        if clock is None or at_ns - clock.at_ns > MEMORY_NS:
+            if clock is None and len(self.clocks) >= MAX_CLOCKS:
+                del self.clocks[min(self.clocks, key=lambda other: self.clocks[other].used_ns)]
+            clock = self.clocks[name] = Clock(at_ns, stamp_ns, at_ns)
+        return clock
+
+
+def number(command: Command) -> int:
+    return -1 if command.sequence is None else command.sequence

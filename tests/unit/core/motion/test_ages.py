@@ -1,0 +1,254 @@
+"""Tests of the age of commands, in networks whose true delays are known."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+
+from acsard.core.motion.ages import MAX_CLOCKS, Ages, Order
+from acsard.core.values import NS_PER_S, Command, Echo, Ns
+from tests.each import each
+from tests.unit.core.motion.networks import (
+    ROUND_TRIPS,
+    RUN,
+    SPEED,
+    TIMEOUT_NS,
+    Network,
+    jitter,
+    play,
+    random_network,
+)
+
+MS = 1_000_000
+BOUND_S = TIMEOUT_NS / NS_PER_S + 0.1
+
+# random networks
+
+
+@each("seed", range(300))
+def test_in_no_network_is_a_command_obeyed_that_is_older_than_the_timeout_and_a_tenth(
+    seed: int,
+) -> None:
+    """Without an echo this needs a clock that is not set, and no queue from the start."""
+    dice = random.Random(seed)
+    network = random_network(dice)
+    assert play(network, True, dice).oldest <= BOUND_S
+    without = play(network, False, dice)
+    if not (network.queued or network.step or network.suspended):
+        assert without.oldest <= BOUND_S
+
+
+@each("name", list(ROUND_TRIPS))
+@each("echoes", [True, False])
+def test_few_prompt_commands_are_refused(name: str, echoes: bool) -> None:
+    way, peaks, most = ROUND_TRIPS[name]
+    dice = random.Random(name)
+    up, down = jitter(dice, way / 2, peaks), jitter(dice, way / 2, peaks)
+    outcome = play(Network(up, down, seconds=300), echoes, dice)
+    assert outcome.prompt > 5500
+    assert outcome.refused / outcome.prompt <= most
+
+
+# rows of stamps: the largest share of prompt commands that is refused
+
+Delay = Callable[[float], float]
+
+
+def lifted(height: float, begin: float, rise: float, end: float) -> Delay:
+    """Return a delay that rises from `begin` on and has ended at `end`."""
+    return lambda t: height * max(0.0, min(1.0, (t - begin) / rise, (end - t) / rise))
+
+
+ROWS: dict[str, tuple[Delay, float, float]] = {  # delay, lost share, most refused
+    "clean": (lambda t: 0.0, 0.0, 0.02),
+    "outage of 3 s, then a burst": (lambda t: 13 - t if 10 < t < 13 else 0.0, 0.0, 0.02),
+    "outage of 20 s, then a burst": (lambda t: 30 - t if 10 < t < 30 else 0.0, 0.0, 0.02),
+    "congestion to 1 s for 3 s": (lifted(1.0, 10.0, 1.0, 15.0), 0.0, 0.03),
+    "congestion to 1 s for 20 s": (lifted(1.0, 10.0, 1.0, 32.0), 0.0, 0.03),
+    "congestion to 5 s for 20 s": (lifted(5.0, 10.0, 5.0, 45.0), 0.0, 0.03),
+    "jump by 0.6 s for 20 s": (lambda t: 0.6 if 10 < t < 30 else 0.0, 0.0, 0.03),
+    "growth by 0.1 s/s to 5 s": (lambda t: max(0.0, min(5.0, 0.1 * (t - 5))), 0.0, 0.1),
+    "growth by 0.02 s/s to 1 s": (lambda t: max(0.0, min(1.0, 0.02 * (t - 5))), 0.0, 0.1),
+    "30 % lost": (lambda t: 0.0, 0.3, 0.02),
+    "30 s of backlog at the first contact": (lambda t: max(0.0, 30 - t / 2), 0.0, 1.0),
+}
+
+
+@each("name", list(ROWS))
+@each("seed", range(3))
+def test_by_stamps_no_old_command_is_obeyed_and_few_prompt_ones_are_refused(
+    name: str, seed: int
+) -> None:
+    dice, (delay, loss, most) = random.Random(seed), ROWS[name]
+    wifi = jitter(dice, 0.004, 0.02)
+    network = Network(lambda t: wifi(t) + delay(t), wifi, loss, seconds=60)
+    outcome = play(network, False, dice)
+    assert outcome.oldest <= BOUND_S
+    assert outcome.refused / max(1, outcome.prompt) <= most
+
+
+@each("step", [10.0, -10.0, -0.4])
+def test_a_clock_that_is_set_makes_no_old_command_count_and_its_cause_is_named(
+    step: float,
+) -> None:
+    dice = random.Random(1)
+    wifi = jitter(dice, 0.004, 0.02)
+    network = Network(wifi, wifi, step_at=10.0, step=step, seconds=60)
+    outcome = play(network, False, dice)
+    assert outcome.oldest <= BOUND_S
+    assert ("set_back" in outcome.verdicts) == (step < 0)
+    assert outcome.refused / outcome.prompt <= (1.0 if step < 0 else 0.02)
+
+
+# stamps
+
+
+class Sender:
+    """One sender whose commands arrive at given times, in ms, with stamps."""
+
+    def __init__(self, timeout_ns: Ns = TIMEOUT_NS) -> None:
+        self.ages, self.order, self.timeout_ns = Ages(), Order(), timeout_ns
+        self.number = 0
+
+    def hear(self, at_ms: float, stamp_ms: float | None, clock: str = "a") -> str:
+        self.number += 1
+        at_ns = int(at_ms * MS) + 1000 * NS_PER_S
+        stamp_ns = None if stamp_ms is None else int(stamp_ms * MS) + 1000 * NS_PER_S
+        command = Command("app", SPEED, at_ns, stamp_ns, clock, "a", sequence=self.number)
+        return self.ages.judge(command, self.order, self.timeout_ns, stalled=False)
+
+    def prove(self, until_ms: int, clock: str = "a") -> Sender:
+        for at_ms in range(0, until_ms + 1, 50):
+            verdict = self.hear(at_ms, at_ms, clock)
+        assert verdict == ""
+        return self
+
+
+def test_a_new_clock_counts_when_its_least_delay_has_not_fallen_for_one_timeout() -> None:
+    sender = Sender()
+    verdicts = [sender.hear(50 * n, 50 * n - (3 - n if n < 3 else 0) * 20) for n in range(9)]
+    assert verdicts == ["unproven"] * 8 + [""]  # the delay falls until the fourth
+
+
+def test_a_lower_delay_counts_when_the_commands_of_one_timeout_confirm_it() -> None:
+    sender = Sender().prove(1000)
+    verdicts = [sender.hear(1050 + 50 * n, 1101 + 50 * n) for n in range(6)]
+    assert verdicts == ["early"] * 5 + [""]
+    assert sender.hear(1400, 1300) == "not_newer"
+    assert sender.hear(1750, 1500) == "stale"
+
+
+def test_one_stamp_from_the_future_changes_nothing() -> None:
+    sender = Sender().prove(1000)
+    assert sender.hear(1050, 9000) == "early"
+    for at_ms in range(1100, 3000, 50):
+        assert sender.hear(at_ms, at_ms) == ""
+
+
+def test_the_least_delay_rises_by_at_most_one_timeout_in_any_hour() -> None:
+    sender, hour_ms = Sender().prove(1000), 3_600_000
+    obeyed: list[tuple[int, float]] = []
+    for second in range(2, 3 * 3600):
+        late_ms = second * 0.1  # 0.1 ms/s is 360 ms in an hour, and no queue grows so evenly
+        if sender.hear(second * 1000, second * 1000 - late_ms) == "":
+            obeyed.append((second * 1000, late_ms))
+    last_ms, late_ms = obeyed[-1]
+    assert last_ms > hour_ms  # a clock that drifts is followed
+    assert late_ms <= 250 * (1 + last_ms / hour_ms) + 1
+
+
+def test_a_silence_raises_the_least_delay_by_at_most_one_timeout() -> None:
+    for silence_s, late_ms, verdict in ((100, 299, ""), (100, 301, "stale"), (3500, 501, "stale")):
+        sender = Sender().prove(1000)
+        at_ms = 1000 + silence_s * 1000
+        assert sender.hear(at_ms, at_ms - late_ms) == verdict
+
+
+def test_a_clock_is_forgotten_after_an_hour_of_silence() -> None:
+    for silence_s, verdict in ((3599, "stale"), (3601, "unproven")):
+        at_ms = 1000 + silence_s * 1000
+        assert Sender().prove(1000).hear(at_ms, at_ms - 5000) == verdict
+
+
+def test_a_flood_of_new_clocks_does_not_push_out_a_clock_that_counts() -> None:
+    sender = Sender().prove(1000)
+    for number in range(3 * MAX_CLOCKS):
+        assert sender.hear(1001 + number, 5, f"stranger {number}") == "unproven"
+    assert len(sender.ages.clocks) == MAX_CLOCKS
+    assert sender.hear(1060, 1060) == ""
+
+
+def test_refusals_name_a_clock_that_was_set_back_after_two_seconds() -> None:
+    sender = Sender().prove(1000)
+    verdicts = [sender.hear(1050 + 50 * n, 50 * n - 5000) for n in range(60)]
+    assert verdicts == ["stale"] * 40 + ["set_back"] * 20
+
+
+def test_without_a_stamp_only_the_order_of_the_numbers_counts() -> None:
+    sender = Sender()
+    assert [sender.hear(at_ms, None) for at_ms in (0, 50)] == ["", ""]
+    sender.number = 0
+    assert sender.hear(10_049, None) == "not_newer"
+    sender.number = 0
+    assert sender.hear(10_050, None) == ""  # the program may have started again
+
+
+# echoes
+
+
+def echo(
+    age_ms: float | None,
+    number: int = 1,
+    beat_ms: int = 100,
+    sender: str = "a",
+    shared: bool = False,
+) -> Command:
+    at_ns = 1000 * NS_PER_S
+    age_ns = None if age_ms is None else int(age_ms * MS)
+    beat = Echo(RUN, beat_ms * MS)
+    return Command(
+        "app",
+        SPEED,
+        at_ns,
+        5,
+        "a",
+        sender,
+        sequence=number,
+        echo=beat,
+        age_ns=age_ns,
+        shared=shared,
+    )
+
+
+@each(
+    ("age_ms", "verdict"),
+    [(0, ""), (300, ""), (301, "too_old"), (-1, "from_future"), (None, "other_run")],
+)
+def test_the_age_of_an_echo_is_judged_without_its_stamp(age_ms: float | None, verdict: str) -> None:
+    assert Ages().judge(echo(age_ms), Order(), TIMEOUT_NS, stalled=True) == verdict
+
+
+@each(
+    ("number", "beat_ms", "verdict"),
+    [
+        (5, 100, "not_newer"),
+        (4, 100, "not_newer"),
+        (9, 50, "not_newer"),
+        (6, 100, ""),
+        (0, 150, ""),
+    ],
+)
+def test_echoes_are_ordered_by_the_beat_and_then_by_the_number(
+    number: int, beat_ms: int, verdict: str
+) -> None:
+    ages, order = Ages(), Order()
+    assert ages.judge(echo(0, 5), order, TIMEOUT_NS, stalled=False) == ""
+    assert ages.judge(echo(0, number, beat_ms), order, TIMEOUT_NS, stalled=False) == verdict
+
+
+@each(("shared", "verdict"), [(False, "no_echo"), (True, "unproven")])
+def test_a_sender_that_has_echoed_must_go_on(shared: bool, verdict: str) -> None:
+    ages, order = Ages(), Order()
+    ages.judge(echo(0), order, TIMEOUT_NS, stalled=False)
+    plain = Command("app", SPEED, 1001 * NS_PER_S, 7, "a", "a", sequence=9, shared=shared)
+    assert ages.judge(plain, order, TIMEOUT_NS, stalled=False) == verdict
