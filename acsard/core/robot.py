@@ -494,7 +494,7 @@ class Robot:
             case "deactivate":
                 return life.deactivate(request.by, now)
             case "set_pose" | "reset_odometry":
-                return self._place(request.pose or Pose())
+                return self.place(request.pose or Pose())
             case "set":
                 changes |= self._set(request.settings, now.mono_ns)
                 return describe_changes(changes) or NOTHING_CHANGED
@@ -507,7 +507,7 @@ class Robot:
             config.odometry, self._kinematics, config.mcu.encoder_counts, config.limits
         )
 
-    def _place(self, pose: Pose) -> str:
+    def place(self, pose: Pose) -> str:
         self._odometry.set_pose(pose, self._errors)
         self._checks.forget_doubt()
         pose = self._odometry.pose

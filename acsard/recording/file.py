@@ -156,6 +156,21 @@ class Damage(Struct, frozen=True):
         return f"{self.path.name}: {what} cannot be read: {self.why}"
 
 
+class Unread(Struct):
+    """Steps of a robot that this version of acsard cannot continue, up to its first rest."""
+
+    version: str  # of acsard, that wrote it
+    begin_ns: Ns
+    end_ns: Ns
+
+    def __str__(self) -> str:
+        seconds = (self.end_ns - self.begin_ns) / NS_PER_S
+        return (
+            f"{seconds:.1f} s cannot be replayed: acsard {self.version} wrote its robot in another "
+            "layout, and a fresh one begins where it rests"
+        )
+
+
 Record = Head | Steps | Waits | Failure
 
 ReadRecord = Head | RecordedStep | Waits | Failure
@@ -277,7 +292,7 @@ class Recording:
     ) -> None:
         self.paths = list(paths)
         self.begin_ns, self.end_ns = begin_ns, end_ns
-        self.damage: list[Damage] = []  # so far, of the last `records()`
+        self.damage: list[Damage | Unread] = []  # so far, of the last `records()`
 
     def contains(self, at: Instant) -> bool:
         """Return whether a step at this time was asked for."""

@@ -20,9 +20,9 @@ from acsard.core.config.parsing import ConfigError, parse_recorded
 from acsard.core.config.settings import Config
 from acsard.core.guard import Guard, Memory
 from acsard.core.robot import Robot
-from acsard.core.values import Event, Instant, News, Trip
+from acsard.core.values import Event, Instant, News, Pose, Trip
 from acsard.host.errors import RecordingError
-from acsard.recording.file import Failure, Head, ReadRecord, Recording
+from acsard.recording.file import Failure, Head, ReadRecord, Recording, Unread
 from acsard.recording.recorded_steps import (
     US_PER_S,
     Micropose,
@@ -31,7 +31,7 @@ from acsard.recording.recorded_steps import (
     checksum,
     micropose,
 )
-from acsard.recording.state import State, StateError, adopt, short, thaw
+from acsard.recording.state import LayoutError, State, StateError, adopt, short, thaw
 
 NO_TRIP: Trip = ""
 
@@ -241,6 +241,8 @@ class Playback:
         self._recording, self._other = recording, other
         self._next: int | None = None  # number of the next step; None: of the next head
         self._last: Instant | None = None
+        self._waits: Config | None = None  # for a rest, with this configuration
+        self._poses: tuple[Micropose, ...] = ()  # the last two, while it waits
 
     @property
     def robot(self) -> Robot:
@@ -269,6 +271,9 @@ class Playback:
             case Failure():
                 self.failure = record
             case RecordedStep(number=number) if number == self._next:
+                if self._waits is not None and not self._rests(record):
+                    self._next = number + 1
+                    return None
                 assert self.replay is not None
                 with self.errors():
                     self.replay.step(record)
@@ -284,13 +289,34 @@ class Playback:
         if same_run and self._last is not None and self._next is not None:
             at = Instant(head.mono_ns, head.wall_ns)
             self.gaps.append(Gap(self._last, at, head.number - self._next))
+        self._next, self._waits = head.number, None
         with self.errors():
-            robot, memory = self._robot_at(head)
-            if self.replay is None:
-                self.replay = Replay(robot, memory)
-            else:
-                self.replay.resume(robot, memory)
-        self._next = head.number
+            try:
+                self._resume(self._robot_at(head))
+            except LayoutError:
+                self._waits = self._other or config_of(head)
+                self._unread = Unread(head.version, head.mono_ns, head.mono_ns)
+                self._recording.damage.append(self._unread)
+
+    def _resume(self, state: State) -> None:
+        if self.replay is None:
+            self.replay = Replay(*state)
+        else:
+            self.replay.resume(*state)
+
+    def _rests(self, step: RecordedStep) -> bool:
+        # Whether the recorded robot rests; then a fresh one begins at its pose.
+        recorded, config = step.recorded, self._waits
+        assert config is not None
+        self._unread.end_ns = step.now.mono_ns
+        self._poses = (self._poses + recorded.poses)[-2:]
+        stays = len(self._poses) == 2 and self._poses[0] == self._poses[1]
+        if not (stays and recorded.line and not max_wheel_speed(recorded.line)):
+            return False
+        robot, self._waits = Robot(config), None
+        robot.place(Pose(*(part / US_PER_S for part in self._poses[1])))
+        self._resume(State(robot, Memory()))
+        return True
 
     def _robot_at(self, head: Head) -> State:
         recorded = config_of(head)

@@ -11,7 +11,7 @@ from acsard.core.config.settings import Config
 from acsard.core.config.validation import show
 from acsard.core.formatting import listed, many, printable
 from acsard.core.values import NS_PER_S, Event, Ns
-from acsard.recording.file import Damage
+from acsard.recording.file import Damage, Unread
 from acsard.recording.recorded_steps import US_PER_S, RecordedOutputs
 from acsard.recording.replay import Comparison, Difference, Gap, max_wheel_speed
 
@@ -53,7 +53,7 @@ def explain_verdict(other: bool) -> str:
     )
 
 
-def describe_missing(gaps: Sequence[Gap], damage: Sequence[Damage], how: str) -> list[str]:
+def describe_missing(gaps: Sequence[Gap], damage: Sequence[Damage | Unread], how: str) -> list[str]:
     """Return lines about the steps that a recording lacks, the first of which begin with `how`."""
     lines = []
     if gaps:

@@ -13,6 +13,7 @@ import copyreg
 import io
 import pickle
 import sys
+import zlib
 from collections import Counter, deque
 from typing import Any, NamedTuple
 
@@ -86,6 +87,10 @@ class StateError(AcsardError):
     """The recorded state of a robot is damaged, or this version of acsard cannot use it."""
 
 
+class LayoutError(StateError):
+    """The parts of the recorded robot are other ones than in this version of acsard."""
+
+
 class State(NamedTuple):
     """The state of a robot between two steps, which with the inputs gives all later outputs."""
 
@@ -100,6 +105,24 @@ class Frozen(Struct):
     memory: Memory
     parts: dict[str, msgspec.Raw]
     rest: bytes  # pickled attributes of the robot
+    layout: int = 0  # `LAYOUT` of the version that wrote it
+
+
+def _layout() -> int:
+    # The fields of all parts with their types. A description is no difference.
+    def bare(item: object) -> object:
+        if isinstance(item, dict):
+            return {key: bare(value) for key, value in item.items() if key != "description"}
+        return [bare(value) for value in item] if isinstance(item, list | tuple) else item
+
+    schemas, components = msgspec.json.schema_components(
+        PARTS.values(), schema_hook=lambda kind: {"type": kind.__name__}
+    )
+    parts = dict(zip(PARTS, schemas, strict=True))
+    return zlib.crc32(msgspec.json.encode(bare([parts, components]), order="deterministic"))
+
+
+LAYOUT = _layout()
 
 
 def freeze(robot: Robot, memory: Memory) -> bytes:
@@ -110,10 +133,14 @@ def freeze(robot: Robot, memory: Memory) -> bytes:
     pickler = pickle.Pickler(written, PICKLE_PROTOCOL)
     pickler.dispatch_table = DISPATCH_TABLE
     pickler.dump(rest)
-    return msgspec.msgpack.encode(Frozen(robot.config, memory, parts, written.getvalue()))
+    return msgspec.msgpack.encode(Frozen(robot.config, memory, parts, written.getvalue(), LAYOUT))
 
 
-_frozen = msgspec.msgpack.Decoder(Frozen)
+class _Written(Struct):
+    layout: int = 0
+
+
+_frozen, _written = msgspec.msgpack.Decoder(Frozen), msgspec.msgpack.Decoder(_Written)
 
 
 def _counter(kind: type, data: object) -> Counter[str]:
@@ -126,11 +153,13 @@ _parts = {name: msgspec.msgpack.Decoder(part, dec_hook=_counter) for name, part 
 def thaw(data: bytes) -> State:
     """Decode a robot and its guard's memory, from bytes that may be forged.
 
-    Raises `StateError`, also for another version that this one cannot use.
+    Raises `LayoutError`, and `StateError` if it is damaged or forged.
     """
     try:
         if len(data) > MAX_BYTES:
             raise ValueError(f"it has {len(data)} bytes: the file is damaged or forged")
+        if _written.decode(data).layout != LAYOUT:
+            raise LayoutError("the recorded robot has another layout than this version of acsard")
         frozen = _frozen.decode(data)
         if problems := contradictions(frozen.config):
             raise ValueError(problems[0])

@@ -513,7 +513,7 @@ FAULTS = (
     fault(
         "session quiet",
         "a silent board gets lines that move it for a second",
-        SESSION,
+        "core/link/link_setup.py",
         "NS_PER_S * max(0.1, 4 / rate_hz",
         "NS_PER_S * max(1.0, 4 / rate_hz",
     ),

@@ -19,7 +19,7 @@ import msgspec
 from acsard.core.config.settings import Config
 from acsard.core.guard import Memory
 from acsard.core.robot import Robot
-from acsard.recording.state import PICKLE_PROTOCOL, Frozen, StateError, thaw
+from acsard.recording.state import LAYOUT, PICKLE_PROTOCOL, Frozen, StateError, thaw
 from acsard.recording.unpickling import MAX_BYTES, MAX_KEY, MAX_OPCODES
 
 EXTENSION = 201
@@ -43,7 +43,7 @@ def whole(body: bytes) -> bytes:
 
 def state_with(rest: bytes) -> bytes:
     """Return the state of a new robot with this pickle of the parts that are not plain data."""
-    return msgspec.msgpack.encode(Frozen(Config(), Memory(), {}, rest))
+    return msgspec.msgpack.encode(Frozen(Config(), Memory(), {}, rest, LAYOUT))
 
 
 def doubled(times: int) -> bytes:

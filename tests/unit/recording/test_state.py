@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import pickle
 import random
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from acsard.recording.file import Recording
 from acsard.recording.replay import Playback
 from acsard.recording.state import (
     DERIVED,
+    LAYOUT,
     PARTS,
     StateError,
     adopt,
@@ -242,3 +244,24 @@ def test_a_part_that_the_state_lacks_comes_from_a_new_robot() -> None:
     del robot._life
     adopt(robot, Robot(PLAIN), Robot(PLAIN))
     assert vars(robot._life) == vars(Robot(PLAIN)._life)
+
+
+def test_a_robot_of_another_layout_is_replaced_by_a_fresh_one_where_it_rests(
+    tmp_path: Path,
+) -> None:
+    first, tape = 100, Tape(every=100)
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=2.0)
+    world.run(2.0)
+    world.drive(0.3, seconds=1.0)
+    frozen = msgspec.msgpack.decode(tape.states[first])
+    tape.states[first] = msgspec.msgpack.encode(frozen | {"layout": LAYOUT + 1})
+    recording = Recording([tape.save(tmp_path / "old", first=first)])
+    playback = Playback(recording)
+    steps = [step for step, _ in playback.steps()]
+    assert 100 < len(steps) < len(tape.taken) - first - 100
+    (note,) = map(str, recording.damage)
+    assert re.match(r"\d\.\d s cannot be replayed: acsard .* in another layout, and a fresh", note)
+    recorded, replayed = playback.comparison.end or ((0, 0, 0), (1, 1, 1))
+    assert recorded == pytest.approx(replayed, abs=1000)
+    assert playback.robot.snapshot(world.now_ns).pose.x > 0.8
