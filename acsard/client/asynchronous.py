@@ -108,7 +108,7 @@ class AsyncClient:
                 raise await _in_thread(partial(self._client.explain_error, error)) from None
             raise
 
-    async def call(self, service: str, **fields: float) -> schema.ServiceReply:
+    async def call(self, service: str, **fields: object) -> schema.ServiceReply:
         """Call a service and return its reply, as `Client.call` does."""
         return await _in_thread(lambda: self._client.call(service, **fields))
 

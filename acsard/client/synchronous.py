@@ -224,6 +224,7 @@ class Client:
         # Compute stamps from the steady clock. If the stamps came from the wall clock, and a
         # program set this clock during a drive, the daemon would mistake the jump for a delay.
         self._wall_offset_ns = clock.now().wall_ns - clock.steady_ns()
+        self._own_causes: set[int] = set()  # that calls of this client have latched
 
     @property
     def caller(self) -> str:
@@ -309,22 +310,34 @@ class Client:
                 raise self.explain_error(error) from None
             raise
 
-    def call(self, service: str, **fields: float) -> schema.ServiceReply:
+    def call(self, service: str, **fields: object) -> schema.ServiceReply:
         """Call a service, such as "stop", and return its reply.
 
         `fields` are the fields of the payload.
 
-        The service "clear" releases a stop or a fault, and "activate" switches on an inactive
-        robot. Both need the number of the stop, the fault or the switch-off, which is `latch` in
-        the key `state`. Without the field `latch`, this method reads the present number. If a
-        person decided to make the call because of an earlier state, pass `latch=state.latch` of
-        that state. The daemon then refuses the call if the robot was stopped or switched off again
-        after that state.
+        The service "clear" releases faults and stops, and "activate" switches on an inactive robot.
+        Both release only the causes whose `numbers` they name. Without the field `numbers`, this
+        method names the `causes` in the key `state` that are older than the call. If a person
+        decided to make the call because of an earlier state, pass the numbers of that state:
+        `numbers=[cause.number for cause in state.causes]`. A later stop then stays.
         """
-        releases = service in ("clear", "activate")
-        if releases and "latch" not in fields and "latch" in self._offered().get(service, ()):
-            fields["latch"] = self.get("state").latch
-        return self.request(service, fields)
+        if service in ("clear", "activate") and "numbers" not in fields:
+            fields["numbers"] = self._present_causes()
+        reply = self.request(service, fields)
+        self._own_causes.update(reply.data.numbers)
+        return reply
+
+    def _present_causes(self) -> list[int]:
+        # Those of this moment: the answer may already have a stop that came after the call. Of a
+        # cause that an earlier call has latched, this client knows that it is older.
+        asked_s = clock.steady_s()
+        causes = self.get("state").causes
+        waited_s = clock.steady_s() - asked_s
+        return [
+            cause.number
+            for cause in causes
+            if cause.number in self._own_causes or (cause.age or 0.0) >= waited_s
+        ]
 
     def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
         """Change settings of the daemon, for example `{"rates.odom": 5.0}`, and return the reply.
@@ -342,7 +355,7 @@ class Client:
     def request(self, service: str, fields: Mapping[str, object]) -> schema.ServiceReply:
         """Call the service `service` with `fields` as its payload, and return its reply.
 
-        Unlike `call`, this method does not add the field `latch`. A payload that is too large for
+        Unlike `call`, this method does not add the field `numbers`. A payload that is too large for
         the daemon is not sent, because the bus may drop it. Instead, this method returns the
         refusal that the daemon would send.
         """

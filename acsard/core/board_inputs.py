@@ -10,7 +10,7 @@ from acsard.core.link.session import McuSession
 from acsard.core.motion.battery import Battery
 from acsard.core.motion.bumpers import Bumpers
 from acsard.core.motion.emergency_stop import DRIVER_FAULT_REASON, EmergencyStop
-from acsard.core.values import Event, Latch, Latches, Ns
+from acsard.core.values import Cause, Event, Latches, Ns
 
 # Words for "wait until the board has reported ...".
 INPUT_NAMES = {
@@ -34,7 +34,7 @@ class BoardInputs(Struct):
     bumpers: Bumpers
     battery: Battery
     # Inputs that caused a latch in an earlier run, until the board reports them: no `clear` before.
-    unreported: dict[str, Latch]
+    unreported: dict[str, Cause]
 
     def missing(self, safety: SafetyConfig) -> bool:
         """Return whether the robot needs an input that the board has not reported."""
@@ -102,14 +102,13 @@ class BoardInputs(Struct):
             del self.unreported[name]
         for name, cause in self.unreported.items():
             advice = f"wait until the board has reported {INPUT_NAMES[name]}"
-            return Reason(cause.code, cause.why, advice, cause.part)
+            return Reason(cause.code, cause.text, advice, cause.part)
         return None
 
 
 def inputs_after(latches: Latches, config: Config) -> BoardInputs:
     """Return the inputs of a robot that starts with these latches."""
-    latched = [latch for latch in (latches.fault, latches.stop) if latch is not None]
-    causes = [cause for latch in latched for cause in latch.causes]
+    causes = latches.of("fault", "stop")
     codes = {cause.code for cause in causes}
     empty = "battery_empty" in codes and config.battery.stop_below > 0.0
     return BoardInputs(

@@ -118,7 +118,7 @@ def rough(seconds: float | None, finest: float = 1.0) -> str:
     return f"{value:.{int(value < 9.95)}f} {unit}"
 
 
-# The daemon publishes the times of up to 36 causes of latches in every step, so they are cached.
+# The daemon publishes the times of up to 32 causes of latches in every step, so they are cached.
 @lru_cache(64)
 def utc(wall_ns: WallNs) -> str:
     """Return a time in the form `2026-11-22 13:05:07 UTC` (Gregorian calendar)."""

@@ -100,7 +100,7 @@ class Robot:
         self._cap = SpeedCap(None)
         self._life = Lifecycle(latches)
         self._announced: tuple[Event, ...] = ()  # for the next `hear`
-        if latches.in_force:
+        if latches.causes:
             kind, why = f"start -> {self._life.mode}", self._life.why
             first = Event("mode", why.text, "warning", kind=kind, code=why.code)
             self._announced = (first,)
@@ -134,10 +134,12 @@ class Robot:
         if session.count_recovery.coarse_lines:
             counters["coarse_encoder_lines"] = session.count_recovery.coarse_lines
         checks = self._checks
-        latch = self._life.latches.in_force
+        life = self._life
+        ages = {number: (now_ns - at_ns) / NS_PER_S for number, at_ns in life.shown.items()}
         return Snapshot(
             status=self.status,
-            latch=0 if latch is None else latch.number,
+            causes=life.latches.causes,
+            cause_ages=ages,
             applied=self.applied,
             pose=self._odometry.pose,
             measured=None if silent else self._odometry.twist,
@@ -198,8 +200,9 @@ class Robot:
         """Process what arrived since the last call, and return what is to be published."""
         now_ns, life = now.mono_ns, self._life
         events, self._announced = [*heard.events, *self._announced], ()
-        if self._arbiter.begin(now_ns, self.config.commands):
-            life.begin(now, stalled=True)
+        self._arbiter.begin(now_ns, self.config.commands)
+        if life.unshown:
+            life.begin(now_ns)
         if heard.missed:
             self.counters["missed_periods"] += heard.missed
             events.append(missed(heard.missed, self.config.period_ns))
@@ -366,12 +369,12 @@ class Robot:
             self._last.press(now_ns)
         if estop.driver_fault:
             self._fault(DRIVER_FAULT_REASON, now, events)
-            life.caused_again(now_ns)
+            life.freed_ns = now_ns
         if inputs.battery.stopped_now:
             life.press(empty_reason(config.battery), now)
         if self.session.status.forgot:
             inputs.forget(config)
-        life.refuse_clear(inputs.clear_refusal(self.session, config), now_ns)
+        life.hold(inputs.clear_refusal(self.session, config), now_ns)
 
     def _choose(self, now_ns: Ns) -> None:
         self._choice = self._arbiter.choose(now_ns, self.config.commands)
@@ -446,7 +449,7 @@ class Robot:
         trip, self._last.trip = self._last.trip, ""
         if trip:
             self._fault(reason(trip), now, events)
-            self._life.caused_again(now.mono_ns)
+            self._life.freed_ns = now.mono_ns
         if heard.shutting_down and self._life.mode is not Mode.SHUTDOWN:
             self._life.leave()
         answers: tuple[Answer, ...] = ()
@@ -455,10 +458,9 @@ class Robot:
         return answers
 
     def _answer(self, request: Request, now: Instant, events: list[Event]) -> Answer:
-        mode, latches = self._life.mode, self._life.latches
-        changes: Changes = {}
+        mode, changes = self._life.mode, Changes()
         try:
-            message = self._execute(request, now, changes)
+            message, numbers = self._execute(request, now, changes)
         except RefusedError as refusal:
             return Answer(request.id, False, str(refusal))
         asked = (request.verb, request.by, request.asked_ns)
@@ -466,38 +468,39 @@ class Robot:
             news = self._life.mode is not mode or request.verb == "set"
             events.append(Event(request.verb, message, by=request.by, news=news))
         self._asked = asked
-        latch = _changed_latch(latches, self._life.latches)
-        if request.verb == "stop":
-            latch = _stop_of(request.by, self._life.latches)
-        return Answer(request.id, True, message, latch, changes)
+        return Answer(request.id, True, message, numbers, changes)
 
-    def _execute(self, request: Request, now: Instant, changes: Changes) -> str:
+    def _execute(
+        self, request: Request, now: Instant, changes: Changes
+    ) -> tuple[str, tuple[int, ...]]:
+        # Return the message and the numbers of the causes that were latched or released.
         life = self._life
         asked_ns = now.mono_ns if request.asked_ns is None else request.asked_ns
         match request.verb:
             case "stop":
-                return life.stop(request.by, asked_ns, now)
+                message = life.stop(request.by, asked_ns, now)
+                return message, life.stop_of(request.by)
             case "clear":
-                released = life.clear(request.latch, asked_ns, now)
-                if not released:
-                    return "nothing to clear: the robot is neither stopped nor in fault"
-                self._forget()
-                if life.latches.stop is None:
-                    self._inputs.estop.powered()
-                self._arbiter.require_neutral(asked_ns)
-                return released
+                message, numbers = life.clear(request.numbers, asked_ns)
+                if numbers:
+                    self._forget()
+                    if not life.latches.of("stop"):
+                        self._inputs.estop.powered()
+                    self._arbiter.require_neutral(asked_ns)
+                return message, numbers
             case "activate":
-                life.activate(request.latch, asked_ns, now)
+                numbers = life.activate(request.numbers, asked_ns)
                 self._arbiter.forget_clocks()
                 self._arbiter.require_neutral(asked_ns)
-                return "active"
+                return "active", numbers
             case "deactivate":
-                return life.deactivate(request.by, now)
+                message = life.deactivate(request.by, now)
+                return message, (life.latches.last,)
             case "set_pose" | "reset_odometry":
-                return self.place(request.pose or Pose())
+                return self.place(request.pose or Pose()), ()
             case "set":
                 changes |= self._set(request.settings, now.mono_ns)
-                return describe_changes(changes) or NOTHING_CHANGED
+                return describe_changes(changes) or NOTHING_CHANGED, ()
             case _:
                 assert_never(request.verb)
 
@@ -592,27 +595,7 @@ class Robot:
         why = reason_of(life, choice, session, inputs, self.config, port_trouble)
         # Use `_value_`, because the property `value` of an enum runs Python code.
         mode, level = life.mode._value_, inputs.battery.level
-        status = Status(mode, why.code, why.text, session.link, choice.source, level)
+        numbers = tuple([cause.number for cause in life.latches.causes])
+        status = Status(mode, why.code, why.text, session.link, choice.source, level, numbers)
         if status != self.status:
             self.status = status
-
-
-def _stop_of(by: str, latches: Latches) -> int:
-    # The number of a client's stop. It may be older than this step's call: the bus hands a call
-    # over as a stop first.
-    causes = () if latches.stop is None else latches.stop.causes
-    return next((one.number for one in causes if (one.code, one.by) == ("stopped", by)), 0)
-
-
-def _changed_latch(before: Latches, after: Latches) -> int:
-    # 0: none was set or released.
-    pairs = (
-        (before.fault, after.fault),
-        (before.stop, after.stop),
-        (before.inactive, after.inactive),
-    )
-    for old, new in pairs:
-        latch = new or old
-        if new is not old and latch is not None:
-            return latch.number
-    return 0

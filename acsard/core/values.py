@@ -6,11 +6,9 @@ time, are never part of a reference cycle.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 from msgspec import Meta, Struct
-from msgspec.structs import replace
 
 from acsard.core.codes import Code, GuardCode, ObjectionCode, Reason, RefusalCode, WaitCode
 
@@ -165,15 +163,15 @@ class Request(Struct, frozen=True, omit_defaults=True):
     asked_ns: Ns | None = None  # arrival (None: this step); `clear` does not release a later stop
     by: str = ""  # client, as `core/incoming/commands.py` names it
     settings: dict[str, Plain] = {}  # of the verb `set`, by dotted key
-    # Number to be released by `clear` or `activate`, if the client gives one.
-    latch: int | None = None
+    # Of the causes that `clear` or `activate` releases, if the client names them.
+    numbers: tuple[int, ...] | None = None
 
 
 class Answer(Struct, frozen=True):
     id: int
     success: bool
     message: str
-    latch: int = 0  # number of the latch that was set or released; 0 without one
+    numbers: tuple[int, ...] = ()  # of the causes that were latched or released
     changes: dict[str, tuple[Plain, Plain]] = {}  # old and new value by dotted key
 
 
@@ -356,61 +354,35 @@ class BatteryStatus(Struct, frozen=True, gc=False):
     mean: float | None = None  # V or % over about 10 s, compared with the thresholds
 
 
-class Latch(Struct, frozen=True):
-    """A stop, a fault or a deactivation of the robot, which lasts until a person releases it."""
+# `clear` releases faults and stops, and `activate` releases `inactive`.
+CauseKind = Literal["fault", "stop", "inactive"]
 
-    # ms since 1970 when it was set, or more than the largest number before: numbers always grow,
-    # over restarts too. JavaScript represents them exactly.
-    number: int
-    at_ns: Ns  # wall clock
-    by: str  # client, if one requested it
-    why: str  # in words
+
+class Cause(Struct, frozen=True):
+    """Why the robot is stopped, in fault or switched off, until a person releases it."""
+
+    number: int  # never used twice for a robot; below 2^53, so JavaScript represents it exactly
+    kind: CauseKind
     code: Code
+    text: str  # in words
     part: str = ""  # of the robot, such as a wheel, unless the code says it
+    by: str = ""  # client, if one asked for it
+    at_ns: WallNs = 0
     kept: bool = False  # from before this run of the daemon
-    # Causes of the same stop or fault that this one has replaced, the newest first, without their
-    # own.
-    earlier: tuple[Latch, ...] = ()
-
-    @property
-    def causes(self) -> tuple[Latch, ...]:
-        """This latch, then `earlier`."""
-        return (self, *self.earlier)
-
-    @property
-    def cause(self) -> tuple[str, str, str]:
-        """The identity of the cause: two latches with the same one have the same cause."""
-        return self.code, self.part, self.by
-
-    def each(self, change: Callable[[Latch], Latch]) -> Latch:
-        """Return a copy with `change` applied to this latch and to each in `earlier`."""
-        return replace(change(self), earlier=tuple([change(cause) for cause in self.earlier]))
 
 
 class Latches(Struct, frozen=True):
-    """The latches. The daemon stores them in a file, so that they last even if it is killed."""
+    """The causes in force, the newest last; `core/motion/latches.py` adds and releases them.
 
-    stop: Latch | None = None
-    fault: Latch | None = None
-    inactive: Latch | None = None
+    The daemon stores them in a file, so that they last even if it is killed.
+    """
 
-    @property
-    def next(self) -> Latch | None:
-        """The latch that `clear` releases next: the fault, or the stop."""
-        return self.fault or self.stop
+    causes: tuple[Cause, ...] = ()
+    last: int = 0  # the number of the newest cause that there ever was
 
-    @property
-    def in_force(self) -> Latch | None:
-        """The latch that decides the mode: the fault, the stop, or `inactive`."""
-        return self.next or self.inactive
-
-    def after_restart(self) -> Latches:
-        """Return the latches for the next run of the daemon, each with `kept`."""
-        stop, fault, inactive = (
-            None if latch is None else latch.each(lambda cause: replace(cause, kept=True))
-            for latch in (self.stop, self.fault, self.inactive)
-        )
-        return Latches(stop, fault, inactive)
+    def of(self, *kinds: CauseKind) -> tuple[Cause, ...]:
+        """Return the causes of these kinds, the newest first."""
+        return tuple([cause for cause in reversed(self.causes) if cause.kind in kinds])
 
 
 class SpeedCap(Struct, frozen=True):
@@ -448,6 +420,7 @@ class Status(Struct, frozen=True):
     # Selected by the arbiter, which does not always drive: it may need a zero, or a latch holds.
     source: str = ""
     battery: BatteryLevel | Literal[""] = ""  # "" if the board does not report it
+    numbers: tuple[int, ...] = ()  # of the causes in force: with a new one, `state` is due at once
 
 
 class News(Struct, frozen=True):
@@ -493,7 +466,8 @@ class Snapshot(Struct, frozen=True):
     """The values for the messages that are not of a feedback line."""
 
     status: Status
-    latch: int  # number of the latch that decides the mode; 0 without one
+    causes: tuple[Cause, ...]  # in force, the newest last
+    cause_ages: dict[int, Seconds]  # since each was published, by its number
     applied: Twist  # commanded, after all limits
     pose: Pose
     measured: Twist | None  # None while the feedback is silent

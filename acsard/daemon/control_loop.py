@@ -12,9 +12,10 @@ from typing import NamedTuple
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.guard import Guard
 from acsard.core.link.serial_output import Port
+from acsard.core.motion.latches import stopped
 from acsard.core.robot import QUIET, Robot
 from acsard.core.values import NS_PER_S, STILL, Heard, Instant, Latches, News, Ns, Trip
-from acsard.daemon.latch_rules import Handover
+from acsard.daemon.latch_file import Keeper
 from acsard.daemon.pacing import NO_PERIOD, Pace, Period
 from acsard.daemon.publication import Publication
 from acsard.recording.recorded_steps import StepRecorder
@@ -45,14 +46,14 @@ class ControlLoop:
         robot: Robot,
         port: Port,
         publication: Publication,
-        handover: Handover,
+        keeper: Keeper,
         start: Instant,
         mono_ns: Callable[[], Ns],
         recorder: StepRecorder | None = None,
     ) -> None:
         self.robot, self.publication = robot, publication
         self.shutting_down = False  # the robot ramps to zero and stays at rest
-        self._port, self._handover, self._recorder = port, handover, recorder
+        self._port, self._keeper, self._recorder = port, keeper, recorder
         self._guard, self._config = Guard(robot.session.codec.stop, robot.config), robot.config
         # Use the longest line of both directions, because answers must not queue in the MCU either.
         mcu = robot.config.mcu
@@ -79,7 +80,7 @@ class ControlLoop:
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Step:
         """Run one wake-up. `period` says how many periods have ended."""
         robot, publication, pace = self.robot, self.publication, self.pace
-        port, handover, recorder = self._port, self._handover, self._recorder
+        port, keeper, recorder = self._port, self._keeper, self._recorder
         heard: Heard | None = None
         tick = due = False
         line: bytes | None = None
@@ -89,8 +90,8 @@ class ControlLoop:
             heard = self._heard(now, period)
             tick = period is not NO_PERIOD and pace.period_ended(heard.missed)
             news = robot.hear(now, heard)
-            if robot.latches is not handover.latches:
-                handover.take(robot.latches)
+            if robot.latches is not keeper.latches:
+                keeper.keep(robot.latches)
             due = tick or (news.urgent and pace.at_once(now.mono_ns, port.sent_ns))
             if due:
                 line = robot.drive(now)
@@ -99,7 +100,7 @@ class ControlLoop:
         except Exception:
             # Store the stops that this wake-up has taken from the bus. The exception may have come
             # before the robot processed them.
-            handover.take_stops(robot.latches, publication.intake.taken_stops(), now)
+            self._keep_stops(robot.latches, publication.intake.taken_stops(), now)
             if recorder is not None and heard is not None:
                 recorder.died(now, heard)
             raise
@@ -123,7 +124,7 @@ class ControlLoop:
         if period is not NO_PERIOD:
             missed = period.expired - 1
             publication.stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns, missed)
-            events += self._handover.take_events()
+            events += self._keeper.take_events()
         # Call `take` before reading `is_open`: in a late wake-up it may find the port lost.
         taken, received = intake.take(publication.serve), port.take(now if missed else None)
         # Pass the fields by position: creating a struct by its names takes three times as long.
@@ -164,12 +165,18 @@ class ControlLoop:
     def finish(self, now: Instant) -> None:
         """Store the stops that arrived after the last wake-up, and send the waiting answers."""
         self.keep_last_stops(now)
-        self._handover.wait()
+        self._keeper.wait()
         self.publication.now = now
         self.publication.answer(last=True)
         self.publication.bus.flush()
 
     def keep_last_stops(self, now: Instant) -> None:
         """Store the stops that arrived after the last wake-up, which none will process."""
-        stops = self.publication.intake.last_stops()
-        self._handover.take_stops(self._handover.latches, stops, now)
+        self._keep_stops(self._keeper.latches, self.publication.intake.last_stops(), now)
+
+    def _keep_stops(self, latches: Latches, by: list[str], now: Instant) -> None:
+        # Of each client one; their new numbers keep a `clear` of earlier stops from releasing them.
+        for name in by:
+            latches = stopped(latches, name, now.wall_ns)
+        if latches is not self._keeper.latches:
+            self._keeper.keep(latches)

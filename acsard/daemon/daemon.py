@@ -26,11 +26,10 @@ from acsard.core.incoming.queries import offered_services
 from acsard.core.link.codec import Codec
 from acsard.core.messages.schema import Info
 from acsard.core.robot import Robot
-from acsard.core.values import NS_PER_S, Event, Instant, Latches, Ns, WallNs
+from acsard.core.values import NS_PER_S, Event, Instant, Ns, WallNs
 from acsard.daemon.bus.bus import ZenohBus
 from acsard.daemon.control_loop import ControlLoop
-from acsard.daemon.latch_file import LatchFile
-from acsard.daemon.latch_rules import Handover
+from acsard.daemon.latch_file import Keeper, LatchFile, new_latches
 from acsard.daemon.pacing import NO_PERIOD, Period
 from acsard.daemon.publication import Publication
 from acsard.daemon.pulse import Pulse
@@ -128,7 +127,7 @@ async def run(
         events, start = list[Event](), clock.now()
         recorder = _recorder(config, events.append, start.wall_ns, stack)
         simulated = stack.enter_context(Simulated(config)) if config.mcu.simulated else None
-        keeper = _keeper(config, stack)
+        keeper = Keeper(new_latches()) if config.mcu.simulated else _latch_file(config, stack)
         path = config.mcu.port if simulated is None else simulated.path
         after = stack.enter_context(ExitStack())
         bus, port = ZenohBus(config, pulse), _port(config, path, pulse, events.append)
@@ -144,15 +143,16 @@ async def run(
         await stack.enter_async_context(port)
         # Read the latches after the bus and the port are open. A second daemon for this robot then
         # ends before it touches the latch file.
-        latches = Latches() if keeper is None else await keeper.start(clock.now())
-        robot, handover = Robot(config, latches), Handover(latches, keeper)
+        if isinstance(keeper, LatchFile):
+            await keeper.start(clock.now())
+        robot = Robot(config, keeper.latches)
         publication = Publication(
-            robot, bus, info, start, log.event, handover, recorder, events, ends, randbits(48)
+            robot, bus, info, start, log.event, keeper, recorder, events, ends, randbits(48)
         )
         publication.adopted = lambda adopted: log.use(adopted.log)
         if simulated is not None:
             publication.beside = simulated.current
-        control = ControlLoop(robot, port, publication, handover, start, clock.mono_ns, recorder)
+        control = ControlLoop(robot, port, publication, keeper, start, clock.mono_ns, recorder)
         between.callback(lambda: control.finish(clock.now()))
         after.callback(lambda: control.keep_last_stops(clock.now()))
         stack.callback(lambda: totals.update(control.totals(clock.mono_ns())))
@@ -181,9 +181,7 @@ def _recorder(
     return recorder
 
 
-def _keeper(config: Config, stack: AsyncExitStack) -> LatchFile | None:
-    if config.mcu.simulated:
-        return None
+def _latch_file(config: Config, stack: AsyncExitStack) -> LatchFile:
     # The stack closes the latch file later than the serial port. A slow disk then cannot delay the
     # last STOP line to the board.
     keeper = LatchFile(config, os.environ)

@@ -1,59 +1,148 @@
-"""The file that stores the latches for the next start of the daemon (`latch_rules.py`).
+"""The file that stores the latches for the next start of the daemon.
 
-The control loop hands them to a thread that writes the file, and never waits for the disk. After
-the rename, a kill loses nothing, and after the sync of a second thread, a power cut. There are two,
-because a stop must not wait for the sync of earlier latches, which takes up to seconds on an SD
-card.
+The robot starts as it ended, or stopped if the file cannot be read or written. One thread writes
+the file: it renames a new one over the old one, waits until the disk has both, and reports. So a
+kill after the rename loses nothing. A power cut before the end of the sync leaves the old file, the
+new one or half of it, which counts as unreadable. The control loop never waits for the disk.
 """
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import fcntl
 import os
+import secrets
 import stat
-import threading
 import time
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-from msgspec.structs import replace as replace_fields
+import msgspec
+from msgspec import Struct
+from msgspec.structs import replace
 
+from acsard.core.codes import CODES, reason
 from acsard.core.config.settings import Config
-from acsard.core.values import NS_PER_S, Event, Instant, Latches
-from acsard.daemon.latch_rules import (
-    MAX_BYTES,
-    LatchFileError,
-    LatchKeeper,
-    after_failed_write,
-    at_start,
-    decode,
-    encode,
-    stopped,
-    unreadable,
-    unwritable,
-)
+from acsard.core.motion.latches import after_restart, latched
+from acsard.core.values import NS_PER_S, AcsardError, Event, Instant, Latches, Level
 from acsard.host import clock
-from acsard.host.atomic_file import replace, sync
-from acsard.host.errors import InUseError
+from acsard.host.atomic_file import replace as replace_file
+from acsard.host.atomic_file import sync
+from acsard.host.errors import MSGSPEC_ERRORS, InUseError
 from acsard.host.mailbox import Mailbox
 from acsard.host.threads import NoThreadError, Worker, in_thread
 from acsard.host.wait_timer import WaitTimer
 
-# A write or a sync that takes longer is a disk that hangs. At the start, the first read and write
-# together may take this time.
+FORMAT = 3  # another version is unreadable
+
+MAX_BYTES = 65_536  # a larger file is unreadable; 32 causes take about 10 kB
+
+MAX_NUMBER = 1 << 52  # later causes get higher ones, and JavaScript knows those below 2^53
+
+MAX_TEXT_LENGTH = 500  # characters of a name or a reason
+
+# A write and a sync that take longer are a disk that hangs. The start waits as long for the read,
+# and again for the first write.
 HANG_TIMEOUT_S = 2.0
 
-MIN_WRITE_PAUSE_S = 0.05  # each stop is a new latch: a flood of stops would wear out an SD card
+MIN_WRITE_PAUSE_S = 0.05  # each stop changes the file: a flood of stops would wear out an SD card
 
 RETRY_PAUSE_S = 1.0  # between two attempts to write
 
 CLOSE_TIMEOUT_S = 0.3  # at the end of the daemon
 
+# The answer to a stop waits for the disk no longer than this, or the client would believe that the
+# robot did not receive its stop.
+MAX_ANSWER_DELAY_NS = NS_PER_S // 5
+
 DISK_HANGS = f"the disk did not answer within {HANG_TIMEOUT_S:g} s"
 
 MAX_EVENTS = 64  # for the next control step; the oldest goes
+
+
+class LatchFileError(AcsardError):
+    """The content of a latch file is damaged, of another version or of another robot."""
+
+
+class _Content(Struct, frozen=True):
+    format: int
+    robot: str
+    latches: Latches
+
+
+def encode(robot: str, latches: Latches) -> bytes:
+    """Return the content of a robot's latch file, as indented JSON."""
+    causes = [
+        replace(cause, text=_safe(cause.text), part=_safe(cause.part), by=_safe(cause.by))
+        for cause in latches.causes
+    ]
+    content = _Content(FORMAT, robot, replace(latches, causes=tuple(causes)))
+    return msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n"
+
+
+def decode(robot: str, data: bytes) -> Latches:
+    """Return the latches of a robot's file for the next run, whose numbers are all new.
+
+    A later version may have written it: fields that it added are ignored, and a cause with a code
+    that it added still holds the robot. Raises `LatchFileError` for other robots, for a format or a
+    kind of cause that this version does not know, and for damage.
+    """
+    if not data.strip(b"\0 \r\n"):
+        raise LatchFileError("it is empty")
+    try:
+        raw = msgspec.json.decode(data)
+        number = raw.get("format") if isinstance(raw, dict) else None
+        if type(number) is int and number != FORMAT:
+            raise LatchFileError(
+                f"another version of acsard wrote the file (format {number}, but this daemon reads "
+                f"format {FORMAT})"
+            )
+        if not all(name in raw["latches"] for name in Latches.__struct_fields__):
+            raise LatchFileError("it is damaged (the field causes or last is missing)")
+        raw["latches"]["causes"] = [_known(cause) for cause in raw["latches"]["causes"]]
+        content = msgspec.convert(raw, _Content)
+    except (*MSGSPEC_ERRORS, TypeError, KeyError) as error:
+        raise LatchFileError(f"it is damaged ({error})") from None
+    if content.robot != robot:
+        raise LatchFileError(f"it belongs to the robot {_safe(content.robot)!r:.60}")
+    latches = content.latches
+    in_range = all(
+        0 < cause.number <= latches.last and abs(cause.at_ns) < 1 << 63 for cause in latches.causes
+    )
+    if not (in_range and 0 <= latches.last <= MAX_NUMBER):
+        # No call could name such a number, and messages have no integers above 64 bits.
+        raise LatchFileError("it is damaged (a number or a time is out of range)")
+    # A run that was killed may have published numbers that are not in the file.
+    return after_restart(replace(latches, last=latches.last + 1 + secrets.randbits(32)))
+
+
+def new_latches() -> Latches:
+    """Return no latches, with a random number, because the numbers before are unknown."""
+    return Latches(last=secrets.randbits(48))
+
+
+def unreadable(where: str, problem: str, now: Instant) -> Latches:
+    """Return the latches for the start of a robot whose latch file cannot be read: stopped."""
+    cause = f"the latch file ({where}) cannot be read: {problem}; a stop may have been lost"
+    return _stopped(new_latches(), "read", cause, now)
+
+
+def not_writable(latches: Latches, where: str, problem: str, now: Instant) -> Latches:
+    """Return the latches for the start of a robot whose latch file cannot be written: stopped.
+
+    The previous run may have lost a stop for the same reason.
+    """
+    return _stopped(latches, "write", unwritable(where, problem), now)
+
+
+def unwritable(where: str, problem: str) -> str:
+    """Return the message for a file that cannot be written."""
+    return (
+        f"a stop would not survive a restart: the latch file ({where}) cannot be written: {problem}"
+    )
 
 
 def place(config: Config, environ: Mapping[str, str]) -> Path:
@@ -80,96 +169,84 @@ def place(config: Config, environ: Mapping[str, str]) -> Path:
         ) from None
 
 
-class LatchFile(LatchKeeper):
+class Keeper:
+    """Gets the latches in force. This one stores nothing, as with the built-in simulator."""
+
+    def __init__(self, latches: Latches) -> None:
+        self.latches = latches
+
+    @property
+    def is_stored(self) -> bool:
+        """Whether a power cut would lose none of the latches, or this keeper stores nothing."""
+        return True
+
+    @property
+    def trouble(self) -> str | None:
+        """Why the latches would not survive a restart, or ""; None without a file."""
+        return None
+
+    def keep(self, latches: Latches) -> None:
+        """Take the latches in force; a later call may come before they are stored."""
+        self.latches = latches
+
+    def wait(self) -> None:
+        """Block until the latches are stored or cannot be, at most `MAX_ANSWER_DELAY_NS`."""
+
+    def take_events(self) -> list[Event]:
+        """Return the events since the last call, such as a failed write."""
+        return []
+
+
+class LatchFile(Keeper):
     """The file that stores a robot's latches over a restart: `start()` once, then `keep()`."""
 
     def __init__(self, config: Config, environ: Mapping[str, str]) -> None:
+        super().__init__(Latches())
         self.where = "no directory"  # for messages
-        self._path: Path | None = None  # of the target, if it is a link
-        self._robot = config.robot.id
-        self._barred = ""  # why the file must never be written
+        self._robot, self._path, self._no_place = config.robot.id, Path(), ""
         try:
             self._path = place(config, environ)
             self.where = str(self._path)
         except OSError as error:
-            self._barred = _reason(error)
+            self._no_place = _reason(error)
         self._lock = -1  # descriptor that keeps other daemons away, or -1
-        # Held while reading or writing, not for a sync, and never by the control loop.
-        self._disk = threading.Lock()
-        self._abandoned = False  # `start` timed out while another thread used the file
-        self._start_latches: Latches | None = None  # in the file at the start
-        self._blind = False  # not read in time: the writing thread reads it before its first write
-        self._missed = Latches()  # latches in such a file, which each write adds again
-        self._box = Mailbox[Latches](1)  # to the writing thread
+        self._box = Mailbox[Latches](1)  # to the thread
         self._news = Mailbox[Event](MAX_EVENTS)
-        self._written_latches: Latches | None = None  # by this process
+        self._renamed: Latches | None = None  # in the file
+        self._stored: Latches | None = None  # on the disk
         self._failed = ""
-        self._newest_latches: Latches | None = None  # of the last `keep`
-        self._write_timer, self._sync_timer = WaitTimer(), WaitTimer()
-        self._hangs = False  # at the last `take_events`
-        self._renamed = Mailbox[Latches](1)  # in the file, to the syncing thread
-        self._threads: tuple[Worker, ...] = ()  # for writing and syncing, once both run
+        self._timer, self._hangs = WaitTimer(), False
+        self._thread = Worker("latches", self._work)
 
-    # The start of the daemon calls the methods below.
-
-    async def start(self, now: Instant) -> Latches:
-        """Read the file, try to write it, and return the latches with which the robot starts.
+    async def start(self, now: Instant) -> None:
+        """Read the file and write it: `latches` are then those with which the robot starts.
 
         They have a stop at `now` if that fails. Raises `InUseError` if another daemon uses the
         file.
         """
         try:
-            latches = await in_thread(lambda: self._load(now), HANG_TIMEOUT_S)
+            self.latches = await in_thread(lambda: self._read(now), HANG_TIMEOUT_S)
         except TimeoutError as error:
-            self._abandoned = True
             why = str(error) if isinstance(error, NoThreadError) else DISK_HANGS
-            self._fail(why)
-            file_latches = self._start_latches
-            if file_latches is None:
-                self._blind = True
-                latches = self._if_unreadable(why, now)
-            else:
-                latches = self._if_unwritable(file_latches, why, now)
-            self.keep(latches)
-        threads = (
-            Worker("latches", lambda: self._work(now)),
-            Worker("latches to disk", self._sync_each),
-        )
+            self.latches = unreadable(self.where, why, now)
+        self.keep(self.latches)
         try:
-            for thread in threads:
-                thread.start()
+            self._thread.start()
         except NoThreadError as error:
-            # The first thread may run already. Without the second thread, the first one must not
-            # write, and must not report a recovery. `_barred` prevents both.
-            self._barred = str(error)
-            self._fail(self._barred)
-            return self._if_unwritable(latches, self._failed, now)
-        self._threads = threads
-        return latches
-
-    def _load(self, now: Instant) -> Latches:
-        with self._disk:
-            if self._abandoned:
-                return Latches()
-            latches = self._start_latches = self._read(now)
-            trouble = self._replace(latches)
-            if trouble and not self._abandoned:
-                self._fail(trouble)
-                latches = self._if_unwritable(latches, trouble, now)
-                self.keep(latches)
-            return latches
-
-    def _if_unreadable(self, why: str, now: Instant) -> Latches:
-        return stopped(Latches(), unreadable(self.where, why), now)
-
-    def _if_unwritable(self, latches: Latches, why: str, now: Instant) -> Latches:
-        return after_failed_write(latches, at_start(unwritable(self.where, why)), now)
+            self._fail(str(error))
+        end_ns = clock.mono_ns() + HANG_TIMEOUT_S * NS_PER_S
+        while self._renamed is None and not self._failed:
+            if clock.mono_ns() > end_ns:
+                self._fail(DISK_HANGS)
+            await asyncio.sleep(0.001)
+        if self._failed:
+            self.keep(not_writable(self.latches, self.where, self._failed, now))
 
     def _read(self, now: Instant) -> Latches:
         # Locks the file; a stop if it is unreadable. Raises `InUseError`.
         path = self._path
-        if path is None:
-            return Latches()
+        if self._no_place:
+            return new_latches()
         # A write replaces the file. If the path is a link, the write must replace its target,
         # because the link may be in a directory that loses its changes at a reboot. The target must
         # be a regular file: a write must not replace /dev/null. If the link cannot be followed, the
@@ -184,13 +261,13 @@ class LatchFile(LatchKeeper):
             # absent counts as unreadable, because the disk of the target may not be mounted.
             os.lstat(path)
         except FileNotFoundError:
-            return Latches()
+            return new_latches()
         except OSError as error:
-            return self._if_unreadable(_reason(error), now)
+            return unreadable(self.where, _reason(error), now)
         try:
             return decode(self._robot, _content(path))
         except (OSError, LatchFileError) as error:
-            return self._if_unreadable(_reason(error), now)
+            return unreadable(self.where, _reason(error), now)
 
     def _take_lock(self, path: Path) -> None:
         try:
@@ -203,12 +280,11 @@ class LatchFile(LatchKeeper):
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(lock)
-            self._barred = (
+            raise InUseError(
                 f"another daemon stores the stop of robot {self._robot} in {path}; end that "
                 "daemon, or give this robot its own id (robot.id) or its own directory "
                 "(control.state_directory)"
-            )
-            raise InUseError(self._barred) from None
+            ) from None
         except OSError:
             os.close(lock)
             # This file system has no locks. The bus detects two daemons with the same id.
@@ -220,67 +296,55 @@ class LatchFile(LatchKeeper):
                 with suppress(OSError):
                     left.unlink()
 
-    # The control loop calls the methods below, which `LatchKeeper` describes.
+    # The control loop calls the methods below.
 
     def keep(self, latches: Latches) -> None:
-        self._newest_latches = latches
+        self.latches = latches
         self._box.put(latches)
 
-    def holds(self, latches: Latches) -> bool:
-        return self._written_latches is latches
+    @property
+    def is_stored(self) -> bool:
+        return self._stored is self.latches
 
-    def wait(self, latches: Latches, seconds: float) -> None:
-        # The latches of a failed write may never be stored.
-        end_ns = clock.mono_ns() + seconds * NS_PER_S
-        while not self.holds(latches) and not self._failed and clock.mono_ns() < end_ns:
+    def wait(self) -> None:
+        end_ns = clock.mono_ns() + MAX_ANSWER_DELAY_NS
+        while not (self.is_stored or self._failed) and clock.mono_ns() < end_ns:
             time.sleep(0.001)
 
     def take_events(self) -> list[Event]:
-        now_ns = clock.mono_ns()
-        write_ns, sync_ns = self._write_timer.wait_ns(now_ns), self._sync_timer.wait_ns(now_ns)
-        if self._written_latches is self._newest_latches:
-            # A slow write does not matter if the file already contains the newest latches.
-            write_ns = 0
-        hangs = not self._failed and max(write_ns, sync_ns) > HANG_TIMEOUT_S * NS_PER_S
+        wait_ns = self._timer.wait_ns(clock.mono_ns())
+        hangs = not self._failed and wait_ns > HANG_TIMEOUT_S * NS_PER_S
         if hangs is not self._hangs:
             self._hangs = hangs
             if hangs:
-                text = unwritable(self.where, DISK_HANGS)
-                self._news.put(Event("latch_file", text, "warning"))
+                self._tell(unwritable(self.where, DISK_HANGS), "warning")
             elif not self._failed:
-                self._news.put(self._again)
+                self._report_success()
         return self._news.take() if self._news.waiting else []
 
     @property
     def trouble(self) -> str:
-        if not all(thread.is_alive() for thread in self._threads):
+        if self._failed or self._hangs:
+            return unwritable(self.where, self._failed or DISK_HANGS)
+        if not self._thread.is_alive():
             return "the thread that writes stops to the latch file has ended; restart the daemon"
-        failed = self._failed or (DISK_HANGS if self._hangs else "")
-        return unwritable(self.where, failed) if failed else ""
-
-    @property
-    def _again(self) -> Event:
-        return Event(
-            "latch_file",
-            f"the daemon can write {self.where} again, so stops survive a restart of the daemon",
-        )
+        return ""
 
     def close(self) -> None:
-        """Wait at most `CLOSE_TIMEOUT_S` until the latches are synced, and end both threads."""
-        end_ns = clock.mono_ns() + CLOSE_TIMEOUT_S * NS_PER_S
-        for box, thread in zip((self._box, self._renamed), self._threads, strict=False):
-            box.close()
-            thread.join(max(0.0, (end_ns - clock.mono_ns()) / NS_PER_S))
+        """Wait at most `CLOSE_TIMEOUT_S` until the latches are stored, and end the thread."""
+        self._box.close()
+        if self._thread.is_alive():
+            self._thread.join(CLOSE_TIMEOUT_S)
 
-    # The writing thread runs the methods below.
+    # The thread runs the methods below.
 
-    def _work(self, now: Instant) -> None:
+    def _work(self) -> None:
         latches: Latches | None = None
         while True:
             # Read `closed` before the latches, so that the last latches are not missed.
             over = self._box.closed
             latches = self._box.pop() or latches
-            if latches is not None and not self._try(latches, now):
+            if latches is not None and self._write(latches):
                 latches = None
                 if not over:
                     time.sleep(MIN_WRITE_PAUSE_S)
@@ -288,111 +352,57 @@ class LatchFile(LatchKeeper):
                 return
             self._box.wait(None if latches is None else RETRY_PAUSE_S)
 
-    def _try(self, latches: Latches, now: Instant) -> str:
-        # Why that fails; `now` is the daemon's start.
-        self._write_timer.begin()
-        with self._disk:
-            if self._blind:
-                self._read_late(now)
-            trouble = self._replace(latches)
-        if trouble:
-            self._fail(trouble)
-        self._write_timer.end()
-        return trouble
-
-    def _read_late(self, now: Instant) -> None:
-        # The next write would overwrite what `start()` could not read in time.
-        self._blind = False
-        if self._start_latches is None:
-            try:
-                self._start_latches = self._read(now)
-            except InUseError:
-                # `_barred` says why the file is not written.
-                self._start_latches = Latches()
-        self._missed = replace_fields(self._start_latches, stop=None)
-
-    def _replace(self, latches: Latches) -> str:
-        if self._path is None or self._barred:
-            return self._barred
+    def _write(self, latches: Latches) -> bool:
+        self._timer.begin()
         try:
+            if self._no_place:
+                raise OSError(errno.ENOENT, self._no_place)
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            # The rename comes before the sync. A process is killed far more often than the power
-            # fails, and a sync takes up to seconds on an SD card. A power cut in between may leave
-            # half a file, which counts as unreadable: the robot then starts stopped.
-            content = encode(self._robot, self._with_missed(latches))
-            replace(self._path, content, synced=False)
-        except OSError as error:
-            return _reason(error)
-        self._written_latches = latches
-        self._renamed.put(latches)
-        return ""
-
-    # The syncing thread runs the methods below.
-
-    def _sync_each(self) -> None:
-        failed = False
-        while True:
-            # Read `closed` before the latches, so that the last latches are not missed.
-            over = self._renamed.closed
-            if failed:
-                # The kernel may have dropped the bytes that it could not sync, so write them again.
-                with self._disk:
-                    assert self._written_latches is not None
-                    self._replace(self._written_latches)
-            if self._renamed.pop() is not None:
-                self._sync_timer.begin()
-                trouble = self._sync()
-                self._sync_timer.end()
-                failed = bool(trouble)
-                if failed:
-                    self._fail(trouble)
-                elif self._newest_latches is None or self._written_latches is self._newest_latches:
-                    # If the newest latches are not written yet, the recovery is reported later.
-                    self._recover()
-            if over:
-                return
-            self._renamed.wait(RETRY_PAUSE_S if failed else None)
-
-    def _sync(self) -> str:
-        assert self._path is not None
-        try:
+            replace_file(self._path, encode(self._robot, latches), synced=False)
+            self._renamed = latches
             sync(self._path)
             sync(self._path.parent)
         except OSError as error:
-            return _reason(error)
-        return ""
-
-    def _with_missed(self, latches: Latches) -> Latches:
-        # A fault of `latches` replaces the missed one for good; so does "inactive". `_missed` has
-        # no stop, because `start()` has set one.
-        missed = self._missed
-        if latches.fault is not None:
-            missed = replace_fields(missed, fault=None)
-        if latches.inactive is not None:
-            missed = replace_fields(missed, inactive=None)
-        self._missed = missed
-        return Latches(
-            latches.stop,
-            latches.fault or missed.fault,
-            latches.inactive or missed.inactive,
-        )
-
-    def _fail(self, reason: str) -> None:
-        if reason == self._failed:
-            return
-        self._failed = reason
-        then = (
-            "the daemon does not try again: correct this, and restart the daemon"
-            if self._barred
-            else f"the daemon tries again every {RETRY_PAUSE_S:g} s"
-        )
-        text = f"{unwritable(self.where, reason)}; {then}"
-        self._news.put(Event("latch_file", text, "warning"))
-
-    def _recover(self) -> None:
-        if self._failed and not self._barred:
+            # The kernel may have dropped the bytes that it could not sync, so all is done again.
+            self._fail(_reason(error))
+            return False
+        finally:
+            self._timer.end()
+        self._stored = latches
+        if self._failed:
             self._failed = ""
-            self._news.put(self._again)
+            self._report_success()
+        return True
+
+    def _fail(self, problem: str) -> None:
+        if problem != self._failed:
+            self._failed = problem
+            again = f"the daemon tries again every {RETRY_PAUSE_S:g} s"
+            self._tell(f"{unwritable(self.where, problem)}; {again}", "warning")
+
+    def _report_success(self) -> None:
+        self._tell(f"the daemon can write {self.where} again, so stops survive a restart", "info")
+
+    def _tell(self, text: str, level: Level) -> None:
+        self._news.put(Event("latch_file", text, level))
+
+
+def _stopped(latches: Latches, failed: str, cause: str, now: Instant) -> Latches:
+    # The read and the write can fail for different reasons, which are then two causes.
+    return latched(latches, "stop", reason("stopped_at_start", failed, cause=cause), now.wall_ns)
+
+
+def _known(raw: Any) -> Any:
+    # A decoded cause, whose code this version can represent.
+    match raw:
+        case {"code": str(code), "text": str(text)} if code not in CODES:
+            why = reason("other_version", part=_safe(code), cause=text, named=code)
+            return raw | {"code": why.code, "text": why.text, "part": why.part}
+    return raw
+
+
+def _safe(text: str) -> str:
+    return text[:MAX_TEXT_LENGTH].encode(errors="replace").decode()
 
 
 def _content(path: Path) -> bytes:

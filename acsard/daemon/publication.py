@@ -1,6 +1,6 @@
 """Publishes what the robot reports, answers queries, and writes the events to the log.
 
-The answer to a call waits until the latches would survive a kill of the process.
+The answer to a call waits until the disk has the latches.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from acsard.core.values import (
     Twist,
 )
 from acsard.daemon.intake import Intake
-from acsard.daemon.latch_rules import MAX_ANSWER_DELAY_NS, Handover
+from acsard.daemon.latch_file import MAX_ANSWER_DELAY_NS, Keeper
 from acsard.daemon.latencies import Stopwatch
 from acsard.host import clock
 from acsard.recording.recorded_steps import StepRecorder
@@ -56,7 +56,7 @@ class Publication:
         info: Info,
         start: Instant,
         log: Callable[[Event], None],
-        handover: Handover,
+        keeper: Keeper,
         recorder: StepRecorder | None = None,
         events: list[Event] | None = None,
         certificate_ends: dict[str, int] | None = None,
@@ -75,12 +75,12 @@ class Publication:
         self.beside: Callable[[str], Message | None] = lambda key: None
         # Gets each new configuration, after the events of its wake-up are in the log.
         self.adopted: Callable[[Config], None] = lambda config: None
-        self._robot, self.bus, self._log, self._handover = robot, bus, log, handover
+        self._robot, self.bus, self._log, self._keeper = robot, bus, log, keeper
         self._recorder = recorder
         self._queries = Queries(config, info)
         # Settings that differ from the start, and their values then.
         self._differing: dict[str, Difference] = {}
-        # Answers, with the time at which each was queued, until the latches are in their file.
+        # Answers, with the time at which each was queued, until the disk has the latches.
         self._answers: deque[tuple[int, Answer]] = deque()
         self.now = start  # of the present wake-up
         bus.feedback_sent = self.stopwatch.figures["feedback_to_bus"].add
@@ -114,8 +114,8 @@ class Publication:
 
     def answer(self, *, last: bool = False) -> None:
         """Send the answers whose latches are stored, or that wait for too long, or all (`last`)."""
-        is_stored, before_ns = self._handover.is_stored, self.now.mono_ns - MAX_ANSWER_DELAY_NS
-        trouble = "" if is_stored else self._handover.trouble or NOT_STORED
+        is_stored, before_ns = self._keeper.is_stored, self.now.mono_ns - MAX_ANSWER_DELAY_NS
+        trouble = "" if is_stored else self._keeper.trouble or NOT_STORED
         while self._answers and (is_stored or last or self._answers[0][0] < before_ns):
             _, answer = self._answers.popleft()
             if trouble and answer.success:
@@ -163,7 +163,7 @@ class Publication:
             figures=self.stopwatch.measured(now_ns),
             missed_last_minute=self.stopwatch.missed(now_ns),
             routers=intake.routers.status,
-            latch_file=self._handover.trouble,
+            latch_file=self._keeper.trouble,
             recording=Recording() if recorder is None else recorder.status,
             settings_differ=listed(named, MAX_NAMED),
         )

@@ -30,6 +30,7 @@ from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import CommandEvents
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.last_line import LastLine
+from acsard.core.motion.lifecycle import Lifecycle
 from acsard.core.motion.modes import Mode
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
@@ -54,6 +55,7 @@ PARTS: dict[str, Any] = {
     "_sanity": Sanity,
     "_inputs": BoardInputs,
     "_told": CommandEvents,
+    "_life": Lifecycle,
     "_tally": EventThrottle,
 }
 

@@ -61,7 +61,7 @@ SAFETY = (
     "acsard/core/motion/modes.py",
     "acsard/core/motion/sanity.py",
     "acsard/core/motion/wheel_witness.py",
-    "acsard/daemon/latch_rules.py",
+    "acsard/core/motion/latches.py",
 )
 ENOUGH = 0.98
 """Share of the mutants of `SAFETY` that tests must notice."""

@@ -18,7 +18,7 @@ from acsard.core.incoming.queries import Query
 from acsard.core.values import NS_PER_S
 from tests.each import each, more
 from tests.scenarios.speakers import SHARED, STAMPED, Speaker, Way, moved
-from tests.scenarios.world import SIGNED, World
+from tests.scenarios.world import SIGNED, World, naming
 
 OWN: tuple[Way, ...] = ("client", "signed", "rmw")
 
@@ -290,7 +290,7 @@ def test_a_zero_from_before_a_restart_of_the_board_arms_no_sender(stall: float) 
     world.drive(0.4, seconds=0.5)
     world.call("stop")
     world.run(3.0)
-    payload = msgspec.json.encode({"latch": world.state.latch})
+    payload = naming(world.numbers)
     at_ns, ms = world.now_ns, 1_000_000
     clear = Query(999, "srv/clear", "srv/clear", "", payload, "", at_ns + ms)
     zero = msgspec.json.encode({"linear": {"x": 0.0}, "angular": {"z": 0.0}})

@@ -159,7 +159,7 @@ def test_a_limiting_bumper_stops_the_robot_within_a_period_and_allows_only_retre
             # A sender that pushed against the obstacle at the release does not drive on.
             world.hold(-0.8 * (sign or 1), seconds=0.3)
             assert {*lines.applied} == {(0.0, 0.0)}
-            assert world.state.latch == 0
+            assert world.newest == 0
     assert slowest_ns <= world.period_ns
     assert (retreats > 0) == (sign != 0)
 
@@ -233,7 +233,7 @@ def test_a_recording_replays_presses_and_releases(config: Config) -> None:
     assert world.state.bumpers == [True, False, False, False]
     middle, tape.cut = len(tape.taken) + 1, True
     world.drive(-0.5, seconds=1.5)
-    while world.state.latch and not world.call("clear").success:
+    while world.newest and not world.call("clear").success:
         world.run(0.2)
     world.drive(0.5, seconds=1.0)
     names = {event.name for step in tape.taken for event in step.news.events}

@@ -17,11 +17,12 @@ from acsard.core.config.settings import (
     SimConfig,
 )
 from acsard.core.incoming.queries import Query
+from acsard.core.motion.latches import after_restart
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.values import NS_PER_S, Latches, Received
 from tests.each import each
 from tests.scenarios.taped import Tape, replayed
-from tests.scenarios.world import SIGNED, World
+from tests.scenarios.world import SIGNED, World, naming
 from tests.stepped import Outputs
 
 ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00"
@@ -80,7 +81,7 @@ def into(world: World, mode: str) -> None:
 
 def out_of(world: World) -> None:
     """Release every latch, and switch the robot on."""
-    while world.state.latch:
+    while world.newest:
         done = world.call("activate" if world.state.mode == "inactive" else "clear")
         assert done.success, done.message
         world.run(0.05)
@@ -102,13 +103,13 @@ def test_each_press_is_a_zero_line_within_a_period_and_no_release_moves_the_robo
             watch.begin()
             into(world, mode)
             world.run(dice.uniform(0.0, 0.03))
-            before = world.state.latch
+            before = world.newest
             with world.mcu.estop_pressed(0.0, 0.0):
                 world.run(0.05)
                 assert world.state.emergency_stop == "pressed"
                 assert world.state.mode == ("fault" if mode == "fault" else "stopped")
                 assert world.state.code == "emergency_stop"
-                assert world.state.latch > before or mode == "fault"
+                assert world.newest > before or mode == "fault"
                 if mode in ("driving", "ready", "inactive"):
                     slowest_ns = max(slowest_ns, watch.waited_ns)
                 assert not world.call("clear").success
@@ -297,7 +298,7 @@ def test_a_press_survives_a_restart_of_the_daemon_and_of_the_board() -> None:
             world.run(0.5)
             assert world.state.emergency_stop == "pressed"
         latches: Latches = world.loop.robot.latches
-    again = World(latches=latches.after_restart())
+    again = World(latches=after_restart(latches))
     with again.mcu.estop():
         again.run(0.3)
         again.hold(0.5, seconds=0.5)
@@ -356,9 +357,9 @@ def test_a_clear_that_came_before_the_release_is_refused_also_if_one_step_takes_
         world.run(0.3)
         with world.mcu.estop_pressed(0.0, 1.0):
             world.run(0.5)
-            latch, begin_ns = world.state.latch, world.now_ns
+            shown, begin_ns = world.numbers, world.now_ns
             world.stall(1.5)
-            asked = json.dumps({"latch": latch}).encode()
+            asked = naming(shown)
             call = "srv/clear", "srv/clear", "", asked, "", begin_ns + NS_PER_S // 5
             world.bus.queries.append(Query(99, *call))
             world.run(0.05)

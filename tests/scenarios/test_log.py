@@ -15,7 +15,7 @@ from acsard.core.messages.schema import Events
 from acsard.core.messages.signature import public_name
 from acsard.core.motion.event_throttle import BURST
 from acsard.core.values import NS_PER_S, Event, EventName
-from tests.scenarios.world import World
+from tests.scenarios.world import World, naming
 
 LINES_A_SECOND = 6
 """Most lines of one name: a burst of five, and the one that is due."""
@@ -55,7 +55,7 @@ def call(world: World, service: str, name: bytes = b"", via: Via = "native") -> 
         )
     payload = SERVICES[VERBS[key]].example.encode()
     if service == "clear":
-        payload = msgspec.json.encode({"latch": world.state.latch})
+        payload = naming(world.numbers)
     query = Query(1, key, key, "", payload, "", at_ns, via, name)
     world.bus.queries.append(query)
     world.run(0.03)

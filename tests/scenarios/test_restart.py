@@ -17,9 +17,9 @@ from acsard.core.config.settings import Config
 from acsard.core.incoming.commands import Arrival
 from acsard.core.messages.signature import public_name
 from acsard.core.robot import Robot
-from acsard.core.values import NS_PER_S, Event, Instant, Latch, Latches
+from acsard.core.values import NS_PER_S, Cause, Event, Instant, Latches
 from acsard.daemon.intake import Intake
-from acsard.daemon.latch_rules import LatchFileError, decode, encode, stopped, unreadable
+from acsard.daemon.latch_file import Keeper, LatchFileError, decode, encode, unreadable
 from acsard.daemon.publication import Publication
 from tests.each import each
 from tests.scenarios.speakers import Speaker, moved
@@ -34,28 +34,26 @@ MODES = {"stop": "stopped", "fault": "fault", "inactive": "inactive"}
 ZEROS_S, CYCLE_S = 0.3, 2.0
 
 
-class MemoryFile:
+class MemoryFile(Keeper):
     """A latch file in memory. It contains the newest latches without waiting for a disk."""
 
+    trouble = ""
+    is_stored = True
+
     def __init__(self) -> None:
+        super().__init__(Latches())
         self.data = b""
-        self.trouble = ""
         self.told: list[Event] = []
-        self.slow = False
-        """True while the disk has not taken the latches that were handed over last."""
         self.hangs = False
         """True if waiting for the disk does not help."""
-        self.waited: list[float] = []
+        self.waited = 0
 
     def keep(self, latches: Latches) -> None:
-        self.data = encode("acsar", latches)
+        self.latches, self.data = latches, encode("acsar", latches)
 
-    def holds(self, latches: Latches) -> bool:
-        return not self.slow
-
-    def wait(self, latches: Latches, seconds: float) -> None:
-        self.waited.append(seconds)
-        self.slow = self.slow and self.hangs
+    def wait(self) -> None:
+        self.waited += 1
+        self.is_stored = self.is_stored or not self.hangs
 
     def take_events(self) -> list[Event]:
         return [self.told.pop() for _ in range(len(self.told))]
@@ -63,9 +61,10 @@ class MemoryFile:
     def read(self, now: Instant) -> Latches:
         """Return the latches that the next start of the daemon reads."""
         try:
-            return decode("acsar", self.data)
+            self.latches = decode("acsar", self.data)
         except LatchFileError as error:
-            return stopped(Latches(), unreadable("FILE", str(error)), now)
+            self.latches = unreadable("FILE", str(error), now)
+        return self.latches
 
 
 class Host:
@@ -225,9 +224,8 @@ def test_a_fault_over_a_stop_takes_two_calls_after_a_restart_as_before() -> None
 @each("away_s", [-(10**9), -60, 0, 1, 10**9])
 def test_a_plain_clear_waits_two_seconds_after_a_reboot_wherever_its_clock_is(away_s: int) -> None:
     at_ns = START.wall_ns - away_s * NS_PER_S
-    world = World(
-        latches=Latches(stop=Latch(7, at_ns, "joe", "stopped by joe", "stopped", kept=True))
-    )
+    cause = Cause(7, "stop", "stopped", "stopped by joe", by="joe", at_ns=at_ns, kept=True)
+    world = World(latches=Latches((cause,), 7))
     world.run(0.5)
     world.ask("srv/clear")
     assert world.state.mode == "stopped"
@@ -247,10 +245,10 @@ def test_a_set_lasts_until_the_restart() -> None:
 def test_a_stop_is_obeyed_immediately_and_answered_after_the_file_is_written() -> None:
     host = Host(random.Random(8))
     host.world.run(0.5)
-    host.file.slow = True
+    host.file.is_stored = False
     assert not host.world.ask("srv/stop")
     assert host.world.state.mode == "stopped"
-    host.file.slow = False
+    host.file.is_stored = True
     host.world.run(0.02)
     (replies,) = host.world.bus.replies.values()
     assert len(replies) == 1
@@ -259,7 +257,7 @@ def test_a_stop_is_obeyed_immediately_and_answered_after_the_file_is_written() -
 def test_a_stop_is_answered_within_0_2_s_however_slow_the_disk_is() -> None:
     host = Host(random.Random(9))
     host.world.run(0.5)
-    host.file.slow = True
+    host.file.is_stored = False
     assert not host.world.ask("srv/stop")
     host.world.run(0.2)
     (replies,) = host.world.bus.replies.values()
@@ -269,7 +267,7 @@ def test_a_stop_is_answered_within_0_2_s_however_slow_the_disk_is() -> None:
 def test_a_stream_of_stops_delays_no_answer_to_another_request() -> None:
     host = Host(random.Random(12))
     host.world.run(0.5)
-    host.file.slow = True
+    host.file.is_stored = False
     assert not host.world.ask("srv/reset_odometry")
     for _ in range(25):
         host.world.put("stop", b"")
@@ -281,13 +279,13 @@ def test_a_stream_of_stops_delays_no_answer_to_another_request() -> None:
 def test_the_answer_of_a_stop_says_that_it_cannot_be_kept() -> None:
     host = Host(random.Random(13))
     host.world.run(0.5)
-    host.file.slow = True
+    host.file.is_stored = False
     host.file.trouble = "a stop would not survive a restart: FILE: No space left on device"
     assert not host.world.ask("srv/stop")
     host.world.run(0.25)
     ((reply,),) = host.world.bus.replies.values()
     assert host.file.trouble in reply.payload.decode()
-    host.file.slow = False
+    host.file.is_stored = True
     assert "would not survive" not in host.world.call("stop").message
 
 
@@ -295,10 +293,10 @@ def test_the_answer_of_a_stop_says_that_it_cannot_be_kept() -> None:
 def test_the_answers_before_the_exit_wait_a_limited_time_for_the_file(hangs: bool) -> None:
     host = Host(random.Random(14))
     host.world.run(0.5)
-    host.file.slow, host.file.hangs = True, hangs
+    host.file.is_stored, host.file.hangs = False, hangs
     assert not host.world.ask("srv/stop")
     host.world.loop.finish(host.world.instant)
-    assert host.file.waited == [0.2]
+    assert host.file.waited == 1
     (replies,) = host.world.bus.replies.values()
     assert len(replies) == 1
 

@@ -137,14 +137,14 @@ def test_a_speed_limit_neither_moves_the_robot_nor_clears_a_stop(world: World) -
     limit(world, 0.3)
     limit(world, 0.0)
     assert world.state.mode == "stopped"
-    assert world.state.latch
+    assert world.newest
     assert world.state.sources[0].age is None
 
 
 def test_a_restart_forgets_the_limit_and_the_latch_file_never_has_it() -> None:
     """A restart removes the speed filter's limit, because no program may be left to lift it."""
     file = MemoryFile()
-    world = World(keeper=file)
+    world = World(keeper=file, latches=file.latches)
     world.run(0.2)
     limit(world, 0.2)
     assert world.state.speed_limit

@@ -30,13 +30,13 @@ from acsard.core.config.settings import BatteryConfig, Config, McuConfig, Record
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query
 from acsard.core.simulator import protocol
-from acsard.core.values import NS_PER_S, BatteryLevel, Latch, Latches
+from acsard.core.values import NS_PER_S, BatteryLevel, Cause, Latches
 from acsard.host.errors import Exit
 from acsard.recording import recorder as module
 from acsard.recording.file import MAGIC, FrameWriter, listed
 from acsard.recording.recorder import Recorder
 from tests.scenarios.speakers import Speaker, over
-from tests.scenarios.world import World
+from tests.scenarios.world import World, naming
 
 pytestmark = pytest.mark.slow
 
@@ -137,8 +137,7 @@ class Host:
         if service == "stop":
             stop = Arrival(service, True, b"", "", world.now_ns, None, "", attachment=signed(name))
             world.bus.arrivals.append(stop)
-        latch = msgspec.json.encode({"latch": world.state.latch})
-        payload = latch if service == "clear" else b""
+        payload = naming(world.numbers) if service == "clear" else b""
         query = Query(1, key, key, "", payload, "", world.now_ns, attachment=signed(name))
         world.bus.queries.append(query)
         self.run(0.05)
@@ -345,8 +344,9 @@ def third_run(host: Host) -> None:
     """Start a robot that is still stopped, because the client anna stopped it earlier."""
     wall_ns = host.world.instant.wall_ns
     client = f"{ANNA}/0123456789abcdef (native)"
-    stop = Latch(1, wall_ns, client, f"stopped by {client}", "stopped", kept=True)
-    host.start(wall_ns + 60 * NS_PER_S, Latches(stop=stop))
+    text = f"stopped by {client}"
+    stop = Cause(1, "stop", "stopped", text, by=client, at_ns=wall_ns, kept=True)
+    host.start(wall_ns + 60 * NS_PER_S, Latches((stop,), 1))
     host.note(
         "restart of a stopped robot",
         "^start: the daemon starts",

@@ -39,7 +39,7 @@ from acsard.core.values import (
     Received,
 )
 from acsard.daemon.control_loop import ControlLoop
-from acsard.daemon.latch_rules import Handover, LatchKeeper
+from acsard.daemon.latch_file import Keeper
 from acsard.daemon.pacing import NO_PERIOD, Period
 from acsard.daemon.publication import Publication
 from acsard.recording.recorded_steps import StepRecorder
@@ -161,6 +161,11 @@ class MemoryBus:
         self.finished.add(ticket)
 
 
+def naming(numbers: Collection[int] | None) -> bytes:
+    """Return the payload of a `clear` or `activate` that names these causes, or of a plain one."""
+    return b"" if numbers is None else msgspec.json.encode({"numbers": list(numbers)})
+
+
 class World:
     """A simulated robot and its daemon in virtual time."""
 
@@ -171,7 +176,7 @@ class World:
         plugged: bool = True,
         recorder: StepRecorder | None = None,
         latches: Latches = Latches(),  # noqa: B008
-        keeper: LatchKeeper | None = None,
+        keeper: Keeper | None = None,
         wanted: Collection[str] = (),
         gyro: ImperfectGyro | None = None,
     ) -> None:
@@ -204,13 +209,13 @@ class World:
         self.events: list[Event] = []
         self.watch: Callable[[Outputs], None] = lambda outputs: None
         info = Info("acsar", "0", 1, "sim", True, self.config.rate_hz, [], [])
-        robot, handover = Robot(self.config, latches), Handover(latches, keeper)
+        robot, keeper = Robot(self.config, latches), keeper or Keeper(latches)
         start, log = self.instant, self.events.append
         publication = Publication(
-            robot, self.bus, info, start, log, handover, recorder, boot_ns=lambda: self.now_ns
+            robot, self.bus, info, start, log, keeper, recorder, boot_ns=lambda: self.now_ns
         )
         self.loop = ControlLoop(
-            robot, self.port, publication, handover, start, lambda: self.now_ns, recorder
+            robot, self.port, publication, keeper, start, lambda: self.now_ns, recorder
         )
         self.outputs: Outputs | None = None
         """Those of the last step."""
@@ -405,10 +410,10 @@ class World:
     def call(self, service: str, payload: bytes = b"") -> ServiceReply:
         """Call a service and return its answer.
 
-        A `clear` or `activate` without a payload names the latch in `state`, as acsard's tools do.
+        A `clear` or `activate` without a payload names the causes in `state`, as acsard's tools do.
         """
         if service in ("clear", "activate") and not payload:
-            payload = msgspec.json.encode({"latch": self.state.latch})
+            payload = naming(self.numbers)
         (reply,) = self.ask(f"srv/{service}", payload=payload)
         return msgspec.json.decode(reply.payload, type=ServiceReply)
 
@@ -419,6 +424,16 @@ class World:
         message = self.loop.publication.current("state")
         assert isinstance(message, RobotState)
         return message
+
+    @property
+    def numbers(self) -> list[int]:
+        """The numbers of the causes in `state`, the newest last."""
+        return [cause.number for cause in self.state.causes]
+
+    @property
+    def newest(self) -> int:
+        """The number of the newest cause; 0 without one."""
+        return max(self.numbers, default=0)
 
     @property
     def odom(self) -> Odometry:

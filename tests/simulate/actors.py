@@ -116,7 +116,7 @@ class Run:
         """Arrivals of stops that were put on the key, and that no step has read yet."""
         self._ticket = 0
         self._numbers: dict[int, int] = {}
-        """Numbers of latches that operators have read in `state`, each with the last time."""
+        """Numbers of causes that operators have read in `state`, each with the last time."""
         self.active: list[tuple[str, tuple[Any, ...]]] = []
         self._names: set[str] = set()
         """Names of the active faults."""
@@ -279,14 +279,17 @@ class Run:
         """Let an operator call a service over a network that may lose, delay or repeat the call."""
         if event["lost"]:
             return
-        latch, read_ns = None, None
+        numbers: list[int] | None = None
+        read_ns = None
         if event.get("named") and self.product.shows_state:
-            latch, read_ns = self.product.state()["latch"], self.true_ns
+            present = [cause["number"] for cause in self.product.state()["causes"]]
+            numbers, read_ns = present, self.true_ns
             if "typed" in event:
-                latch, read_ns = self._typed(latch, event["typed"])
+                numbers, read_ns = [self._typed(present, event["typed"])], -1
             else:
-                self._numbers.pop(latch, None)
-                self._numbers[latch] = read_ns
+                for number in present:
+                    self._numbers.pop(number, None)
+                    self._numbers[number] = read_ns
         end_ns = int(self.plan["seconds"] * NS)
         due_ns = self.true_ns + int(event["late"] * NS)
         times_ns = [int(n * event.get("gap", 0.0) * NS) for n in range(event.get("times", 1))]
@@ -294,22 +297,22 @@ class Run:
             if due_ns + extra_ns < end_ns or self.epilogue:
                 self.at(
                     due_ns + extra_ns,
-                    lambda due=due_ns + extra_ns: self._call_service(event, due, latch, read_ns),  # type: ignore[misc]
+                    lambda due=due_ns + extra_ns: self._call_service(event, due, numbers, read_ns),  # type: ignore[misc]
                 )
 
-    def _typed(self, latch: int, place: int) -> tuple[int, int]:
-        """Return a latch number that an operator types by hand, and when `state` last contained it.
+    def _typed(self, present: list[int], place: int) -> int:
+        """Return the number of a cause that an operator types by hand, and that holds no more.
 
-        The number is one of the last ones that `state` had before, or one that no latch ever had.
+        It is one of the last ones that `state` had before, or one that no cause ever had.
         """
-        older = [known for known in self._numbers.items() if known[0] != latch]
-        return older[-place] if 0 < place <= len(older) else (2**53, -1)
+        older = [number for number in self._numbers if number not in present]
+        return older[-place] if 0 < place <= len(older) else 2**53 - 1
 
     def _call_service(
         self,
         event: dict[str, Any],
         due_ns: int,
-        latch: int | None,
+        numbers: list[int] | None,
         read_ns: int | None,
     ) -> None:
         product, verb, witness = self.product, event["verb"], self.witness
@@ -321,10 +324,10 @@ class Run:
         true_ns = at_ns - START_NS + self.slept_ns
         via, payload = event["via"], b""
         service = verb
-        if verb == "set_pose" or latch is not None:
+        if verb == "set_pose" or numbers is not None:
             via = "native"
-        if latch is not None:
-            payload = json.dumps({"latch": latch}).encode()
+        if numbers is not None:
+            payload = json.dumps({"numbers": numbers}).encode()
         elif verb == "set" and via != "native":
             payload = parameters(event["settings"])
             service = "parameters/set_parameters" + ("_atomically" if event["whole"] else "")

@@ -49,7 +49,7 @@ FORGET_NS = 3 * NS
 STOPPED = {"stopped", "fault", "shutdown"}
 """Modes of a robot that is stopped: a fault and the end of the daemon come before a stop."""
 
-MAX_CLIENTS = 4
+MAX_CLIENTS = 31
 """Number of clients that the reason of a stop names beside the last cause. It leaves out a client
 only if it names this many others."""
 

@@ -70,7 +70,7 @@ MODES, ROBOT, SESSION = "core/motion/modes.py", "core/robot.py", "core/link/sess
 WITNESS, ODOMETRY = "core/motion/wheel_witness.py", "core/motion/odometry.py"
 WHEEL_FAULTS, GYRO = "core/motion/wheel_faults.py", "core/motion/gyro.py"
 UNCERTAINTY = "core/motion/uncertainty.py"
-LATCHES, VALUES, LOOP = "daemon/latch_rules.py", "core/values.py", "daemon/control_loop.py"
+LATCHES, VALUES, LOOP = "core/motion/latches.py", "core/values.py", "daemon/control_loop.py"
 PUBLICATION = "daemon/publication.py"
 REASONS, INPUTS = "core/reasons.py", "core/board_inputs.py"
 COMMANDS, KINEMATICS, CODEC = (
@@ -287,9 +287,9 @@ FAULTS = (
         "neutral nothing",
         "a clear that finds nothing to release asks each sender for a zero",
         ROBOT,
-        "                if not released:\n",
-        "                if not released:\n"
-        "                    self._arbiter.require_neutral(asked_ns)\n",
+        "                if numbers:\n                    self._forget()\n",
+        "                self._arbiter.require_neutral(asked_ns)\n"
+        "                if numbers:\n                    self._forget()\n",
     ),
     fault(
         "neutral late",
@@ -374,31 +374,31 @@ FAULTS = (
     ),
     fault(
         "lifecycle number",
-        "a clear that names an older latch releases the one in force",
+        "a clear that names an older cause releases the later ones, too",
         LIFECYCLE,
-        "            if number != latch.number:",
-        "            if number > latch.number:",
+        "for cause in causes if cause.number in numbers]",
+        "for cause in causes if cause.number >= min(numbers, default=2**60)]",
     ),
     fault(
         "lifecycle repeated",
         "a second stop does not get a number of its own",
         LIFECYCLE,
-        "        if not (named and asked_ns <= self._stop_asked_ns):\n",
-        "        if latch is None:\n",
+        "        if asked_ns > self.stop_asked_ns or not self.stop_of(by):\n",
+        "        if not self.stop_of(by):\n",
     ),
     fault(
         "lifecycle fault",
-        "a clear that names no latch releases a fault at once",
+        "a clear that names no cause releases a fault at once",
         LIFECYCLE,
-        "self._require_latch_was_seen(was, _in_force(latches), set_ns,",
-        "latches.fault or self._require_latch_was_seen(was, _in_force(latches), set_ns,",
+        'self._require_shown(causes, asked_ns, "clear")',
+        'self.latches.of("fault") or self._require_shown(causes, asked_ns, "clear")',
     ),
     fault(
         "lifecycle off",
         "deactivate answers, but does nothing",
         LIFECYCLE,
-        "self._latch(inactive=self._new_latch(now, by, why))",
-        "self._off_ns = now.mono_ns",
+        'self._use(latched(self.latches, "inactive", why, now.wall_ns, by))',
+        "pass",
     ),
     fault(
         "limits jerk",
@@ -446,32 +446,26 @@ FAULTS = (
     ),
     fault(
         "lifecycle seen",
-        "an activate that names no latch works at once",
+        "an activate that names no cause works at once",
         LIFECYCLE,
-        "        if number is None:\n            self._require_latch_was_seen(\n"
-        '                f"the robot was {_stopped(latch)}"',
-        "        if False:\n            self._require_latch_was_seen(\n"
-        '                f"the robot was {_stopped(latch)}"',
+        'self._require_shown(causes, asked_ns, "activate")',
+        "pass",
     ),
     fault(
         "latches names",
         "a second stop replaces the name of the first client",
-        LIFECYCLE,
-        '        self._latch(stop=self._stop(now, "", why))\n',
-        '        self._latch(stop=self._new_latch(now, "", why))\n',
-        Edit(
-            LIFECYCLE,
-            "self._latch(stop=self._stop(now, by, why))",
-            'self._latch(stop=self._new_latch(now, "", reason("stopped", by=NAMELESS)))',
-        ),
+        LATCHES,
+        "for cause in latches.causes if not _equal(cause, new)]",
+        "for cause in latches.causes if cause.kind != kind]",
     ),
     # robot
     fault(
         "robot clear",
         "a clear asks no sender for a zero",
         ROBOT,
-        "                self._arbiter.require_neutral(asked_ns)\n                return released",
-        "                return released",
+        "                    self._arbiter.require_neutral(asked_ns)\n"
+        "                return message, numbers\n",
+        "                return message, numbers\n",
     ),
     fault(
         "robot set",
@@ -821,16 +815,16 @@ FAULTS = (
     fault(
         "latches kept",
         "the latch file is never written",
-        LATCHES,
-        "                self._keeper.keep(latches)",
-        "                pass",
+        LOOP,
+        "                keeper.keep(robot.latches)",
+        "                keeper.latches = robot.latches",
     ),
     fault(
         "latches fault",
         "a fault is gone after a restart",
-        VALUES,
-        "return Latches(stop, fault, inactive)",
-        "return Latches(stop, None, inactive)",
+        LATCHES,
+        "[replace(cause, kept=True) for cause in latches.causes]",
+        '[replace(cause, kept=True) for cause in latches.causes if cause.kind != "fault"]',
     ),
     # gyro
     fault(
@@ -963,7 +957,7 @@ FAULTS = (
         "estop clear",
         "a clear works while the emergency stop is pressed",
         LIFECYCLE,
-        "        if self._held:\n",
+        "        if self.held:\n",
         "        if False:\n",
     ),
     fault(

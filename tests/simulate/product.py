@@ -28,14 +28,13 @@ from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.simulated_robot import WatchedMcu
 from acsard.core.values import Estimate as Measured
-from acsard.core.values import Event, Heard, Instant, Latches, Received, Recording
-from acsard.daemon.latch_rules import (
+from acsard.core.values import Heard, Instant, Latches, Received, Recording
+from acsard.daemon.latch_file import (
+    Keeper,
     LatchFileError,
-    after_failed_write,
-    at_start,
     decode,
     encode,
-    stopped,
+    not_writable,
     unreadable,
     unwritable,
 )
@@ -99,8 +98,7 @@ def problems(config: dict[str, Any]) -> list[str]:
 
 
 def _causes(latches: Latches) -> frozenset[str]:
-    both = [latch for latch in (latches.fault, latches.stop) if latch is not None]
-    return frozenset(cause.code for latch in both for cause in latch.causes)
+    return frozenset(cause.code for cause in latches.of("fault", "stop"))
 
 
 def _plain(estimate: Measured) -> Estimate:
@@ -119,21 +117,23 @@ class CrashError(Exception):
     """An exception that simulates a bug in the daemon."""
 
 
-class Disk:
+class Disk(Keeper):
     """The latch file, from which the next daemon starts."""
 
+    trouble = ""
+
     def __init__(self) -> None:
+        super().__init__(Latches())
         self.full = False
-        self.trouble = ""
         self._running = True
-        self._newest = self._written = Latches()
-        """The latches that the daemon wants to keep, and those in the file."""
+        self._written = self.latches
+        """The latches in the file."""
         self._data = encode("acsar", self._written)
 
     @property
     def behind(self) -> bool:
         """Whether the file lacks the newest latches."""
-        return self._written != self._newest
+        return self._written != self.latches
 
     def fill(self, full: bool) -> None:
         """Fill the disk, so that nothing can be written, or make space again.
@@ -142,10 +142,10 @@ class Disk:
         """
         self.full = full
         if self._running:
-            self.keep(self._newest)
+            self.keep(self.latches)
 
     def keep(self, latches: Latches) -> None:
-        self._newest = latches
+        self.latches = latches
         self.trouble = unwritable("FILE", "no space left on device") if self.full else ""
         if not self.full:
             self._data, self._written = encode("acsar", latches), latches
@@ -158,34 +158,30 @@ class Disk:
             case "zeros":
                 self._data = bytes(len(self._data))
             case "version":
-                self._data = self._data.replace(b'"format": 2', b'"format": 1')
+                self._data = self._data.replace(b'"format": 3', b'"format": 2')
 
     def end(self) -> None:
         """Note that the daemon has ended: it writes nothing any more."""
         self._running = False
 
-    def holds(self, latches: Latches) -> bool:
+    @property
+    def is_stored(self) -> bool:
         return not self.full
-
-    def wait(self, latches: Latches, seconds: float) -> None: ...
-
-    def take_events(self) -> list[Event]:
-        return []
 
     def read(self, now: Instant) -> Latches:
         """Return the latches that the next start of the daemon uses."""
         try:
             latches = decode("acsar", self._data)
         except LatchFileError as error:
-            latches = stopped(Latches(), unreadable("FILE", str(error)), now)
+            latches = unreadable("FILE", str(error), now)
         self._running, self.trouble = True, ""
-        self._newest = self._written = latches
+        self.latches = self._written = latches
         if not self.full:
             self._data = encode("acsar", latches)  # the daemon tries out whether it can write
         if self.full:
             self.trouble = unwritable("FILE", "no space left on device")
-            self._newest = after_failed_write(latches, at_start(self.trouble), now)
-        return self._newest
+            self.latches = not_writable(latches, "FILE", "no space left on device", now)
+        return self.latches
 
 
 class Tape:

@@ -59,7 +59,7 @@ RAMPS_NS = NS // 2
 """A ramp of an orderly end that takes at most this time is not cut short."""
 
 LOOK_NS = 2 * NS
-"""A call without a number is refused for this time, in which its sender may not know the latch."""
+"""A call without numbers is refused for this time, in which its sender may not know the cause."""
 
 HARMLESS = {
     "mute", "noise", "partial_line", "lost_replies", "lost_commands", "slow_reply", "ftdi",
@@ -211,8 +211,6 @@ class Witness:
         self._stalled = -NS, -NS
         if self.blocked_ns is not None:
             self.blocked_ns = at_ns  # this daemon has not yet had the time to find that out
-        self.unfaulted_ns = -LOOK_NS
-        """When a clear last released a fault."""
         self.timeout = dict(self.file_timeout)
         self.pause_ns = self.file_pause_ns
         self.limits = dict(self.file)
@@ -343,21 +341,31 @@ class Witness:
         self.ages.forget_least(at_ns)
 
     def cleared(self, asked_ns: int, read_ns: int | None, text: str, name: str) -> None:
-        """Note that the daemon has executed a clear, whose sender read the latch at `read_ns`."""
+        """Note that the daemon has executed a clear, whose sender read the causes at `read_ns`.
+
+        If others are left, it has released what its sender had read. Without a reading, it has
+        released the faults.
+        """
         if text.startswith("nothing"):
             return
         self.counts["clear"] += 1
         self.arming(asked_ns)
-        faulty = self.fault_ns is not None or bool(self.faults)
-        self._release(self.faults, "a clear releases no later fault", asked_ns, read_ns, name)
-        if self.fault_ns is not None and self.fault_ns <= asked_ns:
+        left = text.startswith("cleared, but") and "call srv/clear again" in text
+        until_ns = read_ns if left and read_ns is not None else asked_ns
+        newest_ns = max([*self.faults, *self.stops, self.fault_ns or 0])
+        both = self.stops and self.fault_ns is not None
+        if read_ns is None and not left and both and newest_ns < asked_ns:
+            raise BrokenError("a plain clear releases the faults first", asked_ns, text)
+        self._release(self.faults, "a clear releases no later fault", until_ns, read_ns, name)
+        if self.fault_ns is not None and self.fault_ns <= until_ns:
             self.fault_ns = min(self.faults, default=None)
-        if faulty:
-            self.unfaulted_ns = asked_ns
-        if text.startswith("fault cleared, but"):
+        if left and read_ns is None:
+            if newest_ns <= asked_ns < newest_ns + LOOK_NS - MARGIN_NS:
+                raise BrokenError("a clear releases no later stop", asked_ns, f"{name}: {text}")
             return
-        self.perhaps_latched.discard("clear")
-        self._release(self.stops, "a clear releases no later stop", asked_ns, read_ns, name)
+        self._release(self.stops, "a clear releases no later stop", until_ns, read_ns, name)
+        if not left:
+            self.perhaps_latched.discard("clear")
 
     def activated(self, asked_ns: int, read_ns: int | None, name: str) -> None:
         """Note that the daemon has executed an `activate`."""
@@ -367,18 +375,17 @@ class Witness:
         self._release(self.offs, "an activate undoes no later one", asked_ns, read_ns, name)
 
     def _release(
-        self, latched: list[int], promise: str, asked_ns: int, read_ns: int | None, name: str
+        self, latched: list[int], promise: str, until_ns: int, read_ns: int | None, name: str
     ) -> None:
         # A stop that arrived behind the call stays latched. The answer may be later than both.
-        later = [at_ns for at_ns in latched if at_ns > asked_ns]
-        # The network may deliver one clear twice, and its sender may not know of a start.
-        last_ns = max(self.born_ns, self.unfaulted_ns if latched is not self.offs else 0)
+        later = [at_ns for at_ns in latched if at_ns > until_ns]
         for at_ns in latched[: len(latched) - len(later)]:
             known = read_ns is not None and read_ns >= at_ns
-            late = read_ns is None and asked_ns >= max(at_ns, last_ns) + LOOK_NS - MARGIN_NS
+            # The sender may not know of a start.
+            late = read_ns is None and until_ns >= max(at_ns, self.born_ns) + LOOK_NS - MARGIN_NS
             if not (known or late):
                 text = f"the call of {name} released what was latched at {at_ns / NS:.3f} s"
-                raise BrokenError(promise, asked_ns, text)
+                raise BrokenError(promise, until_ns, text)
         latched[:] = later
 
     def set_limits(self, at_ns: int, settings: dict[str, float], asked_ns: int) -> None:

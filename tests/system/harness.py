@@ -714,17 +714,18 @@ class Bus:
     def payload(self, key: str, payload: object) -> str | None:
         """Return the payload of a query as JSON.
 
-        A `clear` or `activate` without a payload gets the number of the current latch.
+        A `clear` or `activate` without a payload gets the numbers of the present causes.
         """
         if key in ("srv/clear", "srv/activate") and payload is None:
             states = self.ask("state")
-            payload = {"latch": json.loads(states[0].payload)["latch"]} if states else None
+            causes = json.loads(states[0].payload)["causes"] if states else []
+            payload = {"numbers": [cause["number"] for cause in causes]} if states else None
         return None if payload is None else json.dumps(payload)
 
     def ask(self, key: str, payload: object = None) -> list[Answered]:
         """Return all replies to a query.
 
-        A `clear` or `activate` names the latch of `state`, as acsard's tools do.
+        A `clear` or `activate` names the causes in `state`, as acsard's tools do.
         """
         data = self.payload(key, payload)
         answers = []

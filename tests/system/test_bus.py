@@ -49,7 +49,7 @@ FIELDS = {
         "stamp", "mode", "reason", "x", "y", "yaw", "linear", "angular", "wheels", "link",
         "source", "sources", "refused", "counters", "certificate_expiry", "latencies",
         "gyro", "encoder_counts", "wheel_fault", "sender", "recording_error",
-        "latch", "latch_file_error", "feedback_age", "emergency_stop", "bumpers", "battery",
+        "causes", "latch_file_error", "feedback_age", "emergency_stop", "bumpers", "battery",
         "speed_limit", "settings_differ", "certificate_days",
         "code", "certificate", "version",
     },

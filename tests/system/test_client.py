@@ -389,9 +389,9 @@ def test_a_drive_of_a_stopped_robot_raises_the_daemon_s_reason(shared: Daemon, f
         robot.call("stop")
         with pytest.raises(NotDrivenError, match=f"stopped by {robot.name}"):
             robot.drive(0.5, seconds=0.2)
-        latch = robot.get("state").latch
+        numbers = [cause.number for cause in robot.get("state").causes]
         robot.call("stop")
-        assert not robot.call("clear", latch=latch).success
+        assert not robot.call("clear", numbers=numbers).success
         assert robot.call("clear").success
         robot.call("deactivate")
         with pytest.raises(NotDrivenError, match="srv/activate"):

@@ -120,8 +120,9 @@ def latch(robot: Robot, bus: Bus, kind: Kind) -> None:
 
 
 def is_latched(robot: Robot, kind: Kind) -> bool:
-    """Return whether the latch file contains a latch of this kind."""
-    return json.loads(robot.file.read_bytes())["latches"].get(kind) is not None
+    """Return whether the latch file contains a cause of this kind."""
+    causes = json.loads(robot.file.read_bytes())["latches"]["causes"]
+    return kind in [cause["kind"] for cause in causes]
 
 
 def check_at_rest(robot: Robot, bus: Bus, mode: str, since: float) -> Any:
@@ -146,8 +147,8 @@ def release(bus: Bus, kind: Kind) -> None:
     if kind == "inactive":
         assert bus.get("srv/activate")["success"]
         return
-    number = bus.state()["latch"]
-    assert bus.get("srv/clear", {"latch": number})["success"]
+    numbers = [cause["number"] for cause in bus.state()["causes"]]
+    assert bus.get("srv/clear", {"numbers": numbers})["success"]
     assert bus.get("srv/clear")["success"]
 
 
@@ -243,14 +244,14 @@ def kills_after_a_stop(robot: Robot, times: int, longest_s: float) -> list[float
         with robot.daemon() as daemon, Bus(robot.endpoint) as bus:
             state = bus.state()
             if state["mode"] == "stopped":
-                bus.get("srv/clear", {"latch": state["latch"]})
+                bus.get("srv/clear", {"numbers": [cause["number"] for cause in state["causes"]]})
             assert bus.get("srv/stop")["success"]
             answered = time.monotonic()
             while time.monotonic() < answered + delay:
                 pass
             daemon.signal(signal.SIGKILL)
             daemon.ended(5.0)
-        if json.loads(robot.file.read_text())["latches"]["stop"] is None:
+        if not is_latched(robot, "stop"):
             lost.append(delay)
     return lost
 

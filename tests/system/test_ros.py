@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pytest
 
-from acsard.core.motion.lifecycle import LATCH_REQUIRED_S
+from acsard.core.motion.lifecycle import SHOWN_S
 from tests.promised import TRIGGERS
 from tests.system.builds import BUILD_S
 from tests.system.harness import Bus, Daemon, until
@@ -314,12 +314,12 @@ def test_a_trigger_is_answered_once_for_every_form_of_an_empty_request(
     bus: Bus, ros: Client, verb: str
 ) -> None:
     forms = EMPTY if isinstance(ros, ZenohClient) else (EMPTY_REQUEST,)
-    # A Trigger has no latch number, so `clear` only works 2 s after a stop.
+    # A Trigger names no causes, so `clear` only works 2 s after a stop.
     for request in forms[:1] if verb == "clear" else forms:
         if verb == "clear":
             bus.get("srv/stop")
             stopped = time.monotonic()
-            until(lambda: time.monotonic() > stopped + LATCH_REQUIRED_S, 5.0, "two seconds")  # noqa: B023
+            until(lambda: time.monotonic() > stopped + SHOWN_S, 5.0, "two seconds")  # noqa: B023
         called = ros.call(f"acsard/{verb}", TRIGGER, request)
         for undo in ("clear", "activate"):
             bus.get(f"srv/{undo}")

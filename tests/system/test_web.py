@@ -168,8 +168,8 @@ async def test_programs_query_call_and_list_the_interface(page: Page, bus: Bus) 
         async with session.post("/api/srv/clear") as answer:
             assert answer.status == 409
         async with session.get("/api/state") as answer:
-            latch = (await answer.json())["latch"]
-        async with session.post("/api/srv/clear", json={"latch": latch}) as answer:
+            numbers = [cause["number"] for cause in (await answer.json())["causes"]]
+        async with session.post("/api/srv/clear", json={"numbers": numbers}) as answer:
             assert answer.status == 200
         wish = {"settings": {"limits.linear_speed": 99.0}}
         async with session.post("/api/srv/set", json=wish) as answer:

@@ -160,8 +160,8 @@ class Scene:
             )
             headers = {"Content-Type": "application/json"}
             connection.request("GET", "/api/state")
-            latch = json.loads(connection.getresponse().read())["latch"]
-            body = json.dumps({"latch": latch})
+            causes = json.loads(connection.getresponse().read())["causes"]
+            body = json.dumps({"numbers": [cause["number"] for cause in causes]})
             connection.request("POST", "/api/srv/clear", body, headers)
             connection.getresponse().read()
             connection.close()

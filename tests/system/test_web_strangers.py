@@ -75,7 +75,8 @@ async def test_a_phone_drives_and_is_named_and_a_stop_of_a_viewer_s_latches(
         plain = await ours.call("clear")
         assert not plain["ok"]
         assert "look at the robot" in plain["text"]
-        assert (await ours.call("clear", latch=state["latch"]))["ok"]
+        numbers = [cause["number"] for cause in state["causes"]]
+        assert (await ours.call("clear", numbers=numbers))["ok"]
 
 
 async def test_an_invitation_prints_a_link_and_a_qr_code_that_give_access(page: Page) -> None:

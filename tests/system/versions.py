@@ -21,8 +21,8 @@ MODE, LEVEL, CODE, REASON = "poised", "notice", "pondering", "thinks about the n
 VERB, LATCH_CODE = "dance", "stopped_by_music"
 
 ONLY_SENT = {
-    "RobotState", "SourceState", "BatterySummary", "Spread", "Latency", "LogEvent", "Events",
-    "Change", "ReplyData", "ServiceReply", "Info", "HardwareInterface", "Interfaces",
+    "RobotState", "SourceState", "BatterySummary", "Beat", "Cause", "Spread", "Latency", "LogEvent",
+    "Events", "Change", "ReplyData", "ServiceReply", "Info", "HardwareInterface", "Interfaces",
     "TopicInfo", "Topics", "WhoAmI",
 }  # fmt: skip
 """Messages and parts that only the daemon sends and that are no ROS types: the newer version's
@@ -147,7 +147,7 @@ def _say_more(newer: Version) -> None:
         {
             '            case "deactivate":': f"""\
             case "{VERB}":
-                return "dances"
+                return "dances", ()
             case "deactivate":"""
         },
     )
@@ -179,20 +179,19 @@ def _say_more(newer: Version) -> None:
 def _keep_more(newer: Version) -> None:
     # The files that outlive the process: the latches and the tokens.
     newer.swap(
-        "daemon/latch_rules.py",
+        "daemon/latch_file.py",
         {
             "msgspec.json.encode(content), indent": "msgspec.json.encode("
             "_grown(msgspec.to_builtins(content))), indent",
         },
     )
-    rules = newer.package / "daemon/latch_rules.py"
+    rules = newer.package / "daemon/latch_file.py"
     rules.write_text(
         f"""{rules.read_text()}
 
 def _grown(content):
-    for latch in filter(None, content["latches"].values()):
-        for cause in (latch, *latch["earlier"]):
-            cause |= {{"later": [1]}} | ({{"code": "{LATCH_CODE}"}} if cause["by"] else {{}})
+    for cause in content["latches"]["causes"]:
+        cause |= {{"later": [1]}} | ({{"code": "{LATCH_CODE}"}} if cause["by"] else {{}})
     content["latches"] |= {{"later": None}}
     return content | {{"later": 1}}
 """

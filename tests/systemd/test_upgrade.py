@@ -126,7 +126,7 @@ class Robot(NamedTuple):
 
     def latch(self) -> str:
         """Return the number of the latched stop."""
-        (number,) = re.findall(r'"latch":\s*(\d+)', self.types("get", "state").out)
+        (number,) = re.findall(r'"number":\s*(\d+)', self.types("get", "state").out)
         return str(number)
 
     def kept(self) -> dict[str, str]:

@@ -153,7 +153,8 @@ def test_an_invited_phone_drives_and_stops_the_installed_robot_until_it_is_revok
         await ours.until_driving(0.2)
         assert (await ours.call("stop"))["ok"]
         status = await ours.state(lambda state: state["mode"] == "stopped" and state["linear"] == 0)
-        assert (await ours.call("clear", latch=status["latch"]))["ok"]
+        numbers = [cause["number"] for cause in status["causes"]]
+        assert (await ours.call("clear", numbers=numbers))["ok"]
         await ours.until_driving(0.2)
         holding = asyncio.create_task(ours.hold(0.2, 3 * PATIENCE_S))
         await asyncio.to_thread(robot.types, REVOKING)

@@ -263,8 +263,8 @@ class Receiver:
         match _payloads[verb].decode(encoding, payload):
             case Settings(settings):
                 return replace(request, settings=settings)
-            case Release(latch):
-                return replace(request, latch=latch)
+            case Release(numbers):
+                return replace(request, numbers=None if numbers is None else tuple(numbers))
             case SetPose(x, y, yaw):
                 if not all(map(math.isfinite, (x, y, yaw))) or max(abs(x), abs(y)) > 1e6:
                     raise DecodeError(

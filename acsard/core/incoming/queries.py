@@ -304,9 +304,8 @@ def _encoded(reply: ServiceReply, form: Format) -> bytes:
 
 
 def _data(answer: Answer) -> ReplyData:
-    return ReplyData(
-        answer.latch, {key: Change(old, new) for key, (old, new) in answer.changes.items()}
-    )
+    changes = {key: Change(old, new) for key, (old, new) in answer.changes.items()}
+    return ReplyData(list(answer.numbers), changes)
 
 
 def most_bytes(topic: str) -> int:

@@ -58,18 +58,18 @@ SERVICES: dict[Verb, Service] = {
     "stop": Service("viewer", "stop the robot; it stays stopped until srv/clear is called"),
     "clear": Service(
         "operator",
-        "clear the fault if there is one, else the stop; the payload {latch} names the fault or "
-        "stop to release",
+        "release the causes of faults and stops that the payload {numbers} names; without a "
+        "payload, the faults if there are any, else the stops",
         "Release",
-        '{"latch": 1800000000000}',
+        '{"numbers": [180000000000001]}',
         optional=True,
     ),
     "activate": Service(
         "operator",
-        "switch the robot on, so that it follows commands; the payload {latch} names the latch "
+        "switch the robot on, so that it follows commands; the payload {numbers} names the cause "
         "to release",
         "Release",
-        '{"latch": 1800000000000}',
+        '{"numbers": [180000000000001]}',
         optional=True,
     ),
     "deactivate": Service(

@@ -23,6 +23,7 @@ from acsard.core.messages.recent_events import RecentEvents
 from acsard.core.messages.schema import (
     Battery,
     BatterySummary,
+    Cause,
     DiagnosticArray,
     Header,
     JointState,
@@ -56,6 +57,7 @@ from acsard.core.values import (
     Rad,
     Snapshot,
 )
+from acsard.core.values import Cause as LatchedCause
 from acsard.core.values import Spread as Measurements
 from acsard.core.values import Twist as BodyTwist
 
@@ -301,7 +303,7 @@ class Report:
             wheel_fault=snapshot.doubt.text,
             sender=snapshot.sender,
             recording_error=snapshot.recording.trouble,
-            latch=snapshot.latch,
+            causes=[_cause(cause, snapshot.cause_ages) for cause in snapshot.causes],
             latch_file_error=snapshot.latch_file or "",
             feedback_age=snapshot.feedback_age_s,
             emergency_stop=snapshot.estop,
@@ -350,6 +352,12 @@ def _summary(battery: BatteryStatus | None) -> BatterySummary | None:
     if battery is None:
         return None
     return BatterySummary(battery.volts, battery.percent, battery.amps, battery.level)
+
+
+def _cause(cause: LatchedCause, ages: dict[int, float]) -> Cause:
+    at = Time.from_ns(cause.at_ns)
+    age = ages.get(cause.number)
+    return Cause(cause.number, cause.kind, cause.code, cause.text, cause.by, at, cause.kept, age)
 
 
 def _spread(spread: Measurements) -> Spread:

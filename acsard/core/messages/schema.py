@@ -22,6 +22,7 @@ from acsard.core.values import (
     NS_PER_S,
     ROLES,
     BatteryLevel,
+    CauseKind,
     EstopState,
     EventName,
     GyroDoes,
@@ -38,8 +39,8 @@ Covariance = Annotated[list[float], Meta(min_length=36, max_length=36)]
 
 Covariance3 = Annotated[list[float], Meta(min_length=9, max_length=9)]
 
-LatchNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
-"""Number of a latch. It is below 2^53, so JavaScript represents it exactly."""
+CauseNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
+"""Number of a cause. It is below 2^53, so JavaScript represents it exactly."""
 
 MAX_64_ITEMS = Meta(max_length=64)
 """Limit of 64 items for a list or a map, so that a huge message is refused quickly. No robot has
@@ -328,6 +329,26 @@ class Latency(Message, frozen=True):
     last_minute: Spread
 
 
+class Cause(Message, frozen=True):
+    """Why the robot is stopped, in fault or switched off, until a call releases it."""
+
+    number: CauseNumber
+    """Number that `clear` or `activate` names. No other cause of this robot ever has it."""
+    kind: Annotated[str, one_of(get_args(CauseKind))]
+    """`clear` releases a fault and a stop, and `activate` releases `inactive`."""
+    code: Annotated[str, one_of(get_args(StateCode))]
+    text: str
+    """The cause in words."""
+    by: str
+    """Name of the client that stopped the robot or switched it off; empty if none did."""
+    stamp: Time
+    """Wall-clock time of the cause."""
+    kept: bool
+    """True for a cause from before the last start of the daemon."""
+    age: float | None
+    """Seconds since this daemon first published the cause; null before the next control period."""
+
+
 class RobotState(Message, frozen=True):
     """Summary of the robot: mode and reason, pose (m, rad), twist (m/s, rad/s), wheels (rad/s).
 
@@ -381,12 +402,8 @@ class RobotState(Message, frozen=True):
     """
     recording_error: str = ""
     """Why recording fails at present, in words; empty if recording works or is switched off."""
-    latch: LatchNumber = 0
-    """Number of the latch that keeps the robot from driving; 0 if no latch is set.
-
-    If several latches are set, it is the number of the fault. Without a fault, it is the number of
-    the stop.
-    """
+    causes: list[Cause] = []
+    """Everything that holds the robot until it is released, the newest last."""
     latch_file_error: str = ""
     """Why a latched stop would be lost if the daemon restarted now, in words.
 
@@ -430,7 +447,8 @@ class RobotState(Message, frozen=True):
     - unknown: the time at which they expire is unknown.
     """
     code: Annotated[str, one_of(get_args(StateCode))] = ""
-    """Code of `reason`. If several latches are set, it is the code of `latch`."""
+    """Code of `reason`. With several `causes`, it is the code of the newest fault, else of the
+    newest stop."""
     version: str = ""
     """Version of the daemon, such as `0.2.0`, or `0.2.0.dev0+g1a2b3c4d5` if it is not a release."""
 
@@ -534,8 +552,8 @@ class Change(Message, frozen=True):
 class ReplyData(Message, frozen=True):
     """What a service call has changed, for programs."""
 
-    latch: LatchNumber = 0
-    """Number of the latch that the call has set or released; 0 if it did neither."""
+    numbers: list[CauseNumber] = []
+    """Numbers of the causes that the call has latched or released, as in `RobotState.causes`."""
     changes: dict[str, Change] = {}
     """The settings that the call has changed, by dotted key."""
 
@@ -558,15 +576,14 @@ class SetPose(Message, frozen=True):
 
 
 class Release(Message, frozen=True):
-    """Payload of the services `clear` and `activate`, with the latch that they release."""
+    """Payload of the services `clear` and `activate`, with the causes that they release."""
 
-    latch: LatchNumber | None = None
-    """Number of the latch to release, as in `RobotState.latch`.
+    numbers: Annotated[list[CauseNumber], MAX_64_ITEMS] | None = None
+    """Numbers of the causes to release, as in `RobotState.causes`; others stay.
 
-    For `activate`, 0 means that the robot is off without a latch. If the number is null, the client
-    may not know of the latch yet. Therefore a `clear` without a number is refused for 2 s after a
-    stop, a fault, the `clear` of a fault and the start of the daemon. An `activate` without a
-    number is refused for 2 s after a `deactivate` and the start of the daemon.
+    If it is null, the client may not know a cause yet. Such a `clear` releases the faults if there
+    are any, else the stops. It is refused while one of them has been published for less than 2 s.
+    The same holds for an `activate`.
     """
 
 

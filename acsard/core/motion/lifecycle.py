@@ -1,109 +1,99 @@
 """Keeps the latches and the other facts that determine the mode, and derives the mode from them.
 
-Only `clear` releases a stop or a fault, one at a time, and only `activate` releases a `deactivate`.
-Neither releases a latch that its sender has not seen: the request names the number of the latch, or
-nothing happened in the last `LATCH_REQUIRED_S`; and it arrived after the latch was set. `clear`
-releases nothing while its cause lasts: a pressed input of the board, an empty battery, or a fault
-of a motor driver. A new cause gives its latch a new number and keeps the earlier causes, so that
-the operator reads all of them.
+A latch is a set of numbered causes. `clear` releases exactly the faults and stops that it names:
+those that its caller was shown. A plain `clear` names none, so it releases the faults if there are
+any, else the stops, once each fault and stop has been published for `SHOWN_S`. `activate` releases
+what `deactivate` latched, by the same rule. `clear` releases nothing while a cause lasts: a pressed
+input of the board, an empty battery, or a fault of a motor driver.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection
 
-from msgspec.structs import replace
+from msgspec import Struct
 
 from acsard.core.codes import Reason, reason
-from acsard.core.formatting import utc
+from acsard.core.motion.latches import (
+    NAMELESS,
+    describe,
+    in_force,
+    is_latched,
+    latched,
+    released,
+    stopped,
+)
 from acsard.core.motion.modes import SHUTDOWN_REASON, Mode, RefusedError, mode_of, require_allowed
-from acsard.core.values import NS_PER_S, Instant, Latch, Latches, Ns
+from acsard.core.values import NS_PER_S, Cause, CauseKind, Instant, Latches, Ns
 
-# For this time after a stop, a fault, its `clear`, a `deactivate`, the start or a stall of the
-# daemon, a call must name its latch: an earlier call may still arrive, as the network seldom delays
-# a packet for longer.
-LATCH_REQUIRED_S = 2.0
+# A caller that names no causes must have had this time to read them.
+SHOWN_S = 2.0
 
-# The first clients among the causes of a stop: a flood of stops must not hide the first client.
-MAX_CLIENTS = 4
+NEVER_NS = -(2**62)
 
-MAX_FAULTS = 32  # the daemon knows fewer different ones
-
-LONG_AGO_NS = -(2**62)  # "never"
-
-NAMELESS = "request"  # in a text, a client that has no name
+ZERO_FIRST = "each sender must send a zero before it drives"
 
 
-class Lifecycle:
+class Lifecycle(Struct):
     """The latches and the mode of one robot. Requests that are not allowed raise `RefusedError`."""
 
-    def __init__(self, latches: Latches = Latches()) -> None:  # noqa: B008
-        self.latches = latches
-        self.mode = Mode.WAITING
-        self._shutting_down = self._linked = self._commanded = False
-        old_latches = (latches.stop, latches.fault, latches.inactive)
-        self._number = max([latch.number for latch in old_latches if latch is not None], default=0)
-        self._numbered = False  # this run has numbered a latch (`number_after_restart`)
-        self._stopped_ns = self._faulted_ns = LONG_AGO_NS  # last latched
-        self._cleared_ns = LONG_AGO_NS  # a fault was last cleared
-        self._stop_asked_ns = LONG_AGO_NS  # latest arrival of a client's stop
-        self._off_ns = LONG_AGO_NS  # last switched off
-        self._held: Reason | None = None  # why `clear` is refused now
-        self._freed_ns = LONG_AGO_NS  # a cause last ended or came again; no earlier `clear` counts
-        self._began_ns: Ns | None = None  # first step, or first after the last stall
+    latches: Latches = Latches()
+    mode: Mode = Mode.WAITING
+    shutting_down: bool = False
+    linked: bool = False
+    commanded: bool = False
+    held: Reason | None = None  # why the board's reports forbid `clear` now
+    freed_ns: Ns = NEVER_NS  # when a cause last ended or came again; no earlier `clear` counts
+    shown: dict[int, Ns] = {}  # since when each cause has been published, by its number
+    unshown: bool = True  # call `begin`
+    begun: bool = False  # a step of this run has published its state
+    stop_asked_ns: Ns = NEVER_NS  # latest arrival of a client's stop
+
+    def __post_init__(self) -> None:
         self._derive()
 
     # facts
 
-    def begin(self, now: Instant, *, stalled: bool = False) -> None:
-        """Begin a step; `stalled` says that the daemon stood still before it.
-
-        A client may have sent its call when it could not see the present latch, so for
-        `LATCH_REQUIRED_S` calls must name its number.
-        """
-        if stalled or self._began_ns is None:
-            self._began_ns = now.mono_ns
+    def begin(self, now_ns: Ns) -> None:
+        """Begin a step: the step before has published all causes."""
+        if self.begun:
+            numbers = [cause.number for cause in self.latches.causes]
+            self.shown = {number: self.shown.get(number, now_ns) for number in numbers}
+            self.unshown = False
+        self.begun = True
 
     def link(self, up: bool) -> None:
         """Record whether the board is linked and reports all required inputs; derive the mode."""
-        if up is not self._linked:
-            self._linked = up
+        if up is not self.linked:
+            self.linked = up
             self._derive()
 
     def command(self, fresh: bool) -> None:
         """Record whether there is a fresh command to follow, and derive the mode."""
-        if fresh is not self._commanded:
-            self._commanded = fresh
+        if fresh is not self.commanded:
+            self.commanded = fresh
             self._derive()
 
     def press(self, why: Reason, now: Instant) -> None:
         """Latch a stop with a new number, for the cause that the board reports."""
-        self._stopped_ns = now.mono_ns
-        self._latch(stop=self._stop(now, "", why))
+        self._use(latched(self.latches, "stop", why, now.wall_ns))
 
-    def refuse_clear(self, why: Reason | None, now_ns: Ns) -> None:
+    def hold(self, why: Reason | None, now_ns: Ns) -> None:
         """Record why the board's reports forbid `clear` now, or None."""
-        if self._held is not None and why is None:
-            self._freed_ns = now_ns
-        self._held = why
-
-    def caused_again(self, now_ns: Ns) -> None:
-        self._freed_ns = now_ns
+        if self.held is not None and why is None:
+            self.freed_ns = now_ns
+        self.held = why
 
     def leave(self) -> None:
-        self._shutting_down = True
+        self.shutting_down = True
         self._derive()
 
     def fault(self, why: Reason, now: Instant) -> bool:
-        """Latch a fault and return True, or False if its cause is latched or there is no room."""
-        latch = self.latches.fault
-        if latch is not None:
-            causes = latch.causes
-            if len(causes) >= MAX_FAULTS or _is_latched(why, causes):
-                return False
-        self._faulted_ns = now.mono_ns
-        self._latch(fault=with_causes(self._new_latch(now, "", why), latch))
+        """Latch a fault and return True, or False if it is latched already."""
+        if is_latched(why, self.latches.of("fault")):
+            return False
+        self._use(latched(self.latches, "fault", why, now.wall_ns))
         return True
 
     # requests
@@ -111,250 +101,126 @@ class Lifecycle:
     def stop(self, by: str, asked_ns: Ns, now: Instant) -> str:
         """Latch a stop with a new number, and return a text for the client.
 
-        A repetition changes nothing: the latch names this client, and an accepted stop arrived at
+        A repetition changes nothing: this client's stop is latched, and an accepted stop arrived at
         `asked_ns` or later.
         """
-        latch, why = self.latches.stop, reason("stopped", by=by or NAMELESS)
-        named = latch is not None and (why.code, "", by) in [cause.cause for cause in latch.causes]
-        if not (named and asked_ns <= self._stop_asked_ns):
-            self._stopped_ns = now.mono_ns
-            self._stop_asked_ns = max(self._stop_asked_ns, asked_ns)
-            self._latch(stop=self._stop(now, by, why))
-        if self._shutting_down:
+        if asked_ns > self.stop_asked_ns or not self.stop_of(by):
+            self.stop_asked_ns = max(self.stop_asked_ns, asked_ns)
+            self._use(stopped(self.latches, by, now.wall_ns))
+        if self.shutting_down:
             return f"stopped and latched; {SHUTDOWN_REASON.text}"
-        if self.latches.fault is not None:
-            return (
-                "stopped and latched; call srv/clear twice, "
-                f"{LATCH_REQUIRED_S:g} s apart: the first call releases the fault, the second call "
-                "releases the stop"
-            )
         return "stopped and latched; srv/clear releases it"
 
-    def clear(self, number: int | None, asked_ns: Ns, now: Instant) -> str:
-        """Release the fault if there is one, otherwise the stop; return a text, or "" for neither.
+    def stop_of(self, by: str) -> tuple[int, ...]:
+        """Return the number of a client's stop, or ()."""
+        causes = self.latches.of("stop")
+        return tuple([c.number for c in causes if (c.code, c.by) == ("stopped", by)])
 
-        `number` is of the latch that the client has seen, if it names one. Raises `RefusedError` if
-        the mode or a lasting cause forbids it, or if the client may not know the latch.
+    def clear(self, numbers: Collection[int] | None, asked_ns: Ns) -> tuple[str, tuple[int, ...]]:
+        """Release the named causes; return a text and the numbers released.
+
+        Without `numbers`, release the faults if there are any, else the stops. Raises
+        `RefusedError` if the mode or a lasting cause forbids it, if the caller may not know a
+        cause, or if no named one is in force.
         """
         require_allowed(self.mode, "clear")
-        if self._held:
-            held = self._held
-            raise RefusedError(f"{held.text}: {held.advice}, then call srv/clear again")
-        latches, latch = self.latches, self.latches.next
-        if latch is None:
-            return ""
-        if asked_ns <= self._freed_ns:
-            # A press may be shorter than a step, so this call may have come before the release.
+        if self.held:
+            raise RefusedError(f"{self.held.text}: {self.held.advice}, then call srv/clear again")
+        causes = self.latches.of("fault", "stop")
+        if not causes:
+            return "nothing to clear: the robot is neither stopped nor in fault", ()
+        if asked_ns <= self.freed_ns:
             raise RefusedError(
                 "this call came before the cause of the stop or fault had ended: call srv/clear "
                 "again"
             )
-        if number is None:
-            set_ns = max(self._stopped_ns, self._faulted_ns)
-            last_ns = self._cleared_ns
-            if set_ns <= last_ns and asked_ns - last_ns < LATCH_REQUIRED_S * NS_PER_S:
-                raise RefusedError(
-                    f"a latch was cleared less than {LATCH_REQUIRED_S:g} s ago; the robot is still "
-                    f"{_in_force(latches)}: look at the robot, then call srv/clear again"
-                )
-            stop = latches.stop
-            if latches.fault is None or (stop and self._stopped_ns > self._faulted_ns):
-                was = f"the robot was {_stopped(stop or latch)}"
-            else:
-                was = f"the robot went into fault ({latches.fault.why})"
-            self._require_latch_was_seen(was, _in_force(latches), set_ns, asked_ns, "srv/clear")
-        else:
-            if number != latch.number:
-                raise RefusedError(_not_in_force(number, _in_force(latches), "srv/clear"))
-            set_ns = self._stopped_ns if latches.fault is None else self._faulted_ns
-        if asked_ns <= set_ns or now.mono_ns == set_ns:
-            raise RefusedError(
-                "a stop or a fault came at the same time as this call or after it: call srv/clear "
-                "again"
-            )
-        if latches.fault is None:
-            self._latch(stop=None)
-            return self._cleared_text()
-        self._cleared_ns = now.mono_ns
-        self._latch(fault=None)
-        if latches.stop is None:
-            return self._cleared_text()
-        return (
-            f"fault cleared, but the robot is still {_still(latches.stop)}: call srv/clear again "
-            f"in {LATCH_REQUIRED_S:g} s"
-        )
+        if numbers is None:
+            self._require_shown(causes, asked_ns, "clear")
+            numbers = [c.number for c in self.latches.of("fault") or causes]
+        done = self._release(numbers, causes, "clear")
+        left = self.latches.of("fault", "stop")
+        if left:
+            return f"cleared, but the robot is still {in_force(left)}: call srv/clear again", done
+        if self.latches.causes:
+            return (
+                "cleared, but the robot is still switched off: call srv/activate to switch it on, "
+                f"then {ZERO_FIRST}"
+            ), done
+        return f"cleared; {ZERO_FIRST}", done
 
-    def activate(self, number: int | None, asked_ns: Ns, now: Instant) -> bool:
-        """Switch the robot on; return False if it was on.
+    def activate(self, numbers: Collection[int] | None, asked_ns: Ns) -> tuple[int, ...]:
+        """Switch the robot on, and return the number released; () if it was on.
 
-        `number` is the latch that the client has seen, or None. Raises `RefusedError` like `clear`.
+        Raises `RefusedError` like `clear`.
         """
         require_allowed(self.mode, "activate")
-        latch = self.latches.inactive
-        if latch is None:
-            return False
-        if number is not None and number != latch.number:
-            raise RefusedError(_not_in_force(number, latch.why, "srv/activate"))
-        if number is None:
-            self._require_latch_was_seen(
-                f"the robot was {_stopped(latch)}",
-                _still(latch),
-                self._off_ns,
-                asked_ns,
-                "srv/activate",
-            )
-        if asked_ns <= self._off_ns or now.mono_ns == self._off_ns:
-            raise RefusedError(
-                f"{latch.why} at the same time as this call or after it: call srv/activate again"
-            )
-        self._latch(inactive=None)
-        return True
+        causes = self.latches.of("inactive")
+        if not causes:
+            return ()
+        if numbers is None:
+            self._require_shown(causes, asked_ns, "activate")
+            numbers = [causes[0].number]
+        return self._release(numbers, causes, "activate")
 
     def deactivate(self, by: str, now: Instant) -> str:
         require_allowed(self.mode, "deactivate")
-        self._off_ns = now.mono_ns
         why = reason("switched_off", by=by or NAMELESS)
-        self._latch(inactive=self._new_latch(now, by, why))
+        self._use(latched(self.latches, "inactive", why, now.wall_ns, by))
         return "inactive: the robot brakes to rest; call srv/activate to switch it on again"
 
     @property
     def why(self) -> Reason:
         """The reason of the mode `fault`, `stopped` or `inactive`, and the call that ends it."""
-        latches, held = self.latches, self._held
-        if latches.next is not None:
-            fault, stop = latches.fault, latches.stop
-            faults = () if fault is None else fault.causes
-            parts = [f"{cause.why}, latched {_when(cause)}" for cause in faults]
-            causes = () if stop is None else stop.causes
-            if held is not None and not _is_latched(held, (*faults, *causes)):
-                # For example, one of two pressed bumpers has been released.
-                parts.append(held.text)
-            parts += [_latch_text(cause) for cause in causes]
-            before = "" if held is None else f"{held.advice}, then "
-            twice = f" twice, {LATCH_REQUIRED_S:g} s apart" if fault and stop else ""
-            text = f"{'; also '.join(parts)}; {before}call srv/clear{twice}"
-            return Reason(latches.next.code, text)
-        latch = latches.inactive
-        assert latch is not None
-        return Reason(latch.code, f"{_latch_text(latch)}; call srv/activate")
+        held = self.held
+        causes = (*self.latches.of("fault"), *self.latches.of("stop"))
+        if not causes:
+            (off,) = self.latches.of("inactive")
+            return Reason(off.code, f"{describe(off)}; call srv/activate")
+        parts = [describe(cause) for cause in causes]
+        if held is not None and not is_latched(held, causes):
+            # For example, one of two pressed bumpers has been released.
+            parts.append(held.text)
+        before = "" if held is None else f"{held.advice}, then "
+        return Reason(causes[0].code, f"{'; also '.join(parts)}; {before}call srv/clear")
 
-    # latches and mode
+    def _release(
+        self, numbers: Collection[int], causes: tuple[Cause, ...], verb: str
+    ) -> tuple[int, ...]:
+        done = tuple([cause.number for cause in causes if cause.number in numbers])
+        if not done:
+            raise RefusedError(
+                f"this call names no cause that srv/{verb} would release now; the robot is still "
+                f"{in_force(causes)}: look at the robot, then call srv/{verb} again with the "
+                "numbers of the present `causes` in `state`"
+            )
+        self._use(released(self.latches, done))
+        return done
 
-    def _new_latch(self, now: Instant, by: str, why: Reason) -> Latch:
-        if self._numbered:
-            self._number = max(self._number + 1, now.wall_ns // 1_000_000)
-        else:
-            self._numbered, self._number = True, number_after_restart(self._number, now)
-        return latch_of(self._number, now.wall_ns, by, why)
+    def _require_shown(self, causes: tuple[Cause, ...], asked_ns: Ns, verb: str) -> None:
+        # The newest cause was published last.
+        newest = max(causes, key=lambda cause: cause.number)
+        since_s = (asked_ns - self.shown.get(newest.number, asked_ns)) / NS_PER_S
+        if since_s < SHOWN_S:
+            age_s = max(0.0, math.floor(since_s * 10) / 10)
+            raise RefusedError(
+                f"the robot has shown for only {age_s:.1f} s that it is {in_force([newest])}: look "
+                f"at the robot, then call srv/{verb} again {SHOWN_S:g} s after that, or name the "
+                "numbers of the `causes` in `state`"
+            )
 
-    def _stop(self, now: Instant, by: str, why: Reason) -> Latch:
-        return with_causes(self._new_latch(now, by, why), self.latches.stop)
-
-    def _latch(self, **changes: Latch | None) -> None:
-        self.latches = replace(self.latches, **changes)
+    def _use(self, latches: Latches) -> None:
+        self.latches, self.unshown = latches, True
+        numbers = [cause.number for cause in latches.causes]
+        self.shown = {number: at for number, at in self.shown.items() if number in numbers}
         self._derive()
 
     def _derive(self) -> None:
+        kinds: list[CauseKind] = [cause.kind for cause in self.latches.causes]
         self.mode = mode_of(
-            shutting_down=self._shutting_down,
-            fault=self.latches.fault is not None,
-            stopped=self.latches.stop is not None,
-            inactive=self.latches.inactive is not None,
-            linked=self._linked,
-            commanded=self._commanded,
+            shutting_down=self.shutting_down,
+            fault="fault" in kinds,
+            stopped="stop" in kinds,
+            inactive="inactive" in kinds,
+            linked=self.linked,
+            commanded=self.commanded,
         )
-
-    def _cleared_text(self) -> str:
-        zero = "each sender must send a zero before it drives"
-        if self.latches.inactive is not None:
-            return (
-                "cleared, but the robot is still switched off: call srv/activate to switch it on, "
-                f"then {zero}"
-            )
-        return f"cleared; {zero}"
-
-    def _require_latch_was_seen(
-        self, was: str, still: str, set_ns: Ns, asked_ns: Ns, call: str
-    ) -> None:
-        # `was` is the newest cause, `still` all, `set_ns` its time.
-        began_ns = LONG_AGO_NS if self._began_ns is None else self._began_ns
-        since = asked_ns - max(set_ns, began_ns)
-        if since >= LATCH_REQUIRED_S * NS_PER_S:
-            return
-        age_s = max(0.1, math.floor(since / NS_PER_S * 10) / 10)
-        age_text = f"{was} {age_s:.1f} s ago"
-        if set_ns < began_ns:
-            # The age in an earlier run is unknown: the monotonic clock may have restarted, and the
-            # wall clock may have been set.
-            age_text = (
-                f"the daemon started or resumed {age_s:.1f} s ago and the robot is still {still}"
-            )
-        raise RefusedError(
-            f"{age_text}: look at the robot, then call {call} again when {LATCH_REQUIRED_S:g} s "
-            "have passed since then, or name the number of the latch that you have seen"
-        )
-
-
-def with_causes(latch: Latch, before: Latch | None) -> Latch:
-    """Return a new latch with the earlier causes of the one that it replaces.
-
-    Of those from clients, the oldest `MAX_CLIENTS` are kept.
-    """
-    causes = () if before is None else before.causes
-    earlier = [replace(cause, earlier=()) for cause in causes if cause.cause != latch.cause]
-    surplus = [cause for cause in earlier if cause.by][:-MAX_CLIENTS]
-    return replace(latch, earlier=tuple([cause for cause in earlier if cause not in surplus]))
-
-
-def latch_of(number: int, at_ns: int, by: str, why: Reason) -> Latch:
-    return Latch(number, at_ns, by, why.text, why.code, why.part)
-
-
-def _is_latched(why: Reason, causes: Sequence[Latch]) -> bool:
-    return any(cause.code == why.code and cause.part == why.part for cause in causes)
-
-
-def number_after_restart(last_number: int, now: Instant) -> int:
-    """Return a latch number that no earlier run has used: the wall clock in ms if it is larger.
-
-    If the wall clock was set back, it is `last_number` + 1 + ms since the computer started.
-    """
-    # An earlier latch that is not in the file may have had `last_number` + 1, and a late `clear`
-    # may still name it.
-    number = now.wall_ns // 1_000_000
-    return number if number > last_number else last_number + 1 + now.mono_ns // 1_000_000
-
-
-def _not_in_force(number: int, still: str, call: str) -> str:
-    return (
-        f"latch {number} is not the latch that {call} would release now; the robot is still "
-        f"{still}: look at the robot, then call {call} again with the present `latch` in `state`"
-    )
-
-
-def _in_force(latches: Latches) -> str:
-    if latches.fault is not None:
-        return f"in fault ({'; also '.join([cause.why for cause in latches.fault.causes])})"
-    return _still(latches.stop) if latches.stop else ""
-
-
-def _still(latch: Latch) -> str:
-    return " and ".join([_stopped(cause) for cause in latch.causes])
-
-
-def _stopped(latch: Latch) -> str:
-    return latch.why if _asked_for(latch) else f"stopped ({latch.why})"
-
-
-def _when(latch: Latch) -> str:
-    return f"at {utc(latch.at_ns)}{', before the restart' if latch.kept else ''}"
-
-
-def _asked_for(latch: Latch) -> bool:
-    return latch.code in ("stopped", "switched_off")  # by a client
-
-
-def _latch_text(latch: Latch) -> str:
-    if not _asked_for(latch):
-        return f"{latch.why} (latched {_when(latch)})"
-    return f"{'was ' if latch.kept else ''}{latch.why} {_when(latch)}"

@@ -22,6 +22,7 @@ if (!stopping) {
 const VIEWS = ["drive", "status", "events", "set"];
 const READ = 8000; // time that a person needs to read a message, ms
 const LATCHED = ["stopped", "fault"];
+const KINDS = { stopped: "stop", fault: "fault", inactive: "inactive" }; // of the causes, by the mode
 const ON = { activate: "the robot is already on" };
 /** Maps a mode to the button that would change nothing in it, with the reason. */
 const NEEDLESS = { waiting: ON, driving: ON, ready: ON, inactive: { deactivate: "the robot is already off" } };
@@ -52,7 +53,7 @@ let uninvited = ""; // why the invitation was rejected
 let degrees = false; // turn rates are shown in degrees per second
 let note = { why: "", at: 0 }; // the message at the stick and its time, by performance.now()
 let complaint = { why: "", at: 0 }; // the message about a button and its time, by performance.now()
-let offer = ""; // the mode and the latch that the release button ends, "" while it is hidden
+let offer = ""; // the mode and the numbers of the causes that the release button ends, "" while it is hidden
 let settling = 0; // time at which `offer` changed or the release button was last clicked, by performance.now()
 let down = null; // time at which a finger came down on the release button
 
@@ -97,10 +98,15 @@ function complain(why) {
   views.complain(why);
 }
 
-/** Call the service `verb` to release the latch that this page shows. Without a state, the page shows none, and the
- *  call could release a latch that nobody has seen. */
-function released(verb) {
-  if (state) return asked(verb, { latch: state.latch });
+/** Return the numbers of the causes that hold the robot in `mode` and that this page shows. */
+function shown(mode) {
+  return state.causes.filter(({ kind }) => kind === KINDS[mode]).map(({ number }) => number);
+}
+
+/** Call the service `verb` to release what holds the robot in `mode`. Without a state, the page shows no cause, and the
+ *  call could release one that nobody has seen. */
+function released(verb, mode) {
+  if (state) return asked(verb, { numbers: shown(mode) });
   return answered({ ok: false, text: UNSHOWN });
 }
 
@@ -208,10 +214,10 @@ function readied() {
 /** Show the button that ends the mode. While no new state confirms the mode, the button stays in place and does
  *  nothing. If the button disappeared, STOP would grow into its place under a finger. */
 function releasable() {
-  const shown = state && state.mode in RELEASE;
-  $("clear").hidden = !shown;
+  const offers = state && state.mode in RELEASE;
+  $("clear").hidden = !offers;
   const before = offer;
-  offer = shown ? `${state.mode} ${state.latch}` : "";
+  offer = offers ? `${state.mode} ${shown(state.mode)}` : "";
   if (offer !== before) settling = performance.now();
   $("clear").setAttribute("aria-disabled", String(dated()));
 }
@@ -228,7 +234,7 @@ async function pressed(event) {
   if (since < SETTLED) return answered({ ok: false, text: HASTY });
   const ended = state?.mode;
   const press = stopping.over();
-  const told = await released(ended === "inactive" ? "activate" : "clear");
+  const told = await released(ended === "inactive" ? "activate" : "clear", ended);
   if (ended === "stopped" && told.ok) stopping.released(press);
 }
 
@@ -379,7 +385,7 @@ document.querySelector("nav").addEventListener("keydown", (event) => {
 // The daemon refuses the release if a stop or a "deactivate" came after the state that this person sees.
 $("clear").addEventListener("pointerdown", (event) => (down = event.timeStamp));
 $("clear").addEventListener("click", pressed);
-$("activate").addEventListener("click", () => released("activate"));
+$("activate").addEventListener("click", () => released("activate", "inactive"));
 $("deactivate").addEventListener("click", () => asked("deactivate"));
 $("reset").addEventListener("click", () => asked("reset_odometry"));
 $("nearer").addEventListener("click", () => map.zoom(1.4));

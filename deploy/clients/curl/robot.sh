@@ -20,10 +20,10 @@ stop)
     ask --request POST "$robot/api/srv/stop"
     ;;
 clear)
-    # The number `latch` tells the robot which stop you have seen. The robot does not release a later stop.
+    # The numbers of the causes in the state tell the robot what you have seen. The robot does not release a later stop.
     state=$(ask "$robot/api/state")
-    latch=$(echo "$state" | sed -n 's/.*"latch": *\([0-9]*\).*/\1/p')
-    ask --json "{\"latch\": ${latch:-0}}" "$robot/api/srv/clear"
+    numbers=$(echo "$state" | grep -o '"number": *[0-9]*' | grep -o '[0-9]*$' | paste -s -d , -)
+    ask --json "{\"numbers\": [$numbers]}" "$robot/api/srv/clear"
     ;;
 *)
     echo "usage: sh robot.sh [state | stop | clear]" >&2

@@ -26,7 +26,16 @@ from acsard.core.incoming.imu import reading
 from acsard.core.incoming.queries import Queries, Query
 from acsard.core.messages import schema
 from acsard.core.messages.encodings import FORMATS, DecodeError, Decoder, Format, encode
-from acsard.core.messages.schema import Beat, Header, Imu, Quaternion, Time, Vector3
+from acsard.core.messages.schema import (
+    Beat,
+    Header,
+    Imu,
+    Quaternion,
+    ReplyData,
+    ServiceReply,
+    Time,
+    Vector3,
+)
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import NS_PER_S, REST, Command, Echo, Status
 from acsard.host import clock
@@ -363,20 +372,34 @@ def test_a_stop_is_sent_whatever_the_size_of_its_payload(session: Session) -> No
         client_of(session).request("stop", {"why": "x" * (MAX_COMMAND_BYTES + 1)})
 
 
-@pytest.mark.parametrize("offered", [["latch"], ["numbers"]])
-def test_a_release_names_the_latch_only_if_the_daemon_offers_this_field(
-    session: Session, monkeypatch: pytest.MonkeyPatch, offered: list[str]
+def test_a_release_names_the_causes_that_are_older_than_the_call(
+    session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ours, sent = client_of(session), list[object]()
-    answers = {
-        "info": structs.replace(INFO, services={"clear": offered}),
-        "state": SimpleNamespace(latch=7),
-    }
-    monkeypatch.setattr(ours, "get", answers.get)
-    monkeypatch.setattr(ours, "request", lambda service, fields: sent.append(dict(fields)))
+    """The answer on `state` takes 1 s, in which somebody else has stopped the robot again."""
+    ours, sent, now_s = client_of(session), list[object](), 100.0
+
+    def get(key: str) -> object:
+        nonlocal now_s
+        now_s += 1.0
+        ages = {1: 5.0, 2: 1.01, 3: 0.99, 4: None}
+        causes = [SimpleNamespace(number=number, age=age) for number, age in ages.items()]
+        return {"state": SimpleNamespace(causes=causes)}[key]
+
+    monkeypatch.setattr(clock, "steady_s", lambda: now_s)
+
+    def request(service: str, fields: dict[str, object]) -> ServiceReply:
+        sent.append(dict(fields))
+        return ServiceReply(True, "done", ReplyData([3] if service == "stop" else []))
+
+    monkeypatch.setattr(ours, "get", get)
+    monkeypatch.setattr(ours, "request", request)
     ours.call("clear")
-    ours.call("clear", latch=3)
-    assert sent == [{"latch": 7} if offered == ["latch"] else {}, {"latch": 3}]
+    ours.call("activate")
+    ours.call("clear", numbers=[4])
+    ours.call("stop")
+    assert sent == [{"numbers": [1, 2]}, {"numbers": [1, 2]}, {"numbers": [4]}, {}]
+    ours.call("clear")
+    assert sent[-1] == {"numbers": [1, 2, 3]}, "this client has latched number 3 itself"
 
 
 def test_over_tls_a_service_that_the_robot_does_not_have_is_refused_with_those_that_it_has(

@@ -12,6 +12,7 @@ from itertools import pairwise
 import pytest
 from msgspec.structs import replace
 
+from acsard.core.codes import Code
 from acsard.core.config.settings import (
     BatteryConfig,
     CommandsConfig,
@@ -25,6 +26,7 @@ from acsard.core.config.settings import (
 )
 from acsard.core.link.codec import Codec
 from acsard.core.motion.arbiter_text import MAX_SENDER_LENGTH
+from acsard.core.motion.latches import after_restart
 from acsard.core.robot import Robot
 from acsard.core.values import (
     NS_PER_S,
@@ -32,11 +34,12 @@ from acsard.core.values import (
     STILL,
     Answer,
     BatteryStatus,
+    Cause,
+    CauseKind,
     Command,
     Event,
     GyroSample,
     Instant,
-    Latch,
     Latches,
     Plain,
     Pose,
@@ -103,12 +106,13 @@ class Bench:
     ) -> Outputs:
         """Run one step a period later, or `ms` later, and return its outputs.
 
-        A `clear` or `activate` names the latch that the last step reported, as the tools do. `gyro`
+        A `clear` or `activate` names the faults of the last step, else all causes. `gyro`
         is the rate in a gyro sample. With `late_ms`, another clock stamps the commands, and the
         stamps are `late_ms` old.
         """
-        active_latch = self.out.latches.in_force
-        latch = active_latch.number if ask in ("clear", "activate") and active_latch else None
+        named = self.out.latches.of("fault") or self.out.latches.causes
+        releases = ask in ("clear", "activate") and named
+        shown = tuple([cause.number for cause in named]) if releases else None
         self.now_ns += int((self.period_ms if ms is None else ms) * MS)
         has_reply = self.reply is not None and self.port_open
         stamp_ns = None if late_ms is None else self.now_ns + WALL_NS - int(late_ms * MS)
@@ -121,7 +125,7 @@ class Bench:
                 received=(Received(self.now, self.reply),) if has_reply and self.reply else (),
                 commands=tuple(Command(source, t, self.now_ns, stamp_ns) for t in commands),
                 gyro=() if gyro is None else (GyroSample(self.now_ns, None, gyro),),
-                requests=(Request(ask, 7, pose, latch=latch),) if ask else (),
+                requests=(Request(ask, 7, pose, numbers=shown),) if ask else (),
                 refusals=refusals,
                 guard_trip=guard_trip,
                 superseded=superseded,
@@ -277,8 +281,8 @@ def test_a_clear_in_the_step_of_the_press_does_not_release_the_stop() -> None:
     bench.driving()
     bench.step(ask="stop")
     bench.status(PRESSED_LINE + OK_LINE)
-    assert not bench.answer("clear").success
-    assert bench.mode() == "stopped"
+    assert bench.answer("clear").message.startswith("cleared, but the robot is still stopped")
+    assert (bench.mode(), bench.out.code) == ("stopped", "emergency_stop")
 
 
 def test_an_unreported_emergency_stop_counts_as_pressed_even_without_a_port() -> None:
@@ -386,7 +390,7 @@ def test_a_bumper_that_limits_stops_the_robot_and_each_sender_must_send_a_zero()
     bench = Button(FREE, AWAY)
     bench.driving()
     out = bench.status(FRONT).step(GO)
-    assert (out.mode, out.line, out.latches.in_force) == ("ready", ZERO_LINE, None)
+    assert (out.mode, out.line, out.latches.causes) == ("ready", ZERO_LINE, ())
     assert out.code == "bumper_away"
     for _ in range(50):
         assert bench.step(BACK).line == ZERO_LINE
@@ -403,7 +407,7 @@ def test_a_tap_in_one_read_stops_a_robot_that_a_bumper_only_limits_and_latches_n
     bench = Button(FREE, AWAY)
     bench.driving()
     out = bench.status(FRONT + FREE).step(GO)
-    assert (out.mode, out.line, out.latches.in_force) == ("ready", ZERO_LINE, None)
+    assert (out.mode, out.line, out.latches.causes) == ("ready", ZERO_LINE, ())
     bench.status(FREE)
     assert bench.step(GO).line == ZERO_LINE
     bench.step(REST)
@@ -547,7 +551,7 @@ def test_drivers_without_power_after_a_press_block_the_clear_until_they_recover(
     bench.linked()
     bench.status(PRESSED_LINE).step()
     if restarted:
-        latches = bench.out.latches.after_restart()
+        latches = after_restart(bench.out.latches)
         bench = Button(OK_LINE + DRIVER_FAULT, latches=latches)
         bench.linked()
     bench.status(OK_LINE + DRIVER_OK).step()
@@ -633,7 +637,7 @@ def test_a_board_that_reports_no_inputs_does_not_inherit_those_of_the_previous_b
         assert bench.step(GO).mode == mode
     snapshot = bench.robot.snapshot(bench.now_ns)
     assert (snapshot.estop, snapshot.bumpers, snapshot.board) == ("", None, {})
-    while bench.out.latches.next:
+    while bench.out.latches.causes:
         assert bench.answer("clear").success
     bench.step(REST)
     assert bench.step(GO).mode == "driving"
@@ -804,11 +808,10 @@ def test_a_restarted_daemon_refuses_clear_until_the_board_has_reported_the_cause
     bench = Button(line, GUARDED).linked()
     for _ in range(400):
         bench.step()
-    latches = bench.out.latches.after_restart()
-    assert latches.next is not None
+    latches = after_restart(bench.out.latches)
     after = Button(b"", GUARDED, latches)
     after.linked()
-    assert (after.out.latches, after.out.code) == (latches, latches.next.code)
+    assert (after.out.latches, after.out.code) == (latches, latches.of("fault", "stop")[0].code)
     assert not after.answer("clear").success
     after.status(b"!status estop=ok driver=ok bumpers=.. volts=24.00\r\n")
     # A new number of bumpers counts from its second line on, a voltage after 3 s.
@@ -818,7 +821,7 @@ def test_a_restarted_daemon_refuses_clear_until_the_board_has_reported_the_cause
 
 
 def test_a_restarted_daemon_allows_clear_after_3_s_without_a_report() -> None:
-    latches = Button(PRESSED_LINE).linked().out.latches.after_restart()
+    latches = after_restart(Button(PRESSED_LINE).linked().out.latches)
     after = Bench(latches=latches).linked()
     allowed = [after.answer("clear").success for _ in range(320)]
     assert 290 < allowed.index(True) < 310
@@ -1059,9 +1062,8 @@ def test_a_zero_sent_while_the_port_was_closed_does_not_count_as_neutral() -> No
 def test_a_stop_brakes_by_its_own_deceleration_and_is_latched() -> None:
     bench = Bench().driving()
     answer = bench.answer("stop")
-    stop = bench.robot.latches.stop
-    assert stop is not None
-    assert (answer.success, answer.latch) == (True, stop.number)
+    (stop,) = bench.robot.latches.of("stop")
+    assert (answer.success, answer.numbers) == (True, (stop.number,))
     # 3 m/s2 is 0.03 m/s per step; 0.5 m/s take 17 steps.
     path = [bench.out.applied.linear, *(bench.step(GO).applied.linear for _ in range(17))]
     assert path == pytest.approx([max(0.5 - 0.03 * step, 0.0) for step in range(1, 19)], abs=1e-12)
@@ -1086,7 +1088,7 @@ def test_a_clear_without_a_latch_succeeds_and_changes_nothing() -> None:
     bench = Bench().driving()
     mode, twist = bench.mode(), bench.out.applied
     (answer,) = bench.step(GO, ask="clear").answers
-    assert (answer.success, answer.latch) == (True, 0)
+    assert (answer.success, answer.numbers) == (True, ())
     assert (bench.mode(), bench.out.applied != REST, twist != REST) == (mode, True, True)
 
 
@@ -1095,7 +1097,7 @@ def test_after_clear_the_robot_is_ready_and_each_source_must_be_neutral() -> Non
     bench.step(ask="stop")
     answer = bench.answer("clear")
     assert answer.success
-    assert answer.latch
+    assert answer.numbers
     assert bench.mode() == "ready"
     for _ in range(20):
         bench.step(GO)
@@ -1107,9 +1109,8 @@ def test_after_clear_the_robot_is_ready_and_each_source_must_be_neutral() -> Non
 def test_deactivating_ramps_to_zero_by_the_normal_deceleration() -> None:
     bench = Bench().driving()
     answer = bench.answer("deactivate")
-    off = bench.robot.latches.inactive
-    assert off is not None
-    assert (answer.success, answer.latch) == (True, off.number)
+    (off,) = bench.robot.latches.of("inactive")
+    assert (answer.success, answer.numbers) == (True, (off.number,))
     assert bench.out.applied.linear == pytest.approx(0.49)
     for _ in range(50):
         bench.step(GO)
@@ -1120,10 +1121,9 @@ def test_deactivating_ramps_to_zero_by_the_normal_deceleration() -> None:
 def test_after_an_activation_each_source_must_be_neutral() -> None:
     bench = Bench().driving()
     bench.step(ask="deactivate")
-    off = bench.robot.latches.inactive
-    assert off is not None
+    (off,) = bench.robot.latches.of("inactive")
     answer = bench.answer("activate")
-    assert (answer.success, answer.latch) == (True, off.number)
+    assert (answer.success, answer.numbers) == (True, (off.number,))
     for _ in range(20):
         bench.step(GO)
     assert bench.mode() == "ready"
@@ -1317,14 +1317,10 @@ def test_impossible_speeds_of_any_wheel_are_one_cause_and_hide_no_later_cause() 
             speeds[wheel] = speed
             bench.reply = bench.codec.encode(WheelSpeeds(*speeds))
             bench.step(GO)
-    latch = bench.robot.latches.fault
-    assert latch is not None
-    assert len(latch.causes) == 1
+    (first,) = bench.robot.latches.of("fault")
     bench.step(GO, guard_trip="guard_too_fast")
-    newest = bench.robot.latches.fault
-    assert newest is not None
-    assert newest.number != latch.number
-    assert [cause.code for cause in newest.causes] == ["guard_too_fast", "impossible_speeds"]
+    newest, second = bench.robot.latches.of("fault")
+    assert (newest.code, second) == ("guard_too_fast", first)
 
 
 def test_a_third_impossible_line_is_a_fault_that_brakes_by_the_stop_deceleration() -> None:
@@ -1513,9 +1509,13 @@ def test_the_status_changes_with_mode_reason_link_and_source_and_not_otherwise()
 # the latches that a robot starts with
 
 
-STOPPED = Latches(stop=Latch(7, WALL_NS, "ann", "stopped by ann", "stopped", kept=True))
-FAULTED = Latches(fault=Latch(8, WALL_NS, "", "a wheel is dead", "wheel_dead", kept=True))
-OFF = Latches(inactive=Latch(9, WALL_NS, "joe", "switched off by joe", "switched_off", kept=True))
+def kept(kind: CauseKind, code: Code, text: str, by: str = "") -> Latches:
+    return Latches((Cause(7, kind, code, text, by=by, at_ns=WALL_NS, kept=True),), 7)
+
+
+STOPPED = kept("stop", "stopped", "stopped by ann", "ann")
+FAULTED = kept("fault", "wheel_dead", "a wheel is dead")
+OFF = kept("inactive", "switched_off", "switched off by joe", "joe")
 
 
 @each(
@@ -1539,7 +1539,7 @@ def test_a_robot_starts_in_the_mode_of_its_latches_with_one_event(
         assert bench.step(GO).applied == REST
     assert (bench.mode(), bench.out.latches) == (mode, latches)
     assert bench.answer("activate" if mode == "inactive" else "clear").success
-    assert bench.out.latches == Latches()
+    assert bench.out.latches.causes == ()
     bench.let_go()
     assert bench.step(GO).mode == "driving"
 

@@ -40,9 +40,9 @@ from acsard.core.values import (
     NS_PER_S,
     REST,
     Answer,
+    Cause,
     Command,
     Instant,
-    Latch,
     Latches,
     Plain,
     Pose,
@@ -77,16 +77,16 @@ CONFIGS = [
     Config(commands=COMMANDS, control=ControlConfig(rate=250.0)),
 ]
 
-STOP = Latch(5, 0, "ann", "stopped by ann", "stopped", kept=True)
-FAULT = Latch(6, 0, "", "a wheel is dead", "wheel_dead", kept=True)
-OFF = Latch(7, 0, "joe", "switched off by joe", "switched_off", kept=True)
+STOP = Cause(5, "stop", "stopped", "stopped by ann", by="ann", kept=True)
+FAULT = Cause(6, "fault", "wheel_dead", "a wheel is dead", kept=True)
+OFF = Cause(7, "inactive", "switched_off", "switched off by joe", by="joe", kept=True)
 
 KEPT = [
     Latches(),
     Latches(),
     Latches(),
-    Latches(stop=STOP),
-    Latches(STOP, FAULT, OFF),
+    Latches((STOP,), 5),
+    Latches((STOP, FAULT, OFF), 7),
 ]
 """Latches that a robot starts with; usually none are set."""
 
@@ -441,10 +441,10 @@ class RobotMachine(RuleBasedStateMachine):
     # inputs of the robot
 
     def add_request(self, verb: Verb, off: int | None = 0) -> None:
-        active_latch = self.latches.in_force
-        named = active_latch is not None and verb in ("clear", "activate") and off is not None
-        latch = active_latch.number + (off or 0) if active_latch is not None and named else None
-        self.requests.append(Request(verb, 1, latch=latch))
+        numbers = None
+        if self.latches.causes and verb in ("clear", "activate") and off is not None:
+            numbers = tuple([cause.number + off for cause in self.latches.causes])
+        self.requests.append(Request(verb, 1, numbers=numbers))
 
     def command(
         self, name: str, twist: Twist, arrived_ns: int | None = None, stamp_ns: int | None = None
@@ -623,29 +623,24 @@ class RobotMachine(RuleBasedStateMachine):
             assert outputs.linked
 
     def check_latches(self, outputs: Outputs, requests: tuple[Request, ...]) -> None:
-        """Check that a latch ends only by a correct `clear`.
-
-        A correct `clear` names the latch, or names none and comes long after the latch.
-        """
+        """Check that a cause ends only by a call that names it, or that names none."""
         before, after = self.latches, outputs.latches
         self.latches = after
         done = [r for r, a in zip(requests, outputs.answers, strict=True) if did(a)]
-        clears = [request for request in done if request.verb == "clear"]
-        lost = [
-            was
-            for was, now in ((before.stop, after.stop), (before.fault, after.fault))
-            if was is not None and now is None
-        ]
-        assert len(lost) <= len(clears)
-        assert {r.latch for r in clears if r.latch} <= {latch.number for latch in lost}
-        if before.inactive is not None and after.inactive is None:
+        left = {(cause.kind, cause.code, cause.part, cause.by) for cause in after.causes}
+        for cause in before.causes:
+            if (cause.kind, cause.code, cause.part, cause.by) in left or cause.kind == "inactive":
+                continue
+            calls = [request for request in done if request.verb == "clear"]
+            assert any(r.numbers is None or cause.number in r.numbers for r in calls)
+        if before.of("inactive") and not after.of("inactive"):
             assert "activate" in {request.verb for request in done}
+        fresh = {cause.number for cause in after.causes} - {c.number for c in before.causes}
+        assert all(number > before.last for number in fresh)
         if any(request.verb == "stop" for request in done):
-            assert after.stop is not None
-            assert before.stop is None or after.stop.number > before.stop.number
+            assert after.of("stop")
         assert (before is after) == (before == after)
-        active_latch = after.fault or after.stop or after.inactive
-        assert not active_latch or outputs.mode not in ("waiting", "ready", "driving")
+        assert not after.causes or outputs.mode not in ("waiting", "ready", "driving")
 
     def check_emergency_stop(self, outputs: Outputs, requests: tuple[Request, ...]) -> None:
         """Check that an emergency stop that is pressed, or silent for long, stops the robot.
@@ -662,7 +657,7 @@ class RobotMachine(RuleBasedStateMachine):
         if self.reported or silent:
             assert outputs.mode in ("stopped", "fault", "shutdown")
             assert outputs.speeds.as_tuple() == (0.0, 0.0, 0.0, 0.0)
-            assert outputs.latches.stop is not None
+            assert outputs.latches.of("stop")
             for request, answer in zip(requests, outputs.answers, strict=True):
                 assert request.verb != "clear" or not answer.success
         elif self.reported is False and since_ns <= 500 * MS:

@@ -24,10 +24,10 @@ from acsard.core.link.serial_output import Offered
 from acsard.core.robot import Robot
 from acsard.core.values import (
     NS_PER_S,
+    Cause,
     Event,
     Heard,
     Instant,
-    Latch,
     Latches,
     News,
 )
@@ -116,8 +116,8 @@ def test_a_recorded_drive_replays_bit_by_bit(bench: Bench) -> None:
 def test_a_drive_that_begins_with_kept_latches_replays_bit_by_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stop = Latch(5, START.wall_ns, "ann", "stopped by ann", "stopped", kept=True)
-    bench = Bench(tmp_path, monkeypatch, latches=Latches(stop=stop))
+    stop = Cause(5, "stop", "stopped", "stopped by ann", by="ann", at_ns=START.wall_ns, kept=True)
+    bench = Bench(tmp_path, monkeypatch, latches=Latches((stop,), 5))
     bench.world.drive(0.5, 0.2, seconds=1.0)
     assert bench.world.call("clear").success
     bench.world.drive(0.5, 0.2, seconds=1.0)

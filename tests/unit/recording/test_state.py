@@ -143,9 +143,9 @@ def test_a_part_that_is_plain_data_has_no_configuration_inside(part: Any) -> Non
     assert not [name for name in modules if name.startswith("acsard.core.config")]
 
 
-def test_only_three_parts_are_pickled() -> None:
+def test_only_two_parts_are_pickled() -> None:
     pickled = vars(Robot(PLAIN)).keys() - PARTS.keys() - {*DERIVED}
-    assert pickled == {"session", "_checks", "_life"}
+    assert pickled == {"session", "_checks"}
 
 
 @each(
@@ -241,9 +241,9 @@ def test_configured_values_change_and_values_of_the_drive_stay() -> None:
 
 def test_a_part_that_the_state_lacks_comes_from_a_new_robot() -> None:
     robot = driven()
-    del robot._life
-    adopt(robot, Robot(PLAIN), Robot(PLAIN))
-    assert vars(robot._life) == vars(Robot(PLAIN)._life)
+    del robot._arbiter
+    adopt(robot, Robot(PLAIN), other := Robot(PLAIN))
+    assert robot._arbiter is other._arbiter
 
 
 def test_a_robot_of_another_layout_is_replaced_by_a_fresh_one_where_it_rests(

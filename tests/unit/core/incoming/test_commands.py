@@ -546,22 +546,23 @@ def test_a_service_without_arguments_ignores_its_payload(verb: Any, payload: byt
 
 @each("verb", ["clear", "activate"])
 @each("form", ["json", "msgpack"])
-def test_clear_and_activate_accept_the_number_of_a_latch(form: Format, verb: Verb) -> None:
-    payload = encode({"latch": 1_800_000_000_123}, form)
+def test_clear_and_activate_accept_the_numbers_of_causes(form: Format, verb: Verb) -> None:
+    payload = encode({"numbers": [1_800_000_000_123, 7]}, form)
     request = Receiver.request(verb, 7, "", payload, 5)
-    assert request == Request(verb, 7, asked_ns=5, latch=1_800_000_000_123)
+    assert request == Request(verb, 7, asked_ns=5, numbers=(1_800_000_000_123, 7))
 
 
 @each("verb", ["clear", "activate"])
-@each("payload", [b"", b"{}", b'{"latch": null}', b"\x80"])
+@each("payload", [b"", b"{}", b'{"numbers": null}', b"\x80"])
 def test_clear_and_activate_may_come_without_a_number(payload: bytes, verb: Verb) -> None:
     assert Receiver.request(verb, 7, "", payload) == Request(verb, 7)
 
 
 @each(
     "payload",
-    [b"\xff garbage", b'{"latch": "5"}', b'{"latch": -1}', b'{"latch": 5.5}', b'{"stop": 5}',
-     b'{"latch": 9007199254740992}', b'{"latch": true}'],
+    [b"\xff garbage", b'{"numbers": ["5"]}', b'{"numbers": [-1]}', b'{"numbers": [5.5]}',
+     b'{"stop": 5}', b'{"numbers": [9007199254740992]}', b'{"numbers": 5}', b'{"latch": 5}',
+     b'{"numbers": [' + b"1, " * 64 + b"1]}"],
 )  # fmt: skip
 @each("verb", ["clear", "activate"])
 def test_clear_and_activate_refuse_any_other_payload(payload: bytes, verb: Verb) -> None:

@@ -330,7 +330,7 @@ def test_only_command_interfaces_are_claimed_and_only_while_driving() -> None:
 # services
 
 POSE = encode({"x": 1.0, "y": 2.0, "yaw": 3.0}, "json")
-CLEAR = encode({"latch": 5}, "json")
+CLEAR = encode({"numbers": [5]}, "json")
 SETTINGS = encode({"settings": {"limits.linear_speed": 0.8, "log.level": "debug"}}, "json")
 
 
@@ -344,8 +344,9 @@ def test_a_service_query_with_its_exact_key_makes_a_request_to_the_robot(verb: A
     pose = Pose(1.0, 2.0, 3.0) if verb == "set_pose" else None
     values: dict[str, Plain] = {"limits.linear_speed": 0.8, "log.level": "debug"}
     settings = values if verb == "set" else {}
-    latch = 5 if verb == "clear" else None
-    assert request == Request(verb, 7, pose, by="unnamed (native)", settings=settings, latch=latch)
+    numbers = (5,) if verb == "clear" else None
+    by = "unnamed (native)"
+    assert request == Request(verb, 7, pose, by=by, settings=settings, numbers=numbers)
 
 
 @each("value", [-(1 << 63) - 1, 1 << 63, 10**20, 10**300])
@@ -392,7 +393,7 @@ def test_info_offers_each_service_with_the_fields_of_its_payload() -> None:
     services = offered_services()
     assert set(services) == set(SERVICES)
     assert services["stop"] == []
-    assert services["clear"] == ["latch"]
+    assert services["clear"] == ["numbers"]
     assert services["set_pose"] == ["x", "y", "yaw"]
 
 

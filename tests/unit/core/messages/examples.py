@@ -62,7 +62,8 @@ STATUS = Status("driving", "commanded", "commanded by app", "up", "app")
 
 SNAPSHOT = Snapshot(
     status=STATUS,
-    latch=0,
+    causes=(),
+    cause_ages={},
     applied=Twist(0.3, 0.9),
     pose=Pose(1.6, -2.6, 0.6),
     measured=Twist(0.26, -0.76),
@@ -96,9 +97,8 @@ def due(
 
 def with_outputs(snapshot: Snapshot, outputs: Outputs) -> Snapshot:
     status = Status(outputs.mode, outputs.code, outputs.reason, outputs.link, outputs.source)
-    latch = outputs.latches.in_force
-    number = 0 if latch is None else latch.number
-    return replace(snapshot, status=status, latch=number, applied=outputs.applied)
+    causes = outputs.latches.causes
+    return replace(snapshot, status=status, causes=causes, applied=outputs.applied)
 
 
 def at(instant: Instant, **changes: Any) -> Outputs:

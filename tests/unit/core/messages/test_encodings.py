@@ -77,10 +77,10 @@ REPORT = Report(Config(), START)
 list(due(REPORT, OUTPUTS, {"state"}, lambda: SNAPSHOT))
 MESSAGES = [
     *(REPORT.current(key, lambda: SNAPSHOT) for key in ("odom", "tf", "state", "diagnostics")),
-    ServiceReply(True, "done", ReplyData(7, {"rates.odom": Change(1.0, 2.0)})),
+    ServiceReply(True, "done", ReplyData([7], {"rates.odom": Change(1.0, 2.0)})),
     TwistStamped(Header(Time(1, 2), "odom"), TWIST),
     JointState(name=["a"], velocity=[1.0]),
-    Release(7),
+    Release([7]),
     SetPose(1.0, 2.0, 3.0),
     Settings({"rates.odom": 5.0}),
 ]

@@ -64,7 +64,7 @@ def test_every_message_of_the_bus_is_registered_under_its_name() -> None:
     parts = {"Time", "Header", "Vector3", "Quaternion", "Pose", "PoseWithCovariance"}
     parts |= {"TwistWithCovariance", "Transform", "TransformStamped", "SourceState", "KeyValue"}
     parts |= {"DiagnosticStatus", "HardwareInterface", "TopicInfo", "Spread", "Latency", "LogEvent"}
-    parts |= {"BatterySummary", "Change", "ReplyData"}
+    parts |= {"BatterySummary", "Cause", "Change", "ReplyData"}
     assert set(MESSAGES) == {cls.__name__ for cls in STRUCTS} - parts
 
 

@@ -81,11 +81,11 @@ def test_the_ros_state_equals_the_native_state_field_by_field() -> None:
     plain = set(message.__struct_fields__) - {"header", "sources", "counters"}
     assert all(getattr(message, name) == getattr(STATE, name) for name in plain)
     left_out = set(STATE.__struct_fields__) - set(message.__struct_fields__)
-    # A ROS Trigger has no field for the number of a latch, and diagnostics report the latch file.
+    # A ROS Trigger has no field for the numbers of causes, and diagnostics report the latch file.
     # An exported recording does not contain the configuration file, and the robot that a replay
     # makes knows no speed limit, only the setting that it lowers. The battery has its own topic. An
     # export has the version in its metadata.
     assert left_out == {
-        "stamp", "latencies", "encoder_counts", "latch", "latch_file_error", "settings_differ",
+        "stamp", "latencies", "encoder_counts", "causes", "latch_file_error", "settings_differ",
         "speed_limit", "battery", "certificate_days", "certificate", "version",
     }  # fmt: skip
