@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from tests.simulate.beats import Beats
 from tests.simulate.board_inputs import Inputs, kinds
 from tests.simulate.course import Course
 from tests.simulate.damage import Damage
@@ -32,7 +33,16 @@ from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, StepResult
 from tests.simulate.promises import DIALECTS, INPUTS, BrokenError, Witness
 from tests.simulate.reasons import Reasons
 from tests.simulate.reports import Echo, HalfDuplex, Reports, judge_pose, judge_state
-from tests.simulate.roads import FOREIGN, NS, Message, messages, parameters, read_reply, sample
+from tests.simulate.roads import (
+    ECHOING,
+    NS,
+    Message,
+    Sample,
+    messages,
+    parameters,
+    read_reply,
+    sample,
+)
 from tests.simulate.spread import Spread
 
 REPLAYED = 10
@@ -147,6 +157,7 @@ class Run:
         """The last step sent a whole line."""
         self.epilogue = False
         self.moved_ns = -1
+        self.beats = Beats()
         self.product = Product(plan["config"], self._see)
         self.product.fed = self._fed
         self.product.drops = self._dropped
@@ -210,6 +221,7 @@ class Run:
         self.lasting = [(name, tuple(values)) for name, *values in plan["board"]]
         self.active = list(self.lasting)
         self._board()
+        self._beat()
         for sender in plan["senders"]:
             self.counts[f"way {sender['way']}"] += 1
             for shape in sender["congestion"]:
@@ -228,9 +240,6 @@ class Run:
             queue.reverse()
             if queue:
                 self._next(sender, queue)
-            if sender["name"] in self.liveness.lawful and sender["way"] in FOREIGN:
-                for _, at, *_ in sender["clock"]:
-                    self.at(int(at * NS), lambda: self.liveness.event(TROUBLE_NS))
         several = (name for name, count in clocks.items() if count > 1)
         self.witness.shared_clocks = frozenset(several)
         for event in plan["events"]:
@@ -256,7 +265,9 @@ class Run:
             return
         waited_ns = self._bus_ns if self._bus_ns <= self.true_ns else 0
         at_ns = self._arrival(max(message.arrives_ns, waited_ns))
-        command = sample(sender, message, self.plan["config"], self.product.wall_ns)
+        command = self.sampled(sender, message)
+        if command is None:
+            return
         true_ns = at_ns - START_NS + self.slept_ns
         wish = self.witness.command(sender, message, command, true_ns)
         self.followed.command(sender, message, command, at_ns, wish)
@@ -264,9 +275,25 @@ class Run:
         self.reasons.command(sender, message, command)
         shared = command.clock in self.witness.shared_clocks
         self.reports.command(sender, message, command, at_ns, shared)
+        boot_ns = true_ns + START_NS
         self.product.deliver(
-            at_ns, command.key, command.payload, boot_ns=true_ns, **command.options
+            at_ns, command.key, command.payload, boot_ns=boot_ns, **command.options
         )
+
+    def sampled(self, sender: dict[str, Any], message: Message) -> Sample | None:
+        """Return a message as it arrives, None if its sender still waits for its first beat."""
+        beat = None
+        if sender["way"] in ECHOING:
+            beat = self.beats.newest(sender, message.sent_ns)
+            if beat is None:
+                return None
+        config, wall_ns = self.plan["config"], self.product.wall_ns
+        return sample(sender, message, config, wall_ns, beat, START_NS)
+
+    def _beat(self) -> None:
+        """Note that a daemon starts, and give it the number of its run."""
+        self.beats.begin(self.true_ns)
+        self.product.begin_run(self.beats.run)
 
     def _dropped(self, key: str) -> None:
         """Note that the inbox dropped its oldest message of this key unread."""
@@ -574,6 +601,7 @@ class Run:
         product.reset(2 * NS)
         self.pose.doubt()
         self._troubled("suspend")
+        self.beats.sleep(true_ns, true_ns + lasts_ns)
         self.slept_ns += lasts_ns
         self.resumed_ns = product.now_ns
         product.step_wall(lasts_ns / NS)
@@ -591,6 +619,7 @@ class Run:
         if event["way"] == "term":
             witness.ending_ns = self.true_ns
         product.end(event["way"])
+        self.beats.end(self.true_ns)
         self._raise()
         self.inputs.lost()
         if self._whole:
@@ -615,6 +644,7 @@ class Run:
                 product.disk.damage(event["damage"])
                 witness.file_is_damaged(self.true_ns)
             product.start()
+            self._beat()
             self.liveness.event()
             self._linked = False
             witness.new_life(self.true_ns)
@@ -740,9 +770,7 @@ class Run:
         for name in self._troubling:
             witness.troubles[name] = true_ns
         if snapshot.followed_ns is not None:
-            clock = self.reports.follows(true_ns, snapshot.followed_ns)
-            if clock:
-                witness.ages.clocks[clock].followed = True
+            self.reports.follows(true_ns, snapshot.followed_ns)
         witness.away = self.inputs.limiting
         if self.inputs.limiting:
             # Any command may disarm all senders, and the robot follows only a part of it.

@@ -1,39 +1,34 @@
-"""Judges the age of commands by the true clock, and records the zeros of each sender.
+"""Judges the age of commands, and records the zeros of each sender.
 
-The robot cannot know the true age of a command, because it compares two clocks. This module allows
-the ages that `deploy/clients/README.md` allows, and no more. A command with an echo is fresh if its
-true age exceeds the timeout by at most 50 ms. With a stamp it is fresh if its true age exceeds the
-lowest delay that the robot has seen by at most the timeout, and by 0.5 ms more for each second. For
-a new clock the robot knows no lowest delay, so it accepts any that has not fallen for a timeout.
+A command with an echo is judged by its true age, which the robot never takes for less than it is. A
+stamp without an echo shows only how much later a command is than the fastest one of the same clock.
+This module follows the law of `deploy/clients/README.md` by the stamps that the plan's senders have
+made, and is never stricter than that law.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Any
 
-from tests.simulate.roads import FOREIGN, NS, STEADY, Message, Sample
+from tests.simulate.roads import NS, Message, Sample
 
 MARGIN_NS = 30_000_000
 """Allowed beside a time limit, for a line's way. Where periods matter, a limit allows them too."""
 
-EARLY_NS = 60_000_000
-"""A delay that falls by more than this is a backlog that pours in."""
+ECHO_NS = 100_000_000
+"""A command with an echo is older than its timeout by at most this."""
 
-BURST_NS = 1_000_000
-"""Messages within this time count as one, with the lowest of their delays."""
+LOWER_NS, SURELY_LOWER_NS = 40_000_000, 60_000_000
+"""A delay that is lower than the least by 50 ms is doubtful; these are less and more."""
 
-PAUSE_NS = 2_000_000_000
-"""A longer silence is a pause of the sender, if it is also longer than the timeout."""
+RISES = 0.0005
+"""Share of the time by which the least delay may rise, for a clock that drifts."""
 
-STAYS_NS = 4_000_000_000
-"""Time after which the daemon surely knows lower delays of a foreign clock."""
+HOUR_NS = 3600 * NS
+"""The least delay may rise by one timeout in this time. A clock that was silent for it is new."""
 
-SILENT_NS = 101 * NS // 10
-"""After a silence of this length a sender is certainly not armed."""
-
-REMEMBERED = 15
-"""Number of new names after which a sender that paused is new: a source remembers 16 clocks."""
+REMEMBERED = 16
+"""Clocks of one source that the robot remembers."""
 
 
 class Wish:
@@ -57,43 +52,54 @@ class Sender:
         """Zeros that no speed of a shared identity of the source has followed: when the pause of
         each begins, at the earliest, and its arrival."""
         self.armed_ns = -1
-        self.last_ns = 0
+        self.heard_ns = -1
         """Arrival of its last command."""
 
 
 class Clock:
-    """The true delays of one sender's messages, as far as the robot can have learned them."""
+    """The delays of one clock's stamps on one source: arrival minus stamp."""
 
-    def __init__(self) -> None:
-        self.least_ns: int | None = None
-        self.lower: tuple[int, int] | None = None
-        """Since when all delays of a foreign clock are lower than that, and the lowest of them."""
-        self.recent: deque[tuple[int, int]] = deque()
-        self.constant = False
-        """Its delays once looked constant for the time of a proof, so the daemon may know them."""
-        self.followed = False
-        """The robot has followed one of its commands, so the daemon knows its delays."""
-        self.names = 0
-        """Number of clocks that the robot had met at its last command."""
-        self.loose = False
-        """It was adjusted, or its sender stamps falsely. The pages promise nothing about the age of
-        its commands."""
+    def __init__(self, at_ns: int, delay_ns: int, others: int) -> None:
+        self.last_ns = at_ns
+        self.others = others
+        """Number of clocks of the source that came before its last command."""
+        self.counted = False
+        """Its least delay has once not fallen for a whole timeout."""
+        self._fell_ns = at_ns
+        self.least: tuple[int, int] | None = at_ns, delay_ns
+        """The least delay, behind the time at which it was measured."""
+        self._lower: list[tuple[int, int]] = []
+        """Times and delays of all commands since the first one below the least, if all are."""
 
-    def learn(self, age: int, arrived_ns: int, foreign: bool) -> None:
-        """Record a true delay.
-
-        The stamps of a foreign clock look fresher if that clock was set. So the daemon believes
-        lower delays of a clock that it knows only after they have stayed low.
-        """
-        least, lower = self.least_ns, self.lower
-        known = foreign and (self.followed or self.constant)
-        if least is None or not known or age >= least - EARLY_NS:
-            self.least_ns, self.lower = age if least is None else min(least, age), None
-            return
-        since_ns, lowest = lower or (arrived_ns, age)
-        self.lower = since_ns, min(lowest, age)
-        if arrived_ns - since_ns > STAYS_NS:
-            self.least_ns, self.lower = self.lower[1], None
+    def take(self, at_ns: int, delay_ns: int, timeout_ns: int) -> bool:
+        """Return whether a command with this delay may count."""
+        self.last_ns = at_ns
+        if self.least is None:  # the robot slept
+            self.least = at_ns, delay_ns
+            return True
+        since_ns, least_ns = self.least
+        if not self.counted:
+            if delay_ns < least_ns - SURELY_LOWER_NS:
+                self._fell_ns = at_ns
+            if delay_ns < least_ns:
+                self.least = at_ns, delay_ns
+            self.counted = at_ns - self._fell_ns > timeout_ns - MARGIN_NS
+            return self.counted and delay_ns <= min(least_ns, delay_ns) + timeout_ns + MARGIN_NS
+        passed_ns = at_ns - since_ns
+        rises_ns = min(passed_ns * RISES, timeout_ns * (1 + passed_ns // HOUR_NS))
+        if delay_ns >= least_ns - LOWER_NS:
+            self._lower.clear()
+            if delay_ns < least_ns + rises_ns:
+                self.least = at_ns, delay_ns
+            return bool(delay_ns <= least_ns + rises_ns + timeout_ns + MARGIN_NS)
+        self._lower.append((at_ns, delay_ns))
+        confirms_ns = at_ns - self._lower[0][0]
+        if confirms_ns > 2 * timeout_ns + NS // 5:
+            # Now the robot surely knows the lower delays of the time before the last timeout.
+            known = [delay for then, delay in self._lower if at_ns - then > timeout_ns]
+            self.least = at_ns, min(known)
+            self._lower.clear()
+        return confirms_ns > timeout_ns - MARGIN_NS or delay_ns >= least_ns - SURELY_LOWER_NS
 
 
 class Ages:
@@ -101,13 +107,15 @@ class Ages:
 
     def __init__(self, born_ns: int) -> None:
         self.learned_ns = born_ns
-        self.clocks: dict[str, Clock] = {}
+        self._clocks: dict[tuple[str, str], Clock] = {}
+        self._number: dict[str, int] = {}
+        """Number of clocks of each source so far."""
 
     def forget_least(self, at_ns: int) -> None:
-        """Note that the robot slept until now, so it no longer knows any lowest delay."""
+        """Note that the robot slept until now, so it no longer knows any least delay."""
         self.learned_ns = at_ns
-        for clock in self.clocks.values():
-            clock.least_ns, clock.constant = None, False
+        for clock in self._clocks.values():
+            clock.least = None
 
     def fresh(
         self,
@@ -116,60 +124,21 @@ class Ages:
         sample: Sample,
         arrived_ns: int,
         timeout_ns: int,
-        loose: bool,
     ) -> bool:
-        """Return whether the documentation allows the robot to obey a command of this true age."""
+        """Return whether the documentation allows the robot to obey this command."""
+        if sample.beat is not None:
+            return arrived_ns - message.sent_ns <= timeout_ns + ECHO_NS
         if not sample.clock:
             return True
-        age = arrived_ns - message.sent_ns
-        clock = self.clocks.setdefault(sample.clock, Clock())
-        if sender["way"] in STEADY:
-            return age <= timeout_ns + EARLY_NS + MARGIN_NS
-        clock.loose |= loose
-        if len(self.clocks) - clock.names > REMEMBERED:
-            clock.least_ns, clock.recent, clock.constant = None, deque(), False
-        clock.names = len(self.clocks)
-        foreign = sender["way"] in FOREIGN
-        pause_ns = max(PAUSE_NS, timeout_ns) - NS // 10
-        if (foreign and sender["clock"]) or sender.get("bad_stamps"):
-            clock.loose = True
-        recent = clock.recent
-        least = clock.least_ns
-        clock.learn(age, arrived_ns, foreign)
-        while recent and recent[0][0] < arrived_ns - max(3 * NS, pause_ns):
-            recent.popleft()
-        prompt: int = int(sender["delay"] * NS)
-        allowed = timeout_ns + EARLY_NS + MARGIN_NS
-        if foreign:
-            allowed += min(timeout_ns, (arrived_ns - self.learned_ns) // 2000)
-        if clock.loose or age <= prompt + allowed:
-            fresh = True
-        elif least is None:
-            fresh = False
-        else:
-            falls = self._falls(clock, age, arrived_ns, timeout_ns)
-            # A delay that the daemon knows is no backlog, also if there were longer ones since.
-            fresh = age <= least + allowed and (not falls or (clock.constant and age >= least))
-            clock.constant |= not falls
-        if recent and arrived_ns - recent[-1][0] < BURST_NS:
-            at_ns, before = recent.pop()
-            recent.append((at_ns, min(before, age)))
-        else:
-            recent.append((arrived_ns, age))
-        return fresh
-
-    def _falls(self, clock: Clock, age: int, now_ns: int, proof_ns: int) -> bool:
-        """Return whether the delays fall, so that the daemon cannot take them for constant.
-
-        The delays must have been constant for the proof time. If the robot has followed this clock,
-        they are compared with those of the 3 s before. One late message before a prompt one then
-        does not look like a backlog.
-        """
-        recent = clock.recent
-        window = [(at, d) for at, d in recent if at >= now_ns - proof_ns - MARGIN_NS]
-        if not window or window[0][0] > now_ns - proof_ns + MARGIN_NS:
-            return recent[0][0] > now_ns - proof_ns if recent else True
-        middle = now_ns - proof_ns // 2
-        first = [d for at, d in (recent if clock.followed else window) if at < middle]
-        second = [d for at, d in window if at >= middle] + [age]
-        return bool(first) and min(first) - min(second) > EARLY_NS
+        key, delay_ns = (sender["source"], sample.clock), arrived_ns - message.stamp_ns
+        clock, others = self._clocks.get(key), self._number.get(sender["source"], 0)
+        if clock is not None:
+            silent = arrived_ns - clock.last_ns > HOUR_NS - NS
+            if silent or others - clock.others > REMEMBERED:
+                clock = None
+        if clock is None:
+            self._number[sender["source"]] = others + 1
+            self._clocks[key] = Clock(arrived_ns, delay_ns, others + 1)
+            return timeout_ns < MARGIN_NS
+        clock.others = others
+        return clock.take(arrived_ns, delay_ns, timeout_ns)

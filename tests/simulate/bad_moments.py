@@ -11,6 +11,7 @@ import random
 from collections.abc import Callable
 from typing import Any
 
+from tests.simulate import moments_of_age
 from tests.simulate.board_inputs import NEVER_S
 from tests.simulate.promises import INPUTS
 
@@ -69,6 +70,12 @@ def _driver(plan: Plan, source: dict[str, Any], **more: Any) -> dict[str, Any]:
     return first | usual | more
 
 
+def _need_zeros(plan: Plan) -> None:
+    """Let only zeros arm the senders, and no pauses."""
+    for source in plan["config"]["commands"]["sources"]:
+        source.pop("neutral_first", None)
+
+
 def _speed(dice: random.Random) -> list[float]:
     """Return a random linear speed in m/s and an angular one in rad/s, which is often zero."""
     turn = dice.choice((0.0, round(dice.uniform(-2.0, 2.0), 3)))
@@ -86,6 +93,7 @@ def _late_step(plan: Plan, dice: random.Random) -> None:
     The sender sends speeds, this one zero, and speeds again.
     """
     config, source = plan["config"], _best(plan)
+    _need_zeros(plan)
     safety = config.setdefault("safety", {})
     if "bumpers" not in safety and dice.random() < 0.5:
         safety.update(bumpers=[dice.choice(PLACES) for _ in range(2)], bumper="away")
@@ -367,43 +375,12 @@ def _slow_sender(plan: Plan, dice: random.Random) -> None:
     phases = _drives(plan, dice, 5.0 * every, 5.0 * every, 12.0 * every)
     driver = _alone(plan, dice, phases)
     way = dice.choice(("client", "client", "page", "plain", "signed", "rmw"))
-    driver |= {"way": way, "hz": round(1.0 / every, 4), "seldom": True, "heals": True}
-
-
-def _set_back(plan: Plan, dice: random.Random) -> None:
-    """Set a foreign clock back while the network loses a message or delivers all messages twice."""
-    _best(plan)["timeout"] = dice.choice((0.25, 0.5))
-    driver = _alone(plan, dice, [])
-    phases, clock, holes, at = [[0.0, 0.0, 0.0], [2.5, *_speed(dice)]], [], [], 8.0
-    period = 1.0 / driver["hz"]
-    while at < plan["seconds"] - 4.0:
-        at = round(at, 3)
-        clock.append(
-            ["step", at, -round(1.0 + dice.choice((3.0, 30.0, 3600.0)) * dice.random(), 3)]
-        )
-        match dice.randrange(4):
-            case 0 | 1:
-                holes.append([at, round(at + period * 1.01, 4)])
-            case 2:
-                holes.append([round(at + period, 4), round(at + period * 2.01, 4)])
-        zero = at + 3.0
-        for _ in range(3):
-            phases += [[round(zero, 3), 0.0, 0.0], [round(zero + 1.5, 3), *_speed(dice)]]
-            zero += 6.0
-        at += dice.uniform(20.0, 30.0)
-    driver |= {
-        "way": dice.choice(("signed", "rmw")),
-        "phases": phases,
-        "clock": clock,
-        "holes": holes,
-    }
-    driver["heals"] = True
-    if dice.random() < 0.4:
-        driver |= {"doubled": 0.003, "holes": []}
+    driver |= {"way": way, "hz": round(1.0 / every, 4), "seldom": True}
 
 
 def _routed(plan: Plan, dice: random.Random) -> None:
     """Let two programs without an id send through a router that is not linked to the robot."""
+    _need_zeros(plan)
     _best(plan)["timeout"] = dice.choice((0.25, 0.5, 1.0))
     first = _alone(plan, dice, [])
     ahead = round(dice.uniform(-0.4, 0.3), 3)
@@ -482,6 +459,7 @@ def _stall_behind_a_zero(plan: Plan, dice: random.Random) -> None:
     """
     source = _best(plan)
     pause_s = 1.0
+    _need_zeros(plan)
     source["timeout"] = dice.choice((0.25, 0.5))
     first = _alone(plan, dice, [])
     hz = dice.choice((5.0, 10.0))
@@ -500,47 +478,6 @@ def _stall_behind_a_zero(plan: Plan, dice: random.Random) -> None:
         })  # fmt: skip
         at += dice.uniform(4.0, 6.0)
     first["phases"] = phases
-    plan["senders"] = [first, second]
-
-
-def _doubtful_holder(plan: Plan, dice: random.Random) -> None:
-    """Make the stamps of a sender of zeros doubtful, while another sender wants to move the robot.
-
-    The first sender has the higher priority. Its clock is set, its delay falls, or the daemon
-    stalls.
-    """
-    commands, best = plan["config"]["commands"], _best(plan)
-    best["timeout"] = dice.choice((0.25, 0.5))
-    first = _alone(plan, dice, [[0.0, 0.0, 0.0]])
-    first |= {
-        "way": dice.choice(("client", "signed", "rmw", "zenoh", "header")),
-        "hz": dice.choice((10.0, 20.0)), "delay": 0.001,
-    }  # fmt: skip
-    lower = dice.choice(commands["sources"])
-    second = _driver(plan, lower, way=dice.choice(("client", "plain", "signed")), hz=20.0)
-    second |= {"name": "s1", "id": f"s1/{dice.getrandbits(64):016x}", "from": 3.0}
-    rests_s = 3.5 + 1.0
-    second["phases"] = [[3.0, 0.0, 0.0], [round(rests_s, 3), *_speed(dice)]]
-    at = rests_s + 3.0
-    while at < plan["seconds"] - 6.0:
-        at = round(at, 3)
-        match "fall" if first["way"] == "client" else dice.choice(("set", "set", "fall")):
-            case "set":
-                by_s = -dice.choice((0.3, 0.6, 3.0, 60.0)) * dice.uniform(0.9, 1.5)
-                first["clock"] = [*first["clock"], ["step", at, round(by_s, 3)]]
-            case _:
-                # A client that begins with this delay does not know the shorter one.
-                later = round(dice.uniform(0.06, 0.2), 3)
-                first["congestion"] = [
-                    *first["congestion"],
-                    [at, round(at + 4.0, 3), "jump", later],
-                ]
-        if dice.random() < 0.3:
-            lasts = round(dice.uniform(0.16, 0.6), 3)
-            plan["events"].append(
-                {"at": round(at + 6.0, 3), "do": "stall", "for": lasts, "deaf": 0.002}
-            )
-        at += dice.uniform(12.0, 18.0)
     plan["senders"] = [first, second]
 
 
@@ -619,6 +556,20 @@ def _wheel_limit(plan: Plan, dice: random.Random) -> None:
             at += dice.uniform(2.0, 6.0)
 
 
+def _driven(
+    give: Callable[[Plan, random.Random, dict[str, Any]], None],
+) -> Callable[[Plan, random.Random], None]:
+    """Return what gives a plan one sender that rests and drives, and lets `give` change both."""
+
+    def alone(plan: Plan, dice: random.Random) -> None:
+        _need_zeros(plan)
+        driver = _alone(plan, dice, [])
+        driver["phases"] = _drives(plan, dice, 0.3, 1.0, 5.0)
+        give(plan, dice, driver)
+
+    return alone
+
+
 MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.Random], None]]] = {
     "late step": (0.05, _any, _late_step),
     "half duplex": (0.12, _is_plain, _half_duplex),
@@ -627,17 +578,18 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "stop beside a press": (0.02, _without_check, _named_stop),
     "other board": (0.02, _without_check, _other_board),
     "slow sender": (0.03, _any, _slow_sender),
-    "clock set back": (0.02, _any, _set_back),
     "behind a router": (0.02, _any, _routed),
     "backlogs of newcomers": (0.02, _any, _newcomers),
     "later and later": (0.02, _any, _later_and_later),
     "restart in a fault": (0.06, _without_check, _restart_in_fault),
     "behind a press": (0.04, _without_check, _behind_a_press),
     "stall behind a zero": (0.03, _any, _stall_behind_a_zero),
-    "doubtful holder": (0.03, _any, _doubtful_holder),
     "coarse encoders": (0.05, _may_be_ideal, _coarse),
     "late lines": (0.05, _may_be_ideal, _late_lines),
     "wheel limit": (0.04, _any, _wheel_limit),
+    "queue from the start": (0.03, _any, _driven(moments_of_age.queued)),
+    "plateau behind a pause": (0.03, _any, _driven(moments_of_age.plateau)),
+    "long silence": (0.03, _any, _driven(moments_of_age.silence)),
 }
 """The share of the plans that have each moment, of those that can have it, whether a plan can have
 it, and what makes it."""

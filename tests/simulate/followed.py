@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from tests.simulate.ages import MARGIN_NS, Wish
 from tests.simulate.product import HELD
 from tests.simulate.promises import BrokenError, Witness
-from tests.simulate.roads import FOREIGN, NS, Message, Sample, stable
+from tests.simulate.roads import NS, Message, Sample, stable
 
 STOOD_NS = NS // 2
 """After a step that stalled for this time, the next one may release and stop the robot again, and
@@ -41,9 +41,6 @@ FALL_NS = 5_000_000
 
 UNBROKEN_NS = NS
 """A longer silence begins a new run of even delays."""
-
-PLACE_NS = 5 * NS // 2
-"""A sender that goes on keeps the robot for this time, also while its stamps are in doubt."""
 
 NUMBERED = ("client", "page", "signed", "rmw")
 """Ways whose messages have numbers."""
@@ -97,9 +94,6 @@ class Followed:
         """The lowest delay of each clock, and when the daemon last forgot all delays."""
         self._fell_ns: dict[str, int] = {}
         """When the lowest delay of each clock last fell clearly."""
-        self._late_ns: dict[str, int] = {}
-        """When a command of each adjusted clock last came later than its timeout allows. The daemon
-        may have learned that delay, and a shorter one then looks like a clock that was set."""
         self._newest: dict[str, int] = {}
         """The highest number that arrived, by clock."""
         self._waiting: dict[Who, Command] = {}
@@ -114,10 +108,6 @@ class Followed:
         """The last command that was followed of the sender that keeps the robot."""
         self._higher: list[Wish] = []
         """Commands since the last step of sources of higher priority than that sender."""
-        self._going_ns = 0
-        """Arrival of the last command of that sender, followed or not. It was never silent."""
-        self._goes_ns = 0
-        """The same for the commands since the last step, of which a full buffer may drop some."""
         self._rests_ns: dict[Who, int] = {}
         """Arrival of the newest zero of each sender, by the robot's clock."""
         self._stamps_ns: dict[Who, list[int]] = {}
@@ -160,9 +150,7 @@ class Followed:
             insort(self._stamps_ns.setdefault(key, []), message.stamp_ns)
         if self._keeper is not None:
             priority = self._witness.priority
-            if self._keeper.who == key:
-                self._go_on(at_ns)
-            elif priority[key[0]] > priority[self._keeper.who[0]]:
+            if priority[key[0]] > priority[self._keeper.who[0]]:
                 self._higher.append(wish)
         self._arrived[at_ns] = None if at_ns in self._arrived else command
         if len(self._arrived) > KEPT:
@@ -188,19 +176,6 @@ class Followed:
             and command.arrived_ns - zero.arrived_ns < timeout_ns - MARGIN_NS
         )
 
-    def _go_on(self, at_ns: int) -> None:
-        """Record another command of the sender that drives the robot.
-
-        If it was silent for longer than its timeout, it has lost the robot.
-        """
-        assert self._keeper is not None
-        timeout_ns = self._witness.timeout[self._keeper.who[0]]
-        went_ns = max(self._going_ns, self._goes_ns)
-        if at_ns - went_ns < timeout_ns - self._witness.period_ns:
-            self._goes_ns = max(self._goes_ns, at_ns)
-        else:
-            self._keeper = None
-
     def _certain(self, command: Command, sample: Sample, wish: Wish) -> bool:
         """Return whether the daemon certainly accepts this command."""
         witness, sender, message = self._witness, command.sender, command.message
@@ -211,17 +186,23 @@ class Followed:
         if not sample.clock:
             # A zero of a shared identity counts only behind its pause.
             since_ns = max(witness.armed_since_ns, witness.disarmed_ns)
-            armed = wish.armed_ns > since_ns
-            return wish.certain and (armed or not sample.shared)
+            armed = wish.armed_ns > since_ns and command.who[0] not in witness.pausing
+            waited = witness.may_have_waited(wish)
+            return wish.certain and not waited and (armed or not sample.shared)
         if sample.clock in witness.shared_clocks or not stable(sender):
             return False
+        if sample.beat is not None:
+            # Its age, which the daemon knows, is the time since the beat.
+            timeout_ns = witness.timeout[command.who[0]]
+            prompt = wish.arrived_ns - sample.beat[1] < timeout_ns - MARGIN_NS
+            known = sample.beat[1] > witness.born_ns
+            return prompt and known and message.number > newest
         age, at_ns = wish.arrived_ns - message.sent_ns, wish.arrived_ns
         learned_ns, least = self._least.get(sample.clock, (0, age))
         if learned_ns != witness.ages.learned_ns:
             least = age
         if age < least - FALL_NS:
-            # A backlog pours in, or the clock was set. The daemon takes the clock for new, and may
-            # no longer count the commands before.
+            # A backlog pours in, or the clock was set: the daemon waits for one timeout.
             self._fell_ns[sample.clock] = wish.arrived_ns
             for commands in (self._waiting, self._sure):
                 for key in [
@@ -241,12 +222,9 @@ class Followed:
             run = self._runs[sample.clock] = Run(at_ns, age)
         run.low, run.high, run.last_ns = min(run.low, age), max(run.high, age), at_ns
         timeout_ns = witness.timeout[command.who[0]]
-        proof_ns = 3 * NS + 2 * min(timeout_ns, 2 * NS)
-        if sender["way"] in FOREIGN and age - least > timeout_ns - FALL_NS:
-            self._late_ns[sample.clock] = at_ns
+        proof_ns = 3 * NS + 2 * timeout_ns
         proven = run.followed or (not sender.get("jitter") and at_ns - run.begun_ns > proof_ns)
-        proven &= at_ns - self._fell_ns.get(sample.clock, -NS) >= NS
-        proven &= at_ns - self._late_ns.get(sample.clock, -proof_ns) >= proof_ns
+        proven &= at_ns - self._fell_ns.get(sample.clock, -proof_ns) >= NS + timeout_ns
         return proven and age <= least + EVEN_NS and message.number > newest
 
     @property
@@ -310,9 +288,8 @@ class Followed:
             self.forget()
         elif self._count <= HELD:
             self._sure.update(self._waiting)
-            self._going_ns = max(self._going_ns, self._goes_ns)
         self._waiting.clear()
-        self._count = self._goes_ns = 0
+        self._count = 0
         if any(wish.fresh for wish in self._higher):
             # If a sender of higher priority gets the robot, also one that must send a zero, the
             # first of the others to come gets the robot behind it. The daemon may refuse this
@@ -369,24 +346,22 @@ class Followed:
         set.
         """
         keeper, witness = self._keeper, self._witness
-        if keeper is None or keeper.who != command.who:
-            if keeper is not None and self._is_kept(keeper, decided_ns):
-                priority = witness.priority
-                if priority[command.who[0]] <= priority[keeper.who[0]]:
-                    raise BrokenError(
-                        "the first of equal priority keeps the robot", true_ns,
-                        f"{command.who} is followed, {keeper.who} goes on, and was followed "
-                        f"{(decided_ns - keeper.arrived_ns) / NS:.3f} s ago",
-                    )  # fmt: skip
-            self._going_ns = command.arrived_ns
-        self._keeper, self._going_ns = command, max(self._going_ns, command.arrived_ns)
+        other = keeper is not None and keeper.who != command.who
+        if keeper is not None and other and self._is_kept(keeper, decided_ns):
+            priority = witness.priority
+            if priority[command.who[0]] <= priority[keeper.who[0]]:
+                raise BrokenError(
+                    "the first of equal priority keeps the robot", true_ns,
+                    f"{command.who} is followed, {keeper.who} goes on, and was followed "
+                    f"{(decided_ns - keeper.arrived_ns) / NS:.3f} s ago",
+                )  # fmt: skip
+        self._keeper = command
 
     def _is_kept(self, keeper: Command, decided_ns: int) -> bool:
         """Return whether the daemon must continue to follow this sender."""
         witness, source = self._witness, keeper.who[0]
         return (
-            decided_ns - self._going_ns < witness.timeout[source] - witness.period_ns
-            and decided_ns - keeper.arrived_ns < max(PLACE_NS, witness.timeout[source] // 2)
+            decided_ns - keeper.arrived_ns < witness.timeout[source] - witness.period_ns
             and keeper.true_ns > witness.disarmed_ns
             and source not in witness.churned
         )

@@ -14,7 +14,7 @@ from tests.simulate.ages import MARGIN_NS, Wish
 from tests.simulate.product import START_NS, WALL_OFFSET_NS
 from tests.simulate.promises import BrokenError
 from tests.simulate.reports import judge_counts
-from tests.simulate.roads import NS, STEADY, Message, Sample
+from tests.simulate.roads import ECHOING, FOREIGN, NS, Message, Sample
 
 if TYPE_CHECKING:
     from tests.simulate.actors import Run
@@ -41,7 +41,7 @@ LONGEST_REASON = 4096
 SETTLES_NS = 3 * NS
 """After the last event a lawful sender drives within this time."""
 
-SILENT_NS = 99 * NS // 10
+SILENT_NS = 10 * NS - MARGIN_NS
 """After a silence of this length a sender may have to send a zero again."""
 
 PROOF_NS = 2 * NS
@@ -58,7 +58,7 @@ PROOF_COUNT = 4
 """Number of commands that a new sender needs for its proof, if it sends so seldom that they take
 longer than `PROOF_NS`."""
 
-UNSHARED = (*STEADY, "plain", "bridge")
+UNSHARED = (*ECHOING, "plain", "bridge")
 """Ways without a foreign clock, whose adjustment would ask its sender for a zero."""
 
 QUIET_FAULTS = {
@@ -96,6 +96,8 @@ class Liveness:
         self._began: dict[str, int] = {}
         """Time of the first command behind each lawful sender's last silence."""
         self._latest: dict[str, tuple[int, str]] = {}
+        self._silent_ns: dict[str, int] = {}
+        """Arrival of each lawful sender's last command before a silence that disarms it."""
         self._pauses = {
             sender["name"]: max(PAUSE_NS, int(1.2 * NS / sender["hz"]))
             for sender in run.plan["senders"]
@@ -104,6 +106,7 @@ class Liveness:
         self._proofs = {
             sender["name"]: max(PROOF_NS, int(PROOF_COUNT * NS / sender["hz"]))
             for sender in run.plan["senders"]
+            if sender["way"] in FOREIGN
         }
         self._followed_ns: dict[str, int] = {}
         """When the robot last followed each of these senders."""
@@ -151,8 +154,8 @@ class Liveness:
             return
         wish = self.run.witness.wishes[-1][1]
         before_ns, _ = self._latest.get(name, (0, ""))
-        if wish.arrived_ns - before_ns > SILENT_NS and name in self._armed:
-            self._interrupted[name] = self._armed.pop(name)
+        if wish.arrived_ns - before_ns > SILENT_NS:
+            self._silent_ns[name] = before_ns
         if wish.arrived_ns - before_ns > self._pauses[name]:
             self._since.pop(name, None)
             self._began[name] = wish.arrived_ns
@@ -160,17 +163,19 @@ class Liveness:
         if not self._is_armed(name) or not (wish.v or wish.w):
             self._since.pop(name, None)
         else:
-            proved_ns = self._began.get(name, 0) + self._proofs[name]
+            proved_ns = self._began.get(name, 0) + self._proofs.get(name, 0)
             self._since.setdefault(name, max(wish.arrived_ns, proved_ns))
         self._latest[name] = wish.arrived_ns, sample.identity
 
     def _is_armed(self, name: str) -> bool:
-        return self._armed.get(name, -1) > self._disarmed_ns + self._tick_ns
+        zero_ns = self._armed.get(name, -1)
+        disarmed_ns = self._disarmed_ns + self._tick_ns
+        return zero_ns > max(disarmed_ns, self._silent_ns.get(name, -1))
 
     def _take_zero(self, name: str, wish: Wish) -> None:
         """Record the zero that arms this sender, unless a stall may have hidden it."""
         zero_ns, (begun_ns, ended_ns) = wish.armed_ns, self._stall
-        if self._is_armed(name):
+        if self._is_armed(name) or zero_ns <= self._silent_ns.get(name, -1):
             return
         settled_ns = zero_ns + (self.run.witness.pause_ns if wish.shared else 0)
         if zero_ns <= ended_ns and settled_ns >= begun_ns - self._tick_ns:
@@ -184,16 +189,22 @@ class Liveness:
         priority = run.witness.priority
         rivals = [s for s in run.plan["senders"] if s["name"] != sender["name"]]
         return (
-            (sender["way"] in ("client", "page", "plain", "bridge") or sender.get("heals", False))
+            (sender["way"] in UNSHARED or "seldom" in sender)
             and not any(sender[bad] for bad in ("junk", "churn", "loss", "twice", "swap"))
             and not sender["congestion"]
             and not sender.get("bad_stamps")
             and sender["jitter"] < 0.01
             and (sender["hz"] >= 10.0 or "seldom" in sender)
             and sender["hz"] * run.witness.timeout[sender["source"]] / NS > 2.0
+            and not (sender["way"] in ECHOING and self._round_trip_s(sender) < 2 * sender["delay"])
             and not any(rival["junk"] or rival["churn"] for rival in rivals)
             and all(priority[r["source"]] < priority[sender["source"]] for r in rivals)
         )
+
+    def _round_trip_s(self, sender: dict[str, Any]) -> float:
+        """Return the longest way of a beat and back with which the echo is surely young enough."""
+        timeout_ns: int = self.run.witness.timeout[sender["source"]]
+        return (timeout_ns - MARGIN_NS) / NS
 
     def judge(self, now_ns: int) -> None:
         """Check that the robot drives if a lawful sender has sent speeds for long enough."""
@@ -233,8 +244,9 @@ class Liveness:
         if not QUIET_FAULTS.issuperset(name for name, _ in run.active[len(run.lasting) :]):
             return
         followed_ns = self._followed_ns.get(source, -1)
-        silent = now_ns - followed_ns > SILENT_NS
-        if not silent and followed_ns > max(self._disarmed_ns, self._stall[1]) + self._tick_ns:
+        if now_ns - followed_ns > SILENT_NS - witness.timeout.get(source, 0):
+            return
+        if followed_ns > max(self._disarmed_ns, self._stall[1]) + self._tick_ns:
             text = f"{source} was followed at {followed_ns / NS:.3f} s; {witness.reason}"
             raise BrokenError("an armed sender stays armed", now_ns, text)
 

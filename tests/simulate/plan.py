@@ -323,7 +323,7 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
             mcu["reply_period"] = 0.1
             extras["board"] = [["free_running", 0.1]]
     commands = config["commands"]
-    dice.random()
+    pauses = dice.random() >= 0.85
     names = [*SOURCES, "twin"]
     commands["sources"] = [
         {
@@ -333,6 +333,9 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
         }
         for name in names
     ]
+    if pauses:
+        for source in commands["sources"]:
+            source["neutral_first"] = "pause"
     if dice.random() < 0.3:
         config["odometry"] = {"gyro": True}
 

@@ -41,9 +41,9 @@ FAULT_MINUTES, CASE_MINUTES = 10.0, 30.0
 """Core-minutes within which a fault and a case must be found."""
 
 MEASURED_WITH = (
-    "plan", "roads", "actors", "ages", "bad_moments", "board_inputs", "course", "damage",
-    "followed", "gyro_faults", "jerk", "liveness", "log_lines", "plugging", "pose", "product",
-    "promises", "reasons", "reports", "spread",
+    "plan", "roads", "actors", "ages", "bad_moments", "beats", "board_inputs", "course", "damage",
+    "followed", "gyro_faults", "jerk", "liveness", "log_lines", "moments_of_age",
+    "plugging", "pose", "product", "promises", "reasons", "reports", "spread",
 )  # fmt: skip
 """Modules of the simulator that make the plans, play them and judge them."""
 

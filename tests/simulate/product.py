@@ -335,6 +335,10 @@ class Product:
 
     # the bus
 
+    def begin_run(self, number: int) -> None:
+        """Give the daemon that has started this number, which its beats have."""
+        self._world.loop.publication.intake._receiver._run = number
+
     def deliver(
         self,
         at_ns: int,
@@ -349,7 +353,10 @@ class Product:
         attachment: bytes = b"",
         boot_ns: int = 0,
     ) -> None:
-        """Deliver a sample to the daemon's inbox. It arrived at `at_ns`, now or earlier."""
+        """Deliver a sample to the daemon's inbox. It arrived at `at_ns`, now or earlier.
+
+        `boot_ns` is the same time by the clock of the beats.
+        """
         world = self._world
         arrivals = world.bus.arrivals
         received = None if session else self.wall_ns

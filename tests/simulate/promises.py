@@ -17,7 +17,7 @@ from collections import Counter, deque
 from typing import Any, get_args
 
 from acsard.core.codes import GUARD_CODES, FaultCode, LinkCode, StopCode, WaitCode
-from tests.simulate.ages import MARGIN_NS, SILENT_NS, Ages, Sender, Wish
+from tests.simulate.ages import MARGIN_NS, Ages, Sender, Wish
 from tests.simulate.jerk import STEP, Slope
 from tests.simulate.roads import NS, Message, Sample
 
@@ -57,6 +57,15 @@ LATE_NS = 150_000_000
 
 RAMPS_NS = NS // 2
 """A ramp of an orderly end that takes at most this time is not cut short."""
+
+SILENT_NS = 10 * NS + MARGIN_NS
+"""A sender without an accepted command for this time must send a zero again."""
+
+WAITED_NS = NS // 10 - MARGIN_NS
+"""Behind a stall, speeds without a stamp are refused for this time: they may have waited in it."""
+
+PAUSE_NS = NS - MARGIN_NS
+"""A silence of this length may arm a sender of a source whose senders pauses arm."""
 
 LOOK_NS = 2 * NS
 """A call without numbers is refused for this time, in which its sender may not know the cause."""
@@ -123,6 +132,10 @@ class Witness:
         self.file = dict(config["limits"])
         self.limits = dict(config["limits"])
         commands = config["commands"]
+        self.pausing = {
+            s["name"] for s in commands["sources"] if s.get("neutral_first", "zero") == "pause"
+        }
+        """Sources whose senders a silence of one second arms."""
         self.priority = {s["name"]: s["priority"] for s in commands["sources"]}
         self.file_timeout = {s["name"]: int(s["timeout"] * NS) for s in commands["sources"]}
         self.file_pause_ns = NS
@@ -262,8 +275,7 @@ class Witness:
         zero = v == w == 0.0 and message.junk == ""
         wish = Wish(arrived_ns, v, w)
         wish.identity, wish.shared = sample.identity, sample.shared
-        loose = sample.clock in self.shared_clocks
-        arguments = sender, message, sample, arrived_ns, self.timeout[source], loose
+        arguments = sender, message, sample, arrived_ns, self.timeout[source]
         self._unread[-1] = sample.key, wish, arguments
         wish.certain = (
             not sample.clock and message.junk == "" and sender["way"] in ("plain", "bridge")
@@ -273,11 +285,18 @@ class Witness:
             known = self.senders[source, sample.identity] = Sender()
             if sample.shared:
                 self._sharing.setdefault(source, []).append(known)
-        if arrived_ns - known.last_ns > SILENT_NS:
+        if arrived_ns - known.heard_ns > SILENT_NS:
             known.armed_ns = -1
             known.zeros.clear()
-        known.last_ns = arrived_ns
-        if zero and not sample.shared:
+        if source in self.pausing:
+            calm_ns = max(known.heard_ns, self.armed_since_ns, self._stalled[1])
+            if arrived_ns - calm_ns > PAUSE_NS:
+                known.armed_ns = arrived_ns
+        known.heard_ns = arrived_ns
+        late = sample.beat is not None and not self.ages.fresh(*arguments)
+        if zero and late:
+            pass  # it ends the speed of its sender, but arms nothing
+        elif zero and not sample.shared:
             known.armed_ns = arrived_ns
         elif zero:
             begun_ns, ended_ns = self._stalled
@@ -310,8 +329,15 @@ class Witness:
     def _judge_ages(self) -> None:
         for place, (key, wish, arguments) in enumerate(self._unread):
             if wish is not None:
-                wish.fresh = self.ages.fresh(*arguments)
+                wish.fresh = self.ages.fresh(*arguments) and not self.may_have_waited(wish)
                 self._unread[place] = key, None, ()
+
+    def may_have_waited(self, wish: Wish) -> bool:
+        """Return whether a speed without a stamp arrived in a stall of the daemon or behind it."""
+        begun_ns, ended_ns = self._stalled
+        stalled = ended_ns - begun_ns > LATE_NS + MARGIN_NS + self.period_ns
+        behind = begun_ns < wish.arrived_ns < ended_ns + WAITED_NS
+        return wish.certain and bool(wish.v or wish.w) and stalled and behind
 
     def _cancel_zeros(self, source: str, now_ns: int, sender: Sender) -> None:
         """Cancel the zeros of the source's shared identities, because one has sent a speed.
@@ -370,6 +396,7 @@ class Witness:
     def activated(self, asked_ns: int, read_ns: int | None, name: str) -> None:
         """Note that the daemon has executed an `activate`."""
         self.perhaps_latched.discard("activate")
+        self.ages = Ages(asked_ns)
         if self.offs:
             self.arming(asked_ns)
         self._release(self.offs, "an activate undoes no later one", asked_ns, read_ns, name)
@@ -836,7 +863,7 @@ class Witness:
         lowest, armed_ns = 0, max(self.armed_since_ns, self.disarmed_ns)
         since_ns = max(armed_ns, *self.pending.values(), 0)
         for source, wish in self.wishes:
-            if wish.shared and wish.armed_ns <= armed_ns:
+            if wish.shared and (wish.armed_ns <= armed_ns or source in self.pausing):
                 continue  # a zero of a shared identity counts only behind its pause
             age = at_ns - wish.arrived_ns
             live = 2 * MARGIN_NS < age < self.timeout[source] - self.period_ns - MARGIN_NS

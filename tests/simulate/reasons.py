@@ -16,14 +16,15 @@ from tests.simulate.roads import FOREIGN, NS, Message, Sample
 if TYPE_CHECKING:
     from tests.simulate.actors import Run
 
+LATE = (
+    "no_echo", "other_run", "from_future", "too_old", "round_trip", "not_newer", "early", "stale",
+    "set_back", "stamps",
+)  # fmt: skip
+
 KINDS = {
-    "nothing": "",
-    "no_command": "command",
-    "higher": "priority",
-    "equal": "priority",
+    "nothing": "", "no_command": "command", "higher": "priority", "equal": "priority",
     "unproven": "proof",
-    "early": "proof",
-} | dict.fromkeys(("stale", "set_back", "stamps", "too_old", "round_trip", "not_newer"), "late")
+} | dict.fromkeys(LATE, "late")  # fmt: skip
 """The codes whose kind of cause has another name."""
 
 BUMPERS = ("bumper_away", "bumper_blocks")
@@ -93,6 +94,9 @@ class _LastMessage:
         does not know stamps like a session, so the robot may let such a zero wait for its pause."""
         self.stamped = False
         """A program of this identity has stamped its commands: its zeros may have been late."""
+        self.echoes = False
+        self.old_ns = -NS
+        """Arrival of the last command whose echo was too old, or of another run."""
 
 
 def named_source(state: dict[str, Any]) -> str:
@@ -147,6 +151,12 @@ class Reasons:
         record.shared = sample.shared
         record.stamped |= bool(sample.clock)
         record.foreign, record.own = sender["way"] in FOREIGN, sender["way"] != "zenoh"
+        record.echoes = sample.beat is not None
+        if sample.beat is not None:
+            timeout_ns, (_, beat_ns) = self.run.witness.timeout[source], sample.beat
+            old = at_ns - beat_ns > timeout_ns - MARGIN_NS
+            if old or beat_ns <= self.run.witness.born_ns:
+                record.old_ns = at_ns
         if wish.v or wish.w:
             record.speed_ns = at_ns
         if not sample.clock:
@@ -238,7 +248,12 @@ class Reasons:
         timeout_ns = witness.timeout[source]
         for sender in self._fresh_senders(source, now_ns):
             clock, certain = sender.clock, not (sender.shared and source in self._junk)
-            if clock is None:
+            if sender.echoes:
+                certain &= sender.armed_ns > sender.old_ns
+                odd = clock is not None and clock.odd
+                if odd or now_ns - sender.old_ns < 2 * timeout_ns + MARGIN_NS:
+                    causes.add("late")
+            elif clock is None:
                 certain &= not sender.stamped
             else:
                 certain &= clock.is_proved(sender.armed_ns, timeout_ns)
@@ -250,7 +265,7 @@ class Reasons:
                     causes.add("proof")
             since_ns = max(self._calm_ns, self._dropped_ns.get(source, -1) if sender.shared else -1)
             armed = sender.armed_ns > since_ns and certain
-            if not (armed and sender.own):
+            if not (armed and sender.own) or source in witness.pausing:
                 causes.add("neutral")
         if now_ns - self._stalled_ns < timeout_ns + MARGIN_NS and any(
             sender.arrived_ns <= self._stalled_ns for sender in self._heard.get(source, {}).values()

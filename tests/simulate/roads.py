@@ -16,7 +16,9 @@ from typing import Any, NamedTuple
 import msgspec
 
 NS = 1_000_000_000
-STEADY = ("client", "page")
+ECHOING = ("client", "page")
+"""Ways of the programs that copy the newest beat into each command."""
+
 FOREIGN = ("signed", "rmw", "header", "zenoh", "routed", "bridged")
 AHEAD_NS = NS // 2
 """Zenoh replaces a timestamp that is further ahead of the receiver's clock."""
@@ -56,6 +58,8 @@ class Sample(NamedTuple):
     shared: bool
     clock: str
     """The clock that stamped it, "" without a stamp."""
+    beat: tuple[int, int] | None = None
+    """The run and the true time of the beat that it echoes, ns."""
 
 
 def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) -> list[Message]:
@@ -83,12 +87,10 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
         if wish[0] is not None and not repeats:
             number += 1
             late = (
-                sender["delay"]
-                + _jitter(sender["jitter"], chance[0])
-                + _congestion_delay(sender, t)
+                sender["delay"] + _jitter(sender["jitter"], chance[0]) + congestion_delay(sender, t)
             )
             arrives_ns = int((t + late) * NS)
-            lost = chance[1] < sender["loss"] or _is_in_hole(sender, t)
+            lost = chance[1] < sender["loss"]
             junk = kinds[int(chance[2] * 1e6) % len(kinds)] if chance[3] < sender["junk"] else ""
             if not lost:
                 arrives_ns = last_ns = max(last_ns + 1000, arrives_ns)
@@ -104,9 +106,6 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
                 arrivals.append(message)
                 if chance[5] < sender["twice"]:
                     again_ns = arrives_ns + int(chance[0] * 0.4 * NS)
-                    arrivals.append(message._replace(arrives_ns=again_ns))
-                if "doubled" in sender:
-                    again_ns = arrives_ns + int(sender["doubled"] * NS)
                     arrivals.append(message._replace(arrives_ns=again_ns))
             ended = place
         hz = _hz(sender, t)
@@ -132,16 +131,11 @@ def _hz(sender: dict[str, Any], t: float) -> float:
     return float(sender["hz"])
 
 
-def _is_in_hole(sender: dict[str, Any], t: float) -> bool:
-    """Return whether the network loses a message that is sent at `t`."""
-    return any(begin <= t < end for begin, end in sender.get("holes", ()))
-
-
 def _jitter(scale: float, chance: float) -> float:
     return min(0.1, -scale * math.log(1.0 - chance)) if scale else 0.0
 
 
-def _congestion_delay(sender: dict[str, Any], t: float) -> float:
+def congestion_delay(sender: dict[str, Any], t: float) -> float:
     """Return the additional network delay of a message that is sent at `t`, in s."""
     for begin, end, shape, size in sender["congestion"]:
         if shape == "drain":
@@ -181,9 +175,18 @@ def stable(sender: dict[str, Any]) -> bool:
 
 
 def sample(
-    sender: dict[str, Any], message: Message, config: dict[str, Any], robot_wall_ns: int
+    sender: dict[str, Any],
+    message: Message,
+    config: dict[str, Any],
+    robot_wall_ns: int,
+    beat: tuple[int, int] | None = None,
+    boot_ns: int = 0,
 ) -> Sample:
-    """Return a message as it arrives at the robot, whose wall clock shows `robot_wall_ns`."""
+    """Return a message as it arrives at the robot, whose wall clock shows `robot_wall_ns`.
+
+    `beat` is the one that its sender has received last, and `boot_ns` the time since the start of
+    the robot's computer at the true time 0.
+    """
     way, source = sender["way"], sender["source"]
     options: dict[str, Any] = {}
     own = f"{sender['id']}{message.number}" if sender["churn"] else sender["id"]
@@ -200,7 +203,7 @@ def sample(
         case "client" | "page" | "signed":
             options["attachment"] = msgspec.msgpack.encode(
                 {"sender": own, "stamp": message.stamp_ns, "sequence": message.number}
-                | ({"echo": echo(message.sent_ns)} if way in STEADY and stamp_counts else {})
+                | ({} if beat is None or identity != own else {"echo": _echo(beat, boot_ns)})
             )
         case "rmw":
             gid = _gid(own)
@@ -225,12 +228,13 @@ def sample(
         identity = f"{via if via == 'bridge' else 'native'}/{source}"
     options.update(via=via, session=session, stamp_ns=stamp_ns)
     key, payload = _payload(sender, message, config, via, options)
-    return Sample(key, payload, options, identity, shared, clock)
+    if identity != own:
+        beat = None  # its stamp makes its attachment invalid
+    return Sample(key, payload, options, identity, shared, clock, beat)
 
 
-def echo(sent_ns: int) -> dict[str, int]:
-    """Return the beat that a program has received just now; the daemon's run is always 0."""
-    return {"run": 0, "boot_us": sent_ns // 1000}
+def _echo(beat: tuple[int, int], boot_ns: int) -> dict[str, int]:
+    return {"run": beat[0], "boot_us": (beat[1] + boot_ns) // 1000}
 
 
 def _stamper(sender: dict[str, Any], message: Message, own: str) -> str:

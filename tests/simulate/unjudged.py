@@ -10,7 +10,7 @@ from typing import Any
 
 from tests.simulate.actors import Run
 from tests.simulate.product import StepResult
-from tests.simulate.roads import NS, Message, sample
+from tests.simulate.roads import NS, Message
 
 
 class Unjudged(Run):
@@ -34,8 +34,13 @@ class Unjudged(Run):
         """Deliver a message to the daemon if it runs."""
         if self.product.alive:
             at_ns = self._arrival(message.arrives_ns)
-            command = sample(sender, message, self.plan["config"], self.product.wall_ns)
-            self.product.deliver(at_ns, command.key, command.payload, **command.options)
+            command = self.sampled(sender, message)
+            if command is None:
+                return
+            boot_ns = at_ns + self.slept_ns
+            self.product.deliver(
+                at_ns, command.key, command.payload, boot_ns=boot_ns, **command.options
+            )
 
     def _fed(self, at_ns: int, data: bytes) -> None: ...
 
