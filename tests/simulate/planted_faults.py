@@ -292,6 +292,13 @@ FAULTS = (
         "                if numbers:\n                    self._forget()\n",
     ),
     fault(
+        "neutral overtaken",
+        "a speed that arrives behind a later zero moves the robot",
+        AGES,
+        "if not verdict and last.overtook(command, timeout_ns):",
+        "if False:",
+    ),
+    fault(
         "neutral late",
         "a newer command counts only after 60 ms",
         NEUTRAL,

@@ -64,6 +64,11 @@ class Order(Struct, gc=False):
             return "not_newer"
         return ""
 
+    def overtook(self, command: Command, timeout_ns: Ns) -> bool:
+        """Return whether a command with a higher number came first, stamped by another clock."""
+        numbered = not command.shared and 0 <= number(command) < self.sequence
+        return numbered and command.arrived_ns - self.at_ns <= timeout_ns
+
     def accept(self, command: Command) -> None:
         self.sequence, self.at_ns, self.old_ns = number(command), command.arrived_ns, None
         if command.echo is not None:
@@ -169,6 +174,8 @@ class Ages(Struct):
         elif command.stamp_ns is not None:
             clock = self._clock(command.clock, command.arrived_ns, command.stamp_ns)
             verdict = clock.judge(command.arrived_ns, command.stamp_ns, timeout_ns)
+            if not verdict and last.overtook(command, timeout_ns):
+                verdict = "not_newer"
         elif stalled:
             verdict = "stalled"
         else:

@@ -128,6 +128,9 @@ class Sender(Struct):
         newer = why.what != "not_newer" if sequence is None else sequence > self.order.sequence
         if newer and is_zero(command):
             self.twist = REST
+            if sequence is not None:
+                # A speed that was sent before it, and that it overtook, must not count any more.
+                self.order.sequence, self.order.at_ns = sequence, command.arrived_ns
 
 
 def is_zero(command: Command) -> bool:

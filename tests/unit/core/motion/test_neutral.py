@@ -110,6 +110,24 @@ def test_a_refused_zero_that_is_newer_ends_the_speed_and_arms_nothing() -> None:
     assert bench.driver() == ""
 
 
+@pytest.mark.parametrize("proven", [True, False])
+@pytest.mark.parametrize(
+    ("wait_ms", "number", "code"), [(2, 1, "not_newer"), (2, 3, ""), (260, 1, "")]
+)
+def test_a_speed_that_a_zero_of_another_clock_overtook_is_not_newer(
+    wait_ms: float, number: int, code: str, proven: bool
+) -> None:
+    bench = Bench(HIGH).prove_clock(HIGH)
+    if proven:
+        bench.prove_clock(HIGH, "other clock")
+    stamp_ns = bench.now_ns + bench.offset_ns + 1
+    zero = Command("high", REST, bench.now_ns + 1, stamp_ns, "other clock", sequence=2)
+    assert bench.accept(zero) == ("" if proven else "unproven")
+    bench.wait(wait_ms)
+    speed = Command("high", GO, bench.now_ns, bench.now_ns + bench.offset_ns, sequence=number)
+    assert bench.accept(speed) == code
+
+
 # a pause
 
 
