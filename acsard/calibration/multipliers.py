@@ -35,14 +35,10 @@ class Deviations(Struct, frozen=True):
     @classmethod
     def of(cls, odometry: OdometryConfig, base: Base) -> Deviations:
         """Return the standard deviations that `[odometry]` states for the configured geometry."""
-        sides = (
-            odometry.left_wheel_radius_multiplier_std / base.left,
-            odometry.right_wheel_radius_multiplier_std / base.right,
-        )
         return cls(
             odometry.wheel_separation_multiplier_std / base.track,
-            math.hypot(odometry.wheel_radius_ratio_std, *sides),
-            math.hypot(odometry.distance_scale_std, math.hypot(*sides) / 2),
+            odometry.wheel_radius_ratio_std,
+            odometry.distance_scale_std,
         )
 
 

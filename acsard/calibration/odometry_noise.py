@@ -176,8 +176,8 @@ class LogNoise(Struct, frozen=True):
 
 
 def settings(
-    known: Deviations, track: float, fixed: Collection[str], odometry: OdometryConfig,
-    log_noise: LogNoise | None = None, *, scaled: bool,
+    known: Deviations, track: float, fixed: Collection[str], log_noise: LogNoise | None = None,
+    *, scaled: bool,
 ) -> dict[str, float]:  # fmt: skip
     """Return the new values for settings of `[odometry]`, by the name of the setting.
 
@@ -189,10 +189,6 @@ def settings(
         values["wheel_separation_multiplier_std"] = track * known.track
     if RATIO not in fixed:
         values["wheel_radius_ratio_std"] = known.ratio
-        # The deviation of the ratio of both radii replaces the deviations of the single radii.
-        for side in ("left_wheel_radius_multiplier_std", "right_wheel_radius_multiplier_std"):
-            if getattr(odometry, side):
-                values[side] = 0.0
     if scaled:
         values["distance_scale_std"] = known.scale
     if log_noise is not None:
@@ -200,9 +196,6 @@ def settings(
         values["yaw_variance_per_radian"] = float(log_noise.found[Source.SKID])
         if log_noise.places:
             values["distance_variance_per_metre"] = float(log_noise.found[Source.DISTANCE])
-            # The variance per metre replaces a configured slip.
-            if odometry.wheel_slip_std:
-                values["wheel_slip_std"] = 0.0
     return {
         name: 0.0 if name.endswith("_std") and value < MIN_STD else min(value, MAX_SETTING)
         for name, value in values.items()

@@ -241,7 +241,7 @@ def _calibrated(
     # With a tape, the calibration gives the size of the wheels even if the log improves nothing.
     if worse and tape is None and (log_noise is None or not log_noise.better):
         raise NoCalibrationError(worse)
-    return _calibration(log, tape, best, known, odometry, log_noise)
+    return _calibration(log, tape, best, known, log_noise)
 
 
 def _used_deviations(best: Candidate, odometry: OdometryConfig) -> Deviations:
@@ -345,7 +345,6 @@ def _calibration(
     tape: Tape | None,
     best: Candidate,
     known: Deviations,
-    odometry: OdometryConfig,
     log_noise: LogNoise | None,
 ) -> Calibration:
     made, fitted, rows, rate = best.made, best.fitted, best.rows, best.rate
@@ -381,7 +380,7 @@ def _calibration(
         growth_std=float(np.sqrt(best.covariance[Parameter.TRACK_GROWTH, Parameter.TRACK_GROWTH])),
         improvement=best.improvement, delays=delays, gyro_bias=best.gyro_bias, notes=tuple(notes),
         odometry=settings(
-            known, float(result.values[SEPARATION]), best.stays_configured, odometry,
+            known, float(result.values[SEPARATION]), best.stays_configured,
             log_noise if log_noise is not None and log_noise.better else None, scaled=bool(scale),
         ),
         stays_configured=tuple(best.stays_configured), noise=log_noise,

@@ -71,8 +71,7 @@ SURE = OdometryConfig(
     distance_variance_per_metre=1e-6,
     yaw_variance_per_metre=1e-6,
     yaw_variance_per_radian=1e-5,
-    left_wheel_radius_multiplier_std=1e-4,
-    right_wheel_radius_multiplier_std=1e-4,
+    wheel_radius_ratio_std=1.4e-4,
     wheel_separation_multiplier_std=1e-3,
 )
 """Small errors of healthy wheels, so that the covariance shows the errors of a fault."""

@@ -114,7 +114,7 @@ def guide(
                 track = track_ratio(made, setup.drive)
     if method.by_tape:
         all_readings = [made for leg in legs for made in readings[leg.name]]
-        result = calibrated(all_readings, setup.drive, setup.odometry)
+        result = calibrated(all_readings, setup.drive)
         follows = response(list(rides.values()), setup.drive, setup.feedback)
         if follows is None:
             return result

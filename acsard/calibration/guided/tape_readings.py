@@ -46,7 +46,7 @@ from acsard.calibration.plausibility import RATIO, TRACK, in_range, remarks, too
 from acsard.calibration.positions import WheelSteps, path, wheel_steps
 from acsard.calibration.runs import Run, blocks
 from acsard.calibration.solve import Calibration, DriveTotals
-from acsard.core.config.settings import DriveConfig, OdometryConfig
+from acsard.core.config.settings import DriveConfig
 
 # After 1 m, rad; it grows with the square root of the rolled distance.
 SKID_HEADING_STD = 0.015
@@ -291,9 +291,7 @@ MAX_TAPE_STDS = {TRACK: 0.1, RATIO: 0.02}
 TURNED, STRAIGHT = np.pi, 0.5
 
 
-def calibrated(
-    readings: Sequence[Reading], drive: DriveConfig, odometry: OdometryConfig
-) -> Calibration:
+def calibrated(readings: Sequence[Reading], drive: DriveConfig) -> Calibration:
     """Return the calibration from readings that a person made with a tape.
 
     Raises `NoCalibrationError` if the readings contradict each other or are too inaccurate.
@@ -324,8 +322,7 @@ def calibrated(
         improvement=_improvement(readings, base, fit, rate),
         delays={}, gyro_bias=0.0, notes=tuple(notes),
         odometry=settings(
-            result.relative_deviations(), float(result.values[SEPARATION]), (), odometry,
-            scaled=True,
+            result.relative_deviations(), float(result.values[SEPARATION]), (), scaled=True,
         ),
     )  # fmt: skip
 

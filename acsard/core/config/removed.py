@@ -6,6 +6,7 @@ To be dropped after 0.3.
 from __future__ import annotations
 
 _LIDAR = "describe the lidar in the URDF and set lidar.publish_tf = false"
+_SIDES = "remove the key: odometry.wheel_radius_ratio_std is of both sides"
 _AXES = "remove the key: axes that wheels do not measure always have the variance 1e6"
 _RATE = "remove the key; rates.telemetry is the highest rate of all messages but odom and tf"
 _SIM = "remove the key: the simulated robot has an ideal gyro, even wheels and a dry floor"
@@ -25,6 +26,9 @@ REMOVED = {
     "lidar.lidar_pitch": _LIDAR,
     "odometry.learned_track": "remove the key; `acsard calibrate` measures the track",
     "odometry.covariance": "remove the key: the daemon always computes the covariances",
+    "odometry.left_wheel_radius_multiplier_std": _SIDES,
+    "odometry.right_wheel_radius_multiplier_std": _SIDES,
+    "odometry.wheel_slip_std": "remove the key: odometry.distance_scale_std includes slip",
     "odometry.pose_covariance_diagonal": _AXES,
     "odometry.twist_covariance_diagonal": _AXES,
     "rates.wheel_states": _RATE,

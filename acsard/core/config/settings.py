@@ -297,10 +297,7 @@ class OdometryConfig(Struct, frozen=True):
     yaw_variance_per_metre: ErrorRate = 1e-4
     yaw_variance_per_radian: ErrorRate = 1e-2
     wheel_separation_multiplier_std: Deviation = 0.0
-    left_wheel_radius_multiplier_std: Deviation = 0.0
-    right_wheel_radius_multiplier_std: Deviation = 0.0
     wheel_radius_ratio_std: Deviation = 0.0
-    wheel_slip_std: Deviation = 0.0
     distance_scale_std: Deviation = 0.0
 
 

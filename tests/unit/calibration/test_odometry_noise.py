@@ -394,14 +394,13 @@ def test_noise_that_is_already_right_stays_as_configured(found: Calibration) -> 
 @pytest.mark.slow
 def test_noise_of_a_robot_whose_geometry_is_right_is_written_alone(found: Calibration) -> None:
     geometry = configs(found)[0]
-    present = OdometryConfig(wheel_slip_std=0.01)
+    present = OdometryConfig()
     log = log_of_runs(LOG)
     again = calibrate(log, geometry, None, present)
     assert set(again.stays_configured) == {TRACK, RATIO}
     assert configs(again)[0] == geometry
     written = structs.replace(present, **again.odometry)
     assert written.yaw_variance_per_radian < present.yaw_variance_per_radian / 10
-    assert written.wheel_slip_std == 0.0
 
 
 def test_positions_that_are_recorded_a_second_later_give_the_same_window() -> None:
@@ -432,7 +431,7 @@ def test_positions_that_are_recorded_a_second_later_give_the_same_window() -> No
 def test_a_log_with_only_a_gyro_gives_no_distance_noise() -> None:
     made = SETS["differential"].calibration(LOG, "gyro")
     assert "yaw_variance_per_metre" in made.odometry
-    assert not {"distance_variance_per_metre", "wheel_slip_std"} & set(made.odometry)
+    assert "distance_variance_per_metre" not in made.odometry
 
 
 @pytest.mark.parametrize(("size", "written"), [(0.9e-5, 0.0), (1.1e-5, 1.1e-5)])
@@ -441,7 +440,7 @@ def test_a_negligible_deviation_is_written_as_zero_and_a_small_variance_is_kept(
 ) -> None:
     found = np.full(SOURCE_COUNT, size**2)
     made = settings(
-        Deviations(size, size, size), 1.0, (), OdometryConfig(),
+        Deviations(size, size, size), 1.0, (),
         LogNoise(found, INITIAL_NOISE, 1.0, 0.1, True, 1.0), scaled=True,
     )  # fmt: skip
     variances = {name: made.pop(name) for name in list(made) if "variance" in name}

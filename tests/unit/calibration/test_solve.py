@@ -281,7 +281,6 @@ def test_a_tape_measures_the_wheels_of_a_robot_whose_track_is_right() -> None:
     assert calibration.multipliers.values / first == pytest.approx([1.1] * 3, rel=0.01)
     settings = keys(calibration)
     assert settings["odometry.distance_scale_std"] == pytest.approx(0.0025, abs=0.001)
-    assert "odometry.left_wheel_radius_multiplier_std" not in settings
 
 
 @pytest.mark.slow

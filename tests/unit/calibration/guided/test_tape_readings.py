@@ -26,7 +26,7 @@ from acsard.calibration.guided.tape_readings import (
 from acsard.calibration.log_table import NoCalibrationError
 from acsard.calibration.runs import Run
 from acsard.core.config.parsing import parse
-from acsard.core.config.settings import DriveConfig, OdometryConfig
+from acsard.core.config.settings import DriveConfig
 from acsard.core.config.toml_text import excerpt
 from acsard.terminal.output import plain
 from tests.unit.calibration.cut import BASE, IDEAL, log_of, table
@@ -181,7 +181,7 @@ DRIVE = DriveConfig()
 
 
 def test_the_errors_before_and_after_are_those_of_the_configured_and_found_values() -> None:
-    made = calibrated(readings(), DRIVE, OdometryConfig())
+    made = calibrated(readings(), DRIVE)
     assert made.improvement.turn.before == pytest.approx(180, rel=0.05)
     assert made.improvement.turn.after is not None
     assert made.improvement.turn.after < 10
@@ -190,7 +190,7 @@ def test_the_errors_before_and_after_are_those_of_the_configured_and_found_value
 
 
 def test_the_report_names_the_tape_and_the_configuration_accepts_the_result() -> None:
-    made = calibrated(readings(), DRIVE, OdometryConfig())
+    made = calibrated(readings(), DRIVE)
     text = plain(*parts(report("the drive", made, DRIVE, ""), made, "acsard.toml", guided=True))
     assert "compared with a tape" in text
     assert "heading error after a turn of 360 deg" in text
@@ -205,4 +205,4 @@ def test_inaccurate_readings_are_refused() -> None:
         for reading in readings()
     ]
     with pytest.raises(NoCalibrationError, match="too inaccurate"):
-        calibrated(vague, DRIVE, OdometryConfig())
+        calibrated(vague, DRIVE)
