@@ -21,6 +21,7 @@ import msgspec
 
 from tests.simulate.beats import Beats
 from tests.simulate.board_inputs import Inputs, kinds
+from tests.simulate.causes import Call, Cause, Causes
 from tests.simulate.course import Course
 from tests.simulate.damage import Damage
 from tests.simulate.followed import Followed
@@ -110,6 +111,7 @@ class Run:
         self._asked_ns: int | None = None  # the daemon asked the board for its name
         self.half_duplex = HalfDuplex()
         self.followed, self.course = Followed(self.witness), Course(self.witness)
+        self.causes = Causes()
         self.counts: Counter[str] = self.witness.counts
         self.liveness = Liveness(self)
         self.plugging = Plugging(self.witness.period_ns)
@@ -380,8 +382,14 @@ class Run:
         self._ticket += 1
         ticket = self._ticket
 
+        chosen = None if numbers is None else tuple(numbers)
+        self.causes.call(ticket, Call(verb, chosen, true_ns))
+
         def answered(reply: bytes) -> None:
             success, text = read_reply(reply, via, service.endswith("set_parameters"))
+            self.causes.answered(ticket, success)
+            if verb == "clear" and not success and numbers is None:
+                self._refused_clear(true_ns, text)
             self.counts[f"{verb} {'done' if success else 'refused'}"] += 1
             if asks_for_zeros(verb, event, success, text):
                 self.liveness.event()
@@ -407,6 +415,13 @@ class Run:
 
         self._calls[ticket] = event, true_ns, answered
         product.call_service(at_ns, service, ticket, payload, via, attachment)
+
+    def _refused_clear(self, asked_ns: int, text: str) -> None:
+        """Check that a clear without numbers works as soon as all causes have been shown."""
+        held = bool(kinds(self.plan)) or self.witness.mode not in ("fault", "stopped")
+        if not held and self.causes.is_shown(asked_ns):
+            name = "a clear works two seconds behind the newest cause"
+            raise BrokenError(name, asked_ns, text)
 
     # the board and the host
 
@@ -631,6 +646,7 @@ class Run:
         for arrived_ns in self._puts_ns:
             witness.unanswered("stop", arrived_ns)
         self._puts_ns.clear()
+        lost = product.disk.behind or "damage" in event or event["way"] != "kill"
         if product.disk.behind:
             witness.file_is_behind()
 
@@ -644,6 +660,7 @@ class Run:
                 product.disk.damage(event["damage"])
                 witness.file_is_damaged(self.true_ns)
             product.start()
+            self.causes.restart(lost)
             self._beat()
             self.liveness.event()
             self._linked = False
@@ -760,6 +777,8 @@ class Run:
         if self._calls:
             self._take_answers()
             self._late_answers(true_ns)
+        present = {number: Cause(kind, key) for number, kind, key in snapshot.latched}
+        self.causes.step(snapshot.decided_ns + offset, present)
         if witness.pending:
             witness.pending = {}
         if self._calls and self.product.disk.full:

@@ -41,8 +41,8 @@ FAULT_MINUTES, CASE_MINUTES = 10.0, 30.0
 """Core-minutes within which a fault and a case must be found."""
 
 MEASURED_WITH = (
-    "plan", "roads", "actors", "ages", "bad_moments", "beats", "board_inputs", "course", "damage",
-    "followed", "gyro_faults", "jerk", "liveness", "log_lines", "moments_of_age",
+    "plan", "roads", "actors", "ages", "bad_moments", "beats", "board_inputs", "causes", "course",
+    "damage", "followed", "gyro_faults", "jerk", "liveness", "log_lines", "moments_of_age",
     "plugging", "pose", "product", "promises", "reasons", "reports", "spread",
 )  # fmt: skip
 """Modules of the simulator that make the plans, play them and judge them."""

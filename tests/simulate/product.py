@@ -86,6 +86,8 @@ class StepResult(msgspec.Struct, frozen=True, gc=False):
     estimates: Sequence[Estimate]
     events: Sequence[tuple[str, str, str]] = ()
     """Name, level and text of each line of the log."""
+    latched: Sequence[tuple[int, str, tuple[str, str, str]]] = ()
+    """Number and kind of each cause that holds the robot, with its code, part and client."""
 
 
 def problems(config: dict[str, Any]) -> list[str]:
@@ -244,6 +246,8 @@ class Product:
         self.unplugged_ns = self.plugged_ns = START_NS
         """When the board was last unplugged, and plugged in: a daemon that starts finds it so."""
         self._world = World(self._config, keeper=self.disk, gyro=self._imperfect)
+        self._latches: Latches | None = None
+        self._latched: list[tuple[int, str, tuple[str, str, str]]] = []
         self._tapes: list[Tape] | None = None
         self._began()
 
@@ -292,8 +296,15 @@ class Product:
                 lines,
                 estimates,
                 events,
+                self._latched_of(outputs.latches),
             )
         )
+
+    def _latched_of(self, latches: Latches) -> Sequence[tuple[int, str, tuple[str, str, str]]]:
+        if latches is not self._latches:
+            self._latches = latches
+            self._latched = [(c.number, c.kind, (c.code, c.part, c.by)) for c in latches.causes]
+        return self._latched
 
     # the recording
 
