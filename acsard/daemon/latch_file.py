@@ -27,7 +27,7 @@ from msgspec.structs import replace
 from acsard.core.codes import CODES, reason
 from acsard.core.config.settings import Config
 from acsard.core.motion.latches import after_restart, latched
-from acsard.core.values import NS_PER_S, AcsardError, Event, Instant, Latches, Level
+from acsard.core.values import NS_PER_S, AcsardError, Cause, Event, Instant, Latches
 from acsard.host import clock
 from acsard.host.atomic_file import replace as replace_file
 from acsard.host.atomic_file import sync
@@ -60,8 +60,6 @@ MAX_ANSWER_DELAY_NS = NS_PER_S // 5
 
 DISK_HANGS = f"the disk did not answer within {HANG_TIMEOUT_S:g} s"
 
-MAX_EVENTS = 64  # for the next control step; the oldest goes
-
 
 class LatchFileError(AcsardError):
     """The content of a latch file is damaged, of another version or of another robot."""
@@ -70,7 +68,8 @@ class LatchFileError(AcsardError):
 class _Content(Struct, frozen=True):
     format: int
     robot: str
-    latches: Latches
+    last: int
+    causes: tuple[Cause, ...]
 
 
 def encode(robot: str, latches: Latches) -> bytes:
@@ -79,7 +78,7 @@ def encode(robot: str, latches: Latches) -> bytes:
         replace(cause, text=_safe(cause.text), part=_safe(cause.part), by=_safe(cause.by))
         for cause in latches.causes
     ]
-    content = _Content(FORMAT, robot, replace(latches, causes=tuple(causes)))
+    content = _Content(FORMAT, robot, latches.last, tuple(causes))
     return msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n"
 
 
@@ -100,23 +99,20 @@ def decode(robot: str, data: bytes) -> Latches:
                 f"another version of acsard wrote the file (format {number}, but this daemon reads "
                 f"format {FORMAT})"
             )
-        if not all(name in raw["latches"] for name in Latches.__struct_fields__):
-            raise LatchFileError("it is damaged (the field causes or last is missing)")
-        raw["latches"]["causes"] = [_known(cause) for cause in raw["latches"]["causes"]]
-        content = msgspec.convert(raw, _Content)
-    except (*MSGSPEC_ERRORS, TypeError, KeyError) as error:
+        content = msgspec.convert(_with_known_codes(raw), _Content)
+    except MSGSPEC_ERRORS as error:
         raise LatchFileError(f"it is damaged ({error})") from None
     if content.robot != robot:
         raise LatchFileError(f"it belongs to the robot {_safe(content.robot)!r:.60}")
-    latches = content.latches
-    in_range = all(
-        0 < cause.number <= latches.last and abs(cause.at_ns) < 1 << 63 for cause in latches.causes
-    )
-    if not (in_range and 0 <= latches.last <= MAX_NUMBER):
+    last, causes = content.last, content.causes
+    if not (
+        0 <= last <= MAX_NUMBER
+        and all(0 < cause.number <= last and abs(cause.at_ns) < 1 << 63 for cause in causes)
+    ):
         # No call could name such a number, and messages have no integers above 64 bits.
         raise LatchFileError("it is damaged (a number or a time is out of range)")
     # A run that was killed may have published numbers that are not in the file.
-    return after_restart(replace(latches, last=latches.last + 1 + secrets.randbits(32)))
+    return after_restart(Latches(causes, last + 1 + secrets.randbits(32)))
 
 
 def new_latches() -> Latches:
@@ -211,10 +207,9 @@ class LatchFile(Keeper):
             self._no_place = _reason(error)
         self._lock = -1  # descriptor that keeps other daemons away, or -1
         self._box = Mailbox[Latches](1)  # to the thread
-        self._news = Mailbox[Event](MAX_EVENTS)
         self._renamed: Latches | None = None  # in the file
         self._stored: Latches | None = None  # on the disk
-        self._failed = ""
+        self._failed = self._told = ""  # why the last write failed; the trouble of the last event
         self._timer, self._hangs = WaitTimer(), False
         self._thread = Worker("latches", self._work)
 
@@ -233,11 +228,11 @@ class LatchFile(Keeper):
         try:
             self._thread.start()
         except NoThreadError as error:
-            self._fail(str(error))
+            self._failed = str(error)
         end_ns = clock.mono_ns() + HANG_TIMEOUT_S * NS_PER_S
         while self._renamed is None and not self._failed:
             if clock.mono_ns() > end_ns:
-                self._fail(DISK_HANGS)
+                self._failed = DISK_HANGS
             await asyncio.sleep(0.001)
         if self._failed:
             self.keep(not_writable(self.latches, self.where, self._failed, now))
@@ -312,23 +307,24 @@ class LatchFile(Keeper):
             time.sleep(0.001)
 
     def take_events(self) -> list[Event]:
-        wait_ns = self._timer.wait_ns(clock.mono_ns())
-        hangs = not self._failed and wait_ns > HANG_TIMEOUT_S * NS_PER_S
-        if hangs is not self._hangs:
-            self._hangs = hangs
-            if hangs:
-                self._tell(unwritable(self.where, DISK_HANGS), "warning")
-            elif not self._failed:
-                self._report_success()
-        return self._news.take() if self._news.waiting else []
+        self._hangs = self._timer.wait_ns(clock.mono_ns()) > HANG_TIMEOUT_S * NS_PER_S
+        trouble = self.trouble
+        if trouble == self._told:
+            return []
+        self._told = trouble
+        if not trouble:
+            text = f"the daemon can write {self.where} again, so stops survive a restart"
+            return [Event("latch_file", text)]
+        again = f"; the daemon tries again every {RETRY_PAUSE_S:g} s"
+        text = trouble + (again if self._thread.is_alive() else "")
+        return [Event("latch_file", text, "warning")]
 
     @property
     def trouble(self) -> str:
-        if self._failed or self._hangs:
-            return unwritable(self.where, self._failed or DISK_HANGS)
+        failed = self._failed or (DISK_HANGS if self._hangs else "")
         if not self._thread.is_alive():
-            return "the thread that writes stops to the latch file has ended; restart the daemon"
-        return ""
+            failed = failed or "its thread has ended: restart the daemon"
+        return unwritable(self.where, failed) if failed else ""
 
     def close(self) -> None:
         """Wait at most `CLOSE_TIMEOUT_S` until the latches are stored, and end the thread."""
@@ -364,27 +360,12 @@ class LatchFile(Keeper):
             sync(self._path.parent)
         except OSError as error:
             # The kernel may have dropped the bytes that it could not sync, so all is done again.
-            self._fail(_reason(error))
+            self._failed = _reason(error)
             return False
         finally:
             self._timer.end()
-        self._stored = latches
-        if self._failed:
-            self._failed = ""
-            self._report_success()
+        self._stored, self._failed = latches, ""
         return True
-
-    def _fail(self, problem: str) -> None:
-        if problem != self._failed:
-            self._failed = problem
-            again = f"the daemon tries again every {RETRY_PAUSE_S:g} s"
-            self._tell(f"{unwritable(self.where, problem)}; {again}", "warning")
-
-    def _report_success(self) -> None:
-        self._tell(f"the daemon can write {self.where} again, so stops survive a restart", "info")
-
-    def _tell(self, text: str, level: Level) -> None:
-        self._news.put(Event("latch_file", text, level))
 
 
 def _stopped(latches: Latches, failed: str, cause: str, now: Instant) -> Latches:
@@ -392,8 +373,15 @@ def _stopped(latches: Latches, failed: str, cause: str, now: Instant) -> Latches
     return latched(latches, "stop", reason("stopped_at_start", failed, cause=cause), now.wall_ns)
 
 
-def _known(raw: Any) -> Any:
-    # A decoded cause, whose code this version can represent.
+def _with_known_codes(raw: Any) -> Any:
+    # The decoded JSON of a file, in which `Cause` can represent the code of each cause.
+    match raw:
+        case {"causes": list() as causes}:
+            return raw | {"causes": [_with_known_code(cause) for cause in causes]}
+    return raw
+
+
+def _with_known_code(raw: Any) -> Any:
     match raw:
         case {"code": str(code), "text": str(text)} if code not in CODES:
             why = reason("other_version", part=_safe(code), cause=text, named=code)

@@ -121,7 +121,7 @@ def latch(robot: Robot, bus: Bus, kind: Kind) -> None:
 
 def is_latched(robot: Robot, kind: Kind) -> bool:
     """Return whether the latch file contains a cause of this kind."""
-    causes = json.loads(robot.file.read_bytes())["latches"]["causes"]
+    causes = json.loads(robot.file.read_bytes())["causes"]
     return kind in [cause["kind"] for cause in causes]
 
 

@@ -190,9 +190,8 @@ def _keep_more(newer: Version) -> None:
         f"""{rules.read_text()}
 
 def _grown(content):
-    for cause in content["latches"]["causes"]:
+    for cause in content["causes"]:
         cause |= {{"later": [1]}} | ({{"code": "{LATCH_CODE}"}} if cause["by"] else {{}})
-    content["latches"] |= {{"later": None}}
     return content | {{"later": 1}}
 """
     )

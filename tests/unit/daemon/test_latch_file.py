@@ -30,6 +30,7 @@ from acsard.daemon.latch_file import (
     FORMAT,
     MAX_BYTES,
     MAX_NUMBER,
+    Keeper,
     LatchFile,
     LatchFileError,
     decode,
@@ -707,6 +708,14 @@ def test_a_full_disk_is_reported_once_and_retried_until_a_write_succeeds(
     assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
 
 
+def test_without_a_file_every_answer_is_sent_at_once_and_nothing_is_reported() -> None:
+    keeper = Keeper(NONE)
+    keeper.keep(STOP)
+    keeper.wait()
+    assert (keeper.latches, keeper.is_stored, keeper.trouble) == (STOP, True, None)
+    assert keeper.take_events() == []
+
+
 # the content
 
 
@@ -726,7 +735,7 @@ cause = st.builds(
 def test_the_file_is_json_that_a_person_can_read() -> None:
     text = encode("acsar", STOP).decode()
     assert len(text.splitlines()) > 10
-    assert '\n  "latches"' in text
+    assert '\n  "causes"' in text
     assert text.endswith("\n}\n")
 
 
@@ -786,16 +795,16 @@ def test_garbage_is_refused(data: bytes) -> None:
 
 def test_fields_that_a_later_version_added_are_ignored() -> None:
     raw = msgspec.json.decode(encode("acsar", ALL))
-    for one in raw["latches"]["causes"]:
+    for one in raw["causes"]:
         one["later"] = {"deep": [1]}
-    raw["latches"]["later"], raw["later"] = None, 1
+    raw["later"] = 1
     assert decode("acsar", msgspec.json.encode(raw)).causes == kept(ALL)
 
 
 @each("index", [0, 1, 2])
 def test_a_cause_that_a_later_version_added_still_holds_the_robot(index: int) -> None:
     raw = msgspec.json.decode(encode("acsar", ALL))
-    raw["latches"]["causes"][index] |= {"code": "stopped_by_music", "text": "stopped by music"}
+    raw["causes"][index] |= {"code": "stopped_by_music", "text": "stopped by music"}
     latches = decode("acsar", msgspec.json.encode(raw))
     held = latches.causes[index]
     assert (held.number, held.kind) == (ALL.causes[index].number, ALL.causes[index].kind)
