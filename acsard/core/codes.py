@@ -35,6 +35,9 @@ LinkCode = Literal[
     "received_garbage", "received_few", "received_sparse",
 ]  # fmt: skip
 
+# Why the pose may be far off although the link is up.
+PoseCode = Literal["encoder_counts_wrong", "coarse_encoder"]
+
 # This computer or the built-in simulator is to blame.
 HOST_CODES: tuple[LinkCode, ...] = ("host_late", "simulator_fault")
 
@@ -72,7 +75,7 @@ RefusalCode = Literal[
     "bad_attachment", "bad_echo", "unknown_format",
 ]  # fmt: skip
 
-Code = Literal[StateCode, RefusalCode]
+Code = Literal[StateCode, PoseCode, RefusalCode]
 
 TABLE = """
 commanded
@@ -282,6 +285,16 @@ received_sparse
     no link to the microcontroller: {received};
     -> if the board reports by its own clock, set mcu.reply_period to the seconds between its lines;
     `acsard mcu check` finds out more
+
+encoder_counts_wrong
+    the angles by the board's counts and by its speeds differ, so mcu.encoder_counts is wrong, and
+    the pose uses the speeds:
+    -> write the counts per turn of a wheel that `acsard mcu check` shows
+coarse_encoder
+    the encoders are coarse, and lines get lost or come after varying delays, so the pose may be far
+    off:
+    -> flash the firmware of deploy/firmware, and write mcu.link_check = "on" and
+    mcu.encoder_counts: its lines have counts, which no lost or late line can falsify
 
 unknown_source
     this source is not in commands.sources

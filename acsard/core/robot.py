@@ -153,6 +153,7 @@ class Robot:
             doubt=checks.wheels.status,
             check=session.check,
             encoders=session.count_recovery.counts,
+            pose_doubt=session.doubt.code,
             sender=self._choice.sender,
             estop=self._inputs.estop.state,
             bumpers=self._inputs.bumpers.pressed,

@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 from msgspec import Meta, Struct
 
-from acsard.core.codes import Code, GuardCode, ObjectionCode, Reason, RefusalCode, WaitCode
+from acsard.core.codes import (
+    Code,
+    GuardCode,
+    ObjectionCode,
+    PoseCode,
+    Reason,
+    RefusalCode,
+    WaitCode,
+)
 
 # The order of every value with one item per wheel.
 WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
@@ -193,7 +201,8 @@ EventName = Literal[
     "started", "ended", "signal", "configuration", "real_time", "connecting",
     "port_open", "port_waiting", "port_lost",
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
-    "lines_rejected", "lines_implausible", "lines_lost", "uncommanded_motion", "wheel_fault",
+    "lines_rejected", "lines_implausible", "lines_lost", "pose_doubtful", "uncommanded_motion",
+    "wheel_fault",
     "emergency_stop", "emergency_stop_released", "bumper_pressed", "bumper_released",
     "battery", "battery_stop",
     "gyro", "imu_refused",
@@ -481,6 +490,7 @@ class Snapshot(Struct, frozen=True):
     figures: dict[str, Measured] = {}  # `daemon/latencies.py`
     gyro: GyroStatus = GyroStatus()
     doubt: WheelsStatus = WheelsStatus()
+    pose_doubt: PoseCode | Literal[""] = ""
     estop: EstopState = ""
     bumpers: tuple[bool, ...] | None = None  # pressed, in the board's order; None if never reported
     bumper: Reason | None = None  # why one counts as pressed

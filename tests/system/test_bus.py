@@ -48,7 +48,7 @@ FIELDS = {
     "state": {
         "stamp", "mode", "reason", "x", "y", "yaw", "linear", "angular", "wheels", "link",
         "source", "sources", "refused", "counters", "certificate_expiry", "latencies",
-        "gyro", "encoder_counts", "wheel_fault", "sender", "recording_error",
+        "gyro", "encoder_counts", "wheel_fault", "pose_doubt", "sender", "recording_error",
         "causes", "latch_file_error", "feedback_age", "emergency_stop", "bumpers", "battery",
         "speed_limit", "settings_differ", "certificate_days",
         "code", "certificate", "version",

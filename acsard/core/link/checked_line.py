@@ -86,6 +86,8 @@ class OpenLines:
     def __init__(self) -> None:
         self._sequence = 0
         self._open: deque[tuple[int, Ns]] = deque(maxlen=MAX_OPEN_LINES)
+        # Numbers of the last lines that were answered: a hub or a repeater may send a reply twice.
+        self._answered: deque[int] = deque(maxlen=MAX_OPEN_LINES)
 
     def forget(self) -> None:
         self._open.clear()
@@ -101,15 +103,18 @@ class OpenLines:
     def answered(self, reply: Checked, at_ns: Ns) -> Ns:
         """Return when the line that a correct reply answers was written.
 
-        Raises `FrameError` if no line of the last `ANSWER_TIMEOUT_NS` has its number.
+        Raises `FrameError` if no line of the last `ANSWER_TIMEOUT_NS` has its number; "repeated" if
+        the line was answered before, which is no damage.
         """
         waiting = self._open
         while waiting and at_ns - waiting[0][1] > ANSWER_TIMEOUT_NS:
             waiting.popleft()
         if reply.sequence not in [sequence for sequence, _ in waiting]:
-            raise FrameError("stale_sequence", reply.plain)
+            again = reply.sequence in self._answered
+            raise FrameError("repeated" if again else "stale_sequence", reply.plain)
         # The board answers in order, so earlier lines get no more answers.
         sequence, written_ns = waiting.popleft()
         while sequence != reply.sequence:
             sequence, written_ns = waiting.popleft()
+        self._answered.append(sequence)
         return written_ns

@@ -24,6 +24,7 @@ MAX_SPEED = 99.99  # rad/s, two digits before the point and two after it
 
 Reason = Literal[
     "malformed", "duplicate_wheel", "over_range", "without_crc", "crc_error", "stale_sequence",
+    "repeated",
     "status_malformed", "status_without_crc", "status_crc_error",
 ]  # fmt: skip
 

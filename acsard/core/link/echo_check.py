@@ -18,6 +18,8 @@ QUESTION = b"?"  # it moves nothing
 
 ANSWER_NS = NS_PER_S // 2  # a later `QUESTION` or name has another cause
 
+REPEATED_NS = NS_PER_S // 50  # a name so soon after another one: no board boots in between
+
 COMPARED_LINES = 8  # newest written lines: at 100 Hz, an echo within 70 ms is noticed
 
 WINDOW_NS = NS_PER_S // 2
@@ -43,7 +45,7 @@ class EchoCheck:
         """Forget everything, because the port was opened."""
         self.trouble: Literal["", "echo", "set_points"] = ""  # until the next opening
         self._asked_ns: Ns | None = None
-        self._named = False  # a board has answered
+        self._named_ns: Ns | None = None  # a board has last sent its name since the question
         self._written: deque[bytes] = deque(maxlen=COMPARED_LINES)
         self._speeds = b""  # of the last repeated line
         self._windows = 0  # in a row, of repeated lines with other speeds
@@ -61,7 +63,7 @@ class EchoCheck:
 
     def asks(self, at_ns: Ns) -> None:
         """Record that `QUESTION` was written."""
-        self._asked_ns, self.due, self.asked, self._named = at_ns, False, True, False
+        self._asked_ns, self.due, self.asked, self._named_ns = at_ns, False, True, None
 
     def written(self, line: bytes) -> None:
         self._written.append(line.removesuffix(b"\r\n"))
@@ -82,11 +84,14 @@ class EchoCheck:
             self.trouble = "echo"
 
     def named(self, at_ns: Ns) -> bool:
-        """Return whether a board's name, received now, answers the question."""
-        if self._named or not self._answers(at_ns):
-            return False
-        self._named = True
-        return True
+        """Return whether a board's name, received now, answers the question.
+
+        A hub or a repeater may send the answer twice.
+        """
+        named_ns, self._named_ns = self._named_ns, at_ns
+        if named_ns is not None:
+            return at_ns - named_ns <= REPEATED_NS
+        return self._answers(at_ns)
 
     def _answers(self, at_ns: Ns) -> bool:
         return self._asked_ns is not None and at_ns - self._asked_ns <= ANSWER_NS

@@ -12,6 +12,7 @@ from msgspec import Struct, field
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.link.checked_line import Reading
 from acsard.core.link.codec import Motors
+from acsard.core.link.counts_check import CountsCheck
 from acsard.core.link.encoders import Encoders, Turned
 from acsard.core.link.line_times import FreeRunning, Prompted
 from acsard.core.link.link_setup import LinkSetup
@@ -72,6 +73,8 @@ class Timeline(Struct):
     heard_ns: Ns = 0  # the last line was complete
     last: Instant | None = None  # sample time of the last line
     rest_ns: Ns = 0  # the last command to move ended: zeros, or the board's watchdog
+    counts_check: CountsCheck = field(default_factory=CountsCheck)
+    gaps: int = 0  # lines behind lost ones
     leaps: int = 0  # lines with impossible counts, for which speed times time is used
     restarted: bool = False  # by the board's clock in the last line
 
@@ -80,6 +83,7 @@ class Timeline(Struct):
         self.free_running = FreeRunning()
         self.prompted = Prompted()
         self.encoders.forget()
+        self.counts_check = CountsCheck()
         self.begun = False
 
     def written(self, setup: LinkSetup, at_ns: Ns, moves: bool = True) -> None:
@@ -105,16 +109,12 @@ class Timeline(Struct):
             self.prompted.process_read(end_ns, lines, setup.soonest_ns, setup.apart_ns)
 
     def skip_bad(self, setup: LinkSetup) -> None:
-        """Skip a bad line, and the command that it may answer, or the period."""
+        """Skip a line that is not used, and the command that it may answer, or its period."""
         self.rest -= 1
         if setup.period_ns:
             self.free_running.lost += 1
-        else:
+        elif not setup.mcu.checked:  # else the next reply names its command
             self.prompted.give_up()
-
-    def skip_repeated(self) -> None:
-        """Skip a line that repeats the previous one."""
-        self.rest -= 1
 
     def place(
         self,
@@ -146,9 +146,13 @@ class Timeline(Struct):
             placed = self.prompted.place(self.end_ns, asked_ns, setup.apart_ns)
         dt, bridged = placed.dt_ns / NS_PER_S, placed.bridged_ns / NS_PER_S
         turned, wheels, known = self._turned(setup, reading, came_ns), None, self.begun
+        self.gaps += bridged > 0.0
         if turned is not None:
-            dt, bridged, since, known = turned.dt, 0.0, turned.dt, known and not silent
-            wheels = setup.codec.wheels(turned.motors)
+            if not bridged:
+                self.counts_check.add(turned.motors, speeds.as_tuple(), turned.dt, setup.count)
+            if self.counts_check.agrees:
+                dt, bridged, since, known = turned.dt, 0.0, turned.dt, known and not silent
+                wheels = setup.codec.wheels(turned.motors)
         gap = 0.0
         if not known or self.restarted or dt >= MAX_FILLED_GAP_S:
             gap = 0.0 if last is None else max(since, dt)

@@ -23,6 +23,7 @@ from acsard.core.link.link_diagnosis import Lateness, SilenceDiagnosis
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import GOOD_LINES, WATCHDOG_NS, WATCHDOG_S, Link
 from acsard.core.link.link_state import State as LinkState
+from acsard.core.link.pose_doubt import PoseDoubt
 from acsard.core.link.quantization import CountRecovery
 from acsard.core.values import (
     NS_PER_S,
@@ -87,7 +88,6 @@ class McuSession:
         self._open_lines, self._echo = OpenLines(), EchoCheck(feedback.encoders)
         self._first = True  # nothing was written since the opening
         self._moved = False  # the last written line moves a wheel
-        self._last_reply = b""  # last accepted checked line
         # On a checked link that is not up: valid plain lines, and whether they are the trouble.
         self._plain_lines, self._unchecked = 0, False
         self._sampled = False  # the last good line had the board's counts
@@ -99,6 +99,7 @@ class McuSession:
         self.lateness = Lateness(mcu.simulated, self.quiet_ns)
         self._timeline = Timeline()
         self.count_recovery = CountRecovery(mcu.encoder_counts)
+        self.doubt = PoseDoubt()
         self._hearing, self._longest_reply = SilenceDiagnosis(), longest_reply
         self.rejects: Counter[str] = Counter()
         # By reason, in this `update`: their number, and the last line.
@@ -154,6 +155,10 @@ class McuSession:
                 # stop anyway after `WRITE_PAUSE_S`.
                 self._link.wait(now.mono_ns)
             self._judge(now.mono_ns)
+        if feedback and self.doubt.judge(
+            self._setup, self._timeline, self.good_lines, self.count_recovery.coarse_lines
+        ):
+            self._announce_doubt()
         if self._rejected:
             self._announce_rejects()
         if (self._link.state, self._trouble, self.blocked) != self._announced:
@@ -276,7 +281,6 @@ class McuSession:
         self.count_recovery.forget()
         self._open_lines.forget()
         self._echo.restart()
-        self._last_reply = b""
 
     def _judge(self, now_ns: Ns) -> None:
         link = self._link
@@ -322,6 +326,11 @@ class McuSession:
             )
         self._rejected.clear()
 
+    def _announce_doubt(self) -> None:
+        if self.doubt.code:
+            why = sentence(self.doubt.code)
+            self.events.append(Event("pose_doubtful", why.text, "warning", code=why.code))
+
     def _announce(self) -> None:
         link, trouble, before = self._link.state, self._trouble, self._announced
         self._announced = (link, trouble, self.blocked)
@@ -351,10 +360,6 @@ class McuSession:
             timeline.process_read(self._setup, piece.at, len(piece.data), len(lines), lines[-1][1])
         for line, following in lines:
             self._echo.received(line)
-            if self._last_reply and line == self._last_reply:
-                self.rejects["repeated"] += 1  # by a hub or a repeater, which is no damage
-                timeline.skip_repeated()
-                continue
             reply = self._line(line, piece.at, following)
             if reply is None:
                 timeline.skip_bad(self._setup)
@@ -411,12 +416,14 @@ class McuSession:
             else:
                 speeds = self.codec.decode(line)
         except FrameError as error:
-            if error.reason != "without_crc" or self._link.state == "up" or not self._plain(line):
+            if error.reason == "repeated":
+                self.rejects["repeated"] += 1
+            elif error.reason != "without_crc" or self._link.state == "up" or not self._plain(line):
                 self._reject(error.reason, line)
                 self._link.bad()
             return None
         if self._checked:
-            self._last_reply, self._plain_lines, self._unchecked = line, 0, False
+            self._plain_lines, self._unchecked = 0, False
             self._sampled = reading is not None
             if self._says_samples and not self._sampled:
                 self._says_samples = False

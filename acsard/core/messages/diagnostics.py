@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 from msgspec import Struct
 
+from acsard.core.codes import sentence
 from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_use
 from acsard.core.formatting import many
@@ -120,6 +121,8 @@ def _serial_link(config: Config, snapshot: Snapshot) -> Row:
     values |= {f"counts_{name}": str(counts) for name, counts in named if counts}
     link = snapshot.status.link
     level, message = OK if link == "up" else ERROR, link
+    if snapshot.pose_doubt:
+        level, message = max(level, WARN), f"{message}; {sentence(snapshot.pose_doubt).text}"
     if mcu.simulated:
         level, message = max(level, WARN), f"{message}: this is the simulator, no real wheel turns"
     return Row("serial link", level, message, values | _counted(snapshot.counters, "line"))

@@ -301,6 +301,7 @@ class Report:
             gyro=snapshot.gyro.does,
             encoder_counts=list(snapshot.encoders),
             wheel_fault=snapshot.doubt.text,
+            pose_doubt=snapshot.pose_doubt,
             sender=snapshot.sender,
             recording_error=snapshot.recording.trouble,
             causes=[_cause(cause, snapshot.cause_ages) for cause in snapshot.causes],

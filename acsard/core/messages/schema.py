@@ -13,7 +13,7 @@ from typing import Annotated, get_args
 
 from msgspec import Meta, Struct
 
-from acsard.core.codes import Code, StateCode, WaitCode, received_text
+from acsard.core.codes import Code, PoseCode, StateCode, WaitCode, received_text
 from acsard.core.link.link_state import State
 from acsard.core.messages.certificate_expiry import CertificateCode
 from acsard.core.messages.keys_and_roles import Direction
@@ -393,6 +393,11 @@ class RobotState(Message, frozen=True):
     """Description of a wheel that the odometry ignores, or of a side whose wheels slip.
 
     It is empty if there is no such wheel or side.
+    """
+    pose_doubt: Annotated[str, one_of(["", *get_args(PoseCode)])] = ""
+    """Code of why the pose may be far off although the link is up; empty if nothing shows that.
+
+    `coarse_encoder` advises `mcu.link_check = "on"`.
     """
     sender: str = ""
     """Public name of the selected sender of `source`; empty while no sender is selected.

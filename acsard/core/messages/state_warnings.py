@@ -10,12 +10,13 @@ from typing import Literal, get_args
 
 from msgspec import Struct
 
+from acsard.core.codes import CODES
 from acsard.core.formatting import printable
 from acsard.core.messages.schema import BatterySummary, RobotState
 
 What = Literal[
     "emergency_stop", "bumper", "battery", "certificate", "recording", "latch_file", "wheel",
-    "settings",
+    "pose", "settings",
 ]  # fmt: skip
 
 WARNING_KINDS: tuple[What, ...] = get_args(What)  # most urgent first
@@ -101,5 +102,7 @@ def _warnings(state: RobotState) -> Iterator[StateWarning]:
         yield StateWarning("latch_file", "latch file fails", state.latch_file_error)
     if state.wheel_fault:
         yield StateWarning("wheel", "wheel fault", state.wheel_fault)
+    if doubt := CODES.get(state.pose_doubt):
+        yield StateWarning("pose", "pose doubtful", f"{doubt.text} {doubt.advice}")
     if state.settings_differ:
         yield StateWarning("settings", "settings differ", state.settings_differ)

@@ -85,7 +85,7 @@ acsard/msg/RobotState: \
     float64 x, float64 y, float64 yaw, float64 linear, float64 angular, float64[] wheels, \
     float64 feedback_age, string link, string source, string sender, \
     acsard/msg/SourceState[] sources, \
-    string refused, string gyro, string wheel_fault, \
+    string refused, string gyro, string wheel_fault, string pose_doubt, \
     string emergency_stop, bool[] bumpers, \
     string recording_error, string certificate_expiry, acsard/msg/Counter[] counters
 """

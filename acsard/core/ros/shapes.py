@@ -99,6 +99,7 @@ class State(Struct, frozen=True):
     refused: str
     gyro: str
     wheel_fault: str
+    pose_doubt: str
     emergency_stop: str
     bumpers: list[bool]
     recording_error: str

@@ -113,9 +113,9 @@ def test_counts_are_not_compared_across_a_line_without_counts() -> None:
 def test_counts_fill_a_gap_that_is_short_enough() -> None:
     bench = Bench()
     bench.line(0, 0, 0, 0)
-    sample = bench.line(100, 100, 100, 100, ms=300, gap=True)
+    sample = bench.line(170, 340, 520, 690, ms=300, gap=True)
     assert (sample.dt, sample.gap) == (0.0, 0.3)
-    assert sample.turned == pytest.approx((10 * DEGREE,) * 4)
+    assert sample.turned == pytest.approx((17 * DEGREE, 34 * DEGREE, 52 * DEGREE, 69 * DEGREE))
 
 
 def test_counts_do_not_fill_a_gap_in_which_they_could_have_wrapped() -> None:

@@ -465,7 +465,7 @@ def test_without_a_right_reply_plain_ones_do_not_hold_the_link() -> None:
 @pytest.mark.parametrize("mcu", [McuConfig(), CHECKED], ids=["plain", "checked"])
 def test_an_mcu_that_names_itself_has_restarted(mcu: McuConfig) -> None:
     bench = Bench(mcu).checked() if mcu is CHECKED else Bench(mcu).up()
-    bench.wait(10, BOOTED)
+    bench.wait(30, BOOTED)
     assert bench.session.restarted
     assert bench.link() == "booting"
     assert bench.names() == ["mcu_restarted", "link_booting"]
@@ -489,7 +489,7 @@ def test_the_name_of_the_board_answers_the_question_and_is_no_restart() -> None:
     assert not bench.session.restarted
     bench.wait(10, GOOD + GOOD)
     assert bench.link() == "up"
-    bench.wait(10, BOOTED)
+    bench.wait(30, BOOTED)
     assert bench.session.restarted
 
 

@@ -1,0 +1,54 @@
+"""Finds out whether the pose is far off although all lines are good, and what helps.
+
+A plain line has no number and no counts. So the time of each line is known only to a few ms, and
+the wheels' angle in a lost line is guessed. With fine encoders, that costs some mm. With coarse
+ones, whose speed jumps from line to line, it costs metres.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from msgspec import Struct
+
+from acsard.core.codes import PoseCode
+from acsard.core.link.feedback import Timeline
+from acsard.core.link.line_times import NARROW_DEVIATION
+from acsard.core.link.link_setup import LinkSetup
+
+WINDOW_LINES = 500  # 5 s at 100 Hz
+
+COARSE_ANGLE = math.tau / 200  # rad of one count
+
+MAX_LOST_FRACTION = 0.01
+
+MIN_COARSE_LINES = 50  # of a window, if the counts per turn are not configured
+
+
+class PoseDoubt(Struct):
+    code: PoseCode | Literal[""] = ""
+    # Good lines, lines behind lost ones, and lines of coarse encoders, at the last comparison.
+    lines: int = 0
+    gaps: int = 0
+    coarse: int = 0
+
+    def judge(self, setup: LinkSetup, timeline: Timeline, lines: int, coarse_lines: int) -> bool:
+        """Judge the last `WINDOW_LINES`, and return whether the code has changed.
+
+        `coarse_lines` are those whose speeds jump, while the counts per turn are not configured.
+        """
+        if timeline.counts_check.wrong:
+            before, self.code = self.code, "encoder_counts_wrong"
+            return before != self.code
+        passed = lines - self.lines
+        if passed < WINDOW_LINES:
+            return False
+        coarse = setup.count >= COARSE_ANGLE or coarse_lines - self.coarse >= MIN_COARSE_LINES
+        lossy = timeline.gaps - self.gaps > MAX_LOST_FRACTION * passed
+        # A free-running board has no delay that matters: its lines are a period apart.
+        vague = timeline.prompted.lateness.deviation > NARROW_DEVIATION and not setup.period_ns
+        self.lines, self.gaps, self.coarse = lines, timeline.gaps, coarse_lines
+        doubtful = coarse and (lossy or vague) and not setup.mcu.checked
+        before, self.code = self.code, "coarse_encoder" if doubtful else ""
+        return before != self.code

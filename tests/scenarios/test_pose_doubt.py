@@ -1,0 +1,122 @@
+"""`state` says when the pose may be far off although the link is up, and what helps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from acsard.core.config.settings import Config, McuConfig, SimConfig
+from acsard.core.values import Received
+from tests.scenarios.world import World
+
+
+def world(counts: int, link_check: str = "off", configured: int | None = None) -> World:
+    mcu = McuConfig(
+        link_check="on" if link_check == "on" else "off",
+        encoder_counts=counts if configured is None else configured,
+    )
+    return World(Config(mcu=mcu, sim=SimConfig(encoder_counts=counts)))
+
+
+def drive(world: World, seconds: float = 12.0) -> None:
+    world.run(0.5)
+    for speed, turn in ((0.5, 0.0), (0.4, 0.8), (0.6, -0.5)):
+        world.drive(speed, turn, seconds / 3)
+
+
+def sigmas(world: World) -> float:
+    """Return how many standard deviations the pose is from the true one, along x and y."""
+    state, true, odom = world.state, world.mcu.vehicle.pose, world.odom.pose.covariance
+    return max(
+        abs(state.x - true.x) / math.sqrt(odom[0]), abs(state.y - true.y) / math.sqrt(odom[7])
+    )
+
+
+@pytest.mark.parametrize("wrong", [4.0, 0.25, 1.5])
+def test_with_wrong_counts_the_pose_uses_the_speeds_and_a_warning_says_so(wrong: float) -> None:
+    robot = world(3200, "on", round(3200 * wrong))
+    drive(robot)
+    robot.hold(0.0, 0.0, 1.0)
+    assert robot.state.pose_doubt == "encoder_counts_wrong"
+    assert [e.code for e in robot.events if e.name == "pose_doubtful"] == ["encoder_counts_wrong"]
+    assert sigmas(robot) < 3.0
+
+
+def test_right_counts_are_used_from_the_first_second_of_driving() -> None:
+    robot = world(3200, "on")
+    drive(robot, 3.0)
+    assert robot.state.pose_doubt == ""
+
+
+@pytest.mark.parametrize("counts", [16, 96])
+@pytest.mark.parametrize("configured", [True, False])
+def test_a_coarse_encoder_on_a_plain_link_that_loses_replies_advises_the_checked_link(
+    counts: int, configured: bool
+) -> None:
+    robot = world(counts, configured=None if configured else 0)
+    with robot.mcu.lost_replies(20):
+        drive(robot)
+    assert robot.state.pose_doubt == "coarse_encoder"
+    (event,) = [event for event in robot.events if event.name == "pose_doubtful"]
+    assert 'mcu.link_check = "on"' in event.text
+
+
+@pytest.mark.parametrize("counts", [16, 96])
+def test_a_coarse_encoder_behind_an_adapter_of_16_ms_advises_the_checked_link(counts: int) -> None:
+    robot = world(counts)
+    with robot.mcu.ftdi(0.016):
+        drive(robot)
+    assert robot.state.pose_doubt == "coarse_encoder"
+
+
+def lost(robot: World) -> None:
+    robot.mcu.lose_reply = 20
+
+
+def held(robot: World) -> None:
+    robot.mcu.latency_ns = 16_000_000
+
+
+def nothing(robot: World) -> None:
+    pass
+
+
+@pytest.mark.parametrize(
+    ("counts", "link_check", "fault"),
+    [
+        (16, "off", nothing), (96, "off", nothing), (3200, "off", lost), (3200, "off", held),
+        (16, "on", lost), (16, "on", held),
+    ],
+)  # fmt: skip
+def test_a_sound_link_or_a_fine_encoder_gets_no_advice(
+    counts: int, link_check: str, fault: Callable[[World], None]
+) -> None:
+    robot = world(counts, link_check)
+    fault(robot)
+    robot.run(0.5)
+    for number in range(12):
+        robot.hold(0.5, 0.4 * (-1) ** number, 1.0)
+        robot.stall(0.15)
+    assert robot.state.pose_doubt == ""
+    assert not [event for event in robot.events if event.name == "pose_doubtful"]
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_the_link_comes_up_and_stays_up_if_every_reply_arrives_twice(late: bool) -> None:
+    robot = world(3200, "on")
+    feed, before = robot.port.feed, b""
+
+    def twice(received: Received) -> None:
+        nonlocal before
+        copy, before = before if late else received.data, received.data
+        feed(Received(received.at, received.data + copy))
+
+    robot.port.feed = twice  # type: ignore[method-assign]
+    robot.run(1.0)
+    assert robot.state.link == "up"
+    drive(robot, 3.0)
+    assert "link_lost" not in robot.state.counters
+    assert robot.state.counters["line_repeated"] > 300
+    assert robot.state.mode == "driving"
