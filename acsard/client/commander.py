@@ -18,23 +18,20 @@ SEND_PERIOD_S = 0.05  # of a drive: five commands within a source's default time
 
 MIN_SPACING_S = 0.003  # on one connection: the daemon drops commands above 1000 per second
 
-# Zeros at the beginning: the daemon checks for 0.25 s whether a new sender is late, and with many
-# zeros the jitter of a busy machine does not prolong that.
-OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
+# Zeros at the beginning, at least until a state after the first one may have arrived.
+OPENING_S, OPENING_PERIOD_S = 0.2, 0.01
 
-# Time for these zeros to be accepted: up to 2 s by a source's long timeout, and time for another
-# sender to finish its drive.
-OPEN_TIMEOUT_S = 4.0
+OPEN_TIMEOUT_S = 4.0  # for these zeros to be accepted: another sender may finish its drive
 
 # Least zeros at the end of a drive. A hiccup of the network may lose all, so a sender that follows
 # the state uses `FinalZeros`.
 ZEROS = 3
 
 # A drive ends after this time without an effect, or without a command of the program. It is longer
-# than the 0.25 s in which a new sender is checked, and than a short delay.
+# than a short delay.
 GRACE_S = 0.5
 
-# Without input a held key counts as released. After 2 s the daemon forgets a new sender's zero.
+# Without input a held key counts as released.
 RELEASE_TIMEOUT_NS = 3 * NS_PER_S // 2
 
 STALE_NS = NS_PER_S // 10  # age of a speed that the operator may no longer want
@@ -50,7 +47,6 @@ class Wish(Struct, frozen=True):
 
     twist: Twist
     stamp_ns: Ns | None = None
-    steady: bool = False  # nothing adjusts that clock
     echo: Beat | None = None  # the newest beat that the person's program had received
 
 
@@ -129,7 +125,7 @@ class Commander:
         stamp_ns = self._last.stamp_ns
         if stamp_ns is not None and self._came_ns is not None:
             stamp_ns += at_ns - self._came_ns
-        return Wish(REST, stamp_ns, self._last.steady, self._last.echo)
+        return Wish(REST, stamp_ns, self._last.echo)
 
     @property
     def last_is_nonzero(self) -> bool:
@@ -141,13 +137,10 @@ class CommandSigner:
     def __init__(self, sender_id: str) -> None:
         self._id, self._sequence, self._newest_ns = sender_id, 0, 0
 
-    def sign(
-        self, stamp_ns: Ns | None, *, steady: bool, zero: bool = False, echo: Beat | None = None
-    ) -> Signature:
+    def sign(self, stamp_ns: Ns | None, echo: Beat | None, *, zero: bool = False) -> Signature:
         """Return the signature of the next command, with its sequence number.
 
-        A zero gets a later stamp of this sender, so that it is not refused as older. `steady` says
-        that nothing adjusts the clock of the stamp.
+        A zero gets a later stamp of this sender, so that it is not refused as older.
         """
         self._sequence += 1
         # The daemon refuses a command whose stamp is older than that of an earlier command. If a
@@ -155,7 +148,7 @@ class CommandSigner:
         if stamp_ns is not None:
             newest_ns = max(stamp_ns, self._newest_ns)
             self._newest_ns, stamp_ns = newest_ns, newest_ns if zero else stamp_ns
-        return Signature(self._id, stamp_ns, self._sequence, steady, echo)
+        return Signature(self._id, stamp_ns, self._sequence, echo)
 
 
 def objection(state: RobotState, source: str, sender: str) -> str:

@@ -221,9 +221,6 @@ class Client:
         self._beats = Beats(session, self.key(BEAT))
         # `state.sender` while this client drives.
         self.sender = public_name(whole, self.certificate)
-        # Compute stamps from the steady clock. If the stamps came from the wall clock, and a
-        # program set this clock during a drive, the daemon would mistake the jump for a delay.
-        self._wall_offset_ns = clock.now().wall_ns - clock.steady_ns()
         self._own_causes: set[int] = set()  # that calls of this client have latched
 
     @property
@@ -467,42 +464,32 @@ class Client:
         except zenoh.ZError:
             raise self._refused(name) from None
 
-    def put(
-        self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str = ""
-    ) -> None:
+    def put(self, twist: schema.Twist, signature: Signature, source: str = "") -> None:
         """Forward a command of another sender, for example of a person who uses a web page.
 
         Args:
             twist: the command.
-            signature: the identity of the other sender, and the stamp of the command.
+            signature: the identity of the other sender, and the echo and the stamp of the command.
             source: the command source on which the command is sent; "" for the source of this
                 client.
         """
         with self._spacing.wait():
             self._publish(twist, signature, source or self.source)
 
-    def _publish(
-        self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str
-    ) -> None:
+    def _publish(self, twist: schema.Twist, signature: Signature, source: str) -> None:
         self.session.put(
             self.key(self.command_key(source)),
             encode(twist, "msgpack"),
-            encoding=encoding_name("msgpack", type(twist).__name__),
+            encoding=encoding_name("msgpack", "Twist"),
             express=True,
             attachment=signature.pack(),
-            timestamp=self.session.new_timestamp(),
         )
 
     def _put(self, linear: float, angular: float, echo: schema.Beat) -> None:
         if self._spacing.ending and (linear or angular):
             raise NoAnswerError("the connection to the daemon is being closed: connect again")
-        stamp_ns = clock.steady_ns() + self._wall_offset_ns
-        message = schema.TwistStamped(
-            schema.Header(schema.Time.from_ns(stamp_ns)),
-            schema.Twist(schema.Vector3(x=linear), schema.Vector3(z=angular)),
-        )
-        signature = self._sender.sign(stamp_ns, steady=True, echo=echo)
-        self._publish(message, signature, self.source)
+        twist = schema.Twist(schema.Vector3(x=linear), schema.Vector3(z=angular))
+        self._publish(twist, self._sender.sign(None, echo), self.source)
         if linear or angular:
             self._spacing.moving[self] = clock.steady_s()
         else:

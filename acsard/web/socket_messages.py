@@ -87,8 +87,6 @@ class Command(_Frame, frozen=True):
     least: ClassVar[Role] = COMMAND_ROLE
     cmd: Wish
     stamp: float
-    steady: bool = False
-    """True if `stamp` is from a clock that is never adjusted, such as `performance.now()`."""
     source: Short = DEFAULT_SOURCE
     """Name of one of the robot's command sources."""
     echo: Beat | None = None

@@ -98,9 +98,7 @@ class ViewerCommands:
                 )
                 zero = wish.twist == REST
                 # An echo of this server would hide how late the viewer's command is.
-                signature = sender.sign(
-                    wish.stamp_ns, steady=wish.steady, zero=zero, echo=wish.echo
-                )
+                signature = sender.sign(wish.stamp_ns, wish.echo, zero=zero)
                 client.put(twist, signature, source)
                 self._counts.add("commands")
                 return
@@ -259,7 +257,7 @@ class Viewer:
             return
         self._stamp_ns = stamp_ns
         twist = Twist(frame.cmd.linear_x, frame.cmd.angular_z)
-        wish = Wish(twist, stamp_ns, frame.steady, frame.echo)
+        wish = Wish(twist, stamp_ns, frame.echo)
         commander = self._commanders.setdefault(frame.source, Commander())
         owner = self.who.token or self.sender
         if not self._commands.give(owner, frame.source, commander, self._sender, wish):

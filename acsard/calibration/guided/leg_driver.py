@@ -29,6 +29,8 @@ RESPONSE_TIMEOUT_S = 1.5  # until the robot follows a changed command, including
 
 DEVIATION_TIMEOUT_S = 1.0  # until the leg is halted if the daemon does not follow or report
 
+STARVED_S = 0.4  # without a command that the daemon received, until the leg is halted
+
 PATH_OFF_M, PATH_OFF_RAD = 0.1, 0.15
 # The rolled path may differ from the commanded one by these, plus `SAME_SHARE` of the same motion
 # and `OTHER_SHARE` of the other one. With more, the robot could leave the free floor.
@@ -137,7 +139,7 @@ class LegDriver:
         self._number, self._ends = -1, now
         self._command = REST
         self._waits = "no message with the daemon's state has arrived"  # "" if it accepts commands
-        self._starved = f"the daemon has received no command of source {source} for {OPENING_S:g} s"
+        self._starved = f"the daemon has received no command of source {source} for {STARVED_S:g} s"
         self._still_since: float | None = None
         self._deviates_since: float | None = None
 
@@ -277,7 +279,7 @@ class LegDriver:
             return why
         # A source with a long timeout still drives the robot after its commands stop arriving.
         (age,) = [source.age for source in state.sources if source.name == self._source]
-        if age is None or age >= OPENING_S:
+        if age is None or age >= STARVED_S:
             return self._starved
         return ""
 

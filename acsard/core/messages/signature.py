@@ -39,7 +39,6 @@ class Signature(Struct, frozen=True, omit_defaults=True):
     # Time of sending, ns since 1970 by the sender's clock.
     stamp: Annotated[int, Meta(gt=0, le=MAX_INT64)] | None = None
     sequence: Annotated[int, Meta(ge=0, le=MAX_INT64)] | None = None  # grows by 1 with each command
-    steady: bool = False  # the clock of `stamp` is never adjusted: an old stamp proves a delay
     echo: Beat | None = None
 
     def pack(self) -> bytes:

@@ -112,7 +112,7 @@ export class Drive {
    *  same stamp as a replay, and that command may be a zero. */
   #send(cmd) {
     this.#stamp = Math.max(performance.timeOrigin + performance.now(), this.#stamp + 0.001);
-    const message = { cmd, stamp: this.#stamp, steady: true, source: SOURCE, echo: this.#link.beat };
+    const message = { cmd, stamp: this.#stamp, source: SOURCE, echo: this.#link.beat };
     if (this.held) this.#link.send(message);
     else this.#link.urge(message);
   }

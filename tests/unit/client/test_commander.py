@@ -12,9 +12,11 @@ from acsard.client.commander import (
     CommandSigner,
     Wish,
 )
+from acsard.core.messages.schema import Beat
 from acsard.core.values import NS_PER_S, REST, Twist
 
 AHEAD, LEFT = Twist(0.5, 0.0), Twist(0.0, 1.0)
+BEAT = Beat(7, 1000)
 MS = NS_PER_S // 1000
 
 
@@ -136,29 +138,29 @@ def test_a_zero_is_never_too_old_to_be_sent(panel: Panel) -> None:
 
 def test_commands_of_a_sender_with_its_own_zeros_and_stamps_are_passed_on_unchanged() -> None:
     commander = Commander()
-    for n, wish in enumerate((Wish(AHEAD, 1), Wish(AHEAD, 2, True), Wish(REST, 3))):
+    for n, wish in enumerate((Wish(AHEAD, 1), Wish(AHEAD, 2, BEAT), Wish(REST, 3))):
         commander.take(wish, n * NS_PER_S)
         assert commander.send(n * NS_PER_S) == wish
         assert not commander.waits
 
 
-def test_the_last_zero_of_a_sender_with_a_steady_clock_has_a_stamp_of_that_clock() -> None:
+def test_the_last_zero_of_a_sender_has_a_stamp_of_its_clock_and_its_last_echo() -> None:
     commander = Commander()
-    commander.take(Wish(AHEAD, 1000, True), 0)
+    commander.take(Wish(AHEAD, 1000, BEAT), 0)
     commander.send(0)
-    assert commander.end(7) == Wish(REST, 1007, True)
+    assert commander.end(7) == Wish(REST, 1007, BEAT)
 
 
 def test_a_zero_has_a_stamp_not_older_than_the_commands_before_it() -> None:
     sender = CommandSigner("joe/aa")
-    sender.sign(9, steady=True)
-    assert sender.sign(8, steady=True).stamp == 8  # a late speed must look late
-    assert sender.sign(8, steady=True, zero=True).stamp == 9
-    assert sender.sign(10, steady=True, zero=True).stamp == 10
+    sender.sign(9, None)
+    assert sender.sign(8, None).stamp == 8  # a late speed must look late
+    assert sender.sign(8, None, zero=True).stamp == 9
+    assert sender.sign(10, None, zero=True).stamp == 10
 
 
 def test_the_commands_of_a_sender_are_numbered() -> None:
     sender = CommandSigner("joe/aa")
-    signed = [sender.sign(9, steady=False) for _ in range(3)]
+    signed = [sender.sign(9, BEAT) for _ in range(3)]
     assert [signature.sequence for signature in signed] == [1, 2, 3]
     assert {signature.sender for signature in signed} == {"joe/aa"}

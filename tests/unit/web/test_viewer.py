@@ -27,7 +27,7 @@ from tests.unit.web.test_socket_messages import INVALID_STOPS
 
 PATIENCE_S = 20.0
 
-AHEAD = Wish(Twist(0.2, 0.0), 1000, steady=True)
+AHEAD = Wish(Twist(0.2, 0.0), 1000)
 
 
 def test_a_command_that_cannot_be_sent_is_dropped_and_the_next_is_processed() -> None:
@@ -57,7 +57,7 @@ def test_a_command_is_put_with_the_stamp_the_clock_and_the_echo_of_its_sender() 
     commands = ViewerCommands(lambda: fake, counts)
     commander, sender = Commander(), CommandSigner("joe/aa")
     for stamp_ns, echo in ((1000, Beat(7, 5)), (2000, None)):
-        wish = Wish(Twist(0.2, -0.5), stamp_ns, steady=True, echo=echo)
+        wish = Wish(Twist(0.2, -0.5), stamp_ns, echo)
         assert commands.give("joe", "teleop", commander, sender, wish)
         commands.outbox.flush(PATIENCE_S)
     assert [(x, z) for x, z, _ in put] == [(0.2, -0.5)] * 2
@@ -65,7 +65,7 @@ def test_a_command_is_put_with_the_stamp_the_clock_and_the_echo_of_its_sender() 
     assert [item.stamp for item in signed] == [1000, 2000]
     assert [item.sequence for item in signed] == [1, 2]
     assert [item.echo for item in signed] == [Beat(7, 5), None]  # the server adds none
-    assert {(item.sender, item.steady) for item in signed} == {("joe/aa", True)}
+    assert {item.sender for item in signed} == {"joe/aa"}
     assert counts.all() == {"commands": 2}
 
 
@@ -74,7 +74,7 @@ def test_a_token_that_commands_without_end_is_refused_except_a_zero_after_a_spee
 ) -> None:
     commands, sender = ViewerCommands(lambda: None, Counts()), CommandSigner("joe/aa")
     flooding, driving, other = Commander(), Commander(), Commander()
-    rest = Wish(Twist(0.0, 0.0), 1000, steady=True)
+    rest = Wish(Twist(0.0, 0.0), 1000)
     assert commands.give("token", "teleop", driving, sender, AHEAD)
     results = [commands.give("token", "app", flooding, sender, rest) for _ in range(1000)]
     assert COMMAND_RATE.burst - 1 <= results.count(True) < COMMAND_RATE.burst + 100
