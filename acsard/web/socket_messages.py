@@ -79,23 +79,21 @@ class Wish(_Frame, frozen=True):
 
 
 class Command(_Frame, frozen=True):
-    """Drive at the velocity `cmd`.
-
-    `stamp` is the time of the command on the sender's own clock, ms since 1970.
-    """
+    """Drive at the velocity `cmd`."""
 
     least: ClassVar[Role] = COMMAND_ROLE
     cmd: Wish
-    stamp: float
+    stamp: float | None = None
+    """The time of the command on the sender's own clock, ms since 1970, for one without `echo`."""
     source: Short = DEFAULT_SOURCE
     """Name of one of the robot's command sources."""
     echo: Beat | None = None
     """The value of the key `beat` that the client received last."""
 
     @property
-    def stamp_ns(self) -> int:
+    def stamp_ns(self) -> int | None:
         """The stamp in ns since 1970."""
-        return int(self.stamp * 1e6)
+        return None if self.stamp is None else int(self.stamp * 1e6)
 
     @property
     def moves(self) -> bool:
@@ -161,7 +159,8 @@ def asks_to_stop(text: str) -> bool:
 
 def _require(frame: Frame) -> None:
     # All numbers are finite here: JSON has no NaN, and msgspec refuses numbers that are too large.
-    if isinstance(frame, Command) and not 0.0 < frame.stamp < MAX_STAMP_MS:
+    stamp = frame.stamp if isinstance(frame, Command) else None
+    if stamp is not None and not 0.0 < stamp < MAX_STAMP_MS:
         raise FrameError("cmd", "`stamp` must be the time of the sender's clock in ms since 1970")
     if isinstance(frame, Subscribe) and not 0.0 < frame.rate <= MAX_RATE:
         raise FrameError(

@@ -245,17 +245,18 @@ class Viewer:
             self._out.refuse("cmd", "malformed", text)
             return
         stamp_ns = frame.stamp_ns
-        if stamp_ns == self._stamp_ns and not frame.moves:
-            # The clock of some clients advances in coarse steps. So a zero with the stamp of the
-            # last command may still mean that the user has released the control. Accept it with a
-            # later stamp.
-            stamp_ns += 1
-        if stamp_ns <= self._stamp_ns:
-            self._out.refuse(
-                "cmd", "replayed", "`stamp` must be later than the previous command's stamp"
-            )
-            return
-        self._stamp_ns = stamp_ns
+        if stamp_ns is not None:
+            if stamp_ns == self._stamp_ns and not frame.moves:
+                # The clock of some clients advances in coarse steps. So a zero with the stamp of
+                # the last command may still mean that the user has released the control. Accept it
+                # with a later stamp.
+                stamp_ns += 1
+            if stamp_ns <= self._stamp_ns:
+                self._out.refuse(
+                    "cmd", "replayed", "`stamp` must be later than the previous command's stamp"
+                )
+                return
+            self._stamp_ns = stamp_ns
         twist = Twist(frame.cmd.linear_x, frame.cmd.angular_z)
         wish = Wish(twist, stamp_ns, frame.echo)
         commander = self._commanders.setdefault(frame.source, Commander())

@@ -585,9 +585,7 @@ async def test_cancelling_an_async_drive_sends_the_zero_immediately(
     print(f"cancel -> zero on the bus: {zero.at - cancelled:.4f} s")
     assert zero.at - cancelled < 0.2 + lost(cancelled, zero.at)
     assert not [
-        entry
-        for entry in commands.seen
-        if entry.at > zero.at and entry.value["linear"]["x"] != 0.0
+        entry for entry in commands.seen if entry.at > zero.at and entry.value["linear"]["x"] != 0.0
     ]
 
 
@@ -606,9 +604,7 @@ async def test_an_async_drive_does_not_go_on_after_its_event_loop_was_blocked(
             awake = time.monotonic()
             with pytest.raises(NotDrivenError, match="sent no command for"):
                 await driving
-        commands.find(
-            lambda value: value["linear"]["x"] == 0.0, 2.0, "a zero", after=awake
-        )
+        commands.find(lambda value: value["linear"]["x"] == 0.0, 2.0, "a zero", after=awake)
     speeds = [sample.value["linear"]["x"] for sample in commands.seen if sample.at > awake]
     assert set(speeds) == {0.0}
 

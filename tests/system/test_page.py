@@ -315,13 +315,15 @@ def test_a_browser_with_a_clock_resolution_of_a_tenth_of_a_second_drives_and_sto
     page.hold()
     page.browser.touch("End")
     page.bus.at_rest()
-    assert not page.server.refused().get("replayed", 0)
 
 
 JAM = """(() => {
     const send = WebSocket.prototype.send;
     window.sent = [];
-    WebSocket.prototype.send = function (text) { window.sent.push(text); send.call(this, text); };
+    WebSocket.prototype.send = function (text) {
+        window.sent.push([performance.now(), text]);
+        send.call(this, text);
+    };
     Object.defineProperty(WebSocket.prototype, 'bufferedAmount', {get: () => 1e6});
 })();1"""
 """A network that accepts nothing for now. The page's writes to it are logged."""
@@ -338,10 +340,10 @@ def test_the_zero_of_a_released_stick_is_sent_twice_also_over_a_congested_socket
     page.browser.js(JAM)
     page.browser.touch("End")
     page.bus.at_rest()
-    sent = [json.loads(message) for message in page.browser.js("window.sent")]
-    commands = [message for message in sent if "cmd" in message]
-    assert [message["cmd"]["linear_x"] for message in commands] == [0, 0]
-    assert commands[1]["stamp"] - commands[0]["stamp"] >= 49.0
+    sent = [(at, json.loads(message)) for at, message in page.browser.js("window.sent")]
+    commands = [(at, message["cmd"]["linear_x"]) for at, message in sent if "cmd" in message]
+    assert [speed for _, speed in commands] == [0, 0]
+    assert commands[1][0] - commands[0][0] >= 49.0
 
 
 def test_a_page_that_is_frozen_releases_the_stick(page: Phone) -> None:
@@ -540,14 +542,6 @@ def test_a_gamepad_that_disconnects_releases_the_stick(page: Phone) -> None:
     browser.js("dispatchEvent(new Event('gamepaddisconnected'))")
     page.shows("told", "the gamepad is disconnected")
     bus.at_rest()
-
-
-def test_a_page_that_connects_again_says_why_it_has_released_the_stick(page: Phone) -> None:
-    """If the device's clock was set, the page connects again with a new sender id."""
-    page.hold()
-    page.browser.js("{ const now = Date.now; Date.now = () => now() + 60000; } 1")
-    page.shows("told", "released: this device slept, or its clock was set")
-    page.bus.at_rest()
 
 
 def test_a_gamepad_that_the_browser_does_not_know_drives_nothing_and_says_so(page: Phone) -> None:
@@ -1187,7 +1181,7 @@ def test_a_page_that_is_hidden_sends_its_zero_once(page: Phone) -> None:
         "document.dispatchEvent(new Event('visibilitychange'))"
     )
     page.bus.at_rest()
-    sent = [json.loads(message) for message in page.browser.js("window.sent")]
+    sent = [json.loads(message) for _, message in page.browser.js("window.sent")]
     assert [message["cmd"]["linear_x"] for message in sent if "cmd" in message] == [0]
 
 

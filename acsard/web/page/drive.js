@@ -25,7 +25,6 @@ export class Drive {
   #push = [0, 0];
   #pressed = new Set();
   #pointer = null;
-  #stamp = 0; // stamp of the last command, ms since 1970
   #padFree = null; // index of the gamepad whose shoulder buttons were up at the last look, or null
   #padDrives = null; // index of the gamepad that drives
   #padStrange = false; // the hint about an unknown gamepad was shown
@@ -107,12 +106,9 @@ export class Drive {
     this.#told(why);
   }
 
-  /** Send a command. A release is sent even over a congested connection. The clock of some browsers stands still for
-   *  100 ms, so the stamp is increased by hand. Otherwise the daemon would drop the second of two commands with the
-   *  same stamp as a replay, and that command may be a zero. */
+  /** Send a command. A release is sent even over a congested connection. */
   #send(cmd) {
-    this.#stamp = Math.max(performance.timeOrigin + performance.now(), this.#stamp + 0.001);
-    const message = { cmd, stamp: this.#stamp, source: SOURCE, echo: this.#link.beat };
+    const message = { cmd, source: SOURCE, echo: this.#link.beat };
     if (this.held) this.#link.send(message);
     else this.#link.urge(message);
   }

@@ -3,7 +3,6 @@
 
 const AGAIN = [300, 600, 1200, 2500, 5000];
 const BEAT = 1000; // ms between two pings
-const STOOD = 150; // ms by which the browser's clock may fall behind the wall clock between two pings
 const SILENT = 3000; // ms without any message after which the connection is cut, whatever the socket reports
 
 export class Link extends EventTarget {
@@ -13,7 +12,6 @@ export class Link extends EventTarget {
   #answers = new Map();
   #number = 0;
   #heard = 0;
-  #ahead = null; // lead of the wall clock over performance.now() at the last ping, ms
   #asked = null; // send time of the ping that has no answer yet
   #refused;
   #shut = false; // closed for good
@@ -128,14 +126,9 @@ export class Link extends EventTarget {
   }
 
   #ping() {
-    const before = this.#ahead;
-    this.#ahead = Date.now() - performance.now();
     if (!this.open) return;
-    // performance.now() may stand still while a computer sleeps. Commands stamped by it would then always
-    // look late, so the page reconnects, which gives it a new sender id.
-    const stood = before !== null && Math.abs(this.#ahead - before) > STOOD;
-    if (stood || performance.now() - this.#heard > SILENT) {
-      this.#end(stood ? "this device slept, or its clock was set" : "the robot does not answer");
+    if (performance.now() - this.#heard > SILENT) {
+      this.#end("the robot does not answer");
       this.#connect();
       return;
     }

@@ -57,7 +57,7 @@ func main() {
 	for beat.Load() == nil {
 		time.Sleep(10 * time.Millisecond)
 	}
-	drive(ctx, socket, 0, 750*time.Millisecond) // the robot follows a new sender only after some zeros
+	drive(ctx, socket, 0, 100*time.Millisecond) // a zero arms this sender
 	drive(ctx, socket, 0.2, 2*time.Second)
 	drive(ctx, socket, 0, time.Second)
 	socket.Close(websocket.StatusNormalClosure, "")
@@ -72,9 +72,8 @@ func say(ctx context.Context, socket *websocket.Conn, what any) {
 func drive(ctx context.Context, socket *websocket.Conn, speed float64, lasting time.Duration) {
 	for end := time.Now().Add(lasting); time.Now().Before(end); time.Sleep(period) {
 		say(ctx, socket, map[string]any{
-			"cmd":   map[string]float64{"linear_x": speed, "angular_z": 0},
-			"stamp": float64(time.Now().UnixMicro()) / 1000,
-			"echo":  beat.Load(),
+			"cmd":  map[string]float64{"linear_x": speed, "angular_z": 0},
+			"echo": beat.Load(),
 		})
 	}
 }

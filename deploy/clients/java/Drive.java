@@ -49,8 +49,7 @@ public class Drive implements WebSocket.Listener {
     private static void drive(WebSocket socket, double speed, double seconds) throws InterruptedException {
         for (int sent = 0; sent < seconds * 1000 / PERIOD_MS; sent++) {
             String command = String.format(Locale.ROOT,
-                "{\"cmd\": {\"linear_x\": %f, \"angular_z\": 0}, \"stamp\": %d, \"echo\": %s}",
-                speed, System.currentTimeMillis(), beat);
+                "{\"cmd\": {\"linear_x\": %f, \"angular_z\": 0}, \"echo\": %s}", speed, beat);
             socket.sendText(command, true).join();
             Thread.sleep(PERIOD_MS);
         }
@@ -76,7 +75,7 @@ public class Drive implements WebSocket.Listener {
         while (beat == null) {
             Thread.sleep(10);
         }
-        drive(socket, 0.0, 0.75); // the robot follows a new sender only after some zeros
+        drive(socket, 0.0, 0.1); // a zero arms this sender
         drive(socket, 0.2, 2.0);
         drive(socket, 0.0, 1.0);
         socket.sendClose(WebSocket.NORMAL_CLOSURE, "").join();

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from acsard.core.messages.schema import Beat
 from acsard.core.messages.signature import Signature, unpack
 from acsard.core.values import NS_PER_S
 from acsard.web.socket_messages import (
@@ -33,6 +34,8 @@ COMMAND = {"cmd": {"linear_x": 0.2, "angular_z": -0.1}, "stamp": 1763700000123.4
 
 def test_each_kind_of_message_is_recognized_by_its_field() -> None:
     assert decode(json.dumps(COMMAND)) == Command(Wish(0.2, -0.1), 1763700000123.4)
+    echoed = {"cmd": COMMAND["cmd"], "echo": {"run": 7, "boot_us": 5}}
+    assert decode(json.dumps(echoed)) == Command(Wish(0.2, -0.1), echo=Beat(7, 5))
     assert decode('{"subscribe": "odom"}') == Subscribe("odom", 10.0)
     assert decode('{"unsubscribe": "odom"}') == Unsubscribe("odom")
     assert decode('{"call": "stop", "id": 7}') == Call("stop", 7)
@@ -43,6 +46,7 @@ def test_each_kind_of_message_is_recognized_by_its_field() -> None:
 def test_a_stamp_keeps_its_tenth_of_a_ms_in_ns() -> None:
     frame = decode(json.dumps(COMMAND))
     assert isinstance(frame, Command)
+    assert frame.stamp_ns is not None
     assert abs(frame.stamp_ns - 1763700000123_400000) < 1000
 
 
@@ -55,6 +59,7 @@ def test_a_stamp_that_no_signature_holds_is_refused(stamp: float) -> None:
 def test_the_zero_after_the_latest_stamp_can_still_be_signed() -> None:
     frame = decode(json.dumps(COMMAND | {"stamp": math.nextafter(MAX_STAMP_MS, 0.0)}))
     assert isinstance(frame, Command)
+    assert frame.stamp_ns is not None
     signed = Signature("phone/1", frame.stamp_ns + 60 * NS_PER_S, 1)
     assert unpack(signed.pack()) == signed
 
@@ -81,7 +86,8 @@ def test_a_command_of_two_zeros_moves_nothing() -> None:
         ('{"cmd": {"linear_x": NaN, "angular_z": 0}, "stamp": 1}', "message"),
         ('{"cmd": {"linear_x": 1e999, "angular_z": 0}, "stamp": 1}', "cmd"),
         ('{"cmd": {"linear_x": "0.2", "angular_z": 0}, "stamp": 1}', "cmd"),
-        ('{"cmd": {"linear_x": 0.2, "angular_z": 0}}', "cmd"),
+        ('{"cmd": {"linear_x": 0.2, "angular_z": 0}, "echo": [1, 2]}', "cmd"),
+        ('{"cmd": {"linear_x": 0.2, "angular_z": 0}, "echo": {"run": -1, "boot_us": 2}}', "cmd"),
         ('{"cmd": {"linear_x": 0.2, "angular_z": 0}, "stamp": 0}', "cmd"),
         ('{"cmd": {"linear_x": 0.2, "angular_z": 0}, "stamp": -5}', "cmd"),
         ('{"cmd": {"linear_x": 0.2, "angular_z": 0}, "stamp": 1e300}', "cmd"),
