@@ -128,7 +128,10 @@ class CountRecovery:
                     line = replace(line, bridged=0.0)
             else:
                 self._whole.apart = 0.0
-        elif elapsed_s > 0.0 and self._coarseness.add(speeds, elapsed_s):
+            # One count is a step of this size; none is learned.
+            step = self._angle / elapsed_s if elapsed_s > 0.0 else 0.0
+            return replace(line, counted=counted, steps=(step, step, step, step), count=self._angle)
+        if elapsed_s > 0.0 and self._coarseness.add(speeds, elapsed_s):
             self.coarse_lines += 1
         a, b, c, d = self._wheels
         a.add(speeds[0])
@@ -140,4 +143,4 @@ class CountRecovery:
             most = MAX_STEP_RATIO * sorted(reported)[2]
             self._reported = reported
             self._steps = min(a.size, most), min(b.size, most), min(c.size, most), min(d.size, most)
-        return replace(line, counted=counted, steps=self._steps, count=self._angle)
+        return replace(line, steps=self._steps)
