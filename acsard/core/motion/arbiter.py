@@ -120,8 +120,10 @@ class Arbiter(Struct):
     def accept(self, command: Command, commands: CommandsConfig) -> Wait | None:
         """Process a command. Return None if it is accepted, otherwise why it is refused."""
         self.until_ns = 0
-        settings = next((s for s in commands.sources if s.name == command.source), None)
-        if settings is None:
+        for settings in commands.sources:
+            if settings.name == command.source:
+                break
+        else:
             return Wait("unknown_source", command.source)
         if not (math.isfinite(command.twist.linear) and math.isfinite(command.twist.angular)):
             self.notice(command.source, command.sender, command.arrived_ns)
@@ -330,8 +332,10 @@ def _changes_ns(sender: Sender, now_ns: Ns, timeout: Ns) -> Ns:
 
 def _next_report_ns(ns: Ns) -> Ns:
     # The duration at which `_reported_duration_s` gives another result.
-    after = [limit for seconds in REPORTED_DURATIONS_S if (limit := int(seconds * NS_PER_S)) > ns]
-    return after[0] if after else FOREVER_NS
+    for seconds in REPORTED_DURATIONS_S:
+        if ns < seconds * NS_PER_S:
+            return int(seconds * NS_PER_S)
+    return FOREVER_NS
 
 
 def _reported_duration_s(ns: Ns) -> float:

@@ -71,16 +71,18 @@ class Sender(Struct):
 
     def changes_ns(self, now_ns: Ns, timeout_ns: Ns) -> Ns:
         """Return the next time at which a method gives another result without a new message."""
-        times = [self.refused_ns + timeout_ns + 1, FOREVER_NS]
-        if self.arrived_ns is not None:
-            times += (
-                self.arrived_ns + timeout_ns + 1,
-                self.present_ns + timeout_ns + 1,
-                self.arrived_ns + SILENT_NS + 1,
-            )
-        if self.zero_ns is not None:
-            times.append(self.zero_ns + NEUTRAL_PAUSE_NS)
-        return min([time for time in times if time > now_ns])
+        arrived_ns, zero_ns = self.arrived_ns or 0, self.zero_ns or 0
+        next_ns = FOREVER_NS
+        for time_ns in (
+            arrived_ns + timeout_ns + 1,
+            self.present_ns + timeout_ns + 1,
+            self.refused_ns + timeout_ns + 1,
+            arrived_ns + SILENT_NS + 1,
+            zero_ns + NEUTRAL_PAUSE_NS,
+        ):
+            if now_ns < time_ns < next_ns:
+                next_ns = time_ns
+        return next_ns
 
     def require_neutral(self) -> None:
         """Forget the last command; the sender must be neutral again before it drives."""

@@ -184,6 +184,21 @@ def test_refusals_name_a_clock_that_was_set_back_after_two_seconds() -> None:
     assert verdicts == ["stale"] * 40 + ["set_back"] * 20
 
 
+def test_stamps_that_stand_still_for_a_timeout_are_refused_until_two_seconds_later() -> None:
+    sender = Sender().prove(1000)
+    verdicts = [sender.hear(1050 + 50 * n, 1050) for n in range(8)]
+    assert verdicts == ["", *["not_newer"] * 5, *["stamps"] * 2]
+    assert sender.hear(3400, 3400) == "stamps"
+    assert sender.hear(3450, 3450) == ""
+
+
+def test_a_repeated_command_is_no_sign_that_the_stamps_stand_still() -> None:
+    sender = Sender().prove(1000)
+    for at_ms in range(1050, 4000, 50):
+        assert sender.hear(at_ms, at_ms) == ""
+        assert [sender.hear(at_ms + late_ms, at_ms) for late_ms in (1, 40)] == ["not_newer"] * 2
+
+
 def test_without_a_stamp_only_the_order_of_the_numbers_counts() -> None:
     sender = Sender()
     assert [sender.hear(at_ms, None) for at_ms in (0, 50)] == ["", ""]

@@ -9,7 +9,7 @@ import pytest
 
 from acsard.core.config.settings import CommandsConfig, Source
 from acsard.core.motion.arbiter import Arbiter, Choice
-from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
+from acsard.core.values import NS_PER_S, REST, Command, Echo, SourceStatus, Twist, Wait
 from tests.each import each
 from tests.unit.core.motion.commanders import BACK, GO, HIGH, LEFT, LOW, MS, RIGHT, SLOW, Bench
 
@@ -303,6 +303,34 @@ def test_a_stall_of_the_daemon_does_not_change_the_followed_sender(other: Source
     assert bench.choice().wait == bench.status(LEFT).waits_for == Wait("stalled", "left")
     bench.wait(5).send(LEFT, REST, "a")
     assert (bench.choice().sender, bench.choice().twist) == ("a", REST)
+
+
+@each(("advance", "kept"), [(0.0, "they stand still"), (0.5, "by 0.5 s in a second")])
+def test_the_wait_for_stamps_that_are_no_times_says_how_they_advance(
+    advance: float, kept: str
+) -> None:
+    bench = Bench(HIGH).prove_clock(HIGH, "clock", "a")
+    for number in range(100):
+        late_ms = 50 * number * (1 - advance)
+        bench.wait(50).stamped(HIGH, late_ms, "clock", REST, "a")
+    assert bench.status(HIGH).waits_for == Wait("stamps", "high", 0.25, kept=kept)
+
+
+def test_the_wait_for_a_long_round_trip_has_its_length_and_its_limit() -> None:
+    bench = Bench(HIGH)
+    for number in range(60):
+        bench.wait(50)
+        echo = Echo(1, bench.now_ns - 430 * MS)
+        bench.accept(Command("high", GO, bench.now_ns, sequence=number, echo=echo, age_ns=430 * MS))
+    assert bench.status(HIGH).waits_for == Wait("round_trip", "high", 0.3, kept="0.5")
+
+
+def test_a_sender_of_zeros_for_hours_is_reported_with_the_longest_duration() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH, REST)
+    bench.arbiter.sources["high"].senders[""].zeros_ns = bench.now_ns - 7200 * NS_PER_S
+    assert bench.choice().wait.lasts == 3600.0
+    assert bench.arbiter.until_ns > bench.now_ns
 
 
 # how many senders are remembered

@@ -68,6 +68,18 @@ def test_the_pause_behind_a_shared_zero_starts_again_after_a_stall() -> None:
     assert sender.is_armed(bench.now_ns + 1000 * MS)
 
 
+def test_a_stall_brings_back_no_sender_that_was_silent_before() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.arbiter.begin(bench.now_ns, bench.commands)
+    bench.send(HIGH, REST)
+    bench.wait(100).arbiter.begin(bench.now_ns, bench.commands)
+    bench.wait(200).arbiter.begin(bench.now_ns, bench.commands)
+    assert bench.choice().wait.what == "stalled"
+    for ms in (100, 100, 100, 200):
+        bench.wait(ms).arbiter.begin(bench.now_ns, bench.commands)
+    assert bench.choice().wait.what == "command"
+
+
 # a zero of a clock that is not proven yet
 
 
