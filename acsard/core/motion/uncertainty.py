@@ -55,6 +55,9 @@ Vector = tuple[float, float, float]  # x, y (m) and yaw (rad) of an error
 # and per rad.
 Effect = tuple[float, float, float, float]
 
+ORIGIN: Vector = (0.0, 0.0, 0.0)
+NO_EFFECT: Effect = (0.0, 0.0, 0.0, 0.0)
+
 # Causes of an error that do not average out. The motion that the pose may have missed is that of
 # gaps, of wheels of a side that are in doubt, and the difference of the turns by gyro and wheels.
 Missed = Literal["gap", "left", "right", "gyro"]
@@ -100,7 +103,7 @@ class ErrorModel:
         share = odometry.wheel_separation_multiplier_std / kinematics.multipliers[2]
         scale = (odometry.distance_scale_std, 0.0, 0.0, 0.0)
         # One radius is larger by half of the ratio's error, the other smaller.
-        longer, none = ratio * track / 4, (0.0, 0.0, 0.0, 0.0)
+        longer, none = ratio * track / 4, NO_EFFECT
         by_wheels = [(0.0, longer, ratio / track, 0.0), (0.0, 0.0, 0.0, -share), scale, none]
         by_gyro = [(0.0, longer, 0.0, 0.0), none, scale, (0.0, 0.0, 0.0, gyro)]
         missed = [none] * len(MISSED)
@@ -200,7 +203,7 @@ class Uncertainty(Struct):
 
     @classmethod
     def initial(cls, model: ErrorModel) -> Uncertainty:
-        columns = [(0.0, 0.0, 0.0)] * CAUSES
+        columns = [ORIGIN] * CAUSES
         return cls(model.start, model.start, Bend(model.start, columns), columns)
 
     def update(self, model: ErrorModel, yaw: Rad, *, slips: bool, by_gyro: bool) -> None:
@@ -221,8 +224,11 @@ class Uncertainty(Struct):
         p = carried(self.p, dx, dy, turning / 2)  # half of the noise of the turn comes before
         self.p = added(p, along, turning / 2, both, c, s)
         columns = []
-        # Unpacking into names is faster than indexing tuples.
-        for (x, y, turned), effect in zip(self.columns, model.effects[by_gyro], strict=True):
+        for column, effect in zip(self.columns, model.effects[by_gyro], strict=True):
+            if effect == NO_EFFECT and column == ORIGIN:  # most of them, in most robots
+                columns.append(column)
+                continue
+            x, y, turned = column
             of_distance, of_turn, turn_of_distance, turn_of_turn = effect
             further = of_distance * distance + of_turn * turn
             more = turn_of_distance * distance + turn_of_turn * turn
@@ -383,6 +389,8 @@ def _difference(p: PoseCovariance, q: PoseCovariance) -> PoseCovariance:
 def _total(p: PoseCovariance, columns: list[Vector]) -> PoseCovariance:
     xx, xy, xyaw, yy, yyaw, yawyaw = p.xx, p.xy, p.xyaw, p.yy, p.yyaw, p.yawyaw
     for x, y, yaw in columns:
+        if x == 0.0 == yaw and y == 0.0:
+            continue
         xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
         xyaw, yyaw, yawyaw = xyaw + x * yaw, yyaw + y * yaw, yawyaw + yaw * yaw
     return PoseCovariance(xx, xy, xyaw, yy, yyaw, yawyaw)
