@@ -35,7 +35,7 @@ from acsard.core.values import (
 REST_S = 0.2
 REST_COUNTS, REST_ANGLE = 2, 0.05
 
-LEARNING_TIME_S, NEW_BIAS_TIME_S = 0.5, 1.0  # at rest, until a bias is known, or replaced
+LEARNING_TIME_S = 0.5  # at rest, until a bias is known
 MAX_BIAS = 0.2  # rad/s; a higher rate at rest is a person who turns the robot
 BIAS_RANDOM_WALK = 1e-4  # of a cheap gyro with temperature, rad/s per square root of a second
 MIN_NOISE = 1e-5  # rad/s of a sample: a coarse gyro may repeat one value
@@ -71,9 +71,10 @@ DISAGREES_S = 5.0  # of driving after a contradiction
 # True turn divided by the turn of the wheels, on any floor.
 MIN_RATIO, MAX_RATIO = 0.25, 2.5
 MIN_TURN_RATE = 0.1  # rad/s of the wheels; less may be a count, or unequal tyres on a straight
-# Turns by the wheels, rad, that prove a gyro, and refute it. Wheels that spin on the spot look like
-# a dead gyro, so one that has proved itself is called dead later.
-PROVING_TURN, REFUTING_TURN, DEAD_TURN = 0.1, 0.4, 4.0
+# Turns by the wheels, rad, that prove a gyro, and refute it. A gyro in use must prove itself again
+# if it turns the other way, or by this angle more than the wheels on any floor. If it turns less,
+# the wheels may spin on the spot.
+PROVING_TURN, REFUTING_TURN, MAX_MORE = 0.1, 0.4, 0.3
 MIN_DEGREES_RATIO, MAX_DEGREES_RATIO = 15.0, 150.0  # 57 without slip and errors
 
 STATUS_TEXTS: dict[GyroDoes, str] = {
@@ -137,8 +138,7 @@ class Turn(Struct, frozen=True, gc=False):
 class Bias(Struct):
     """Reading of the gyro at rest, rad/s, with its variance and that of one sample.
 
-    The first estimate is a mean. Then a scalar Kalman filter follows a random walk. Another
-    constant reading at rest replaces it.
+    The first estimate is a mean. Then a scalar Kalman filter follows a random walk.
     """
 
     value: RadPerS = 0.0
@@ -146,7 +146,6 @@ class Bias(Struct):
     noise: float = 0.0
     rested_s: Seconds = 0.0
     samples: int = 0
-    other: Bias | None = None
 
     @property
     def is_known(self) -> bool:
@@ -157,12 +156,8 @@ class Bias(Struct):
         if not self.is_known:
             return self._average(rate, variance, span)
         error, noise = rate - self.value, max(self.noise, variance, MIN_NOISE**2)
-        limit = MAX_DEVIATIONS * math.sqrt(noise + self.variance) + VIBRATION
-        if abs(error) > limit:
-            return self._replace(
-                rate, variance, span, MAX_DEVIATIONS * math.sqrt(noise) + VIBRATION
-            )
-        self.other = None
+        if abs(error) > MAX_DEVIATIONS * math.sqrt(noise + self.variance) + VIBRATION:
+            return False
         gain = self.variance / (self.variance + noise)
         self.value += gain * error
         self.variance *= 1.0 - gain
@@ -178,17 +173,6 @@ class Bias(Struct):
         self.value += error / self.samples
         self.noise += (error * (rate - self.value) - self.noise) / self.samples
         self.variance = max(self.noise, variance, MIN_NOISE**2) / self.samples
-        return True
-
-    def _replace(self, rate: RadPerS, variance: float, span: Seconds, spread: RadPerS) -> bool:
-        other = self.other = self.other or Bias()
-        if not other._average(rate, variance, span) or math.sqrt(other.noise) > spread:
-            self.other = None
-            return False
-        if other.rested_s < NEW_BIAS_TIME_S:
-            return False
-        self.value, self.variance, self.noise = other.value, other.variance, other.noise
-        self.other = None
         return True
 
 
@@ -251,9 +235,6 @@ class Gyro(Struct):
     straight: Compared = field(default_factory=Compared)
     short: Compared = field(default_factory=Compared)  # turns; the trial of a gyro, too
     long: Compared = field(default_factory=Compared)
-    # Turns by the wheels in a contradiction, and by the gyro, positive to the same side.
-    against: Rad = 0.0
-    against_gyro: Rad = 0.0
     disagrees_s: Seconds = 0.0  # left
     learn_again: bool = False  # the bias, at the next rest: it may have changed
     doubt: Rad = 0.0  # for the next turn
@@ -347,11 +328,11 @@ class Gyro(Struct):
             self._follow_repetition(sample.rate == last.rate, span)
         bias.variance += BIAS_RANDOM_WALK * BIAS_RANDOM_WALK * span
         stands = self.rest_s > REST_S and not self.hangs
-        was, is_new = bias.value, self.learn_again or not bias.is_known
+        was, is_known = bias.value, bias.is_known
         if stands and self.learn_again:
             bias.variance, self.learn_again = (MAX_BIAS / 4) ** 2, False
         stands = stands and bias.follow(sample.rate, sample.variance, span)
-        if stands and not is_new and abs(bias.value - was) > VIBRATION:
+        if stands and is_known and abs(bias.value - was) > VIBRATION:
             # Nobody knows when the bias changed.
             self.doubt += (bias.value - was) * self.since_rest_s
         before, self.rate = self.rate, 0.0 if stands else sample.rate - bias.value
@@ -482,7 +463,7 @@ class Gyro(Struct):
         ratio = trial.gyro / trial.wheels
         if MIN_RATIO <= ratio <= MAX_RATIO:
             if known and trial.turned >= PROVING_TURN:
-                self.verdict, self.against, self.against_gyro = "good", 0.0, 0.0
+                self.verdict = "good"
         elif trial.turned >= REFUTING_TURN:
             verdict, self.short = _named(ratio), Compared()
             if known or verdict == "in degrees":
@@ -508,12 +489,14 @@ class Gyro(Struct):
         contradiction = off > DEVIATIONS * std + lag
         if self.disagrees_s > 0.0:
             self.doubt += block.gyro - block.wheels
-            self._weigh(block)
         elif contradiction:
             self.doubt += compared.gyro - compared.wheels
-            self.against = self.against_gyro = 0.0
         if contradiction:
             self.disagrees_s, self.learn_again = DISAGREES_S, True
+            wheels, gyro = abs(compared.wheels), abs(compared.gyro)
+            opposite = compared.gyro * compared.wheels < 0.0 and wheels > 2.0 * MARGIN
+            if (opposite and gyro > MIN_RATIO * wheels) or gyro > MAX_RATIO * wheels + MAX_MORE:
+                self.verdict, self.disagrees_s = "none yet", 0.0
             self._forget_compared()
 
     def _difference(self, compared: Compared, claims: Claims) -> tuple[Rad, Rad]:
@@ -526,18 +509,6 @@ class Gyro(Struct):
             + self.bias.variance * compared.seconds**2
         )
         return abs(compared.gyro - compared.wheels), math.sqrt(variance)
-
-    def _weigh(self, block: Compared) -> None:
-        opposite = block.gyro * block.wheels < 0.0 and abs(block.wheels) > MIN_TURN_RATE * BLOCK_S
-        self.against += abs(block.wheels)
-        self.against_gyro += -abs(block.gyro) if opposite else abs(block.gyro)
-        against, gyro = self.against, self.against_gyro
-        if MIN_RATIO * against <= gyro <= MAX_RATIO * against:
-            return
-        dead = abs(gyro) < MIN_RATIO * against
-        if against >= DEAD_TURN if dead else max(against, abs(gyro) / MAX_RATIO) >= REFUTING_TURN:
-            self.verdict = _named(gyro / against if against else math.inf)
-            self._forget_compared()
 
 
 def _span(last: GyroSample, sample: GyroSample) -> Seconds:

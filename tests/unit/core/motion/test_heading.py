@@ -193,7 +193,7 @@ def test_the_heading_of_a_gyro_that_hangs_is_taken_back_or_in_the_covariance(
     bench.run(1.0, Twist(0.0, 1.0))
     bench.hangs_at = 1.0
     bench.run(8.0, Twist(0.5 if drives_on else 0.0, 0.0))
-    assert bench.gyro.status.does == ("not believed" if drives_on else "hangs")
+    assert bench.gyro.status.does == ("disagrees" if drives_on else "hangs")
     assert abs(bench.off) < 2.0 * math.sqrt(bench.yaw_variance)
     if not drives_on:
         assert abs(bench.off) < 0.02
