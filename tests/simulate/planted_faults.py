@@ -32,7 +32,7 @@ PLANS_OF_FAULT = {
     "session echo": "half_duplex", "case 11": "echo", "limits clock": "wall",
     "robot unsent": "block", "robot limits": "limits", "lifecycle number": "typed",
     "lifecycle fault": "driver_fault",
-    "gyro hangs": "hangs", "gyro turn": "hangs", "gyro wrong": "wrong",
+    "gyro hangs": "hangs",
 }  # fmt: skip
 """Kinds of plans by the name of a fault, or by the first word of its name."""
 
@@ -840,20 +840,6 @@ FAULTS = (
         GYRO,
         "self.hangs |= share < MAX_REPEATING and",
         "self.hangs |= share < 0.0 and",
-    ),
-    fault(
-        "gyro turn",
-        "the turn of a gyro that hangs stays in the pose until the hang is certain",
-        GYRO,
-        "            off = self.since_change if self.hangs else self.since_sample\n",
-        "            off = 0.0 if self.hangs else self.since_sample\n",
-    ),
-    fault(
-        "gyro wrong",
-        "a single wrong sample of the gyro turns the pose",
-        GYRO,
-        "                if (sample.rate - last.rate) / jump >= CONFIRMED:\n",
-        "                if (sample.rate - last.rate) / jump >= -1e9:\n",
     ),
     # recording
     fault(
