@@ -1,14 +1,11 @@
 """Estimates from a log how soon the wheels follow their commands, and how fast they can turn.
 
-The daemon reports a wheel fault if a wheel contradicts the model of a healthy wheel for
-`feedback.fault_time`. This module finds the `feedback.response_time` that fits the healthy wheels
-of the log best, and runs the daemon's own detection (`core/motion/wheel_witness.py`) on the log
-with the configured one, which shows false faults.
+The daemon compares each wheel with its command behind a lag of `feedback.response_time`
+(`core/motion/wheels.py`). This module finds the one that fits the wheels of the log best.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,11 +14,8 @@ from msgspec import Struct
 
 from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import GAP_S, Run
-from acsard.core.config.motion_rules import MIN_EVIDENCE_LINES
 from acsard.core.config.settings import DriveConfig, FeedbackConfig
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.wheel_faults import MIN_COMMANDED_SPEED
-from acsard.core.motion.wheel_witness import MIN_FAULT_SPEED, Expected, Witness
 from acsard.core.values import RadPerS, Seconds, Twist
 
 RESPONSE_TIMES_S = np.geomspace(0.01, 5.0, 60)  # the range of `feedback.response_time`
@@ -31,10 +25,8 @@ LEAST_ROWS, MOST_ROWS = 200, 30_000
 
 MAX_UNEXPLAINED = 0.5  # fraction of the sum of squared wheel speeds
 
-MAX_FAULTY_FRACTION = 0.5  # of a fault time, in which a healthy wheel may look faulty
-
 # Limits that show that a wheel turns as fast as it can.
-STEADY_S, REACHED, CONSTANT = 1.0, 0.9, 0.03
+STEADY_S, REACHED, CONSTANT, MIN_SPEED = 1.0, 0.9, 0.03, 2.0  # s, fractions, rad/s
 
 AGREEMENT_FACTOR = 1.5  # up to which the fitted and the configured response time agree
 
@@ -51,40 +43,24 @@ class WheelResponse(Struct, frozen=True):
     """The response of the wheels to their commands in a log."""
 
     seconds: Seconds  # response time that fits the log best
-    proposed: Seconds | None  # to configure; None if the tool proposes no change
     present: Seconds  # configured
-    false_fault: bool  # the daemon would report one in this log with the configured time
     fastest: RadPerS  # highest speed of the wheels; infinity if the log shows no such limit
 
     def settings(self) -> dict[str, float]:
-        """Return the new values for settings of `[feedback]`; empty if none must change."""
-        if not self.false_fault or self.proposed is None:
+        """Return the new values for settings of `[feedback]`; empty if none must change.
+
+        A shorter one is not proposed: it would only leave less time for a bump.
+        """
+        if self.seconds <= AGREEMENT_FACTOR * self.present:
             return {}
-        return {"response_time": self.proposed}
+        return {"response_time": float(f"{self.seconds:.2g}")}
 
     def sentences(self) -> list[str]:
         follow = f"the wheels follow their commands with a response time of {self.seconds:.2g} s"
-        if self.false_fault:
-            then = (
-                f", but with feedback.response_time = {self.present:g} the daemon would report a "
-                "wheel fault: "
-            )
-            if self.proposed is not None:
-                then += f"the new feedback.response_time is {self.proposed:g}"
-            elif np.isfinite(self.fastest):
-                then += "first lower limits.wheel_speed as the next note says"
-            else:
-                then += (
-                    "raising feedback.response_time does not reliably prevent this; if the wheels "
-                    "are healthy, raise feedback.fault_time"
-                )
-        elif max(self.seconds / self.present, self.present / self.seconds) > AGREEMENT_FACTOR:
-            then = (
-                f"; the configured feedback.response_time = {self.present:g} s differs, but causes "
-                "no fault in this log"
-            )
+        if self.settings():
+            then = f"; the configured feedback.response_time = {self.present:g} s is too short"
         else:
-            then = f", which agrees with the configured feedback.response_time = {self.present:g} s"
+            then = f", and feedback.response_time = {self.present:g} s is long enough"
         sentences = [follow + then]
         if np.isfinite(self.fastest):
             sentences.append(
@@ -115,20 +91,7 @@ def response(
     best = int(np.argmin(squares))
     if not squares[best] < MAX_UNEXPLAINED * whole:
         return None
-    limit, proposed = feedback.fault_time, None
-    false_fault = limit > 0.0 and _evidence(parts, feedback.response_time, limit) > limit
-    if false_fault:
-        rounded = (float(f"{t:.2g}") for t in RESPONSE_TIMES_S[best:])
-        good = (
-            t
-            for t in rounded
-            if t >= RESPONSE_TIMES_S[best]
-            and _evidence(parts, t, limit) <= MAX_FAULTY_FRACTION * limit
-        )
-        proposed = next(good, None)
-    return WheelResponse(
-        float(RESPONSE_TIMES_S[best]), proposed, feedback.response_time, false_fault, fastest
-    )
+    return WheelResponse(float(RESPONSE_TIMES_S[best]), feedback.response_time, fastest)
 
 
 def _commanded(run: Run, drive: DriveConfig) -> Commanded:
@@ -161,32 +124,11 @@ def _expected(part: Commanded) -> Floats:
     return expected
 
 
-def _evidence(parts: Sequence[Commanded], response_time: float, fault_time: float) -> float:
-    longest, most = 0.0, fault_time / MIN_EVIDENCE_LINES
-    for steps, wanted, actual in parts:
-        sides = [(Expected(), Witness()) for _ in range(2)]
-        for step, commands, speeds in zip(
-            steps.tolist(), wanted.tolist(), actual.tolist(), strict=True
-        ):
-            still = max(map(abs, commands)) < MIN_COMMANDED_SPEED
-            for (expected, witness), command, speed in zip(sides, commands, speeds, strict=True):
-                if math.isnan(step):
-                    expected.forget()
-                    witness.forget()
-                    continue
-                expected.follow(command, speed, speed, step, response_time)
-                witness.check_speed(speed, expected, step, most, 0.0, still)
-                longest = max(longest, *witness.evidence.values())
-    return longest
-
-
 def _fastest(parts: Sequence[Commanded]) -> float:
     speeds: list[float] = []
     for steps, wanted, actual in parts:
         for command, speed in zip(wanted.T, np.abs(actual.T), strict=True):
-            short = (
-                (speed > MIN_FAULT_SPEED) & (speed < REACHED * np.abs(command)) & ~np.isnan(steps)
-            )
+            short = (speed > MIN_SPEED) & (speed < REACHED * np.abs(command)) & ~np.isnan(steps)
             edges = np.flatnonzero(np.diff(short.astype(np.int8), prepend=0, append=0))
             for begin, end in edges.reshape(-1, 2):
                 at = np.cumsum(steps[begin:end])

@@ -17,7 +17,7 @@ from acsard.checkup.findings import StoppedError, WireLostError, motor_name, mot
 from acsard.checkup.lateness import HostDelays
 from acsard.checkup.motion import ZERO, BoardReply
 from acsard.checkup.restarts import RestartedError, Restarts
-from acsard.core.config.settings import MAX_REPLY_PERIOD_S, McuConfig, WheelMap
+from acsard.core.config.settings import McuConfig, WheelMap
 from acsard.core.config.wire_time import line_bytes, wire_ns
 from acsard.core.link.board_status import STATUS, decode_status
 from acsard.core.link.checked_line import SAMPLE_REQUEST, SEQUENCES, seal, unseal
@@ -96,12 +96,8 @@ class Board:
     it sends nothing, so that the board's watchdog can stop the motor.
     """
 
-    def __init__(
-        self, wire: Wire, mcu: McuConfig, rate_hz: float, longest_reply: float = MAX_REPLY_PERIOD_S
-    ) -> None:
+    def __init__(self, wire: Wire, mcu: McuConfig, rate_hz: float) -> None:
         self.wire, self.mcu, self.rate_hz = wire, mcu, rate_hz
-        # Largest permitted value of the setting `mcu.reply_period`.
-        self.longest_reply_s = longest_reply
         # Whether the check has seen all motors stand still. From then on, the check ends if a motor
         # runs away or if the board falls silent.
         self.armed = False

@@ -14,7 +14,7 @@ from acsard.checkup import lateness, motion, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError, motor_name
 from acsard.checkup.motion import BOOT_S, SHORT_MEASUREMENT_S, WATCHDOG_SILENCE_S, ZERO, BoardReply
-from acsard.core.config.settings import Baud
+from acsard.core.config.settings import MAX_REPLY_PERIOD_S, Baud
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.core.link.checked_line import seal
 from acsard.core.link.session import IDENTITY
@@ -179,7 +179,7 @@ def rate(board: Board) -> Finding:
     unset_s = max(0.1, 4 * period_s)  # the silence that the host allows by default
     quiet_s = max(unset_s, 3 * configured)
     slow, lossy = 3 * gap_s > 1.1 * quiet_s, not board.own_clock and answered < 0.8
-    most_s = board.longest_reply_s
+    most_s = MAX_REPLY_PERIOD_S
     rare, period = slow and gap_s > most_s, min(float(f"{gap_s:.1g}"), most_s)
     keys: dict[str, object] = {"mcu.reply_period": period if slow else configured}
     outcome = "rare" if rare else "slow" if slow else "lossy" if lossy else "right"

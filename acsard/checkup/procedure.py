@@ -30,7 +30,6 @@ from acsard.checkup.motion import SHORT_MEASUREMENT_S
 from acsard.checkup.outcomes import TimingFinding
 from acsard.checkup.restarts import Restart, RestartedError
 from acsard.checkup.wheels import Channel, encoder_finding, wheel_map
-from acsard.core.config.motion_rules import longest_reply
 from acsard.core.config.settings import Config, SafetyConfig
 from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S
@@ -109,8 +108,7 @@ def run(
     why = ""
     all_restarts: list[Restart] = []
     try:
-        longest_s = longest_reply(config.feedback.fault_time)
-        with Board(wire, config.mcu, config.rate_hz, longest_s) as board:
+        with Board(wire, config.mcu, config.rate_hz) as board:
             board.zeros()
             if operator.ask(CONFIRMATION, (LIFTED,)) != LIFTED:
                 raise StoppedError(outcomes.find("wheels: not lifted"))

@@ -57,9 +57,12 @@ GUARD_CODES: tuple[GuardCode, ...] = get_args(GuardCode)
 
 # Causes of a latched fault.
 FaultCode = Literal[
-    GuardCode, "driver_fault", "impossible_speeds", "wheel_dead", "wheel_reversed",
-    "wheel_runaway", "wheel_stuck",
+    GuardCode, "driver_fault", "impossible_speeds", "wheel_reversed", "wheel_runaway",
+    "wheel_too_fast", "wheels_swapped",
 ]  # fmt: skip
+
+# What a wheel does that is no reason to stop.
+WheelCode = Literal["wheel_blocked", "wheel_slow", "wheel_fast", "wheel_stuck"]
 
 StateCode = Literal[
     StopCode, FaultCode, LinkCode, WaitCode, "switched_off", "other_version", "shutting_down",
@@ -75,7 +78,7 @@ RefusalCode = Literal[
     "bad_attachment", "bad_echo", "unknown_format",
 ]  # fmt: skip
 
-Code = Literal[StateCode, PoseCode, RefusalCode]
+Code = Literal[StateCode, PoseCode, RefusalCode, WheelCode]
 
 TABLE = """
 commanded
@@ -184,19 +187,31 @@ driver_fault
     -> repair the driver, or switch the robot off and on
 impossible_speeds
     the board reports impossible speeds ({cause})
-wheel_dead
-    {wheel} wheel does not turn, or its encoder is dead {figures}:
-    -> check cable, motor and encoder, and for motor d also the setting mcu.trailing_comma
 wheel_reversed
-    {wheel} wheel turns against its command {figures}:
+    {wheel} wheel does not obey its command: it turns the wrong way {figures}:
     -> check the leads of its motor, the wires A and B of its encoder, and the wheel's sign in
     mcu.wheels
 wheel_runaway
-    {wheel} wheel turns faster than commanded {figures}:
+    {wheel} wheel does not obey its command: it rolls on, or too far {figures}:
     -> check the motor driver and the encoder
+wheel_too_fast
+    {wheel} wheel turns faster than the limiter allows {figures}:
+    -> check the speed controller of the board
+wheels_swapped
+    {wheels} wheels do not obey their commands: each turns as the other one is commanded {figures}:
+    -> check whether their motors or encoders are swapped, or reversed
+wheel_blocked
+    {wheel} wheel is blocked, or has no power:
+    -> check cable, motor and encoder, and for motor d also the setting mcu.trailing_comma
+wheel_slow
+    {wheel} wheel reaches {share} of its expected speed:
+    -> check the load, the battery, limits.wheel_speed and feedback.response_time
+wheel_fast
+    {wheel} wheel reaches {share} of its expected speed:
+    -> check the speed controller of the board and feedback.response_time
 wheel_stuck
-    {wheel} wheel reports a speed that never changes, so its encoder is stuck {figures}:
-    -> check the encoder and its cable
+    {wheel} wheel reports exactly {speed} rad/s without a command:
+    -> check its encoder, and whether the firmware keeps the last speed when a wheel stops
 guard_line_damaged
     the daemon's guard replaced a line for the board with zeros: the line is not complete, or does
     not have four wheel speeds

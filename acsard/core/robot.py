@@ -18,7 +18,6 @@ from msgspec.structs import replace
 from acsard.core.board_inputs import inputs_after
 from acsard.core.codes import Reason, RefusalCode, reason
 from acsard.core.config.live import Changes, changed, describe_changes
-from acsard.core.config.motion_rules import longest_reply
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config, LimitsConfig
 from acsard.core.link.board_status import as_text
@@ -89,8 +88,7 @@ class Robot:
     def __init__(self, config: Config, latches: Latches = Latches()) -> None:  # noqa: B008
         # As after a start of the daemon; `latches` decides the first mode.
         self.config = config  # in force; a `set` replaces it
-        longest_s = longest_reply(config.feedback.fault_time)
-        self.session = McuSession(config.mcu, config.rate_hz, config.feedback, longest_s)
+        self.session = McuSession(config.mcu, config.rate_hz, config.feedback)
         self._kinematics = Kinematics(config.drive)
         self._errors = self._error_model()
         self._odometry = Odometry.initial(self._errors)
@@ -150,7 +148,7 @@ class Robot:
             refused_age_s=None if since_ns is None else (now_ns - since_ns) / NS_PER_S,
             feedback_age_s=session.feedback_age_s(now_ns),
             gyro=checks.gyro_status,
-            doubt=checks.wheels.status,
+            doubt=checks.wheels_status,
             check=session.check,
             encoders=session.count_recovery.counts,
             pose_doubt=session.doubt.code,
@@ -426,19 +424,14 @@ class Robot:
         # do not follow the commanded speeds are not a sign of a fault.
         estop = self._inputs.estop
         pressed = estop.is_pressed or estop.pressed_now is not None
-        if self.session.lateness.step_s > WRITE_PAUSE_S and not pressed:
-            # This computer was late, and the board may have stopped the motors meanwhile. So the
-            # feedback lines that waited to be read say nothing about faults of the wheels.
-            fault = None
-            wheels.skip(line.speeds)
-        else:
-            fault = wheels.watch(None if pressed else self._last.written, line.speeds, line.since)
-        if fault is not None:
-            self._fault(fault, now, events)
+        wheels.commanded = None if pressed else self._last.written
+        wheels.late = self.session.lateness.step_s > WRITE_PAUSE_S
+        estimate = self._odometry.fold(line, checks, self._errors)
+        if wheels.fault is not None:
+            self._fault(wheels.fault, now, events)
         if wheels.pushed:
             self.counters["uncommanded_motion"] += 1
             events.append(Event("uncommanded_motion", wheels.pushed, "warning"))
-        estimate = self._odometry.fold(line, checks, self._errors)
         if wheels.events:
             self.counters["wheel_faults"] += len(wheels.events)
         events += checks.events

@@ -298,14 +298,11 @@ class SourceStatus(Struct, frozen=True):
 
 
 class WheelsStatus(Struct, frozen=True):
-    """The result of the checks for wheel faults, slip and slow wheels."""
+    """The verdicts on the wheels that are no reason to stop."""
 
-    text: str = ""  # faults and slip, in words
+    text: str = ""
     left_out: tuple[str, ...] = ()  # wheels that the odometry ignores
     slipping: tuple[str, ...] = ()  # sides, `left` or `right`, within half a second
-    # Difference of front and rear wheel, left and right: 0.01 if the front one rolls 1 % farther.
-    differ: tuple[float, float] = (0.0, 0.0)
-    slow: tuple[str, ...] = ()  # such as "front_left 60%" of the expected speed
 
 
 class RoutersStatus(Struct, frozen=True):

@@ -49,7 +49,7 @@
 
 #define RUNAWAY_DUTY 0.75f     /* of full voltage, against which it turns ... */
 #define RUNAWAY_MS 150         /* ... without getting slower for this long */
-#define STUCK_MS 1000          /* or it stands at full voltage for this long; above `fault_time` */
+#define STUCK_MS 1000          /* or it stands at full voltage for this long */
 
 /* Inputs. The board reports those that are wired in its status line; README.md, "Wire the inputs". */
 

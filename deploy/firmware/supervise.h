@@ -10,7 +10,7 @@
  *   voltage too, but gets slower.
  * - It stands at full voltage for STUCK_MS, except for a count or two. This is a wheel that is blocked,
  *   or one whose encoder is dead or has a dead channel. Its motor must not get voltage for ever. If a
- *   robot pushes against a wall, its host stops it earlier (`fault_time`, 0.5 s), or the wheels slip.
+ *   robot pushes against a wall, its host only reports that, or the wheels slip.
  */
 #ifndef SUPERVISE_H
 #define SUPERVISE_H

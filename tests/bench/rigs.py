@@ -68,7 +68,7 @@ def config(rate: float = 100.0, reply_period: float = 0.0) -> Config:
         commands=CommandsConfig(sources=(Source("bench", 100),)),
         control=ControlConfig(rate=rate),
         mcu=McuConfig(reply_period=reply_period),
-        feedback=FeedbackConfig(fault_time=0.0),
+        feedback=FeedbackConfig(encoders=False),
         limits=LimitsConfig(
             linear_acceleration=100.0,
             linear_deceleration=100.0,

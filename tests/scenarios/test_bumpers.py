@@ -9,7 +9,6 @@ import pytest
 from acsard.core.config.settings import (
     Config,
     ControlConfig,
-    FeedbackConfig,
     McuConfig,
     Place,
     SafetyConfig,
@@ -60,7 +59,6 @@ class Lines:
 SLUGGISH = Config(
     control=ControlConfig(rate=20.0),
     mcu=McuConfig(reply_period=0.1),
-    feedback=FeedbackConfig(fault_time=0.2),
     safety=STOP.safety,
     sim=SimConfig(motor_time_constant=0.319),
 )

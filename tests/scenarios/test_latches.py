@@ -312,8 +312,8 @@ def test_a_clear_of_one_fault_does_not_release_another_fault_that_came_after_it(
     world: World,
 ) -> None:
     """The second fault's cause ends by itself, so a wrongly released fault would be lost."""
-    with world.mcu.dead_motor(0):
-        world.drive(0.5, seconds=1.2)
+    with world.mcu.reversed_motor(0):
+        world.drive(0.5, seconds=2.0)
     assert world.state.mode == "fault"
     shown = world.numbers
     with world.mcu.driver_fault(0.0, 0.3):

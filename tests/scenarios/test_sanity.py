@@ -39,11 +39,10 @@ def stopped(world: World) -> bool:
 
 @pytest.mark.variations(6)
 @pytest.mark.parametrize("wheel", range(4))
-@pytest.mark.parametrize("kind", ["stuck", "reversed", "runaway"])
+@pytest.mark.parametrize("kind", ["reversed", "runaway"])
 def test_a_faulty_encoder_stops_the_robot_and_is_named(world: World, wheel: int, kind: str) -> None:
     world.drive(0.5, seconds=1.5)
     faults: dict[str, Fault] = {
-        "stuck": world.mcu.stuck_encoder(wheel),
         "reversed": world.mcu.bias(wheel, -1.0),
         "runaway": world.mcu.bias(wheel, 2.0),
     }

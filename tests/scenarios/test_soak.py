@@ -290,7 +290,7 @@ TROUBLES = (
     "bad commands", "clock", "stop",
 )  # fmt: skip
 
-WHEEL_CODES = ("wheel_dead", "wheel_reversed", "wheel_runaway", "wheel_stuck")
+WHEEL_CODES = ("wheel_reversed", "wheel_reversed", "wheel_runaway", "wheel_stuck")
 
 
 def trouble(world: World, kind: str, dice: random.Random) -> str:

@@ -11,7 +11,6 @@ import pytest
 
 from acsard.core.config.settings import (
     Config,
-    FeedbackConfig,
     LimitsConfig,
     McuConfig,
     OdometryConfig,
@@ -25,15 +24,15 @@ from tests.scenarios.imperfect_gyro import ImperfectGyro
 from tests.scenarios.world import World
 from tests.unit.core.motion.liars import Plain
 
+COUNTS = SimConfig().encoder_counts
+
 
 def world(
-    gyro: ImperfectGyro | None = None, sim: SimConfig | None = None, fault_time: float = 0.0
+    gyro: ImperfectGyro | None = None, sim: SimConfig | None = None, counts: int = COUNTS
 ) -> World:
-    """Return a world in which a wheel fault latches nothing, so that the robot drives on."""
-    feedback = FeedbackConfig(fault_time=fault_time)
     made = World(
         Config(
-            feedback=feedback,
+            mcu=McuConfig(encoder_counts=counts),
             odometry=OdometryConfig(gyro=gyro is not None),
             sim=sim or SimConfig(),
         ),
@@ -97,37 +96,36 @@ def test_with_one_wheel_fault_the_pose_stays_right_and_state_names_the_wheel(
         assert made.state.wheel_fault.startswith(f"{WHEELS[wheel]} wheel is left out")
         assert (row(made).level, row(made).message) == (1, made.state.wheel_fault)
         distance, turn = off(made)
-        assert distance < 0.02
-        assert turn < 0.03
+        assert distance < 0.03
+        assert turn < 0.05
     reports = [event.text for event in made.events if event.name == "wheel_fault"]
     assert f"{WHEELS[wheel]} wheel is left out" in reports[0]
 
 
-def test_a_stuck_wheel_is_left_out_within_50_ms_and_the_fault_follows_in_time() -> None:
-    made = world(fault_time=0.5)
+def test_a_dead_encoder_is_left_out_within_60_ms_and_the_robot_drives_on() -> None:
+    made = world()
     made.drive(0.8, seconds=2.0)
     begun, out = made.now_ns, 0
     with made.mcu.stuck_encoder(1):
-        while made.state.mode == "driving" and made.now_ns - begun < NS_PER_S:
+        while made.now_ns - begun < NS_PER_S:
             made.hold(0.8, seconds=0.01, hz=100.0)
             if not out and made.state.wheel_fault.startswith("front_left wheel is left out"):
                 out = made.now_ns
-        assert made.state.mode == "fault"
-        assert made.state.code == "wheel_dead"
-    assert 0 < out - begun <= 0.05 * NS_PER_S
-    assert 0.49 < (made.now_ns - begun) / NS_PER_S < 0.6
-    assert off(made)[1] < 0.04  # of the lines before it was left out
+        assert made.state.mode == "driving"
+        assert "front_left wheel is blocked, or has no power" in made.state.wheel_fault
+    assert 0 < out - begun <= 0.06 * NS_PER_S
+    assert off(made)[1] < 0.05
 
 
-@pytest.mark.parametrize(("speed", "mode"), [(0.1, "driving"), (0.12, "fault")])
-def test_a_dead_encoder_stops_the_robot_above_2_rad_s_and_is_named_at_any_speed(
-    speed: float, mode: str
+@pytest.mark.parametrize("speed", [0.05, 0.1, 0.3])
+def test_a_dead_encoder_is_left_out_and_named_at_any_speed_and_the_robot_drives_on(
+    speed: float,
 ) -> None:
-    made = world(fault_time=0.5)
+    made = world()
     made.drive(speed, seconds=1.0)
     with made.mcu.stuck_encoder(0):
         made.hold(speed, seconds=2.0)
-    assert made.state.mode == mode
+    assert made.state.mode == "driving"
     assert made.state.wheel_fault.startswith("front_right wheel is left out of the pose")
 
 
@@ -168,7 +166,7 @@ def reversed_encoder(seed: int) -> tuple[float, float, str]:
     dice, plain = random.Random(seed), Plain()
     lag, scale = dice.choice((0.05, 0.2, 0.6)), dice.choice((0.25, 1.0))
     sim = SimConfig(encoder_counts=96, motor_time_constant=lag)
-    made, wheel = world(sim=sim, fault_time=0.5), dice.randrange(4)
+    made, wheel = world(sim=sim, counts=96), dice.randrange(4)
     integrate = made.loop.robot._check_and_integrate
 
     def both(line: Feedback, now: Instant, events: list[Event]) -> Estimate:
@@ -264,7 +262,7 @@ def test_a_wheel_that_is_ignored_as_dead_leaves_the_turn_rate_uncertain() -> Non
 def test_a_wheel_that_may_be_right_although_it_is_ignored_is_in_the_covariance(
     kind: str, linear: float, angular: float
 ) -> None:
-    made = World(Config(odometry=SURE))
+    made = World(Config(mcu=McuConfig(encoder_counts=COUNTS), odometry=SURE))
     made.run(1.5)
     made.drive(linear, angular, seconds=2.0)
     before = off(made)[1]
@@ -279,9 +277,8 @@ def test_a_wheel_that_may_be_right_although_it_is_ignored_is_in_the_covariance(
             faults.enter_context(fault(0))
         made.hold(linear, angular, seconds=1.0)
         made.run(1.0)
-    assert made.state.mode == "fault"
     error, std = off(made)[1] - before, math.sqrt(made.odom.pose.covariance[35])
-    assert 0.1 < error < 2.0 * std
+    assert 0.1 < error < 3.0 * std
 
 
 @pytest.mark.parametrize("configured", [False, True])
@@ -314,7 +311,7 @@ def test_stalls_of_the_computer_do_not_make_an_encoder_with_few_counts_look_fail
 
 
 def test_wheels_of_both_sides_that_may_be_right_do_not_cancel() -> None:
-    made = World(Config(odometry=SURE, feedback=FeedbackConfig(fault_time=0.0)))
+    made = World(Config(odometry=SURE))
     made.run(1.5)
     made.drive(0.5, seconds=1.0)
     with made.mcu.stuck_encoder(0), made.mcu.bias(1, 0.0):
@@ -346,7 +343,7 @@ def test_slip_makes_the_covariance_a_hundred_times_as_large() -> None:
 def test_ordinary_drives_cause_no_wheel_fault(counts: int, seconds: int) -> None:
     """The robot skids on a slippery floor, has coarse encoders, and is sometimes pushed."""
     sim = SimConfig(encoder_counts=counts, track_multiplier=1.6)
-    made, dice = world(sim=sim, fault_time=0.5), random.Random(counts)
+    made, dice = world(sim=sim, counts=counts), random.Random(counts)
     made.send(0.0)
     made.run(0.1)
     while made.now_ns < (6.5 + seconds) * NS_PER_S:
@@ -429,14 +426,9 @@ def test_a_runaway_is_detected_after_a_late_step_and_again_after_a_clear(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("every", "fault_time"), [(0.5, 0.5), (0.7, 0.8)])
-def test_a_computer_that_is_late_repeatedly_hides_no_runaway(
-    every: float, fault_time: float
-) -> None:
-    config = Config(
-        mcu=McuConfig(reply_period=0.01), feedback=FeedbackConfig(fault_time=fault_time)
-    )
-    world = World(config)
+@pytest.mark.parametrize("every", [0.5, 0.7])
+def test_a_computer_that_is_late_repeatedly_hides_no_runaway(every: float) -> None:
+    world = World(Config(mcu=McuConfig(reply_period=0.01)))
     with world.mcu.free_running(0.01):
         world.run(0.5)
         world.drive(0.8, seconds=1.0)

@@ -697,7 +697,6 @@ class Run:
         if not end or not any(line[:2] in (b"ap", b"an") for line in lines.split(b"\n")):
             return  # The line has no end, or begins with noise, or the board greets.
         true_ns = at_ns - START_NS + self.slept_ns
-        self.witness.reported(true_ns, lines)
         gap_ns = true_ns - self._fed_ns
         if self._flipped:
             self._flipped -= 1

@@ -517,7 +517,6 @@ def _late_lines(plan: Plan, dice: random.Random) -> None:
     period, baud = dice.choice(((0.01, 38400), (0.01, 115200), (0.02, 19200), (0.05, 9600)))
     config["mcu"] |= {"baud_rate": baud, "reply_period": period}
     config["control"]["rate"] = min(100.0, 1.0 / period)
-    config["feedback"] = {"fault_time": dice.choice((0.1, 0.2, 0.5, 0.5))}
     for source in config["commands"]["sources"]:
         source["timeout"] = max(source["timeout"], 0.25)
     plan["board"] = [["free_running", period]]

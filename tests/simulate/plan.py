@@ -374,7 +374,6 @@ def _make_other(dice: random.Random, config: dict[str, Any]) -> None:
     config["feedback"] = {
         "wheel_speed": round(config["limits"]["wheel_speed"] * dice.uniform(1.5, 2.0), 2),
         "response_time": dice.choice((0.2, 0.5, 1.0)),
-        "fault_time": dice.choice((0.0, 0.3, 0.5, 2.0)),
     }
     config["odometry"] = config.get("odometry", {}) | {
         name: dice.choice((1e-5, 1e-4, 1e-3, 1e-2))

@@ -15,7 +15,7 @@ from tests.simulate.planted_faults import (
     NEUTRAL,
     ROBOT,
     SESSION,
-    WITNESS,
+    WHEELS_LAW,
     Edit,
     fault,
 )
@@ -91,9 +91,9 @@ CASES = (
     fault(
         "case 9",
         "healthy motors that lag latch the fault `runaway`",
-        WITNESS,
-        "nearing = off < self._nearest - MIN_APPROACH",
-        "nearing = off < self._nearest - MIN_APPROACH and not fast",
+        WHEELS_LAW,
+        "if approaches or farther",
+        "if farther",
     ),
     fault(
         "case 10",

@@ -23,9 +23,9 @@ PLANS_OF_FAULT = {
     "moment": "late step", "robot set": "late step",
     "neutral stall": "stall behind a zero", "neutral place": "doubtful holder",
     "driver release": "behind a press",
-    "wheel press": "behind a press", "wheel counts": "coarse encoders",
+    "wheel press": "behind a press",
     "wheel waited": "late lines", "limits saturated": "wheel limit",
-    "replay": "recorded", "lines endless": "endless", "sanity blind": "reversed_motor",
+    "replay": "recorded", "lines endless": "endless", "wheel reversed": "reversed_motor",
     "session gap": "mute", "session stale": "mute", "odometry silent": "mute",
     "odometry gap": "mute",
     "loop end": "restart", "robot end": "restart", "gate late": "stall in step",
@@ -67,8 +67,8 @@ AGES, LIMITS, LIFECYCLE = (
     "core/motion/lifecycle.py",
 )
 MODES, ROBOT, SESSION = "core/motion/modes.py", "core/robot.py", "core/link/session.py"
-WITNESS, ODOMETRY = "core/motion/wheel_witness.py", "core/motion/odometry.py"
-WHEEL_FAULTS, GYRO = "core/motion/wheel_faults.py", "core/motion/gyro.py"
+WHEELS_LAW, ODOMETRY = "core/motion/wheels.py", "core/motion/odometry.py"
+GYRO = "core/motion/gyro.py"
 UNCERTAINTY = "core/motion/uncertainty.py"
 LATCHES, VALUES, LOOP = "core/motion/latches.py", "core/values.py", "daemon/control_loop.py"
 PUBLICATION = "daemon/publication.py"
@@ -701,25 +701,46 @@ FAULTS = (
     ),
     # sanity
     fault(
-        "sanity evidence",
-        "evidence against a healthy wheel is never dropped",
-        WITNESS,
-        "self.evidence[kind] = self.evidence[kind] + min(dt, most) if sign else 0.0",
-        "self.evidence[kind] = self.evidence[kind] + (min(dt, most) if sign else 0.0)",
+        "wheel runaway",
+        "a wheel that rolls on after a stop is never a fault",
+        WHEELS_LAW,
+        "if wheel.same_s < wheel.apart_s:",
+        "if False:",
     ),
     fault(
-        "sanity dead",
-        "a healthy wheel that follows its command slowly is called dead",
-        WITNESS,
-        "moving and least > MIN_FAULT_SPEED and abs(raw_speed) < 0.1 * least",
-        "moving and least > MIN_FAULT_SPEED and abs(raw_speed) < 0.97 * least",
+        "wheel fast",
+        "a robot that is faster than its limiter is never a fault",
+        WHEELS_LAW,
+        "elif wheel.fast_s >= TOO_FAST_S and",
+        "elif False and",
     ),
     fault(
-        "sanity blind",
-        "a wheel that contradicts its command is never a fault",
-        WHEEL_FAULTS,
-        "if not (limit and (bad_left or bad_right)):",
-        "if True:",
+        "wheel swapped",
+        "wheels that turn as commanded to the other side are not named",
+        WHEELS_LAW,
+        "if abs(both) > 0.75 * abs(due) or",
+        "if True or",
+    ),
+    fault(
+        "wheel blocked",
+        "a wheel that does not turn is not reported",
+        WHEELS_LAW,
+        "elif off * command < 0.0 and abs(speed) < AGREEMENT * abs(command):",
+        "elif False:",
+    ),
+    fault(
+        "wheel stuck",
+        "a wheel that repeats one speed at rest is not reported",
+        WHEELS_LAW,
+        "if still and wheel.same_s >= HELD_S and",
+        "if False and wheel.same_s >= HELD_S and",
+    ),
+    fault(
+        "wheel reversed",
+        "a wheel that turns the wrong way is never a fault",
+        WHEELS_LAW,
+        "elif goes_on and abs(speed) >= AGREEMENT * abs(command):",
+        "elif False:",
     ),
     # bus
     fault(
@@ -891,23 +912,16 @@ FAULTS = (
     fault(
         "wheel press",
         "a wheel that rested during a press and is then turned by hand is a runaway",
-        WITNESS,
-        "self.driven = self.driven and not self._is_surely_slow(raw_speed, dt, count)",
-        "self.driven = self.driven",
-    ),
-    fault(
-        "wheel counts",
-        "a wheel with few encoder counts is a runaway because its smoothed speed is late",
-        WITNESS,
-        "turns > 1.5 * due + MIN_FAULT_SPEED",
-        "turns > 1.5 * fastest + MIN_FAULT_SPEED",
+        WHEELS_LAW,
+        "                _rest(wheel, angle, block)\n        else:",
+        "                pass\n        else:",
     ),
     fault(
         "wheel waited",
         "the lines of a board that stopped its motors during a stall are a wheel fault",
         ROBOT,
-        "if self.session.lateness.step_s > WRITE_PAUSE_S and not pressed:",
-        "if False:",
+        "wheels.late = self.session.lateness.step_s > WRITE_PAUSE_S",
+        "wheels.late = False",
     ),
     fault(
         "driver cut",

@@ -78,8 +78,8 @@ HARMLESS = {
 """Troubles of the board for which the robot may not latch a fault."""
 
 DISOBEYS_NS = NS
-"""Within this time, `feedback.fault_time` and three time constants of a motor, a wheel that does
-not obey is a fault. A wheel whose motor is dead first comes to rest, which may take longer."""
+"""Within this time, three response times and three time constants of a motor, a wheel that does
+not obey is a fault."""
 
 CLEARLY = 4.0
 """rad/s. From this speed on, a wheel that does not obey cannot be taken for one that does."""
@@ -177,17 +177,15 @@ class Witness:
         """The present faults of the board, without its lasting properties."""
         self.lying_ns = 0
         """When the last fault of the board began."""
-        fault_time = config.get("feedback", {}).get("fault_time", 0.5)
+        response_time = config.get("feedback", {}).get("response_time", 0.2)
         coarse = config.get("sim", {}).get("encoder_counts", 3200) < 400
         lag = config.get("sim", {}).get("motor_time_constant", 0.1)
         self._slows_ns = int(3 * lag * NS)
         """Time in which a wheel follows the largest part of a change of its command."""
-        seen_ns = DISOBEYS_NS + int(fault_time * NS)
-        self._disobeys_ns = 0 if coarse or not fault_time else seen_ns
+        seen_ns = DISOBEYS_NS + int(3 * response_time * NS)
+        self._disobeys_ns = 0 if coarse else seen_ns
         """Within this time and `_slows_ns`, a wheel that does not obey is a fault; 0 if the robot
         cannot see it."""
-        self._turned_ns = -NS
-        """When the board last reported that the wheel with a dead motor turned."""
         self._driven: list[tuple[int, float]] = [(0, 0.0)] * 4
         """Since when each wheel has been commanded to turn clearly and in one direction."""
         self.rested = True
@@ -618,21 +616,9 @@ class Witness:
         since_ns = max(self.lying_ns, self._stalled[1], *others, 0)
         wheel = next(w for w, (place, _) in enumerate(self.motors) if place == values[0])
         begun_ns = max(since_ns, self._driven[wheel][0]) + self._slows_ns
-        if name == "dead_motor":
-            # The last count of a wheel that creeps to rest may come late. It is a turn the right
-            # way, so it ends the contradiction.
-            begun_ns = max(begun_ns, self._turned_ns)
         if at_ns - begun_ns > self._disobeys_ns:
             text = f"wheel {wheel} with {name}{values} is commanded {wheels[wheel]:.2f} rad/s"
             raise BrokenError("a wheel that does not obey is a fault", at_ns, text)
-
-    def reported(self, at_ns: int, lines: bytes) -> None:
-        """Note lines of the board, which report the speeds of its motors a to d."""
-        if len(self.lies) != 1 or self.lies[0][0] != "dead_motor":
-            return
-        letter = "abcd"[self.lies[0][1][0]].encode()
-        if any(float(speed) > 0.0 for speed in re.findall(letter + SPEED, lines)):
-            self._turned_ns = at_ns
 
     def stalls(self, begun_ns: int, ended_ns: int) -> None:
         """Note a stall of the host. The steps after it read the bytes that arrived during it.
@@ -914,7 +900,7 @@ def disobeys(name: str, values: tuple[Any, ...]) -> bool:
     """Return whether a wheel with this fault of the board clearly does not obey its command."""
     if name == "bias":
         return values[1] in (-1.0, 9.0)
-    return name in ("dead_motor", "stuck_encoder", "reversed_motor", "reversed_encoder")
+    return name in ("reversed_motor", "reversed_encoder")
 
 
 def _fastest(wheels: tuple[float, ...]) -> float:

@@ -10,7 +10,7 @@ import math
 from msgspec import Struct
 
 from acsard.core.config.partial import Rule
-from acsard.core.config.settings import MAX_REPLY_PERIOD_S, Config
+from acsard.core.config.settings import Config
 
 MIN_JERK = 0.01  # m/s3 or rad/s3: with less, walking pace takes more than 10 s
 
@@ -22,9 +22,6 @@ MAX_RAMP_S = 5.0  # from full speed after the last command, while no sender cont
 OVERSPEED_FACTOR = 1.1
 
 MAX_WHEEL_SPEED = 99.99  # rad/s in a line to the board
-
-# Lines that must show a wheel fault before it is reported.
-MIN_EVIDENCE_LINES = 2
 
 
 class _Reach(Struct, frozen=True):
@@ -94,27 +91,6 @@ def _feedback_problems(config: Config, asked: float) -> list[str]:
     ]
 
 
-def _reply_problems(config: Config) -> list[str]:
-    period, fault_s = config.mcu.reply_period, config.feedback.fault_time
-    most = longest_reply(fault_s)
-    if period <= most:
-        return []
-    return [
-        f"mcu.reply_period = {period:g}: one lost line would look like a wheel fault; write "
-        f"{most:g} or less and make the firmware report more often; or write feedback.fault_time "
-        f"= {_rounded_up(period * MIN_EVIDENCE_LINES):g}"
-    ]
-
-
-def longest_reply(fault_s: float) -> float:
-    """Return the longest `mcu.reply_period`, with `MIN_EVIDENCE_LINES` in `fault_s`, s.
-
-    Without checks (0) it is `MAX_REPLY_PERIOD_S`.
-    """
-    share = math.floor(round(fault_s / MIN_EVIDENCE_LINES * 1000, 6)) / 1000
-    return min(MAX_REPLY_PERIOD_S, share) if fault_s else MAX_REPLY_PERIOD_S
-
-
 def _rounded_up(value: float) -> float:
     # An error recommends the result, with three decimals: rounded down, it would be too low.
     return math.ceil(round(value * 1000, 6)) / 1000
@@ -126,5 +102,4 @@ RULES: tuple[Rule, ...] = (
     lambda config: _jerk_problems(config, "linear_jerk"),
     lambda config: _jerk_problems(config, "angular_jerk"),
     lambda config: _feedback_problems(config, _reach(config).wheel),
-    _reply_problems,
 )

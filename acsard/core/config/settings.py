@@ -214,7 +214,6 @@ class FeedbackConfig(Struct, frozen=True):
     encoders: bool = True
     wheel_speed: WheelSpeed = 80.0
     response_time: Annotated[float, Meta(ge=0.01, le=5.0, extra={"unit": "s"})] = 0.2
-    fault_time: Annotated[float, Meta(ge=0.0, le=10.0, extra={"unit": "s (0 = off)"})] = 0.5
 
 
 EstopUse = Literal["auto", "required", "off"]

@@ -28,7 +28,6 @@ from acsard.core.motion.emergency_stop import (
     SILENT_REASON,
 )
 from acsard.core.motion.gyro import STATUS_TEXTS
-from acsard.core.motion.wheel_faults import slow_text
 from acsard.core.values import (
     WHEELS,
     GyroStatus,
@@ -166,16 +165,12 @@ def _commands(snapshot: Snapshot) -> Row:
 
 
 def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
-    left, right = doubt.differ
     values = {
         "left_out": ", ".join(doubt.left_out),
         "slipping": ", ".join(doubt.slipping),
-        "slow": ", ".join(doubt.slow),
-        "front_more_left": f"{left:.3f}",
-        "front_more_right": f"{right:.3f}",
     }
-    trouble = doubt.text or (doubt.slow and slow_text(doubt.slow))
-    level, message = WARN if trouble else OK, trouble or "front and rear wheels agree"
+    level = WARN if doubt.text else OK
+    message = doubt.text or "every wheel obeys its command"
     values |= _counted(counters, "wheel_fault") | _counted(counters, "uncommanded_motion")
     return Row("wheels", level, message, values)
 

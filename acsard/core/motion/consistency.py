@@ -1,7 +1,7 @@
 """Compares the wheels with each other, with their commands and with a gyro.
 
-`wheel_faults.py` ignores a wheel with a faulty encoder, and reports a fault after a long
-contradiction. `gyro.py` takes the heading from a gyro, and compares it with the wheels that are not
+`wheels.py` ignores a wheel with a faulty encoder, and reports a wheel that does not obey its
+command. `gyro.py` takes the heading from a gyro, and compares it with the wheels that are not
 ignored. Only this module determines the order of these checks.
 """
 
@@ -12,8 +12,10 @@ from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.gyro import Gyro, Turn, claims
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.wheel_faults import WheelFaults
-from acsard.core.values import Event, GyroSample, GyroStatus, Seconds
+from acsard.core.motion.wheels import Wheels, count_angle, new_wheels
+from acsard.core.values import Event, GyroSample, GyroStatus, Seconds, WheelsStatus
+
+NO_ENCODERS = "feedback.encoders = false: the pose is what was commanded"
 
 
 class ConsistencyChecks:
@@ -27,12 +29,17 @@ class ConsistencyChecks:
         feedback: FeedbackConfig,
     ) -> None:
         self._kinematics = kinematics
-        self.wheels = WheelFaults(kinematics, encoder_counts, feedback)
+        self._feedback, self._count = feedback, count_angle(encoder_counts)
+        self.wheels: Wheels = new_wheels()
         self.gyro = Gyro() if odometry.gyro else None
         self._claims = claims(odometry, kinematics, encoder_counts)
         self.turn: Turn | None = None  # turn of the last line by the gyro; None: use the wheels
         self.slips = False  # the wheels contradict each other or the gyro
-        self.events: list[Event] = []  # of the last line
+        self.events: tuple[Event, ...] = ()  # of the last line
+
+    @property
+    def wheels_status(self) -> WheelsStatus:
+        return self.wheels.status if self._feedback.encoders else WheelsStatus(NO_ENCODERS)
 
     @property
     def gyro_status(self) -> GyroStatus:
@@ -61,7 +68,13 @@ class ConsistencyChecks:
             turn = gyro.turn(line.at.mono_ns, seconds_known, by_wheels, way, idle, self._claims)
             by_gyro = None if turn is None else turn.wheels
         self.turn = turn
-        wheels.check_line(rolled, line.speeds, seconds, by_gyro)
-        self.slips = wheels.slips or (turn is not None and turn.slips)
+        wheels.add(
+            rolled, line.speeds, seconds, by_gyro, self._feedback, self._kinematics, self._count
+        )
+        self.slips = (
+            wheels.slips
+            or (turn is not None and turn.slips)
+            or not self._feedback.encoders  # the speeds are commands
+        )
         event = None if gyro is None else gyro.event()
-        self.events = wheels.events if event is None else [event, *wheels.events]
+        self.events = wheels.events if event is None else (event, *wheels.events)

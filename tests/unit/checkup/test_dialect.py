@@ -176,9 +176,11 @@ def test_a_reply_period_that_the_configuration_refuses_is_not_advised(period_s: 
     assert rate.mend.endswith("at least every 0.25 s")
 
 
-def test_the_advised_reply_period_is_not_rounded_above_the_limit() -> None:
+def test_the_advised_reply_period_is_not_rounded_above_the_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(dialect, "MAX_REPLY_PERIOD_S", 0.15)
     with Robot().board() as board, board.wire.mcu.sparse_replies(0.12):  # type: ignore[attr-defined]
-        board.longest_reply_s = 0.15
         rate = dialect.rate(board)
     period = rate.keys["mcu.reply_period"]
     assert isinstance(period, float)

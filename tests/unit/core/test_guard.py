@@ -684,7 +684,7 @@ def legal(draw: st.DrawFn) -> Config:
     return Config(
         drive=drive,
         limits=LimitsConfig(**numbers),
-        feedback=FeedbackConfig(wheel_speed=99.99, fault_time=0.0),
+        feedback=FeedbackConfig(wheel_speed=99.99),
     )
 
 

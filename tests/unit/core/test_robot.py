@@ -70,11 +70,10 @@ class Bench:
         self,
         config: Config | None = None,
         latches: Latches = Latches(),  # noqa: B008
-        fault_time: float = 0.0,
+        watched: bool = False,
     ) -> None:
-        # `fault_time` 0 disables contradiction faults, because this MCU always reports the same
-        # speeds.
-        config = replace(config or Config(), feedback=FeedbackConfig(fault_time=fault_time))
+        # This MCU always reports the same speeds, so nothing follows from them unless `watched`.
+        config = replace(config or Config(), feedback=FeedbackConfig(encoders=watched))
         self.robot = Robot(config, latches)
         self.stepped = SteppedRobot(self.robot)
         self.codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
@@ -307,7 +306,7 @@ def test_a_required_input_that_is_not_reported_keeps_the_robot_from_ready() -> N
 
 
 def test_wheels_that_roll_without_power_cause_no_fault() -> None:
-    bench = Bench(fault_time=0.2)
+    bench = Bench(watched=True)
     bench.linked().step(REST)
     for _ in range(100):
         speed = bench.step(GO).speeds.front_left
@@ -857,7 +856,7 @@ def test_a_step_without_a_tick_uses_feedback_and_sends_no_line() -> None:
 
 
 def test_odometry_follows_the_wheels() -> None:
-    bench = Bench().linked()
+    bench = Bench(watched=True).linked()
     bench.reply = bench.codec.encode(ROLLING)
     for _ in range(100):
         bench.step()
@@ -1514,7 +1513,7 @@ def kept(kind: CauseKind, code: Code, text: str, by: str = "") -> Latches:
 
 
 STOPPED = kept("stop", "stopped", "stopped by ann", "ann")
-FAULTED = kept("fault", "wheel_dead", "a wheel is dead")
+FAULTED = kept("fault", "wheel_reversed", "a wheel turns the wrong way")
 OFF = kept("inactive", "switched_off", "switched off by joe", "joe")
 
 
@@ -1522,7 +1521,7 @@ OFF = kept("inactive", "switched_off", "switched off by joe", "joe")
     ("latches", "mode", "code"),
     [
         (STOPPED, "stopped", "stopped"),
-        (FAULTED, "fault", "wheel_dead"),
+        (FAULTED, "fault", "wheel_reversed"),
         (OFF, "inactive", "switched_off"),
     ],
 )
@@ -1597,15 +1596,15 @@ def test_a_link_that_was_lost_in_time_is_not_counted_as_late() -> None:
 
 
 def test_wheels_that_turn_against_their_command_are_a_fault() -> None:
-    bench = Bench(fault_time=0.3).driving(steps=1)
+    bench = Bench(watched=True).driving(steps=1)
     bench.reply = bench.codec.encode(WheelSpeeds(-10.0, -10.0, -10.0, -10.0))
-    for _ in range(100):
+    for _ in range(200):
         bench.step(GO)
     assert bench.mode() == "fault"
 
 
 def test_wheels_that_turn_without_a_command_are_reported_and_counted() -> None:
-    bench = Bench(fault_time=0.3).linked()
+    bench = Bench(watched=True).linked()
     bench.reply = bench.codec.encode(WheelSpeeds(5.0, 5.0, 5.0, 5.0))
     event_names = [event.name for _ in range(100) for event in bench.step().events]
     assert "uncommanded_motion" in event_names
@@ -1614,7 +1613,7 @@ def test_wheels_that_turn_without_a_command_are_reported_and_counted() -> None:
 
 
 def test_a_wheel_at_rest_while_the_others_roll_is_reported_and_counted() -> None:
-    bench = Bench().driving()
+    bench = Bench(watched=True).driving()
     bench.reply = bench.codec.encode(replace(ROLLING, front_left=0.0))
     event_names = [event.name for _ in range(200) for event in bench.step(GO).events]
     assert "wheel_fault" in event_names

@@ -78,7 +78,7 @@ CONFIGS = [
 ]
 
 STOP = Cause(5, "stop", "stopped", "stopped by ann", by="ann", kept=True)
-FAULT = Cause(6, "fault", "wheel_dead", "a wheel is dead", kept=True)
+FAULT = Cause(6, "fault", "wheel_reversed", "a wheel is dead", kept=True)
 OFF = Cause(7, "inactive", "switched_off", "switched off by joe", by="joe", kept=True)
 
 KEPT = [

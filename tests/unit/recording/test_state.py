@@ -116,8 +116,7 @@ def of_older_code(path: Path, forget: Callable[[Robot], None]) -> Recording:
 @pytest.mark.slow
 def test_attributes_that_an_older_robot_lacks_come_from_a_new_robot(tmp_path: Path) -> None:
     def forget(robot: Robot) -> None:
-        for side in robot._checks.wheels._sides:
-            del side.late
+        del robot._checks.turn
 
     assert played(of_older_code(tmp_path / "old", forget)).comparison.same
 
@@ -176,7 +175,7 @@ SPOILERS: dict[str, Callable[[Robot], None]] = {
     "a number for the session": lambda robot: setattr(robot, "session", 5),
     "words for a time": lambda robot: setattr(robot._last, "left_ns", "now"),
     "a list for a counter": lambda robot: setattr(robot, "counters", []),
-    "no wheels": lambda robot: setattr(robot._checks.wheels, "_left", ()),
+    "no wheels": lambda robot: setattr(robot._checks.wheels, "wheels", ()),
     "itself, almost": lambda robot: setattr(robot, "_checks", Robot(Config())),
 }
 

@@ -70,7 +70,7 @@ def test_every_live_setting_is_a_key_and_every_source_has_a_live_timeout() -> No
 
 @each(
     "key",
-    ["mcu.port", "drive.wheel_radius", "feedback.fault_time", "commands.neutral_first",
+    ["mcu.port", "drive.wheel_radius", "feedback.response_time", "commands.neutral_first",
      "commands.sources.nav.priority", "bus.listen", "access.maintainers", "robot.id",
      "odometry.gyro", "odometry.distance_scale_std", "commands.sources.nav"],
 )  # fmt: skip

@@ -133,8 +133,9 @@ def odometry(counts: int = 0) -> Odometer:
 
 def fold(robot: Odometer, line: Feedback, commanded: WheelSpeeds) -> tuple[Estimate, Reason | None]:
     """Return the estimate after a line, and the wheel fault that it proves."""
-    fault = robot.checks.wheels.watch(commanded, line.speeds, line.dt)
-    return robot.fold(line), fault
+    robot.checks.wheels.commanded = commanded
+    estimate = robot.fold(line)
+    return estimate, robot.checks.wheels.fault
 
 
 def apart(a: Pose, b: Pose) -> tuple[float, float]:

@@ -17,7 +17,7 @@ from acsard.core.motion.latches import (
 from acsard.core.values import Latches
 
 WALL_NS = 1_800_000_000_000_000_000
-DEAD = reason("wheel_dead", part="front_left", wheel="front_left", figures="(1)")
+DEAD = reason("wheel_reversed", part="front_left", wheel="front_left", figures="(1)")
 FLAT = reason("battery_empty", threshold="22 V", charged="24 V")
 
 
@@ -80,7 +80,7 @@ def test_of_too_many_causes_the_newest_stop_of_a_client_goes() -> None:
         "client99",
     ]
     latches = latched(latches, "stop", FLAT, WALL_NS)
-    assert [latches.causes[place].code for place in (0, -1)] == ["wheel_dead", "battery_empty"]
+    assert [latches.causes[place].code for place in (0, -1)] == ["wheel_reversed", "battery_empty"]
     assert latches.last == 102
 
 

@@ -26,7 +26,7 @@ def at(seconds: float) -> Instant:
 
 
 def why(part: str) -> Reason:
-    return Reason("wheel_dead", f"{part} is dead", part=part)
+    return Reason("wheel_reversed", f"{part} is dead", part=part)
 
 
 PRESSED = reason("emergency_stop")
@@ -283,7 +283,7 @@ def test_the_reason_names_each_cause_and_what_a_person_can_do(timed: Timed) -> N
     timed.fault("front_left")
     timed.press()
     text = timed.life.why.text
-    assert timed.life.why.code == "wheel_dead"
+    assert timed.life.why.code == "wheel_reversed"
     assert text.startswith("front_left is dead (latched at 2027-01-15 08:00:00 UTC); also ")
     assert "; also emergency stop pressed at the robot (latched at" in text
     assert "; also stopped by ann at 2027" in text

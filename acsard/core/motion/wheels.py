@@ -1,0 +1,631 @@
+"""Decides whether each wheel obeys its command, and which wheels the pose uses.
+
+The expected speed is the command behind a lag of `feedback.response_time`. Measured minus expected
+is summed to an angle (`Wheel.off`), which leaks only while both agree. Beyond 1 rad and 3 counts, a
+wheel that came no nearer to its command for three response times does not obey it: a fault if it
+rolls on, too far or the wrong way, else a warning. A wheel that contradicts the other wheel of its
+side, and also the command or the gyro, is left out of the pose until both agree for 2 s. A line
+only adds its angles: all else runs on the sums of `BLOCK_S`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+from msgspec import Struct
+
+from acsard.core.codes import Code, Reason, joined, reason
+from acsard.core.config.settings import FeedbackConfig
+from acsard.core.link.codec import Motors
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.values import (
+    STILL,
+    WHEELS,
+    Event,
+    Rad,
+    RadPerS,
+    Seconds,
+    WheelSpeeds,
+    WheelsStatus,
+)
+
+SideName = Literal["left", "right"]
+
+BLOCK_S = 0.05
+MAX_BLOCK_S = 0.1  # the longest time for which one line is evidence: it may cover a stall
+
+FAULT_ANGLE, FAULT_COUNTS = 1.0, 3.0  # rad and counts, both of them
+FAULT_RESPONSES = 3.0  # response times without an approach
+
+AGREEMENT = 0.3  # fraction of the larger of two speeds
+IDLE = 0.06  # counts per second of a smoothed speed that may be the rest of one count
+LEAK_S = 2.0
+# Largest fractions of the evidence for a fault that are kept: while both agree, and at all, because
+# more would only delay the opposite one.
+AGREED, MOST = 0.3, 1.2
+APPROACH = 0.15  # fraction of the distance to the command that counts as coming nearer
+
+# The smoothed speed covers this many counts, within the longest time: a coarse encoder reports no
+# motion in most lines.
+SMOOTHED_COUNTS, SMOOTHED_S = 3.0, 1.0
+
+REST_S, REST_ANGLE = 0.5, 0.02  # at least, without a command: the wheel rests
+LEAST_SPEED = 0.05  # m/s, of a runaway that must not look like rest
+
+TOO_FAST, TOO_FAST_S = 1.2, 1.0  # times the largest output of the limiter
+PACE_S = 1.5  # faster or slower by `AGREEMENT`, until this is a warning: 2 s with the smoothing
+ROUNDING = 0.006  # rad/s, of a reported speed
+HELD_S = 2.0  # for which a wheel repeats one speed at rest, until this is a warning
+SAME_S = 0.1  # for which a wheel reports one speed, until its encoder may be stuck
+
+COMMANDED = 0.005  # rad/s: a line to the board shows a lower one as 0.00
+
+# The wheels of a side contradict each other if their sums differ by more than this fraction, counts
+# and rad. They slip if they also differ by more than a motor that reacts later (s) explains. The
+# time constant of these sums is in s, and s for each rad of a count.
+PARTNER_FRACTION, PARTNER_COUNTS, PARTNER_ANGLE, PARTNER_DELAY_S = 0.05, 1.2, 0.002, 0.03
+PARTNER_S, PARTNER_S_PER_RAD = 0.14, 5.0
+OUT_COUNTS, OUT_ANGLE = 3.5, 0.05  # by which they must differ until one is left out
+OUT_BLOCKS = 2
+AGAIN_S = 2.0  # of agreement, until the pose uses a wheel again
+SLIP_S, SLIP_REPORTED_S = 0.5, 0.1  # after the last contradiction, and after the first one
+
+REPEATED_S = 1.0  # between two reports of motion without a command
+
+SWAPPED_FRACTION = 0.2  # of the commands: by how much those of the sides must differ
+
+# Encoder counts per turn if they are not configured: the least that acsard supports.
+ASSUMED_COUNTS = 16
+
+SIDES: tuple[tuple[SideName, int, int], ...]
+SIDES = ("left", 1, 2), ("right", 0, 3)  # with their front and rear wheel, by `WHEELS`
+SIDE_OF, ACROSS = (1, 0, 0, 1), (1, 0, 3, 2)  # each wheel's side, and wheel on the other one
+
+NOTHING: Motors = (0.0, 0.0, 0.0, 0.0)
+
+
+class Block(NamedTuple):
+    """The sums of some lines, and the bounds for them."""
+
+    s: Seconds
+    angles: Motors
+    speeds: Motors  # in the last line
+    unit: Rad  # of an encoder count
+    limit: Rad  # evidence of a fault
+    patience: Seconds  # without an approach
+    rest: Seconds  # without motion or a command, after which a wheel rests
+
+
+class Wheel(Struct):
+    command: RadPerS = 0.0
+    speed: RadPerS = 0.0  # smoothed
+    due: RadPerS = 0.0  # expected, and smoothed alike
+    off: Rad = 0.0  # the sum of measured minus expected
+    agrees: bool = True
+    approaches: bool = False  # in the last block
+    apart_s: Seconds = 0.0  # since it came nearer to its command
+    speed_then: RadPerS = 0.0  # when it did
+    command_then: RadPerS = 0.0
+    missed: Rad = 0.0  # expected minus measured since both agreed
+    rested: bool = True  # and was not commanded since then
+    rest_s: Seconds = 0.0
+    rest_angle: Rad = 0.0
+    fast_s: Seconds = 0.0
+    fast_angle: Rad = 0.0
+    pace_s: Seconds = 0.0
+    pace_angle: Rad = 0.0
+    reported: RadPerS = 0.0  # in the last line
+    same_s: Seconds = 0.0  # for which it repeats this speed
+    warning: Code | None = None
+
+
+class Side(Struct):
+    """The front and rear wheel of a side, which have one command."""
+
+    command: RadPerS = 0.0
+    expected: RadPerS = 0.0
+    peak: RadPerS = 0.0  # of the commands in the last three response times, at least
+    next_peak: RadPerS = 0.0
+    peak_s: Seconds = 0.0  # since `peak` began
+    apart: Rad = 0.0  # recent sum of front minus rear
+    rolled: Rad = 0.0  # recent sum of the magnitudes
+    net: Rad = 0.0  # recent sum of the mean
+    why: str = ""  # the sign of a faulty encoder that one wheel shows
+    suspect: int = -1  # this wheel, by `WHEELS`; -1: it may be either
+    votes: int = 0  # blocks with this sign, with the angles in them
+    front: Rad = 0.0
+    rear: Rad = 0.0
+    low: Rad = 0.0  # bounds of what a healthy wheel rolled meanwhile
+    high: Rad = 0.0
+    out: int = -1  # wheel that the pose leaves out
+    good_s: Seconds = 0.0
+    slip_s: Seconds = 0.0  # until the slip counts as ended
+    slipped_s: Seconds = 0.0
+
+
+class Wheels(Struct):
+    """The verdicts on four wheels. `add` takes each line; `fault`, `events`, `pushed` are of it."""
+
+    wheels: tuple[Wheel, Wheel, Wheel, Wheel]
+    sides: tuple[Side, Side]
+    # Commanded speeds, for the caller to set. None: the emergency stop may cut the motors' power.
+    commanded: WheelSpeeds | None = STILL
+    late: bool = False  # this computer was late, so the board may have stopped the motors
+    begins: bool = True  # the expected speeds begin at the measured ones
+    angles: Motors = NOTHING  # of the block, rad
+    turn: Rad = 0.0  # of the block by a gyro
+    by_gyro: bool = True  # it is known
+    seconds: Seconds = 0.0
+    lines: int = 0
+    apart: Rad = 0.0  # of front and rear in one block, beyond which it ends early
+    unreported_s: Seconds = REPEATED_S
+    leaves_out: bool = False
+    slips: bool = False  # the wheels of a side contradict each other
+    missed: tuple[tuple[SideName, Motors], ...] = ()  # by both wheels of a side
+    fault: Reason | None = None
+    pushed: str = ""
+    events: tuple[Event, ...] = ()
+
+    def add(
+        self,
+        turned: Motors,
+        speeds: WheelSpeeds,
+        dt: Seconds,
+        turn: Rad | None,
+        feedback: FeedbackConfig,
+        kinematics: Kinematics,
+        count: Rad,
+    ) -> None:
+        """Add a line, in which the wheels turned by `turned` rad, and a trusted gyro by `turn`.
+
+        `count` is the angle of an encoder count (`count_angle`).
+        """
+        front_right, front_left, rear_left, rear_right = self.angles
+        first, second, third, fourth = turned
+        front_right += first
+        front_left += second
+        rear_left += third
+        rear_right += fourth
+        self.angles = front_right, front_left, rear_left, rear_right
+        seconds = self.seconds = self.seconds + dt
+        self.lines += 1
+        if turn is None:
+            self.by_gyro = False
+        else:
+            self.turn += turn
+        self.events, self.fault, self.pushed = (), None, ""
+        apart = self.apart
+        if seconds < BLOCK_S and (
+            self.lines == 1
+            or (
+                -apart < front_left - rear_left < apart
+                and -apart < front_right - rear_right < apart
+            )
+        ):
+            return
+        if feedback.encoders and seconds > 0.0:
+            self.apart = OUT_COUNTS * count + OUT_ANGLE
+            self._judge(speeds.as_tuple(), feedback.response_time, kinematics, count)
+        self._begin()
+
+    def forget(self) -> None:
+        """Drop the evidence of faults: the link was lost, or a fault was cleared."""
+        self._drop()
+        self._begin()
+
+    def believed(self, wheels: Motors) -> Motors:
+        """Return angles or speeds, with the other wheel of its side for one that is left out."""
+        if not self.leaves_out:
+            return wheels
+        values = list(wheels)
+        for side, (_, front, rear) in zip(self.sides, SIDES, strict=True):
+            if side.out >= 0:
+                values[side.out] = wheels[front + rear - side.out]
+        return _motors(values)
+
+    def possible_motion(self, wheels: Motors) -> list[tuple[SideName, Motors]]:
+        """Return, by side, angles that may be true and that the pose leaves out, rad.
+
+        Call this once for each line. A wheel that is left out may be blocked, or its motor may be
+        reversed; two wheels of a side that do not obey may have two faulty encoders.
+        """
+        if not (self.leaves_out or self.missed):
+            return []
+        found, self.missed = list(self.missed), ()
+        for side, (name, front, rear) in zip(self.sides, SIDES, strict=True):
+            if side.out >= 0 and side.why != "repeats":
+                values = [0.0] * 4
+                values[side.out] = wheels[side.out] - wheels[front + rear - side.out]
+                found.append((name, _motors(values)))
+        return found
+
+    @property
+    def status(self) -> WheelsStatus:
+        out = [side for side in self.sides if side.out >= 0]
+        slipping = tuple(
+            name for side, (name, _, _) in zip(self.sides, SIDES, strict=True) if side.slip_s
+        )
+        texts = [_out_text(side) for side in out] + [_slip_text(name) for name in slipping]
+        texts += [_text(wheel, i) for i, wheel in enumerate(self.wheels) if wheel.warning]
+        return WheelsStatus("; ".join(texts), tuple(WHEELS[side.out] for side in out), slipping)
+
+    def _begin(self) -> None:
+        self.angles, self.seconds, self.lines, self.turn, self.by_gyro = NOTHING, 0.0, 0, 0.0, True
+
+    def _drop(self) -> None:
+        self.begins = True
+        for wheel in self.wheels:
+            wheel.off = wheel.apart_s = wheel.fast_s = wheel.fast_angle = wheel.missed = 0.0
+        for side in self.sides:
+            side.peak = side.next_peak = 0.0
+
+    def _judge(self, speeds: Motors, lag: Seconds, kinematics: Kinematics, count: Rad) -> None:
+        s, angles, commanded = self.seconds, self.angles, self.commanded
+        if s > MAX_BLOCK_S:
+            angles = _motors([angle * MAX_BLOCK_S / s for angle in angles])
+            s = MAX_BLOCK_S
+        limit, patience = max(FAULT_ANGLE, FAULT_COUNTS * count), FAULT_RESPONSES * lag
+        rest = REST_S + 2 * count * kinematics.radius / LEAST_SPEED
+        block = Block(s, angles, speeds, count, limit, patience, rest)
+        if commanded is None:
+            self._drop()
+            for wheel, angle in zip(self.wheels, angles, strict=True):
+                _rest(wheel, angle, block)
+        else:
+            left, right = self.sides
+            due_left = _expect(left, commanded.front_left, s, lag)
+            due_right = _expect(right, commanded.front_right, s, lag)
+            if self.begins or self.late:
+                for side, (_, front, rear) in zip(self.sides, SIDES, strict=True):
+                    speed = max(angles[front], angles[rear], key=abs) / s
+                    side.expected = speed if self.begins else _nearer(side.expected, speed)
+                self.begins = False
+            if not self.late:
+                self._obey(block, (due_left, due_right))
+                self._miss(lag)
+        self._compare(block, kinematics)
+
+    def _obey(self, block: Block, due: tuple[Rad, Rad]) -> None:
+        s, angles, speeds, _, limit, patience, _ = block
+        fastest = 0.0
+        for i, wheel in enumerate(self.wheels):
+            k, angle = SIDE_OF[i], angles[i]
+            command = wheel.command = self.sides[k].command
+            still = -COMMANDED < command < COMMANDED
+            if not still:
+                if wheel.rested:
+                    wheel.off = wheel.apart_s = 0.0
+                wheel.rested, wheel.rest_s, wheel.rest_angle = False, 0.0, 0.0
+            elif not wheel.rested:
+                _rest(wheel, angle, block)
+            _follow(wheel, angle, due[k], block)
+            if speeds[i] == wheel.reported != 0.0 and abs(angle - speeds[i] * s) < ROUNDING * s:
+                wheel.same_s += s
+            else:
+                wheel.same_s, wheel.reported = 0.0, speeds[i]
+            if wheel.rested and abs(wheel.off) >= limit:
+                fastest, wheel.off = max(fastest, abs(wheel.speed)), 0.0
+            if not wheel.rested:
+                self._pace(i, wheel, due[k], block)
+                if not wheel.agrees and abs(wheel.off) >= limit and wheel.apart_s >= patience:
+                    self._disobeys(i, wheel, angle)
+            if still and wheel.same_s >= HELD_S and wheel.apart_s >= HELD_S:
+                self._warn(i, wheel, "wheel_stuck")
+            elif wheel.warning and _obeys_again(wheel):
+                self._warn(i, wheel, None)
+        self.unreported_s += s
+        if fastest and self.unreported_s >= REPEATED_S:
+            self.unreported_s = 0.0
+            self.pushed = (
+                f"wheels turn at {fastest:.1f} rad/s without a command: is the robot being pushed?"
+            )
+
+    def _pace(self, i: int, wheel: Wheel, due: Rad, block: Block) -> None:
+        s, angle, peak = block.s, block.angles[i], self.sides[SIDE_OF[i]].peak
+        turns, most = abs(wheel.speed), TOO_FAST * peak
+        if wheel.fast_s or 0.0 < most < turns:
+            # An encoder with few counts looks slow between two of them.
+            wheel.fast_s += s if turns > most else -s
+            wheel.fast_angle += abs(angle) - most * s
+            if wheel.fast_s <= 0.0 or wheel.approaches or not peak:
+                wheel.fast_s = wheel.fast_angle = 0.0
+            elif wheel.fast_s >= TOO_FAST_S and wheel.fast_angle >= block.limit:
+                self._latch("wheel_too_fast", i, peak)
+        if not wheel.agrees and wheel.due * wheel.command > 0.0:
+            wheel.pace_s += s
+            wheel.pace_angle += angle - due
+            if wheel.pace_s >= PACE_S and abs(wheel.pace_angle) >= block.unit:
+                fast = turns > abs(wheel.due)
+                self._warn(i, wheel, wheel.warning or ("wheel_fast" if fast else "wheel_slow"))
+        elif wheel.pace_s:
+            wheel.pace_s -= s
+            if wheel.pace_s <= 0.0:
+                wheel.pace_s = wheel.pace_angle = 0.0
+
+    def _disobeys(self, i: int, wheel: Wheel, angle: Rad) -> None:
+        speed, off, command = wheel.speed, wheel.off, wheel.command
+        if self._are_swapped(i):
+            return
+        # The smoothed speed of a coarse encoder lasts longer than the motion.
+        goes_on = angle * off > 0.0 and speed * off > 0.0
+        if goes_on and abs(command) < COMMANDED:
+            # A speed that never changes is no motion, but the firmware's or the encoder's.
+            if wheel.same_s < wheel.apart_s:
+                self._latch("wheel_runaway", i, command)
+        elif goes_on and off * command > 0.0:
+            if abs(speed) > abs(command):
+                self._latch("wheel_runaway", i, command)
+        elif goes_on and abs(speed) >= AGREEMENT * abs(command):
+            self._latch("wheel_reversed", i, command)
+        elif off * command < 0.0 and abs(speed) < AGREEMENT * abs(command):
+            self._warn(i, wheel, "wheel_blocked")
+
+    def _are_swapped(self, i: int) -> bool:
+        # Whether this wheel and the one across turn as commanded to each other.
+        one, other = self.wheels[i], self.wheels[ACROSS[i]]
+        command, due = one.command - other.command, one.due - other.due
+        if abs(command) < SWAPPED_FRACTION * max(abs(one.command), abs(other.command)):
+            return False
+        both = one.speed + other.speed - one.due - other.due
+        if abs(both) > 0.75 * abs(due) or (one.speed - other.speed) * due >= -due * due / 2:
+            return False
+        names = f"{WHEELS[i]} and {WHEELS[ACROSS[i]]}"
+        figures = (
+            f"(commanded {one.command:.2f} and {other.command:.2f}, "
+            f"measured {one.speed:.2f} and {other.speed:.2f} rad/s)"
+        )
+        self.fault = joined(reason("wheels_swapped", part=names, wheels=names, figures=figures))
+        return True
+
+    def _latch(self, code: Code, i: int, command: RadPerS) -> None:
+        wheel, name = self.wheels[i], WHEELS[i]
+        if self.fault is None:
+            figures = f"(commanded {command:.2f}, measured {wheel.speed:.2f} rad/s)"
+            self.fault = joined(reason(code, part=name, wheel=name, figures=figures))
+        # Another fault needs new evidence: the robot stops now.
+        wheel.off = wheel.apart_s = wheel.fast_s = wheel.fast_angle = 0.0
+
+    def _warn(self, i: int, wheel: Wheel, code: Code | None) -> None:
+        if code == wheel.warning:
+            return
+        wheel.warning = code
+        if code is None:
+            text = f"{WHEELS[i]} wheel obeys its command again"
+            event = Event("wheel_fault", text, kind="again")
+        else:
+            event = Event("wheel_fault", _text(wheel, i), "warning", kind=code, code=code)
+        self.events = (*self.events, event)
+
+    def _miss(self, lag: Seconds) -> None:
+        for side, (name, front, rear) in zip(self.sides, SIDES, strict=True):
+            one, other = self.wheels[front], self.wheels[rear]
+            if side.out >= 0 or one.rested or not (one.missed and other.missed):
+                continue
+            if one.apart_s >= lag and other.apart_s >= lag:
+                values = [0.0] * 4
+                values[front], values[rear] = one.missed, other.missed
+                one.missed = other.missed = 0.0
+                self.missed = (*self.missed, (name, _motors(values)))
+
+    def _compare(self, block: Block, kinematics: Kinematics) -> None:
+        s, angles, count = block.s, block.angles, block.unit
+        keep = 1.0 / (1.0 + s / (PARTNER_S + PARTNER_S_PER_RAD * count))
+        left, right = self.sides
+        agree = (
+            _partners(left, angles[1], angles[2], keep, count),
+            _partners(right, angles[0], angles[3], keep, count),
+        )
+        if agree == (True, True) and not self.slips:
+            return
+        for k, side in enumerate(self.sides):
+            side.slip_s = max(0.0, side.slip_s - s)
+            if not side.slip_s:
+                side.slipped_s = 0.0
+            if agree[k]:
+                self._agree(side, block)
+                continue
+            side.good_s = 0.0
+            if side.out >= 0:
+                continue
+            low, high = sorted((side.command * s, side.expected * s))
+            if self.by_gyro and agree[1 - k]:
+                means = (angles[1] + angles[2]) / 2, (angles[0] + angles[3]) / 2
+                low = high = kinematics.opposite(*means, self.turn)[k]
+            if not self._leave_out(k, side, low, high, block) and _slips(side, k, block):
+                before, side.slipped_s, side.slip_s = side.slipped_s, side.slipped_s + s, SLIP_S
+                if before < SLIP_REPORTED_S <= side.slipped_s:
+                    self._tell(_slip_text(SIDES[k][0]), "slip")
+        self.leaves_out = left.out >= 0 or right.out >= 0
+        self.slips = self.leaves_out or left.slip_s > 0.0 or right.slip_s > 0.0
+
+    def _agree(self, side: Side, block: Block) -> None:
+        if side.out < 0:
+            side.why = ""
+        elif side.rolled > OUT_COUNTS * block.unit + OUT_ANGLE:
+            side.good_s += block.s
+            if side.good_s >= AGAIN_S:
+                name, side.out = WHEELS[side.out], -1
+                text = (
+                    f"{name} wheel agrees with the other wheel of its side again: the pose uses it"
+                )
+                self.events = (*self.events, Event("wheel_fault", text, kind="again"))
+
+    def _leave_out(self, k: int, side: Side, low: Rad, high: Rad, block: Block) -> bool:
+        # A wheel is left out if it shows a sign of a faulty encoder, and is farther from what a
+        # healthy one rolls by a third of the difference.
+        if low * high <= 0.0:
+            return False  # near rest, or while the direction changes, a healthy wheel may do both
+        _, front, rear = SIDES[k]
+        one, other = block.angles[front], block.angles[rear]
+        sign = _sign(side, one, other, block.unit)
+        if sign[0] == "still" and not one == other == 0.0:
+            sign = "still", front if abs(one) < abs(other) else rear
+        same = [i for i in (front, rear) if self.wheels[i].same_s >= SAME_S]
+        if same and not sign[0]:
+            sign = "repeats", same[0]
+        if sign != (side.why, side.suspect):
+            side.why, side.suspect = sign
+            side.votes, side.front, side.rear, side.low, side.high = 0, 0.0, 0.0, 0.0, 0.0
+        if not side.why:
+            return False
+        side.votes += 1
+        side.front += one
+        side.rear += other
+        side.low += low
+        side.high += high
+        apart = abs(side.front - side.rear)
+        off_front = max(side.low - side.front, side.front - side.high, 0.0)
+        off_rear = max(side.low - side.rear, side.rear - side.high, 0.0)
+        out = front if off_front > off_rear else rear
+        if (
+            side.votes < OUT_BLOCKS
+            or apart < OUT_COUNTS * block.unit + OUT_ANGLE
+            or abs(off_front - off_rear) < apart / 3
+            or min(off_front, off_rear) > apart / 2
+            or side.suspect not in (-1, out)
+            # An even wheel may be right, and the other one slip.
+            or (side.why == "repeats" and apart < AGREEMENT * max(abs(side.front), abs(side.rear)))
+        ):
+            return False
+        side.out, side.slip_s = out, 0.0
+        self._tell(_out_text(side), "left out")
+        return True
+
+    def _tell(self, text: str, kind: str) -> None:
+        self.events = (*self.events, Event("wheel_fault", text, "warning", kind=kind))
+
+
+def new_wheels() -> Wheels:
+    return Wheels((Wheel(), Wheel(), Wheel(), Wheel()), (Side(), Side()))
+
+
+def count_angle(counts: int) -> Rad:
+    """Return the angle of an encoder count; `counts` per turn are 0 if they are unknown."""
+    return math.tau / (counts or ASSUMED_COUNTS)
+
+
+def _expect(side: Side, command: RadPerS, s: Seconds, lag: Seconds) -> Rad:
+    # Exact for a command that is constant in the block; the mean of two is, in a ramp.
+    goal, side.command = (side.command + command) / 2, command
+    before, rest = side.expected - goal, math.exp(-s / lag)
+    side.expected = goal + before * rest
+    size = command if command > 0.0 else -command
+    side.peak_s += s
+    if side.peak_s >= FAULT_RESPONSES * lag:
+        side.peak, side.next_peak, side.peak_s = side.next_peak, size, 0.0
+    if size > side.next_peak:
+        side.next_peak = size
+    if size > side.peak:
+        side.peak = size
+    return goal * s + before * lag * (1.0 - rest)
+
+
+def _follow(wheel: Wheel, angle: Rad, due: Rad, block: Block) -> None:
+    s, count, command, speed = block.s, block.unit, wheel.command, wheel.speed
+    size = command if command > 0.0 else -command
+    turns = speed if speed > 0.0 else -speed
+    most = turns if turns > size else size
+    smoothed = SMOOTHED_S
+    if most * SMOOTHED_S > SMOOTHED_COUNTS * count:
+        smoothed = SMOOTHED_COUNTS * count / most
+    share = 1.0 / (smoothed + s)
+    speed = wheel.speed = speed + (angle - speed * s) * share
+    expected = wheel.due = wheel.due + (due - wheel.due * s) * share
+    turns = speed if speed > 0.0 else -speed
+    apart = abs(speed - expected)
+    off, most = wheel.off + angle - due, MOST * block.limit
+    agrees = wheel.agrees = apart <= AGREEMENT * max(turns, abs(expected)) or apart < IDLE * count
+    if agrees:
+        off -= off * s / LEAK_S
+        most = AGREED * block.limit
+        wheel.missed = 0.0
+    else:
+        wheel.missed += due - angle
+    wheel.off = most if off > most else -most if off < -most else off
+    away = speed - command
+    nearer, farther = wheel.speed_then - speed, wheel.command_then - command
+    if away < 0.0:
+        away, nearer, farther = -away, -nearer, -farther
+    approaches = wheel.approaches = nearer > APPROACH * away + 2 * count * share
+    if approaches or farther > AGREEMENT * away or away <= AGREEMENT * max(turns, size):
+        wheel.apart_s, wheel.speed_then, wheel.command_then = 0.0, speed, command
+    else:
+        wheel.apart_s += s
+        if nearer < 0.0:
+            wheel.speed_then = speed  # the worst one counts
+
+
+def _rest(wheel: Wheel, angle: Rad, block: Block) -> None:
+    wheel.rest_angle += angle
+    wheel.rest_s += block.s
+    if abs(wheel.rest_angle) > 1.01 * block.unit + REST_ANGLE:
+        wheel.rest_s = wheel.rest_angle = 0.0
+    elif wheel.rest_s >= block.rest:
+        wheel.rested, wheel.rest_s, wheel.rest_angle, wheel.off = True, 0.0, 0.0, 0.0
+
+
+def _obeys_again(wheel: Wheel) -> bool:
+    if wheel.warning == "wheel_stuck":
+        return wheel.same_s == 0.0
+    return wheel.agrees and abs(wheel.command) >= COMMANDED and wheel.pace_s == 0.0
+
+
+def _partners(side: Side, front: Rad, rear: Rad, keep: float, count: Rad) -> bool:
+    side.apart = keep * (side.apart + front - rear)
+    side.net = keep * (side.net + (front + rear) / 2)
+    side.rolled = keep * (side.rolled + (abs(front) + abs(rear)) / 2)
+    return abs(side.apart) <= _allowed(side, count)
+
+
+def _allowed(side: Side, count: Rad) -> Rad:
+    return PARTNER_FRACTION * side.rolled + PARTNER_COUNTS * count + PARTNER_ANGLE
+
+
+def _slips(side: Side, k: int, block: Block) -> bool:
+    _, front, rear = SIDES[k]
+    speed = (block.angles[front] + block.angles[rear]) / 2 / block.s
+    mean = side.net / (PARTNER_S + PARTNER_S_PER_RAD * block.unit)
+    return abs(side.apart) > _allowed(side, block.unit) + PARTNER_DELAY_S * abs(speed - mean)
+
+
+def _sign(side: Side, one: Rad, other: Rad, count: Rad) -> tuple[str, int]:
+    # Of a faulty encoder. Between two counts, the last sign stays.
+    larger = max(abs(one), abs(other))
+    if one == other == 0.0 or (one * other == 0.0 and side.why == "against"):
+        return side.why, side.suspect
+    if one * other < 0.0 and abs(one + other) <= AGREEMENT * larger + OUT_COUNTS * count:
+        return "against", -1
+    return ("still" if min(abs(one), abs(other)) <= 0.1 * larger else ""), -1
+
+
+def _nearer(one: RadPerS, other: RadPerS) -> RadPerS:
+    return min(one, other, key=abs) if one * other > 0.0 else 0.0
+
+
+def _motors(values: list[float]) -> Motors:
+    front_right, front_left, rear_left, rear_right = values
+    return front_right, front_left, rear_left, rear_right
+
+
+OUT_TEXTS = {
+    "still": "reports no motion while the other wheel on its side turns",
+    "against": "reports a direction opposite to that of the other wheel on its side",
+    "repeats": "reports a speed that never changes",
+}
+
+
+def _out_text(side: Side) -> str:
+    name = WHEELS[side.out]
+    return f"{name} wheel is left out of the pose: it {OUT_TEXTS[side.why]}; check its encoder"
+
+
+def _slip_text(name: SideName) -> str:
+    return f"{name} wheels slip: front and rear turn differently"
+
+
+def _text(wheel: Wheel, i: int) -> str:
+    assert wheel.warning is not None
+    share = wheel.speed / wheel.due if wheel.due else 0.0
+    speed = f"{wheel.reported:.2f}"
+    return joined(reason(wheel.warning, wheel=WHEELS[i], speed=speed, share=f"{share:.0%}")).text

@@ -1,0 +1,285 @@
+"""Simulated robots of any size that drive at random, and report what their encoders count.
+
+The product's limiter and kinematics give the commands. Each motor follows its own with a
+first-order lag. The seed determines everything that a robot does.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from typing import Literal
+
+from msgspec import Struct
+
+from acsard.core.config.settings import DriveConfig, FeedbackConfig, LimitsConfig
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.limits import Motion
+from acsard.core.motion.wheels import Wheels, count_angle, new_wheels
+from acsard.core.values import WHEELS, Twist, WheelSpeeds
+
+Kind = Literal["reversed", "runaway", "dead", "stuck", "swapped", "too fast", "too slow"]
+
+COUNTS = 16, 24, 48, 96, 400, 1024, 3200
+
+FACTORS = {"too fast": (1.6, 2.5), "too slow": (0.35, 0.55)}
+
+# The codes that name each fault. A wheel with a stuck encoder looks as if it did not obey.
+RIGHT: dict[Kind, set[str]] = {
+    "reversed": {"wheel_reversed", "left out"},
+    "runaway": {"wheel_runaway"},
+    "dead": {"wheel_blocked", "left out"},
+    "stuck": {
+        "wheel_stuck", "wheel_runaway", "wheel_too_fast", "wheel_reversed", "wheel_blocked",
+        "wheel_slow", "left out",
+    },
+    "swapped": {"wheels_swapped"},
+    "too fast": {"wheel_too_fast", "wheel_runaway", "wheel_fast"},
+    "too slow": {"wheel_slow", "wheel_blocked"},
+}  # fmt: skip
+
+
+class Robot(Struct, frozen=True):
+    """A robot: its size, its encoders, its motors, and what the configuration says of them."""
+
+    radius: float
+    track: float
+    counts: int
+    declared: bool
+    lag: float
+    response_time: float
+    rate: float
+    speed: float  # m/s, at which it drives
+
+    @property
+    def drive(self) -> DriveConfig:
+        return DriveConfig(wheel_radius=self.radius, wheel_separation=self.track)
+
+    @property
+    def limits(self) -> LimitsConfig:
+        return LimitsConfig(wheel_speed=min(90.0, 3.0 / self.radius))
+
+
+def robot(dice: random.Random, sound: bool = True) -> Robot:
+    radius = math.exp(dice.uniform(math.log(0.03), math.log(0.2)))
+    lag = math.exp(dice.uniform(math.log(0.05), math.log(1.5 if sound else 0.3)))
+    known = lag * dice.uniform(0.75, 1.33)
+    return Robot(
+        radius,
+        radius * dice.uniform(4.0, 8.0),
+        dice.choice(COUNTS),
+        dice.random() < 0.5,
+        lag,
+        0.2 if lag < 0.3 else known,
+        dice.choice((50.0, 100.0)),
+        math.exp(dice.uniform(math.log(0.05), 0.0)),
+    )
+
+
+class Findings(Struct):
+    """What `Wheels` said: the first time of each code, the latched faults, and the reports."""
+
+    first: dict[str, float] = {}
+    faults: list[str] = []
+    pushes: int = 0
+    left_out: set[str] = set()
+
+
+class Bench:
+    """One robot with its `Wheels`, step by step."""
+
+    def __init__(self, robot: Robot, dice: random.Random) -> None:
+        self.robot, self.dice = robot, dice
+        self.kinematics = Kinematics(robot.drive)
+        self.limits = robot.limits
+        self.feedback = FeedbackConfig(response_time=robot.response_time)
+        self.count = count_angle(robot.counts if robot.declared else 0)
+        self.unit = math.tau / robot.counts
+        self.wheels: Wheels = new_wheels()
+        self.motion = Motion()
+        self.now = 0.0
+        self.speeds = [0.0] * 4
+        self.angles = [dice.uniform(0.0, self.unit) for _ in WHEELS]
+        self.counted = [math.floor(angle / self.unit) for angle in self.angles]
+        self.lags = [robot.lag * dice.uniform(0.9, 1.1) for _ in WHEELS]
+        self.sizes = [dice.uniform(0.985, 1.015) for _ in WHEELS]
+        self.gain = 1.0  # slopes and bumps
+        self.hand: list[float] | None = None  # rad/s of each wheel that a person turns
+        self.drives: dict[int, float] = {}  # factor of the command of a motor
+        self.keeps: set[int] = set()  # motors that keep their speed
+        self.swaps: list[tuple[int, int]] = []
+        self.dead: set[int] = set()  # encoders
+        self.signs: dict[int, int] = {}  # of encoders
+        self.frozen: dict[int, float] = {}  # encoders that repeat a speed
+        self.rolled = [0.0] * 4  # rad, magnitudes
+        self.said = Findings()
+        self.cap = math.inf
+
+    def step(self, wished: Twist) -> None:
+        dt = 1.0 / self.robot.rate
+        self.now += dt
+        self.motion = self.motion.follow(wished, dt, self.limits, self.kinematics, self.cap)
+        commanded = self.kinematics.wheel_speeds(self.motion.twist)
+        goals = list(commanded.as_tuple())
+        for i, j in self.swaps:
+            goals[i], goals[j] = goals[j], goals[i]
+        turned, speeds = [0.0] * 4, [0.0] * 4
+        for i, goal in enumerate(goals):
+            lag, goal = self.lags[i], goal * self.gain * self.sizes[i] * self.drives.get(i, 1.0)
+            if self.hand is not None:
+                goal, lag = self.hand[i], 0.1
+            before = self.speeds[i]
+            goal *= self.dice.uniform(0.98, 1.02)
+            speed = before if i in self.keeps else goal + (before - goal) * math.exp(-dt / lag)
+            self.speeds[i] = speed
+            moved = (before + speed) / 2 * dt * self.dice.uniform(0.95, 1.05)
+            self.angles[i] += moved
+            self.rolled[i] += abs(moved)
+            counted = math.floor(self.angles[i] / self.unit)
+            counts, self.counted[i] = counted - self.counted[i], counted
+            counts = 0 if i in self.dead else counts * self.signs.get(i, 1)
+            speeds[i] = self.frozen.get(i, round(counts * self.unit / dt, 2))
+            turned[i] = speeds[i] * dt
+        front_right, front_left, rear_left, rear_right = speeds
+        reported = WheelSpeeds(front_right, front_left, rear_left, rear_right)
+        first, second, third, fourth = turned
+        wheels, said = self.wheels, self.said
+        wheels.commanded = commanded
+        wheels.add(
+            (first, second, third, fourth), reported, dt, None, self.feedback, self.kinematics,
+            self.count,
+        )  # fmt: skip
+        self.reported = speeds
+        for event in wheels.events:
+            said.first.setdefault(event.code or event.kind, self.now)
+        if wheels.fault is not None:
+            said.first.setdefault(wheels.fault.code, self.now)
+            said.faults.append(wheels.fault.code)
+        said.pushes += bool(wheels.pushed)
+        said.left_out.update(WHEELS[side.out] for side in wheels.sides if side.out >= 0)
+
+    def hold(self, wished: Twist, seconds: float) -> None:
+        for _ in range(max(1, round(seconds * self.robot.rate))):
+            self.step(wished)
+
+
+def twist(dice: random.Random, made: Robot) -> Twist:
+    kind, speed = dice.random(), made.speed
+    turn = 2.0 * speed / made.track * dice.uniform(-1.0, 1.0)
+    if kind < 0.25:
+        return Twist(dice.choice((-1, 1)) * speed)
+    if kind < 0.45:
+        return Twist(0.0, turn)
+    if kind < 0.6:
+        return Twist()
+    return Twist(speed * dice.uniform(-1.0, 1.0), turn * dice.uniform(0.0, 1.0))
+
+
+def sound(seed: int, seconds: float) -> tuple[Robot, Findings]:
+    """Drive a sound robot at random: slopes, bumps, reversals, caps, and pushes while it rests."""
+    dice = random.Random(seed)
+    made = robot(dice)
+    bench = Bench(made, dice)
+    while bench.now < seconds:
+        slope = dice.uniform(0.75, 1.15)
+        bench.cap = made.speed * dice.uniform(0.2, 1.0) if dice.random() < 0.2 else math.inf
+        wished, until = twist(dice, made), bench.now + dice.uniform(0.2, 5.0)
+        while bench.now < until:
+            bench.gain = slope
+            if dice.random() < 0.02:
+                bench.gain = slope * dice.uniform(0.6, 1.4)
+            bench.hold(wished, min(dice.uniform(0.1, 0.3), until - bench.now))
+        if dice.random() < 0.1:
+            rest = 3.0 + 6.0 * made.lag
+            bench.hold(Twist(), rest + made.speed)
+            ahead, turning = dice.uniform(-1, 1), dice.choice((0.0, dice.uniform(-1, 1)))
+            pushed = bench.kinematics.wheel_speeds(Twist(ahead, turning / made.track))
+            bench.hand = list(pushed.as_tuple())
+            bench.hold(Twist(), dice.uniform(0.5, 4.0))
+            bench.hand = [0.0] * 4
+            bench.hold(Twist(), 2.5)
+            bench.hand = None
+    return made, bench.said
+
+
+class Case(Struct, frozen=True):
+    robot: Robot
+    kind: Kind
+    wheels: tuple[int, ...]
+    found: str  # the first right code, "" if it was not found
+    said: dict[str, float]
+    late: float  # rad beyond the bound that the faulty wheels have rolled when it was found
+
+
+GROUPS: tuple[tuple[int, ...], ...] = (0,), (1,), (2,), (3,), (0, 3), (1, 2), (0, 1, 2, 3)
+
+
+def faulty(kind: Kind, seed: int) -> Case:
+    """Drive a robot that has a fault, until it is found or the bound has passed by far."""
+    dice = random.Random(f"{kind} {seed}")
+    made = robot(dice, sound=False)
+    bench = Bench(made, dice)
+    group = GROUPS[seed % len(GROUPS)]
+    speed = made.speed * dice.choice((-1, 1))
+    arc = Twist(speed, dice.choice((0.0, dice.uniform(-0.5, 0.5) * speed / made.track)))
+    wished = arc
+    if kind == "swapped":
+        pairs = dice.choice([[(0, 1)], [(3, 2)], [(0, 1), (3, 2)]])
+        bench.swaps = pairs
+        group = tuple(i for pair in pairs for i in pair)
+        turn = dice.choice((-1, 1)) * dice.uniform(0.6, 2.0) * abs(speed) / made.track
+        wished = Twist(speed * dice.choice((0.0, 0.5)), turn)
+    motors = kind in ("runaway", "too fast", "too slow") or dice.random() < 0.5
+    for i in group:
+        if kind == "reversed":
+            if motors:
+                bench.drives[i] = -1.0
+            else:
+                bench.signs[i] = -1
+        elif kind == "dead":
+            if motors:
+                bench.drives[i] = 0.0
+            else:
+                bench.dead.add(i)
+        elif kind in FACTORS:
+            bench.drives[i] = dice.uniform(*FACTORS[kind])
+    bench.hold(Twist(), 1.0)
+    if kind in ("runaway", "stuck"):
+        # The fault begins in motion; then the robot stops, or turns around.
+        bench.hold(arc, 3.0 + abs(speed) / bench.limits.linear_acceleration)
+        if kind == "runaway":
+            bench.keeps = set(group)
+        else:
+            bench.frozen = {i: round(bench.speeds[i], 2) for i in group}
+        wished = Twist() if kind == "runaway" else Twist(-0.5 * speed)
+    bench.said = Findings()
+    start, right = bench.now, RIGHT[kind]
+    ramp = _ramp(bench, wished)
+    patience = 2.0 if kind in FACTORS else 3.0 * made.response_time
+    bench.hold(wished, ramp + patience)
+    limit = (
+        (3.0 * max(bench.unit, bench.count))
+        if kind in FACTORS
+        else max(1.0, 3.0 * max(bench.unit, bench.count))
+    )
+    commanded = bench.kinematics.wheel_speeds(bench.motion.twist).as_tuple()
+    began, needs = bench.now, 0.0
+    found = ""
+    while not found and bench.now < began + 60.0:
+        found = next((code for code in bench.said.first if code in right), "")
+        if found:
+            break
+        before = list(bench.angles)
+        bench.step(wished)
+        # What the wheels or their encoders show, or ought to show.
+        needs += min(
+            max(abs(bench.angles[i] - before[i]), abs(commanded[i]) / made.rate) for i in group
+        )
+    said = {code: when - start for code, when in bench.said.first.items()}
+    return Case(made, kind, group, found, said, needs - limit)
+
+
+def _ramp(bench: Bench, wished: Twist) -> float:
+    limits, now = bench.limits, bench.motion.twist
+    linear = abs(wished.linear - now.linear) / limits.linear_acceleration
+    return max(linear, abs(wished.angular - now.angular) / limits.angular_acceleration)
