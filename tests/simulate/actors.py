@@ -45,6 +45,7 @@ from tests.simulate.roads import (
     sample,
 )
 from tests.simulate.spread import Spread
+from tests.simulate.wheels import Impossible, Wheels
 
 REPLAYED = 10
 """One plan in so many is recorded and replayed."""
@@ -111,6 +112,7 @@ class Run:
         self._asked_ns: int | None = None  # the daemon asked the board for its name
         self.half_duplex = HalfDuplex()
         self.followed, self.course = Followed(self.witness), Course(self.witness)
+        self.wheels, self.impossible = Wheels(self.witness), Impossible(self.witness)
         self.causes = Causes()
         self.counts: Counter[str] = self.witness.counts
         self.liveness = Liveness(self)
@@ -674,7 +676,7 @@ class Run:
             self.pose.latest = None
             self.damage.forget()
             self.reasons.restart()
-            self.pose.begin()
+            self.pose.new_life()
 
         self.at(after_ns + 1000, start)
 
@@ -697,6 +699,8 @@ class Run:
         if not end or not any(line[:2] in (b"ap", b"an") for line in lines.split(b"\n")):
             return  # The line has no end, or begins with noise, or the board greets.
         true_ns = at_ns - START_NS + self.slept_ns
+        others = bool(set(self._names) - NO_TROUBLE - {"bias"}) or self._flipped > 0
+        self.impossible.fed(lines, others)
         gap_ns = true_ns - self._fed_ns
         if self._flipped:
             self._flipped -= 1
@@ -795,6 +799,7 @@ class Run:
             witness.disarmed_ns = max(witness.disarmed_ns, true_ns)
             self.followed.forget()
             self.liveness.event()
+        self.impossible.step(true_ns, snapshot.mode)
         self.followed.step(
             true_ns, snapshot.decided_ns, snapshot.followed_ns, snapshot.mode, snapshot.link
         )
@@ -847,6 +852,10 @@ class Run:
             for estimate in snapshot.estimates:
                 self.spread.see(true_ns, estimate, lies)
             witness.wheels(true_ns, truth[4])
+            others = (at for name, at in witness.troubles.items() if name not in self._names)
+            quiet_ns = max(calm_ns + offset, *others, 0)
+            lies = set(self._troubling)
+            self.wheels.see(true_ns, self.product.wheels(), snapshot.causes, lies, quiet_ns)
         if self.pose.end_step():
             self.spread.forget()
         self.log_lines.see(true_ns, snapshot)

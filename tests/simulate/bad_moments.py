@@ -11,7 +11,7 @@ import random
 from collections.abc import Callable
 from typing import Any
 
-from tests.simulate import moments_of_age
+from tests.simulate import moments_of_age, moments_of_wheels
 from tests.simulate.board_inputs import NEVER_S
 from tests.simulate.promises import INPUTS
 
@@ -49,7 +49,7 @@ def removed(plan: Plan) -> Plan:
     }
 
 
-NEW = {"flip", "half_duplex", "constant_answers", "gyro"}
+NEW = {"flip", "half_duplex", "constant_answers", "gyro", "runaway", "set_points", "gain"}
 """Events and faults that an older simulator does not know."""
 
 
@@ -589,6 +589,9 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "queue from the start": (0.03, _any, _driven(moments_of_age.queued)),
     "plateau behind a pause": (0.03, _any, _driven(moments_of_age.plateau)),
     "long silence": (0.03, _any, _driven(moments_of_age.silence)),
+    "slow wheels": (0.15, _is_plain, _driven(moments_of_wheels.slow_wheels)),
+    "wrong counts": (0.03, _any, _driven(moments_of_wheels.wrong_counts)),
+    "set points": (0.05, _is_plain, _driven(moments_of_wheels.set_points)),
 }
 """The share of the plans that have each moment, of those that can have it, whether a plan can have
 it, and what makes it."""

@@ -43,7 +43,8 @@ FAULT_MINUTES, CASE_MINUTES = 10.0, 30.0
 MEASURED_WITH = (
     "plan", "roads", "actors", "ages", "bad_moments", "beats", "board_inputs", "causes", "course",
     "damage", "followed", "gyro_faults", "jerk", "liveness", "log_lines", "moments_of_age",
-    "plugging", "pose", "product", "promises", "reasons", "reports", "spread",
+    "moments_of_wheels", "plugging", "pose", "product", "promises", "reasons", "reports", "spread",
+    "wheels",
 )  # fmt: skip
 """Modules of the simulator that make the plans, play them and judge them."""
 

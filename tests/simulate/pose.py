@@ -31,6 +31,10 @@ GAP_NS = 3 * NS // 10
 MOVES = 0.1
 """Speed, m/s, from which on a robot certainly moves before a gap."""
 
+DRIVES, MISCOUNTS_NS = 0.05, 3 * NS // 2
+"""Speed, m/s, from which on a robot certainly drives, and the time of driving after which a wrong
+number of counts is known."""
+
 STANDS = 0.001
 """Distance, m, and turn, rad, up to which the true pose has stayed the same."""
 
@@ -104,6 +108,11 @@ class PoseWitness:
         """Distance by which one damaged speed of one line may move the pose, m."""
         self._known_ns = 0
         """From when on the lines show the motion again."""
+        checked = config.get("mcu", {}).get("link_check") == "on"
+        self._miscounts = checked and mcu_counts is not None and mcu_counts != (counts or 3200)
+        """The configuration has a wrong number of counts, which the lines contradict."""
+        self._driven_ns = self._seen_ns = 0
+        """Time for which this daemon has seen the robot drive, and the last estimate."""
         rate = config.get("control", {}).get("rate")
         self._seldom = rate == 10.0
         """Whether lines come so seldom that two of them say little of a longer gap between."""
@@ -181,6 +190,11 @@ class PoseWitness:
         """Note that the lines do not show the true motion until this time."""
         self._known_ns = max(self._known_ns, at_ns)
 
+    def new_life(self) -> None:
+        """Note that a daemon starts."""
+        self._driven_ns = 0
+        self.begin()
+
     def begin(self) -> None:
         """Forget all earlier estimates, because a daemon starts or the pose is set."""
         self.doubt()
@@ -205,7 +219,11 @@ class PoseWitness:
         at_ns, x, y, yaw, _ = truth
         self._true.append((at_ns + offset_ns, (x, y, yaw)))
         self._speed = self._present_speed()
+        if self._speed > DRIVES:
+            self._driven_ns += now_ns - self._seen_ns
+        self._seen_ns = now_ns
         lies = not LIARS.isdisjoint(faults) or now_ns < self._known_ns
+        lies |= self._miscounts and self._driven_ns < MISCOUNTS_NS
         silent_only = not lies or faults & LIARS == {"mute"}
         if lies:
             self.doubt(silent_only)

@@ -444,7 +444,7 @@ class Product:
             if name == "constant_answers":
                 self._lasting.enter_context(mcu._with(_processing=repeat(values[0])))
                 continue
-            if name == "half_duplex":
+            if name in ("half_duplex", "runaway", "set_points", "gain"):
                 continue
             # The daemon's TX is joined to its RX, so nothing of the board arrives.
             fault = "mute" if name == "echo" else name
@@ -454,6 +454,11 @@ class Product:
         for name, values in faults:
             if name == "half_duplex":
                 self._half_duplex(mcu, *values)
+            if name == "set_points":
+                self._report_set_points(mcu)
+            if name == "gain":
+                self._lasting.enter_context(mcu._with(drives=[values[0]] * 4))
+        self._run_away(mcu, [values[0] for name, values in faults if name == "runaway"])
 
     def _garble(self, mcu: FakeMcu, baud_rate: int) -> None:
         """Connect this board by a serial line on which the board uses another baud rate."""
@@ -484,6 +489,32 @@ class Product:
         mcu.vehicle.load = load
         self._lasting.callback(vars(mcu).pop, "receive", None)
         self._lasting.callback(setattr, mcu.vehicle, "load", 0.0)
+
+    def _run_away(self, mcu: FakeMcu, motors: list[int]) -> None:
+        """Let these motors keep their set points, whatever the board commands."""
+        vehicle = mcu.vehicle
+        places = [mcu._wiring[motor][0] for motor in motors]
+        kept = {place: vehicle.set_points[place] for place in places}
+
+        def advance(dt: float, push: float | None = None) -> None:
+            for place, speed in kept.items():
+                # A motor at rest runs away with its next command.
+                kept[place] = speed = speed or vehicle.set_points[place]
+                vehicle.set_points[place] = speed
+            type(vehicle).advance(vehicle, dt, push)
+
+        vars(vehicle).pop("advance", None)
+        if kept:
+            vars(vehicle)["advance"] = advance
+
+    def _report_set_points(self, mcu: FakeMcu) -> None:
+        """Let the board report its set points as speeds, as one without encoders does."""
+
+        def speeds(now_ns: int) -> list[float]:
+            return [mcu.vehicle.set_points[wheel] * forward for wheel, forward in mcu._wiring]
+
+        vars(mcu)["_speeds"] = speeds
+        self._lasting.callback(vars(mcu).pop, "_speeds", None)
 
     def flip(self, place: int, mask: int, behind: int) -> None:
         """Invert bits of one character in a reply with speeds.
@@ -540,6 +571,10 @@ class Product:
         vehicle = mcu.vehicle
         pose, fastest = vehicle.pose, max(map(abs, vehicle.speeds))
         return mcu._now_ns, pose.x, pose.y, pose.yaw, fastest
+
+    def wheels(self) -> list[float]:
+        """Return the true speeds of the wheels, rad/s, in the order of the configuration."""
+        return list(self._world.mcu.vehicle.speeds)
 
     @property
     def plugged(self) -> bool:
