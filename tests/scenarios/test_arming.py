@@ -444,7 +444,7 @@ def test_where_a_pause_arms_a_replaced_sender_has_not_paused() -> None:
 
 # starts and returns
 
-ALONE: tuple[Way, ...] = ("header", "plain", "bridge")
+ALONE: tuple[Way, ...] = ("header", "plain", "bridge", "routed")
 """Routes on which all programs of a source have one identity."""
 
 
