@@ -519,6 +519,13 @@ FAULTS = (
         "NS_PER_S * max(1.0, 4 / rate_hz",
     ),
     fault(
+        "times commands",
+        "the time between two replies is twice that between their commands",
+        "core/link/line_times.py",
+        "dt_ns = sample_ns - before if before else 0",
+        "dt_ns = 2 * (sample_ns - before) if before else 0",
+    ),
+    fault(
         "session stale",
         "a robot whose board is silent gets zeros and says `driving`",
         ROBOT,
