@@ -41,6 +41,7 @@ MAX_HEADING_VARIANCE = 1.0  # rad2, of the second order: its series does not con
 
 ASSUMED_COUNTS = 400  # per revolution; few encoders have fewer
 ASSUMED_PERIOD_S = 0.01  # of the lines, before it is known
+MIN_PERIOD_S = 1e-3  # no serial line is as short
 SPEED_RESOLUTION = 0.01  # rad/s: a line has two decimals
 LATERAL_VARIANCE = 1e-3  # m2/s2 sideways, which wheels do not measure, while the robot moves
 MIN_TWIST_VARIANCE = 1e-8  # filters that use the published twist treat less as an error
@@ -211,7 +212,7 @@ class Uncertainty(Struct):
         stretch, self.stretch = self.stretch, Stretch()
         distance, turn, dx, dy = stretch.distance, stretch.turn, stretch.dx, stretch.dy
         if stretch.lines and stretch.seconds:
-            self.period = stretch.seconds / stretch.lines
+            self.period = max(MIN_PERIOD_S, stretch.seconds / stretch.lines)
         if not (distance or turn or dx or dy) or self._is_lost():
             return
         heading = yaw - turn / 2

@@ -88,7 +88,7 @@ def test_a_cause_says_in_words_what_holds_the_robot_and_since_when() -> None:
     latches = latched(Latches(), "fault", DEAD, WALL_NS)
     latches = stopped(latched(latches, "stop", FLAT, WALL_NS), "", WALL_NS)
     dead, flat, stop = latches.causes
-    assert describe(dead).endswith("(1): (latched at 2027-01-15 08:00:00 UTC)")
+    assert describe(dead).endswith("(1) (latched at 2027-01-15 08:00:00 UTC)")
     assert describe(flat) == "battery below 22 V (latched at 2027-01-15 08:00:00 UTC)"
     assert describe(stop) == "stopped by request at 2027-01-15 08:00:00 UTC"
     (*_, kept) = after_restart(latches).causes
@@ -96,4 +96,6 @@ def test_a_cause_says_in_words_what_holds_the_robot_and_since_when() -> None:
         "was stopped by request at 2027-01-15 08:00:00 UTC, before the restart"
     )
     assert in_force([flat, stop]) == "stopped (battery below 22 V) and stopped by request"
-    assert in_force([stop, dead]).startswith("in fault (front_left wheel does not turn")
+    assert in_force([stop, dead]).startswith(
+        "in fault (front_left wheel does not obey its command: it"
+    )
