@@ -166,7 +166,7 @@ def _draw_unstamped_zeros(dice: random.Random, senders: list[dict[str, Any]]) ->
         if sender["churn"] or sender["bad_stamps"] or ids.count(sender["id"]) > 1:
             continue
         if sender["way"] != "signed":
-            sender["way"] = "rmw"  # `header` has no numbers, and the stamps of `client` are steady
+            sender["way"] = "rmw"  # `header` has no numbers, and `client` echoes
         ends = [
             [after[0], dice.random() < 0.7]
             for before, after in itertools.pairwise(phases)

@@ -21,7 +21,7 @@ class Edit(NamedTuple):
 PLANS_OF_FAULT = {
     "estop": "estop", "away": "away", "battery": "battery", "driver": "driver_fault",
     "moment": "late step", "robot set": "late step",
-    "neutral stall": "stall behind a zero", "neutral place": "doubtful holder",
+    "neutral stall": "stall behind a zero", "neutral place": "stall",
     "driver release": "behind a press",
     "wheel press": "behind a press",
     "wheel waited": "late lines", "limits saturated": "wheel limit",
@@ -297,6 +297,27 @@ FAULTS = (
         AGES,
         "if not verdict and last.overtook(command, timeout_ns):",
         "if False:",
+    ),
+    fault(
+        "ages proof",
+        "the second command of a new clock counts",
+        AGES,
+        "elif at_ns - self.since_ns >= timeout_ns:",
+        "elif at_ns > self.since_ns:",
+    ),
+    fault(
+        "ages silence",
+        "a sender stays armed through any silence",
+        NEUTRAL,
+        "now_ns - self.arrived_ns > SILENT_NS",
+        "now_ns - self.arrived_ns > 10**15",
+    ),
+    fault(
+        "neutral anywhere",
+        "a pause arms a sender of each source",
+        ARBITER,
+        'if not zero and settings.neutral_first == "pause":',
+        "if not zero:",
     ),
     fault(
         "neutral late",
