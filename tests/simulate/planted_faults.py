@@ -31,7 +31,7 @@ PLANS_OF_FAULT = {
     "loop end": "restart", "robot end": "restart", "gate late": "stall in step",
     "session echo": "half_duplex", "case 11": "echo", "limits clock": "wall",
     "robot unsent": "block", "robot limits": "limits", "lifecycle number": "typed",
-    "lifecycle fault": "driver_fault",
+    "lifecycle fault": "driver_fault", "ages echo": "queue from the start",
     "gyro hangs": "hangs",
 }  # fmt: skip
 """Kinds of plans by the name of a fault, or by the first word of its name."""
@@ -297,6 +297,13 @@ FAULTS = (
         AGES,
         "if not verdict and last.overtook(command, timeout_ns):",
         "if False:",
+    ),
+    fault(
+        "ages echo",
+        "a command with an echo counts however late it is",
+        AGES,
+        "if age_ns > timeout_ns + MARGIN_NS:",
+        "if age_ns > 10**12:",
     ),
     fault(
         "ages proof",
