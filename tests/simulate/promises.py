@@ -395,8 +395,7 @@ class Witness:
         """Note that the daemon has executed an `activate`."""
         self.perhaps_latched.discard("activate")
         self.ages = Ages(asked_ns)
-        if self.offs:
-            self.arming(asked_ns)
+        self.arming(asked_ns)  # also if the robot was on
         self._release(self.offs, "an activate undoes no later one", asked_ns, read_ns, name)
 
     def _release(
