@@ -283,7 +283,7 @@ class Wheels(Struct):
                 self.begins = False
             if not self.late:
                 self._obey(block, (due_left, due_right))
-                self._miss(lag)
+                self._miss(patience)
         self._compare(block, kinematics)
 
     def _obey(self, block: Block, due: tuple[Rad, Rad]) -> None:
@@ -397,12 +397,12 @@ class Wheels(Struct):
             event = Event("wheel_fault", _text(wheel, i), "warning", kind=code, code=code)
         self.events = (*self.events, event)
 
-    def _miss(self, lag: Seconds) -> None:
+    def _miss(self, patience: Seconds) -> None:
         for side, (name, front, rear) in zip(self.sides, SIDES, strict=True):
             one, other = self.wheels[front], self.wheels[rear]
             if side.out >= 0 or one.rested or not (one.missed and other.missed):
                 continue
-            if one.apart_s >= lag and other.apart_s >= lag:
+            if one.apart_s >= patience and other.apart_s >= patience:
                 values = [0.0] * 4
                 values[front], values[rear] = one.missed, other.missed
                 one.missed = other.missed = 0.0
