@@ -212,7 +212,7 @@ class Robot:
         if heard.speed_cap is not None:
             self._cap_speed(heard.speed_cap, events)
         if life.mode not in UNLATCHED:
-            self._arbiter.watched_ns = now_ns
+            self._arbiter.watched_ns = max(self._arbiter.watched_ns, now_ns)
         if heard.commands or heard.refusals:
             self._accept_commands(now_ns, heard, events)
         is_chosen = now_ns >= self._arbiter.until_ns

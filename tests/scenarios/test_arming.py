@@ -365,9 +365,9 @@ def test_two_programs_with_a_gid_of_zeros_never_arm_each_other() -> None:
 
 
 def navigating(way: Way, name: str = "nav2") -> tuple[World, Speaker]:
-    """Return a world whose link is up for 1.5 s, and a sender to the source `nav`."""
+    """Return a world in which a pause counts, and a sender to the source `nav`."""
     world = World()
-    world.run(1.5)
+    world.run(6.5)
     speaker = Speaker(world, way, name)
     speaker.key = "cmd/nav"
     return world, speaker
@@ -392,7 +392,7 @@ def test_where_a_pause_arms_a_goal_under_way_does_not_drive_after_an_event(
     if event == "restart":
         world = World()
         nav.world = world
-        world.run(0.5)
+        world.run(4.5)  # until its Zenoh client tries again
     else:
         nav.hold(0.4, 1.0)
     match event:

@@ -441,7 +441,7 @@ def test_every_goal_of_nav2_drives_without_a_hand(
 
     The smoother of 2026 stamps the zero at the end of its ramp with a time in the future.
     """
-    world.run(1.1)
+    world.run(6.1)
     for name, pause in (("first", 3.0), ("first", 60.0), ("started again", 2.0)):
         nav2 = Nav2(world, road, name, smoother=smoother, stamps=stamps)
         drives(world, lambda: nav2.goal(FAST, 1.0))  # noqa: B023
@@ -458,7 +458,7 @@ def test_every_goal_of_nav2_drives_without_a_hand(
 def test_a_goal_of_nav2_under_way_at_a_clear_drives_when_it_was_cancelled_and_sent_again(
     world: World, road: Road, smoother: bool
 ) -> None:
-    world.run(1.1)
+    world.run(6.1)
     nav2 = Nav2(world, road, smoother=smoother)
     drives(world, lambda: nav2.goal(FAST, 1.0))
     stop_and_clear(world, lambda: nav2.goal(FAST, CLEAR_S))

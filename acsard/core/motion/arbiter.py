@@ -29,6 +29,10 @@ NOTHING, COMMAND = Wait("nothing"), Wait("command")
 
 NOBODY = ("", "")
 
+# After a start no pause counts for this time: a Zenoh client that has lost the daemon tries again
+# every 4 s at most, and a goal that is under way at a restart must not look like a new one.
+RECONNECT_NS = 5 * NS_PER_S
+
 
 class Choice(Struct, frozen=True):
     """The twist to follow, or None and the reason `wait`; the chosen source and sender."""
@@ -79,7 +83,8 @@ class Arbiter(Struct):
     since_ns: Ns = 0  # zeros from then on arm
     begun_ns: Ns = 0  # last step
     caught_up_ns: Ns = 0  # until then, commands may arrive that waited during the last stall
-    watched_ns: Ns = 0  # since then the robot could drive, and the daemon has not stood still
+    # From then on a pause counts: the robot could drive, and the daemon did not stand still.
+    watched_ns: Ns = 0
     until_ns: Ns = 0  # the last `choose` holds until then, unless another method is called
 
     def require_neutral(self, since_ns: Ns = 0) -> None:
@@ -100,22 +105,21 @@ class Arbiter(Struct):
         for source in self.sources.values():
             source.ages = Ages()
 
-    def begin(self, now_ns: Ns, commands: CommandsConfig) -> bool:
-        """Begin a control step, and return whether the daemon stood still before (True at first).
-
-        After `LATE_STEP_NS`, the bus may not have delivered all commands.
-        """
+    def begin(self, now_ns: Ns, commands: CommandsConfig) -> None:
+        """Begin a control step. After `LATE_STEP_NS`, the bus may not have delivered all commands."""
         before_ns, self.begun_ns = self.begun_ns, now_ns
         if now_ns - before_ns <= LATE_STEP_NS:
-            return False
-        self.watched_ns, self.until_ns = now_ns, 0
+            return
+        self.until_ns = 0
         if before_ns:
             self.caught_up_ns = now_ns + CATCH_UP_NS
+            self.watched_ns = max(self.watched_ns, now_ns)
+        else:
+            self.watched_ns = now_ns + RECONNECT_NS
         for settings in commands.sources:
             if (source := self.sources.get(settings.name)) is not None:
                 for sender in source.senders.values():
                     sender.resume(before_ns, now_ns, timeout_ns(settings))
-        return True
 
     def accept(self, command: Command, commands: CommandsConfig) -> Wait | None:
         """Process a command. Return None if it is accepted, otherwise why it is refused."""
