@@ -28,6 +28,10 @@ LOSS_SLOTS, LOST_SLOTS = 0.6, 0.75  # more than usual; of the earliest of `LEAST
 
 LEAST_READS = 8
 
+# Lines that are counted one by one. After a longer silence, such as a night without power for the
+# board, the rest is missing at once: counting 360,000 lines of an hour takes 0.2 s.
+MAX_MISSING = 1000
+
 MAX_ADAPTER_DELAY_NS = 25_000_000  # an FTDI chip holds a line for 16 ms
 
 EARLY_SLOTS = 0.5  # a line that comes so much too early: a loss that was none
@@ -122,6 +126,10 @@ class FreeRunning(Struct):
             self.lost -= early
             late += early
         elif drained:
+            if (missing := int(late) - MAX_MISSING) > 0:
+                self.lost += missing
+                late -= missing
+                self.lateness.recent = []
             while self.lateness.missing(late, lines, period):
                 self.lost += 1
                 late -= 1.0

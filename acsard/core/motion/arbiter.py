@@ -106,7 +106,7 @@ class Arbiter(Struct):
             source.ages = Ages()
 
     def begin(self, now_ns: Ns, commands: CommandsConfig) -> None:
-        """Begin a control step. After `LATE_STEP_NS`, the bus may not have delivered all commands."""
+        """Begin a step. After `LATE_STEP_NS`, the bus may not have delivered all commands."""
         before_ns, self.begun_ns = self.begun_ns, now_ns
         if now_ns - before_ns <= LATE_STEP_NS:
             return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from time import process_time
 from typing import Literal
 
 import pytest
@@ -294,3 +295,15 @@ def test_answers_after_a_phase_of_sparse_replies_are_not_matched_to_old_lines() 
             lines += read(bench, 0, 1 if number > 7 else 8)  # the host stood still for eight lines
     assert max(line.dt for line in lines) <= 0.08  # the duration of the stall
     assert sum(line.dt for line in lines) == pytest.approx(0.6, abs=0.06)
+
+
+def test_a_free_running_board_that_was_silent_for_a_day_costs_no_period() -> None:
+    bench = Bench(counts=0, period=0.01)
+    for _ in range(100):
+        bench.line()
+    begin = process_time()
+    line = bench.line(ms=86_400_000.0, gap=True)
+    assert process_time() - begin < 0.02
+    assert line.gap == pytest.approx(86_400.0, abs=0.02)
+    for _ in range(100):
+        assert bench.line().dt == pytest.approx(0.01)
