@@ -134,7 +134,7 @@ def test_a_command_held_up_on_the_way_is_counted_as_stale(bus: Bus) -> None:
         return bus.count("commands") > before
 
     until(counted, 5.0, "stamped zeros")
-    refused_without_motion(bus, Bad(stamped(1.0), "stale", "the network delayed it"))
+    refused_without_motion(bus, Bad(stamped(1.0), "stale", "the network delays them"))
 
 
 def test_enormous_wheel_speeds_are_clamped_to_the_limits(bus: Bus) -> None:

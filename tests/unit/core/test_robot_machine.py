@@ -42,6 +42,7 @@ from acsard.core.values import (
     Answer,
     Cause,
     Command,
+    Echo,
     Instant,
     Latches,
     Plain,
@@ -65,7 +66,11 @@ SOURCES = (
     Source("app", 50),
     Source("twin", 50, timeout=0.1),
     Source("nav", 10, timeout=1.0),
+    Source("page", 30),
 )
+ECHOES = "page"
+"""The source whose sender echoes the beat; the others stamp some commands."""
+
 NAMES = [source.name for source in SOURCES]
 COMMANDS = CommandsConfig(sources=SOURCES)
 CONFIGS = [
@@ -96,6 +101,7 @@ speeds = st.sampled_from([0.0, 0.02, 0.3, -0.3, 0.7, -1.0, 1.0, 30.0, -1e300])
 turns = st.sampled_from([0.0, 0.0, 0.5, -1.5, 4.0, -60.0, 1e300])
 twists = st.builds(Twist, speeds, turns)
 names = st.sampled_from(NAMES)
+stamping = st.sampled_from([name for name in NAMES if name != ECHOES])
 places = st.floats(-1e6, 1e6)
 
 
@@ -145,7 +151,10 @@ class Books:
     def __init__(self, source: Source) -> None:
         self.priority = source.priority
         self.timeout_ns = round(source.timeout * NS_PER_S)
-        self.promptest: tuple[int, int] | None = None
+        self.stamped_ns: int | None = None
+        """Last accepted stamped command; None while the clock is not proven."""
+        self.since_zero_ns = 0
+        """Zeros from then on arm."""
         self.start_over()
 
     def start_over(self) -> None:
@@ -158,7 +167,7 @@ class Books:
     def take(self, wish: Twist, at_ns: int) -> None:
         if at_ns - self.heard_ns > 10 * NS_PER_S:
             self.neutral = False
-        if wish == REST:
+        if wish == REST and at_ns >= self.since_zero_ns:
             self.neutral = True
         if not self.is_live(at_ns):
             self.since_ns = at_ns
@@ -214,7 +223,10 @@ class RobotMachine(RuleBasedStateMachine):
         self.told_link, self.was_open, self.last_opened = "down", False, 0
         self.pose, self.sampled_ns = Pose(), self.now_ns - NS_PER_S
         self.fastest = 0.0
-        self.lates = 0
+        self.sequence, self.beat_ns = 0, 0
+        """The newest number and beat of the sender that echoes."""
+        self.caught_up_ns = 0
+        """Until then, a speed without a stamp may have waited while the daemon stalled."""
         self.clocks_become_known()
         self.step(tick=False)
         if rolling:
@@ -228,13 +240,14 @@ class RobotMachine(RuleBasedStateMachine):
             self.cruise("app", Twist(0.7, 0.5), 30, 1)
 
     def clocks_become_known(self) -> None:
-        """Send zeros from all sources before the port opens. The senders' clocks are then known."""
+        """Send zeros before the port opens. The clocks of the senders that stamp are then known."""
         for _ in range(50):
             self.now_ns += 50 * MS
-            for name in NAMES:
-                self.books[name].promptest = (0, self.now_ns)
             wall_ns = self.now_ns + WALL_NS
-            zeros = [Command(name, REST, self.now_ns, wall_ns, name) for name in NAMES]
+            stamping = [name for name in NAMES if name != ECHOES]
+            for name in stamping:
+                self.books[name].stamped_ns = self.now_ns
+            zeros = [Command(name, REST, self.now_ns, wall_ns, name) for name in stamping]
             now = Instant(self.now_ns, wall_ns)
             self.stepped.step(Inputs(now, tick=False, port_open=False, commands=tuple(zeros)))
 
@@ -270,31 +283,69 @@ class RobotMachine(RuleBasedStateMachine):
     def a_zero_comes(self, name: str) -> None:
         self.command(name, REST)
 
-    @rule(name=names, twist=twists)
+    @rule(name=stamping, twist=twists)
     def a_prompt_stamped_command_comes(self, name: str, twist: Twist) -> None:
-        known = self.books[name].promptest
-        if known is None or self.now_ns - known[1] > 200 * NS_PER_S:
-            return  # after so long a silence the clock counts as new
-        self.books[name].promptest = (0, self.now_ns)
-        self.command(name, twist, stamp_ns=self.now_ns + WALL_NS)
+        stamped_ns = self.books[name].stamped_ns
+        # After 100 s the least delay has risen by 50 ms, and a prompt command looks early.
+        if stamped_ns is not None and 0 < self.now_ns - stamped_ns < 90 * NS_PER_S:
+            self.books[name].stamped_ns = self.now_ns
+            self.command(name, twist, stamp_ns=self.now_ns + WALL_NS)
 
-    @rule(name=names, twist=twists, late_ms=st.integers(20, 9000))
+    @rule(name=stamping, twist=twists)
+    def a_new_clock_is_proven(self, name: str, twist: Twist) -> None:
+        """No command of a clock counts before the end of its first timeout."""
+        book, first_ns = self.books[name], self.now_ns
+        while book.stamped_ns is None and self.now_ns - first_ns < book.timeout_ns:
+            stamp_ns = self.now_ns + WALL_NS
+            command = Command(name, twist, self.now_ns, stamp_ns, name)
+            self.refused(("unproven",), command, ms=self.period_ms, ticks=True)
+        if book.stamped_ns is None:
+            book.stamped_ns = self.now_ns
+            self.command(name, twist, stamp_ns=self.now_ns + WALL_NS)
+
+    @rule(name=stamping, twist=twists, late_ms=st.integers(20, 9000))
     def a_command_comes_late(self, name: str, twist: Twist, late_ms: int) -> None:
         book = self.books[name]
-        self.lates += 1  # never as late as those before, which would look like a clock that was set
-        late_ns = book.timeout_ns + (late_ms + self.lates % 7 * 1500) * MS
-        if book.promptest is not None and self.now_ns - book.promptest[1] < 9 * NS_PER_S:
-            command = Command(name, twist, self.now_ns, self.now_ns + WALL_NS - late_ns, name)
-            self.refused("stale", command)
+        if book.stamped_ns is not None and self.now_ns - book.stamped_ns < 9 * NS_PER_S:
+            stamp_ns = self.now_ns + WALL_NS - book.timeout_ns - late_ms * MS
+            command = Command(name, twist, self.now_ns, stamp_ns, name)
+            # Refusals that last for 2 s have a code of their own.
+            self.refused(("stale", "set_back", "stamps"), command)
+
+    @rule(
+        twist=twists,
+        age_ms=st.sampled_from([None, -9000, -1, 301, 1000, 9000]),
+        echoes=st.booleans(),
+    )
+    def a_command_with_a_wrong_echo_comes(
+        self, twist: Twist, age_ms: int | None, echoes: bool
+    ) -> None:
+        """The beat is too old, from the future, of another run (None), or missing."""
+        self.command(ECHOES, REST)
+        self.step()
+        age_ns = None if age_ms is None or not echoes else age_ms * MS
+        beat = Echo(1, self.now_ns - (age_ns or 0)) if echoes else None
+        self.sequence += 1
+        command = Command(
+            ECHOES, twist, self.now_ns, sequence=self.sequence, echo=beat, age_ns=age_ns
+        )
+        late = ("too_old", "round_trip") if age_ns and age_ns > 0 else ("from_future",)
+        self.refused(("no_echo",) if beat is None else late if age_ns else ("other_run",), command)
+
+    @rule(twist=twists)
+    def a_command_with_an_echo_comes_twice(self, twist: Twist) -> None:
+        self.command(ECHOES, twist)
+        repeated = msgspec.structs.replace(self.commands[-1], arrived_ns=self.now_ns + 20 * MS)
+        self.refused(("not_newer",), repeated)
 
     @rule(name=names, bad=st.sampled_from([math.nan, math.inf, -math.inf]), linear=st.booleans())
     def a_command_that_is_no_number_comes(self, name: str, bad: float, linear: bool) -> None:
         twist = Twist(bad, 0.0) if linear else Twist(0.0, bad)
-        self.refused("not_finite", Command(name, twist, self.now_ns))
+        self.refused(("not_finite",), Command(name, twist, self.now_ns))
 
     @rule(name=st.sampled_from(["", "stranger", "App", "cmd/app", "teleop "]), twist=twists)
     def a_stranger_commands(self, name: str, twist: Twist) -> None:
-        self.refused("unknown_source", Command(name, twist, self.now_ns))
+        self.refused(("unknown_source",), Command(name, twist, self.now_ns))
 
     @rule(count=st.integers(1, 5), age_us=st.integers(0, 5000))
     def good_lines_come(self, count: int, age_us: int) -> None:
@@ -452,18 +503,31 @@ class RobotMachine(RuleBasedStateMachine):
         at_ns = self.now_ns if arrived_ns is None else arrived_ns
         if self.commands:  # one queue: commands are taken in order of arrival
             at_ns = max(at_ns, self.commands[-1].arrived_ns)
-        self.commands.append(Command(name, twist, at_ns, stamp_ns, name))
+        command = Command(name, twist, at_ns, stamp_ns, name)
+        if name == ECHOES:
+            self.sequence += 1
+            self.beat_ns = max(self.beat_ns, at_ns - 20 * MS)
+            command = Command(
+                name, twist, at_ns, sequence=self.sequence,
+                echo=Echo(1, self.beat_ns), age_ns=at_ns - self.beat_ns,
+            )  # fmt: skip
+        self.commands.append(command)
 
-    def refused(self, reason: str, command: Command) -> None:
-        """Run a step with only this command, which must be refused for this reason."""
+    def refused(
+        self, codes: tuple[str, ...], command: Command, ms: float = 0.2, ticks: bool = False
+    ) -> None:
+        """Run a step with only this command, which must be refused with one of these codes."""
         self.step(ms=0.2, tick=False)
         before = dict(self.robot.counters)
-        self.step(ms=0.2, tick=False, unheard=(command,))
+        self.step(ms=ms, tick=ticks, reply=ticks, unheard=(command,))
         after = self.robot.counters
-        # Refusals that last for 2 s have a code of their own.
-        keys = [f"command_{reason}", *(["command_set_back"] if reason == "stale" else [])]
+        keys = [
+            "commands_of_new_senders" if code == "unproven" else f"command_{code}" for code in codes
+        ]
         assert sum(after[key] - before.get(key, 0) for key in keys) == 1
         assert after["commands"] == before.get("commands", 0)
+        if command.twist == REST and codes != ("not_newer",) and command.source in self.books:
+            self.books[command.source].wish = REST  # a refused zero ends a speed, but arms nothing
 
     def receive(self, data: bytes, good: int, age_us: int = 0) -> None:
         """Receive bytes that contain this many good lines, or none."""
@@ -499,6 +563,8 @@ class RobotMachine(RuleBasedStateMachine):
         passed_ms = self.period_ms if ms is None else ms
         self.now_ns += int(passed_ms * MS)
         self.late_ns = max(self.late_ns, int(passed_ms * MS))
+        if passed_ms > 150:
+            self.caught_up_ns = self.now_ns + 100 * MS
         if 2 * passed_ms * MS >= self.quiet_ns:
             self.stalled_ns += int(passed_ms * MS)
         if self.opened != self.last_opened or not self.port_open:
@@ -573,12 +639,13 @@ class RobotMachine(RuleBasedStateMachine):
         lost = self.was_open and not self.port_open
         over = lost or self.opened != self.last_opened or self.reset_seen
         over = over or any(event.name == "fault" for event in outputs.events)
-        switched_off = self.before is None or self.before.mode == "inactive"
         for request, answer in zip(requests, outputs.answers, strict=True):
-            if did(answer):
-                over = over or request.verb == "clear"
-                over = over or (request.verb == "activate" and switched_off)
-                switched_off = switched_off or request.verb == "deactivate"
+            if did(answer) and request.verb in ("clear", "activate"):
+                over = True
+                for book in self.books.values():
+                    book.since_zero_ns = self.now_ns
+                    if request.verb == "activate":
+                        book.stamped_ns = None
         self.reset_seen = False
         self.was_open, self.last_opened, self.told_link = (
             self.port_open,
@@ -589,7 +656,9 @@ class RobotMachine(RuleBasedStateMachine):
             for book in self.books.values():
                 book.start_over()
         for command in commands:
-            self.books[command.source].take(command.twist, command.arrived_ns)
+            waited = command.arrived_ns < self.caught_up_ns and command.twist != REST
+            if command.stamp_ns is not None or command.echo is not None or not waited:
+                self.books[command.source].take(command.twist, command.arrived_ns)
 
     # invariants
 
