@@ -674,9 +674,7 @@ def test_a_drive_that_is_suspended_stops_gives_the_terminal_back_and_goes_on(
         suspended = time.monotonic()
         program.signal(signal.SIGTSTP)
         until(lambda: terminal.settings == usual, 5.0, "the terminal as it was")
-        commands.find(
-            lambda value: value["twist"]["linear"]["x"] == 0, 2.0, "a zero", after=suspended
-        )
+        commands.find(lambda value: value["linear"]["x"] == 0, 2.0, "a zero", after=suspended)
         bus.at_rest()
         program.signal(signal.SIGCONT)
         until(lambda: terminal.settings == during, 5.0, "the screen again")
@@ -728,7 +726,7 @@ def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silenc
             until(lambda: (bus.state()["linear"] or 0.0) > 0.2, 5.0, "moving")
         closed = time.monotonic()
         terminal.close()
-        commands.find(lambda value: value["twist"]["linear"]["x"] == 0, 1.0, "a zero", after=closed)
+        commands.find(lambda value: value["linear"]["x"] == 0, 1.0, "a zero", after=closed)
     bus.at_rest()
 
 
@@ -802,9 +800,7 @@ def test_ctrl_c_while_driving_stops_and_leaves_with_0_and_the_terminal_as_it_was
             terminal.press("\x03")
             left = time.monotonic()
             assert program.ended(3.0) == 0
-            commands.find(
-                lambda value: value["twist"]["linear"]["x"] == 0, 2.0, "a zero", after=left
-            )
+            commands.find(lambda value: value["linear"]["x"] == 0, 2.0, "a zero", after=left)
         bus.at_rest()
         after = terminal.settings
     assert "Traceback" not in terminal.screen + program.stderr
