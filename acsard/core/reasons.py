@@ -7,6 +7,7 @@ from typing import assert_never
 from acsard.core.board_inputs import BoardInputs
 from acsard.core.codes import Reason, joined, sentence
 from acsard.core.config.settings import Config
+from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Choice
 from acsard.core.motion.arbiter_text import chosen
@@ -20,6 +21,7 @@ def reason_of(
     life: Lifecycle,
     choice: Choice,
     session: McuSession,
+    setup: LinkSetup,
     inputs: BoardInputs,
     config: Config,
     port_trouble: str,
@@ -39,7 +41,7 @@ def reason_of(
         case Mode.WAITING:
             if session.link == "up":
                 return MISSING_REASON if inputs.estop.missing(safety) else missing_reason(safety)
-            return session.describe_link(port_trouble)
+            return session.describe_link(setup, port_trouble)
         case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
             return life.why
         case Mode.SHUTDOWN:

@@ -23,6 +23,7 @@ from acsard.core.config.settings import Config, LimitsConfig
 from acsard.core.link.board_status import as_text
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.link_diagnosis import UnansweredLines
+from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
@@ -88,7 +89,8 @@ class Robot:
     def __init__(self, config: Config, latches: Latches = Latches()) -> None:  # noqa: B008
         # As after a start of the daemon; `latches` decides the first mode.
         self.config = config  # in force; a `set` replaces it
-        self.session = McuSession(config.mcu, config.rate_hz, config.feedback)
+        self.link_setup = LinkSetup.of(config.mcu, config.rate_hz, config.feedback)
+        self.session = McuSession()
         self._kinematics = Kinematics(config.drive)
         self._errors = self._error_model()
         self._odometry = Odometry.initial(self._errors)
@@ -149,8 +151,8 @@ class Robot:
             feedback_age_s=session.feedback_age_s(now_ns),
             gyro=checks.gyro_status,
             doubt=checks.wheels_status,
-            check=session.check,
-            encoders=session.count_recovery.counts,
+            check=session.check(self.link_setup),
+            encoders=session.count_recovery.counts(self.config.mcu.encoder_counts),
             pose_doubt=session.doubt.code,
             sender=self._choice.sender,
             estop=self._inputs.estop.state,
@@ -271,7 +273,7 @@ class Robot:
             motion = last.motion.coast(since, limits, stop=mode in HALTED)
             speeds = self._kinematics.wheel_speeds(motion.twist)
         last.speeds, last.applied = speeds, motion.twist
-        line = self.session.line(now_ns, speeds)
+        line = self.session.line(self.link_setup, now_ns, speeds)
         if line is not None:
             last.waiting = (motion, speeds)
         return line
@@ -284,7 +286,7 @@ class Robot:
         left = line is not None
         self._last.sent(left, trip)
         # The board must not be expected to answer a line that the guard has replaced.
-        self.session.sent(left_ns, was_written=left and not trip)
+        self.session.sent(self.link_setup, left_ns, was_written=left and not trip)
         if left:
             self.counters["lines_sent"] += 1
         elif self.session.link != "down":
@@ -294,7 +296,9 @@ class Robot:
 
     def _fold(self, now: Instant, heard: Heard, events: list[Event]) -> tuple[Estimate, ...]:
         session, before = self.session, self.status.link
-        feedback = session.update(now, heard.port_open, heard.opened, heard.received)
+        feedback = session.update(
+            self.link_setup, now, heard.port_open, heard.opened, heard.received
+        )
         link, inputs = session.link, self._inputs
         if feedback or link != "up":
             warning = self._answered.check(
@@ -586,7 +590,7 @@ class Robot:
 
     def _restate(self, port_trouble: str) -> None:
         life, choice, session, inputs = self._life, self._choice, self.session, self._inputs
-        why = reason_of(life, choice, session, inputs, self.config, port_trouble)
+        why = reason_of(life, choice, session, self.link_setup, inputs, self.config, port_trouble)
         # Use `_value_`, because the property `value` of an enum runs Python code.
         mode, level = life.mode._value_, inputs.battery.level
         numbers = tuple([cause.number for cause in life.latches.causes])

@@ -54,7 +54,7 @@ class ControlLoop:
         self.robot, self.publication = robot, publication
         self.shutting_down = False  # the robot ramps to zero and stays at rest
         self._port, self._keeper, self._recorder = port, keeper, recorder
-        self._guard, self._config = Guard(robot.session.codec.stop, robot.config), robot.config
+        self._guard, self._config = Guard(robot.link_setup.codec.stop, robot.config), robot.config
         # Use the longest line of both directions, because answers must not queue in the MCU either.
         mcu = robot.config.mcu
         self.pace = Pace(wire_ns(mcu.line_bytes, mcu.baud_rate), robot.config.period_ns)

@@ -100,7 +100,7 @@ class Replay:
         """Go on with another robot, for example after missing steps, and its guard's memory."""
         self.robot = robot
         self._config = robot.config
-        self._guard = Guard(robot.session.codec.stop, robot.config, memory)
+        self._guard = Guard(robot.link_setup.codec.stop, robot.config, memory)
 
     def step(self, step: RecordedStep) -> Difference | None:
         """Replay the next step; return how it differs, or None."""

@@ -26,6 +26,7 @@ from acsard.core.config.settings import Config
 from acsard.core.formatting import printable
 from acsard.core.guard import Memory
 from acsard.core.link.link_diagnosis import UnansweredLines
+from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import CommandEvents
 from acsard.core.motion.event_throttle import EventThrottle
@@ -40,6 +41,7 @@ from acsard.recording.unpickling import MAX_BYTES, unpickle
 
 # Attributes of a robot that are plain data, without configuration inside, with their types.
 PARTS: dict[str, Any] = {
+    "session": McuSession,
     "counters": Counter,
     "_last": LastLine,
     "_cap": SpeedCap,
@@ -60,7 +62,7 @@ PARTS: dict[str, Any] = {
 }
 
 # Not stored: they follow from the configuration, and no line is pending between two steps.
-DERIVED = ("config", "_kinematics", "_errors", "_steady")
+DERIVED = ("config", "link_setup", "_kinematics", "_errors", "_steady")
 
 # A package ends with a dot. The classes need constructors without side effects.
 PART_MODULES = (

@@ -613,7 +613,7 @@ class Product:
             world.loop.finish(world.instant)
         if world.port.mcu is not None:
             # The unit sends zeros when the process has ended.
-            stop = world.loop.robot.session.codec.stop
+            stop = world.loop.robot.link_setup.codec.stop
             world.port.mcu.receive(world.now_ns + 50_000_000, b"\r\n" + stop)
         self.disk.end()
         self.alive = False

@@ -22,6 +22,7 @@ import serial
 
 from acsard.core.config.settings import McuConfig
 from acsard.core.link.checked_line import seal
+from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.session import McuSession
 from acsard.core.values import NS_PER_S, STILL, Event, Instant
 from acsard.daemon.serial.device import open_raw
@@ -220,7 +221,7 @@ async def test_a_port_whose_driver_accepts_no_bytes_is_reported_while_it_still_r
     """The simulated board sends reports and reads nothing, so the port's output buffer fills."""
     os.set_blocking(line.board, False)
     os.set_blocking(line.device, False)
-    wake, session = asyncio.Event(), McuSession(McuConfig(), 100.0)
+    wake, setup, session = asyncio.Event(), LinkSetup.of(McuConfig(), 100.0), McuSession()
     async with line.port(wake=lambda now: wake.set()) as port:
 
         async def blocked(link: str) -> bool:
@@ -231,11 +232,11 @@ async def test_a_port_whose_driver_accepts_no_bytes_is_reported_while_it_still_r
                 await asyncio.wait_for(wake.wait(), 5.0)
                 wake.clear()
                 now = clock.now()
-                session.update(now, port.is_open, port.opened, port.take())
-                data = session.line(now.mono_ns, STILL)
+                session.update(setup, now, port.is_open, port.opened, port.take())
+                data = session.line(setup, now.mono_ns, STILL)
                 if data is not None:
                     written = port.offer(data, now) == "sent"
-                    session.sent(now.mono_ns, was_written=written)
+                    session.sent(setup, now.mono_ns, was_written=written)
                 await asyncio.sleep(0.01)  # the wire is free again
             assert session.link == link
             return session.blocked

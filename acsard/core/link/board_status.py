@@ -57,7 +57,7 @@ def merged(status: BoardStatus, newer: BoardStatus) -> BoardStatus:
     return BoardStatus(*[old if new is None else new for old, new in pairs])
 
 
-class StatusReports:
+class StatusReports(Struct):
     """The fields that the board on this port has reported.
 
     Another board may answer after the port was opened again, so the fields that only the previous
@@ -65,16 +65,15 @@ class StatusReports:
     that it no longer reports is a fault.
     """
 
-    def __init__(self) -> None:
-        self.new: list[tuple[Ns, BoardStatus]] = []  # of the last update, with arrival
-        self.last = BoardStatus()  # last value of each field, until it is forgotten
-        self.last_ns: Ns | None = None  # arrival of the last line
-        self.forgot = False  # in the last update
-        # Both of these since the last opening, and how long the link was up: None after the fields
-        # of another board were forgotten, and then `judge` has nothing to do.
-        self._since_opening: tuple[BoardStatus, Ns | None] = (BoardStatus(), None)
-        self.up_ns: Ns | None = 0
-        self._judged_ns = 0
+    new: list[tuple[Ns, BoardStatus]] = []  # of the last update, with arrival
+    last: BoardStatus = BoardStatus()  # last value of each field, until it is forgotten
+    last_ns: Ns | None = None  # arrival of the last line
+    forgot: bool = False  # in the last update
+    # Both of these since the last opening, and how long the link was up: None after the fields of
+    # another board were forgotten, and then `judge` has nothing to do.
+    since_opening: tuple[BoardStatus, Ns | None] = (BoardStatus(), None)
+    up_ns: Ns | None = 0
+    judged_ns: Ns = 0
 
     def begin_update(self) -> None:
         self.forgot = False
@@ -82,13 +81,13 @@ class StatusReports:
             self.new = []
 
     def reopen(self) -> None:
-        self._since_opening, self.up_ns = (BoardStatus(), None), 0
+        self.since_opening, self.up_ns = (BoardStatus(), None), 0
 
     def take(self, line: bytes, check: bool, at_ns: Ns) -> None:
         """Take a status line, as `decode_status`. Raises `FrameError`."""
         status = decode_status(line, check)
         self.last, self.last_ns = merged(self.last, status), at_ns
-        self._since_opening = merged(self._since_opening[0], status), at_ns
+        self.since_opening = merged(self.since_opening[0], status), at_ns
         self.new.append((at_ns, status))
 
     def judge(self, now_ns: Ns, up: bool, late: bool) -> None:
@@ -97,11 +96,11 @@ class StatusReports:
         Call it while `up_ns` is known.
         """
         assert self.up_ns is not None
-        passed_ns, self._judged_ns = now_ns - self._judged_ns, now_ns
+        passed_ns, self.judged_ns = now_ns - self.judged_ns, now_ns
         self.up_ns = 0 if not up else self.up_ns + (0 if late else passed_ns)
         if self.up_ns >= FORGET_NS:
             self.up_ns, self.forgot = None, True
-            self.last, self.last_ns = self._since_opening
+            self.last, self.last_ns = self.since_opening
 
 
 def as_text(status: BoardStatus) -> dict[str, str]:

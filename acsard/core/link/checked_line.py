@@ -13,7 +13,6 @@ from __future__ import annotations
 import binascii
 import re
 import struct
-from collections import deque
 
 from msgspec import Struct
 
@@ -80,25 +79,26 @@ def _reading(sample: bytes) -> Reading:
     return Reading(mcu_ms, (a, b, c, d))
 
 
-class OpenLines:
+class OpenLines(Struct):
     """Numbers the checked lines, and finds the line that a reply answers."""
 
-    def __init__(self) -> None:
-        self._sequence = 0
-        self._open: deque[tuple[int, Ns]] = deque(maxlen=MAX_OPEN_LINES)
-        # Numbers of the last lines that were answered: a hub or a repeater may send a reply twice.
-        self._answered: deque[int] = deque(maxlen=MAX_OPEN_LINES)
+    sequence: int = 0  # of the last line
+    waiting: list[tuple[int, Ns]] = []  # numbers and times of lines without an answer
+    # Numbers of the last lines that were answered: a hub or a repeater may send a reply twice.
+    last: list[int] = []
 
     def forget(self) -> None:
-        self._open.clear()
+        self.waiting.clear()
 
     def next_number(self) -> int:
-        self._sequence = (self._sequence + 1) % SEQUENCES
-        return self._sequence
+        self.sequence = (self.sequence + 1) % SEQUENCES
+        return self.sequence
 
     def written(self, at_ns: Ns) -> None:
         """Record that the line with the last number was written."""
-        self._open.append((self._sequence, at_ns))
+        self.waiting.append((self.sequence, at_ns))
+        if len(self.waiting) > MAX_OPEN_LINES:
+            del self.waiting[0]
 
     def answered(self, reply: Checked, at_ns: Ns) -> Ns:
         """Return when the line that a correct reply answers was written.
@@ -106,15 +106,16 @@ class OpenLines:
         Raises `FrameError` if no line of the last `ANSWER_TIMEOUT_NS` has its number; "repeated" if
         the line was answered before, which is no damage.
         """
-        waiting = self._open
+        waiting = self.waiting
         while waiting and at_ns - waiting[0][1] > ANSWER_TIMEOUT_NS:
-            waiting.popleft()
+            waiting.pop(0)
         if reply.sequence not in [sequence for sequence, _ in waiting]:
-            again = reply.sequence in self._answered
+            again = reply.sequence in self.last
             raise FrameError("repeated" if again else "stale_sequence", reply.plain)
         # The board answers in order, so earlier lines get no more answers.
-        sequence, written_ns = waiting.popleft()
+        sequence, written_ns = waiting.pop(0)
         while sequence != reply.sequence:
-            sequence, written_ns = waiting.popleft()
-        self._answered.append(sequence)
+            sequence, written_ns = waiting.pop(0)
+        self.last.append(sequence)
+        del self.last[:-MAX_OPEN_LINES]
         return written_ns

@@ -9,8 +9,9 @@ repeated speeds changed, or once when the lines of a steady drive begin to be re
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Literal
+
+from msgspec import Struct
 
 from acsard.core.values import NS_PER_S, Ns
 
@@ -36,47 +37,52 @@ _SPEEDS = 31  # bytes of a line without its checksum
 _NO_SPEED = b"abcdpn0.,"  # of these bytes is the line of zeros
 
 
-class EchoCheck:
-    def __init__(self, encoders: bool) -> None:
-        self._encoders = encoders  # `feedback.encoders`
-        self.forget()
+class EchoCheck(Struct):
+    """What was written and received since the port was opened."""
 
-    def forget(self) -> None:
-        """Forget everything, because the port was opened."""
-        self.trouble: Literal["", "echo", "set_points"] = ""  # until the next opening
-        self._asked_ns: Ns | None = None
-        self._named_ns: Ns | None = None  # a board has last sent its name since the question
-        self._written: deque[bytes] = deque(maxlen=COMPARED_LINES)
-        self._speeds = b""  # of the last repeated line
-        self._windows = 0  # in a row, of repeated lines with other speeds
-        self._steady = False  # the last window had repeated lines of a moving robot
-        self._begin(0)
-        self.restart()
+    trouble: Literal["", "echo", "set_points"] = ""  # until the next opening
+    due: bool = False  # the question
+    asked: bool = False  # in this session
+    asked_ns: Ns | None = None
+    named_ns: Ns | None = None  # a board has last sent its name since the question
+    sent: list[bytes] = []  # newest lines, with their ends
+    speeds: bytes = b""  # of the last repeated line
+    windows: int = 0  # in a row, of repeated lines with other speeds
+    steady: bool = False  # the last window had repeated lines of a moving robot
+    # The window: its begin, and the lines in it.
+    since_ns: Ns = 0
+    written_lines: int = 0
+    lines: int = 0  # received
+    repeated: int = 0
+    changes: int = 0  # of their speeds
 
     def restart(self) -> None:
         """Ask again after the next line, because a new session begins."""
-        self.due = self.asked = False  # in this session
+        self.due = self.asked = False
 
     def _begin(self, now_ns: Ns) -> None:
-        self.since_ns = now_ns  # begin of the window
-        self._written_lines = self._lines = self._repeated = self._changes = 0
+        self.since_ns = now_ns
+        self.written_lines = self.lines = self.repeated = self.changes = 0
 
     def asks(self, at_ns: Ns) -> None:
         """Record that `QUESTION` was written."""
-        self._asked_ns, self.due, self.asked, self._named_ns = at_ns, False, True, None
+        self.asked_ns, self.due, self.asked, self.named_ns = at_ns, False, True, None
 
     def written(self, line: bytes) -> None:
-        self._written.append(line.removesuffix(b"\r\n"))
-        self._written_lines += 1
+        sent = self.sent
+        sent.append(line)
+        if len(sent) > COMPARED_LINES:
+            del sent[0]
+        self.written_lines += 1
 
     def received(self, line: bytes) -> None:
         if not self.asked:
             self.due = True  # not before: a board that boots would not get it
-        self._lines += 1
-        if line in self._written:
-            self._repeated += 1
-            speeds, self._speeds = self._speeds, line[:_SPEEDS]
-            self._changes += bool(speeds) and speeds != self._speeds
+        self.lines += 1
+        if line + b"\r\n" in self.sent:
+            self.repeated += 1
+            speeds, self.speeds = self.speeds, line[:_SPEEDS]
+            self.changes += bool(speeds) and speeds != self.speeds
 
     def returned(self, at_ns: Ns) -> None:
         """Record that `QUESTION` was received."""
@@ -88,31 +94,31 @@ class EchoCheck:
 
         A hub or a repeater may send the answer twice.
         """
-        named_ns, self._named_ns = self._named_ns, at_ns
+        named_ns, self.named_ns = self.named_ns, at_ns
         if named_ns is not None:
             return at_ns - named_ns <= REPEATED_NS
         return self._answers(at_ns)
 
     def _answers(self, at_ns: Ns) -> bool:
-        return self._asked_ns is not None and at_ns - self._asked_ns <= ANSWER_NS
+        return self.asked_ns is not None and at_ns - self.asked_ns <= ANSWER_NS
 
-    def end_window(self, now_ns: Ns, moving: bool) -> None:
+    def end_window(self, now_ns: Ns, moving: bool, encoders: bool) -> None:
         """Ask, or find a board without encoders, `WINDOW_NS` or more after the window began.
 
         If `moving`, repeated zeros are no reason, and an equal speed is one only at first: a motor
-        may be that steady.
+        may be that steady. `encoders` is `feedback.encoders`.
         """
-        least, changes = min(self._lines, RETURNED_FRACTION * self._written_lines), self._changes
-        suspect = 0 < least <= self._repeated
+        least, changes = min(self.lines, RETURNED_FRACTION * self.written_lines), self.changes
+        suspect = 0 < least <= self.repeated
         self._begin(now_ns)
-        known, self._steady = self._steady, suspect and bool(self._speeds.strip(_NO_SPEED))
+        known, self.steady = self.steady, suspect and bool(self.speeds.strip(_NO_SPEED))
         if not suspect:
-            self._windows = 0
+            self.windows = 0
             return
-        self._windows += changes > 0
-        if self.trouble or (moving and not changes and (known or not self._steady)):
+        self.windows += changes > 0
+        if self.trouble or (moving and not changes and (known or not self.steady)):
             return
-        if self._windows < SET_POINT_WINDOWS or self._asked_ns is None:
+        if self.windows < SET_POINT_WINDOWS or self.asked_ns is None:
             self.due = True
-        elif self._encoders and not self._answers(now_ns):
+        elif encoders and not self._answers(now_ns):
             self.trouble = "set_points"

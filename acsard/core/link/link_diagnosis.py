@@ -9,17 +9,15 @@ from __future__ import annotations
 import re
 from typing import Literal
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 from acsard.core.codes import CODES, Reason, sentence
 from acsard.core.formatting import many, printable_bytes
 from acsard.core.link.codec import TOKENS
+from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import Link
 from acsard.core.link.link_state import State as LinkState
 from acsard.core.values import NS_PER_S, Event, Ns
-
-# Share of `Link.quiet_ns` between two steps that makes the second late.
-LATE_STEP_FRACTION = 0.5
 
 BUSY_ADVICE = CODES["host_late"].advice
 
@@ -56,38 +54,36 @@ WINDOW_LINES = 1000  # sent lines whose answers are counted: 10 s at 100 Hz
 MAX_UNANSWERED_FRACTION = 0.02  # a good link loses no answer
 
 
-class Lateness:
+class Lateness(Struct):
     """Detects control steps that come too late.
 
     The daemon reads the board's lines only in its steps, so the board is not to blame for a silence
     that ends with a late one.
     """
 
-    def __init__(self, simulated: bool, quiet_ns: Ns) -> None:
-        self._simulated, self._least_ns = simulated, LATE_STEP_FRACTION * quiet_ns
-        self._looked_ns: Ns | None = None
-        self.late_s = 0.0  # longest time between two steps since the last good line, if late
-        self.step_s = 0.0  # between the last two steps, if the last was late
+    looked_ns: Ns | None = None
+    late_s: float = 0.0  # longest time between two steps since the last good line, if late
+    step_s: float = 0.0  # between the last two steps, if the last was late
 
-    def record_step(self, now_ns: Ns, good: bool) -> bool:
+    def record_step(self, setup: LinkSetup, now_ns: Ns, good: bool) -> bool:
         """Record a step, and return whether it ends a silence that this computer caused.
 
         Only a good line ends one. The built-in simulator runs on this computer, so with it the
         result is True for every good line.
         """
-        before_ns, self._looked_ns = self._looked_ns, now_ns
+        before_ns, self.looked_ns = self.looked_ns, now_ns
         passed_ns = 0 if before_ns is None else now_ns - before_ns
-        step_s = self.step_s = passed_ns / NS_PER_S if passed_ns >= self._least_ns else 0.0
+        step_s = self.step_s = passed_ns / NS_PER_S if passed_ns >= setup.late_step_ns else 0.0
         late_s = step_s if step_s > self.late_s else self.late_s
         self.late_s = 0.0 if good else late_s
-        return good and (late_s > 0.0 or self._simulated)
+        return good and (late_s > 0.0 or setup.mcu.simulated)
 
-    def describe(self, link: LinkState) -> Reason:
+    def describe(self, setup: LinkSetup, link: LinkState) -> Reason:
         """Return a sentence about the link, which may blame this computer or the simulator."""
         if link == "stale" and self.late_s:
             received = "nothing from the microcontroller"
             return sentence("host_late", seconds=self.late_s, received=received)
-        if link == "stale" and self._simulated:
+        if link == "stale" and setup.mcu.simulated:
             return SIMULATOR_FAULT
         return STATE_REASONS[link]
 
@@ -157,28 +153,27 @@ class Heard(Struct):
         return sentence(self.code, received=self.counted, firmware=firmware)
 
 
-class SilenceDiagnosis:
+class SilenceDiagnosis(Struct):
     """The diagnosis of why the link is not up, renewed every `FIRST_DIAGNOSIS_NS`."""
 
-    def __init__(self) -> None:
-        self.heard: Heard | None = None  # of the last complete interval, if there is a diagnosis
-        self.now = Heard()  # of the present interval
-        self._since_ns: Ns | None = None
+    heard: Heard | None = None  # of the last complete interval, if there is a diagnosis
+    now: Heard = field(default_factory=Heard)  # of the present interval
+    since_ns: Ns | None = None
 
     def forget(self) -> None:
         """Discard the diagnosis: the link is up, the output blocked, or the port changed."""
-        self.heard, self.now, self._since_ns = None, Heard(), None
+        self.heard, self.now, self.since_ns = None, Heard(), None
 
     def judge(self, now_ns: Ns, late_s: float = 0.0) -> bool:
         """Process a step without a link, and return whether the diagnosis is of a new class."""
-        if self._since_ns is None:
-            self._since_ns = now_ns
+        if self.since_ns is None:
+            self.since_ns = now_ns
         else:
             self.now.late_s = max(self.now.late_s, late_s)
-        if now_ns - self._since_ns < FIRST_DIAGNOSIS_NS:
+        if now_ns - self.since_ns < FIRST_DIAGNOSIS_NS:
             return False
         before, self.heard = self.heard, self.now
-        self.now, self._since_ns = Heard(), now_ns
+        self.now, self.since_ns = Heard(), now_ns
         return before is None or before.code != self.heard.code
 
 
@@ -220,17 +215,10 @@ class UnansweredLines(Struct):
 
 
 def describe_link(
-    link: Link,
-    silence: SilenceDiagnosis,
-    lateness: Lateness,
-    longest_reply: float,
-    checked: bool,
+    setup: LinkSetup, link: Link, silence: SilenceDiagnosis, lateness: Lateness
 ) -> Reason:
-    """Return a sentence about the link while the port is open.
-
-    `longest_reply` is the highest value that `mcu.reply_period` may have, s. `checked` is
-    `mcu.checked`.
-    """
+    """Return a sentence about the link while the port is open."""
+    checked = setup.checked
     if link.state in ("booting", "stale"):
         traffic = silence.heard
         if traffic is not None and not traffic.good:
@@ -238,10 +226,10 @@ def describe_link(
         if checked and link.damaged:
             return sentence("replies_damaged")
         if link.sparse_s:
-            return _sparse(link.sparse_s, longest_reply)
+            return _sparse(link.sparse_s, setup.longest_reply)
         if traffic is not None:
             return traffic.diagnosis(checked)
-    return lateness.describe(link.state)
+    return lateness.describe(setup, link.state)
 
 
 def _sparse(sparse_s: float, longest_reply: float) -> Reason:

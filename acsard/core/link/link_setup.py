@@ -11,18 +11,24 @@ from msgspec import Struct
 
 from acsard.core.config.settings import MAX_REPLY_PERIOD_S, FeedbackConfig, McuConfig
 from acsard.core.config.wire_time import PLAIN_BYTES, wire_ns
+from acsard.core.link.checked_line import SAMPLE_REQUEST
 from acsard.core.link.codec import Codec
 from acsard.core.values import NS_PER_S, Ns
+
+LATE_STEP_FRACTION = 0.5  # of `quiet_ns`, between two steps: the second is late
 
 
 class LinkSetup(Struct, frozen=True):
     mcu: McuConfig
     codec: Codec
+    checked: bool  # `mcu.checked`
+    letters: bytes  # that end a checked command
     rest: bytes  # begin of every line with speed zero
     period_ns: Ns  # of a free-running board; 0: it answers commands
     apart_ns: Ns  # between two commands
     soonest_ns: Ns  # a command and its reply on the wire
     quiet_ns: Ns  # silence after which the link is stale
+    late_step_ns: float  # time between two steps that makes the second late
     count: float  # rad of one encoder count; 0 if unknown
     fastest: float  # counts per ms at `feedback.wheel_speed`
     encoders: bool  # `feedback.encoders`
@@ -37,14 +43,18 @@ class LinkSetup(Struct, frozen=True):
         longest_reply: float = MAX_REPLY_PERIOD_S,
     ) -> LinkSetup:
         codec, counts = Codec(mcu.wheels, mcu.trailing_comma), mcu.encoder_counts
+        quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
         return cls(
             mcu,
             codec,
+            checked=mcu.checked,
+            letters=SAMPLE_REQUEST if mcu.wants_samples else b"",
             rest=codec.stop.rstrip(b",\r\n"),
             period_ns=0 if mcu.checked else round(NS_PER_S * mcu.reply_period),
             apart_ns=round(NS_PER_S / rate_hz),
             soonest_ns=wire_ns(2 * PLAIN_BYTES, mcu.baud_rate),
-            quiet_ns=int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period)),
+            quiet_ns=quiet_ns,
+            late_step_ns=LATE_STEP_FRACTION * quiet_ns,
             count=math.tau / counts if counts else 0.0,
             fastest=feedback.wheel_speed / math.tau * counts / 1000,
             encoders=feedback.encoders,

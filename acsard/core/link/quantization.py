@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import math
 
+from msgspec import Struct, field
 from msgspec.structs import replace
 
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.whole_counts import MAX_DOUBT, WholeCounts
+from acsard.core.values import Rad
 
 MIN_CHANGE = 0.0105  # rad/s; less may be rounding
 
@@ -34,7 +36,7 @@ MAX_INTERVAL_S = 0.03  # over a longer time, accelerations look like jumps
 NO_STEPS = (0.0, 0.0, 0.0, 0.0)
 
 
-class Steps:
+class Steps(Struct):
     """The size of the steps that an encoder causes in the reported speed of its wheel, rad/s.
 
     One count in a period T changes the speed by 2 pi / (counts per turn x T): 31 rad/s at 20 counts
@@ -42,105 +44,104 @@ class Steps:
     divides by its nominal period. It is inf before `FIRST_STEPS` steps.
     """
 
-    def __init__(self) -> None:
-        self.size = math.inf
-        self._before = math.inf
-        self._last = 0.0
-        self._largest = [0.0] * STEP_RANK
-        self._count = 0
+    size: float = math.inf
+    last: float = 0.0  # speed
+    largest: list[float] = field(default_factory=lambda: [0.0] * STEP_RANK)  # in this block
+    count: int = 0
 
     def add(self, speed: float) -> None:
-        step = abs(speed - self._last)
+        step = abs(speed - self.last)
         if step < MIN_CHANGE:
             return
-        self._last = speed
-        largest = self._largest
+        self.last = speed
+        largest = self.largest
         if step > largest[0]:
             largest[0] = step
             largest.sort()
             if largest[0] > self.size:
                 self.size = largest[0]
-        self._count += 1
-        if self._count == FIRST_STEPS and self.size == math.inf:
+        self.count += 1
+        if self.count == FIRST_STEPS and self.size == math.inf:
             self.size = largest[0]
-        if self._count == BLOCK_STEPS:
-            self._before, self._count = largest[0], 0
-            self.size, self._largest = self._before, [0.0] * STEP_RANK
+        if self.count == BLOCK_STEPS:
+            self.size, self.count = largest[0], 0
+            self.largest = [0.0] * STEP_RANK
 
 
-class Coarseness:
+class Coarseness(Struct):
     """Detects wheel speeds that jump back and forth from line to line, as with coarse encoders.
 
     The jump of speeds v0, v1, v2 in successive lines is |v0 - 2 v1 + v2| dt / 2. A change of the
     acceleration causes one, too, but only in one line.
     """
 
-    def __init__(self) -> None:
-        self._rows = NO_STEPS, NO_STEPS
-        self._jumps, self._wheel = [0.0] * 4, 0  # rad per line; the wheel of the last line
+    rows: tuple[Motors, Motors] = (NO_STEPS, NO_STEPS)  # the last two lines
+    jumps: list[float] = field(default_factory=lambda: [0.0] * 4)  # rad per line
+    wheel: int = 0  # of the last line
 
     def add(self, speeds: Motors, elapsed_s: float) -> bool:
         """Return whether the encoder is coarse that it is the turn of, by the speeds of a line.
 
         Return False after more than `MAX_INTERVAL_S`, or if all speeds were and are 0.
         """
-        (older, before), self._rows = self._rows, (self._rows[1], speeds)
+        (older, before), self.rows = self.rows, (self.rows[1], speeds)
         if speeds == NO_STEPS == before or elapsed_s > MAX_INTERVAL_S:
             return False
         # One wheel per line keeps every control step short.
-        wheel = self._wheel = (self._wheel + 1) % 4
-        mean, jump = self._jumps[wheel], abs(older[wheel] - 2 * before[wheel] + speeds[wheel])
-        self._jumps[wheel] = mean = mean + JUMP_GAIN * (elapsed_s / 2 * jump - mean)
+        wheel = self.wheel = (self.wheel + 1) % 4
+        mean, jump = self.jumps[wheel], abs(older[wheel] - 2 * before[wheel] + speeds[wheel])
+        self.jumps[wheel] = mean = mean + JUMP_GAIN * (elapsed_s / 2 * jump - mean)
         return mean > COARSE
 
 
-class CountRecovery:
-    def __init__(self, counts: int = 0) -> None:
-        self._configured, self._whole = counts, WholeCounts()
-        self._angle = math.tau / counts if counts else 0.0
-        self.coarse_lines = 0  # with a coarse encoder and no configured counts
-        self.forget()
+def _unknown() -> tuple[Steps, Steps, Steps, Steps]:
+    return Steps(), Steps(), Steps(), Steps()
+
+
+class CountRecovery(Struct):
+    whole: WholeCounts = field(default_factory=WholeCounts)
+    coarseness: Coarseness = field(default_factory=Coarseness)
+    wheels: tuple[Steps, Steps, Steps, Steps] = field(default_factory=_unknown)
+    learned: Motors = NO_STEPS
+    steps: Motors = NO_STEPS  # limited by `MAX_STEP_RATIO`
+    coarse_lines: int = 0  # with a coarse encoder and no configured counts
 
     def forget(self) -> None:
         """Forget all earlier lines: the board has restarted or was replaced."""
-        self._whole = WholeCounts()
-        self._coarseness = Coarseness()
-        self._wheels = tuple(Steps() for _ in NO_STEPS)
-        self._reported, self._steps = NO_STEPS, NO_STEPS  # learned, and limited by `MAX_STEP_RATIO`
+        self.whole, self.coarseness, self.wheels = WholeCounts(), Coarseness(), _unknown()
+        self.learned = self.steps = NO_STEPS
 
-    @property
-    def counts(self) -> tuple[int, ...]:
-        """Configured counts per turn; all 0 without them, or if the speeds contradict them."""
-        return (self._configured if self._whole.doubt < MAX_DOUBT else 0,) * 4
+    def counts(self, configured: int) -> tuple[int, ...]:
+        """Return the configured counts per turn; all 0 if the speeds contradict them."""
+        return (configured if self.whole.doubt < MAX_DOUBT else 0,) * 4
 
-    def recover_counts(self, line: Feedback) -> Feedback:
+    def recover_counts(self, line: Feedback, angle: Rad) -> Feedback:
         """Return a good line with `counted`, `steps` and `count`.
 
-        If the counts include the motion of a missing line before it, `bridged` becomes 0.
+        `angle` is that of one count, rad, or 0 if the counts are not configured. If the counts
+        include the motion of a missing line before it, `bridged` becomes 0.
         """
         elapsed_s, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
-        if self._angle:
+        if angle:
             if line.turned is None and elapsed_s > 0.0:
-                counted = self._whole.turned(
-                    self._angle, speeds, elapsed_s, line.jitter, line.bridged
-                )
-                if self._whole.covers_gap:
+                counted = self.whole.turned(angle, speeds, elapsed_s, line.jitter, line.bridged)
+                if self.whole.covers_gap:
                     line = replace(line, bridged=0.0)
             else:
-                self._whole.apart = 0.0
+                self.whole.apart = 0.0
             # One count is a step of this size; none is learned.
-            step = self._angle / elapsed_s if elapsed_s > 0.0 else 0.0
-            return replace(line, counted=counted, steps=(step, step, step, step), count=self._angle)
-        if elapsed_s > 0.0 and self._coarseness.add(speeds, elapsed_s):
+            step = angle / elapsed_s if elapsed_s > 0.0 else 0.0
+            return replace(line, counted=counted, steps=(step, step, step, step), count=angle)
+        if elapsed_s > 0.0 and self.coarseness.add(speeds, elapsed_s):
             self.coarse_lines += 1
-        a, b, c, d = self._wheels
+        a, b, c, d = self.wheels
         a.add(speeds[0])
         b.add(speeds[1])
         c.add(speeds[2])
         d.add(speeds[3])
         reported = a.size, b.size, c.size, d.size
-        if reported != self._reported:
+        if reported != self.learned:
             most = MAX_STEP_RATIO * sorted(reported)[2]
-            self._reported = reported
-            self._steps = min(a.size, most), min(b.size, most), min(c.size, most), min(d.size, most)
-        return replace(line, steps=self._steps)
+            self.learned = reported
+            self.steps = min(a.size, most), min(b.size, most), min(c.size, most), min(d.size, most)
+        return replace(line, steps=self.steps)

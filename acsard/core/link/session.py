@@ -7,14 +7,14 @@ the link up, because a port that returns it has no board.
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import Literal
 
+from msgspec import Struct, field
+
 from acsard.core.codes import Reason, sentence
-from acsard.core.config.settings import MAX_REPLY_PERIOD_S, FeedbackConfig, McuConfig
 from acsard.core.link import link_diagnosis
 from acsard.core.link.board_status import STATUS, StatusReports
-from acsard.core.link.checked_line import SAMPLE_REQUEST, OpenLines, Reading, seal, unseal
+from acsard.core.link.checked_line import OpenLines, Reading, seal, unseal
 from acsard.core.link.codec import FrameError
 from acsard.core.link.echo_check import QUESTION, WINDOW_NS, EchoCheck
 from acsard.core.link.feedback import Feedback, Timeline
@@ -65,63 +65,56 @@ NO_SAMPLES = (
 Trouble = Literal["", "echo", "set_points", "no_checksum"]
 
 
-class McuSession:
+class McuSession(Struct):
     """The exchange of lines with the MCU on one serial port.
 
-    A session begins when the port is opened, when the MCU restarts, and after `LONG_GAP_NS`.
+    A session begins when the port is opened, when the MCU restarts, and after `LONG_GAP_NS`. The
+    configuration is in `setup`.
     """
 
-    def __init__(
-        self,
-        mcu: McuConfig,
-        rate_hz: float,
-        feedback: FeedbackConfig = FeedbackConfig(),  # noqa: B008
-        longest_reply: float = MAX_REPLY_PERIOD_S,
-    ) -> None:
-        # `longest_reply` is the highest value that `mcu.reply_period` may have, s.
-        setup = self._setup = LinkSetup.of(mcu, rate_hz, feedback, longest_reply)
-        self.codec, self._rest = setup.codec, setup.rest
-        self._answers = not mcu.reply_period  # sends nothing while it receives no line
-        self._lines = LineReader()
-        self._mcu, self._checked = mcu, mcu.checked
-        self._letters = SAMPLE_REQUEST if mcu.wants_samples else b""
-        self._open_lines, self._echo = OpenLines(), EchoCheck(feedback.encoders)
-        self._first = True  # nothing was written since the opening
-        self._moved = False  # the last written line moves a wheel
-        # On a checked link that is not up: valid plain lines, and whether they are the trouble.
-        self._plain_lines, self._unchecked = 0, False
-        self._sampled = False  # the last good line had the board's counts
-        self.status = StatusReports()
-        self.reopened = False  # in the last `update`
-        self.quiet_ns = setup.quiet_ns
-        self._link = Link(self.quiet_ns, mcu.checked)
-        self.link: LinkState = "down"  # after the last `update`; the robot drives only while `up`
-        self.lateness = Lateness(mcu.simulated, self.quiet_ns)
-        self._timeline = Timeline()
-        self.count_recovery = CountRecovery(mcu.encoder_counts)
-        self.doubt = PoseDoubt()
-        self._hearing, self._longest_reply = SilenceDiagnosis(), longest_reply
-        self.rejects: Counter[str] = Counter()
-        # By reason, in this `update`: their number, and the last line.
-        self._rejected: dict[str, tuple[int, bytes]] = {}
-        self.good_lines = 0
-        self._heard_ns: Ns | None = None
-        self.restarted = False  # the last `update` began a new session
-        self._resumed = False  # the port accepts lines again after `LONG_GAP_NS`
-        self.events: list[Event] = []  # of the last `update`, for the log
-        self._starting_over = False
-        self._announced: tuple[LinkState, Trouble, bool] = ("down", "", False)
-        self._says_samples = mcu.wants_samples  # a board without counts has not been reported yet
-        self._opened = 0
-        self._blind_ns: Ns | None = None  # last stop to a silent board
-        self._just_blind = False
-        self._made: tuple[bytes, int] | None = None  # last result of `line()`, not yet written
-        self._left_ns = 0  # the port last wrote a line or was opened
-        self._held_up = False  # the port did not write the last line
-        self.blocked = False  # the open port's driver has accepted no line for `WATCHDOG_NS`
+    link: LinkState = "down"  # after the last `update`; the robot drives only while `up`
+    blocked: bool = False  # the open port's driver has accepted no line for `WATCHDOG_NS`
+    good_lines: int = 0
+    rejects: dict[str, int] = {}  # by reason
+    lateness: Lateness = field(default_factory=Lateness)
+    status: StatusReports = field(default_factory=StatusReports)
+    count_recovery: CountRecovery = field(default_factory=CountRecovery)
+    doubt: PoseDoubt = field(default_factory=PoseDoubt)
+    _lines: LineReader = field(default_factory=LineReader)
+    _open_lines: OpenLines = field(default_factory=OpenLines)
+    _echo: EchoCheck = field(default_factory=EchoCheck)
+    _link: Link = field(default_factory=Link)
+    _timeline: Timeline = field(default_factory=Timeline)
+    _hearing: SilenceDiagnosis = field(default_factory=SilenceDiagnosis)
+
+    # Of the last `update`.
+    restarted: bool = False  # it began a new session
+    reopened: bool = False
+    events: list[Event] = []  # for the log
+    _rejected: dict[str, tuple[int, bytes]] = {}  # by reason: their number, and the last line
+    _starting_over: bool = False
+
+    _opened: int = 0
+    _heard_ns: Ns | None = None
+    _announced: tuple[LinkState, Trouble, bool] = ("down", "", False)
+    # On a checked link that is not up: valid plain lines, and whether they are the trouble.
+    _plain_lines: int = 0
+    _unchecked: bool = False
+    _sampled: bool = False  # the last good line had the board's counts
+    _says_samples: bool = False  # a board without counts has not been reported yet
+
+    _made: tuple[bytes, Ns] | None = None  # last result of `line()`, not yet written
+    _first: bool = True  # nothing was written since the opening
+    _moved: bool = False  # the last written line moves a wheel
+    _left_ns: Ns = 0  # the port last wrote a line or was opened
+    _held_up: bool = False  # the port did not write the last line
+    _resumed: bool = False  # the port accepts lines again after `LONG_GAP_NS`
+    _blind_ns: Ns | None = None  # last stop to a silent board
+    _just_blind: bool = False
 
     def update(
         self,
+        setup: LinkSetup,
         now: Instant,
         port_open: bool,
         opened: int,
@@ -139,56 +132,61 @@ class McuSession:
             self.status.begin_update()
         feedback = []
         if not port_open or opened != self._opened:
-            self._begin(port_open, opened, now.mono_ns)
+            self._begin(setup, port_open, opened, now.mono_ns)
         if port_open:
             for piece in received:
-                feedback += self._decode(piece)
-            more = self._lines.too_long - self.rejects.get("too_long", 0) if received else 0
-            if more > 0:
+                feedback += self._decode(setup, piece)
+            if received and (more := self._lines.too_long - self.rejects.get("too_long", 0)):
                 self._reject("too_long", more=more)
-                self._link.bad()
-            if self.lateness.record_step(now.mono_ns, good=bool(feedback)):
+                self._link.bad(setup.checked)
+            lateness = self.lateness
+            if lateness.record_step(setup, now.mono_ns, good=bool(feedback)):
                 self._link.reset_silences()
-            if 0.0 < self.lateness.step_s < WATCHDOG_S and self._answers and not feedback:
+            if (
+                lateness.step_s
+                and lateness.step_s < WATCHDOG_S
+                and not setup.mcu.reply_period
+                and not feedback
+            ):
                 # The board may have had nothing to answer. Before its watchdog has stopped the
                 # motors, a stop without a ramp would only shake the robot. `Robot` makes such a
                 # stop anyway after `WRITE_PAUSE_S`.
-                self._link.wait(now.mono_ns)
-            self._judge(now.mono_ns)
+                self._link.wait(now.mono_ns, setup.quiet_ns)
+            self._judge(setup, now.mono_ns)
         if feedback and self.doubt.judge(
-            self._setup, self._timeline, self.good_lines, self.count_recovery.coarse_lines
+            setup, self._timeline, self.good_lines, self.count_recovery.coarse_lines
         ):
             self._announce_doubt()
         if self._rejected:
             self._announce_rejects()
         if (self._link.state, self._trouble, self.blocked) != self._announced:
-            self._announce()
+            self._announce(setup)
         return feedback
 
-    def line(self, now_ns: Ns, speeds: WheelSpeeds) -> bytes | None:
+    def line(self, setup: LinkSetup, now_ns: Ns, speeds: WheelSpeeds) -> bytes | None:
         """Return the line that commands `speeds`, or None if no line is due.
 
         It is a stop, whatever `speeds` is, while the board does not answer. The first of these is
         due immediately, because the board may still execute the previous line. `QUESTION` takes
         the place of a line.
         """
-        line = self._next_line(now_ns, speeds)
+        line = self._next_line(setup, now_ns, speeds)
         self._made = None if line is None else (line, now_ns)
         return line
 
-    def _next_line(self, now_ns: Ns, speeds: WheelSpeeds) -> bytes | None:
+    def _next_line(self, setup: LinkSetup, now_ns: Ns, speeds: WheelSpeeds) -> bytes | None:
         if self._echo.due and not self._first and (speeds != STILL or not self._moved):
             return QUESTION_LINE  # but not instead of the line that stops the wheels
-        if self.silent(now_ns):
+        if now_ns > self._link.silent_ns:
             last_ns = self._blind_ns
             self._just_blind = last_ns is None or now_ns - last_ns >= SILENT_BOARD_PERIOD_NS
             if not self._just_blind:
                 return None
             speeds = STILL
-        line = self.codec.stop if speeds == STILL else self.codec.encode(speeds)
-        if not self._checked or self._first:  # the port begins with a plain stop
+        line = setup.codec.stop if speeds == STILL else setup.codec.encode(speeds)
+        if not setup.checked or self._first:  # the port begins with a plain stop
             return line
-        return seal(line, self._open_lines.next_number(), self._letters)
+        return seal(line, self._open_lines.next_number(), setup.letters)
 
     def silent(self, now_ns: Ns) -> bool:
         """Return whether the last good line of this session is older than `quiet_ns`, or missing.
@@ -201,7 +199,7 @@ class McuSession:
         """Return the time since the last good line of any session; None before the first one."""
         return None if self._heard_ns is None else (now_ns - self._heard_ns) / NS_PER_S
 
-    def describe_link(self, port_trouble: str = "") -> Reason:
+    def describe_link(self, setup: LinkSetup, port_trouble: str = "") -> Reason:
         """Return a sentence about the link; `port_trouble` says why the port is closed."""
         if self.link == "down" and port_trouble:
             return sentence("port_trouble", trouble=port_trouble)
@@ -209,22 +207,19 @@ class McuSession:
             return link_diagnosis.PORT_BLOCKED
         if self._trouble and self.link in ("booting", "stale"):
             return sentence(self._trouble)
-        return link_diagnosis.describe_link(
-            self._link, self._hearing, self.lateness, self._longest_reply, self._checked
-        )
+        return link_diagnosis.describe_link(setup, self._link, self._hearing, self.lateness)
 
     @property
     def _trouble(self) -> Trouble:
         return self._echo.trouble or ("no_checksum" if self._unchecked else "")
 
-    @property
-    def check(self) -> str:
-        """The form of the lines, for `diagnostics`."""
-        if not self._checked:
+    def check(self, setup: LinkSetup) -> str:
+        """Return the form of the lines, for `diagnostics`."""
+        if not setup.checked:
             return "plain"
         return "checked with samples" if self._sampled else "checked"
 
-    def sent(self, left_ns: Ns, *, was_written: bool) -> None:
+    def sent(self, setup: LinkSetup, left_ns: Ns, *, was_written: bool) -> None:
         """Record whether and when the last result of `line()` was written to the port."""
         made = self._made
         if made is None:
@@ -246,12 +241,12 @@ class McuSession:
         self._echo.written(line)
         if b"#" in line:
             self._open_lines.written(left_ns)
-        self._moved = not line.startswith(self._rest)
-        self._timeline.written(self._setup, left_ns, moves=self._moved)
+        self._moved = not line.startswith(setup.rest)
+        self._timeline.written(setup, left_ns, moves=self._moved)
 
     # sessions
 
-    def _begin(self, port_open: bool, opened: int, now_ns: Ns) -> None:
+    def _begin(self, setup: LinkSetup, port_open: bool, opened: int, now_ns: Ns) -> None:
         self._link.apply("opened" if port_open else "closed")
         self.link = self._link.state
         self.restarted = self.reopened = opened != self._opened
@@ -263,9 +258,9 @@ class McuSession:
             self._blind_ns = None
         self._lines.clear()
         self._hearing.forget()
-        self._echo.forget()
+        self._echo = EchoCheck()
         self._plain_lines, self._unchecked = 0, False
-        self._first, self._says_samples = True, self._mcu.wants_samples
+        self._first, self._says_samples = True, setup.mcu.wants_samples
         self._start_over()
 
     def _restart(self, how: str) -> None:
@@ -282,7 +277,7 @@ class McuSession:
         self._open_lines.forget()
         self._echo.restart()
 
-    def _judge(self, now_ns: Ns) -> None:
+    def _judge(self, setup: LinkSetup, now_ns: Ns) -> None:
         link = self._link
         if not self._held_up:
             self.blocked = False
@@ -294,12 +289,12 @@ class McuSession:
         # The arbiter must see a lost link first.
         echo, was_up = self._echo, link.state == "up"
         if now_ns - echo.since_ns >= WINDOW_NS:
-            echo.end_window(now_ns, moving=was_up)
+            echo.end_window(now_ns, moving=was_up, encoders=setup.encoders)
         if echo.trouble:
             link.apply("repeated")
         held = self._starting_over or not echo.asked or echo.trouble
         if link.state != "up" or now_ns > link.silent_ns:
-            link.judge(now_ns, may_rise=not held)
+            link.judge(now_ns, may_rise=not held, checked=setup.checked)
         self.link, up = link.state, link.state == "up"
         if self.status.up_ns is not None:  # else nothing is to be forgotten
             self.status.judge(now_ns, up, late=self.lateness.step_s > 0.0)
@@ -309,11 +304,11 @@ class McuSession:
         elif self._hearing.judge(now_ns, self.lateness.step_s):
             # The board may answer only plain lines, such as the first one after the opening.
             self._unchecked = self._unchecked or self._plain_lines > 0
-            why = self.describe_link()
+            why = self.describe_link(setup)
             self.events.append(Event(NAMES[self.link], why.text, "warning", code=why.code))
 
     def _reject(self, reason: str, line: bytes = b"", more: int = 1) -> None:
-        self.rejects[reason] += more
+        self.rejects[reason] = self.rejects.get(reason, 0) + more
         before, _ = self._rejected.get(reason, (0, b""))
         self._rejected[reason] = (before + more, line)
 
@@ -331,12 +326,12 @@ class McuSession:
             why = sentence(self.doubt.code)
             self.events.append(Event("pose_doubtful", why.text, "warning", code=why.code))
 
-    def _announce(self) -> None:
+    def _announce(self, setup: LinkSetup) -> None:
         link, trouble, before = self._link.state, self._trouble, self._announced
         self._announced = (link, trouble, self.blocked)
         if link != before[0] or self.blocked > before[2]:
             plain = not (self.blocked or self._link.damaged or trouble)
-            why = self.lateness.describe(link) if plain else self.describe_link()
+            why = self.lateness.describe(setup, link) if plain else self.describe_link(setup)
             good = link in ("up", "booting") and not self.blocked
             level: Level = "info" if good else "warning"
             self.events.append(Event(NAMES[link], why.text, level, code=why.code))
@@ -346,23 +341,23 @@ class McuSession:
 
     # lines
 
-    def _decode(self, piece: Received) -> list[Feedback]:
+    def _decode(self, setup: LinkSetup, piece: Received) -> list[Feedback]:
         lines, timeline, feedback = self._lines.feed(piece.data), self._timeline, []
         link, data = self._link, piece.data
         for line, _ in lines:
             if line.startswith(REMARKS):
-                lines = self._without_remarks(lines, piece.at.mono_ns)
+                lines = self._without_remarks(setup, lines, piece.at.mono_ns)
                 data = b"\n".join([line for line, _ in lines])
                 break
         if link.state != "up":
             self._hearing.now.take(data)
         if lines:
-            timeline.process_read(self._setup, piece.at, len(piece.data), len(lines), lines[-1][1])
+            timeline.process_read(setup, piece.at, len(piece.data), len(lines), lines[-1][1])
         for line, following in lines:
             self._echo.received(line)
-            reply = self._line(line, piece.at, following)
+            reply = self._line(setup, line, piece.at, following)
             if reply is None:
-                timeline.skip_bad(self._setup)
+                timeline.skip_bad(setup)
             else:
                 feedback.append(reply)
             if link.state != "up":
@@ -370,70 +365,76 @@ class McuSession:
         return feedback
 
     def _without_remarks(
-        self, lines: list[tuple[bytes, int]], at_ns: Ns
+        self, setup: LinkSetup, lines: list[tuple[bytes, int]], at_ns: Ns
     ) -> list[tuple[bytes, int]]:
         # A remark is not a reply, so it is not used for the sample times and the link.
         for line, _ in lines:
             if line.startswith(REMARKS):
-                self._take_remark(line, at_ns)
+                self._take_remark(setup, line, at_ns)
         return [each for each in lines if not each[0].startswith(REMARKS)]
 
-    def _take_remark(self, line: bytes, at_ns: Ns) -> None:
+    def _take_remark(self, setup: LinkSetup, line: bytes, at_ns: Ns) -> None:
         if line.startswith(STATUS):
-            self._take_status(line, at_ns)
+            self._take_status(setup, line, at_ns)
             return
         if line == QUESTION:
             self._reject("echo")
             self._echo.returned(at_ns)
         elif not line.startswith(IDENTITY):
             self._reject("malformed", line)
-            self._link.bad()
+            self._link.bad(setup.checked)
         elif not self._echo.named(at_ns):
             self._restart(
                 f"has restarted and sent its start line: {line.decode('ascii', 'replace')}"
             )
 
-    def _take_status(self, line: bytes, at_ns: Ns) -> None:
+    def _take_status(self, setup: LinkSetup, line: bytes, at_ns: Ns) -> None:
         try:
-            self.status.take(line, self._checked, at_ns)
+            self.status.take(line, setup.checked, at_ns)
         except FrameError as error:
             self._reject(error.reason, line)
             return
         if self._link.state != "up":
             self._hearing.now.statuses += 1
 
-    def _line(self, line: bytes, read_at: Instant, following: int) -> Feedback | None:
+    def _line(
+        self, setup: LinkSetup, line: bytes, read_at: Instant, following: int
+    ) -> Feedback | None:
         if self._echo.trouble:
             self._reject(self._echo.trouble)
             self._link.reset_good_lines()
             return None
         reading, asked_ns = None, None
         try:
-            if self._checked:
+            if setup.checked:
                 reply = unseal(line)
-                speeds, reading = self.codec.decode(reply.plain), reply.reading
+                speeds, reading = setup.codec.decode(reply.plain), reply.reading
                 asked_ns = self._open_lines.answered(reply, read_at.mono_ns)
             else:
-                speeds = self.codec.decode(line)
+                speeds = setup.codec.decode(line)
         except FrameError as error:
             if error.reason == "repeated":
-                self.rejects["repeated"] += 1
-            elif error.reason != "without_crc" or self._link.state == "up" or not self._plain(line):
+                self.rejects["repeated"] = self.rejects.get("repeated", 0) + 1
+            elif (
+                error.reason != "without_crc"
+                or self._link.state == "up"
+                or not self._plain(setup, line)
+            ):
                 self._reject(error.reason, line)
-                self._link.bad()
+                self._link.bad(setup.checked)
             return None
-        if self._checked:
+        if setup.checked:
             self._plain_lines, self._unchecked = 0, False
             self._sampled = reading is not None
             if self._says_samples and not self._sampled:
                 self._says_samples = False
                 self.events.append(Event("link_check", NO_SAMPLES, "warning"))
-        return self._good(speeds, reading, read_at, (following, len(line) + 2), asked_ns)
+        return self._good(setup, speeds, reading, read_at, following, len(line) + 2, asked_ns)
 
-    def _plain(self, line: bytes) -> bool:
+    def _plain(self, setup: LinkSetup, line: bytes) -> bool:
         # On a checked link that is not up. The first one answers the stop after the opening.
         try:
-            self.codec.decode(line)
+            setup.codec.decode(line)
         except FrameError:
             return False
         self._plain_lines += 1
@@ -442,23 +443,23 @@ class McuSession:
 
     def _good(
         self,
+        setup: LinkSetup,
         speeds: WheelSpeeds,
         reading: Reading | None,
         read_at: Instant,
-        size: tuple[int, int],
+        following: int,
+        length: int,
         asked_ns: Ns | None,
     ) -> Feedback:
-        # `size` is `following` and `length` of `Timeline.place`.
         self.good_lines += 1
         before_ns, self._heard_ns = self._heard_ns, read_at.mono_ns
         if before_ns is not None and read_at.mono_ns - before_ns >= LONG_GAP_NS:
             self.restarted = True  # even if an earlier update has already reported a restart
-        since_ns = self._link.good(read_at.mono_ns)
-        silent = since_ns is None or since_ns > self.quiet_ns
-        feedback = self._timeline.place(self._setup, speeds, reading, *size, silent, asked_ns)
-        more = self._timeline.leaps - self.rejects.get("count_leap", 0)
-        if more > 0:
+        since_ns = self._link.good(read_at.mono_ns, setup.quiet_ns)
+        silent = since_ns is None or since_ns > setup.quiet_ns
+        feedback = self._timeline.place(setup, speeds, reading, following, length, silent, asked_ns)
+        if more := self._timeline.leaps - self.rejects.get("count_leap", 0):
             self._reject("count_leap", more=more)
         if self._timeline.restarted:
             self._restart("has restarted: its clock went back")
-        return self.count_recovery.recover_counts(feedback)
+        return self.count_recovery.recover_counts(feedback, setup.count)

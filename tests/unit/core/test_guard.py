@@ -583,7 +583,7 @@ class Loop:
     def __init__(self, config: Config, wheel_speed: float | None = None) -> None:
         self.robot = Robot(config)
         self.stepped = SteppedRobot(self.robot)
-        self.stop = self.robot.session.codec.stop
+        self.stop = self.robot.link_setup.codec.stop
         most = config.limits.wheel_speed if wheel_speed is None else wheel_speed
         self.guard = Guarded(self.stop, most, config.commands.sources)
         self.guard.guard.use(replace(config, limits=replace(config.limits, wheel_speed=most)))

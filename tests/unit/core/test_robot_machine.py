@@ -190,7 +190,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.robot = Robot(config, latches)
         self.stepped = SteppedRobot(self.robot)
         self.config, self.limits = config, self.robot.config.limits
-        self.guard = Guard(self.robot.session.codec.stop, self.robot.config)
+        self.guard = Guard(self.robot.link_setup.codec.stop, self.robot.config)
         self.quiet_ns = round(NS_PER_S * max(0.1, 4 / config.rate_hz))
         self.period_ms = 1000 / config.rate_hz
         self.books = {s.name: Books(s) for s in SOURCES}

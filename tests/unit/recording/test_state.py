@@ -142,9 +142,9 @@ def test_a_part_that_is_plain_data_has_no_configuration_inside(part: Any) -> Non
     assert not [name for name in modules if name.startswith("acsard.core.config")]
 
 
-def test_only_two_parts_are_pickled() -> None:
+def test_only_one_part_is_pickled() -> None:
     pickled = vars(Robot(PLAIN)).keys() - PARTS.keys() - {*DERIVED}
-    assert pickled == {"session", "_checks"}
+    assert pickled == {"_checks"}
 
 
 @each(

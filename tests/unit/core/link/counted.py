@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from acsard.core.config.settings import FeedbackConfig, McuConfig
+from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.session import McuSession
 from acsard.core.motion.sanity import Sanity
 from acsard.core.values import Instant, Received
@@ -89,7 +90,8 @@ class Host:
 
     def __init__(self, feedback: FeedbackConfig | None = None, counts: int = 0) -> None:
         """`counts` is the configured number of counts per turn, or 0 if it is unknown."""
-        self.session = McuSession(McuConfig(encoder_counts=counts), 100.0)
+        self.setup = LinkSetup.of(McuConfig(encoder_counts=counts), 100.0)
+        self.session = McuSession()
         self.sanity, self.fastest = Sanity(), (feedback or FeedbackConfig()).wheel_speed
         self.odometry = Odometer(counts=counts)
         self.now_ns = 1_000_000_000
@@ -99,7 +101,7 @@ class Host:
     def receive(self, line: bytes, after_ns: int = PERIOD_NS) -> None:
         self.now_ns += after_ns
         now = Instant(self.now_ns, self.now_ns + WALL_NS)
-        for feedback in self.session.update(now, True, 1, (Received(now, line),)):
+        for feedback in self.session.update(self.setup, now, True, 1, (Received(now, line),)):
             self.lines += 1
             why = self.sanity.impossible(feedback, self.fastest)
             if why:

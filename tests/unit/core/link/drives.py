@@ -18,6 +18,7 @@ from msgspec import Struct
 
 from acsard.core.config.settings import McuConfig
 from acsard.core.link.feedback import Feedback
+from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.session import McuSession
 from acsard.core.values import NS_PER_S, Instant, Pose, Received, WheelSpeeds
 from tests.unit.core.motion.odometer import Odometer, arc
@@ -151,7 +152,7 @@ class Host:
             encoder_counts=configured,
             link_check="on" if case.checked else "off",
         )
-        self.session = McuSession(mcu, RATE)
+        self.setup, self.session = LinkSetup.of(mcu, RATE), McuSession()
         self.found = Odometer(counts=configured)
         self.floor, self.by_arrival, self.counter = Arcs(), Arcs(), Arcs()
         """Poses from each line's true time, from arrival times, and from the encoders' counts.
@@ -262,8 +263,8 @@ class Host:
         self.now = at
         now = _instant(at)
         self._update(now, ())
-        line = self.session.line(now.mono_ns, ROLLING)
-        self.session.sent(now.mono_ns, was_written=True)
+        line = self.session.line(self.setup, now.mono_ns, ROLLING)
+        self.session.sent(self.setup, now.mono_ns, was_written=True)
         return line
 
     def read(self, at: float, data: bytes) -> None:
@@ -273,7 +274,7 @@ class Host:
             self._update(now, (Received(now, data[start : start + PIECE]),))
 
     def _update(self, now: Instant, received: tuple[Received, ...]) -> None:
-        for feedback in self.session.update(now, True, 1, received):
+        for feedback in self.session.update(self.setup, now, True, 1, received):
             self.heard.append(feedback)
             self.found.fold(feedback)
             since = (feedback.heard_ns - (self._heard_ns or feedback.heard_ns)) / NS_PER_S

@@ -49,7 +49,7 @@ def drive(counts: int, seed: int, seconds: float, configured: int = 0) -> Driven
     host = Host(counts=configured)
     for line in lines(wheels, counts):
         host.receive(line)
-    assert host.session.count_recovery.counts == (configured,) * 4
+    assert host.session.count_recovery.counts(configured) == (configured,) * 4
     pose, true = host.odometry.pose, end(np.diff(wheels, axis=0))
     exact = counted(wheels, counts) * math.tau / counts
     plain = np.round(exact / PERIOD, 2) * PERIOD
@@ -133,7 +133,7 @@ def test_no_line_of_a_firmware_that_filters_is_dropped(counts: int, share: float
         rows.append(speed)
     host = host_after(np.round(np.array(rows), 2))
     assert (host.dropped, host.why) == (0, "")
-    assert host.session.count_recovery.counts == (0,) * 4
+    assert host.session.count_recovery.counts(0) == (0,) * 4
 
 
 def wild(wheels: int, seed: int) -> Host:

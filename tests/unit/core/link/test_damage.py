@@ -138,7 +138,7 @@ def count_errors(lines: list[bytes], every: int) -> tuple[int, int, int]:
             speeds = codec.decode(sent[:-2])
         except FrameError:
             continue
-        steps = recovery.recover_counts(Feedback(AT, speeds, 0.01)).steps
+        steps = recovery.recover_counts(Feedback(AT, speeds, 0.01), 0.0).steps
         if speeds != truth and i > len(lines) // 10:
             wrong += 1
             believed[0] += plausible(sanity, before, speeds, steps)

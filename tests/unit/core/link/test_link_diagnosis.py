@@ -18,10 +18,11 @@ from acsard.core.link.link_diagnosis import (
     SilenceDiagnosis,
     UnansweredLines,
 )
+from acsard.core.link.link_setup import LinkSetup
 from tests.unit.core.link.test_session import GOOD, Bench
 
 MS = 1_000_000
-QUIET_NS = 100 * MS
+SIMULATED, REAL = (LinkSetup.of(McuConfig(port=port), 100.0) for port in ("sim", "/dev/board"))
 
 STILL = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 
@@ -56,19 +57,19 @@ def test_a_board_that_only_prints_noise_is_reported_with_its_noise() -> None:
         bench.wait(10, *([b"\x00\xff~" + GOOD] if tick % 2 else []))
         codes += [event.code for event in bench.session.events if event.name == "link_booting"]
     assert codes.count("received_foreign") == 1
-    assert bench.session.describe_link().code == "received_foreign"
+    assert bench.why().code == "received_foreign"
     bench.wait(10, GOOD * 3)
-    assert bench.session.describe_link().code == "link_up"
+    assert bench.why().code == "link_up"
 
 
 def test_a_silent_link_is_reported_first_and_the_received_data_later() -> None:
     bench = Bench().up()
     for _ in range(20):
         bench.wait(10)
-    assert bench.session.describe_link().code == "simulator_fault"
+    assert bench.why().code == "simulator_fault"
     for _ in range(302):
         bench.wait(10)
-    assert bench.session.describe_link().code == "received_nothing"
+    assert bench.why().code == "received_nothing"
 
 
 @pytest.mark.parametrize(
@@ -86,7 +87,7 @@ def test_lines_too_far_apart_are_reported_with_a_setting_only_if_it_is_valid(
     bench = Bench(McuConfig(port="/dev/board"), longest_reply=longest).open()
     for tick in range(600):
         bench.wait(10, *([] if tick % apart else [GOOD]))
-    assert bench.session.describe_link().code == code
+    assert bench.why().code == code
 
 
 def test_a_single_silence_does_not_suggest_a_reply_period() -> None:
@@ -94,7 +95,7 @@ def test_a_single_silence_does_not_suggest_a_reply_period() -> None:
     for _ in range(20):
         bench.wait(10)
     bench.wait(10, GOOD)
-    assert (bench.link(), bench.session.describe_link().code) == ("stale", "link_silent")
+    assert (bench.link(), bench.why().code) == ("stale", "link_silent")
 
 
 @pytest.mark.parametrize("port", ["sim", "/dev/board"])
@@ -103,9 +104,9 @@ def test_lines_that_the_host_read_late_give_no_advice_about_the_board(port: str)
     codes = set()
     for _ in range(20):  # this computer runs a step late and finds the bytes that arrived meanwhile
         bench.wait(300)
-        codes.add(bench.session.describe_link().code)
+        codes.add(bench.why().code)
         bench.wait(10, GOOD)
-        codes.add(bench.session.describe_link().code)
+        codes.add(bench.why().code)
     assert codes == {"host_late", "simulator_fault" if port == "sim" else "link_silent"}
 
 
@@ -114,39 +115,39 @@ def after(*steps_ms: int, good: bool = False, simulated: bool = False) -> Latene
 
     `good` says whether another good line arrives in the last step.
     """
-    lateness = Lateness(simulated, QUIET_NS)
+    lateness, setup = Lateness(), SIMULATED if simulated else REAL
     now_ns = 0
-    lateness.record_step(now_ns, good=True)
+    lateness.record_step(setup, now_ns, good=True)
     for number, step_ms in enumerate(steps_ms, 1):
         now_ns += step_ms * MS
-        lateness.record_step(now_ns, good=good and number == len(steps_ms))
+        lateness.record_step(setup, now_ns, good=good and number == len(steps_ms))
     return lateness
 
 
 def test_silence_during_punctual_steps_is_blamed_on_the_board() -> None:
-    assert after(*[10] * 11).describe("stale").code == "link_silent"
+    assert after(*[10] * 11).describe(REAL, "stale").code == "link_silent"
     assert after(*[49] * 3).late_s == 0.0
 
 
 def test_a_host_stall_is_reported_with_its_length() -> None:
     for steps in ((800,), (10, 800, 10), (60, 800)):
-        assert after(*steps).describe("stale").code == "host_late"
+        assert after(*steps).describe(REAL, "stale").code == "host_late"
         assert after(*steps).late_s == 0.8
 
 
 def test_a_good_line_ends_the_host_stall() -> None:
     assert after(800, 10, good=True).late_s == 0.0
-    assert after(800, good=True).describe("stale").code == "link_silent"
+    assert after(800, good=True).describe(REAL, "stale").code == "link_silent"
 
 
 def test_a_late_simulator_is_not_reported_as_a_silent_microcontroller() -> None:
-    assert after(10, 10, simulated=True).describe("stale").code == "simulator_fault"
-    assert after(800, simulated=True).describe("stale").code == "host_late"
+    assert after(10, 10, simulated=True).describe(SIMULATED, "stale").code == "simulator_fault"
+    assert after(800, simulated=True).describe(SIMULATED, "stale").code == "host_late"
 
 
 def test_a_link_that_is_not_stale_is_reported_unchanged_despite_a_host_stall() -> None:
     late = after(800)
-    codes = [late.describe(state).code for state in ("up", "booting", "down")]
+    codes = [late.describe(REAL, state).code for state in ("up", "booting", "down")]
     assert codes == ["link_up", "booting", "port_closed"]
 
 

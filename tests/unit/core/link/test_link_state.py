@@ -23,19 +23,19 @@ class Bench:
     """A link to an MCU that sends a good line every 10 ms."""
 
     def __init__(self, checked: bool = False) -> None:
-        self.link, self.now_ns = Link(QUIET_NS, checked), 1000 * MS
+        self.link, self.checked, self.now_ns = Link(), checked, 1000 * MS
         self.link.apply("opened")
 
     def good(self, count: int = 1, ms: float = 10, may_rise: bool = True) -> str:
         for _ in range(count):
             self.now_ns += int(ms * MS)
-            self.link.good(self.now_ns)
-            self.link.judge(self.now_ns, may_rise)
+            self.link.good(self.now_ns, QUIET_NS)
+            self.link.judge(self.now_ns, may_rise, self.checked)
         return self.link.state
 
     def wait(self, ms: float) -> str:
         self.now_ns += int(ms * MS)
-        self.link.judge(self.now_ns, True)
+        self.link.judge(self.now_ns, True, self.checked)
         return self.link.state
 
 
@@ -66,9 +66,9 @@ def test_bad_lines_alone_do_not_take_the_link_down_but_are_reported() -> None:
         bench = Bench(checked)
         bench.good(GOOD_LINES)
         for _ in range(BAD_LINES - 1):
-            bench.link.bad()
+            bench.link.bad(bench.checked)
         assert (bench.link.state, bench.link.damaged) == ("up", False)
-        bench.link.bad()
+        bench.link.bad(bench.checked)
         assert (bench.link.state, bench.link.damaged) == (state, True)
         assert bench.good() == "up"
         assert not bench.link.damaged
@@ -76,8 +76,8 @@ def test_bad_lines_alone_do_not_take_the_link_down_but_are_reported() -> None:
 
 def test_one_good_line_opens_a_checked_link_and_a_bad_one_opens_nothing() -> None:
     bench = Bench(checked=True)
-    bench.link.bad()
-    bench.link.judge(bench.now_ns, may_rise=True)
+    bench.link.bad(bench.checked)
+    bench.link.judge(bench.now_ns, True, bench.checked)
     assert bench.link.state == "booting"
     assert bench.good() == "up"
 
@@ -96,8 +96,8 @@ def test_after_the_link_ends_good_lines_are_counted_from_zero(sign: Input, state
 
 def test_the_first_line_of_a_session_has_no_time_since_a_previous_line() -> None:
     bench = Bench()
-    assert bench.link.good(bench.now_ns) is None
-    assert bench.link.good(bench.now_ns + 7) == 7
+    assert bench.link.good(bench.now_ns, QUIET_NS) is None
+    assert bench.link.good(bench.now_ns + 7, QUIET_NS) == 7
     bench.link.apply("restarted")
     assert bench.link.silent(bench.now_ns + 8)
-    assert bench.link.good(bench.now_ns + 9) is None
+    assert bench.link.good(bench.now_ns + 9, QUIET_NS) is None

@@ -23,11 +23,14 @@ def speeds(counts: int) -> Array:
     return values
 
 
-def recover(recovery: CountRecovery, rows: Array, counts: bool = False) -> list[Feedback]:
+def recover(
+    recovery: CountRecovery, rows: Array, configured: int = 0, counts: bool = False
+) -> list[Feedback]:
     """Process each row as a line. With `counts`, the lines contain counts."""
+    angle = math.tau / configured if configured else 0.0
     turned = (0.0,) * 4 if counts else None
     lines = (Feedback(AT, WheelSpeeds(*row), PERIOD, turned=turned) for row in rows.tolist())
-    return [recovery.recover_counts(line) for line in lines]
+    return [recovery.recover_counts(line, angle) for line in lines]
 
 
 def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are_counted() -> None:
@@ -35,16 +38,16 @@ def test_without_configured_counts_no_line_has_whole_counts_and_coarse_lines_are
     assert all(
         line.counted is None for line in recover(coarse, speeds(20)) + recover(fine, speeds(3200))
     )
-    assert coarse.counts == fine.counts == (0,) * 4
+    assert coarse.counts(0) == fine.counts(0) == (0,) * 4
     assert coarse.coarse_lines > 1000
     assert fine.coarse_lines == 0
 
 
 def test_with_configured_counts_no_line_is_counted_as_coarse() -> None:
-    recovery = CountRecovery(20)
-    lines = recover(recovery, speeds(20))
+    recovery = CountRecovery()
+    lines = recover(recovery, speeds(20), 20)
     assert all(line.counted for line in lines)
-    assert recovery.counts == (20,) * 4
+    assert recovery.counts(20) == (20,) * 4
     assert recovery.coarse_lines == 0
 
 
@@ -57,15 +60,15 @@ def test_after_forgetting_no_step_is_known() -> None:
 
 
 def test_no_counts_are_derived_from_speeds_if_the_line_has_its_own_counts() -> None:
-    lines = recover(CountRecovery(20), speeds(20), counts=True)
+    lines = recover(CountRecovery(), speeds(20), 20, counts=True)
     assert all(line.counted is None for line in lines)
     assert max(lines[-1].steps) == pytest.approx(math.tau / 20 / PERIOD, abs=0.01)
 
 
 def test_no_counts_are_derived_from_a_line_after_a_gap() -> None:
-    recovery = CountRecovery(400)
-    recover(recovery, speeds(400))
-    line = recovery.recover_counts(Feedback(AT, WheelSpeeds(*[15.71] * 4), 0.0, gap=0.5))
+    recovery, line = CountRecovery(), Feedback(AT, WheelSpeeds(*[15.71] * 4), 0.0, gap=0.5)
+    recover(recovery, speeds(400), 400)
+    line = recovery.recover_counts(line, math.tau / 400)
     assert line.counted is None
 
 
@@ -74,7 +77,7 @@ def test_a_randomly_jumping_wheel_beside_three_fine_ones_is_not_a_coarse_encoder
     for _ in range(1000):
         fine = [round(5.0 + dice.uniform(-0.1, 0.1), 2) for _ in range(3)]
         speeds = WheelSpeeds(round(dice.uniform(-70.0, 70.0), 2), *fine)
-        line = recovery.recover_counts(Feedback(AT, speeds, 0.01))
+        line = recovery.recover_counts(Feedback(AT, speeds, 0.01), 0.0)
     assert max(line.steps) < 1.0
 
 

@@ -7,10 +7,12 @@ import random
 import pytest
 from msgspec.structs import replace
 
+from acsard.core.codes import Reason
 from acsard.core.config.settings import FeedbackConfig, McuConfig, WheelMap
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.link.checked_line import seal
 from acsard.core.link.feedback import MIN_INTERVAL_NS, Feedback
+from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import BAD_LINES, GOOD_LINES
 from acsard.core.link.session import LONG_GAP_NS, QUESTION_LINE, McuSession
 from acsard.core.values import NS_PER_S, STILL, Instant, Received, WheelSpeeds
@@ -32,7 +34,8 @@ class Bench:
     def __init__(
         self, mcu: McuConfig | None = None, rate_hz: float = 100.0, longest_reply: float = 0.25
     ) -> None:
-        self.session = McuSession(mcu or McuConfig(), rate_hz, longest_reply=longest_reply)
+        self.setup = LinkSetup.of(mcu or McuConfig(), rate_hz, longest_reply=longest_reply)
+        self.session = McuSession()
         self.now_ns = self.made_ns = 1000 * MS
         self.opened = 0
         self.port_open = False
@@ -44,9 +47,15 @@ class Bench:
     def link(self) -> str:
         return self.session.link
 
+    def why(self) -> Reason:
+        return self.session.describe_link(self.setup)
+
+    def counts(self) -> tuple[int, ...]:
+        return self.session.count_recovery.counts(self.setup.mcu.encoder_counts)
+
     def line(self, speeds: WheelSpeeds = SLOW) -> bytes | None:
         self.made_ns = self.now_ns
-        return self.session.line(self.now_ns, speeds)
+        return self.session.line(self.setup, self.now_ns, speeds)
 
     def answer(self, line: bytes | None) -> bytes:
         """Return the checked reply to a line from the host."""
@@ -68,7 +77,7 @@ class Bench:
         """Open the port and talk until the link is up and checked."""
         self.open().wait(10)
         self.talk(count=3)
-        assert (self.link(), self.session.check) == ("up", "checked")
+        assert (self.link(), self.session.check(self.setup)) == ("up", "checked")
         return self
 
     def names(self) -> list[str]:
@@ -96,8 +105,8 @@ class Bench:
             reads = BOOTED, *reads
         self.now_ns += int(ms * MS)
         received = tuple(Received(self.now, data) for data in reads)
-        self.session.sent(self.made_ns, was_written=True)
-        return self.session.update(self.now, self.port_open, self.opened, received)
+        self.session.sent(self.setup, self.made_ns, was_written=True)
+        return self.session.update(self.setup, self.now, self.port_open, self.opened, received)
 
     def happen(self, port: str, ms: float, data: bytes) -> None:
         """Open or close the port if `port` says so, let time pass, and read these bytes."""
@@ -172,10 +181,10 @@ def test_a_line_is_never_older_than_the_previous_line() -> None:
 
 
 def test_a_step_of_the_wall_clock_changes_no_dt() -> None:
-    session = McuSession(FREE, 100.0)
+    setup, session = LinkSetup.of(FREE, 100.0), McuSession()
     for step in range(1, 10):
         now = Instant(step * 10 * MS, WALL_NS + (-1) ** step * 3600 * NS_PER_S)
-        (feedback,) = session.update(now, True, 1, (Received(now, GOOD),))
+        (feedback,) = session.update(setup, now, True, 1, (Received(now, GOOD),))
         assert feedback.dt == (0.01 if step > 1 else 0.0)
         late_ns = now.mono_ns - feedback.at.mono_ns
         assert late_ns == now.wall_ns - feedback.at.wall_ns == wire_ns(len(GOOD), 115200)
@@ -303,8 +312,8 @@ def test_the_line_is_read_by_the_wheel_map_of_the_configuration() -> None:
 
 
 def test_the_codec_writes_the_dialect_of_the_configuration() -> None:
-    session = McuSession(McuConfig(trailing_comma=True), 100.0)
-    assert session.codec.encode(WheelSpeeds(*SEED_MOTORS)) == SEED_LINE + b",\r\n"
+    setup = LinkSetup.of(McuConfig(trailing_comma=True), 100.0)
+    assert setup.codec.encode(WheelSpeeds(*SEED_MOTORS)) == SEED_LINE + b",\r\n"
 
 
 # the checked link
@@ -350,7 +359,7 @@ def test_plain_replies_never_open_a_checked_link_and_the_reason_says_what_to_cha
     assert bench.session.good_lines == 0
     (outcome,) = [event for event in events if event.name == "link_check"]
     assert (outcome.level, outcome.code) == ("error", "no_checksum")
-    why = bench.session.describe_link()
+    why = bench.why()
     assert why.code == "no_checksum"
     assert 'mcu.link_check = "off"' in why.text
     bench.wait(100)
@@ -365,7 +374,7 @@ def test_a_board_that_ignores_checked_lines_is_known_by_its_reply_to_the_first_s
     for _ in range(320):
         bench.line()
         bench.wait(10)
-    assert bench.session.describe_link().code == "no_checksum"
+    assert bench.why().code == "no_checksum"
 
 
 def test_a_silent_board_on_a_checked_link_is_told_by_a_reason_with_the_setting() -> None:
@@ -374,7 +383,7 @@ def test_a_silent_board_on_a_checked_link_is_told_by_a_reason_with_the_setting()
         for _ in range(320):
             bench.line()
             bench.wait(10)
-        why = bench.session.describe_link()
+        why = bench.why()
         assert why.code == "received_nothing"
         assert ("mcu.link_check" in why.text) is told
 
@@ -436,7 +445,7 @@ def test_five_bad_replies_in_a_row_end_the_link_until_the_next_right_one() -> No
     assert bench.link() == "up"
     bench.wait(1, BAD)
     assert bench.link() == "stale"
-    assert bench.session.describe_link().code == "replies_damaged"
+    assert bench.why().code == "replies_damaged"
     bench.talk()
     assert bench.link() == "up"
 
@@ -459,7 +468,7 @@ def test_without_a_right_reply_plain_ones_do_not_hold_the_link() -> None:
         bench.wait(10, GOOD)
         bench.line()
         assert bench.link() == "stale"
-    assert bench.session.describe_link().code == "no_checksum"
+    assert bench.why().code == "no_checksum"
 
 
 @pytest.mark.parametrize("mcu", [McuConfig(), CHECKED], ids=["plain", "checked"])
@@ -512,7 +521,7 @@ def test_a_port_that_returns_the_question_is_never_linked(mcu: McuConfig, board:
     bench = Bench(mcu).open()
     bench.wait(10)
     lines = echoed(bench, 1.0, 1000, board=board)
-    assert (bench.link(), bench.session.describe_link().code) == ("booting", "echo")
+    assert (bench.link(), bench.why().code) == ("booting", "echo")
     assert all(line.startswith((ZERO, b"?")) for line in lines)
     bench.checked() if mcu.checked else bench.up()  # until the port is opened again
 
@@ -530,13 +539,13 @@ def test_lines_that_return_during_a_drive_raise_the_question_after_a_change_of_s
     assert b"?\r\n" not in echoed(bench, 0.0, 300)  # every board at rest repeats zeros
     lines = echoed(bench, 1.0, 100)
     assert lines.count(b"?\r\n") == 1
-    assert (bench.link(), bench.session.describe_link().code) == ("stale", "echo")
+    assert (bench.link(), bench.why().code) == ("stale", "echo")
 
 
 @each("encoders", [True, False])
 def test_a_board_that_repeats_commands_but_not_the_question_has_no_encoders(encoders: bool) -> None:
     bench = Bench()
-    bench.session = McuSession(McuConfig(), 100.0, FeedbackConfig(encoders=encoders))
+    bench.setup = LinkSetup.of(McuConfig(), 100.0, FeedbackConfig(encoders=encoders))
     bench.up()
     for n in range(400):
         speed = n % 100 / 10
@@ -547,7 +556,7 @@ def test_a_board_that_repeats_commands_but_not_the_question_has_no_encoders(enco
             break
     assert bench.link() == ("stale" if encoders else "up")
     if encoders:
-        assert bench.session.describe_link().code == "set_points"
+        assert bench.why().code == "set_points"
         assert 150 < n < 300
 
 
@@ -578,14 +587,14 @@ def test_the_first_stop_of_a_silence_is_sent_without_delay() -> None:
     while not bench.session.silent(bench.now_ns):
         assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
         bench.wait(10)
-    assert bench.line() == bench.session.codec.stop
+    assert bench.line() == bench.setup.codec.stop
 
 
 def test_an_mcu_that_restarted_gets_a_stop_without_delay() -> None:
     bench = Bench().up()
     assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
     bench.wait(10, BOOTED)
-    assert bench.line() == bench.session.codec.stop
+    assert bench.line() == bench.setup.codec.stop
 
 
 def test_a_board_that_reports_by_its_own_clock_gets_no_more_time_behind_a_late_step() -> None:
@@ -602,12 +611,12 @@ def test_a_silent_mcu_gets_stops_at_ten_hertz() -> None:
     bench = Bench().up()
     for _ in range(3):
         bench.wait(50)
-    assert bench.line(WheelSpeeds(5.0, 5.0, 5.0, 5.0)) == bench.session.codec.stop
+    assert bench.line(WheelSpeeds(5.0, 5.0, 5.0, 5.0)) == bench.setup.codec.stop
     lines = []
     for _ in range(100):
         bench.wait(10)
         lines.append(bench.line())
-    assert [line for line in lines if line] == [bench.session.codec.stop] * 10
+    assert [line for line in lines if line] == [bench.setup.codec.stop] * 10
 
 
 def test_zero_speeds_are_sent_as_the_stop_line() -> None:
@@ -620,7 +629,7 @@ def disbelieved() -> Bench:
     for _ in range(100):
         line = ",".join(f"{motor}p{dice.uniform(20, 60):05.2f}" for motor in "abcd")
         bench.wait(10, line.encode() + b"\r\n")
-    assert bench.session.count_recovery.counts == (0,) * 4
+    assert bench.counts() == (0,) * 4
     return bench
 
 
@@ -628,13 +637,13 @@ def test_the_configured_counts_are_trusted_again_after_the_port_reopens() -> Non
     bench = disbelieved()
     bench.close().wait(10)
     bench.open().wait(10)
-    assert bench.session.count_recovery.counts == (20,) * 4
+    assert bench.counts() == (20,) * 4
 
 
 def test_the_configured_counts_are_trusted_again_after_the_mcu_restarts() -> None:
     bench = disbelieved()
     bench.wait(10, BOOTED)
-    assert bench.session.count_recovery.counts == (20,) * 4
+    assert bench.counts() == (20,) * 4
 
 
 @pytest.mark.parametrize("reads", [1, 4])
@@ -718,8 +727,8 @@ def update(bench: Bench, *, left: bool, ms: float = 10, read: bytes = GOOD) -> N
     """Let time pass, then update the session. `left` says whether the port sent the last line."""
     bench.now_ns += int(ms * MS)
     received = (Received(bench.now, read),) if read else ()
-    bench.session.sent(bench.made_ns, was_written=left)
-    bench.session.update(bench.now, bench.port_open, bench.opened, received)
+    bench.session.sent(bench.setup, bench.made_ns, was_written=left)
+    bench.session.update(bench.setup, bench.now, bench.port_open, bench.opened, received)
 
 
 def blocked(bench: Bench, ms: float) -> Bench:
@@ -739,7 +748,7 @@ def test_an_output_that_is_blocked_for_the_watchdog_time_makes_the_link_stale() 
     update(bench, left=False, ms=20)
     assert (bench.link(), bench.session.blocked) == ("stale", True)
     assert bench.names() == ["link_stale"]
-    codes = bench.session.describe_link().code, bench.session.events[0].code
+    codes = bench.why().code, bench.session.events[0].code
     assert codes == ("port_blocked", "port_blocked")
 
 

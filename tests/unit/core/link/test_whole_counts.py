@@ -176,7 +176,7 @@ def off_by(lost: str, counts: int, jitter: float) -> float:
     way = np.array([np.interp(at, n * PERIOD, wheel) for wheel in wheels.T]).T
     whole = np.floor(way * counts / math.tau)
     indices = np.flatnonzero(n % 3 != 0)
-    recovery, total, before = CountRecovery(counts), np.zeros(4), np.zeros(4)
+    recovery, total, before = CountRecovery(), np.zeros(4), np.zeros(4)
     for last, this in itertools.pairwise(indices.tolist()):
         began = last if lost == "command" else this - 1
         speeds = (whole[this] - whole[began]) * math.tau / counts / (at[this] - at[began])
@@ -185,7 +185,7 @@ def off_by(lost: str, counts: int, jitter: float) -> float:
             Instant(0, 0), WheelSpeeds(*np.round(speeds, 2).tolist()), bridged + PERIOD,
             bridged=bridged,
         )  # fmt: skip
-        result = recovery.recover_counts(line)
+        result = recovery.recover_counts(line, math.tau / counts)
         rates = np.array(result.speeds.as_tuple())
         counted = result.counted or rates * (result.dt - result.bridged)
         total += np.array(counted) + result.bridged * (before + rates) / 2
