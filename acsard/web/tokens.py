@@ -22,6 +22,7 @@ from msgspec import Struct
 from msgspec.structs import asdict
 
 from acsard.core.values import ROLES, Role
+from acsard.host import clock
 from acsard.host.atomic_file import replace
 from acsard.host.errors import MSGSPEC_ERRORS, MendableError, NotPermittedError, UsageError
 from acsard.web.callers import AdmittedClient
@@ -57,7 +58,8 @@ class Vault:
     """The access tokens of one robot. The token file also contains tokens of other robots.
 
     The clock of a robot without a battery begins in 1970 at each start. An expired token stays
-    expired, because the time is the clock's or the newest in the file, whichever is later.
+    expired, because the time is the clock's or the newest in the file, whichever is later. The
+    latter goes on, or no token would ever expire on a robot that never learns the time.
     """
 
     def __init__(self, directory: Path, robot: str) -> None:
@@ -65,10 +67,16 @@ class Vault:
         # The stamp of the file (mtime ns, inode) when it was read, and its content: a tuple,
         # because several threads replace them.
         self._read: tuple[tuple[int, int] | None, _File] = None, _File([])
+        self._newest = 0.0, clock.steady_s()  # time of a file, and when it was read, s
 
     def now_s(self) -> float:
         """Return the time of the tokens, s, as of the last call that read the token file."""
-        return max(time.time(), self._read[1].newest)
+        newest_s, read_s = self._newest
+        return max(time.time(), newest_s + clock.steady_s() - read_s)
+
+    def _learn(self, newest_s: float) -> None:
+        if newest_s > self.now_s():
+            self._newest = newest_s, clock.steady_s()
 
     def find_owner(self, text: str) -> AdmittedClient | None:
         """Return the owner of a valid token, as of the last call that read the token file."""
@@ -98,6 +106,7 @@ class Vault:
             # accepted.
             read = None, _File([])
         self._read = read
+        self._learn(read[1].newest)
         return read[1]
 
     def valid_digests(self) -> frozenset[str]:
@@ -167,6 +176,7 @@ class Vault:
                 data = self._load()
                 file = self._decoded(data)
                 self._read = None, file
+                self._learn(file.newest)
                 tokens = list(file.tokens)
                 yield tokens
                 # A field that only a later version knows may limit its token, so it is kept.

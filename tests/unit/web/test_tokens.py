@@ -13,6 +13,7 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
+from acsard.host import clock
 from acsard.host.errors import MendableError, NotPermittedError, UsageError
 from acsard.web import tokens
 from acsard.web.callers import AdmittedClient
@@ -115,6 +116,23 @@ def test_an_expired_token_stays_expired_after_a_start_without_the_time(
     # A new token counts from the newest known time, so it is valid now.
     late, _ = Vault(tmp_path, "robot1").invite("operator", "phone", 1)
     assert owner(server, late) is not None
+
+
+def test_a_token_expires_on_a_robot_that_never_learns_the_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wall_s, steady_s = 1_800_000_000.0, 0.0
+    monkeypatch.setattr(time, "time", lambda: wall_s)
+    monkeypatch.setattr(clock, "steady_s", lambda: steady_s)
+    text, token = Vault(tmp_path, "robot1").invite("maintainer", "me", 1)
+    for _ in range(2):  # starts, each of which runs for 13 hours
+        wall_s, server = 5.0, Vault(tmp_path, "robot1")
+        for _ in range(13):
+            valid = token.digest in server.valid_digests()
+            wall_s += 3600.0
+            steady_s += 3600.0
+    assert not valid
+    assert owner(server, text) is None
 
 
 def test_the_time_is_written_each_minute_at_most_and_only_beside_tokens(
