@@ -199,8 +199,10 @@ class Robot:
 
     def hear(self, now: Instant, heard: Heard) -> News:
         """Process what arrived since the last call, and return what is to be published."""
-        now_ns, life = now.mono_ns, self._life
-        events, self._announced = [*heard.events, *self._announced], ()
+        now_ns, life, events = now.mono_ns, self._life, list[Event]()
+        if heard.events or self._announced:
+            events += heard.events + self._announced
+            self._announced = ()
         self._arbiter.begin(now_ns, self.config.commands)
         if life.unshown:
             life.begin(now_ns)
@@ -222,14 +224,7 @@ class Robot:
             self._choose(now_ns)
         mode, status = life.mode, self.status
         urgent = (self._choice.arrived_ns, mode) != self._last.made_of
-        if (
-            is_chosen
-            or events
-            or answers
-            or mode not in UNLATCHED
-            or mode._value_ != status.mode
-            or self._inputs.battery.level != status.battery
-        ):
+        if is_chosen or events or answers or mode not in UNLATCHED or mode._value_ != status.mode:
             self._restate(heard.port_trouble)
         changed = self.status is not status
         if changed or urgent:
@@ -377,6 +372,8 @@ class Robot:
             life.press(empty_reason(config.battery), now)
         if self.session.status.forgot:
             inputs.forget(config)
+        if inputs.battery.level != self.status.battery:
+            self._arbiter.until_ns = 0  # to state it
         life.hold(inputs.clear_refusal(self.session, config), now_ns)
 
     def _choose(self, now_ns: Ns) -> None:

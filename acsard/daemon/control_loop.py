@@ -7,14 +7,23 @@ synchronous, so that the daemon can call `step` from one task, and the tests in 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.guard import Guard
 from acsard.core.link.serial_output import Port
 from acsard.core.motion.latches import stopped
 from acsard.core.robot import QUIET, Robot
-from acsard.core.values import NS_PER_S, STILL, Heard, Instant, Latches, News, Ns, Trip
+from acsard.core.values import (
+    NS_PER_S,
+    STILL,
+    Event,
+    Heard,
+    Instant,
+    Latches,
+    News,
+    Ns,
+    Trip,
+)
 from acsard.daemon.latch_file import Keeper
 from acsard.daemon.pacing import NO_PERIOD, Pace, Period
 from acsard.daemon.publication import Publication
@@ -29,13 +38,9 @@ Left = tuple[bytes | None, Trip, Ns]
 NOTHING_LEFT: Left = None, "", 0
 
 
-class Step(NamedTuple):
-    """The result of a wake-up."""
-
-    now: Instant
-    news: News
-    due: bool  # a line was due: the period has ended, or `News.urgent`
-    line: bytes | None  # that the robot decided to send
+# The result of a wake-up: its time, what the robot makes of it, whether a line was due (the period
+# has ended, or `News.urgent`), and the line that the robot decided to send.
+Step = tuple[Instant, News, bool, bytes | None]
 
 
 class ControlLoop:
@@ -105,42 +110,44 @@ class ControlLoop:
                 recorder.died(now, heard)
             raise
         had_input = bool(heard.commands or heard.refusals or heard.requests)
-        pace.record_step(tick, due, left[0] is not None, news.urgent, had_input, port.sent_ns)
+        if period is not NO_PERIOD or due or had_input or news.urgent or pace.waiting:
+            pace.record_step(tick, due, left[0] is not None, news.urgent, had_input, port.sent_ns)
         if recorder is not None:
             step = now, heard, due, line, *left, news, robot.status
             recorder.step(step, robot, self._guard)
         if due or news is not QUIET:
             publication.publish(news, robot.applied if due else None)
-        publication.stopwatch.figures["step_time"].add(self._mono_ns() - now.mono_ns)
+        publication.stopwatch.step_time(self._mono_ns() - now.mono_ns)
         # Flush last, because the threads that send need this core and Python's interpreter lock,
         # which are free only while this loop waits.
         publication.bus.flush()
-        return Step(now, news, due, line)
+        return now, news, due, line
 
     def _heard(self, now: Instant, period: Period) -> Heard:
-        port, publication = self._port, self.publication
-        intake, missed = publication.intake, 0
-        events = intake.events
+        port, publication, missed = self._port, self.publication, 0
+        intake = publication.intake
         if period is not NO_PERIOD:
             missed = period.expired - 1
             publication.stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns, missed)
-            events += self._keeper.take_events()
+            if told := self._keeper.take_events():
+                intake.events += told
         # Call `take` before reading `is_open`: in a late wake-up it may find the port lost.
         taken, received = intake.take(publication.serve), port.take(now if missed else None)
+        events: tuple[Event, ...] = ()
+        if intake.events:
+            events = tuple(intake.events)
+            intake.events.clear()
         # Pass the fields by position: creating a struct by its names takes three times as long.
-        heard = Heard(
+        return Heard(
             port.is_open,
             port.opened,
             port.trouble,
             received,
             *taken,
-            tuple(events),
+            events,
             missed,
             self.shutting_down,
         )
-        if events:
-            events.clear()
-        return heard
 
     def _write(self, line: bytes, now: Instant) -> Left:
         # The guard may replace the line, and the port may drop it.

@@ -229,8 +229,9 @@ async def _control(
 
     def step(now: Instant, period: Period) -> bool:
         control.shutting_down = departure.begun_ns is not None
-        changed, robot = control.step(now, period).news.status_changed, control.robot
-        if period is not NO_PERIOD or changed:
+        _, news, _, _ = control.step(now, period)
+        if period is not NO_PERIOD or news.status_changed:
+            robot, changed = control.robot, news.status_changed
             manager.step(now.mono_ns, robot.status, robot.applied, changed=changed)
         return not (control.shutting_down and departure.over(now.mono_ns, control.at_rest))
 

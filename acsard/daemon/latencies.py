@@ -16,7 +16,7 @@ from itertools import accumulate, cycle
 from operator import add
 from typing import Final, Literal, get_args
 
-from acsard.core.values import NS_PER_S, Estimate, Measured, Ns, Spread
+from acsard.core.values import NS_PER_S, Measured, Ns, Spread
 
 PER_DECADE = 20  # buckets: a percentile is at most 12 % too high
 
@@ -140,6 +140,9 @@ class Stopwatch:
         self._missed = LastMinuteCount()
         self._cached: dict[str, Measured] = {}
         self._cached_ns = -FRESH_NS
+        # Of a duration, ns: for latencies that a wake-up measures itself.
+        self.step_time = self.figures["step_time"].add
+        self.round_trip = self.figures["mcu_round_trip"].add
         self._turns, self._turn_ns = cycle(self.figures.values()), 0
 
     def measured(self, now_ns: Ns) -> dict[str, Measured]:
@@ -171,9 +174,3 @@ class Stopwatch:
         # until its source was chosen.
         if command_ns > before_ns:
             self.figures["command_to_wire"].add(sent_ns - command_ns)
-
-    def feedback(self, estimate: Estimate) -> None:
-        """Record `mcu_round_trip` if the estimate's line names the line that it answers."""
-        at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
-        if asked_ns is not None:
-            self.figures["mcu_round_trip"].add(at_ns - asked_ns)

@@ -47,7 +47,7 @@ class Pace:
         self._possible = self._gap_ns < period_ns  # a period is long enough for an early line
         self._ahead = False  # an early line has replaced the next period's
         self._tried = False  # an early line, in this period
-        self._waiting = False  # for a command that came too soon after the last line
+        self.waiting = False  # for a command that came too soon after the last line
         self._idle = 0
         self.early = self._possible
         self.retry_ns: Ns | None = None
@@ -68,16 +68,16 @@ class Pace:
     def record_step(
         self, tick: bool, due: bool, written: bool, changed: bool, had_input: bool, sent_ns: Ns
     ) -> None:
-        """Record the result of a step.
+        """Record the result of a step. A step only with bytes changes nothing, unless `waiting`.
 
         `tick` says that it had to write a period's line, `due` that it had a line, `changed` that
         the command or the mode was new or an input was pressed, and `had_input` that the bus had
         any.
         """
-        self._waiting = changed and not due
+        self.waiting = changed and not due
         self._idle += had_input and not changed
         if due and not tick:
             self._tried, self._ahead = True, written
         may_try = self._possible and not self._tried
-        self.early = may_try and not self._waiting and self._idle <= MAX_IDLE_WAKES
-        self.retry_ns = sent_ns + self._gap_ns if self._waiting and may_try else None
+        self.early = may_try and not self.waiting and self._idle <= MAX_IDLE_WAKES
+        self.retry_ns = sent_ns + self._gap_ns if self.waiting and may_try else None

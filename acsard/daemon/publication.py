@@ -64,7 +64,7 @@ class Publication:
         boot_ns: Callable[[], Ns] = clock.boot_ns,
     ) -> None:
         # `events` collects those of other parts. `run` and `boot_ns` are those of the beats.
-        config = robot.config
+        self._config = config = robot.config
         self.report = Report(config, start, certificate_ends, info.version)
         self.intake = Intake(
             config, bus, [] if events is None else events, self.report.certificate_ends, run
@@ -91,18 +91,20 @@ class Publication:
         `applied` is the twist in a line that was due.
         """
         bus, report, now, config = self.bus, self.report, self.now, self._robot.config
-        is_new = config is not report.config
+        is_new = config is not self._config
         if is_new:
             self._use(config, news.answers)
         wanted = bus.wanted_keys
-        if report.beat_due(now.mono_ns, wanted):
-            bus.publish_beat(self._beat())
         for estimate in news.estimates:
             for topic in report.feedback_due(estimate, wanted):
                 bus.publish_feedback(topic, estimate)
-            self.stopwatch.feedback(estimate)
-        for key, message in report.others_due(now, news, applied, wanted, self._snapshot):
-            bus.publish(key, message)
+            if estimate.asked_ns is not None:
+                self.stopwatch.round_trip(estimate.heard_ns - estimate.asked_ns)
+        if applied is not None or news.events or news.status_changed:
+            if report.beat_due(now.mono_ns, wanted):
+                bus.publish_beat(self._beat())
+            for key, message in report.others_due(now, news, applied, wanted, self._snapshot):
+                bus.publish(key, message)
         for answer in news.answers:
             self._answers.append((now.mono_ns, answer))
         if self._answers:
@@ -169,7 +171,7 @@ class Publication:
         )
 
     def _use(self, config: Config, answers: tuple[Answer, ...]) -> None:
-        self._queries.config = self.report.config = config
+        self._config = self._queries.config = self.report.config = config
         for answer in answers:
             for key, (old, new) in answer.changes.items():
                 earlier = self._differing.pop(key, None)

@@ -79,20 +79,28 @@ _OTHERS = frozenset({"cmd_vel_out", "events", "state", "diagnostics", "battery"}
 
 
 class _Rate:
-    # Messages of one key. A change of its rate must not make one due, so the last one counts.
+    # The rate of the messages of one key. A change of the rate must not make one due, so the last
+    # one counts.
     def __init__(self) -> None:
-        self._last_ns = NEVER_NS
+        self._last_ns, self._period_ns = NEVER_NS, 0
+        self.due_ns = NEVER_NS  # of the next message
 
-    def due(self, now_ns: Ns, hz: float, at_once: bool = False) -> bool:
-        # 0 Hz is no limit. Allow a twentieth of the period as grace. Otherwise a step that is a
-        # microsecond early would wait for the next period.
-        period_ns = int(NS_PER_S / hz) if hz else 0
-        next_ns = self._last_ns + period_ns
-        if not at_once and now_ns < next_ns - period_ns // 20:
-            return False
-        behind = at_once or now_ns - next_ns > period_ns
+    def use(self, hz: float) -> None:
+        # 0 Hz is no limit.
+        self._period_ns = int(NS_PER_S / hz) if hz else 0
+        self._set_due()
+
+    def record(self, now_ns: Ns, at_once: bool = False) -> None:
+        # Of a message now; `at_once`: before it was due.
+        next_ns = self._last_ns + self._period_ns
+        behind = at_once or now_ns - next_ns > self._period_ns
         self._last_ns = now_ns if behind else next_ns
-        return True
+        self._set_due()
+
+    def _set_due(self) -> None:
+        # Allow a twentieth of the period as grace. Otherwise a step that is a microsecond early
+        # would wait for the next period.
+        self.due_ns = self._last_ns + self._period_ns - self._period_ns // 20
 
 
 class Report:
@@ -118,15 +126,35 @@ class Report:
             FeedbackTopic("tf", self._tf, tf_numbers),
             FeedbackTopic("wheel_states", self._wheel_states, wheel_states_numbers),
         )
-        # Builders by key, with their highest rate, Hz; also due with `status_changed`.
-        self._summaries: dict[str, tuple[BuildSummary, float]] = {
-            "state": (self._state, STATE_HZ),
-            "diagnostics": (self._diagnostics, DIAGNOSTICS_HZ),
-            "battery": (self._battery, BATTERY_HZ),
+        # Builders by key; also due with `status_changed`.
+        self._summaries: dict[str, BuildSummary] = {
+            "state": self._state,
+            "diagnostics": self._diagnostics,
+            "battery": self._battery,
         }
         limited = (BEAT, "odom", "wheel_states", "cmd_vel_out", *self._summaries)
         self._rates = {key: _Rate() for key in limited}
-        self.config = config  # in force
+        self.config = config
+
+    @property
+    def config(self) -> Config:
+        """The configuration in force."""
+        return self._config
+
+    @config.setter
+    def config(self, config: Config) -> None:
+        self._config, limits = config, config.rates
+        highest = {
+            BEAT: BEAT_HZ,
+            "odom": limits.odom,
+            "wheel_states": limits.telemetry,
+            "cmd_vel_out": limits.telemetry,
+            "state": limits.at_most(STATE_HZ),
+            "diagnostics": limits.at_most(DIAGNOSTICS_HZ),
+            "battery": limits.at_most(BATTERY_HZ),
+        }
+        for key, rate in self._rates.items():
+            rate.use(highest[key])
 
     def due(
         self,
@@ -142,23 +170,33 @@ class Report:
             for estimate in news.estimates
             for topic in self.feedback_due(estimate, wanted)
         ]
+        if applied is None and not (news.events or news.status_changed):
+            return feedback
         return feedback + self.others_due(now, news, applied, wanted, get_snapshot)
 
     def beat_due(self, now_ns: Ns, wanted: Collection[str]) -> bool:
         """Return whether a beat is to be published."""
-        return BEAT in wanted and self._rates[BEAT].due(now_ns, BEAT_HZ)
+        beat = self._rates[BEAT]
+        if now_ns < beat.due_ns or BEAT not in wanted:
+            return False
+        beat.record(now_ns)
+        return True
 
     def feedback_due(self, estimate: Estimate, wanted: Collection[str]) -> list[FeedbackTopic]:
         """Return the topics on which a message of this feedback line is to be published."""
+        self._estimate = estimate
+        rates, at_ns, due = self._rates, estimate.at.mono_ns, list[FeedbackTopic]()
         odom, tf, wheel_states = self._feedback
-        rates = self.config.rates
-        due, at_ns = list[FeedbackTopic](), estimate.at.mono_ns
-        if ("odom" in wanted or "tf" in wanted) and self._rates["odom"].due(at_ns, rates.odom):
+        rate = rates["odom"]
+        if at_ns >= rate.due_ns and ("odom" in wanted or "tf" in wanted):
+            rate.record(at_ns)
             if "odom" in wanted:
                 due.append(odom)
-            if "tf" in wanted and self.config.odometry.publish_tf:
+            if "tf" in wanted and self._config.odometry.publish_tf:
                 due.append(tf)
-        if "wheel_states" in wanted and self._rates["wheel_states"].due(at_ns, rates.telemetry):
+        rate = rates["wheel_states"]
+        if at_ns >= rate.due_ns and "wheel_states" in wanted:
+            rate.record(at_ns)
             due.append(wheel_states)
         return due
 
@@ -172,31 +210,26 @@ class Report:
     ) -> list[tuple[str, Message]]:
         """Return the messages that are not of a feedback line.
 
-        `applied` is the twist in a line that was due in this wake-up: the others have no message,
-        unless something has happened.
+        `applied` is the twist in a line that was due in this wake-up. Bytes alone make no message
+        due: a summary waits for the next line, unless something has happened.
         """
         self._now = now
         if news.events:
             self._happened.add(news.events, now)
-        if news.estimates:
-            self._estimate = news.estimates[-1]
-        # Bytes alone make no message due: a summary waits for the next line.
         due: list[tuple[str, Message]] = []
-        if applied is None and not (news.events or news.status_changed):
-            return due
         if _OTHERS.isdisjoint(wanted):
             return due
-        now_ns, rates, limits = now.mono_ns, self._rates, self.config.rates
-        if (
-            applied is not None
-            and "cmd_vel_out" in wanted
-            and rates["cmd_vel_out"].due(now_ns, limits.telemetry)
-        ):
+        now_ns, rates, changed = now.mono_ns, self._rates, news.status_changed
+        rate = rates["cmd_vel_out"]
+        if applied is not None and now_ns >= rate.due_ns and "cmd_vel_out" in wanted:
+            rate.record(now_ns)
             due.append(("cmd_vel_out", self._cmd_vel_out(now, applied)))
         if news.events and "events" in wanted and (events_message := self._happened.message()):
             due.append(("events", events_message))
-        for key, (build, hz) in self._summaries.items():
-            if key in wanted and rates[key].due(now_ns, limits.at_most(hz), news.status_changed):
+        for key, build in self._summaries.items():
+            rate = rates[key]
+            if (changed or now_ns >= rate.due_ns) and key in wanted:
+                rate.record(now_ns, changed)
                 message = build(now, get_snapshot())
                 if message is not None:
                     due.append((key, message))
@@ -213,7 +246,7 @@ class Report:
                     self._odom(estimate, get_snapshot().measured is not None) if estimate else None
                 )
             case "tf":
-                return self._tf(estimate) if estimate and self.config.odometry.publish_tf else None
+                return self._tf(estimate) if estimate and self._config.odometry.publish_tf else None
             case "wheel_states":
                 return (
                     self._wheel_states(estimate, get_snapshot().speeds is not None)
@@ -226,21 +259,21 @@ class Report:
                 return self._happened.message()
             case _:
                 summary = self._summaries.get(key)
-                return summary[0](now, get_snapshot()) if summary and now else None
+                return summary(now, get_snapshot()) if summary and now else None
 
     def tf_static(self) -> TFMessage:
         """Return the transform of the lidar, empty if it is switched off."""
-        lidar = self.config.lidar
+        lidar = self._config.lidar
         if not lidar.publish_tf:
             return TFMessage([])
-        base = Header(Time.from_ns(self._start.wall_ns), self.config.odometry.base_frame)
+        base = Header(Time.from_ns(self._start.wall_ns), self._config.odometry.base_frame)
         place = Vector3(lidar.lidar_x_offset, lidar.lidar_y_offset)
         pose = Transform(place, from_yaw(lidar.lidar_yaw))
         return TFMessage([TransformStamped(base, lidar.lidar_frame, pose)])
 
     def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
         # Not `live`: without feedback, the twist is 0 and of `UNKNOWN_COVARIANCE`.
-        frames, pose = self.config.odometry, estimate.pose
+        frames, pose = self._config.odometry, estimate.pose
         of_pose = pose_covariance(estimate.covariance)
         of_twist = twist_covariance(estimate.twist_variances) if live else UNKNOWN_COVARIANCE
         return Odometry(
@@ -251,7 +284,7 @@ class Report:
         )
 
     def _tf(self, estimate: Estimate) -> TFMessage:
-        frames, pose = self.config.odometry, estimate.pose
+        frames, pose = self._config.odometry, estimate.pose
         header = Header(Time.from_ns(estimate.at.wall_ns), frames.odom_frame)
         where = Transform(Vector3(pose.x, pose.y), from_yaw(pose.yaw))
         return TFMessage([TransformStamped(header, frames.base_frame, where)])
@@ -265,7 +298,7 @@ class Report:
         )
 
     def _cmd_vel_out(self, now: Instant, applied: BodyTwist) -> TwistStamped:
-        header = Header(Time.from_ns(now.wall_ns), self.config.odometry.base_frame)
+        header = Header(Time.from_ns(now.wall_ns), self._config.odometry.base_frame)
         return TwistStamped(header, _twist(applied))
 
     def _state(self, now: Instant, snapshot: Snapshot) -> RobotState:
@@ -317,7 +350,7 @@ class Report:
         )
 
     def _certificate_days(self, now: Instant) -> float | None:
-        if not (self.config.bus.tls and self.certificate_ends):
+        if not (self._config.bus.tls and self.certificate_ends):
             return None
         return round((first_expiry(self.certificate_ends)[1] - now.wall_ns) / DAY_NS, 2)
 
@@ -341,12 +374,12 @@ class Report:
         )
 
     def _certificate(self, now: Instant) -> tuple[str, str]:
-        if not self.config.bus.tls:
+        if not self._config.bus.tls:
             return "", ""
         return expiry(self.certificate_ends, now.wall_ns)
 
     def _diagnostics(self, now: Instant, snapshot: Snapshot) -> DiagnosticArray:
-        return diagnostics(self.config, now, snapshot, self._certificate(now))
+        return diagnostics(self._config, now, snapshot, self._certificate(now))
 
 
 def _summary(battery: BatteryStatus | None) -> BatterySummary | None:

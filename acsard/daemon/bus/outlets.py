@@ -63,12 +63,13 @@ class _Outlet:
         self.publisher, self.form = publisher, form
         self.wanted = False  # it has a subscriber or is latched
         self._gid, self._sequence = gid, 0
-        self._signed = {"attachment": signed} if signed else {}
+        self.put: Callable[[bytes], object] = publisher.put
+        if gid:
+            self.put = self._put_ros
+        elif signed:
+            self.put = partial(publisher.put, attachment=signed)
 
-    def put(self, payload: bytes) -> None:
-        if not self._gid:
-            self.publisher.put(payload, **self._signed)
-            return
+    def _put_ros(self, payload: bytes) -> None:
         self._sequence += 1
         attachment = Attachment(self._sequence, clock.now().wall_ns, self._gid)
         self.publisher.put(payload, attachment=attachment.pack())
@@ -193,7 +194,8 @@ class Outlets:
                 # Two outlets with one encoding are rare, and a frame is filled in 3 us.
                 outlet.put(topic.encode(estimate, outlet.form))
         now_ns = clock.mono_ns()
-        self._note_put(topic.key, now_ns - began_ns)
+        if self._slow or now_ns - began_ns > SLOW_PUT_NS:
+            self._note_put(topic.key, now_ns - began_ns)
         self.feedback_sent(now_ns - estimate.heard_ns)
 
     def _send_beat(self, beat: Beat) -> None:
