@@ -50,13 +50,16 @@ class BoardInputs(Struct):
 
     def expects_reports(self, session: McuSession) -> bool:
         """Return whether `process_reports` has something to do."""
+        status = session.status
+        if status.last_ns is None and not (status.forgot or self.unreported):
+            return self.battery.known == "stop"  # the board has reported nothing
         return bool(
-            session.status.new
+            status.new
             or self.estop.state
             or self.bumpers.state
             or self.battery.status
             or self.unreported
-            or session.status.forgot
+            or status.forgot
             or self.battery.known == "stop"
         )
 

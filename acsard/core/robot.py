@@ -199,11 +199,12 @@ class Robot:
 
     def hear(self, now: Instant, heard: Heard) -> News:
         """Process what arrived since the last call, and return what is to be published."""
-        now_ns, life, events = now.mono_ns, self._life, list[Event]()
+        now_ns, life, arbiter = now.mono_ns, self._life, self._arbiter
+        events: list[Event] = []
         if heard.events or self._announced:
             events += heard.events + self._announced
             self._announced = ()
-        self._arbiter.begin(now_ns, self.config.commands)
+        arbiter.begin(now_ns, self.config.commands)
         if life.unshown:
             life.begin(now_ns)
         if heard.missed:
@@ -216,17 +217,17 @@ class Robot:
         if heard.speed_cap is not None:
             self._cap_speed(heard.speed_cap, events)
         if life.mode not in UNLATCHED:
-            self._arbiter.watched_ns = max(self._arbiter.watched_ns, now_ns)
+            arbiter.watched_ns = max(arbiter.watched_ns, now_ns)
         if heard.commands or heard.refusals:
             self._accept_commands(now_ns, heard, events)
-        is_chosen = now_ns >= self._arbiter.until_ns
+        is_chosen = now_ns >= arbiter.until_ns
         if is_chosen:
             self._choose(now_ns)
-        mode, status = life.mode, self.status
+        mode, status, changed = life.mode, self.status, False
         urgent = (self._choice.arrived_ns, mode) != self._last.made_of
-        if is_chosen or events or answers or mode not in UNLATCHED or mode._value_ != status.mode:
+        if is_chosen or events or answers or mode._value_ != status.mode or mode not in UNLATCHED:
             self._restate(heard.port_trouble)
-        changed = self.status is not status
+            changed = self.status is not status
         if changed or urgent:
             why = Reason(self.status.code, self.status.reason)
             events += self._told.changes(mode, self._choice, why)
@@ -304,17 +305,18 @@ class Robot:
             )
             if warning is not None:
                 events.append(warning)
-        if before == "up" != link:
-            self.counters["link_lost"] += 1
-            if session.lateness.late_s:
-                self.counters["link_lost_host_stall"] += 1
         if link != "up":
+            if before == "up":
+                self.counters["link_lost"] += 1
+                if session.lateness.late_s:
+                    self.counters["link_lost_host_stall"] += 1
             self._forget()
         if session.restarted:
             # No sender drives before the link is up for the first time, so accept a zero that was
             # sent during the start.
             self._arbiter.require_neutral(now.mono_ns if self._linked_once else 0)
-        events += session.events
+        if session.events:
+            events += session.events
         if session.reopened:
             inputs.reopen()
         is_watched, safety = inputs.expects_reports(session), self.config.safety

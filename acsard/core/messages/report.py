@@ -185,7 +185,8 @@ class Report:
     def feedback_due(self, estimate: Estimate, wanted: Collection[str]) -> list[FeedbackTopic]:
         """Return the topics on which a message of this feedback line is to be published."""
         self._estimate = estimate
-        rates, at_ns, due = self._rates, estimate.at.mono_ns, list[FeedbackTopic]()
+        due: list[FeedbackTopic] = []
+        rates, at_ns = self._rates, estimate.at.mono_ns
         odom, tf, wheel_states = self._feedback
         rate = rates["odom"]
         if at_ns >= rate.due_ns and ("odom" in wanted or "tf" in wanted):

@@ -86,14 +86,15 @@ class Odometry(Struct):
         checks.check_line(line, rolled, seconds, known=gap is None or not gap.unknown)
         turn, slips = checks.turn, checks.slips
 
-        believed = wheels.believed(reported)
+        believed = wheels.believed(reported) if wheels.leaves_out else reported
         self.rested = self.rested + line.dt - line.bridged if believed == AT_REST else 0.0
         at_rest = self.rested > REST_S
         if self.held != AT_REST or (at_rest and rolled != AT_REST):
             rolled = self._beyond_rocking(rolled, at_rest, model)
         self.positions = plus(self.positions, rolled)
-        linear, angular = model.kinematics.moved(believed)
-        distance, angle = model.kinematics.moved(wheels.believed(rolled))
+        moved = model.kinematics.moved
+        linear, angular = moved(believed)
+        distance, angle = moved(wheels.believed(rolled) if wheels.leaves_out else rolled)
         variance = 0.0
         if turn is not None:
             angle, angular, variance = turn.angle, turn.rate, turn.variance
