@@ -145,7 +145,11 @@ class Timeline(Struct):
                 self.prompted.measure(self.end_ns - asked_ns, self.read_lines, setup.apart_ns)
             placed = self.prompted.place(self.end_ns, asked_ns, setup.apart_ns)
         dt, bridged = placed.dt_ns / NS_PER_S, placed.bridged_ns / NS_PER_S
-        turned, wheels, known = self._turned(setup, reading, came_ns), None, self.begun
+        turned, wheels, known, self.restarted = None, None, self.begun, False
+        if reading is not None and setup.count:
+            turned = self._turned(setup, reading, came_ns)
+        elif self.encoders.last is not None:
+            self.encoders.forget()
         self.gaps += bridged > 0.0
         if turned is not None:
             if not bridged:
@@ -184,11 +188,7 @@ class Timeline(Struct):
         self.last = Instant(mono_ns, wall_ns)
         return self.last
 
-    def _turned(self, setup: LinkSetup, reading: Reading | None, at_ns: Ns) -> Turned | None:
-        self.restarted = False
-        if reading is None or not setup.count:
-            self.encoders.forget()
-            return None
+    def _turned(self, setup: LinkSetup, reading: Reading, at_ns: Ns) -> Turned | None:
         turned = self.encoders.turned(setup, reading, at_ns)
         if isinstance(turned, Turned):
             return turned

@@ -82,25 +82,23 @@ class _Rate:
     # The rate of the messages of one key. A change of the rate must not make one due, so the last
     # one counts.
     def __init__(self) -> None:
-        self._last_ns, self._period_ns = NEVER_NS, 0
+        self._last_ns, self._period_ns, self._pause_ns = NEVER_NS, 0, 0
         self.due_ns = NEVER_NS  # of the next message
 
     def use(self, hz: float) -> None:
         # 0 Hz is no limit.
-        self._period_ns = int(NS_PER_S / hz) if hz else 0
-        self._set_due()
+        self._period_ns = period_ns = int(NS_PER_S / hz) if hz else 0
+        # Allow a twentieth of the period as grace. Otherwise a step that is a microsecond early
+        # would wait for the next period.
+        self._pause_ns = period_ns - period_ns // 20
+        self.due_ns = self._last_ns + self._pause_ns
 
     def record(self, now_ns: Ns, at_once: bool = False) -> None:
         # Of a message now; `at_once`: before it was due.
         next_ns = self._last_ns + self._period_ns
         behind = at_once or now_ns - next_ns > self._period_ns
-        self._last_ns = now_ns if behind else next_ns
-        self._set_due()
-
-    def _set_due(self) -> None:
-        # Allow a twentieth of the period as grace. Otherwise a step that is a microsecond early
-        # would wait for the next period.
-        self.due_ns = self._last_ns + self._period_ns - self._period_ns // 20
+        last_ns = self._last_ns = now_ns if behind else next_ns
+        self.due_ns = last_ns + self._pause_ns
 
 
 class Report:
