@@ -130,7 +130,7 @@ class _States:
             look("driving", "DRIVING")
             browser.lift()
             bus.at_rest()
-            usual, board.reply = board.reply, lambda speeds: PLAIN((0.0, *speeds[1:]))
+            usual, board.reply = board.reply, lambda speeds: PLAIN((-speeds[0], *speeds[1:]))
             with bus.commanding(0.3):
                 look("wheel-fault", "FAULT", "Fault")
                 assert "wheel is left out" in browser.text("doubt")

@@ -176,7 +176,7 @@ def test_an_independent_client_stops_and_clears_the_robot(ground: Ground) -> Non
     assert ground.bus.state()["mode"] == "stopped"
     refused = ground.sdk.do("call", ground.prefix + "/acsard/clear", TRIGGER)
     assert refused["success"] is False
-    again = "call srv/clear again when 2 s have passed since then"
+    again = "call srv/clear again 2 s after that"
     assert again in refused["message"]
     until(
         lambda: ground.sdk.do("call", ground.prefix + "/acsard/clear", TRIGGER)["success"],
@@ -373,7 +373,7 @@ def test_a_command_held_up_on_the_way_is_stale_by_its_attachment(bus: Bus, ros: 
         ros.session.put(ros.key("cmd_vel", TWIST), GO, attachment=attached)
 
     ros.zeros(bus)
-    refused_without_motion(bus, late, "stale", "the network delayed it")
+    refused_without_motion(bus, late, "stale", "the network delays them")
 
 
 def test_a_command_of_a_sender_whose_clock_is_an_hour_off_is_accepted(
