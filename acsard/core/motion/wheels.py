@@ -107,6 +107,7 @@ class Wheel(Struct):
     apart_s: Seconds = 0.0  # since it came nearer to its command
     speed_then: RadPerS = 0.0  # when it did
     command_then: RadPerS = 0.0
+    reacts: bool = False  # it came nearer since the command last moved away from it
     missed: Rad = 0.0  # expected minus measured since both agreed
     rested: bool = True  # and was not commanded since then
     rest_s: Seconds = 0.0
@@ -548,11 +549,14 @@ def _follow(wheel: Wheel, angle: Rad, due: Rad, block: Block) -> None:
     if away < 0.0:
         away, nearer, farther = -away, -nearer, -farther
     approaches = wheel.approaches = nearer > APPROACH * away + 2 * count * share
-    if approaches or farther > AGREEMENT * away or away <= AGREEMENT * max(turns, size):
+    if away <= AGREEMENT * max(turns, size) or farther > AGREEMENT * away:
         wheel.apart_s, wheel.speed_then, wheel.command_then = 0.0, speed, command
+        wheel.reacts = False
+    elif approaches:
+        wheel.apart_s, wheel.speed_then, wheel.reacts = 0.0, speed, True
     else:
         wheel.apart_s += s
-        if nearer < 0.0:
+        if nearer < 0.0 and not wheel.reacts:
             wheel.speed_then = speed  # the worst one counts
 
 

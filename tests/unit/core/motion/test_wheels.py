@@ -141,6 +141,17 @@ def test_wheels_that_roll_on_after_a_stop_are_a_fault_at_any_speed() -> None:
         assert bench.faults[0] == "wheel_runaway"
 
 
+@pytest.mark.parametrize("half", [0.2, 0.4, 0.5])
+def test_a_reversed_wheel_is_a_fault_although_its_command_goes_up_and_down(half: float) -> None:
+    """A wheel that runs away from each rise and comes back at each fall comes no nearer."""
+    bench, speed = Bench(), 0.0
+    for step in range(round(6 * half / PERIOD)):
+        command = 8.0 if step * PERIOD % (2 * half) < half else 1.0
+        speed += (-command - speed) * PERIOD / 0.1
+        bench.run(all_at(round(speed, 2)), all_at(command), seconds=PERIOD)
+    assert bench.faults[:1] == ["wheel_reversed"]
+
+
 def test_four_wheels_without_power_are_a_warning() -> None:
     bench = Bench()
     bench.run(STILL, TEN, seconds=1.0)
