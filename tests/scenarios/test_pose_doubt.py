@@ -44,6 +44,17 @@ def test_with_wrong_counts_the_pose_uses_the_speeds_and_a_warning_says_so(wrong:
     assert sigmas(robot) < 3.0
 
 
+@pytest.mark.parametrize(("counts", "configured"), [(64, 16), (24, 96), (64, 32)])
+def test_what_wrong_counts_moved_before_they_were_noticed_is_a_doubt(
+    counts: int, configured: int
+) -> None:
+    robot = world(counts, "on", configured)
+    robot.run(0.5)
+    robot.drive(0.5, 0.0, 1.5)
+    robot.hold(0.0, 0.0, 1.0)
+    assert sigmas(robot) < 3.0
+
+
 def test_right_counts_are_used_from_the_first_second_of_driving() -> None:
     robot = world(3200, "on")
     drive(robot, 3.0)

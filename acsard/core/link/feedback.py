@@ -54,6 +54,7 @@ class Feedback(Struct, frozen=True, gc=False):
     # or the board's watchdog. It is negative if that was before the sample.
     driven: float = 0.0
     jitter: float = 0.0  # mean error of `dt`, s
+    doubt: Motors | None = None  # angles by wrong counts, which earlier lines had too much, rad
 
 
 class Timeline(Struct):
@@ -157,7 +158,7 @@ class Timeline(Struct):
             if self.counts_check.agrees:
                 dt, bridged, since, known = turned.dt, 0.0, turned.dt, known and not silent
                 wheels = setup.codec.wheels(turned.motors)
-        gap = 0.0
+        gap, doubt, self.counts_check.doubt = 0.0, self.counts_check.doubt, None
         if not known or self.restarted or dt >= MAX_FILLED_GAP_S:
             gap = 0.0 if last is None else max(since, dt)
             dt = bridged = since = 0.0
@@ -177,6 +178,7 @@ class Timeline(Struct):
             came_ns,
             driven=driven,
             jitter=placed.jitter_ns / NS_PER_S,
+            doubt=None if doubt is None else setup.codec.wheels(doubt),
         )
 
     def _sampled(self, mono_ns: Ns) -> Instant:

@@ -111,7 +111,7 @@ class Odometry(Struct):
         self.pose = Pose(pose.x + dx, pose.y + dy, yaw)
         uncertainty.stretch.add(share * distance, share * angle, dx, dy, variance, seconds)
         doubts = wheels.possible_motion(rolled)
-        due |= turn is not None and turn.doubt != 0.0
+        due |= line.doubt is not None or (turn is not None and turn.doubt != 0.0)
         if due or gap or doubts or self.was_set or uncertainty.stretch.seconds >= UPDATE_S:
             uncertainty.update(model, yaw, slips=slips, by_gyro=turn is not None)
             rate_variance = None if turn is None else turn.rate_variance
@@ -125,6 +125,9 @@ class Odometry(Struct):
                 uncertainty.doubt((distance / 2) ** 2, (angle / 2) ** 2, 0.0, heading)
             if gap and not (rested and line.driven <= 0.0):
                 self._doubt_gap(gap, before, turn is not None, heading, model)
+            if line.doubt is not None:
+                distance, angle = model.kinematics.moved(line.doubt)
+                uncertainty.miss("gap", distance, 0.0 if turn is not None else angle, heading)
             if turn is not None and turn.doubt:
                 uncertainty.miss("gyro", 0.0, turn.doubt, heading)
             for side, angles in doubts:
