@@ -73,6 +73,9 @@ class Lateness(Struct):
         """
         before_ns, self.looked_ns = self.looked_ns, now_ns
         passed_ns = 0 if before_ns is None else now_ns - before_ns
+        if passed_ns < setup.late_step_ns and not self.late_s:
+            self.step_s = 0.0
+            return good and setup.mcu.simulated
         step_s = self.step_s = passed_ns / NS_PER_S if passed_ns >= setup.late_step_ns else 0.0
         late_s = step_s if step_s > self.late_s else self.late_s
         self.late_s = 0.0 if good else late_s

@@ -130,18 +130,20 @@ class McuSession(Struct):
             self.events = []
         if self.status.new or self.status.forgot:
             self.status.begin_update()
-        feedback = []
+        now_ns, link, echo, is_settled = now.mono_ns, self._link, self._echo, False
+        feedback: list[Feedback] = []
         if not port_open or opened != self._opened:
-            self._begin(setup, port_open, opened, now.mono_ns)
+            self._begin(setup, port_open, opened, now_ns)
         if port_open:
-            for piece in received:
-                feedback += self._decode(setup, piece)
-            if received and (more := self._lines.too_long - self.rejects.get("too_long", 0)):
-                self._reject("too_long", more=more)
-                self._link.bad(setup.checked)
+            if received:
+                for piece in received:
+                    feedback += self._decode(setup, piece)
+                if more := self._lines.too_long - self.rejects.get("too_long", 0):
+                    self._reject("too_long", more=more)
+                    link.bad(setup.checked)
             lateness = self.lateness
-            if lateness.record_step(setup, now.mono_ns, good=bool(feedback)):
-                self._link.reset_silences()
+            if lateness.record_step(setup, now_ns, good=bool(feedback)):
+                link.reset_silences()
             if (
                 lateness.step_s
                 and lateness.step_s < WATCHDOG_S
@@ -151,15 +153,24 @@ class McuSession(Struct):
                 # The board may have had nothing to answer. Before its watchdog has stopped the
                 # motors, a stop without a ramp would only shake the robot. `Robot` makes such a
                 # stop anyway after `WRITE_PAUSE_S`.
-                self._link.wait(now.mono_ns, setup.quiet_ns)
-            self._judge(setup, now.mono_ns)
+                link.wait(now_ns, setup.quiet_ns)
+            # A link that is up stays up until one of these is false.
+            is_settled = (
+                link.state == "up"
+                and now_ns <= link.silent_ns
+                and now_ns - echo.since_ns < WINDOW_NS
+                and not (self._held_up or self.blocked or echo.trouble)
+                and self.status.up_ns is None
+            )
+            if not is_settled:
+                self._judge(setup, now_ns)
         if feedback and self.doubt.judge(
             setup, self._timeline, self.good_lines, self.count_recovery.coarse_lines
         ):
             self._announce_doubt()
         if self._rejected:
             self._announce_rejects()
-        if (self._link.state, self._trouble, self.blocked) != self._announced:
+        if not is_settled and (link.state, self._trouble, self.blocked) != self._announced:
             self._announce(setup)
         return feedback
 
@@ -458,8 +469,9 @@ class McuSession(Struct):
         since_ns = self._link.good(read_at.mono_ns, setup.quiet_ns)
         silent = since_ns is None or since_ns > setup.quiet_ns
         feedback = self._timeline.place(setup, speeds, reading, following, length, silent, asked_ns)
-        if more := self._timeline.leaps - self.rejects.get("count_leap", 0):
-            self._reject("count_leap", more=more)
-        if self._timeline.restarted:
-            self._restart("has restarted: its clock went back")
+        if reading is not None:
+            if more := self._timeline.leaps - self.rejects.get("count_leap", 0):
+                self._reject("count_leap", more=more)
+            if self._timeline.restarted:
+                self._restart("has restarted: its clock went back")
         return self.count_recovery.recover_counts(feedback, setup.count)
