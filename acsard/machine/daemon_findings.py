@@ -222,7 +222,8 @@ def link(running: Running) -> Iterator[Finding]:
             )
         yield Finding("link", "ok", text)
     if state.wheel_fault:
-        yield Finding("wheels", "warning", state.wheel_fault, mend)
+        advice = mend if config.feedback.encoders else NO_ENCODERS_ADVICE
+        yield Finding("wheels", "warning", state.wheel_fault, advice)
     yield from _emergency_stop(config, state, mend)
     yield from _bumpers(config, state, mend)
     yield from _battery(config.battery, state.battery, mend)
@@ -357,8 +358,12 @@ OTHER_VERSION_ADVICE = (
     "if the daemon has another version of acsard, run this tool from the same version"
 )
 
-SIGN_ADVICE = (
-    "or let the clients sign their commands (deploy/clients/README.md): signed commands do not "
+NO_ENCODERS_ADVICE = (
+    "nothing is wrong if the robot has no encoders; else set feedback.encoders = true"
+)
+
+ECHO_ADVICE = (
+    "or let the clients echo the key beat (deploy/clients/README.md): commands with an echo do not "
     "need a common clock"
 )
 
@@ -521,7 +526,7 @@ def clocks(running: Running) -> Iterator[Finding]:
             "clock",
             "warning",
             text,
-            f"let NTP set the clocks of both machines (timedatectl), {SIGN_ADVICE}",
+            f"let NTP set the clocks of both machines (timedatectl), {ECHO_ADVICE}",
         )
     replaced = counters.get("stamps_replaced", 0)
     if replaced:
@@ -530,7 +535,7 @@ def clocks(running: Running) -> Iterator[Finding]:
             "replaced the time stamps of these commands"
         )
         yield Finding(
-            "clock", "warning", text, f"let NTP set the clocks of daemon and clients, {SIGN_ADVICE}"
+            "clock", "warning", text, f"let NTP set the clocks of daemon and clients, {ECHO_ADVICE}"
         )
 
 

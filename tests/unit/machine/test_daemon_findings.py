@@ -19,6 +19,7 @@ from acsard.core.config.settings import (
     BusConfig,
     Config,
     DriveConfig,
+    FeedbackConfig,
     McuConfig,
     RobotConfig,
     SafetyConfig,
@@ -31,6 +32,7 @@ from acsard.core.messages.schema import (
     RobotState,
     Time,
 )
+from acsard.core.motion.consistency import NO_ENCODERS
 from acsard.core.values import GyroDoes
 from acsard.host.errors import CertificateError, NoAnswerError, UsageError
 from acsard.machine import daemon_findings
@@ -219,6 +221,9 @@ def situations() -> dict[str, Iterable[Finding]]:
         "losses by the board, too": link_findings({}, {"link_lost": 5, "link_lost_host_stall": 3}),
         "losses of the simulator": link_findings({}, {"link_lost": 2}, Config()),
         "a wheel fault": board(wheel_fault="rear left: its encoder stands"),
+        "no encoders": board(
+            replace(CONFIG, feedback=FeedbackConfig(encoders=False)), wheel_fault=NO_ENCODERS
+        ),
         **{
             f"an emergency stop: {now}": board(emergency_stop=now)
             for now in ("pressed", "silent", "released")
