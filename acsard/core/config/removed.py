@@ -14,6 +14,7 @@ _SIM = "remove the key: the simulated robot has an ideal gyro, even wheels and a
 REMOVED = {
     "control.auto_activate": "remove the key: `acsard call deactivate` lasts over restarts",
     "feedback.wheel_acceleration": "remove the key: the bound is 1500 rad/s2",
+    "feedback.fault_time": "remove the key: feedback.response_time bounds how late a wheel obeys",
     "battery.return_below": "remove the key: use battery.warning_below",
     "battery.hysteresis": "remove the key: a level ends 0.5 V or % above its threshold",
     "commands.neutral_first": 'remove the key: a source may have neutral_first = "pause"',
