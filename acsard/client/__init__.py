@@ -9,7 +9,8 @@
 `connect` is for scripts and `connect_async` for asyncio programs. Both offer the same methods and
 typed messages (`acsard.core.messages.schema`). The daemon refuses late commands, and requires a
 zero (a command with the speed 0) from each sender before that sender may move the robot. The client
-follows these rules: it signs, numbers and stamps its commands, and sends zeros before each drive.
+follows these rules: each command has its sender, a number and the newest beat of the daemon, and
+zeros come before each drive.
 When the `with` block ends, even with an exception, the client sends zeros until the robot stands,
 for up to 2 s, if its last command was not zero. `drive` raises an error if the robot does not
 follow the commands. When `drive` returns, the robot stands still, unless something else moves it.
