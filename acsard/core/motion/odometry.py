@@ -94,7 +94,10 @@ class Odometry(Struct):
         self.positions = plus(self.positions, rolled)
         moved = model.kinematics.moved
         linear, angular = moved(believed)
-        distance, angle = moved(wheels.believed(rolled) if wheels.leaves_out else rolled)
+        if wheels.leaves_out:
+            distance, angle = moved(plus(wheels.believed(rolled), wheels.repair))
+        else:
+            distance, angle = moved(rolled)
         variance = 0.0
         if turn is not None:
             angle, angular, variance = turn.angle, turn.rate, turn.variance

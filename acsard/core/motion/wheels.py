@@ -4,8 +4,9 @@ The expected speed is the command behind a lag of `feedback.response_time`. Meas
 is summed to an angle (`Wheel.off`), which leaks only while both agree. Beyond 1 rad and 3 counts, a
 wheel that came no nearer to its command for three response times does not obey it: a fault if it
 rolls on, too far or the wrong way, else a warning. A wheel that contradicts the other wheel of its
-side, and also the command or the gyro, is left out of the pose until both agree for 2 s. A line
-only adds its angles: all else runs on the sums of `BLOCK_S`.
+side, and also the command or the gyro, is left out of the pose until both agree for 2 s, and the
+pose gets back what this wheel falsified before. A line only adds its angles: all else runs on the
+sums of `BLOCK_S`.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from msgspec import Struct
 from acsard.core.codes import Code, Reason, joined, reason
 from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.codec import Motors
+from acsard.core.motion.gaps import times
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import (
     STILL,
@@ -57,7 +59,9 @@ TOO_FAST, TOO_FAST_S = 1.2, 1.0  # times the largest output of the limiter
 PACE_S = 1.5  # faster or slower by `AGREEMENT`, until this is a warning: 2 s with the smoothing
 ROUNDING = 0.006  # rad/s, of a reported speed
 HELD_S = 2.0  # for which a wheel repeats one speed at rest, until this is a warning
-SAME_S = 0.1  # for which a wheel reports one speed, until its encoder may be stuck
+# For which a wheel reports one speed, until its encoder may be stuck, and is although the other
+# wheel of its side differs little.
+SAME_S, PROVEN_S = 0.1, 1.0
 
 COMMANDED = 0.005  # rad/s: a line to the board shows a lower one as 0.00
 
@@ -90,7 +94,8 @@ class Block(NamedTuple):
 
     s: Seconds
     angles: Motors
-    speeds: Motors  # in the last line
+    line: Motors  # the angles of the last line
+    speeds: Motors  # in it
     unit: Rad  # of an encoder count
     limit: Rad  # evidence of a fault
     patience: Seconds  # without an approach
@@ -118,6 +123,7 @@ class Wheel(Struct):
     pace_angle: Rad = 0.0
     reported: RadPerS = 0.0  # in the last line
     same_s: Seconds = 0.0  # for which it repeats this speed
+    ignored_s: Seconds = 0.0  # for which the command fell meanwhile; inf: it grew after the stop
     warning: Code | None = None
 
 
@@ -134,6 +140,7 @@ class Side(Struct):
     net: Rad = 0.0  # recent sum of the mean
     why: str = ""  # the sign of a faulty encoder that one wheel shows
     suspect: int = -1  # this wheel, by `WHEELS`; -1: it may be either
+    before: Rad = 0.0  # front minus rear in the block before the first one with this sign
     votes: int = 0  # blocks with this sign, with the angles in them
     front: Rad = 0.0
     rear: Rad = 0.0
@@ -164,6 +171,7 @@ class Wheels(Struct):
     leaves_out: bool = False
     slips: bool = False  # the wheels of a side contradict each other
     missed: tuple[tuple[SideName, Motors], ...] = ()  # by both wheels of a side
+    repair: Motors = NOTHING  # what the pose still has of a wheel that is left out now, rad
     fault: Reason | None = None
     pushed: str = ""
     events: tuple[Event, ...] = ()
@@ -195,7 +203,7 @@ class Wheels(Struct):
             self.by_gyro = False
         else:
             self.turn += turn
-        self.events, self.fault, self.pushed = (), None, ""
+        self.events, self.fault, self.pushed, self.repair = (), None, "", NOTHING
         apart = self.apart
         if seconds < BLOCK_S and (
             self.lines == 1
@@ -207,7 +215,7 @@ class Wheels(Struct):
             return
         if feedback.encoders and seconds > 0.0:
             self.apart = OUT_COUNTS * count + OUT_ANGLE
-            self._judge(speeds.as_tuple(), feedback.response_time, kinematics, count)
+            self._judge(turned, speeds.as_tuple(), feedback.response_time, kinematics, count)
         self._begin()
 
     def forget(self) -> None:
@@ -237,7 +245,9 @@ class Wheels(Struct):
         for side, (name, front, rear) in zip(self.sides, SIDES, strict=True):
             if side.out >= 0 and side.why != "repeats":
                 values = [0.0] * 4
-                values[side.out] = wheels[side.out] - wheels[front + rear - side.out]
+                values[side.out] = (
+                    wheels[side.out] - wheels[front + rear - side.out] - self.repair[side.out]
+                )
                 found.append((name, _motors(values)))
         return found
 
@@ -261,14 +271,16 @@ class Wheels(Struct):
         for side in self.sides:
             side.peak = side.next_peak = 0.0
 
-    def _judge(self, speeds: Motors, lag: Seconds, kinematics: Kinematics, count: Rad) -> None:
+    def _judge(
+        self, line: Motors, speeds: Motors, lag: Seconds, kinematics: Kinematics, count: Rad
+    ) -> None:
         s, angles, commanded = self.seconds, self.angles, self.commanded
         if s > MAX_BLOCK_S:
-            angles = _motors([angle * MAX_BLOCK_S / s for angle in angles])
-            s = MAX_BLOCK_S
+            share, s = MAX_BLOCK_S / s, MAX_BLOCK_S
+            angles, line = times(angles, share), times(line, share)
         limit, patience = max(FAULT_ANGLE, FAULT_COUNTS * count), FAULT_RESPONSES * lag
         rest = REST_S + 2 * count * kinematics.radius / LEAST_SPEED
-        block = Block(s, angles, speeds, count, limit, patience, rest)
+        block = Block(s, angles, line, speeds, count, limit, patience, rest)
         if commanded is None:
             self._drop()
             for wheel, angle in zip(self.wheels, angles, strict=True):
@@ -288,7 +300,7 @@ class Wheels(Struct):
         self._compare(block, kinematics)
 
     def _obey(self, block: Block, due: tuple[Rad, Rad]) -> None:
-        s, angles, speeds, _, limit, patience, _ = block
+        s, angles, _, speeds, _, limit, patience, _ = block
         fastest = 0.0
         for i, wheel in enumerate(self.wheels):
             k, angle = SIDE_OF[i], angles[i]
@@ -303,14 +315,18 @@ class Wheels(Struct):
             _follow(wheel, angle, due[k], block)
             if speeds[i] == wheel.reported != 0.0 and abs(angle - speeds[i] * s) < ROUNDING * s:
                 wheel.same_s += s
+                if not still and abs(command) < (1.0 - AGREEMENT) * abs(speeds[i]):
+                    wheel.ignored_s += s
             else:
-                wheel.same_s, wheel.reported = 0.0, speeds[i]
+                grew = still and abs(speeds[i]) > abs(wheel.reported)
+                wheel.same_s, wheel.ignored_s = 0.0, math.inf if grew else 0.0
+                wheel.reported = speeds[i]
             if wheel.rested and abs(wheel.off) >= limit:
                 fastest, wheel.off = max(fastest, abs(wheel.speed)), 0.0
             if not wheel.rested:
                 self._pace(i, wheel, due[k], block)
                 if not wheel.agrees and abs(wheel.off) >= limit and wheel.apart_s >= patience:
-                    self._disobeys(i, wheel, angle)
+                    self._disobeys(i, wheel, angle, block.unit)
             if still and wheel.same_s >= HELD_S and wheel.apart_s >= HELD_S:
                 self._warn(i, wheel, "wheel_stuck")
             elif wheel.warning and _obeys_again(wheel):
@@ -344,15 +360,17 @@ class Wheels(Struct):
             if wheel.pace_s <= 0.0:
                 wheel.pace_s = wheel.pace_angle = 0.0
 
-    def _disobeys(self, i: int, wheel: Wheel, angle: Rad) -> None:
+    def _disobeys(self, i: int, wheel: Wheel, angle: Rad, count: Rad) -> None:
         speed, off, command = wheel.speed, wheel.off, wheel.command
         if self._are_swapped(i):
             return
         # The smoothed speed of a coarse encoder lasts longer than the motion.
         goes_on = angle * off > 0.0 and speed * off > 0.0
         if goes_on and abs(command) < COMMANDED:
-            # A speed that never changes is no motion, but the firmware's or the encoder's.
-            if wheel.same_s < wheel.apart_s:
+            # A firmware that waits for the next count keeps the last speed of a wheel that stops:
+            # it followed the command until the last two counts, and never changes after them.
+            kept = wheel.ignored_s <= max(MAX_BLOCK_S, 2 * count / abs(speed))
+            if not (kept and wheel.same_s >= wheel.apart_s):
                 self._latch("wheel_runaway", i, command)
         elif goes_on and off * command > 0.0:
             if abs(speed) > abs(command):
@@ -442,7 +460,7 @@ class Wheels(Struct):
 
     def _agree(self, side: Side, block: Block) -> None:
         if side.out < 0:
-            side.why = ""
+            side.why, side.before = "", 0.0
         elif side.rolled > OUT_COUNTS * block.unit + OUT_ANGLE:
             side.good_s += block.s
             if side.good_s >= AGAIN_S:
@@ -463,12 +481,13 @@ class Wheels(Struct):
         if sign[0] == "still" and not one == other == 0.0:
             sign = "still", front if abs(one) < abs(other) else rear
         same = [i for i in (front, rear) if self.wheels[i].same_s >= SAME_S]
-        if same and not sign[0]:
+        if len(same) == 1 and not sign[0]:
             sign = "repeats", same[0]
         if sign != (side.why, side.suspect):
             side.why, side.suspect = sign
             side.votes, side.front, side.rear, side.low, side.high = 0, 0.0, 0.0, 0.0, 0.0
         if not side.why:
+            side.before = one - other
             return False
         side.votes += 1
         side.front += one
@@ -486,10 +505,19 @@ class Wheels(Struct):
             or min(off_front, off_rear) > apart / 2
             or side.suspect not in (-1, out)
             # An even wheel may be right, and the other one slip.
-            or (side.why == "repeats" and apart < AGREEMENT * max(abs(side.front), abs(side.rear)))
+            or (
+                self.wheels[out].same_s < PROVEN_S
+                and side.why == "repeats"
+                and apart < AGREEMENT * max(abs(side.front), abs(side.rear))
+            )
         ):
             return False
         side.out, side.slip_s = out, 0.0
+        # The pose has the last line right, and the lines before it wrong.
+        missed = side.rear - side.front - side.before - block.line[rear] + block.line[front]
+        repair = list(self.repair)
+        repair[out] = missed if out == front else -missed
+        self.repair = _motors(repair)
         self._tell(_out_text(side), "left out")
         return True
 

@@ -1,8 +1,8 @@
-"""Simulated drives of four encoders, of which one may fail, for the tests of `wheel_faults.py`.
+"""Simulated drives of four encoders, of which one may fail, for the tests of `wheels.py`.
 
 Each wheel has its own motor lag, tyre and load, and starts at a random position within one count. A
 line reports counts divided by its period in two decimals. These drives test the module
-`core/motion/wheel_faults.py`, so this module uses only numpy and shares no code with it. The seed
+`core/motion/wheels.py`, so this module uses only numpy and shares no code with it. The seed
 determines everything that a robot does.
 """
 
