@@ -72,6 +72,9 @@ PARTNER_FRACTION, PARTNER_COUNTS, PARTNER_ANGLE, PARTNER_DELAY_S = 0.05, 1.2, 0.
 PARTNER_S, PARTNER_S_PER_RAD = 0.14, 5.0
 OUT_COUNTS, OUT_ANGLE = 3.5, 0.05  # by which they must differ until one is left out
 OUT_BLOCKS = 2
+TURNING = (
+    4.0  # largest ratio of the command and the expected speed: above it, the wheels turn around
+)
 AGAIN_S = 2.0  # of agreement, until the pose uses a wheel again
 SLIP_S, SLIP_REPORTED_S = 0.5, 0.1  # after the last contradiction, and after the first one
 
@@ -473,7 +476,7 @@ class Wheels(Struct):
     def _leave_out(self, k: int, side: Side, low: Rad, high: Rad, block: Block) -> bool:
         # A wheel is left out if it shows a sign of a faulty encoder, and is farther from what a
         # healthy one rolls by a third of the difference.
-        if low * high <= 0.0:
+        if low * high <= 0.0 or max(low / high, high / low) > TURNING:
             return False  # near rest, or while the direction changes, a healthy wheel may do both
         _, front, rear = SIDES[k]
         one, other = block.angles[front], block.angles[rear]
