@@ -92,8 +92,8 @@ CASES = (
         "case 9",
         "healthy motors that lag latch the fault `runaway`",
         WHEELS_LAW,
-        "if approaches or farther",
-        "if farther",
+        "elif approaches:",
+        "elif False:",
     ),
     fault(
         "case 10",
