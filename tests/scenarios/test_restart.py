@@ -107,7 +107,7 @@ class Host:
             case "inactive":
                 assert self.world.call("deactivate").success
             case "fault":
-                with self.world.mcu.dead_motor(self.dice.randrange(4)):
+                with self.world.mcu.reversed_motor(self.dice.randrange(4)):
                     self.patrols(2 * CYCLE_S)
         assert self.world.state.mode == MODES[kind]
 
@@ -202,20 +202,20 @@ def test_an_event_of_the_latch_file_reaches_the_log() -> None:
 
 
 @pytest.mark.slow
-def test_a_fault_over_a_stop_takes_two_calls_after_a_restart_as_before() -> None:
+def test_a_fault_over_a_stop_takes_two_plain_clears_after_a_restart_as_before() -> None:
     host = Host(random.Random(3))
     host.patrols(2 * CYCLE_S)
     host.latch("fault")
     assert host.world.call("stop").success
     host.restart()
-    host.patrols(CYCLE_S)
+    host.patrols(2 * CYCLE_S)
     assert host.world.state.mode == "fault"
-    host.release("fault")
+    host.world.ask("srv/clear")
     assert host.world.state.mode == "stopped"
     host.restart()
-    host.patrols(CYCLE_S)
+    host.patrols(2 * CYCLE_S)
     assert host.world.state.mode == "stopped"
-    host.release("stop")
+    host.world.ask("srv/clear")
     host.patrols(2 * CYCLE_S)
     assert host.world.state.mode == "driving"
 
