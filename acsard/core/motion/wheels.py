@@ -390,7 +390,9 @@ class Wheels(Struct):
         if abs(command) < SWAPPED_FRACTION * max(abs(one.command), abs(other.command)):
             return False
         both = one.speed + other.speed - one.due - other.due
-        if abs(both) > 0.75 * abs(due) or (one.speed - other.speed) * due >= -due * due / 2:
+        turning = one.speed - other.speed
+        # Wheels that are quicker than expected turn as commanded, but not as is due.
+        if abs(both) > 0.75 * abs(due) or turning * due >= -due * due / 2 or turning * command >= 0:
             return False
         names = f"{WHEELS[i]} and {WHEELS[ACROSS[i]]}"
         figures = (

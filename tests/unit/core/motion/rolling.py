@@ -202,6 +202,25 @@ def sound(seed: int, seconds: float) -> tuple[Robot, Findings]:
     return made, bench.said
 
 
+def restless(seed: int, seconds: float) -> tuple[Robot, Findings]:
+    """Drive a sound robot whose stick moves to and fro between two wishes, on slopes."""
+    dice = random.Random(seed)
+    made = robot(dice)
+    bench = Bench(made, dice)
+    while bench.now < seconds:
+        one, other = twist(dice, made), twist(dice, made)
+        if dice.random() < 0.5:
+            other = Twist(one.linear * dice.uniform(-1, 1), one.angular * dice.uniform(-1, 1))
+        each, until = dice.uniform(0.1, 2.5), bench.now + dice.uniform(2.0, 20.0)
+        slope = dice.uniform(0.75, 1.15)
+        bench.cap = made.speed * dice.uniform(0.2, 1.0) if dice.random() < 0.2 else math.inf
+        while bench.now < until:
+            bench.gain = slope * (dice.uniform(0.6, 1.1) if dice.random() < 0.1 else 1.0)
+            bench.hold(one, each * dice.uniform(0.5, 1.5))
+            bench.hold(other, each * dice.uniform(0.5, 1.5))
+    return made, bench.said
+
+
 class Case(Struct, frozen=True):
     robot: Robot
     kind: Kind

@@ -34,7 +34,7 @@ from tests.unit.core.motion.liars import (
     rolled,
     wishes,
 )
-from tests.unit.core.motion.rolling import RIGHT, Kind, faulty, sound
+from tests.unit.core.motion.rolling import RIGHT, Kind, faulty, restless, sound
 from tests.unit.core.motion.test_odometry import Says
 
 TEN = WheelSpeeds(10.0, 10.0, 10.0, 10.0)
@@ -131,6 +131,15 @@ def test_sound_robots_latch_no_fault(robots: int, seconds: float) -> None:
         assert (said.faults, said.left_out) == ([], set()), (seed, made, said)
         pushes += said.pushes
     assert pushes
+
+
+@pytest.mark.parametrize(
+    "seed", [31, *(pytest.param(seed, marks=SOAK) for seed in range(100, 200))]
+)
+def test_sound_robots_whose_stick_moves_to_and_fro_latch_no_fault(seed: int) -> None:
+    """The motors of robot 31 are quicker than configured, so they turn before they are due."""
+    made, said = restless(seed, 10.0 if seed == 31 else 60.0)
+    assert said.faults == [], made
 
 
 def test_wheels_that_roll_on_after_a_stop_are_a_fault_at_any_speed() -> None:
