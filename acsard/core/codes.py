@@ -106,7 +106,8 @@ too_old
     count: the network delays it
 round_trip
     the round trip to {source} takes {note} s, but its timeout allows at most {seconds:g} s;
-    -> raise the timeout of the source in commands.sources, or look for what delays the network
+    -> echo the newest beat, not an old one; if the network is as slow, raise the timeout of the
+    source in commands.sources
 not_newer
     a command of {source} is not newer than the last accepted one of its sender: the network
     repeated or swapped commands, or the sender's stamps or numbers do not rise
