@@ -113,6 +113,7 @@ class Wheel(Struct):
     agrees: bool = True
     approaches: bool = False  # in the last block
     apart_s: Seconds = 0.0  # since it came nearer to its command
+    apart_angle: Rad = 0.0  # that it rolled since then
     speed_then: RadPerS = 0.0  # when it did
     command_then: RadPerS = 0.0
     reacts: bool = False  # it came nearer since the command last moved away from it
@@ -270,7 +271,8 @@ class Wheels(Struct):
     def _drop(self) -> None:
         self.begins = True
         for wheel in self.wheels:
-            wheel.off = wheel.apart_s = wheel.fast_s = wheel.fast_angle = wheel.missed = 0.0
+            wheel.off = wheel.fast_s = wheel.fast_angle = wheel.missed = 0.0
+            wheel.apart_s = wheel.apart_angle = 0.0
         for side in self.sides:
             side.peak = side.next_peak = 0.0
 
@@ -311,7 +313,7 @@ class Wheels(Struct):
             still = -COMMANDED < command < COMMANDED
             if not still:
                 if wheel.rested:
-                    wheel.off = wheel.apart_s = 0.0
+                    wheel.off = wheel.apart_s = wheel.apart_angle = 0.0
                 wheel.rested, wheel.rest_s, wheel.rest_angle = False, 0.0, 0.0
             elif not wheel.rested:
                 _rest(wheel, angle, block)
@@ -368,7 +370,8 @@ class Wheels(Struct):
         if self._are_swapped(i):
             return
         # The smoothed speed of a coarse encoder lasts longer than the motion.
-        goes_on = angle * off > 0.0 and speed * off > 0.0
+        rolled = abs(wheel.apart_angle) >= AGREEMENT * abs(speed) * wheel.apart_s
+        goes_on = angle * off > 0.0 and speed * off > 0.0 and rolled
         if goes_on and abs(command) < COMMANDED:
             # A firmware that waits for the next count keeps the last speed of a wheel that stops:
             # it followed the command until the last two counts, and never changes after them.
@@ -408,7 +411,7 @@ class Wheels(Struct):
             figures = f"(commanded {command:.2f}, measured {wheel.speed:.2f} rad/s)"
             self.fault = joined(reason(code, part=name, wheel=name, figures=figures))
         # Another fault needs new evidence: the robot stops now.
-        wheel.off = wheel.apart_s = wheel.fast_s = wheel.fast_angle = 0.0
+        wheel.off = wheel.apart_s = wheel.apart_angle = wheel.fast_s = wheel.fast_angle = 0.0
 
     def _warn(self, i: int, wheel: Wheel, code: Code | None) -> None:
         if code == wheel.warning:
@@ -583,12 +586,13 @@ def _follow(wheel: Wheel, angle: Rad, due: Rad, block: Block) -> None:
         away, nearer, farther = -away, -nearer, -farther
     approaches = wheel.approaches = nearer > APPROACH * away + 2 * count * share
     if away <= AGREEMENT * max(turns, size) or farther > AGREEMENT * away:
-        wheel.apart_s, wheel.speed_then, wheel.command_then = 0.0, speed, command
-        wheel.reacts = False
+        wheel.apart_s, wheel.apart_angle = 0.0, 0.0
+        wheel.speed_then, wheel.command_then, wheel.reacts = speed, command, False
     elif approaches:
-        wheel.apart_s, wheel.speed_then, wheel.reacts = 0.0, speed, True
+        wheel.apart_s, wheel.apart_angle, wheel.speed_then, wheel.reacts = 0.0, 0.0, speed, True
     else:
         wheel.apart_s += s
+        wheel.apart_angle += angle
         if nearer < 0.0 and not wheel.reacts:
             wheel.speed_then = speed  # the worst one counts
 

@@ -161,6 +161,14 @@ def test_a_reversed_wheel_is_a_fault_although_its_command_goes_up_and_down(half:
     assert bench.faults[:1] == ["wheel_reversed"]
 
 
+def test_a_slow_motor_that_has_come_to_rest_is_no_fault_whatever_counts_are_assumed() -> None:
+    """The smoothed speed of a coarse encoder falls for a second, longer than the motor turns."""
+    bench = driven(all_at(18.0), counts=0)
+    for step in range(300):
+        bench.run(all_at(18.0 * math.exp(-step * PERIOD / 0.342)), STILL, seconds=PERIOD)
+    assert bench.faults == []
+
+
 def test_four_wheels_without_power_are_a_warning() -> None:
     bench = Bench()
     bench.run(STILL, TEN, seconds=1.0)
