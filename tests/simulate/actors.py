@@ -112,7 +112,8 @@ class Run:
         self._asked_ns: int | None = None  # the daemon asked the board for its name
         self.half_duplex = HalfDuplex()
         self.followed, self.course = Followed(self.witness), Course(self.witness)
-        self.wheels, self.impossible = Wheels(self.witness), Impossible(self.witness)
+        self.impossible = Impossible(self.witness)
+        self.wheels = Wheels(self.witness, lambda: self.product.state())
         self.causes = Causes()
         self.counts: Counter[str] = self.witness.counts
         self.liveness = Liveness(self)

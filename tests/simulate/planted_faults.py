@@ -24,8 +24,10 @@ PLANS_OF_FAULT = {
     "neutral stall": "stall behind a zero", "neutral place": "stall",
     "driver release": "behind a press",
     "wheel press": "behind a press",
-    "wheel waited": "late lines", "limits saturated": "wheel limit",
+    "limits saturated": "wheel limit",
     "replay": "recorded", "lines endless": "endless", "wheel reversed": "reversed_motor",
+    "wheel runaway": "slow wheels", "wheel fast": "gain",
+    "wheel blocked": "dead_motor",
     "session gap": "mute", "session stale": "mute", "odometry silent": "mute",
     "odometry gap": "mute",
     "loop end": "restart", "robot end": "restart", "gate late": "stall in step",
@@ -83,6 +85,9 @@ EMERGENCY_STOP, BUMPERS, BATTERY = (
     "core/motion/bumpers.py",
     "core/motion/battery.py",
 )
+
+LINK_FIELD = "    _link: Link = field(default_factory=Link)\n"
+"""A field of the session, behind which a fault adds one of its own."""
 
 BLIND_GUARD = Edit(GUARD, 'return (self._stop, trip) if trip else (line, "")', 'return line, ""')
 """The guard passes every line."""
@@ -587,30 +592,32 @@ FAULTS = (
         "session first",
         "the first line to a board that was plugged in waits for a second",
         SESSION,
-        "        if self.silent(now_ns):\n",
+        "        if now_ns > self._link.silent_ns:\n",
         "        if now_ns - self._opened_ns < NS_PER_S:\n            return None\n"
-        "        if self.silent(now_ns):\n",
+        "        if now_ns > self._link.silent_ns:\n",
         Edit(
             SESSION,
             '        self._link.apply("opened" if port_open else "closed")',
             "        self._opened_ns = now_ns\n"
             '        self._link.apply("opened" if port_open else "closed")',
         ),
+        Edit(SESSION, LINK_FIELD, f"{LINK_FIELD}    _opened_ns: int = 0\n"),
     ),
     fault(
         "session deaf",
         "behind a damaged line the next five lines are ignored",
         SESSION,
         "        if self._echo.trouble:\n            self._reject",
-        "        self._deaf = getattr(self, '_deaf', 0) - 1\n"
+        "        self._deaf -= 1\n"
         "        if self._deaf > 0:\n            return None\n"
         "        if self._echo.trouble:\n            self._reject",
         Edit(
             SESSION,
-            "                self._reject(error.reason, line)\n                self._link.bad()",
-            "                self._reject(error.reason, line)\n                self._link.bad()\n"
-            "            self._deaf = 6",
+            "self._link.bad(setup.checked)\n            return None\n        if",
+            "self._link.bad(setup.checked)\n            self._deaf = 6\n"
+            "            return None\n        if",
         ),
+        Edit(SESSION, LINK_FIELD, f"{LINK_FIELD}    _deaf: int = 0\n"),
     ),
     fault(
         "gate late",
@@ -623,7 +630,7 @@ FAULTS = (
         "lines endless",
         "a line without an end fills the memory",
         "core/link/lines.py",
-        "            if len(self._held) >= MAX_LINE_BYTES:",
+        "            if len(self.held) >= MAX_LINE_BYTES:",
         "            if False:",
     ),
     fault(
@@ -709,8 +716,8 @@ FAULTS = (
         "session echo",
         "an echo beside the replies of a board is not noticed",
         "core/link/echo_check.py",
-        "least, changes = min(self._lines, RETURNED_FRACTION * self._written_lines), self._changes",
-        "least, changes = self._lines, self._changes",
+        "least, changes = min(self.lines, RETURNED_FRACTION * self.written_lines), self.changes",
+        "least, changes = self.lines, self.changes",
     ),
     # log
     fault(
@@ -750,25 +757,11 @@ FAULTS = (
         "elif False and",
     ),
     fault(
-        "wheel swapped",
-        "wheels that turn as commanded to the other side are not named",
-        WHEELS_LAW,
-        "if abs(both) > 0.75 * abs(due) or",
-        "if True or",
-    ),
-    fault(
         "wheel blocked",
         "a wheel that does not turn is not reported",
         WHEELS_LAW,
         "elif off * command < 0.0 and abs(speed) < AGREEMENT * abs(command):",
         "elif False:",
-    ),
-    fault(
-        "wheel stuck",
-        "a wheel that repeats one speed at rest is not reported",
-        WHEELS_LAW,
-        "if still and wheel.same_s >= HELD_S and",
-        "if False and wheel.same_s >= HELD_S and",
     ),
     fault(
         "wheel reversed",
@@ -950,13 +943,6 @@ FAULTS = (
         WHEELS_LAW,
         "                _rest(wheel, angle, block)\n        else:",
         "                pass\n        else:",
-    ),
-    fault(
-        "wheel waited",
-        "the lines of a board that stopped its motors during a stall are a wheel fault",
-        ROBOT,
-        "wheels.late = self.session.lateness.step_s > WRITE_PAUSE_S",
-        "wheels.late = False",
     ),
     fault(
         "driver cut",

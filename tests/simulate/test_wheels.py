@@ -26,7 +26,7 @@ def drives(
 ) -> None:
     """Judge a robot whose first `wheels` wheels have this speed, all rad/s."""
     witness = Witness(CONFIG)
-    judge = Wheels(witness)
+    judge = Wheels(witness, dict)
     witness.last = (command,) * 4
     for n in range(200, 200 + round(seconds * 100)):
         speeds = [speed] * wheels + [command] * (4 - wheels)
@@ -71,7 +71,7 @@ def test_motors_that_are_swapped_between_the_sides_are_found_in_the_first_turn(
 ) -> None:
     config = CONFIG | {"mcu": {"port": "/dev/board"}, "drive": {}}
     witness = Witness(config)
-    judge, witness.lies = Wheels(witness), [("swapped_motors", motors)]
+    judge, witness.lies = Wheels(witness, dict), [("swapped_motors", motors)]
     witness.last = (1.0, left, left, 1.0)
     with pytest.raises(BrokenError, match="swapped") if finding else nullcontext():
         for n in range(200, 200 + round(seconds * 100)):
@@ -92,3 +92,18 @@ def test_speeds_that_no_wheel_can_have_are_a_fault(
             speed = b"95.00" if n < fast else b"05.00"
             judge.fed(b"ap05.00,bn05.00,cp" + speed + b",dp05.00\r\n", others)
             judge.step(n, mode)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text", "finding"),
+    [(2.8, "", False), (3.8, "", True), (9.0, "front_left wheel is blocked, or", False),
+     (9.0, "front_right wheel is blocked, or", True)],
+)  # fmt: skip
+def test_state_names_a_wheel_that_does_not_turn(seconds: float, text: str, finding: bool) -> None:
+    witness = Witness(CONFIG)
+    judge = Wheels(witness, lambda: {"wheel_fault": text})
+    witness.lies = [("dead_motor", (witness.motors[1][0],))]
+    witness.last = (1.0,) * 4
+    with pytest.raises(BrokenError, match="is named") if finding else nullcontext():
+        for n in range(200, 200 + round(seconds * 100)):
+            judge.see(n * NS // 100, [1.0, 0.0, 1.0, 1.0], frozenset(), {"dead_motor"}, 0)

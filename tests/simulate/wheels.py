@@ -4,16 +4,18 @@ The judge knows the true speed of each wheel. A wheel that turns against its com
 stop, must be a latched fault before it has rolled 1 rad and 3 encoder counts. Before that, the
 command must have been constant for three response times. A robot that drives 20 % faster than any
 command of that time must be stopped, too, and one with motors swapped between its sides in its
-first turn.
+first turn. `state` must name a wheel that does not turn.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from typing import get_args
+from collections.abc import Callable
+from typing import Any, get_args
 
 from acsard.core.codes import FaultCode
+from acsard.core.values import WHEELS
 from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.roads import NS
 
@@ -37,6 +39,9 @@ TURNS = 0.05
 TOO_FAST, FAST_NS = 1.25, 3 * NS // 2
 """Share of the fastest command, and the time, after which a robot is certainly too fast."""
 
+
+NAMED_S = 1.5
+"""Within this time more, `state` names the wheel: a coarse encoder is smoothed over a second."""
 
 TURN_RAD, DIFFER = math.radians(45.0), 0.3
 """Commanded turn, with room, in which swapped motors are found, and the share by which the commands
@@ -86,7 +91,8 @@ class Impossible:
 class Wheels:
     """Compares the true speeds of the wheels with the commands on the wire."""
 
-    def __init__(self, witness: Witness) -> None:
+    def __init__(self, witness: Witness, state: Callable[[], dict[str, Any]]) -> None:
+        self._state = state
         config = witness.config
         self._witness = witness
         counts = config.get("sim", {}).get("encoder_counts", 3200)
@@ -101,6 +107,8 @@ class Wheels:
         """Since when the command of each wheel is constant, and nothing else happened."""
         self._rolled = [0.0] * 4
         """Way of each wheel against its command, or on after a stop, rad."""
+        self._missed = [0.0] * 4
+        """Commanded way of each wheel that does not turn, since `state` last named it, rad."""
         self._recent: list[tuple[int, float]] = []
         """Times and the fastest commands of the last three response times, rad/s."""
         self._fast_ns: int | None = None
@@ -109,6 +117,7 @@ class Wheels:
 
     def _forget(self, at_ns: int) -> None:
         self._since_ns, self._rolled, self._fast_ns = [at_ns] * 4, [0.0] * 4, None
+        self._missed = [0.0] * 4
         self._turned = self._apart = 0.0
 
     def see(
@@ -130,7 +139,7 @@ class Wheels:
         while self._recent and self._recent[0][0] < at_ns - self._response_ns - ROOM_NS:
             del self._recent[0]
         self._recent.append((at_ns, fastest))
-        motors = bool(lies) and lies <= MOTORS | {"gain"}
+        motors = bool(lies) and lies <= MOTORS | {"gain", "dead_motor"}
         found = not causes.isdisjoint(FAULTS)
         unseen = passed_ns > NS // 5
         if not motors or found or unseen or calm_ns > at_ns - NS or not witness.linked:
@@ -139,7 +148,8 @@ class Wheels:
         for place, (command, speed) in enumerate(zip(commands, speeds, strict=True)):
             if abs(command - self._commands[place]) > STEADY:
                 self._commands[place], self._since_ns[place] = command, at_ns
-                self._rolled[place] = 0.0
+                self._rolled[place] = self._missed[place] = 0.0
+            self._named(at_ns, place, passed_ns / NS, speed)
             against = abs(speed) > TURNS and speed * command <= 0.0
             if not against or at_ns - self._since_ns[place] < self._response_ns:
                 self._rolled[place] = 0.0
@@ -154,6 +164,23 @@ class Wheels:
         self._too_fast(at_ns, min(map(abs, speeds)))
         if self._is_swapped():
             self._swapped(at_ns, passed_ns / NS, commands[0], commands[1])
+
+    def _named(self, at_ns: int, place: int, seconds: float, speed: float) -> None:
+        """Check that `state` names a wheel that does not turn."""
+        if at_ns - self._since_ns[place] < self._response_ns or abs(speed) > TURNS:
+            return
+        command, motor = abs(self._commands[place]), self._witness.motors[place][0]
+        faults = [name for name, values in self._witness.lies if values[:1] == (motor,)]
+        if faults != ["dead_motor"] or command < 2 * TURNS:
+            return
+        self._missed[place] += command * seconds
+        if self._missed[place] <= self._roll + ROOM_RAD + command * NAMED_S:
+            return
+        self._missed[place] = 0.0
+        self._witness.counts["wheels named"] += 1
+        text = self._state()["wheel_fault"]
+        if f"{WHEELS[place]} wheel is blocked" not in text:
+            raise BrokenError("a wheel that does not turn is named", at_ns, f"{place}: {text!r}")
 
     def _too_fast(self, at_ns: int, slowest: float) -> None:
         """Check that a robot all of whose wheels are too fast is stopped."""
