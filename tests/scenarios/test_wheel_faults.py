@@ -136,7 +136,7 @@ def test_an_encoder_that_works_again_is_used_again() -> None:
     with made.mcu.stuck_encoder(2):
         made.hold(0.5, seconds=1.0)
         assert made.state.wheel_fault
-    made.hold(0.5, seconds=2.5)
+    made.hold(0.5, seconds=2.0)
     assert not made.state.wheel_fault
     assert off(made)[1] < 0.02
 

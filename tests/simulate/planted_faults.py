@@ -746,7 +746,7 @@ FAULTS = (
         "wheel runaway",
         "a wheel that rolls on after a stop is never a fault",
         WHEELS_LAW,
-        "if not (kept and wheel.same_s >= wheel.apart_s):",
+        "if far and not (kept and wheel.same_s >= wheel.apart_s):",
         "if False:",
     ),
     fault(

@@ -376,7 +376,9 @@ class Wheels(Struct):
             # A firmware that waits for the next count keeps the last speed of a wheel that stops:
             # it followed the command until the last two counts, and never changes after them.
             kept = wheel.ignored_s <= max(MAX_BLOCK_S, 2 * count / abs(speed))
-            if not (kept and wheel.same_s >= wheel.apart_s):
+            # A sound wheel comes to rest before it has rolled this far without an approach.
+            far = abs(wheel.apart_angle) >= max(FAULT_ANGLE, FAULT_COUNTS * count)
+            if far and not (kept and wheel.same_s >= wheel.apart_s):
                 self._latch("wheel_runaway", i, command)
         elif goes_on and off * command > 0.0:
             if abs(speed) > abs(command):
