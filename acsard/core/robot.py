@@ -94,8 +94,7 @@ class Robot:
         self._kinematics = Kinematics(config.drive)
         self._errors = self._error_model()
         self._odometry = Odometry.initial(self._errors)
-        counts = config.mcu.encoder_counts
-        self._checks = ConsistencyChecks(config.odometry, self._kinematics, counts, config.feedback)
+        self._checks = ConsistencyChecks()
         self._arbiter = Arbiter()
         self._cap = SpeedCap(None)
         self._life = Lifecycle(latches)
@@ -149,8 +148,8 @@ class Robot:
             refused=refused,
             refused_age_s=None if since_ns is None else (now_ns - since_ns) / NS_PER_S,
             feedback_age_s=session.feedback_age_s(now_ns),
-            gyro=checks.gyro_status,
-            doubt=checks.wheels_status,
+            gyro=checks.gyro_status(self.config.odometry),
+            doubt=checks.wheels_status(self.config.feedback),
             check=session.check(self.link_setup),
             encoders=session.count_recovery.counts(self.config.mcu.encoder_counts),
             pose_doubt=session.doubt.code,
@@ -333,8 +332,8 @@ class Robot:
             # Nothing else changes whether an input is missing.
             self._linked_once = True
             self._life.link(up=not inputs.missing(safety))
-        if heard.gyro:
-            self._checks.add_samples(heard.gyro)
+        if heard.gyro and self._errors.claims is not None:
+            self._checks.gyro.add_samples(heard.gyro)
         if not feedback:
             return ()
         estimates: list[Estimate] = []
@@ -504,12 +503,16 @@ class Robot:
     def _error_model(self) -> ErrorModel:
         config = self.config
         return ErrorModel(
-            config.odometry, self._kinematics, config.mcu.encoder_counts, config.limits
+            config.odometry,
+            self._kinematics,
+            config.mcu.encoder_counts,
+            config.limits,
+            config.feedback,
         )
 
     def place(self, pose: Pose) -> str:
         self._odometry.set_pose(pose, self._errors)
-        self._checks.forget_doubt()
+        self._checks.gyro.forget_doubt()
         pose = self._odometry.pose
         return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 

@@ -31,7 +31,7 @@ from acsard.recording.recorded_steps import (
     checksum,
     micropose,
 )
-from acsard.recording.state import LayoutError, State, StateError, adopt, short, thaw
+from acsard.recording.state import LayoutError, State, StateError, short, thaw
 
 NO_TRIP: Trip = ""
 
@@ -319,14 +319,9 @@ class Playback:
         return True
 
     def _robot_at(self, head: Head) -> State:
-        recorded = config_of(head)
-        config = self._other or recorded
-        if not head.state:
-            return State(Robot(config), Memory())
-        state = thaw(head.state)
-        if self._other is not None:
-            adopt(state.robot, Robot(recorded), Robot(config))
-        return state
+        if head.state:
+            return thaw(head.state, self._other)
+        return State(Robot(self._other or config_of(head)), Memory())
 
     @contextmanager
     def errors(self) -> Iterator[None]:

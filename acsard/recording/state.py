@@ -1,20 +1,14 @@
-"""Encodes a `Robot` between two steps as bytes, decodes it, and applies another configuration.
+"""Encodes a `Robot` between two steps as bytes, and decodes it, maybe with another configuration.
 
 A recording begins with a robot (a run's first file may not), and has one about every 20 s, so that
-a replay goes on after damage. The state is a record: the configuration in force, the parts that are
-plain data (`PARTS`), and a pickle of the others. `thaw` reads that with `unpickling.py`, because a
-forged file could run code through pickle. When all parts are plain data, the pickle,
-`unpickling.py` and `adopt` go.
+a replay goes on after damage. The state is a record of plain data: the configuration in force, the
+guard's memory and the parts of the robot. Forged bytes can only give wrong numbers.
 """
 
 from __future__ import annotations
 
-import copyreg
-import io
-import pickle
-import sys
 import zlib
-from collections import Counter, deque
+from collections import Counter
 from typing import Any, NamedTuple
 
 import msgspec
@@ -29,15 +23,14 @@ from acsard.core.link.link_diagnosis import UnansweredLines
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import CommandEvents
+from acsard.core.motion.consistency import ConsistencyChecks
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.last_line import LastLine
 from acsard.core.motion.lifecycle import Lifecycle
-from acsard.core.motion.modes import Mode
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
 from acsard.core.robot import Robot
 from acsard.core.values import AcsardError, Event, Ns, SpeedCap, Status
-from acsard.recording.unpickling import MAX_BYTES, unpickle
 
 # Attributes of a robot that are plain data, without configuration inside, with their types.
 PARTS: dict[str, Any] = {
@@ -54,6 +47,7 @@ PARTS: dict[str, Any] = {
     "_linked_once": bool,
     "_answered": UnansweredLines,
     "_odometry": Odometry,
+    "_checks": ConsistencyChecks,
     "_sanity": Sanity,
     "_inputs": BoardInputs,
     "_told": CommandEvents,
@@ -64,27 +58,9 @@ PARTS: dict[str, Any] = {
 # Not stored: they follow from the configuration, and no line is pending between two steps.
 DERIVED = ("config", "link_setup", "_kinematics", "_errors", "_steady")
 
-# A package ends with a dot. The classes need constructors without side effects.
-PART_MODULES = (
-    "acsard.core.values", "acsard.core.codes", "acsard.core.config.settings",
-    "acsard.core.motion.", "acsard.core.link.",
-)  # fmt: skip
-
-# Classes by module and name.
-OTHER_PARTS: dict[tuple[str, str], type] = {
-    ("collections", "Counter"): Counter,
-    ("collections", "deque"): deque,
-}
-
-PICKLE_PROTOCOL = 5  # read by `unpickling.py`
+MAX_BYTES = 1 << 20  # usually 8 000 to 30 000, more with many senders
 
 MAX_ERROR_LENGTH = 200  # characters of an error's text
-
-# Python before 3.11.4 would encode a mode as a call of `getattr`, which `unpickling.py` refuses.
-# Here it is a call of `Mode`.
-DISPATCH_TABLE = copyreg.dispatch_table | {
-    Mode: lambda mode: (Mode, (mode.value,)),
-}
 
 
 class StateError(AcsardError):
@@ -108,7 +84,6 @@ class Frozen(Struct):
     config: Config  # in force
     memory: Memory
     parts: dict[str, msgspec.Raw]
-    rest: bytes  # pickled attributes of the robot
     layout: int = 0  # `LAYOUT` of the version that wrote it
 
 
@@ -131,13 +106,8 @@ LAYOUT = _layout()
 
 def freeze(robot: Robot, memory: Memory) -> bytes:
     """Encode the state of a robot and of its guard, for `thaw`."""
-    rest = {name: part for name, part in vars(robot).items() if name not in DERIVED}
-    parts = {name: msgspec.Raw(msgspec.msgpack.encode(rest.pop(name))) for name in PARTS}
-    written = io.BytesIO()
-    pickler = pickle.Pickler(written, PICKLE_PROTOCOL)
-    pickler.dispatch_table = DISPATCH_TABLE
-    pickler.dump(rest)
-    return msgspec.msgpack.encode(Frozen(robot.config, memory, parts, written.getvalue(), LAYOUT))
+    parts = {name: msgspec.Raw(msgspec.msgpack.encode(getattr(robot, name))) for name in PARTS}
+    return msgspec.msgpack.encode(Frozen(robot.config, memory, parts, LAYOUT))
 
 
 class _Written(Struct):
@@ -154,10 +124,11 @@ def _counter(kind: type, data: object) -> Counter[str]:
 _parts = {name: msgspec.msgpack.Decoder(part, dec_hook=_counter) for name, part in PARTS.items()}
 
 
-def thaw(data: bytes) -> State:
+def thaw(data: bytes, config: Config | None = None) -> State:
     """Decode a robot and its guard's memory, from bytes that may be forged.
 
-    Raises `LayoutError`, and `StateError` if it is damaged or forged.
+    `config` replaces the configuration that was in force. Raises `LayoutError`, and `StateError` if
+    it is damaged or forged.
     """
     try:
         if len(data) > MAX_BYTES:
@@ -167,19 +138,12 @@ def thaw(data: bytes) -> State:
         frozen = _frozen.decode(data)
         if problems := contradictions(frozen.config):
             raise ValueError(problems[0])
-        robot = Robot(frozen.config)
+        robot = Robot(config or frozen.config)
         for name, raw in frozen.parts.items():
             if name in PARTS:
                 setattr(robot, name, _parts[name].decode(raw))
-        rest = unpickle(frozen.rest, part_class)
     except (ValueError, RecursionError) as error:  # msgspec's errors are a `ValueError`
         raise _unreadable(error) from None
-    if not isinstance(rest, dict):
-        raise StateError("the recorded state of the robot is not valid")
-    for name in vars(robot).keys() - PARTS.keys() - {*DERIVED}:
-        # What an older version has not recorded is as in a new robot.
-        if name in rest:
-            setattr(robot, name, rest[name])
     return State(robot, frozen.memory)
 
 
@@ -193,85 +157,3 @@ def short(error: Exception) -> str:
     """Return the text of an error without control characters, cut to `MAX_ERROR_LENGTH`."""
     # The text may quote a forged file.
     return printable(str(error))[:MAX_ERROR_LENGTH]
-
-
-def part_class(module: str, name: str) -> type:
-    """Return a class that may be a part of a robot, for `unpickle`; this imports nothing.
-
-    Raises `ValueError`.
-    """
-    if (module, name) in OTHER_PARTS:
-        return OTHER_PARTS[module, name]
-    ours = module in PART_MODULES or any(
-        r.endswith(".") and module.startswith(r) for r in PART_MODULES
-    )
-    part = vars(sys.modules[module]).get(name) if ours and module in sys.modules else None
-    if not isinstance(part, type) or part.__module__ != module or part.__name__ != name:
-        raise ValueError(f"{module:.50}.{name:.50} is not a class of a robot's state")
-    return part
-
-
-PLAIN_TYPES = (bool, int, float, str, bytes, type(None))
-
-
-def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
-    """Change the configuration of a recorded robot, in place.
-
-    An attribute that differs from `begun`, a new robot with the recorded configuration, keeps its
-    value. Others get that of `other`, a new robot with the new one, which must not be used later.
-    """
-    _Walk().into(robot, begun, other)
-
-
-class _Walk:
-    # Walks through the three robots of `adopt()` and changes each part of the first once.
-    def __init__(self) -> None:
-        self._visited: dict[int, Any] = {}  # by `id()`, which the reference keeps valid
-
-    def into(self, now: Any, begun: Any, other: Any) -> None:
-        if id(now) in self._visited:
-            return
-        self._visited[id(now)] = now
-        for name in _names(other):
-            new = getattr(other, name)
-            # Another version of acsard may have recorded the robot without this attribute.
-            if not hasattr(now, name):
-                setattr(now, name, new)
-                continue
-            recorded = getattr(now, name)
-            merged = self.merged(recorded, getattr(begun, name, recorded), new)
-            if merged is not recorded:
-                setattr(now, name, merged)
-
-    def merged(self, now: Any, begun: Any, other: Any) -> Any:
-        """Return the new value of an attribute; parts of `now` may change in place."""
-        if type(now) is not type(other):
-            return other if _same(now, begun) else now
-        match now:
-            case dict():
-                for key, new in other.items():
-                    recorded = now.get(key, new)
-                    now[key] = self.merged(recorded, begun.get(key, recorded), new)
-                return now
-            case list() | tuple() if len(now) == len(begun) == len(other):
-                parts = [self.merged(*three) for three in zip(now, begun, other, strict=True)]
-                if all(a is b for a, b in zip(parts, now, strict=True)):
-                    return now
-                return parts if isinstance(now, list) else type(now)(parts)
-            case list() | tuple() | set() | frozenset() | deque() | msgspec.Struct():
-                return other if now == begun else now
-            case _ if isinstance(now, PLAIN_TYPES):
-                return other if _same(now, begun) else now
-        if _names(now):
-            self.into(now, begun, other)
-        return now
-
-
-def _same(now: Any, begun: Any) -> bool:
-    return type(now) is type(begun) and bool(now == begun)
-
-
-def _names(item: object) -> list[str]:
-    slots = [name for kind in type(item).__mro__ for name in getattr(kind, "__slots__", ())]
-    names = [*getattr(item, "__dict__", ()), *slots]
-    return [name for name in names if hasattr(item, name)]

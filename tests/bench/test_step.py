@@ -126,7 +126,7 @@ class Run:
         robot, self.heard = made.loop.robot, list[Received]()
         self.lines = Timed(robot._check_and_integrate)
         self.parts = {"odometry": self.lines, "session": Timed(robot.session.update)}
-        self.parts["gyro"] = Timed(robot._checks.add_samples)
+        self.parts["gyro"] = Timed(robot._checks.gyro.add_samples)
         self.took = dict.fromkeys((*self.parts, "step", "simplest"), 0)
         simplest = Simplest()
 

@@ -12,7 +12,7 @@ from acsard.core.link.serial_output import Offered
 from acsard.core.robot import Robot
 from acsard.core.values import Instant
 from acsard.recording.replay import Replay, max_wheel_speed
-from acsard.recording.state import adopt, thaw
+from acsard.recording.state import thaw
 from tests.scenarios.taped import (
     INPUTS,
     WITH_ARGUMENTS,
@@ -231,9 +231,7 @@ def test_a_replay_may_change_the_limits_in_the_middle_of_a_drive() -> None:
     tape.cut = True
     world.hold(0.5, 0.3, seconds=2.0)
     (first,) = tape.states
-    state = thaw(tape.states[first])
-    adopt(state.robot, Robot(PLAIN), Robot(SLOW_LIMITS))
-    replay = Replay(*state)
+    replay = Replay(*thaw(tape.states[first], SLOW_LIMITS))
     for step in tape.steps(first):
         replay.step(step)
     comparison = replay.comparison

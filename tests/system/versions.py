@@ -233,8 +233,8 @@ def _grown(part):
     newer.swap(
         "recording/state.py",
         {
-            "    rest: bytes  # pickled attributes of the robot\n": """\
-    rest: bytes
+            "    layout: int = 0  # `LAYOUT` of the version that wrote it\n": """\
+    layout: int = 0
     later: int = 1
 """
         },

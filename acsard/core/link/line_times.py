@@ -49,7 +49,7 @@ LEAST_DELAY_GAIN = 0.002  # rise of the least delay per reply: an old one is for
 
 # Mean deviation of the delay that USB and the scheduler explain, and above which an adapter is the
 # cause. In between, it is the board's own.
-USB_JITTER_NS, ADAPTER_JITTER_NS = 350_000, 2_500_000
+USB_JITTER_NS, ADAPTER_JITTER_NS = 350_000.0, 2_500_000.0
 
 
 class Lateness(Struct):

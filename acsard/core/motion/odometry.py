@@ -83,7 +83,7 @@ class Odometry(Struct):
             rolled, seconds = gap.angles, gap.seconds
         else:
             rolled = line.turned or line.counted or times(reported, seconds)
-        checks.check_line(line, rolled, seconds, known=gap is None or not gap.unknown)
+        checks.check_line(model, line, rolled, seconds, known=gap is None or not gap.unknown)
         turn, slips = checks.turn, checks.slips
 
         believed = wheels.believed(reported) if wheels.leaves_out else reported

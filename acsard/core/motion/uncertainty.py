@@ -19,9 +19,11 @@ from typing import Literal
 
 from msgspec import Struct, field
 
-from acsard.core.config.settings import LimitsConfig, OdometryConfig
+from acsard.core.config.settings import FeedbackConfig, LimitsConfig, OdometryConfig
 from acsard.core.link.feedback import MAX_FILLED_GAP_S
+from acsard.core.motion.gyro import claims
 from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.wheels import count_angle
 from acsard.core.values import (
     Metres,
     PoseCovariance,
@@ -68,7 +70,7 @@ CAUSES = len(PARAMETERS) + len(MISSED)
 
 
 class ErrorModel:
-    """What the configuration says about errors."""
+    """What the configuration says about the odometry and its errors."""
 
     def __init__(
         self,
@@ -76,11 +78,14 @@ class ErrorModel:
         kinematics: Kinematics,
         counts: int = 0,
         limits: LimitsConfig = LimitsConfig(),  # noqa: B008
+        feedback: FeedbackConfig = FeedbackConfig(),  # noqa: B008
     ) -> None:
         # `counts` per revolution is 0 if unknown.
         track, radius = kinematics.track, kinematics.radius
         self.kinematics, self.track = kinematics, track
         self.count: Rad = math.tau / counts if counts else 0.0
+        self.wheel_count, self.feedback = count_angle(counts), feedback  # for `wheels.py`
+        self.claims = claims(odometry, kinematics, counts) if odometry.gyro else None
         count = radius * math.tau / (counts or ASSUMED_COUNTS)  # m
         # Counts of both sides that arrive at different times turn the heading by this, to and fro.
         self.play: Rad = count / track

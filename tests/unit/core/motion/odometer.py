@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
-from acsard.core.config.settings import DriveConfig, FeedbackConfig, LimitsConfig, OdometryConfig
+from acsard.core.config.settings import DriveConfig, LimitsConfig, OdometryConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.consistency import ConsistencyChecks
+from acsard.core.motion.gyro import Gyro, claims
 from acsard.core.motion.kinematics import Kinematics, on_arc
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.uncertainty import ErrorModel
@@ -22,12 +23,17 @@ class Odometer:
     ) -> None:
         kinematics = Kinematics(drive)
         self.model = ErrorModel(odometry, kinematics, counts, LimitsConfig())
-        self.checks = ConsistencyChecks(odometry, kinematics, counts, FeedbackConfig())
+        self.checks = ConsistencyChecks()
         self.odometry = Odometry.initial(self.model)
+        self._claims = claims(odometry, kinematics, counts)
 
     @property
     def pose(self) -> Pose:
         return self.odometry.pose
+
+    def use(self, gyro: Gyro) -> None:
+        """Use this gyro, whether one is configured or not."""
+        self.checks.gyro, self.model.claims = gyro, self._claims
 
     def fold(self, line: Feedback) -> Estimate:
         return self.odometry.fold(line, self.checks, self.model)
@@ -37,7 +43,7 @@ class Odometer:
 
     def set_pose(self, pose: Pose) -> None:
         self.odometry.set_pose(pose, self.model)
-        self.checks.forget_doubt()
+        self.checks.gyro.forget_doubt()
 
 
 def arc(pose: Pose, distance: float, turn: float) -> Pose:

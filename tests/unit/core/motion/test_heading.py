@@ -82,7 +82,7 @@ def test_the_turn_of_the_wheels_that_a_gyro_gets_is_the_turn_of_the_heading(
     lines: list[Line],
 ) -> None:
     robot, listening = Odometer(counts=3200), Listening()
-    robot.checks.gyro = listening
+    robot.use(listening)
     for state in lines:
         if state.skipped:
             robot.skip(feedback_of(state))
@@ -102,7 +102,7 @@ def test_a_gap_before_a_skipped_line_counts_for_the_next_line() -> None:
 
 def test_the_gyro_is_compared_with_the_wheels_over_no_unknown_distance() -> None:
     robot, listening = Odometer(), Listening()
-    robot.checks.gyro = listening
+    robot.use(listening)
     for state in (Line(9.0, 9.0), Line(9.0, 9.0, bridged=0.3), Line(9.0, 9.0, gap=0.5)):
         robot.fold(feedback_of(state))
     assert listening.seconds == [0.01, pytest.approx(0.31), 0.0]
@@ -115,7 +115,7 @@ class Turning:
         """Start at rest. The gyro reports `scale` times the true turn."""
         self.scale = scale
         self.gyro, self.robot = Gyro(), Odometer(counts=3200)
-        self.robot.checks.gyro = self.gyro
+        self.robot.use(self.gyro)
         self.now_ns, self.true, self.rate = NS_PER_S, 0.0, 0.0
         self.does: list[str] = []
         self.hangs_at: float | None = None
@@ -204,7 +204,7 @@ def test_the_heading_of_a_gyro_that_hangs_is_taken_back_or_in_the_covariance(
 @pytest.mark.parametrize("turns", [2, pytest.param(20, marks=pytest.mark.slow)])
 def test_the_error_of_a_gyros_scale_grows_with_the_turns(turns: int, std: float) -> None:
     bench = proved(1 + std)
-    bench.robot.model = ErrorModel(OdometryConfig(gyro_scale_std=std), KINEMATICS, 3200)
+    bench.robot.model = ErrorModel(OdometryConfig(gyro=True, gyro_scale_std=std), KINEMATICS, 3200)
     off, variance = bench.off, bench.yaw_variance
     bench.run(turns * math.tau / 2.0, Twist(0.0, 2.0))
     bench.run(1.0, Twist())

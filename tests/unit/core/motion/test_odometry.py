@@ -324,7 +324,7 @@ def test_the_errors_of_several_gaps_add_up_without_cancelling() -> None:
 @pytest.mark.parametrize("dt", [0.11, 0.0], ids=["filled", "not filled"])
 def test_a_gyro_measures_the_turn_of_a_gap_between_speeds_of_single_counts(dt: float) -> None:
     robot = odometry()
-    robot.checks.gyro = Says(always=Turn(0.0, 1e-6, 0.0, 1e-3))
+    robot.use(Says(always=Turn(0.0, 1e-6, 0.0, 1e-3)))
     for speed in (0.0, 6.5, 0.0, 6.5):
         estimate = robot.fold(feedback(speed, speed, 0.01))
     before, gap = estimate.covariance, 0.11 - dt
@@ -499,7 +499,7 @@ def test_the_wheels_give_only_the_distance_when_a_gyro_gives_the_turn(
 ) -> None:
     speeds, wheels, gyro = WheelSpeeds(20.0, 10.0, 10.0, 20.0), Odometer(), Odometer()
     by_wheels = wheels.fold(line(1.0, 0.01, speeds, turned=turned))
-    gyro.checks.gyro = Says(always=Turn(0.05, 1e-4, 4.0, 1e-3))
+    gyro.use(Says(always=Turn(0.05, 1e-4, 4.0, 1e-3)))
     by_gyro = gyro.fold(line(1.0, 0.01, speeds, turned=turned))
     assert by_gyro.pose.yaw == pytest.approx(0.05)
     assert by_gyro.pose.yaw != pytest.approx(by_wheels.pose.yaw, rel=0.1)
@@ -512,7 +512,7 @@ def test_the_wheels_give_only_the_distance_when_a_gyro_gives_the_turn(
 
 def test_the_gyro_gives_the_turn_over_a_gap() -> None:
     robot = Odometer()
-    robot.checks.gyro = Says(always=Turn(0.3, 1e-4, 0.7, 1e-3))
+    robot.use(Says(always=Turn(0.3, 1e-4, 0.7, 1e-3)))
     estimate = robot.fold(line(1.0, 0.0, WheelSpeeds(), gap=0.4))
     assert estimate.pose == Pose(0.0, 0.0, 0.3)
 

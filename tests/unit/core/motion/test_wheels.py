@@ -395,8 +395,8 @@ def test_slip_makes_every_variance_a_hundred_times_larger() -> None:
 
 def test_wheels_that_a_gyro_contradicts_have_a_hundred_times_larger_variances() -> None:
     calm, slipping = odometry(3200), odometry(3200)
-    calm.checks.gyro = Says(always=Turn(0.0, 0.0, 0.0, 0.0, slips=False))
-    slipping.checks.gyro = Says(always=Turn(0.0, 0.0, 0.0, 0.0, slips=True))
+    calm.use(Says(always=Turn(0.0, 0.0, 0.0, 0.0, slips=False)))
+    slipping.use(Says(always=Turn(0.0, 0.0, 0.0, 0.0, slips=True)))
     for _ in range(100):
         line = Feedback(AT, TEN, PERIOD)
         sure = calm.fold(line)
