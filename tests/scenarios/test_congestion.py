@@ -178,8 +178,9 @@ def test_too_long_a_round_trip_is_named_with_its_length_and_the_setting() -> Non
     assert waits_for(world) == "round_trip"
     (text,) = [entry.waits_for for entry in world.state.sources if entry.name == "app"]
     assert text == (
-        "the round trip to app takes 0.4 s, but its timeout allows at most 0.3 s; raise the "
-        "timeout of the source in commands.sources, or look for what delays the network"
+        "the round trip to app takes 0.4 s, but its timeout allows at most 0.3 s; echo the newest "
+        "beat, not an old one; if the network is as slow, raise the timeout of the source in "
+        "commands.sources"
     )
 
 

@@ -223,14 +223,14 @@ def first_run(host: Host) -> None:
 
     host.note(
         "neutral-first",
-        r"^reason: ready: send a zero first: nav must send a zero .* \(by nav\)",
+        r"^reason: ready: send a zero first: dock must send a zero .* \(by dock\)",
     )
     host.note(
         "neutral-first, for long",
-        f"^commands without effect: nav: send a zero first: .* for over 3 s {by(NAV, 'nav')}",
+        f"^commands without effect: dock: send a zero first: .* for over 3 s {by(NAV, 'dock')}",
         after=3.0,
     )
-    host.hold(NAV, "nav", 0.5, 4.0)
+    host.hold(NAV, "dock", 0.5, 4.0)
 
     host.drive()
     host.note(
@@ -259,7 +259,7 @@ def first_run(host: Host) -> None:
     host.drive()
     host.note(
         "congested Wi-Fi",
-        rf"^command refused: .*stale.*: the network delays them, .* {TOM_BY}",
+        rf"^command refused: .*stale.*: the network delays them; .* {TOM_BY}",
         after=3.6,
     )
     speaker = Speaker(host.world, "client", f"{TOM}/s3cret")
@@ -282,7 +282,7 @@ def first_run(host: Host) -> None:
     host.note(
         "damaged board",
         "^wheel fault: .*front_left wheel is left out .* check its encoder",
-        "^fault: front_left wheel turns against its command .*: check the leads of its motor",
+        "^fault: front_left wheel does not obey its command: it turns the wrong way .*: check",
         "^mode: driving -> fault: front_left wheel",
         after=0.3,
     )
