@@ -259,7 +259,7 @@ def first_run(host: Host) -> None:
     host.drive()
     host.note(
         "congested Wi-Fi",
-        rf"^command refused: .*stale.*: the network delays them; .* {TOM_BY}",
+        rf"^command refused: .*too_old.* after the beat that it echoes, .* {TOM_BY}",
         after=3.6,
     )
     speaker = Speaker(host.world, "client", f"{TOM}/s3cret")

@@ -59,6 +59,8 @@ from tests.unit.core.guarded import checked
 MS = 1_000_000
 WALL_NS = 1_800_000_000 * NS_PER_S
 ROUNDING = 0.006
+LEFT_OUT_S = 0.3
+"""Longest time of the evidence that leaves a wheel out."""
 """Largest rounding error of a line, rad/s, because a line has two decimals."""
 
 SOURCES = (
@@ -223,6 +225,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.told_link, self.was_open, self.last_opened = "down", False, 0
         self.pose, self.sampled_ns = Pose(), self.now_ns - NS_PER_S
         self.fastest = 0.0
+        self.left_out: tuple[str, ...] = ()
         self.sequence, self.beat_ns = 0, 0
         """The newest number and beat of the sender that echoes."""
         self.caught_up_ns = 0
@@ -737,8 +740,10 @@ class RobotMachine(RuleBasedStateMachine):
 
         The faster wheel speed of both ends of this time counts. Odometry does not fill long
         silences. A line has the time of its sample slot, which may be some periods before its
-        arrival and is never later.
+        arrival and is never later. A wheel that is left out gives back what it missed meanwhile.
         """
+        out = self.robot.snapshot(self.now_ns).doubt.left_out
+        newly, self.left_out = not set(out) <= set(self.left_out), out
         drive, feedback = self.config.drive, self.config.feedback
         for estimate in outputs.estimates:
             fastest = max(map(abs, estimate.speeds.as_tuple())) * drive.wheel_radius
@@ -746,7 +751,7 @@ class RobotMachine(RuleBasedStateMachine):
             dt = (estimate.at.mono_ns - self.sampled_ns) / NS_PER_S
             assert dt >= 0.0
             # Missing lines are filled in, but not more than a second of them.
-            dt = min(dt, MAX_FILLED_GAP_S) + 2 * self.period_ms / 1000
+            dt = min(dt, MAX_FILLED_GAP_S) + 2 * self.period_ms / 1000 + LEFT_OUT_S * newly
             fastest, self.fastest = max(fastest, self.fastest), fastest
             most = fastest * dt
             x, y = estimate.pose.x - self.pose.x, estimate.pose.y - self.pose.y
