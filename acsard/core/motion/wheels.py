@@ -58,6 +58,7 @@ LEAST_SPEED = 0.05  # m/s, of a runaway that must not look like rest
 TOO_FAST, TOO_FAST_S = 1.2, 1.0  # times the largest output of the limiter
 PACE_S = 1.5  # faster or slower by `AGREEMENT`, until this is a warning: 2 s with the smoothing
 ROUNDING = 0.006  # rad/s, of a reported speed
+JITTER_S = 0.004  # of the times of lines
 HELD_S = 2.0  # for which a wheel repeats one speed at rest, until this is a warning
 # For which a wheel reports one speed, until its encoder may be stuck, and is although the other
 # wheel of its side differs little.
@@ -318,7 +319,8 @@ class Wheels(Struct):
             elif not wheel.rested:
                 _rest(wheel, angle, block)
             _follow(wheel, angle, due[k], block)
-            if speeds[i] == wheel.reported != 0.0 and abs(angle - speeds[i] * s) < ROUNDING * s:
+            slack = ROUNDING * s + JITTER_S * abs(speeds[i])
+            if speeds[i] == wheel.reported != 0.0 and abs(angle - speeds[i] * s) < slack:
                 wheel.same_s += s
                 if not still and abs(command) < (1.0 - AGREEMENT) * abs(speeds[i]):
                     wheel.ignored_s += s
