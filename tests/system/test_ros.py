@@ -296,7 +296,9 @@ def test_a_command_by_wildcard_drives_nothing(bus: Bus, zenoh_ros: ZenohClient) 
         behind(bus, lambda: zenoh_ros.put("cmd_vel", TWIST, b""), "malformed")
         after = bus.state()
         # Either the access rules keep it out, or the daemon's code refuses it.
-        mine = {"command_malformed", "command_wildcard", "command_no_attachment"}
+        mine = {
+            "command_malformed", "command_wildcard", "command_no_attachment", "command_not_a_put",
+        }  # fmt: skip
         assert changes(before, after).keys() <= mine, key
         assert (after["x"], after["wheels"]) == (before["x"], before["wheels"]), key
         if after["mode"] == "stopped":  # "**" includes `stop`
