@@ -21,6 +21,7 @@ from acsard.core.config.settings import (
     FeedbackConfig,
     LimitsConfig,
     McuConfig,
+    OdometryConfig,
     SafetyConfig,
     Source,
 )
@@ -1140,6 +1141,14 @@ def test_activating_an_active_robot_asks_each_sender_for_a_zero() -> None:
     assert bench.mode() == "driving"
     bench.set({"limits.linear_speed": 0.9})
     assert bench.step(GO).applied == GO
+
+
+def test_a_sample_of_the_gyro_is_kept_if_the_robot_uses_one() -> None:
+    for uses in (True, False):
+        bench = Bench(Config(odometry=OdometryConfig(gyro=uses))).linked()
+        before = bench.robot.snapshot(bench.now_ns).gyro
+        bench.step(gyro=0.0)
+        assert (bench.robot.snapshot(bench.now_ns).gyro != before) is uses
 
 
 def test_each_change_of_mode_by_request_is_an_event_even_in_quick_succession() -> None:
