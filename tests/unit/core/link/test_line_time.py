@@ -114,7 +114,19 @@ def test_answers_that_take_1_to_5_ms_give_half_the_error_of_arrival_times(
 @pytest.mark.parametrize(
     ("prompted", "seconds", "seeds"),
     [
-        pytest.param(False, 60.0, 4, marks=pytest.mark.slow, id="reporting-45 m"),
+        pytest.param(
+            False,
+            60.0,
+            4,
+            marks=[
+                pytest.mark.slow,
+                pytest.mark.xfail(
+                    strict=True,
+                    reason="a batched link with many lost lines needs the times of arrival",
+                ),
+            ],
+            id="reporting-45 m",
+        ),
         # In one minute, the answers lost around a stall decide the result.
         pytest.param(True, 600.0, 3, marks=pytest.mark.soak, id="prompted-450 m thrice"),
         pytest.param(False, *FULL.values, marks=FULL.marks, id="reporting-450 m"),
