@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from acsard.host.real_time import WAKE_UP_LATENCY
-from tests.system.harness import Daemon, running
+from tests.system.harness import Daemon, running, until
 
 POLICY = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
 
@@ -76,5 +76,5 @@ def test_real_time_scheduling_present_at_the_start_is_not_requested_again(tmp_pa
     without = ["setpriv", "--bounding-set", "-sys_nice,-ipc_lock"]
     with Daemon(tmp_path, before=[*as_a_service, *without]) as daemon:
         assert os.sched_getparam(daemon.pid).sched_priority == 5
-        (event,) = daemon.events("real_time")
+        (event,) = until(lambda: daemon.events("real_time"), 5.0, "the log")
     assert "no permission for locked memory," in event["text"]
