@@ -56,11 +56,11 @@ SCALES = ("planted", "mutants", "hunks")
 SAFETY = (
     "acsard/core/guard.py",
     "acsard/core/motion/neutral.py",
-    "acsard/core/motion/freshness.py",
+    "acsard/core/motion/ages.py",
     "acsard/core/motion/lifecycle.py",
     "acsard/core/motion/modes.py",
     "acsard/core/motion/sanity.py",
-    "acsard/core/motion/wheel_witness.py",
+    "acsard/core/motion/wheels.py",
     "acsard/core/motion/latches.py",
 )
 ENOUGH = 0.98

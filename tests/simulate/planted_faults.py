@@ -645,7 +645,7 @@ FAULTS = (
         "no line leaves while the latch file cannot be written",
         LOOP,
         'if port.offer(line, now) != "sent":',
-        'if self._handover.trouble or port.offer(line, now) != "sent":',
+        'if self._keeper.trouble or port.offer(line, now) != "sent":',
     ),
     fault(
         "loop end",

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import acsard
 from tests.simulate import planted
 from tests.simulate.planted import (
     CASE_MINUTES,
@@ -25,6 +27,7 @@ from tests.simulate.planted_cases import CASES
 from tests.simulate.planted_faults import FAULTS, PLANS_OF_FAULT, Fault
 
 ALL = (*FAULTS, *CASES)
+PACKAGE = Path(acsard.__file__).parent
 
 
 @pytest.mark.parametrize("fault", ALL, ids=lambda fault: fault.name)
@@ -43,6 +46,16 @@ def test_faults_use_only_names_that_exist(tmp_path: Path) -> None:
     ruff = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F821", str(tmp_path)]
     checked = subprocess.run(ruff, capture_output=True, text=True, timeout=60)
     assert checked.returncode == 0, checked.stdout
+
+
+def test_faults_use_only_attributes_that_exist() -> None:
+    """Otherwise each seed finds the fault, because the planted product raises `AttributeError`."""
+    product = " ".join(path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py"))
+    names = set(re.findall(r"\w+", product))
+    for fault in ALL:
+        planted_text = " ".join(edit.new for edit in fault.edits)
+        declared = set(re.findall(r"\b(_\w+):", planted_text))
+        assert set(re.findall(r"\.(_[a-z]\w*)", planted_text)) <= names | declared, fault.name
 
 
 def test_plans_are_chosen_for_faults_that_exist() -> None:

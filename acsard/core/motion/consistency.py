@@ -48,7 +48,7 @@ class ConsistencyChecks(Struct):
             way, by_wheels = model.kinematics.moved(wheels.believed(rolled))
             seconds_known, idle = seconds if known else 0.0, line.driven <= 0.0
             turn = gyro.turn(line.at.mono_ns, seconds_known, by_wheels, way, idle, model.claims)
-            by_gyro = None if turn is None else turn.wheels
+            by_gyro = None if turn is None else turn.trusted
             event = gyro.event()
         self.turn = turn
         feedback = model.feedback

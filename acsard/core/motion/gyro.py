@@ -40,10 +40,8 @@ MAX_BIAS = 0.2  # rad/s; a higher rate at rest is a person who turns the robot
 BIAS_RANDOM_WALK = 1e-4  # of a cheap gyro with temperature, rad/s per square root of a second
 MIN_NOISE = 1e-5  # rad/s of a sample: a coarse gyro may repeat one value
 NOISE_GAIN = 0.02  # of the noise, about fifty samples
-MAX_DEVIATIONS, VIBRATION = (
-    5.0,
-    0.01,
-)  # of a sample at rest from the bias: standard deviations, rad/s
+MAX_DEVIATIONS = 5.0  # standard deviations of a sample at rest from the bias
+VIBRATION = 0.01  # rad/s, in addition
 
 SILENCE_TIMEOUT_NS = NS_PER_S // 5  # until then the robot is assumed to turn at the last rate
 MAX_EXTRA_DELAY_NS = NS_PER_S // 4  # above the least one; a later sample says nothing of now
@@ -130,7 +128,7 @@ class Turn(Struct, frozen=True, gc=False):
     variance: float  # rad2, without the error of the gyro's scale
     rate: RadPerS
     rate_variance: float  # rad2/s2
-    wheels: Rad | None = None  # of wheels without a fault
+    trusted: Rad | None = None  # the angle, if the wheels agree with it
     slips: bool = False
     doubt: Rad = 0.0  # by which gyro and wheels differ: does not average out
 

@@ -9,7 +9,8 @@ stretch of the path, with the displacement (dx, dy), moves all of it by F:
 
 Q is of distance and turn (Siegwart, Nourbakhsh & Scaramuzza, Autonomous Mobile Robots, 5.2.4).
 `_bend` has the second order: a wrong heading to either side makes the robot get less far, which is
-nearly all of the error along a straight of 60 m.
+nearly all of the error along a straight of 60 m. `astray` has what is beyond any order: with a turn
+that was missed, or a heading of which nothing is known, the robot may be anywhere within its way.
 """
 
 from __future__ import annotations
@@ -206,6 +207,7 @@ class Uncertainty(Struct):
     period: Seconds = ASSUMED_PERIOD_S
     turned: Rad = 0.0  # in all, and the middle of the play in it
     middle: Rad = 0.0
+    astray: Metres = 0.0  # standard deviation to all sides
 
     @classmethod
     def initial(cls, model: ErrorModel) -> Uncertainty:
@@ -247,7 +249,17 @@ class Uncertainty(Struct):
         bend.rolled += abs(distance) + model.track / 2 * abs(turn)
         if bend.rolled > BEND_M:
             self._bend(model)
+        self.astray += abs(distance) * self._share_astray()
         self._publish()
+
+    def _share_astray(self) -> float:
+        # The deviation of 1 - cos(e) for a normal error e of the heading.
+        variance = self.covariance.yawyaw
+        if variance <= MAX_HEADING_VARIANCE:
+            variance = sum([yaw * yaw for _, _, yaw in self.columns[len(PARAMETERS) :]])
+        if not variance:
+            return 0.0
+        return math.sqrt(1.5 - 2.0 * math.exp(-variance / 2) + math.exp(-2.0 * variance) / 2)
 
     def doubt(self, along: float, yaw: float, aside: float, heading: Rad) -> None:
         """Add variances of distance, m2, turn, rad2, and of the position sideways, m2."""
@@ -356,7 +368,8 @@ class Uncertainty(Struct):
 
     def _publish(self) -> None:
         p, (xx, xy, yy) = _total(self.p, self.columns), self.bend.added
-        p = PoseCovariance(p.xx + xx, p.xy + xy, p.xyaw, p.yy + yy, p.yyaw, p.yawyaw)
+        far = self.astray * self.astray
+        p = PoseCovariance(p.xx + xx + far, p.xy + xy, p.xyaw, p.yy + yy + far, p.yyaw, p.yawyaw)
         known = p.xx < MAX_VARIANCE and p.yy < MAX_VARIANCE and p.yawyaw < MAX_VARIANCE
         self.covariance = p if known else UNKNOWN_POSE
 

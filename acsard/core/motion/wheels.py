@@ -73,9 +73,7 @@ PARTNER_FRACTION, PARTNER_COUNTS, PARTNER_ANGLE, PARTNER_DELAY_S = 0.05, 1.2, 0.
 PARTNER_S, PARTNER_S_PER_RAD = 0.14, 5.0
 OUT_COUNTS, OUT_ANGLE = 3.5, 0.05  # by which they must differ until one is left out
 OUT_BLOCKS = 2
-TURNING = (
-    4.0  # largest ratio of the command and the expected speed: above it, the wheels turn around
-)
+TURNING = 4.0  # ratio of command and expected speed above which the wheels turn around
 AGAIN_S = 2.0  # of agreement, until the pose uses a wheel again
 SLIP_S, SLIP_REPORTED_S = 0.5, 0.1  # after the last contradiction, and after the first one
 
@@ -356,7 +354,9 @@ class Wheels(Struct):
                 wheel.fast_s = wheel.fast_angle = 0.0
             elif wheel.fast_s >= TOO_FAST_S and wheel.fast_angle >= block.limit:
                 self._latch("wheel_too_fast", i, peak)
-        if not wheel.agrees and wheel.due * wheel.command > 0.0:
+        # Quick or slow motors differ from what is expected after a change of the command.
+        steady = abs(wheel.due - wheel.command) < AGREEMENT * abs(wheel.command)
+        if not wheel.agrees and steady:
             wheel.pace_s += s
             wheel.pace_angle += angle - due
             if wheel.pace_s >= PACE_S and abs(wheel.pace_angle) >= block.unit:

@@ -238,6 +238,23 @@ def test_an_unknown_heading_adds_no_second_order() -> None:
     assert max(map(abs, robot.odometry.uncertainty.bend.added)) < 1.0
 
 
+@pytest.mark.parametrize("missed", [0.3, 0.7, 1.5, 4.0])
+def test_after_a_missed_turn_each_axis_is_as_uncertain_as_the_robots_are_apart(
+    missed: float,
+) -> None:
+    """5 m straight ahead, with a heading that is wrong by a normal error of this deviation."""
+    robot = Odometer()
+    robot.odometry.uncertainty.miss("gyro", 0.0, missed, 0.0)
+    for _ in range(500):
+        estimate = robot.fold(Feedback(AT, WheelSpeeds(20.0, 20.0, 20.0, 20.0), 0.01))
+    headings = np.random.default_rng(1).normal(0.0, missed, 10_000)
+    along, aside = 5.0 * (np.cos(headings) - 1.0), 5.0 * np.sin(headings)
+    stated = math.sqrt(estimate.covariance.xx), math.sqrt(estimate.covariance.yy)
+    for axis, errors in zip(stated, (along, aside), strict=True):
+        assert axis > 0.9 * float(np.sqrt((errors**2).mean()))
+    assert max(stated) < 5.0 * (missed + 1.5)
+
+
 # the twist
 
 
