@@ -253,13 +253,14 @@ class Uncertainty(Struct):
         self._publish()
 
     def _share_astray(self) -> float:
-        # The deviation of 1 - cos(e) for a normal error e of the heading.
+        # The root mean square of 1 - cos(e) for a normal error e of the heading; u is its mean.
         variance = self.covariance.yawyaw
         if variance <= MAX_HEADING_VARIANCE:
             variance = sum([yaw * yaw for _, _, yaw in self.columns[len(PARAMETERS) :]])
         if not variance:
             return 0.0
-        return math.sqrt(1.5 - 2.0 * math.exp(-variance / 2) + math.exp(-2.0 * variance) / 2)
+        u = -math.expm1(-variance / 2)
+        return u * math.sqrt(3.0 - 2.0 * u + u * u / 2)
 
     def doubt(self, along: float, yaw: float, aside: float, heading: Rad) -> None:
         """Add variances of distance, m2, turn, rad2, and of the position sideways, m2."""

@@ -255,6 +255,17 @@ def test_after_a_missed_turn_each_axis_is_as_uncertain_as_the_robots_are_apart(
     assert max(stated) < 5.0 * (missed + 1.5)
 
 
+def test_a_missed_turn_of_any_size_makes_the_robot_get_less_far() -> None:
+    for missed in (10.0**-exponent for exponent in range(1, 13)):
+        robot = Odometer()
+        robot.odometry.uncertainty.miss("gyro", 0.0, missed, 0.0)
+        for _ in range(200):
+            estimate = robot.fold(Feedback(AT, WheelSpeeds(20.0, 20.0, 20.0, 20.0), 0.01))
+        # 1 - cos(e) is nearly e2 / 2, whose root mean square is sqrt(3) / 2 of the variance of e.
+        share = robot.odometry.uncertainty.astray / estimate.pose.x
+        assert share == pytest.approx(math.sqrt(0.75) * missed**2, rel=0.05, abs=0.0)
+
+
 # the twist
 
 
