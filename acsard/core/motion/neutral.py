@@ -8,6 +8,7 @@ the daemon watched it. `require_neutral` disarms, and so does silence of `SILENT
 from __future__ import annotations
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from acsard.core.motion.ages import SILENT_NS, Order
 from acsard.core.values import NS_PER_S, REST, Command, Ns, Twist, Wait
@@ -104,6 +105,8 @@ class Sender(Struct):
         self.armed = self.is_armed(before_ns)
         if self.zero_ns is not None:
             self.zero_ns = now_ns
+        if self.hint is not None:
+            self.hint = replace(self.hint, at_ns=now_ns)
 
     def take(self, command: Command, timeout_ns: Ns) -> None:
         now_ns, zero = command.arrived_ns, is_zero(command)

@@ -106,6 +106,17 @@ def test_a_shared_zero_during_the_proof_waits_for_a_second_without_a_speed_too()
     assert bench.driver() == "high"
 
 
+def test_the_pause_behind_a_shared_zero_during_the_proof_starts_again_after_a_stall() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.arbiter.begin(bench.now_ns, bench.commands)
+    bench.stamped(HIGH, twist=REST, shared=True)
+    bench.wait(900).arbiter.begin(bench.now_ns, bench.commands)
+    assert bench.stamped(HIGH, twist=REST, shared=True) == ""
+    sender = bench.arbiter.sources["high"].senders[""]
+    assert not sender.is_armed(bench.now_ns + 999 * MS)
+    assert sender.is_armed(bench.now_ns + 1000 * MS)
+
+
 def test_a_refused_zero_that_is_newer_ends_the_speed_and_arms_nothing() -> None:
     bench = Bench(HIGH)
     go = Command("high", GO, bench.now_ns, sequence=1)
