@@ -766,7 +766,7 @@ class Run:
         if snapshot.at_ns - snapshot.decided_ns > NS // 1000:
             # A stall in a step waits for a step that makes a line.
             self._stalled_ns = max(self._stalled_ns, true_ns)
-        witness.read()
+        witness.read(called=bool(self._calls))
         self.longest_reason = max(self.longest_reason, len(snapshot.reason))
         if self._puts_ns:
             self._puts_ns = [

@@ -237,6 +237,8 @@ class Witness:
         self._unread: list[tuple[str, Wish | None, tuple[Any, ...]]] = []
         """Messages that no step has read yet: the key, the command if it can be read, and the
         arguments for its age."""
+        self._since_call: list[tuple[Wish, tuple[Any, ...]]] = []
+        """Commands since the step that may execute the first call without an answer."""
         self._undone: list[list[tuple[Sender, list[tuple[int, int]]]]] = []
         """The zeros of other identities that each of them has cancelled."""
         self.last: tuple[float, ...] = ZERO
@@ -318,8 +320,13 @@ class Witness:
         for known, zeros in self._undone.pop(place):
             known.zeros[:0] = zeros
 
-    def read(self) -> None:
-        """Judge the ages of all commands that a step has read."""
+    def read(self, called: bool = False) -> None:
+        """Judge the ages of all commands that a step has read. `called`: a call has no answer."""
+        if not called:
+            self._since_call.clear()
+        self._since_call += [
+            (wish, arguments) for _, wish, arguments in self._unread if wish is not None
+        ]
         self._judge_ages()
         self._unread.clear()
         self._undone.clear()
@@ -395,6 +402,8 @@ class Witness:
         """Note that the daemon has executed an `activate`."""
         self.perhaps_latched.discard("activate")
         self.ages = Ages(asked_ns)
+        for wish, arguments in self._since_call:  # a step executes its calls first
+            wish.fresh |= self.ages.fresh(*arguments)
         self.arming(asked_ns)  # also if the robot was on
         self._release(self.offs, "an activate undoes no later one", asked_ns, read_ns, name)
 
