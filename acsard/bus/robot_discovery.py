@@ -6,7 +6,6 @@ Over TLS a client must name each robot, because the access rules allow only exac
 from __future__ import annotations
 
 from collections.abc import Sequence
-from difflib import get_close_matches
 
 import zenoh
 from msgspec import Struct
@@ -144,6 +143,8 @@ def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) 
     if presence.here:
         return f"robot {robot_id} is there, but {_silent(key)}"
     if presence.others:
+        from difflib import get_close_matches
+
         # With a cutoff of 0.0, no robot is excluded, and the most similar ids come first.
         near = get_close_matches(robot_id, presence.others, MAX_NAMED, 0.0)
         more = len(presence.others) - len(near)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncGenerator, Callable, Iterator
 from contextlib import suppress
 from typing import Any
@@ -88,6 +87,8 @@ class Subscription:
 
     async def arriving(self) -> AsyncGenerator[zenoh.Sample, None]:
         """Yield samples until the session closes; then undeclare."""
+        import asyncio  # it loads for 10 ms, and `acsard call stop` does not need it
+
         arrived, loop = asyncio.Event(), asyncio.get_running_loop()
 
         def wake() -> None:

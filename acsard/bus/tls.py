@@ -8,19 +8,22 @@ from __future__ import annotations
 
 import errno
 import ipaddress
-import socket
-import ssl
 import time
 from collections.abc import Mapping
 from contextlib import suppress
 from enum import IntEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from acsard.core.config.settings import is_tls
 from acsard.core.values import NS_PER_S, WallNs
 from acsard.host import clock
 from acsard.host.errors import CertificateError, NotPermittedError
+
+if TYPE_CHECKING:
+    # Functions import them, because they take 7 ms, and only programs with TLS need them.
+    import socket
+    import ssl
 
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
 
@@ -72,6 +75,8 @@ def files_in(directory: str) -> tuple[Path, Path, Path]:
 
 def unusable(authority: Path, certificate: Path, key: Path) -> str:
     """Return why OpenSSL cannot use these files together, or ""."""
+    import ssl
+
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_verify_locations(authority)
@@ -114,6 +119,8 @@ def _plain(name: str) -> str:
 def _decoded(directory: str) -> dict[str, Any]:
     # The standard library decodes only the certificate of a connected peer. So connect a client and
     # a server in memory, both of which use this certificate.
+    import ssl
+
     server_context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     server_context.verify_mode = ssl.CERT_REQUIRED
     # Accept an expired certificate, because its name is needed to say how to replace it.
@@ -200,6 +207,8 @@ def peer_ends_ns(endpoint: str, directory: str) -> WallNs | None:
         from cryptography import x509
     except ImportError:
         return None
+    import socket
+
     host, port = host_and_port(endpoint)
     try:
         with (
@@ -212,6 +221,8 @@ def peer_ends_ns(endpoint: str, directory: str) -> WallNs | None:
 
 
 def _trusting(directory: str) -> ssl.SSLContext:
+    import ssl
+
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     _load(context, directory)
@@ -259,6 +270,8 @@ def trouble(endpoint: str, directory: str) -> str:
 
     Blocks for a few seconds, or longer if the lookup of the host name is slow.
     """
+    import socket
+
     host, port = host_and_port(endpoint)
     try:
         plain = socket.create_connection((host, int(port)), HANDSHAKE_TIMEOUT_S)
@@ -289,6 +302,8 @@ def trouble(endpoint: str, directory: str) -> str:
 
 
 def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
+    import ssl
+
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.load_verify_locations(f"{directory}/{CA}")
     _load(context, directory)
@@ -323,6 +338,8 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
 
 
 def _wrong_date(certificate: Mapping[str, Any]) -> int:
+    import ssl
+
     now = clock.now().wall_ns / NS_PER_S
     if now > ssl.cert_time_to_seconds(certificate["notAfter"]):
         return DateError.EXPIRED

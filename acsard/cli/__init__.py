@@ -2,7 +2,8 @@
 
 A module's docstring is the text of `--help`, `add_options` declares the options, and `main` (or a
 main function for each action, as of `acsard tls init`) runs it. Only the module of the typed
-subcommand is imported. It imports at its top everything but libraries that may be missing.
+subcommand is imported. It imports at its top everything but libraries that may be missing
+or that are slow to load. `acsard call stop` must leave quickly.
 """
 
 from __future__ import annotations
@@ -13,11 +14,9 @@ import io
 import os
 import re
 import sys
-import traceback
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
-from decimal import Decimal
 from importlib import import_module
 from types import ModuleType
 from typing import NoReturn
@@ -26,7 +25,6 @@ from acsard.core.config.nearest import nearest
 from acsard.core.formatting import lines, printable
 from acsard.core.values import AcsardError
 from acsard.host.errors import Exit, MendableError
-from acsard.host.version import version
 
 # Subcommands in the order of `acsard --help`; the name is the module's too.
 VERBS = {
@@ -113,14 +111,16 @@ class _Parser(argparse.ArgumentParser):
 class _Version(argparse.Action):
     # argparse's own action takes the text, for which a clone asks git, before it is needed.
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from acsard.host.version import version
+
         print(f"acsard {version()}")
         parser.exit()
 
 
 def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
-    """Return the parser, with the options of the subcommands in `called` only.
+    """Return the parser of the subcommands in `called`, or if one is unknown, of all by name.
 
-    The modules of others are not imported.
+    Only the modules in `called` are imported.
     """
     whole = _Parser(
         prog="acsard",
@@ -132,7 +132,8 @@ def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
     )
     whole.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     verbs = whole.add_subparsers(title="subcommands", metavar="SUBCOMMAND", dest="verb")
-    for name in (*VERBS, *UNLISTED):
+    names = (*VERBS, *UNLISTED)
+    for name in called if all(name in names for name in called) else names:
         # argparse lists only subcommands that have a help.
         verb = verbs.add_parser(name, help=VERBS[name]) if name in VERBS else verbs.add_parser(name)
         if name in called:
@@ -197,7 +198,11 @@ _EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}")
 
 def _decimal(word: str) -> str:
     # argparse would mistake `-1e-3` for an option.
-    return f"{Decimal(word):f}" if _EXPONENT.fullmatch(word) else word
+    if not _EXPONENT.fullmatch(word):
+        return word
+    from decimal import Decimal
+
+    return f"{Decimal(word):f}"
 
 
 def _unusable(words: Sequence[str]) -> str:
@@ -242,6 +247,8 @@ def entry() -> NoReturn:
     except SystemExit as end:  # argparse ends this way after --help, --version and usage errors
         code = end.code if isinstance(end.code, int) else Exit.FAILURE
     except BaseException:  # noqa: BLE001 - print the traceback as Python would
+        import traceback
+
         traceback.print_exc()
         code = Exit.FAILURE
     for stream in (sys.stdout, sys.stderr):

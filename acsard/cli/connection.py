@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from threading import Event
+from threading import Event, Thread
 
 import zenoh
 
@@ -22,7 +22,6 @@ from acsard.core.config.settings import TLS_PREFIX
 from acsard.core.formatting import printable
 from acsard.core.messages.keys_and_roles import key_hint, row_of, unknown
 from acsard.host.errors import UsageError
-from acsard.host.threads import Worker
 
 SEVERAL_IDS = "; several ids separated by commas, or '*' for all robots"
 
@@ -168,7 +167,7 @@ def explained(
             elif not reported:
                 reported = print_reason(ceased())
 
-    Worker("waiting", print_reasons).start()
+    Thread(name="waiting", target=print_reasons, daemon=True).start()
     try:
         yield come.set
         if time.monotonic() - began_s >= timeout_s:

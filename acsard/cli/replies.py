@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import msgspec
 
@@ -51,6 +50,8 @@ def of_each(
     robot: Client, ids: Sequence[str], call: Callable[[Client], ServiceReply]
 ) -> dict[str, ServiceReply | AcsardError]:
     """Call a service of several robots at once, and return replies or errors by robot id."""
+    from concurrent.futures import ThreadPoolExecutor  # slow, and one robot does not need it
+
     wanted = present_ids(robot, ids)
 
     def called(robot_id: str) -> ServiceReply | AcsardError:

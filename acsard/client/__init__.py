@@ -39,8 +39,9 @@ text of an error says what to do:
     DecodeError                         a payload is not a message of acsard
 """
 
+from typing import TYPE_CHECKING
+
 from acsard.bus.subscription import Subscription
-from acsard.client.asynchronous import AsyncClient, connect_async
 from acsard.client.identity import ClientIdentity
 from acsard.client.synchronous import Client, connect
 from acsard.core.messages.encodings import DecodeError
@@ -54,6 +55,9 @@ from acsard.host.errors import (
     UnreachableError,
     UsageError,
 )
+
+if TYPE_CHECKING:
+    from acsard.client.asynchronous import AsyncClient, connect_async
 
 __all__ = (
     "AcsardError",
@@ -73,3 +77,12 @@ __all__ = (
     "connect",
     "connect_async",
 )
+
+
+def __getattr__(name: str) -> object:
+    # asyncio loads for 10 ms, which a program without it does not wait for.
+    if name not in ("AsyncClient", "connect_async"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from acsard.client import asynchronous
+
+    return getattr(asynchronous, name)

@@ -30,9 +30,6 @@ from acsard.client.commander import (
 )
 from acsard.client.driving import UnheardError, drive, repeat_zeros
 from acsard.client.identity import ClientIdentity, identity
-from acsard.core.incoming.commands import require_size
-from acsard.core.incoming.imu import UNKNOWN_COVARIANCE
-from acsard.core.incoming.queries import BUSY_ENCODING, invalid_call, not_offered
 from acsard.core.messages import schema
 from acsard.core.messages.encodings import (
     DecodeError,
@@ -54,6 +51,12 @@ from acsard.core.messages.keys_and_roles import (
     unknown,
 )
 from acsard.core.messages.permissions import COMMAND_ROLE, has
+from acsard.core.messages.refusals import (
+    BUSY_ENCODING,
+    invalid_call,
+    not_offered,
+    require_size,
+)
 from acsard.core.messages.signature import Signature, public_name
 from acsard.core.values import Plain, Pose
 from acsard.host import clock
@@ -559,17 +562,18 @@ class Client:
         return NotDrivenError(f"{error}; {us.describe()}" if explains else str(error))
 
 
+_UNKNOWN = [0.0] * 9  # the covariance in sensor_msgs/Imu
+
+
 class _PartialImu(schema.Imu, frozen=True, kw_only=True):
     # In JSON and msgpack only `angular_velocity` is required.
     header: schema.Header = schema.Header()
     orientation: schema.Quaternion = schema.Quaternion()
-    orientation_covariance: schema.Covariance3 = field(default_factory=UNKNOWN_COVARIANCE.copy)
+    orientation_covariance: schema.Covariance3 = field(default_factory=_UNKNOWN.copy)
     angular_velocity: schema.Vector3
-    angular_velocity_covariance: schema.Covariance3 = field(default_factory=UNKNOWN_COVARIANCE.copy)
+    angular_velocity_covariance: schema.Covariance3 = field(default_factory=_UNKNOWN.copy)
     linear_acceleration: schema.Vector3 = schema.Vector3()
-    linear_acceleration_covariance: schema.Covariance3 = field(
-        default_factory=UNKNOWN_COVARIANCE.copy
-    )
+    linear_acceleration_covariance: schema.Covariance3 = field(default_factory=_UNKNOWN.copy)
 
 
 class _ImuDecoder(Decoder[schema.Imu]):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import stat
-import tempfile
 from contextlib import suppress
 from pathlib import Path
 
@@ -41,6 +40,8 @@ def replace(
     before = file.stat() if file.is_file() else None
     if mode is None:
         mode = NEW_MODE if before is None else stat.S_IMODE(before.st_mode)
+    import tempfile  # readers do not need it
+
     handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
     try:
         with os.fdopen(handle, "wb") as new:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import ipaddress
-import json
 import os
 import pwd
-import secrets
-import subprocess
 import sys
+from base64 import urlsafe_b64encode
 from pathlib import Path
 
 from acsard.core.messages.signature import MAX_NAME_LENGTH
-from acsard.host.processes import run_command
 
 
 def own_name() -> str:
@@ -34,11 +30,18 @@ def sender_id(name: str, secret: str = "") -> str:
 
 def new_secret() -> str:
     """Return 128 random bits as 22 characters that do not include "/"."""
-    return secrets.token_urlsafe(16)
+    return urlsafe_b64encode(os.urandom(16)).rstrip(b"=").decode()
 
 
 def own_addresses() -> list[str]:
     """Return this machine's IP addresses that others can reach; none if the command `ip` fails."""
+    # Only servers need this. A client only has a name.
+    import ipaddress
+    import json
+    import subprocess
+
+    from acsard.host.processes import run_command
+
     try:
         links = json.loads(run_command(("ip", "-json", "address"), 5.0).stdout or "[]")
     except (OSError, ValueError, subprocess.TimeoutExpired):

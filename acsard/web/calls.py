@@ -13,10 +13,10 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, TypeVar
 
 from acsard.client import Client
-from acsard.core.incoming.queries import BUSY
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.keys_and_roles import SERVICE_NAME, service_key
 from acsard.core.messages.permissions import least_role
+from acsard.core.messages.refusals import BUSY
 from acsard.core.messages.schema import ServiceReply
 from acsard.host.errors import MendableError, UsageError
 from acsard.host.rate_limits import Places

@@ -33,8 +33,8 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 import zenoh
 
-from acsard.core.incoming.queries import BUSY_ENCODING
 from acsard.core.messages.keys_and_roles import command_key
+from acsard.core.messages.refusals import BUSY_ENCODING
 
 T = TypeVar("T")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 
 MAX_COMPARED_LENGTH = 80  # characters of a mistyped word, so that a long one takes a short time
@@ -10,6 +9,8 @@ MAX_COMPARED_LENGTH = 80  # characters of a mistyped word, so that a long one ta
 
 def nearest(word: str, known: Iterable[str]) -> list[str]:
     """Return the known word that is most similar, in a list, or []."""
+    import difflib  # most words are right
+
     return difflib.get_close_matches(word[:MAX_COMPARED_LENGTH], list(known), n=1, cutoff=0.6)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from codecs import BOM_UTF8
 from typing import Any
 
@@ -51,6 +50,10 @@ def _table(text: bytes) -> dict[str, Any]:
         raise ConfigError(
             [f"more than {MAX_BYTES} bytes: too large for a configuration; shorten the file"]
         )
+    if not text:
+        return {}
+    import tomllib  # it loads for 2 ms, and a computer without a file does not need it
+
     try:
         return tomllib.loads(text.removeprefix(BOM_UTF8).decode("utf-8"))
     except UnicodeDecodeError as error:
@@ -67,6 +70,8 @@ def _table(text: bytes) -> dict[str, Any]:
 
 
 def _checked(table: object) -> Config:
+    if table == {}:
+        return Config()  # the defaults are valid
     problems: list[str] = []
     invalid: set[str] = set()
     try:

@@ -18,6 +18,7 @@ from acsard.core.config.settings import JointsConfig
 from acsard.core.messages import signature
 from acsard.core.messages.encodings import DecodeError, StrictDecoder, decode_cdr, detect
 from acsard.core.messages.keys_and_roles import COMMANDS, SERVICES
+from acsard.core.messages.refusals import MAX_COMMAND_BYTES, require_size
 from acsard.core.messages.schema import (
     MESSAGES,
     Beat,
@@ -83,8 +84,6 @@ class Bindings:
             del self._seen[next(iter(self._seen))]
         return None
 
-
-MAX_COMMAND_BYTES = 4096  # a TwistStamped in JSON is shorter than 300
 
 # Largest lead of a timestamp over the daemon's clock; Zenoh replaces one that is further ahead.
 MAX_TIMESTAMP_LEAD_NS = NS_PER_S // 2
@@ -272,12 +271,6 @@ class Receiver:
                     )
                 return replace(request, pose=Pose(x, y, yaw))
         return request
-
-
-def require_size(verb: Verb, payload: bytes) -> None:
-    """Raise `DecodeError` if the payload is too large; a service without one ignores any."""
-    if verb in _payloads and len(payload) > MAX_COMMAND_BYTES:
-        raise DecodeError("too_big", f"the payload has over {MAX_COMMAND_BYTES} bytes")
 
 
 class Identity(Struct, frozen=True):

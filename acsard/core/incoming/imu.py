@@ -14,8 +14,9 @@ from collections.abc import MutableMapping
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, claimed_identity
+from acsard.core.incoming.commands import Arrival, claimed_identity
 from acsard.core.messages.encodings import DecodeError, StrictDecoder, decode_cdr, detect
+from acsard.core.messages.refusals import MAX_COMMAND_BYTES
 from acsard.core.messages.schema import Covariance3, Header, Imu, Quaternion, Vector3
 from acsard.core.messages.signature import public_name
 from acsard.core.values import NS_PER_S, Event, GyroSample, Ns

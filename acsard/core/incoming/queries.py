@@ -6,15 +6,14 @@ clear a latch. Other keys may be queried with a wildcard.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.core.config.nearest import hint
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
-from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Receiver, Via, caller_name
+from acsard.core.incoming.commands import Receiver, Via, caller_name
 from acsard.core.messages.cdr import CdrError
 from acsard.core.messages.encodings import (
     FORMATS,
@@ -37,6 +36,7 @@ from acsard.core.messages.keys_and_roles import (
     service_key,
     whoami_key,
 )
+from acsard.core.messages.refusals import MAX_COMMAND_BYTES, invalid_call, not_offered
 from acsard.core.messages.schema import (
     MESSAGES,
     Change,
@@ -61,17 +61,11 @@ from acsard.core.ros.parameters import (
 )
 from acsard.core.ros.shapes import Trigger
 from acsard.core.ros.transports import PARAMETERS_PREFIX, left_out
-from acsard.core.values import ROLES, Answer, Ns, Request, Status, Verb, WallNs
+from acsard.core.values import ROLES, Answer, Ns, Request, Status, WallNs
 
 Current = Callable[[str], Message | None]
 
 MAX_WILDCARD_LENGTH = 512  # of a wildcard: no key is longer, and it would delay the control loop
-
-MAX_VERB_LENGTH = 40  # characters of an unknown verb in a reply
-
-BUSY = "busy: too many queries at once; ask again"
-
-BUSY_ENCODING = "text/plain;busy"  # by which a client knows the error reply `BUSY`
 
 
 class Query(Struct, frozen=True):
@@ -287,11 +281,6 @@ def refused(query: Query, why: str, wall_ns: WallNs, encoding: str = "text/plain
     return Reply(query.ticket, query.topic, payload, cdr, attachment=attachment)
 
 
-def invalid_call(verb: Verb, error: DecodeError) -> ServiceReply:
-    """Return the reply to a service call whose payload is not valid."""
-    return ServiceReply(False, f"{error}; send {SERVICES[verb].example}")
-
-
 def _unknown_service(query: Query, form: Format) -> Reply:
     verb = query.topic.removeprefix(service_key(""))
     reply = ServiceReply(False, not_offered(verb, SERVICES))
@@ -332,13 +321,6 @@ def _format(query: Query) -> Format:
         except DecodeError:
             pass  # a service that needs no payload ignores a payload that cannot be decoded
     return "json"
-
-
-def not_offered(verb: str, services: Iterable[str]) -> str:
-    """Return the words that refuse a call of a service that the robot does not have."""
-    verb, known = verb[:MAX_VERB_LENGTH], list(services)
-    why = hint(verb, known, f"its services are {', '.join(known)}")
-    return f"{verb!r} is not a service of this robot; {why}"
 
 
 def offered_services() -> dict[str, list[str]]:

@@ -6,9 +6,10 @@ import math
 
 from msgspec import Struct
 
-from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, caller_name
+from acsard.core.incoming.commands import Arrival, caller_name
 from acsard.core.messages.encodings import DecodeError, StrictDecoder, decode_cdr, detect
 from acsard.core.messages.keys_and_roles import SPEED_LIMIT
+from acsard.core.messages.refusals import MAX_COMMAND_BYTES
 from acsard.core.messages.schema import Header, SpeedLimit
 from acsard.core.values import SpeedCap
 

@@ -14,6 +14,7 @@ import msgspec
 from acsard.core.config.settings import Config
 from acsard.core.messages.keys_and_roles import SERVICES
 from acsard.core.messages.schema import (
+    BOTH_WAYS,
     MESSAGES,
     Imu,
     JointState,
@@ -75,9 +76,6 @@ SCHEMAS: dict[str, Schema] = {
         name: (coming_in if name in INCOMING_ONLY else going_out)(cls, name)
         for name, cls in MESSAGES.items()
     },
-    **{
-        f"{cls.__name__}In": coming_in(cls, f"{cls.__name__}In")
-        for cls in (TwistStamped, JointState, Imu)
-    },
+    **{name: coming_in(cls, name) for name, cls in BOTH_WAYS.items()},
     "Config": going_out(Config, "Config"),
 }

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Literal, get_args
 
-from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.keys_and_roles import JSON_TREE, VERBS, Topic, json_key, row_of
+from acsard.core.messages.schema import SCHEMA_NAMES
 from acsard.core.values import ROLES, Role, Verb
 
 Use = Literal["publish", "subscribe", "query"]  # a call of a service is a query
@@ -47,7 +47,7 @@ def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
         return
     if least is None:
         return
-    for name in SCHEMAS if "<Type>" in row.key else ("",):
+    for name in SCHEMA_NAMES if "<Type>" in row.key else ("",):
         yield row.key.replace("<Type>", name), least
     if use != "publish" and row.subscribe and row.query:
         yield json_key(row.key), least

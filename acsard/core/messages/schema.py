@@ -698,3 +698,12 @@ MESSAGES: dict[str, type[Message]] = {
 }
 """Maps the name of each complete message type to the type. Types that are only parts of messages
 are not included. A query of the key `schema/<Type>` returns the JSON Schema of a type."""
+
+BOTH_WAYS: dict[str, type[Message]] = {
+    f"{cls.__name__}In": cls for cls in (TwistStamped, JointState, Imu)
+}
+"""Types that the daemon both publishes and receives, by the name of the schema of the received."""
+
+SCHEMA_NAMES = (*MESSAGES, *BOTH_WAYS, "Config")
+"""The `<Type>` of each key `schema/<Type>`. The schemas are in `json_schema.py`, which takes 17 ms
+to make them."""

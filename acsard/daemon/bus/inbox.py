@@ -17,8 +17,8 @@ from itertools import count
 import zenoh
 
 from acsard.core.incoming.bus_interface import BusInput, Waker
-from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via, parts
-from acsard.core.incoming.queries import BUSY, BUSY_ENCODING, Query, Reply, most_bytes, refused
+from acsard.core.incoming.commands import Arrival, Via, parts
+from acsard.core.incoming.queries import Query, Reply, most_bytes, refused
 from acsard.core.messages.keys_and_roles import (
     ANY_SERVICE,
     IMU,
@@ -29,6 +29,7 @@ from acsard.core.messages.keys_and_roles import (
     service_key,
     source_keys,
 )
+from acsard.core.messages.refusals import BUSY, BUSY_ENCODING, MAX_COMMAND_BYTES
 from acsard.core.ros.transports import Endpoint
 from acsard.core.values import NS_PER_S
 from acsard.host import clock

@@ -21,11 +21,12 @@ from acsard.client.driving import UnheardError
 from acsard.client.identity import ClientIdentity
 from acsard.client.synchronous import decoder
 from acsard.core.config.settings import Config, DriveConfig, JointsConfig
-from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Receiver
+from acsard.core.incoming.commands import Arrival, Receiver
 from acsard.core.incoming.imu import reading
 from acsard.core.incoming.queries import Queries, Query
 from acsard.core.messages import schema
 from acsard.core.messages.encodings import FORMATS, DecodeError, Decoder, Format, encode
+from acsard.core.messages.refusals import MAX_COMMAND_BYTES
 from acsard.core.messages.schema import (
     Beat,
     Header,

@@ -21,7 +21,6 @@ from acsard.core.config.settings import CommandsConfig, DriveConfig, JointsConfi
 from acsard.core.incoming.commands import (
     BINDING_NS,
     MAX_BINDINGS,
-    MAX_COMMAND_BYTES,
     Arrival,
     Bindings,
     Receiver,
@@ -29,6 +28,7 @@ from acsard.core.incoming.commands import (
     claimed_identity,
 )
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode
+from acsard.core.messages.refusals import MAX_COMMAND_BYTES
 from acsard.core.messages.schema import JointState, TwistStamped
 from acsard.core.messages.schema import Twist as TwistMessage
 from acsard.core.messages.signature import HASH_DIGITS, MAX_NAME_LENGTH, public_name

@@ -19,8 +19,6 @@ from acsard.core.config.settings import (
     RobotConfig,
 )
 from acsard.core.incoming.queries import (
-    BUSY,
-    BUSY_ENCODING,
     Queries,
     Query,
     Reply,
@@ -40,6 +38,7 @@ from acsard.core.messages.keys_and_roles import (
     TOPICS,
     offered,
 )
+from acsard.core.messages.refusals import BUSY, BUSY_ENCODING
 from acsard.core.messages.report import Report
 from acsard.core.messages.schema import MESSAGES, Info, Interfaces, Message, ServiceReply, Topics
 from acsard.core.messages.signature import public_name
