@@ -312,7 +312,7 @@ class Wheels(Struct):
             still = -COMMANDED < command < COMMANDED
             if not still:
                 if wheel.rested:
-                    wheel.off = wheel.apart_s = wheel.apart_angle = 0.0
+                    wheel.off = wheel.missed = wheel.apart_s = wheel.apart_angle = 0.0
                 wheel.rested, wheel.rest_s, wheel.rest_angle = False, 0.0, 0.0
             elif not wheel.rested:
                 _rest(wheel, angle, block)
@@ -431,7 +431,9 @@ class Wheels(Struct):
     def _miss(self, patience: Seconds) -> None:
         for side, (name, front, rear) in zip(self.sides, SIDES, strict=True):
             one, other = self.wheels[front], self.wheels[rear]
-            if side.out >= 0 or one.rested or not (one.missed and other.missed):
+            # Quick motors stop before they are expected to.
+            still = -COMMANDED < side.command < COMMANDED
+            if side.out >= 0 or still or not (one.missed and other.missed):
                 continue
             if one.apart_s >= patience and other.apart_s >= patience:
                 values = [0.0] * 4

@@ -262,6 +262,16 @@ def test_wheels_that_start_again_after_a_stall_are_not_blocked() -> None:
     assert (bench.faults, bench.events) == ([], [])
 
 
+def test_motors_that_stop_sooner_than_declared_missed_no_turn() -> None:
+    bench, doubts, speed = driven(counts=0), [], 10.0
+    for step in range(200):
+        command = max(0.0, 10.0 - step / 2)
+        speed = round(speed + (command - speed) / 3, 2)
+        bench.run(all_at(speed), all_at(command), seconds=PERIOD)
+        doubts += bench.wheels.possible_motion((0.0, 0.0, 0.0, 0.0))
+    assert doubts == []
+
+
 def test_stalls_hide_no_wheel_that_rolls_on() -> None:
     bench = driven()
     for step in range(200):
