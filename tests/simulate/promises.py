@@ -119,6 +119,8 @@ class Witness:
             radius * drive.get(f"{side}_wheel_radius_multiplier", 1.0) for side in ("right", "left")
         )
         self.radius = sum(self.radii) / 2
+        # A robot that looks for 5 cm/s with encoders of 16 counts needs so long.
+        self._rests_ns = int((1.0 + 20.0 * self.radius) * NS)
         self.half = (
             drive.get("wheel_separation", 0.3) * drive.get("wheel_separation_multiplier", 1.0) / 2
         )
@@ -785,11 +787,12 @@ class Witness:
             raise BrokenError(name, at_ns, text)
 
     def wheels(self, at_ns: int, fastest: float) -> None:
-        """Note the speed of the fastest true wheel, rad/s, and whether the robot stands."""
+        """Note the speed of the fastest true wheel, rad/s, and whether the robot sees it stand."""
         unseen, self._wheels_ns = at_ns - self._wheels_ns > NS // 2, at_ns
+        unseen |= not self.linked
         if self.last != ZERO or fastest > 0.1 or unseen:
             self._turns_ns = at_ns
-        self.rested |= at_ns - self._turns_ns > NS
+        self.rested |= at_ns - self._turns_ns > self._rests_ns
 
     def _wished(
         self,

@@ -729,7 +729,7 @@ def test_a_hand_that_turns_wheels_at_rest_causes_no_fault() -> None:
         witness.step(3 * NS, "fault", "wheel_runaway", "why")
 
 
-@pytest.mark.parametrize(("steps", "visible"), [(4, True), (0, False)])
+@pytest.mark.parametrize(("steps", "visible"), [(8, True), (0, False)])
 def test_wheels_that_rest_only_while_the_host_stalls_may_look_like_a_runaway(
     steps: int, visible: bool
 ) -> None:
@@ -737,12 +737,12 @@ def test_wheels_that_rest_only_while_the_host_stalls_may_look_like_a_runaway(
     witness.rested = False
     for n in range(steps + 1):
         witness.wheels(NS + n * NS // 4, 0.0)
-    witness.wheels(9 * NS // 4, 0.0)
-    witness.troubles["pushed"] = 3 * NS
-    witness.wheels(5 * NS // 2, 9.0)
+    witness.wheels(13 * NS // 4, 0.0)
+    witness.troubles["pushed"] = 7 * NS // 2
+    witness.wheels(7 * NS // 2, 9.0)
     expected = pytest.raises(BrokenError, match="without a cause") if visible else nullcontext()
     with expected:
-        witness.step(3 * NS, "fault", "wheel_runaway", "why")
+        witness.step(4 * NS, "fault", "wheel_runaway", "why")
 
 
 def test_a_pose_may_not_jump_although_the_encoders_missed_a_part_of_the_drive() -> None:
