@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from copy import copy
 from functools import lru_cache
 from typing import Any
 
@@ -238,6 +239,12 @@ class Client:
         """Return a client of a robot on the same connection, which is a separate sender."""
         other = Client(self.session, robot_id, self.source, self.where.tls, self.where.endpoint)
         other.name, other._secret, other._spacing = self.name, self._secret, self._spacing
+        return other
+
+    def named(self, name: str) -> Client:
+        """Return this client under another name in the daemon's log of service calls."""
+        other = copy(self)
+        other.name = name
         return other
 
     def key(self, name: str) -> str:

@@ -169,20 +169,28 @@ class File(Struct, frozen=True):
 
 
 class Files:
-    """Cache of the page's files, which reads a file again when it has changed on the disk."""
+    """The page's files, as of the last reading of the disk."""
 
     def __init__(self, directory: Path = PAGE_DIRECTORY) -> None:
         self._directory = directory
         self._files: dict[str, File] = {}
+        self.read()
 
     def get(self, name: str) -> File | None:
-        """Return a file, or None if it may not be sent.
+        return self._files.get(name)
 
-        That is so for another suffix, for a dot first or a path in the name, and for a symbolic
-        link.
-        """
+    def read(self) -> None:
+        """Read the files that have changed on the disk."""
+        try:
+            names = [path.name for path in self._directory.iterdir()]
+        except OSError:
+            names = []
+        files = {name: self._read(name) for name in names}
+        self._files = {name: file for name, file in files.items() if file is not None}
+
+    def _read(self, name: str) -> File | None:
         kind = CONTENT_TYPES.get(Path(name).suffix)
-        if kind is None or "/" in name or name.startswith("."):
+        if kind is None or name.startswith("."):
             return None
         paths = [self._directory / entry for entry in (name, *INLINED.get(name, ()))]
         try:
@@ -191,11 +199,9 @@ class Files:
             stats = [path.stat() for path in paths]
             stamp = tuple((entry.st_mtime_ns, entry.st_size) for entry in stats)
             known = self._files.get(name)
-            if known is None or known.stamp != stamp:
-                known = self._files[name] = _load_file(paths, kind, stamp)
+            return known if known and known.stamp == stamp else _load_file(paths, kind, stamp)
         except (OSError, ValueError):
             return None
-        return known
 
 
 def _load_file(paths: Sequence[Path], kind: str, stamp: tuple[tuple[int, int], ...]) -> File:

@@ -26,27 +26,17 @@ from acsard.core.ros.parameters import kind_of
 from acsard.core.values import Role
 from acsard.host import clock
 from acsard.host.errors import MendableError, NoAnswerError
-from acsard.host.threads import NoThreadError, in_thread
 from acsard.web import metrics, openapi
-from acsard.web.acceptor import Acceptor
-from acsard.web.admission import IDENTITY_KEY, Admission, own_port, peer_of
-from acsard.web.answers import (
-    READ_TIMEOUT_S,
-    File,
-    Files,
-    TroubleError,
-    file_answer,
-    reply,
-    sent_in_pieces,
-)
+from acsard.web.access import IDENTITY_KEY, LAST_KEY, Access, connection_of, own_port, peer_of
+from acsard.web.answers import Files, TroubleError, file_answer, reply, sent_in_pieces
 from acsard.web.callers import PROTOCOL, RequestRefusedError, cookie_name, tokens_offered
 from acsard.web.camera import SEND_TIMEOUT_S, Camera
-from acsard.web.limits import OPENINGS, PICTURES, STOPS, WebSocketLimits
+from acsard.web.connections import Connections
 from acsard.web.recordings import BlackBox, Recording
 from acsard.web.routes import FORM, JSON, RECORDINGS_ROLE, Body, Problem, Route, services, values
 from acsard.web.socket_messages import MAX_MESSAGE_BYTES
 from acsard.web.streams import as_json
-from acsard.web.tokens import Vault
+from acsard.web.tokens import ReadTokens
 from acsard.web.viewer import PING_INTERVAL_S, Parts, Viewer
 
 # Most bodies have a few hundred bytes.
@@ -92,24 +82,19 @@ class Page:
     def __init__(
         self,
         parts: Parts,
-        vault: Vault,
+        tokens: ReadTokens,
         names: AbstractSet[str],
-        acceptor: Acceptor,
+        connections: Connections,
         rules: WebConfig,
     ) -> None:
-        self._parts, self._vault, self._acceptor = parts, vault, acceptor
-        self._robot, self._files = parts.robot, Files()
+        self._parts, self._tokens, self._connections = parts, tokens, connections
+        self._robot, self.files = parts.robot, Files()
         self._box = BlackBox(parts.robot)
-        self._websocket_limits, self._camera = WebSocketLimits(), Camera(rules.camera)
+        self._camera = Camera(rules.camera)
         self._has_camera = bool(rules.camera)
-        # Each page file, and when the disk was last checked for a change, on the event loop's
-        # clock.
-        self._sent: dict[str, tuple[File, float]] = {}
         self._viewers: set[Viewer] = set()
-        # The last read of the token file, which may take any time.
-        self._token_read: asyncio.Future[frozenset[str]] | None = None
-        self._admission = Admission(parts.robot.id, names, vault, acceptor, parts.counts, rules)
-        self.app = self._admission.application(ROUTES, self)
+        self._access = Access(parts.robot.id, names, tokens, connections, rules)
+        self.app = self._access.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:
         """End every WebSocket for a reason (120 characters at most), and the camera."""
@@ -117,27 +102,12 @@ class Page:
         for viewer in list(self._viewers):
             viewer.end(why)
 
-    async def tidy(self) -> None:
-        """Close the connections whose token is not valid any more. Call this once a second.
-
-        If the disk hangs, no token counts as valid. If no thread can be started, all connections
-        stay.
-        """
-        # While the disk hangs, all calls wait for the same read. Otherwise, each call would leave
-        # one more blocked thread.
-        if self._token_read is None or self._token_read.done():
-            self._token_read = asyncio.ensure_future(in_thread(self._vault.valid_digests, None))
-        try:
-            async with asyncio.timeout(READ_TIMEOUT_S):
-                valid = await asyncio.shield(self._token_read)
-        except NoThreadError:
-            return  # the disk was not read, so all tokens stay valid
-        except TimeoutError:
-            valid = frozenset()
-        for viewer in list(self._viewers):
-            if viewer.who.token and viewer.who.token not in valid:
-                viewer.end("your token has expired or was revoked: ask for a new one")
-        self._acceptor.tidy(valid)
+    def tidy(self) -> None:
+        """End the connections whose token is not valid any more. Call this once a second."""
+        for token in self._connections.tokens():
+            if not self._tokens.left_s(token):
+                why = "your token has expired or was revoked: ask for a new one"
+                self._connections.end(token, why)
 
     # The page and its files.
 
@@ -151,19 +121,9 @@ class Page:
         return await self._send(request, request.match_info["name"])
 
     async def _send(self, request: web.Request, name: str) -> web.StreamResponse:
-        now = asyncio.get_running_loop().time()
-        file, read = self._sent.get(name, (None, 0.0))
-        # Access the disk at most once a second for each file. Each access starts a thread, and the
-        # whole server waits while a thread starts.
-        if file is None or now > read + 1.0:
-            if file is not None:
-                # Other requests get the old file until the disk has answered.
-                self._sent[name] = file, now
-            file = await in_thread(lambda: self._files.get(name), READ_TIMEOUT_S)
-            if file is None:
-                self._sent.pop(name, None)
-                raise web.HTTPNotFound
-            self._sent[name] = file, now
+        file = self.files.get(name)
+        if file is None:
+            raise web.HTTPNotFound
         return file_answer(request, file)
 
     async def token(self, request: web.Request) -> web.StreamResponse:
@@ -177,17 +137,17 @@ class Page:
             raise RequestRefusedError(
                 "plain", "over plain http, no token is needed: connect without one"
             )
-        identity = await self._admission.owner(peer_of(request), [form.token])
+        identity = await self._access.owner(peer_of(request), [form.token])
         cookie = cookie_name(self._robot.id, own_port(request))
         old_token = "" if form.replace else request.cookies.get(cookie, "")
-        present = self._vault.find_owner(old_token)
+        present = self._tokens.owner([old_token])
         if present is not None and not identity.may(present.role):
             raise TroubleError(
                 409,
                 f"this browser is already signed in as {present.name} ({present.role}); the link "
                 f"would sign it in as {identity.name} ({identity.role}), with fewer permissions",
             )
-        left_s = await in_thread(lambda: self._vault.left_s(identity.token), READ_TIMEOUT_S)
+        left_s = self._tokens.left_s(identity.token)
         response = web.Response(status=303, headers={"Location": "/"})
         response.set_cookie(
             cookie, form.token, max_age=left_s, path="/", secure=True, httponly=True,
@@ -196,7 +156,7 @@ class Page:
         return response
 
     async def socket(self, request: web.Request) -> web.StreamResponse:
-        identity, peer = request[IDENTITY_KEY], peer_of(request)
+        identity = request[IDENTITY_KEY]
         offered = request.headers.get("Sec-WebSocket-Protocol", "")
         if tokens_offered(offered) and PROTOCOL not in map(str.strip, offered.split(",")):
             # If aiohttp knew none of the offered names, it would log all of them, and so the token.
@@ -204,26 +164,22 @@ class Page:
                 "malformed",
                 f"the WebSocket must offer the subprotocol {PROTOCOL} besides the token",
             )
-        if full := self._websocket_limits.enter(peer, identity.token):
-            raise RequestRefusedError("too_many", full)
+        served = web.WebSocketResponse(
+            max_msg_size=MAX_MESSAGE_BYTES,
+            heartbeat=PING_INTERVAL_S,
+            compress=False,
+            protocols=[PROTOCOL],
+            autoping=False,  # `Viewer` limits the rate of pings too
+        )
+        await served.prepare(request)
+        _limit_buffer(request)
+        viewer = Viewer(served, request, identity, self._parts, camera=self._has_camera)
+        connection_of(request).become_socket(viewer.end)
+        self._viewers.add(viewer)
         try:
-            served = web.WebSocketResponse(
-                max_msg_size=MAX_MESSAGE_BYTES,
-                heartbeat=PING_INTERVAL_S,
-                compress=False,
-                protocols=[PROTOCOL],
-                autoping=False,  # `Viewer` limits the rate of pings too
-            )
-            await served.prepare(request)
-            _limit_buffer(request)
-            viewer = Viewer(served, request, identity, self._parts, camera=self._has_camera)
-            self._viewers.add(viewer)
-            try:
-                await viewer.run()
-            finally:
-                self._viewers.discard(viewer)
+            await viewer.run()
         finally:
-            self._websocket_limits.leave(peer, identity.token)
+            self._viewers.discard(viewer)
         return served
 
     # The interface for programs.
@@ -243,8 +199,7 @@ class Page:
         identity = request[IDENTITY_KEY]
         # A browser does not report to its page why a WebSocket was refused, so `full` reports it
         # here.
-        full = self._websocket_limits.refusal(peer_of(request), identity.token)
-        return reply(Caller(identity.role, identity.name, full))
+        return reply(Caller(identity.role, identity.name, request.get(LAST_KEY, "")))
 
     async def value(self, request: web.Request) -> web.StreamResponse:
         return reply(msgspec.Raw(await self._value(request.path.removeprefix("/api/"))))
@@ -268,17 +223,14 @@ class Page:
         picture = await self._camera.after(number)
         if picture is None:
             return web.Response(status=304)
-        async with self._camera.sending(request[IDENTITY_KEY].token):
-            _limit_buffer(request)
-            picture = self._camera.newest or picture  # a newer one may have arrived
-            now_ns = clock.steady_ns()
-            headers = {
-                "Content-Type": "image/jpeg",
-                "ETag": f'"{picture.number}"',
-                "Age-Ms": str((now_ns - picture.at_ns) // 1_000_000),
-                "Waited-Ms": str((now_ns - begun_ns) // 1_000_000),
-            }
-            return await sent_in_pieces(request, picture.body, headers, SEND_TIMEOUT_S)
+        _limit_buffer(request)
+        headers = {
+            "Content-Type": "image/jpeg",
+            "ETag": f'"{picture.number}"',
+            "Age-Ms": str((clock.steady_ns() - picture.at_ns) // 1_000_000),
+            "Waited-Ms": str((clock.steady_ns() - begun_ns) // 1_000_000),
+        }
+        return await sent_in_pieces(request, picture.body, headers, SEND_TIMEOUT_S)
 
     async def recordings(self, request: web.Request) -> web.StreamResponse:
         return reply(await self._box.rows())
@@ -377,10 +329,10 @@ ROUTES: tuple[Route, ...] = (
                          Problem)}),
     Route("GET", "/ws", "viewer", Page.socket,
         "a WebSocket that carries JSON text both ways, to follow Zenoh keys, to drive and to stop",
-        gives={101: Body("The WebSocket is open.", media="")}, rate=OPENINGS, waits=True),
+        gives={101: Body("The WebSocket is open.", media="")}),
     Route("GET", "/api", "viewer", Page.api, "this document", gives={200: Body("OpenAPI 3.1.")}),
     Route("GET", "/api/whoami", "viewer", Page.whoami, "the caller's role and name",
-        gives={200: Body("The caller.", Caller)}, rate=STOPS, waits=True),
+        gives={200: Body("The caller.", Caller)}, always=True),
     Route("GET", "/api/settings", least_role("config"), Page.settings,
         "the settings that srv/set accepts: values, ranges, and whether each may change while the "
         "robot moves",
@@ -390,8 +342,7 @@ ROUTES: tuple[Route, ...] = (
         "request waited here (`Waited-Ms`), in ms; a request that has the last picture's `ETag` "
         "as `If-None-Match` waits up to a second for a newer picture",
         gives={200: Body("A picture.", str, "image/jpeg"),
-               304: Body("There is no newer picture.", media="")},
-        rate=PICTURES, waits=True),
+               304: Body("There is no newer picture.", media="")}),
     Route("GET", "/api/recordings", "viewer", Page.recordings,
         "the recordings of the black box, oldest first",
         gives={200: Body("A list.", list[Recording])}),

@@ -1,52 +1,37 @@
-"""Sends the service calls and queries of the page's clients to the robot.
+"""Sends the service calls, stops and queries of the page's clients to the robot.
 
-Each call blocks a thread of its own. Calls of the service `stop` ("stops") have their own limits,
-so a stop never waits for other calls. If clients request several stops in quick succession, the
-server sends the first stop immediately. Later requests may share one stop, which the server sends
-after the last of these requests has arrived.
+Each call blocks a thread of its own, so a stop never waits for other calls. Of each caller, one
+stop is under way, and one more follows it, which all later presses share. So each press is answered
+by a stop that was sent after it.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Mapping
+from typing import Any
 
 from acsard.client import Client
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.keys_and_roles import SERVICE_NAME, service_key
 from acsard.core.messages.permissions import least_role
-from acsard.core.messages.refusals import BUSY
 from acsard.core.messages.schema import ServiceReply
-from acsard.host.errors import MendableError, UsageError
-from acsard.host.rate_limits import Places
+from acsard.host.errors import MendableError, NoAnswerError, UsageError
 from acsard.host.threads import in_thread
 from acsard.machine.kept_settings import set_and_keep
 from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.followed_robot import FollowedRobot
-from acsard.web.tasks import shared
-
-# At the same time: queries and calls other than a stop, and stops.
-MAX_CALLS, MAX_STOPS = 16, 32
-
-# between two stops that are sent for one client
-MIN_STOP_INTERVAL_S = 0.02
 
 # `Client` has a shorter limit, and raises an error with a clear message.
 ANSWER_TIMEOUT_S = 8.0
 
-T = TypeVar("T")
-
-Stop = Callable[[], Awaitable[ServiceReply]]
-
 
 class Calls:
-    """Sends service calls and queries to the robot, within the limits of this module."""
+    """The calls of all clients of the page, over one connection to the robot."""
 
     def __init__(self, robot: FollowedRobot, config: str | None = None) -> None:
         self._robot, self._config = robot, config
-        self._stops, self._merged = Stops(), StopMerger()
-        self._asks = Places(MAX_CALLS, MAX_CALLS)
+        self._stops: dict[str, _Stops] = {}
 
     async def call(
         self, identity: AdmittedClient, verb: str, payload: Mapping[str, Any]
@@ -56,30 +41,18 @@ class Calls:
         Raises `RequestRefusedError` if the client may not do that.
         """
         require(identity, verb)
-        client = self._robot.client
-        if client is None:
-            return ServiceReply(False, self._robot.gone)
-
-        def request() -> ServiceReply:
-            named = _named(client, identity)
-            if verb != "set" or "keep" not in payload:
-                return named.request(verb, payload)
-            arguments = dict(payload)
-            keep, settings = arguments.pop("keep"), arguments.get("settings")
-            if keep is True and isinstance(settings, dict):
-                return set_and_keep(named, self._config, settings)
-            return named.request(verb, arguments)
-
-        async def stop() -> ServiceReply:
-            return await self._stops.send_stop(request)
-
+        if self._robot.client is None:
+            return ServiceReply(False, unanswered(verb))
+        # The robot's daemon logs the call under this name.
+        client = self._robot.client.named(f"{identity.name}@page")
         try:
             if verb == "stop":
-                reply = await self._merged.send_stop(identity.token, stop)
-            else:
-                reply = await self._run_call(request)
-        except (MendableError, UsageError, DecodeError, TimeoutError) as error:
-            return ServiceReply(False, str(error) or "the robot did not answer in time: try again")
+                return await self._stops.setdefault(client.name, _Stops()).send(client)
+            reply = await in_thread(lambda: self._request(client, verb, payload), ANSWER_TIMEOUT_S)
+        except (NoAnswerError, TimeoutError):
+            return ServiceReply(False, unanswered(verb))
+        except (MendableError, UsageError, DecodeError) as error:
+            return ServiceReply(False, str(error))
         if verb == "set" and reply.success:
             self._robot.refresh_about()
         return reply
@@ -87,82 +60,44 @@ class Calls:
     async def get(self, name: str) -> tuple[str, bytes]:
         """Query the last value of a key as JSON: (encoding, payload).
 
-        Raises `MendableError` without bus or answer or if too many calls run, and `TimeoutError` if
-        the bus is stuck.
+        Raises `MendableError` without bus or answer, and `TimeoutError` if the bus is stuck.
         """
         client = self._robot.client
         if client is None:
             raise MendableError(self._robot.gone)
-        return await self._run_call(lambda: client.reply(f"{name}?fmt=json"))
+        return await in_thread(lambda: client.reply(f"{name}?fmt=json"), ANSWER_TIMEOUT_S)
 
-    async def _run_call(self, call: Callable[[], T]) -> T:
-        with self._asks.place() as free:
-            if not free:
-                raise MendableError(BUSY)
-            return await in_thread(call, ANSWER_TIMEOUT_S)
+    def _request(self, client: Client, verb: str, payload: Mapping[str, Any]) -> ServiceReply:
+        if verb != "set" or "keep" not in payload:
+            return client.request(verb, payload)
+        arguments = dict(payload)
+        keep, settings = arguments.pop("keep"), arguments.get("settings")
+        if keep is True and isinstance(settings, dict):
+            return set_and_keep(client, self._config, settings)
+        return client.request(verb, arguments)
 
 
-class StopMerger:
-    """Merges the stops of one client in quick succession.
-
-    The first is sent at once. All within `MIN_STOP_INTERVAL_S` after a sent one share the next, so
-    none is lost.
-    """
-
+class _Stops:
     def __init__(self) -> None:
-        # Set and removed `MIN_STOP_INTERVAL_S` after a client's last stop.
-        self._rests: dict[str, asyncio.Event] = {}
-        # waits for that event, then sends a stop
-        self._next: dict[str, asyncio.Task[ServiceReply]] = {}
-
-    async def send_stop(self, name: str, stop: Stop) -> ServiceReply:
-        """Send a stop, or share the one of the client that waits; return the reply."""
-        if name in self._next:
-            return await asyncio.shield(self._next[name])
-        rest = self._rests.get(name)
-        if rest is None:
-            self._begin_pause(name)
-            return await stop()
-        self._next[name] = shared(self._later(name, rest, stop))
-        return await asyncio.shield(self._next[name])
-
-    def _begin_pause(self, name: str) -> None:
-        self._rests[name] = asyncio.Event()
-        asyncio.get_running_loop().call_later(
-            MIN_STOP_INTERVAL_S, lambda: self._rests.pop(name).set()
-        )
-
-    async def _later(self, name: str, rest: asyncio.Event, stop: Stop) -> ServiceReply:
-        # If the event loop is late, `rest` may be set and gone from `_rests` before this starts.
-        await rest.wait()
-        del self._next[name]  # later callers share the next stop
-        self._begin_pause(name)
-        return await stop()
-
-
-class Stops:
-    """Limits the stops at the same time.
-
-    All further callers share one, sent when an earlier one has ended.
-    """
-
-    def __init__(self) -> None:
-        self._room = asyncio.Semaphore(MAX_STOPS)
+        self._under_way = asyncio.Lock()
         self._next: asyncio.Task[ServiceReply] | None = None
 
-    async def send_stop(self, call: Callable[[], ServiceReply]) -> ServiceReply:
-        """Send a stop by `call`, or wait for the shared one, and return the reply."""
-        if not self._room.locked():
-            async with self._room:
-                return await in_thread(call, ANSWER_TIMEOUT_S)
+    async def send(self, client: Client) -> ServiceReply:
         if self._next is None:
-            self._next = shared(self._later(call))
+            self._next = asyncio.create_task(self._send(client))
+            # Its error counts as retrieved even if all callers have gone.
+            self._next.add_done_callback(lambda done: done.cancelled() or done.exception())
         return await asyncio.shield(self._next)
 
-    async def _later(self, call: Callable[[], ServiceReply]) -> ServiceReply:
-        async with self._room:
-            self._next = None  # later callers share the next request
-            return await in_thread(call, ANSWER_TIMEOUT_S)
+    async def _send(self, client: Client) -> ServiceReply:
+        async with self._under_way:
+            self._next = None  # a later press needs a later stop
+            return await in_thread(lambda: client.request("stop", {}), ANSWER_TIMEOUT_S)
+
+
+def unanswered(verb: str) -> str:
+    """Return the sentence for a call that the robot did not answer."""
+    return f"the robot's daemon does not answer, so `{verb}` is not confirmed: does it run?"
 
 
 def require(caller: AdmittedClient, verb: str) -> None:
@@ -173,10 +108,3 @@ def require(caller: AdmittedClient, verb: str) -> None:
     if not SERVICE_NAME.fullmatch(verb):
         raise RequestRefusedError("malformed", f"{verb!r} is not the name of a service")
     caller.require(least_role(service_key(verb)), verb)
-
-
-def _named(client: Client, identity: AdmittedClient) -> Client:
-    # The robot's daemon logs the calls of this client under its name.
-    other = client.sibling(client.where.robot_id)
-    other.name = f"{identity.name}@page"
-    return other

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import suppress
 from email.message import Message
 
 import aiohttp
@@ -20,10 +19,9 @@ from msgspec import Struct
 
 from acsard.core.values import NS_PER_S, Ns
 from acsard.host import clock
-from acsard.host.rate_limits import Places
 from acsard.web.answers import TroubleError
 
-# For a new picture of the camera, and for the limit `SENDS` to let it be sent.
+# For a new picture of the camera.
 PICTURE_TIMEOUT_S = 1.0
 
 # For connecting to the camera's server, and for each wait for its data.
@@ -31,9 +29,6 @@ CONNECT_S, SILENT_S = 3.0, 3.0
 
 # Bytes of a picture and of the lines before it. A full HD picture has a few hundred kB.
 MAX_PICTURE, MAX_HEAD = 1_000_000, 4096
-
-# Pictures that are sent at the same time: in total, and with one token.
-SENDS, SENDS_OF_TOKEN = 8, 2
 
 # The page in the browser waits no longer.
 SEND_TIMEOUT_S = 5.0
@@ -102,8 +97,7 @@ class Camera:
         self._number = 0
         self._trouble = ("the camera's stream has no picture yet", "")  # and its detail
         self._asked_ns = 0
-        self._changed, self._sent = asyncio.Event(), asyncio.Event()
-        self._sends = Places(SENDS, SENDS_OF_TOKEN)
+        self._changed = asyncio.Event()
         self._reading: asyncio.Task[None] | None = None
 
     async def after(self, number: int) -> Picture | None:
@@ -128,26 +122,6 @@ class Camera:
         if newest is None:
             raise TroubleError(503, *self._trouble)
         return None if newest.number == number else newest
-
-    @asynccontextmanager
-    async def sending(self, token: str) -> AsyncIterator[None]:
-        """Limit the pictures that are sent at the same time.
-
-        Raises `TroubleError` after too long a wait.
-        """
-        try:
-            async with asyncio.timeout(PICTURE_TIMEOUT_S):
-                while not self._sends.enter(token):
-                    await self._sent.wait()
-        except TimeoutError:
-            text = f"{SENDS_OF_TOKEN} pictures with this token, or {SENDS} in total, are being sent"
-            raise TroubleError(503, text, "ask again when one of them has arrived") from None
-        try:
-            yield
-        finally:
-            self._sends.leave(token)
-            self._sent.set()
-            self._sent.clear()
 
     def close(self) -> None:
         if self._reading is not None:

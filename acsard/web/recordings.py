@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import asyncio
 import calendar
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from msgspec import Meta, Struct
 
-from acsard.core.values import NS_PER_S
-from acsard.host import clock
 from acsard.host.threads import in_thread
 from acsard.recording.directory import NAME_TIME_FORMAT, is_being_recorded
 from acsard.recording.file import listed
 from acsard.web.answers import READ_TIMEOUT_S, TroubleError
 from acsard.web.callers import RequestRefusedError, is_loopback
 from acsard.web.followed_robot import FollowedRobot
-from acsard.web.tasks import shared
 
-MIN_LIST_INTERVAL_NS = NS_PER_S // 4
+T = TypeVar("T")
 
 
 class Recording(Struct, frozen=True):
@@ -43,41 +40,23 @@ class BlackBox:
 
     def __init__(self, robot: FollowedRobot) -> None:
         self._robot = robot
-        self._listing: asyncio.Task[list[Recording]] | None = None
-        self._listed_ns = 0  # start of the task `_listing`
 
     async def rows(self) -> list[Recording]:
-        """Return all recordings, oldest first, as they were `MIN_LIST_INTERVAL_NS` ago or later."""
-        # All requests within `MIN_LIST_INTERVAL_NS` share one list. Otherwise, a client that
-        # requests the list all the time would use so much processor time that the stops of other
-        # clients are late.
-        place, now_ns = self._place(), clock.mono_ns()
-        old = now_ns - self._listed_ns > MIN_LIST_INTERVAL_NS
-        if self._listing is None or (old and self._listing.done()):
-            self._listing = shared(in_thread(lambda: rows(place), READ_TIMEOUT_S))
-            self._listed_ns = now_ns
-        try:
-            return await asyncio.shield(self._listing)
-        except (OSError, TimeoutError) as error:
-            raise _unread(place, error) from None
+        """Return all recordings, oldest first."""
+        directory = self._directory()
+        return [] if directory is None else await _read(directory, rows)
 
     async def find(self, name: str) -> Path:
         """Return the path of a recording. Raises `RequestRefusedError` if it does not exist."""
-        place = self._place()
-
-        def find_file() -> Path | None:
-            return next((path for path in _files(place) if path.name == name), None)
-
-        try:
-            path = await in_thread(find_file, READ_TIMEOUT_S)
-        except (OSError, TimeoutError) as error:
-            raise _unread(place, error) from None
+        directory = self._directory()
+        paths = [] if directory is None else await _read(directory, _files)
+        path = next((path for path in paths if path.name == name), None)
         if path is None:
             text = "this recording does not exist; GET /api/recordings lists them"
             raise RequestRefusedError("path", text)
         return path
 
-    def _place(self) -> Path:
+    def _directory(self) -> Path | None:
         host = self._robot.endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
         if not (is_loopback(host) or host == "localhost"):
             raise TroubleError(
@@ -85,13 +64,17 @@ class BlackBox:
                 "the recordings are on the robot, but this page's server runs on another machine: "
                 "open the page that the robot serves",
             )
-        if not self._robot.about.recordings:
-            raise TroubleError(
-                404,
-                "the daemon records nothing, because record.directory is not set: set it and "
-                "restart the daemon",
-            )
-        return Path(self._robot.about.recordings)
+        # A daemon whose record.directory is not set records nothing.
+        directory = self._robot.about.recordings
+        return Path(directory) if directory else None
+
+
+async def _read(directory: Path, read: Callable[[Path], T]) -> T:
+    try:
+        return await in_thread(lambda: read(directory), READ_TIMEOUT_S)
+    except (OSError, TimeoutError) as error:
+        words = getattr(error, "strerror", None) or "the disk does not answer; try again"
+        raise TroubleError(503, f"cannot read {directory}: {words}") from None
 
 
 def rows(directory: Path) -> list[Recording]:
@@ -125,8 +108,3 @@ def _begun(path: Path) -> float | None:
     except ValueError:
         return None
     return float(calendar.timegm(begun))
-
-
-def _unread(place: Path, error: Exception) -> TroubleError:
-    words = getattr(error, "strerror", None) or "the disk does not answer; try again"
-    return TroubleError(503, f"cannot read {place}: {words}")

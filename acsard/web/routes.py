@@ -1,7 +1,7 @@
 """Defines the type of the rows in `app.ROUTES`, the table of all paths of the page's server.
 
-The router, the admission of requests, the rate limits and the OpenAPI document use that table. This
-module also creates the rows for the keys and services of the bus. The module is pure.
+The router, the checks of `access.py` and the OpenAPI document use that table. This module also
+creates the rows for the keys and services of the bus. The module is pure.
 """
 
 from __future__ import annotations
@@ -23,8 +23,6 @@ from acsard.core.messages.keys_and_roles import (
 )
 from acsard.core.messages.permissions import least_role
 from acsard.core.values import ROLES, Role
-from acsard.host.rate_limits import Rate
-from acsard.web.limits import REQUEST_RATE, STOPS
 
 # Takes the `Page` and the request.
 Handler = Callable[[Any, Any], Awaitable[Any]]
@@ -65,10 +63,9 @@ class Route(Struct, frozen=True):
     takes: type | str | None = None  # type, or name of a bus message in `SCHEMAS`
     forms: tuple[str, ...] = (JSON,)  # media types of the body
     gives: Mapping[int, Body] = {}  # by HTTP status; any other one gives a `Problem`
-    rate: Rate = REQUEST_RATE  # with one token; all routes with the same rate share one limit
-    # A request beyond `rate` waits; a POST acts at once, and only its answer waits. The rate then
-    # holds for each token in each network.
-    waits: bool = False
+    # Served even if the client's token has too many connections or requests. The connection ends
+    # after the answer.
+    always: bool = False
 
     @property
     def parameters(self) -> list[str]:
@@ -108,6 +105,5 @@ def services(handler: Handler) -> Iterator[Route]:
         }
         yield Route(
             "POST", f"/api/{key.replace('<verb>', '{verb}')}", least_role(key), handler, notes[key],
-            takes=takes, gives=gives, rate=STOPS if verb == "stop" else REQUEST_RATE,
-            waits=verb == "stop",
+            takes=takes, gives=gives, always=verb == "stop",
         )  # fmt: skip

@@ -8,7 +8,7 @@ import signal
 import socket
 import ssl
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Sequence
 from contextlib import AsyncExitStack, suppress
 from pathlib import Path
 from typing import Any
@@ -21,26 +21,23 @@ from acsard.bus.certificate_watch import CertificateFiles
 from acsard.bus.tls import CERTIFICATE, KEY, files_in, names_in
 from acsard.bus.zenoh_sessions import client_session
 from acsard.client import Client
+from acsard.client.outbox import Outbox
 from acsard.core.config.settings import Config
 from acsard.core.values import Event
 from acsard.host.child import HEARTBEAT_S, Parent, end_signals, end_with_parent
 from acsard.host.logs import Log
 from acsard.host.threads import NoThreadError, in_thread
-from acsard.web.acceptor import READ_BYTES, Acceptor, Reader
 from acsard.web.app import Page
 from acsard.web.callers import is_loopback
+from acsard.web.connections import Connections
 from acsard.web.followed_robot import About, FollowedRobot
 from acsard.web.listen import Listen, open_sockets, own_name, require_certificate
 from acsard.web.metrics import Counts
 from acsard.web.socket_messages import DEFAULT_SOURCE
-from acsard.web.tokens import Vault
+from acsard.web.tokens import ReadTokens, Vault
 from acsard.web.viewer import Parts
 
-TIDY_S = 1.0
-
-# Of a request. A browser sends the cookies for all ports of a host in one header, so less could
-# lock it out.
-FIELD_BYTES, FIELDS = 8190, 64
+TICK_S = 1.0
 
 # For zeros to the robot of viewers that drive, and for running requests.
 SHUTDOWN_S = 0.3
@@ -76,71 +73,76 @@ async def serve(
         # The daemon, which started this server, must have priority over it.
         os.nice(5)
     counts = Counts()
-    # `CertificateFiles` records the state of the files. Create it before the files are read, so
-    # that it notices every later change.
-    files = CertificateFiles(*files_in(options.tls))
-    secure, names = _certified(options)
+    certificate = None
+    if any(address.secure for address in options.listen):
+        require_certificate(options.listen, options.tls)
+        certificate = Certificate(options.tls, log)
+    names = set[str]() if certificate is None else certificate.names
     robot = FollowedRobot(
         options.address, lambda: _connected(options.address), _about(options), counts
     )
     parts = Parts(robot, counts, options.file)
-    vault, acceptor = Vault(options.state, options.address.robot_id), Acceptor(counts)
-    page = Page(parts, vault, names, acceptor, options.config.web)
-    runner = web.AppRunner(
-        page.app, access_log=None, handle_signals=False, keepalive_timeout=20.0,
-        shutdown_timeout=SHUTDOWN_S, max_line_size=FIELD_BYTES, max_field_size=FIELD_BYTES,
-        max_headers=FIELDS, read_bufsize=READ_BYTES,
-        # A body is never decompressed, so compressed data is refused like any other malformed body.
-        auto_decompress=False,
-    )  # fmt: skip
+    tokens = ReadTokens(Vault(options.state, options.address.robot_id))
+    connections = Connections(counts)
+    page = Page(parts, tokens, names, connections, options.config.web)
+    runner = web.AppRunner(page.app, handle_signals=False, shutdown_timeout=SHUTDOWN_S)
     async with AsyncExitStack() as stack:
         await runner.setup()
+        assert runner.server is not None
         stack.push_async_callback(runner.cleanup)
+        work = [leaving.wait(), robot.run(), _tick(page, counts, log)]
+        work.append(_read_disk(tokens, page, certificate))
+        if options.supervised:
+            work.append(_watch_parent(leaving))
         places = open_sockets(options.listen, options.supervised)
         for address, opened in places:
-            tls = secure if address.secure else None
-            acceptor.listen(opened, tls, lambda: Reader(counts, runner.server))
-        stack.callback(acceptor.close)
+            stack.callback(opened.close)
+            tls = certificate if address.secure else None
+            work.append(connections.accept(runner.server, opened, tls))
+        stack.callback(connections.close)
         announce([address for address, _ in places])
-        stack.callback(asyncio.create_task(_report_refusals(counts, log)).cancel)
-        if secure is not None:
-            renewing = _renew(secure, names, files, options.tls, log)
-            stack.callback(asyncio.create_task(renewing).cancel)
-        await _until(leaving, parts, page, options)
+        await first_ended(work, parts.commands.outbox)
         page.end_all("the page's server ends")
         await asyncio.sleep(0)
         await asyncio.to_thread(parts.commands.outbox.flush, SHUTDOWN_S)
 
 
-async def _until(leaving: asyncio.Event, parts: Parts, page: Page, options: ServerOptions) -> None:
-    work: list[asyncio.Future[Any]] = [
-        asyncio.create_task(leaving.wait()),
-        asyncio.create_task(parts.robot.run()),
-        asyncio.create_task(_tidy(page)),
-        asyncio.wrap_future(parts.commands.outbox.dead),
-    ]
-    if options.supervised:
-        work.append(asyncio.create_task(_watch_parent(leaving)))
+async def first_ended(work: Iterable[Coroutine[Any, Any, object]], outbox: Outbox) -> None:
+    """Run `work` until one of its coroutines or the outbox ends. Raises the error that ended it."""
+    tasks: list[asyncio.Future[Any]] = [asyncio.create_task(coroutine) for coroutine in work]
+    # The shield leaves the outbox its future: a cancelled one could not report a later error.
+    tasks.append(asyncio.shield(asyncio.wrap_future(outbox.dead)))
     try:
-        done, _ = await asyncio.wait(work, return_when=asyncio.FIRST_COMPLETED)
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
-            task.result()  # raises the error that ended it
+            task.result()
     finally:
-        for task in work:
+        for task in tasks:
             task.cancel()
 
 
-async def _tidy(page: Page) -> None:
+async def _tick(page: Page, counts: Counts, log: Log) -> None:
     while True:
-        await asyncio.sleep(TIDY_S)
-        await page.tidy()
-
-
-async def _report_refusals(counts: Counts, log: Log) -> None:
-    while True:
-        await asyncio.sleep(TIDY_S)
+        await asyncio.sleep(TICK_S)
+        page.tidy()
         if (refusals := counts.new_refusals()) is not None:
             log.event(refusals)
+
+
+async def _read_disk(tokens: ReadTokens, page: Page, certificate: Certificate | None) -> None:
+    def read() -> None:
+        tokens.read()
+        page.files.read()
+        if certificate is not None:
+            certificate.read()
+
+    while True:
+        # Wait without a time limit. With a limit, each attempt to read from a disk that hangs would
+        # leave one more blocked thread. Only this task waits, and not the page.
+        with suppress(NoThreadError):
+            await in_thread(read, None)
+        tokens.announce()
+        await asyncio.sleep(TICK_S)
 
 
 async def _watch_parent(leaving: asyncio.Event) -> None:
@@ -177,49 +179,43 @@ def _about(options: ServerOptions) -> About:
     )
 
 
-def _certified(options: ServerOptions) -> tuple[ssl.SSLContext | None, set[str]]:
-    if not any(address.secure for address in options.listen):
-        return None, set()
-    require_certificate(options.listen, options.tls)
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.minimum_version = ssl.TLSVersion.TLSv1_2
-    _load(context, options.tls)
-    return context, _names(options.tls)
+class Certificate:
+    """The certificate of the page, and the names of the robot in it, as of the last reading."""
 
+    def __init__(self, directory: str, log: Log) -> None:
+        self._directory, self._log = directory, log
+        # `CertificateFiles` records the state of the files. Create it before the files are read, so
+        # that it notices every later change.
+        self._files = CertificateFiles(*files_in(directory))
+        self.names = set[str]()
+        self.context = self._load()
+        self._is_renewed, self._reported = False, ""
 
-def _load(context: ssl.SSLContext, directory: str) -> None:
-    context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}", password="")
-
-
-def _names(directory: str) -> set[str]:
-    names = {socket.gethostname().lower(), own_name(), *map(str.lower, names_in(directory))}
-    return {name for name in names if name != "localhost" and not is_loopback(name)}
-
-
-async def _renew(
-    context: ssl.SSLContext, names: set[str], files: CertificateFiles, directory: str, log: Log
-) -> None:
-    renewed, reported = False, ""
-    while True:
-        await asyncio.sleep(TIDY_S)
-        # Wait without a time limit. With a limit, each attempt to read from a disk that hangs would
-        # leave one more blocked thread. Only this task waits, and not the page.
-        with suppress(NoThreadError):
-            renewed = await in_thread(files.renewed, None) or renewed
-        if not renewed:
-            continue
+    def read(self) -> None:
+        """Load the files if they were replaced. Open connections keep the old certificate."""
+        self._is_renewed = self._files.renewed() or self._is_renewed
+        if not self._is_renewed:
+            return
         try:
-            _load(context, directory)
-            names |= _names(directory)
+            self.context = self._load()
         except (OSError, ValueError) as error:
             # The files may just be in the process of being replaced. The next round tries again.
             text = f"the page cannot use its new TLS certificate yet: {error}"
-            if text != reported:
-                log.event(Event("configuration", text, "warning"))
-            reported = text
-            continue
-        renewed, reported = False, ""
-        log.info(
+            if text != self._reported:
+                self._log.event(Event("configuration", text, "warning"))
+            self._reported = text
+            return
+        self._is_renewed, self._reported = False, ""
+        self._log.info(
             "configuration",
             text="the page uses its new TLS certificate and keeps its open connections",
         )
+
+    def _load(self) -> ssl.SSLContext:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        where = self._directory
+        context.load_cert_chain(f"{where}/{CERTIFICATE}", f"{where}/{KEY}", password="")
+        names = {socket.gethostname().lower(), own_name(), *map(str.lower, names_in(where))}
+        self.names |= {name for name in names if name != "localhost" and not is_loopback(name)}
+        return context

@@ -23,10 +23,13 @@ from acsard.host.rate_limits import Buckets, Rate
 from acsard.web.answers import cut
 from acsard.web.callers import Reason
 from acsard.web.followed_robot import RETRY_DELAY_S, FollowedRobot
-from acsard.web.limits import MAX_UNREAD_BYTES
 from acsard.web.metrics import Counts
 from acsard.web.socket_messages import Refused, Subscribe, Unsubscribe
 from acsard.web.streams import NOT_READY_ERRORS, VIEWER_KEYS, Stream
+
+# Above this, the client gets no new values. It is less than `connections.WRITE_BYTES`, so that a
+# client that does not read delays no task.
+MAX_UNREAD_BYTES = 32768
 
 # Of reports about refused messages, for each kind of message and each reason.
 REPORT_RATE = Rate(1.0)

@@ -6,13 +6,14 @@ random bytes, so nobody can compute a token from its hash.
 
 from __future__ import annotations
 
+import asyncio
 import fcntl
 import hashlib
-import hmac
+import math
 import os
 import secrets
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,7 @@ class Token(Struct, frozen=True):
 
 
 class _File(Struct, frozen=True):
-    tokens: list[Token]
+    tokens: list[dict[str, Any]]  # a record that is not a valid `Token` is kept and admits nobody
     newest: int = 0  # the newest time that a server has seen, s since 1970
 
 
@@ -64,59 +65,29 @@ class Vault:
 
     def __init__(self, directory: Path, robot: str) -> None:
         self.path, self.robot = directory / FILE, robot
-        # The stamp of the file (mtime ns, inode) when it was read, and its content: a tuple,
-        # because several threads replace them.
-        self._read: tuple[tuple[int, int] | None, _File] = None, _File([])
         self._newest = 0.0, clock.steady_s()  # time of a file, and when it was read, s
+        self._stored_s = 0  # time in the file, s
 
     def now_s(self) -> float:
         """Return the time of the tokens, s, as of the last call that read the token file."""
         newest_s, read_s = self._newest
         return max(time.time(), newest_s + clock.steady_s() - read_s)
 
-    def _learn(self, newest_s: float) -> None:
-        if newest_s > self.now_s():
-            self._newest = newest_s, clock.steady_s()
-
-    def find_owner(self, text: str) -> AdmittedClient | None:
-        """Return the owner of a valid token, as of the last call that read the token file."""
-        return owner_in(self._own(self._read[1].tokens), text, self.now_s())
-
-    def left_s(self, digest: str) -> int:
-        """Return the time until a token expires; 0 if it has expired or is unknown."""
-        ends = [token.ends for token in self.all() if token.digest == digest]
-        return max(0, int(max(ends, default=0) - self.now_s()))
-
     def all(self) -> list[Token]:
         """Return this robot's tokens, also expired ones; [] if the file cannot be read."""
-        return self._own(self._shared().tokens)
-
-    def _own(self, tokens: list[Token]) -> list[Token]:
-        return [token for token in tokens if token.robot == self.robot]
-
-    def _shared(self) -> _File:
         try:
-            status = self.path.stat()
-            stamp = status.st_mtime_ns, status.st_ino
-            read = self._read
-            if stamp != read[0]:
-                read = stamp, msgspec.json.decode(self.path.read_bytes(), type=_File)
+            return self._own(self._load()[1].tokens)
         except (OSError, *MSGSPEC_ERRORS):
-            # The file is missing or unreadable. A token that cannot be checked must not be
-            # accepted.
-            read = None, _File([])
-        self._read = read
-        self._learn(read[1].newest)
-        return read[1]
+            return []
 
-    def valid_digests(self) -> frozenset[str]:
-        """Return the digests of the tokens that are valid now, and store the time if it is due."""
+    def valid(self) -> list[Token]:
+        """Return the tokens that are valid now, and store the time in the file if that is due."""
         tokens, now_s = self.all(), self.now_s()
-        if tokens and now_s >= self._read[1].newest + WRITE_INTERVAL_S:
+        if tokens and now_s >= self._stored_s + WRITE_INTERVAL_S:
             # Without room on the disk, the tokens expire by the clock alone.
             with suppress(MendableError, NotPermittedError, UsageError), self._changing():
                 pass
-        return frozenset(token.digest for token in tokens if token.ends > now_s)
+        return [token for token in tokens if token.ends > now_s]
 
     def unknown_to(self, service: Path = SERVICE_DIRECTORY) -> str:
         """Return a warning if the service `acsard-web` reads another token file, else ""."""
@@ -132,10 +103,12 @@ class Vault:
 
         Expired tokens are deleted. Raises `UsageError` for a name in use, or for too many tokens.
         """
-        with self._changing() as tokens:
+        with self._changing() as rows:
             now_s = int(self.now_s())
-            tokens[:] = [record for record in tokens if record.ends > now_s]
-            ours = self._own(tokens)
+            rows[:] = [
+                row for row in rows if (record := _token(row)) is None or record.ends > now_s
+            ]
+            ours = self._own(rows)
             if any(record.name == name for record in ours):
                 raise UsageError(
                     f"the token {name} exists already: either give another --name, or revoke the "
@@ -148,42 +121,52 @@ class Vault:
             text = secrets.token_urlsafe(32)
             ends = now_s + 3600 * (24 * days + hours)
             token = Token(name, role, _digest(text), now_s, ends, self.robot)
-            tokens.append(token)
+            rows.append(asdict(token))
         return text, token
 
     def revoke(self, name: str) -> None:
         """Delete the robot's token with this name. Raises `UsageError` if there is none."""
-        with self._changing() as tokens:
-            ours = self._own(tokens)
+        with self._changing() as rows:
+            ours = self._own(rows)
             if all(token.name != name for token in ours):
                 known = ", ".join(token.name for token in ours) or "none"
                 raise UsageError(
                     f"there is no token {name} of {self.robot} in {self.path}; the robot's tokens: "
                     f"{known}"
                 )
-            tokens[:] = [
-                token for token in tokens if (token.name, token.robot) != (name, self.robot)
+            rows[:] = [
+                row
+                for row in rows
+                if (token := _token(row)) is None or (token.name, token.robot) != (name, self.robot)
             ]
 
+    def _own(self, rows: list[dict[str, Any]]) -> list[Token]:
+        tokens = (_token(row) for row in rows)
+        return [token for token in tokens if token is not None and token.robot == self.robot]
+
+    def _load(self) -> tuple[dict[str, Any], _File]:
+        # Fields that only a later version knows are written back.
+        raw = msgspec.json.decode(self.path.read_bytes(), type=dict[str, Any])
+        file = msgspec.convert(raw, _File)
+        self._stored_s = file.newest
+        if file.newest > self.now_s():
+            self._newest = file.newest, clock.steady_s()
+        return raw, file
+
     @contextmanager
-    def _changing(self) -> Iterator[list[Token]]:
+    def _changing(self) -> Iterator[list[dict[str, Any]]]:
         directory = self.path.parent
         try:
             directory.mkdir(mode=0o700, parents=True, exist_ok=True)
             handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX)
-                data = self._load()
-                file = self._decoded(data)
-                self._read = None, file
-                self._learn(file.newest)
-                tokens = list(file.tokens)
-                yield tokens
-                # A field that only a later version knows may limit its token, so it is kept.
-                raw = msgspec.json.decode(data)
-                stored = {row["digest"]: row for row in raw["tokens"]}
-                rows = [stored.get(token.digest, {}) | asdict(token) for token in tokens]
-                self._write(raw | {"tokens": rows, "newest": int(self.now_s())})
+                try:
+                    raw, file = self._load()
+                except FileNotFoundError:
+                    raw, file = {}, _File([])
+                yield file.tokens
+                self._write(raw | {"tokens": file.tokens, "newest": int(self.now_s())})
             finally:
                 os.close(handle)
         except PermissionError:
@@ -192,16 +175,6 @@ class Vault:
             ) from None
         except OSError as error:
             raise MendableError(f"cannot write {self.path}: {error.strerror}") from None
-
-    def _load(self) -> bytes:
-        try:
-            return self.path.read_bytes()
-        except FileNotFoundError:
-            return b'{"tokens":[]}'
-
-    def _decoded(self, data: bytes) -> _File:
-        try:
-            return msgspec.json.decode(data, type=_File)
         except MSGSPEC_ERRORS as error:
             raise UsageError(
                 f"{self.path} is not a list of tokens ({error}): correct it, or move it away "
@@ -226,18 +199,52 @@ def place() -> Path:
     return Path(base) / "acsard-web"
 
 
-def owner_in(tokens: Sequence[Token], text: str, now_s: float) -> AdmittedClient | None:
-    """Return the owner of a token that is in `tokens` and has not expired by `now_s`."""
-    if not text or len(text) > 200:
+class ReadTokens:
+    """The tokens that were valid at the last reading of the file, for a server.
+
+    `read` runs in a thread, because a disk may not answer. Until it does, a token is valid if it
+    was valid before, and has not expired since.
+    """
+
+    def __init__(self, vault: Vault) -> None:
+        self._vault = vault
+        self._known: dict[str, Token] = {}
+        self._news = asyncio.Event()
+
+    def read(self) -> None:
+        self._known = {token.digest: token for token in self._vault.valid()}
+
+    def announce(self) -> None:
+        """Wake the callers of `next_reading`. Call this in the event loop after `read`."""
+        self._news.set()
+        self._news.clear()
+
+    async def next_reading(self) -> None:
+        """Wait until the file has been read again, but at most 2 s."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(2.0):
+                await self._news.wait()
+
+    def owner(self, texts: Iterable[str]) -> AdmittedClient | None:
+        """Return the owner of the first valid token, or None."""
+        for digest in map(_digest, texts):
+            token = self._known.get(digest)
+            if token is not None and self.left_s(digest):
+                role = next((role for role in ROLES if role == token.role), None)
+                return role and AdmittedClient(role, token.name, digest)
         return None
-    digest, match = _digest(text), None
-    for token in tokens:
-        if hmac.compare_digest(token.digest, digest):
-            match = token
-    if match is None or match.ends <= now_s:
+
+    def left_s(self, digest: str) -> int:
+        """Return the time until a token expires; 0 if it is not valid."""
+        token = self._known.get(digest)
+        return 0 if token is None else max(0, math.ceil(token.ends - self._vault.now_s()))
+
+
+def _token(row: dict[str, Any]) -> Token | None:
+    try:
+        return msgspec.convert(row, Token)
+    except msgspec.ValidationError:
         return None
-    role = next((role for role in ROLES if role == match.role), None)
-    return role and AdmittedClient(role, match.name, match.digest)
 
 
 def _digest(text: str) -> str:

@@ -23,13 +23,13 @@ from acsard.core.messages.signature import public_name
 from acsard.core.values import REST, Role, Twist
 from acsard.host import clock
 from acsard.host.own_identity import sender_id
-from acsard.host.rate_limits import Bucket, Buckets
+from acsard.host.rate_limits import Bucket
 from acsard.machine import versions
 from acsard.web import socket_messages
+from acsard.web.access import FLOOD_TEXT, REQUEST_RATE
 from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.calls import Calls
 from acsard.web.followed_robot import FollowedRobot
-from acsard.web.limits import COMMAND_RATE, MAX_OVERRUNS, MESSAGE_RATE
 from acsard.web.metrics import Counts
 from acsard.web.routes import RECORDINGS_ROLE
 from acsard.web.socket_messages import (
@@ -56,8 +56,6 @@ ACTIONS: dict[str, Role] = {
 # The connection ends if the client does not answer a ping within half of this time.
 PING_INTERVAL_S = 10.0
 
-MAX_OPEN_CALLS = 8
-
 
 class ViewerCommands:
     """Sends the newest velocity command of each viewer on the bus, once and with the viewer's
@@ -68,26 +66,16 @@ class ViewerCommands:
 
     def __init__(self, client: Callable[[], Client | None], counts: Counts) -> None:
         self._client, self._counts = client, counts
-        self._rates = Buckets(COMMAND_RATE)
         # If an error ends its thread, the server must exit: it cannot stop the robot any more when
         # a viewer disconnects.
         self.outbox = Outbox(partial(counts.add, "commands_dropped"))
 
-    def give(
-        self, owner: str, source: str, commander: Commander, sender: CommandSigner, wish: Wish
-    ) -> bool:
-        """Queue a command, which replaces an unsent one, unless the owner exceeds `COMMAND_RATE`.
-
-        A zero after a speed is always queued. `owner` is the token, or the name of a local viewer.
-        """
-        ends = wish.twist == REST and commander.last_is_nonzero
-        if not self._rates.take(owner, clock.mono_ns()) and not ends:
-            return False
+    def give(self, source: str, commander: Commander, sender: CommandSigner, wish: Wish) -> None:
+        """Queue a command, which replaces an unsent one."""
         replaced = commander.replaced
         self.outbox.take(commander, partial(self._publish, source, sender), wish)
         if commander.replaced > replaced:
             self._counts.add("commands_superseded")
-        return True
 
     def _publish(self, source: str, sender: CommandSigner, wish: Wish) -> None:
         try:
@@ -136,13 +124,12 @@ class Viewer:
         # Public name, in `state.sender` while the client drives; the sender id stays secret.
         self.sender = public_name(whole, parts.robot.certificate)
         self._socket = socket
-        self._bucket = Bucket(MESSAGE_RATE)
-        self._overruns = self._calling = 0
+        self._bucket = Bucket(REQUEST_RATE)
         self._out = Outgoing(socket, request, parts.counts, who.origin)
         self._keys = Keys(self._out, parts.robot, self._start)
         self._tasks: set[asyncio.Task[None]] = set()
         self._stops: set[asyncio.Task[None]] = set()
-        self._ended = False
+        self._ended = self._is_calling = False
         self._stamp_ns = -1  # of the last command
         self._unreachable_reason, self._about = "", parts.robot.about
 
@@ -176,48 +163,36 @@ class Viewer:
     # Incoming messages.
 
     def _take(self, message: aiohttp.WSMessage) -> None:
-        if self._ended:
-            return  # after the close frame, messages are ignored
+        if self._ended:  # after the close frame, only a stop counts
+            if message.type == aiohttp.WSMsgType.TEXT and asks_to_stop(message.data):
+                self._obey(Call("stop"))
+            return
         if message.type == aiohttp.WSMsgType.ERROR:  # aiohttp closes the connection after this
             self._counts.refuse("too_big", self.who.origin)
             return
-        if message.type in (aiohttp.WSMsgType.PING, aiohttp.WSMsgType.PONG):
-            self._ping(message)
-            return
-        if message.type != aiohttp.WSMsgType.TEXT:
-            self._out.refuse("message", "malformed", "messages must be JSON in text frames")
-            return
         room = self._bucket.take(clock.mono_ns())
+        if message.type == aiohttp.WSMsgType.PING:
+            self._out.pong(message.data)
+        elif message.type == aiohttp.WSMsgType.TEXT:
+            self._take_text(message.data, room=room)
+        elif message.type != aiohttp.WSMsgType.PONG:
+            self._out.refuse("message", "malformed", "messages must be JSON in text frames")
         if not room:
-            self._overruns += 1
+            self._counts.refuse("too_fast", self.who.origin)
+            self.end(f"messages of this WebSocket: {FLOOD_TEXT}")
+
+    def _take_text(self, text: str, *, room: bool) -> None:
         try:
-            frame = decode(message.data)
+            frame = decode(text)
         except FrameError as error:
             self._out.refuse(error.about, "malformed", str(error))
-            if asks_to_stop(message.data):
-                self._obey(Call("stop"))
-        else:
-            # A message that ends a drive or stops the robot is obeyed even beyond the limit.
-            urgent = (isinstance(frame, Call) and frame.call == "stop") or (
-                isinstance(frame, Command) and not frame.moves
-            )
-            if room or urgent:
-                self._obey(frame)
-            else:
-                self._refuse(
-                    frame, f"you send more than {MESSAGE_RATE.hz:g} messages a second: send fewer"
-                )
-        if self._overruns >= MAX_OVERRUNS:
-            self.end("too many messages")
-
-    def _ping(self, message: aiohttp.WSMessage) -> None:
-        if not self._bucket.take(clock.mono_ns()):
-            self._overruns += 1
-            if self._overruns >= MAX_OVERRUNS:
-                self._counts.refuse("too_fast", self.who.origin)
-                self._out.cut()
-        elif message.type == aiohttp.WSMsgType.PING:
-            self._out.pong(message.data)
+            if not asks_to_stop(text):
+                return
+            frame = Call("stop")
+        # A message that ends a drive or stops the robot is obeyed even beyond the limit.
+        is_stop = isinstance(frame, Call) and frame.call == "stop"
+        if room or is_stop or (isinstance(frame, Command) and not frame.moves):
+            self._obey(frame)
 
     def _obey(self, frame: Frame) -> None:
         try:
@@ -260,10 +235,7 @@ class Viewer:
         twist = Twist(frame.cmd.linear_x, frame.cmd.angular_z)
         wish = Wish(twist, stamp_ns, frame.echo)
         commander = self._commanders.setdefault(frame.source, Commander())
-        owner = self.who.token or self.sender
-        if not self._commands.give(owner, frame.source, commander, self._sender, wish):
-            text = f"you send more than {COMMAND_RATE.hz:g} commands a second: send fewer"
-            self._out.refuse("cmd", "too_fast", text)
+        self._commands.give(frame.source, commander, self._sender, wish)
 
     def _release(self) -> None:
         timeouts = self._robot.about.timeouts
@@ -274,18 +246,13 @@ class Viewer:
         if frame.call == "stop":
             # Keep stops in a separate set of tasks, which continue when the connection ends.
             start(self._answer(frame), self._stops)
-        elif self._calling >= MAX_OPEN_CALLS:
-            self._refuse(frame, f"{MAX_OPEN_CALLS} calls are running already: wait for an answer")
-        else:
-            self._calling += 1
-            self._start(self._answer(frame))
-
-    def _refuse(self, frame: Frame, text: str) -> None:
-        if isinstance(frame, Call):
+        elif self._is_calling:
             self._counts.refuse("too_fast", self.who.origin)
+            text = "another call of this WebSocket is under way: wait for its answer"
             self._out.enqueue(socket_messages.Answer(frame.id, False, text))
         else:
-            self._out.refuse(frame.kind, "too_fast", text)
+            self._is_calling = True
+            self._start(self._answer(frame))
 
     async def _answer(self, frame: Call) -> None:
         try:
@@ -296,7 +263,7 @@ class Viewer:
             ok, text = False, str(error)
         finally:
             if frame.call != "stop":
-                self._calling -= 1
+                self._is_calling = False
         self._out.enqueue(socket_messages.Answer(frame.id, ok, text))
 
     # Outgoing messages.

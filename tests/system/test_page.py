@@ -11,19 +11,17 @@ import struct
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import aiohttp
 import pytest
 
 from acsard.machine.authority import Authority
-from acsard.web.limits import MAX_LOCAL_WEBSOCKETS
 from acsard.web.viewer import PING_INTERVAL_S
 from tests import pictures
 from tests.pictures import VIEWS
-from tests.system.browser import NAME, TRUSTING, Hands, Page, answer, hands
+from tests.system.browser import NAME, TRUSTING, Page, answer, hands
 from tests.system.bystander import lost
 from tests.system.chromium import (
     CHROMIUM,
@@ -918,33 +916,6 @@ def test_every_control_is_large_enough_for_a_finger(page: Phone) -> None:
         page.browser.size(*size)
         pictures.show(page.browser, view)
         assert page.browser.too_small() == [], (size, view)
-
-
-@pytest.mark.nightly
-@alone
-async def test_a_page_beyond_the_connection_limit_says_why_and_can_still_stop(page: Phone) -> None:
-    reading: list[asyncio.Task[None]] = []
-
-    async def read(other: Hands) -> None:
-        """Stay connected as a viewer until the task is cancelled."""
-        async for _ in other.socket:
-            pass
-
-    def look() -> None:
-        page.browser.open(page.server.here)
-        page.shows("reason", f"{MAX_LOCAL_WEBSOCKETS} pages are open on the robot itself")
-        page.browser.tap("stop")
-        until(lambda: page.bus.state()["mode"] == "stopped", 5.0, "it stops all the same")
-
-    page.browser.open("about:blank")
-    async with AsyncExitStack() as stack:
-        left = MAX_LOCAL_WEBSOCKETS
-        while left:  # the page that was open here disappears once the server notices
-            with suppress(aiohttp.WSServerHandshakeError):
-                other = await stack.enter_async_context(hands(page.server))
-                reading.append(asyncio.create_task(read(other)))
-                left -= 1
-        await asyncio.to_thread(look)
 
 
 @pytest.mark.nightly

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
+import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AsyncExitStack, contextmanager
+from typing import Any
 
 import pytest
 
 from acsard.machine.authority import Authority
-from tests.system.browser import NAME, TRUSTING, Page
+from acsard.web.connections import MAX_OF_TOKEN
+from tests.system.browser import NAME, TRUSTING, Page, hands
 from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
-from tests.system.harness import running, until
+from tests.system.harness import PATIENCE_S, running, until
 
 pytestmark = [
     pytest.mark.slow,
@@ -81,6 +86,14 @@ def silent(browser: Browser, path: str) -> Iterator[None]:
         browser.ask("Network.setBlockedURLs", urls=[])
 
 
+def ask(server: Page, key: str, payload: object = None) -> Any:
+    """Return the robot's answer to a client on the robot itself."""
+    body = None if payload is None else json.dumps(payload).encode()
+    request = urllib.request.Request(f"{server.here}/api/{key}", body)
+    with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:
+        return json.load(answer)
+
+
 def test_an_invitation_outlives_a_network_that_fails(stranger: Stranger) -> None:
     browser = stranger.browser
     token = stranger.server.invite("operator", "flaky")
@@ -131,6 +144,25 @@ def test_a_page_without_a_token_says_so_and_retries_only_after_a_press(stranger:
     browser.tap("again")
     stranger.shows("role", "viewer")
     assert browser.too_small() == []
+
+
+async def test_a_page_beyond_the_connections_of_its_token_says_why_and_can_still_stop(
+    stranger: Stranger, server: Page
+) -> None:
+    token = server.invite("operator", "shared")
+
+    def look() -> None:
+        stranger.opens(token)
+        stranger.shows("reason", f"{MAX_OF_TOKEN} connections with this token are open already")
+        stranger.browser.tap("stop")
+        until(lambda: ask(server, "state")["mode"] == "stopped", 5.0, "it stops all the same")
+
+    async with AsyncExitStack() as stack:
+        for _ in range(MAX_OF_TOKEN):
+            await stack.enter_async_context(hands(server, token))
+        await asyncio.to_thread(look)
+    numbers = [cause["number"] for cause in ask(server, "state")["causes"]]
+    assert ask(server, "srv/clear", {"numbers": numbers})["success"]
 
 
 @pytest.mark.parametrize(("agrees", "role"), [(False, "operator"), (True, "viewer")])

@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import math
 import os
-import re
 import socket
 import ssl
 import time
@@ -23,18 +22,11 @@ import aiohttp
 import pytest
 from yarl import URL
 
-from acsard.host.rate_limits import Rate
-from acsard.web.acceptor import REQUEST_TIMEOUT_S, UNREAD_TIMEOUT_S
+from acsard.web.access import REQUEST_RATE
 from acsard.web.app import BODY_TIMEOUT_S
-from acsard.web.limits import (
-    HANDSHAKE_RATE,
-    MAX_TCP_OF_NETWORK,
-    OPENINGS,
-    REFUSAL_DELAY_S,
-    STOPS,
-    STRANGER_RATE,
-)
+from acsard.web.connections import IDLE_S, MAX_LOCAL, UNREAD_S
 from tests.system.browser import NAME, Hands, Page, hands
+from tests.system.bystander import lost
 from tests.system.harness import (
     PATIENCE_S,
     Bus,
@@ -204,27 +196,43 @@ async def test_a_request_for_a_forbidden_resource_is_refused(
                 assert answer.status == status
 
 
-async def test_a_client_that_floods_requests_is_limited_and_can_still_stop(
+async def test_a_flood_of_a_viewer_ends_its_connections_and_delays_no_stop_of_another(
     table: Table, bus: Bus, tokens: dict[str, str]
 ) -> None:
-    with table.attack("800 questions at once", "429", "too_fast", 100):
-        async with table.page.client(tokens["viewer"]) as session:
+    page, url = table.page, table.page.away
+    with table.attack("a viewer that floods", "its connections end", "too_fast", 8):
+        phone = page.client(page.invite("operator", f"phone-{time.time_ns()}"))
+        flooding = page.client(tokens["viewer"])
+        async with phone, flooding, hands(page, tokens["viewer"]) as theirs:
+            statuses = Counter[int]()
 
-            async def one(_: int) -> int:
-                async with session.get(f"{table.page.away}/api/state") as answer:
-                    return answer.status
+            async def asks() -> None:
+                while True:
+                    with suppress(aiohttp.ClientError):
+                        async with flooding.get(f"{url}/api/state") as answer:
+                            statuses[answer.status] += 1
 
-            statuses = set[int]()
-            for _ in range(16):
-                statuses |= set(await asyncio.gather(*map(one, range(50))))
-            async with session.get(f"{table.page.away}/api/whoami") as answer:
-                assert answer.status == 200  # a page that reconnects is not locked out
-            async with session.post(f"{table.page.away}/api/srv/stop") as answer:
-                stopped = answer.status
+            ending = asyncio.create_task(_drained(theirs))
+            floods = [asyncio.create_task(asks()) for _ in range(7)]
+            took = list[float]()
+            for _ in range(20):
+                begun = time.monotonic()
+                async with phone.post(f"{url}/api/srv/stop") as answer:
+                    assert answer.status == 200
+                ended = time.monotonic()
+                took.append(ended - begun - 4 * lost(begun, ended))
+                await asyncio.sleep(0.1)
+            for flood in floods:
+                flood.cancel()
+            # The one that floods may stop the robot too, and learns why its pages are closed.
+            async with flooding.post(f"{url}/api/srv/stop") as answer:
+                assert answer.status == 200
+            await asyncio.wait_for(ending, PATIENCE_S)
+            assert theirs.socket.close_code == 1008
         assert bus.get("srv/clear")["success"]
-    assert statuses <= {200, 429, 503}
-    assert {200, 429} <= statuses
-    assert stopped == 200
+    print(f"\na stop of another token takes {1000 * max(took):.0f} ms, {statuses}")
+    assert {200, 429} <= set(statuses)
+    assert max(took) < 0.5
 
 
 STOP = "POST /api/srv/stop HTTP/1.1\r\nHost: 127.0.0.1\r\n"
@@ -324,9 +332,10 @@ async def test_a_message_that_is_too_big_ends_its_connection_and_no_other(
 async def test_a_frame_that_is_not_a_message_is_reported_once_a_second_and_a_flood_ends(
     table: Table, bus: Bus
 ) -> None:
-    with table.attack("1200 messages that are none", "its connection ends", "malformed", 600):
+    most = int(REQUEST_RATE.burst)
+    with table.attack("many messages that are none", "its connection ends", "malformed", most):
         async with hands(table.page) as ours:
-            for _ in range(1200):
+            for _ in range(4 * most):
                 await ours.socket.send_str("{}")
             async with asyncio.timeout(PATIENCE_S):
                 frames = []
@@ -343,7 +352,7 @@ async def test_a_thousand_connections_do_not_disconnect_the_page_that_drives(
     place = page.here.removeprefix("http://").split(":")
     async with hands(page) as ours:
         await ours.say(subscribe="state", rate=50)
-        few = 1000 - MAX_TCP_OF_NETWORK
+        few = 1000 - MAX_LOCAL
         with table.attack("1000 connections", "64 have places", "crowded", few, stands=False):
             await ours.until_driving(0.3)
             holding = asyncio.create_task(ours.hold(0.3, PATIENCE_S))
@@ -352,9 +361,8 @@ async def test_a_thousand_connections_do_not_disconnect_the_page_that_drives(
             await ours.find(lambda frame: frame.get("pong") == 7)
             await ours.state(lambda s: s["mode"] == "driving")
             async with asyncio.timeout(PATIENCE_S):
-                while (left := sum(map(_waits, idle))) > MAX_TCP_OF_NETWORK:
+                while sum(map(_waits, idle)) >= MAX_LOCAL:  # one place is that of the page
                     await asyncio.sleep(0.01)
-            assert left == MAX_TCP_OF_NETWORK
             holding.cancel()
             for idle_socket in idle:
                 idle_socket.close()
@@ -431,7 +439,7 @@ def test_answers_that_no_client_reads_cost_little_memory(
             client.connect(("127.0.0.1", place.port))
             greedy.append(stack.enter_context(trusting.wrap_socket(client)))
             greedy[-1].setblocking(False)
-        before, most, end = resident_kb(page.pid), 0, time.monotonic() + UNREAD_TIMEOUT_S - 1.0
+        before, most, end = resident_kb(page.pid), 0, time.monotonic() + UNREAD_S - 1.0
         while time.monotonic() < end:
             for client in greedy:
                 with suppress(OSError):
@@ -439,7 +447,7 @@ def test_answers_that_no_client_reads_cost_little_memory(
             most = max(most, resident_kb(page.pid) - before)
             time.sleep(0.01)
     print(f"\n60 clients that read no answers, {headers} more headers: {most / 1000:+.1f} MB")
-    assert most < 15_000
+    assert most < 30_000
 
 
 async def test_a_viewer_that_floods_with_pings_is_cut_off(
@@ -459,7 +467,7 @@ def test_a_slow_or_silent_client_is_disconnected(table: Table, bus: Bus) -> None
     """One client sends a byte a second, one sends nothing, one announces a body and sends none."""
     begun = time.monotonic()
     with (
-        table.attack("a slow loris, and who says nothing", "cut off", "slow", 2),
+        table.attack("a slow loris, and who says nothing", "cut off", "malformed"),
         _opened(table.page) as drips, _opened(table.page) as says_nothing,
         _opened(table.page) as keeps,
     ):  # fmt: skip
@@ -478,7 +486,7 @@ def test_a_slow_or_silent_client_is_disconnected(table: Table, bus: Bus) -> None
             assert says_nothing.recv(4096) == b""
         answer = keeps.recv(4096)
     assert answer.startswith(b"HTTP/1.1 408"), answer
-    assert time.monotonic() - begun < max(BODY_TIMEOUT_S, REQUEST_TIMEOUT_S) + PATIENCE_S
+    assert time.monotonic() - begun < max(BODY_TIMEOUT_S, IDLE_S) + PATIENCE_S
 
 
 def test_a_client_that_does_not_read_its_answers_is_disconnected_soon(
@@ -503,149 +511,8 @@ def test_a_client_that_does_not_read_its_answers_is_disconnected_soon(
             for _ in range(100_000):
                 greedy.send(b"GET /page/main.js HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         until(held, PATIENCE_S, "it is accepted")
-        until(lambda: not held(), UNREAD_TIMEOUT_S + PATIENCE_S / 3, "it is disconnected")
+        until(lambda: not held(), UNREAD_S + PATIENCE_S / 3, "it is disconnected")
     assert "Traceback" not in table.page.stderr
-
-
-ENDLESS: dict[str, tuple[str, int, Rate, str]] = {
-    "files": ("GET /page/main.js", 30, STRANGER_RATE, "200"),
-    "no token": ("GET /api/state", 30, STRANGER_RATE, "401"),
-    "whoami": ("GET /api/whoami", 30, STOPS, "200"),
-    "sockets": ("GET /ws", 5, OPENINGS, "101"),
-    "stops": ("POST /api/srv/stop", 30, STOPS, "200"),
-}
-"""A request that some clients send without end: their number, its rate, and the answer."""
-
-
-@pytest.mark.variations(5)
-@pytest.mark.parametrize("what", ENDLESS)
-async def test_a_client_that_pipelines_requests_without_end_is_delayed_and_not_refused(
-    table: Table, bus: Bus, tokens: dict[str, str], what: str
-) -> None:
-    request, clients, rate, status = ENDLESS[what]
-    place, lasts_s = URL(table.page.away), 3.0
-    headers = {"Host": f"{place.host}:{place.port}", "Content-Length": "0"}
-    if rate != STRANGER_RATE:
-        headers["Authorization"] = f"Bearer {tokens['viewer']}"
-    if request.endswith("/ws"):
-        headers |= UPGRADE
-    lines = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
-    words = f"{request} HTTP/1.1\r\n{lines}\r\n".encode()
-    answers: Counter[str] = Counter()
-
-    async def asks(end: float) -> None:
-        trusting = ssl._create_unverified_context()
-        while time.monotonic() < end:
-            reader, writer = await asyncio.open_connection(
-                "127.0.0.1", place.port, ssl=trusting, server_hostname=NAME
-            )
-            while time.monotonic() < end:
-                writer.write(words)
-                head = (await reader.readuntil(b"\r\n\r\n")).decode()
-                answers[head.split()[1]] += 1
-                if status == "101":
-                    break
-                length = re.search(r"(?i)content-length: (\d+)", head)
-                await reader.readexactly(int(length[1]) if length else 0)
-            writer.transport.abort()
-
-    end = time.monotonic() + lasts_s
-    await asyncio.gather(*(asks(end) for _ in range(clients)))
-    print(f"\n{what}: {answers.total() / lasts_s:.0f} answers a second to {clients} clients")
-    assert set(answers) == {status}
-    lasts_s += REFUSAL_DELAY_S  # an answer may come after the end
-    assert answers.total() <= rate.burst + (rate.hz + clients / REFUSAL_DELAY_S) * lasts_s
-
-
-async def test_a_stop_beyond_the_rate_is_sent_immediately_and_only_its_answer_waits(
-    page: Page, bus: Bus, tokens: dict[str, str]
-) -> None:
-    async with page.client(tokens["viewer"]) as session:
-
-        async def asks() -> None:
-            while True:
-                async with session.get(f"{page.away}/api/whoami") as answer:
-                    await answer.read()
-
-        async def stop() -> float:
-            begun = time.monotonic()
-            async with session.post(f"{page.away}/api/srv/stop") as answer:
-                assert answer.status == 200
-            return time.monotonic() - begun
-
-        # These clients have the same rate, and take almost all of it.
-        others = [asyncio.create_task(asks()) for _ in range(50)]
-        await asyncio.sleep(2.0)
-        took = 0.0
-        for _ in range(20):
-            await asyncio.to_thread(bus.ask, "srv/clear")
-            asking = asyncio.create_task(stop())
-            await asyncio.to_thread(
-                until, lambda: bus.state()["mode"] == "stopped", PATIENCE_S, "it stops"
-            )
-            early = not asking.done()
-            if (took := await asking) >= REFUSAL_DELAY_S:
-                assert early
-                break
-        assert took >= REFUSAL_DELAY_S
-        for task in others:
-            task.cancel()
-
-
-async def test_handshakes_from_one_network_are_delayed_beyond_their_rate(
-    table: Table, bus: Bus
-) -> None:
-    place, lasts_s, done = URL(table.page.away), 3.0, 0
-
-    async def shakes(end: float) -> None:
-        nonlocal done
-        trusting = ssl._create_unverified_context()
-        while time.monotonic() < end:
-            with suppress(ConnectionError, TimeoutError):
-                async with asyncio.timeout(end - time.monotonic()):
-                    _, writer = await asyncio.open_connection(
-                        "127.0.0.1", place.port, ssl=trusting, server_hostname=NAME
-                    )
-                done += 1
-                writer.transport.abort()
-
-    end = time.monotonic() + lasts_s
-    await asyncio.gather(*(shakes(end) for _ in range(30)))
-    print(f"\n{done / lasts_s:.0f} handshakes a second")
-    assert done <= HANDSHAKE_RATE.burst + HANDSHAKE_RATE.hz * lasts_s + 5
-
-
-async def test_a_connection_with_a_valid_cookie_is_kept_from_its_first_file_on(
-    table: Table, bus: Bus, tokens: dict[str, str]
-) -> None:
-    place, trusting = URL(table.page.away), ssl._create_unverified_context()
-    with table.attack("a crowd around a phone that loads", "it loads", "crowded", 10):
-        async with table.page.client() as phone:
-            form = {"token": tokens["viewer"]}
-            async with phone.post(
-                f"{table.page.away}/token", data=form, allow_redirects=False
-            ) as a:
-                cookie = a.headers["Set-Cookie"].partition(";")[0]
-        reader, writer = await asyncio.open_connection(
-            "127.0.0.1", place.port, ssl=trusting, server_hostname=NAME
-        )
-
-        async def fetches(path: str) -> bytes:
-            host = f"{place.host}:{place.port}"
-            http_request = f"GET {path} HTTP/1.1\r\nHost: {host}\r\nCookie: {cookie}\r\n\r\n"
-            writer.write(http_request.encode())
-            head = await reader.readuntil(b"\r\n\r\n")
-            length = re.search(rb"(?i)content-length: (\d+)", head)
-            await reader.readexactly(int(length[1]) if length else 0)
-            return head
-
-        assert b" 200 " in await fetches("/")
-        idle = await _idle("127.0.0.1", place.port or 0, MAX_TCP_OF_NETWORK + 10)
-        await asyncio.sleep(0.3)
-        assert b" 200 " in await fetches("/page/main.js")
-        for tcp_socket in idle:
-            tcp_socket.close()
-        writer.transport.abort()
 
 
 async def _drained(ours: Hands) -> None:

@@ -1,8 +1,8 @@
-"""Crowds of connections from another host cost the page little, and exclude no phone.
+"""A crowd of connections from another host moves no robot and costs no control period.
 
-Each crowd connects twice: once while a phone drives, and once while the phone and a browser on the
-robot itself stop the robot. Another crowd connects to a page that has reached its limit of open
-files. With `-s` pytest prints the figures of each crowd.
+The crowd has no token. While it connects, a phone that has opened the page drives on, and a browser
+on the robot itself stops the robot. After the crowd has gone, the page works again for a new phone.
+With `-s` pytest prints the figures of each crowd.
 """
 
 from __future__ import annotations
@@ -10,21 +10,30 @@ from __future__ import annotations
 import asyncio
 import http.client
 import json
-import resource
+import math
 import ssl
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from acsard.machine.authority import Authority
-from acsard.web.acceptor import NO_FILES_PAUSE_S
-from acsard.web.calls import MIN_STOP_INTERVAL_S
+from acsard.web.connections import MAX_CONNECTIONS
 from tests.system.browser import Hands, Page
 from tests.system.bystander import lost
-from tests.system.harness import PATIENCE_S, Daemon, Program, free_endpoint, resident_kb, until
+from tests.system.harness import (
+    PATIENCE_S,
+    Daemon,
+    Periods,
+    Program,
+    free_endpoint,
+    kept_waiting,
+    resident_kb,
+    until,
+)
 from tests.system.hosts import ROBOT_AT, STRANGER_AT, Hosts, inside, ip, on
 from tests.system.strangers import command_line
 
@@ -34,9 +43,14 @@ ROBOT_6 = "fd00:77::1"
 OLDER = [f"198.18.77.{n}" for n in range(11, 16)]
 NEWER = [f"fd00:77::a:{n:x}" for n in range(1, 65)]
 
-MORE_KB = 30_000
-PHONE_S, HERE_S = 0.5, 0.05
-STOPS = 20
+MORE_KB = 0.5 * 1000 * MAX_CONNECTIONS
+"""The buffers of as many TLS connections as the page accepts, 0.5 MB each."""
+
+HERE_S = 0.05
+"""The time of a stop from the robot itself."""
+
+BACK_S = 10.0
+"""The time after the end of a crowd in which a new phone can stop the robot."""
 
 CROWD = """\
 import os, resource, socket, ssl, sys, time
@@ -93,20 +107,6 @@ def robot(hosts: Hosts, where: Path) -> Iterator[Daemon]:
         yield daemon
 
 
-@contextmanager
-def files(most: int) -> Iterator[None]:
-    """Raise or lower the limit of open files for programs that start in the body of the `with`.
-
-    The machine's hard limit still applies.
-    """
-    before = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (min(most, before[1]), before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, before)
-
-
 class Scene:
     """The robot, its page, and a crowd on another host."""
 
@@ -115,58 +115,50 @@ class Scene:
         kind, count, sources = CROWDS[crowd]
         where = newer if ":" in sources[0] else page.away
         host, _, port = where.removeprefix("https://").rpartition(":")
-        self._words = command_line(CROWD, kind, host.strip("[]"), port, count, *sources)
+        words = command_line(CROWD, kind, host.strip("[]"), port, count, *sources)
+        self.crowd = Program(words, page.tls)
         self._token = page.invite("operator", "phone")
         self._trusted = ssl.create_default_context(cafile=str(page.tls / "ca.pem"))
 
-    def crowd(self) -> Program:
-        return Program(self._words, self.page.tls)
-
-    async def start_crowd(self, crowd: Program) -> None:
-        """Start the crowd on the other host, and wait until it has opened all its connections."""
+    async def comes(self) -> None:
+        """Start the crowd, and wait until it has opened all its connections."""
         with inside(self._hosts.stranger):
-            crowd.__enter__()
-        await asyncio.to_thread(crowd.says, "opened", PATIENCE_S)
+            self.crowd.__enter__()
+        await asyncio.to_thread(self.crowd.says, "opened", PATIENCE_S)
 
-    def stop_here(self) -> float:
-        """Stop the robot by a client on the robot itself, and return how long that took, s."""
+    def goes(self) -> None:
+        if hasattr(self.crowd, "process"):
+            self.crowd.__exit__()
+
+    def ask_here(self, path: str, payload: object = None) -> Any:
+        """Send a request from the robot itself, and return the answer."""
         with inside(self._hosts.robot):
             place = self.page.here.removeprefix("http://")
-            return _stopped(lambda: http.client.HTTPConnection(place, timeout=PATIENCE_S), {})
+            return _asked(http.client.HTTPConnection(place, timeout=PATIENCE_S), path, payload)
 
-    def reaches_the_daemon(self) -> bool:
-        with suppress(AssertionError):
-            return self.stop_here() >= 0.0
-        return False
-
-    def stop_away(self) -> float:
-        """Stop the robot by a new connection of the phone, and return how long that took, s."""
+    def ask_away(self, path: str, payload: object = None) -> Any:
+        """Send a request by a new connection of the phone, and return the answer."""
         with inside(self._hosts.stranger):
-            place = self.page.away.removeprefix("https://")
-            headers = {"Authorization": f"Bearer {self._token}"}
-            return _stopped(
-                lambda: http.client.HTTPSConnection(
-                    place, timeout=PATIENCE_S, context=self._trusted,
-                    source_address=(STRANGER_AT, 0),
-                ),
-                headers,
-            )  # fmt: skip
+            connection = http.client.HTTPSConnection(
+                self.page.away.removeprefix("https://"),
+                timeout=2.0,
+                context=self._trusted,
+                source_address=(STRANGER_AT, 0),
+            )
+            return _asked(connection, path, payload, Authorization=f"Bearer {self._token}")
 
     def clear(self) -> None:
         """Release the stop from the robot itself."""
-        with inside(self._hosts.robot):
-            connection = http.client.HTTPConnection(
-                self.page.here.removeprefix("http://"), timeout=9
-            )
-            headers = {"Content-Type": "application/json"}
-            connection.request("GET", "/api/state")
-            causes = json.loads(connection.getresponse().read())["causes"]
-            body = json.dumps({"numbers": [cause["number"] for cause in causes]})
-            connection.request("POST", "/api/srv/clear", body, headers)
-            connection.getresponse().read()
-            connection.close()
+        causes = self.ask_here("/api/state")["causes"]
+        numbers = [cause["number"] for cause in causes]
+        assert self.ask_here("/api/srv/clear", {"numbers": numbers})["success"]
 
-    async def drive_on(self, crowd: Program) -> list[str]:
+    def works_away(self) -> bool:
+        with suppress(OSError, http.client.HTTPException, AssertionError):
+            return bool(self.ask_away("/api/srv/stop", {})["success"])
+        return False
+
+    async def drive_through(self) -> list[str]:
         """Drive from the phone while the crowd connects, and return the robot's modes meanwhile."""
         with inside(self._hosts.stranger):
             session = self.page.client(self._token)
@@ -177,7 +169,7 @@ class Scene:
             await ours.state(lambda state: state["link"] == "up")
             await ours.until_driving(0.3)
             holding = asyncio.create_task(ours.hold(0.3, 3 * PATIENCE_S))
-            coming = asyncio.create_task(self.start_crowd(crowd))
+            coming = asyncio.create_task(self.comes())
             modes, end = list[str](), 0.0
             # A state that was sent before the hold began does not count.
             await ours.state(lambda state: state["mode"] == "driving")
@@ -192,142 +184,91 @@ class Scene:
         return modes
 
 
-FREE_FILES, SILENT = 12, 80
+def _asked(
+    connection: http.client.HTTPConnection, path: str, payload: object, **headers: str
+) -> Any:
+    try:
+        body = None if payload is None else json.dumps(payload)
+        headers["Content-Type"] = "application/json"
+        connection.request("GET" if body is None else "POST", path, body, headers)
+        answer = connection.getresponse()
+        told = json.loads(answer.read())
+    finally:
+        connection.close()
+    assert answer.status == 200, told
+    return told
 
 
 @pytest.mark.parametrize(
-    "near",
-    [False, pytest.param(True, marks=pytest.mark.nightly)],
-    ids=["other host", "robot itself"],
+    "crowd",
+    [pytest.param(crowd, marks=pytest.mark.nightly if n else ()) for n, crowd in enumerate(CROWDS)],
 )
-def test_a_page_that_runs_out_of_files_stops_the_robot_and_recovers(
-    hosts: Hosts, robot: Daemon, where: Path, near: bool, tmp_path: Path
+def test_a_crowd_without_a_token_moves_no_robot_costs_no_period_and_leaves_a_page_that_works(
+    hosts: Hosts, robot: Daemon, where: Path, crowd: str, tmp_path: Path
 ) -> None:
-    """The test lowers the limit of open files after the page has read it.
+    (tmp_path / "tls").symlink_to(where / "tls")
+    newer = f"https://[{ROBOT_6}]:{free_endpoint().rpartition(':')[2]}"
+    server = Page(robot, tmp_path, "--address", newer, at=ROBOT_AT)
+    with inside(hosts.robot):
+        server.__enter__()
+    try:
+        scene = Scene(hosts, server, crowd, newer)
+        try:
+            _stand_through(scene, robot)
+        finally:
+            scene.goes()
+            scene.clear()
+        assert "Traceback" not in server.stderr
+        assert server.process.poll() is None
+    finally:
+        server.__exit__()
 
-    The page therefore accepts more connections than it can open.
-    """
+
+def _stand_through(scene: Scene, robot: Daemon) -> None:
+    until(scene.works_away, BACK_S, "the page works before")
+    scene.clear()
+    kb = resident_kb(scene.page.pid)
+    before, waited = scene.ask_here("/api/state"), kept_waiting(robot.pid)
+    asyncio.run(asyncio.wait_for(scene.comes(), 2 * PATIENCE_S))
+    time.sleep(1.0)
+    after, waited = scene.ask_here("/api/state"), kept_waiting(robot.pid) - waited
+    more = resident_kb(scene.page.pid) - kb
+    moved = math.hypot(after["x"] - before["x"], after["y"] - before["y"])
+    missed = Periods.between(before, after).missed
+    took = min(_timed(lambda: scene.ask_here("/api/srv/stop", {})) for _ in range(5))
+    scene.goes()
+    begun = time.monotonic()
+    until(scene.works_away, BACK_S, "the page works for a new phone")
+    back = time.monotonic() - begun
+    print(f"\n{more / 1000:+.1f} MB, moved {1000 * moved:.1f} mm, {missed} periods missed "
+          f"({waited:.2f} s without a core), a stop from here {1000 * took:.0f} ms, back after "
+          f"{back:.2f} s")  # fmt: skip
+    assert moved < 0.001
+    assert missed <= 100.0 * waited
+    assert took < HERE_S
+    assert more < MORE_KB
+
+
+def _timed(call: Callable[[], object]) -> float:
+    begun = time.monotonic()
+    call()
+    took = time.monotonic() - begun
+    return max(0.0, took - 4 * lost(begun, begun + took))
+
+
+def test_a_phone_that_has_opened_the_page_drives_on_through_a_crowd(
+    hosts: Hosts, robot: Daemon, where: Path, tmp_path: Path
+) -> None:
     (tmp_path / "tls").symlink_to(where / "tls")
     server = Page(robot, tmp_path, at=ROBOT_AT)
     with inside(hosts.robot):
         server.__enter__()
     scene = Scene(hosts, server, "2500 silent", "")
-    place = (server.here if near else server.away).rpartition("//")[2]
-    host, _, port = place.rpartition(":")
-    crowd = Program(
-        command_line(CROWD, "silent", host, port, SILENT, *([host] if near else OLDER)), server.tls
-    )
     try:
-        until(scene.reaches_the_daemon, 10.0, "the page reaches the daemon")
-        alone = asyncio.run(_stops(scene.stop_here))
-        open_files = len(list(Path(f"/proc/{server.pid}/fd").iterdir()))
-        hard = resource.prlimit(server.pid, resource.RLIMIT_NOFILE)[1]
-        resource.prlimit(server.pid, resource.RLIMIT_NOFILE, (open_files + FREE_FILES, hard))
-        with inside(hosts.robot if near else hosts.stranger):
-            crowd.__enter__()
-        crowd.says("opened", PATIENCE_S)
-        crowded = asyncio.run(_stops(scene.stop_here))
-        crowd.__exit__()
-        after, away = asyncio.run(_stops(scene.stop_here)), scene.stop_away()
-        times = [f"{1000 * nine_of_ten(took):.0f} ms" for took in (alone, crowded, after)]
-        print("\nno file: a stop from here before, meanwhile and after:", ", ".join(times))
-        # Each turn without a file displaces one connection, and the listeners rest after it.
-        assert nine_of_ten(crowded) < HERE_S + 4 * NO_FILES_PAUSE_S
-        assert nine_of_ten(after) < HERE_S
-        assert away < PHONE_S
-        with inside(hosts.robot):
-            assert server.refused()["crowded"] > 0
-        assert "Traceback" not in server.stderr
-        assert server.process.poll() is None
-    finally:
-        if hasattr(crowd, "process"):
-            crowd.__exit__()
-        try:
-            scene.clear()
-        finally:
-            server.__exit__()
-
-
-def nine_of_ten(took: list[float]) -> float:
-    """Return the time in which 90 % of the stops were done, s."""
-    return sorted(took)[round(0.9 * len(took)) - 1]
-
-
-async def _stops(stop: Callable[[], float]) -> list[float]:
-    """Stop the robot several times, and return how long each stop took, s.
-
-    The pauses are so long that the page does not merge two stops.
-    """
-    took = []
-    for _ in range(STOPS):
-        took.append(await asyncio.to_thread(stop))
-        await asyncio.sleep(2 * MIN_STOP_INTERVAL_S)
-    return took
-
-
-def _stopped(connect: Callable[[], http.client.HTTPConnection], headers: dict[str, str]) -> float:
-    begun = time.monotonic()
-    connection = connect()
-    try:
-        connection.request("POST", "/api/srv/stop", headers=headers)
-        answer = connection.getresponse()
-        body = answer.read()
-    finally:
-        connection.close()
-    took = time.monotonic() - begun
-    assert (answer.status, json.loads(body)["success"]) == (200, True), body
-    return max(0.0, took - 4 * lost(begun, begun + took))
-
-
-@pytest.mark.parametrize("most", [1024, pytest.param(65536, marks=pytest.mark.nightly)])
-@pytest.mark.parametrize(
-    "crowd",
-    [pytest.param(crowd, marks=pytest.mark.nightly if n else ()) for n, crowd in enumerate(CROWDS)],
-)
-def test_a_crowd_costs_little_and_keeps_no_stop_and_no_phone_out(
-    hosts: Hosts, robot: Daemon, where: Path, crowd: str, most: int, tmp_path: Path
-) -> None:
-    (tmp_path / "tls").symlink_to(where / "tls")
-    newer = f"https://[{ROBOT_6}]:{free_endpoint().rpartition(':')[2]}"
-    with files(most):
-        server = Page(robot, tmp_path, "--address", newer, at=ROBOT_AT)
-        with inside(hosts.robot):
-            server.__enter__()
-    try:
-        scene = Scene(hosts, server, crowd, newer)
-        _drive_and_stop(scene, crowd, most)
-    finally:
-        server.__exit__()
-
-
-def _drive_and_stop(scene: Scene, crowd: str, most: int) -> None:
-    page, crowds = scene.page, [scene.crowd(), scene.crowd()]
-
-    async def story() -> None:
-        before = resident_kb(page.pid)
-        modes = await scene.drive_on(crowds[0])
+        modes = asyncio.run(asyncio.wait_for(scene.drive_through(), 4 * PATIENCE_S))
         # On a busy machine the simulated board may be late, which "waiting" says.
         assert modes.count("driving") + modes.count("waiting") == len(modes)
         assert modes.count("driving") > 0.9 * len(modes)
-        alone = await _stops(scene.stop_here)
-        coming = asyncio.create_task(scene.start_crowd(crowds[1]))
-        here, away = await _stops(scene.stop_here), await _stops(scene.stop_away)
-        await coming
-        more = resident_kb(page.pid) - before
-        print(f"\n{crowd}, {most} files: {more / 1000:+.1f} MB, a stop from here "
-              f"{1000 * nine_of_ten(here):.0f} ms ({1000 * nine_of_ten(alone):.0f} before), from "
-              f"the phone {1000 * nine_of_ten(away):.0f} ms")  # fmt: skip
-        assert more < MORE_KB
-        # The slowest ones measure the machine, which may be busy with other work.
-        assert nine_of_ten(here) < HERE_S
-        assert nine_of_ten(away) < PHONE_S
-
-    try:
-        asyncio.run(asyncio.wait_for(story(), 6 * PATIENCE_S))
     finally:
-        for program in crowds:
-            if hasattr(program, "process"):
-                program.__exit__()
-        scene.clear()
-    assert page.process.poll() is None
-    assert "Traceback" not in page.stderr
+        scene.goes()
+        server.__exit__()

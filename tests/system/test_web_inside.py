@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -10,21 +11,23 @@ from typing import Any, cast
 
 import aiohttp
 import pytest
-from aiohttp.test_utils import TestServer
+from aiohttp import web
+from yarl import URL
 
 from acsard.bus.address import Address
 from acsard.bus.zenoh_sessions import client_session
 from acsard.client import Client
-from acsard.core.config.settings import Config, WebConfig
+from acsard.core.config.settings import WebConfig
 from acsard.core.messages.signature import MAX_INT64
 from acsard.host.errors import UnreachableError
-from acsard.web.acceptor import Acceptor
+from acsard.web.access import REQUEST_RATE
 from acsard.web.app import Page
+from acsard.web.connections import Connections
 from acsard.web.followed_robot import About, FollowedRobot
-from acsard.web.limits import MAX_OVERRUNS, MAX_UNREAD_BYTES
 from acsard.web.metrics import Counts
-from acsard.web.server import ServerOptions, _until
-from acsard.web.tokens import Vault
+from acsard.web.server import first_ended
+from acsard.web.socket_sender import MAX_UNREAD_BYTES
+from acsard.web.tokens import ReadTokens, Vault
 from acsard.web.viewer import Parts
 from tests.system.browser import Hands
 from tests.system.harness import PATIENCE_S, Daemon, seconds
@@ -51,18 +54,30 @@ class Inside:
         self.robot = FollowedRobot(
             Address("tcp/127.0.0.1:1", "acsar", ""), connect, ABOUT, self.counts
         )
-        self.parts = Parts(self.robot, self.counts)
-        self.page = Page(
-            self.parts, Vault(where, "acsar"), frozenset(), Acceptor(self.counts), rules=rules
-        )
+        self.parts, self.connections = Parts(self.robot, self.counts), Connections(self.counts)
+        tokens = ReadTokens(Vault(where, "acsar"))
+        self.page = Page(self.parts, tokens, frozenset(), self.connections, rules)
+
+    @asynccontextmanager
+    async def served(self) -> AsyncIterator[URL]:
+        """Serve the page on loopback, and yield its URL."""
+        runner = web.AppRunner(self.page.app, handle_signals=False, shutdown_timeout=0.1)
+        await runner.setup()
+        assert runner.server is not None
+        with socket.create_server(("127.0.0.1", 0)) as listening:
+            listening.setblocking(False)
+            accepting = asyncio.create_task(self.connections.accept(runner.server, listening, None))
+            yield URL(f"http://127.0.0.1:{listening.getsockname()[1]}")
+            accepting.cancel()
+        await runner.cleanup()
 
     @asynccontextmanager
     async def hands(self) -> AsyncIterator[Hands]:
         """Serve the page and open its WebSocket as a client."""
         async with (
-            TestServer(self.page.app) as server,
+            self.served() as url,
             aiohttp.ClientSession() as session,
-            session.ws_connect(server.make_url("/ws")) as opened,
+            session.ws_connect(url / "ws") as opened,
         ):
             yield Hands(opened)
 
@@ -148,7 +163,7 @@ async def test_a_stamp_too_large_to_sign_is_refused_and_the_next_command_is_acce
 
 async def test_a_flood_of_stops_ends_its_connection(inside: Inside) -> None:
     async with inside.hands() as ours:
-        for n in range(3 * MAX_OVERRUNS):
+        for n in range(3 * int(REQUEST_RATE.burst)):
             await ours.say(call="stop", id=n)
         async with asyncio.timeout(PATIENCE_S):
             while (await ours.socket.receive()).type == aiohttp.WSMsgType.TEXT:
@@ -200,7 +215,7 @@ async def test_a_client_that_pings_without_reading_gets_one_answer_to_all_pings(
         (viewer,) = inside.page._viewers
         viewer._out.enqueue({"more than a kernel holds": "x" * 3_000_000})
         await eventually(lambda: viewer._out._unread() > MAX_UNREAD_BYTES)
-        for n in range(300):
+        for n in range(100):
             await ours.socket.ping(b"%0125d" % n)
         await ours.drive(0.0)
         await eventually(lambda: inside.counts.all().get("commands_dropped"))
@@ -209,7 +224,7 @@ async def test_a_client_that_pings_without_reading_gets_one_answer_to_all_pings(
         async with asyncio.timeout(PATIENCE_S):
             while (message := await ours.socket.receive()).type != aiohttp.WSMsgType.PONG:
                 pass
-        assert message.data == b"%0125d" % 299
+        assert message.data == b"%0125d" % 99
 
 
 async def test_a_bus_that_is_gone_is_reported_and_the_key_comes_when_it_is_back(
@@ -244,12 +259,11 @@ async def test_a_robot_with_a_closed_session_is_reported_as_gone_and_the_server_
         running.cancel()
 
 
-async def test_a_failed_command_outbox_ends_the_server(inside: Inside, tmp_path: Path) -> None:
-    address = Address("tcp/127.0.0.1:1", "acsar", "")
-    options = ServerOptions(Config(), address, (), "", tmp_path)
-    inside.parts.commands.outbox.dead.set_exception(MemoryError("no room"))
+async def test_a_failed_command_outbox_ends_the_server(inside: Inside) -> None:
+    outbox = inside.parts.commands.outbox
+    outbox.dead.set_exception(MemoryError("no room"))
     with pytest.raises(MemoryError):
-        await _until(asyncio.Event(), inside.parts, inside.page, options)
+        await first_ended([asyncio.sleep(60)], outbox)
 
 
 async def test_a_client_on_the_robot_has_the_role_of_the_configuration(tmp_path: Path) -> None:
@@ -274,8 +288,8 @@ async def test_only_a_page_of_a_listed_origin_may_send_requests_and_read_answers
     shared: Inside,
 ) -> None:
     """The test also tries another page of this machine, and the robot's own page."""
-    async with TestServer(shared.page.app) as server, aiohttp.ClientSession() as session:
-        place, own = server.make_url("/api/srv/stop"), f"http://127.0.0.1:{server.port}"
+    async with shared.served() as url, aiohttp.ClientSession() as session:
+        place, own = url / "api/srv/stop", str(url.origin())
         for origin, status, readable in [
             (DASHBOARD, 409, DASHBOARD),  # there is no robot to stop
             ("http://127.0.0.1:5174", 403, None),
@@ -295,8 +309,8 @@ async def test_only_a_page_of_a_listed_origin_may_send_requests_and_read_answers
 
 
 async def test_a_browser_learns_what_a_page_of_a_listed_origin_may_send(shared: Inside) -> None:
-    async with TestServer(shared.page.app) as server, aiohttp.ClientSession() as session:
-        place = server.make_url("/api/srv/clear")
+    async with shared.served() as url, aiohttp.ClientSession() as session:
+        place = url / "api/srv/clear"
         asked = {"Access-Control-Request-Method": "POST"}
         async with session.options(place, headers=asked | {"Origin": DASHBOARD}) as answer:
             assert answer.status == 204
@@ -314,14 +328,13 @@ async def test_a_browser_learns_what_a_page_of_a_listed_origin_may_send(shared: 
 async def test_a_page_of_a_listed_origin_opens_the_socket_and_exchanges_no_link(
     shared: Inside,
 ) -> None:
-    async with TestServer(shared.page.app) as server, aiohttp.ClientSession() as session:
-        place, site_headers = server.make_url("/ws"), {"Origin": DASHBOARD}
+    async with shared.served() as url, aiohttp.ClientSession() as session:
+        place, site_headers = url / "ws", {"Origin": DASHBOARD}
         async with session.ws_connect(place, headers=site_headers) as opened:
             assert "hello" in (await opened.receive()).data
         with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
             await session.ws_connect(place, headers={"Origin": "http://127.0.0.1:5174"})
         assert caught.value.status == 403
-        url = server.make_url("/token")
-        async with session.post(url, json={"token": "x"}, headers=site_headers) as answer:
+        async with session.post(url / "token", json={"token": "x"}, headers=site_headers) as answer:
             assert answer.status == 403
             assert "another site" in (await answer.json())["error"]

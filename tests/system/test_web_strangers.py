@@ -23,12 +23,8 @@ import websockets
 from acsard.bus.tls import peer_ends_ns
 from acsard.core.values import ROLES, Role
 from acsard.machine.authority import Authority
-from acsard.web.limits import (
-    MAX_LOCAL_WEBSOCKETS,
-    MAX_WEBSOCKETS_OF_NETWORK,
-    MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK,
-)
-from acsard.web.server import TIDY_S
+from acsard.web.connections import MAX_OF_TOKEN
+from acsard.web.server import TICK_S
 from tests.system.browser import NAME, Page, hands, run
 from tests.system.bystander import lost
 from tests.system.harness import PATIENCE_S, Bus, Daemon, until
@@ -199,7 +195,7 @@ async def test_a_driver_whose_token_is_revoked_is_disconnected_within_a_second_a
             "your token has expired or was revoked: ask for a new one",
         )
         # The server looks it up that often, and may wait for a core as this process does.
-        assert ended - begun < TIDY_S + PASSES_S + 4 * lost(begun, ended)
+        assert ended - begun < TICK_S + PASSES_S + 4 * lost(begun, ended)
         bus.at_rest()
         with suppress(ConnectionError):
             await holding
@@ -225,43 +221,33 @@ async def test_a_connection_whose_token_was_revoked_is_cut_and_others_are_not(pa
     (borrowed, first), (owned, second) = [await opened(secret) for secret in tokens]
     page.vault.revoke(names[0])
     with suppress(ConnectionError):
-        assert await asyncio.wait_for(borrowed.read(), 3 * TIDY_S + PATIENCE_S) == b""
+        assert await asyncio.wait_for(borrowed.read(), 3 * TICK_S + PATIENCE_S) == b""
     with pytest.raises(TimeoutError):
-        await asyncio.wait_for(owned.read(1), 2 * TIDY_S)
+        await asyncio.wait_for(owned.read(1), 2 * TICK_S)
     for writer in (first, second):
         writer.transport.abort()
 
 
-async def test_a_client_with_too_many_connections_shuts_out_no_other_at_its_address(
+async def test_a_token_has_few_connections_and_still_stops_beyond_them(
     page: Page, bus: Bus
 ) -> None:
-    """All clients, including the robot's own browser, connect from 127.0.0.1."""
-    few = MAX_WEBSOCKETS_OF_NETWORK // MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK + 1
-    broken, *others = (page.invite("viewer", f"one{n}") for n in range(few))
+    names = [f"{name}-{time.time_ns()}" for name in ("broken", "phone")]
+    broken, phone = [page.invite("viewer", name) for name in names]
     counted = page.refused().get("too_many", 0)
-
-    async def taken(stack: AsyncExitStack, token: str) -> int:
-        """Open more connections than one client may have; return how many succeed."""
-        session = await stack.enter_async_context(page.client(token))
-        count = 0
-        for _ in range(MAX_WEBSOCKETS_OF_NETWORK):
-            with suppress(aiohttp.WSServerHandshakeError):
-                await stack.enter_async_context(session.ws_connect(f"{page.away}/ws"))
-                count += 1
+    async with AsyncExitStack() as stack:
+        session = await stack.enter_async_context(page.client(broken))
+        for _ in range(MAX_OF_TOKEN):
+            await stack.enter_async_context(session.ws_connect(f"{page.away}/ws"))
+        with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
+            await session.ws_connect(f"{page.away}/ws")
+        assert caught.value.status == 503
         async with session.get(f"{page.away}/api/whoami") as answer:
             assert "close some" in (await answer.json())["full"]
-        return count
-
-    async with AsyncExitStack() as stack:
-        assert await taken(stack, broken) == MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK
-        rest = [await taken(stack, invitation) for invitation in others]
-        assert rest[:-1] == [MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK] * (few - 2)
-        assert sum(rest) == MAX_WEBSOCKETS_OF_NETWORK - MAX_WEBSOCKETS_OF_TOKEN_IN_NETWORK
-        for _ in range(MAX_LOCAL_WEBSOCKETS):
-            ours = await stack.enter_async_context(hands(page))
-        assert (await ours.call("stop"))["ok"]
-    refused = few * MAX_WEBSOCKETS_OF_NETWORK - MAX_WEBSOCKETS_OF_NETWORK
-    assert page.refused()["too_many"] == counted + refused
+        async with session.post(f"{page.away}/api/srv/stop") as answer:
+            assert (await answer.json())["success"]
+        theirs = await stack.enter_async_context(hands(page, phone))
+        assert (await theirs.call("stop"))["ok"]
+    assert page.refused()["too_many"] == counted + 1
 
 
 def test_bytes_that_are_not_a_request_get_a_json_error(page: Page, bus: Bus) -> None:

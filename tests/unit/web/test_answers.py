@@ -76,6 +76,7 @@ def test_a_changed_file_is_read_again(page: Path) -> None:
     before = files.get("small.js")
     (page / "small.js").write_text("2")
     os.utime(page / "small.js", ns=(1, 1))
+    files.read()
     after = files.get("small.js")
     assert before is not None
     assert after is not None
@@ -130,6 +131,7 @@ def test_a_page_whose_stop_script_changed_is_read_again(page: Path) -> None:
     files = Files(page)
     before = files.get("index.html")
     (page / "stop.js").write_text("stop(2)")
+    files.read()
     after = files.get("index.html")
     assert before is not None
     assert after is not None

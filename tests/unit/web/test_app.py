@@ -1,12 +1,10 @@
-"""The page's server lists the settings, and checks tokens even while the disk hangs."""
+"""The page's server lists the settings, and a stop waits for nothing."""
 
 from __future__ import annotations
 
 import asyncio
-import os
-from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 from unittest.mock import Mock
 
 import pytest
@@ -22,19 +20,17 @@ from acsard.core.config.settings import Config, WebConfig
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import NS_PER_S, Role
 from acsard.host import clock
-from acsard.host.threads import NoThreadError
 from acsard.web import app
-from acsard.web.acceptor import Acceptor
-from acsard.web.admission import IDENTITY_KEY
+from acsard.web.access import IDENTITY_KEY
 from acsard.web.app import Page, settings_in
 from acsard.web.callers import RequestRefusedError
 from acsard.web.camera import Camera
+from acsard.web.connections import Connections
 from acsard.web.followed_robot import About, FollowedRobot
 from acsard.web.metrics import Counts
-from acsard.web.tokens import FILE, Vault
+from acsard.web.tokens import ReadTokens, Vault
 from acsard.web.viewer import Parts
 from tests.each import each
-from tests.unit.web.hanging_disk import threads_named
 from tests.unit.web.test_callers import MAINTAINER
 
 ABOUT = About("1", True, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
@@ -46,73 +42,19 @@ def followed(client: Client | None) -> FollowedRobot:
     return result
 
 
-def fails(error: Exception) -> Callable[..., Awaitable[Any]]:
-    async def in_thread(*_: object) -> None:
-        raise error
-
-    return in_thread
-
-
-class Phone:
-    """A viewer with a token."""
-
-    who = replace(MAINTAINER, token="lent")
-
-    def __init__(self, ends: list[str]) -> None:
-        self.end = ends.append
-
-
-def page_with_phone(directory: Path, ends: list[str]) -> Page:
+def page_of(directory: Path, client: Client | None = None) -> Page:
     counts = Counts()
-    parts = Parts(followed(None), counts)
-    page = Page(parts, Vault(directory, "acsar"), frozenset(), Acceptor(counts), WebConfig())
-    page._viewers.add(Phone(ends))  # type: ignore[arg-type]
-    return page
-
-
-async def test_a_phone_stays_if_no_thread_can_read_the_tokens(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ends = list[str]()
-    page = page_with_phone(tmp_path, ends)
-    monkeypatch.setattr(app, "in_thread", fails(NoThreadError("no thread")))
-    await page.tidy()
-    assert not ends
-
-
-async def test_a_phone_leaves_if_the_disk_hangs_and_only_one_thread_waits_for_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(app, "READ_TIMEOUT_S", 0.02)
-    ends, file = list[str](), tmp_path / FILE
-    os.mkfifo(file)
-    page = page_with_phone(tmp_path, ends)
-    for count in range(1, 4):
-        await page.tidy()
-        assert len(ends) == count
-        assert threads_named("valid_digests") == 1
-    hanging = os.open(file, os.O_WRONLY)
-    file.unlink()
-    os.close(hanging)
-    async with asyncio.timeout(20.0):
-        while threads_named("valid_digests"):
-            await asyncio.sleep(0.01)
-    Vault(tmp_path, "acsar").invite("viewer", "phone", 1)
-    (token,) = Vault(tmp_path, "acsar").all()
-    monkeypatch.setattr(Phone, "who", replace(MAINTAINER, token=token.digest))
-    await page.tidy()  # may still use the result of the read that hung
-    ends.clear()
-    await page.tidy()
-    assert not ends
+    tokens = ReadTokens(Vault(directory, "acsar"))
+    return Page(
+        Parts(followed(client), counts), tokens, frozenset(), Connections(counts), WebConfig()
+    )
 
 
 async def test_the_age_of_a_picture_counts_a_suspend(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The age must include the suspend, in which the monotonic clock stands still."""
-    counts, headers = Counts(), dict[str, str]()
-    parts = Parts(followed(None), counts)
-    page = Page(parts, Vault(tmp_path, "acsar"), frozenset(), Acceptor(counts), WebConfig())
+    headers, page = dict[str, str](), page_of(tmp_path)
     page._camera = Camera("http://127.0.0.1:1/")
 
     async def sent(request: web.Request, body: bytes, fields: dict[str, str], *_: object) -> None:
@@ -138,9 +80,8 @@ class Daemon:
     def __init__(self, calls: list[str]) -> None:
         self._calls = calls
 
-    def sibling(self, robot: str) -> Daemon:
-        assert robot == "acsar"
-        return Daemon(self._calls)
+    def named(self, name: str) -> Daemon:
+        return self
 
     def request(self, verb: str, payload: object) -> ServiceReply:
         self._calls.append(verb)
@@ -149,10 +90,8 @@ class Daemon:
 
 def page_with_daemon(directory: Path) -> tuple[Page, list[str]]:
     """Return a page, and the list of the calls that reach the robot."""
-    counts, calls = Counts(), list[str]()
-    parts = Parts(followed(cast(Client, Daemon(calls))), counts)
-    vault = Vault(directory, "acsar")
-    return Page(parts, vault, frozenset(), Acceptor(counts), WebConfig()), calls
+    calls = list[str]()
+    return page_of(directory, cast(Client, Daemon(calls))), calls
 
 
 def posted(verb: str, *body: bytes, end: bool = True, role: Role = "viewer") -> web.Request:

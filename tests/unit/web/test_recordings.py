@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from acsard.web import recordings
+from acsard.web.callers import RequestRefusedError
 from acsard.web.recordings import BlackBox, Recording, rows
 
 
@@ -44,22 +45,14 @@ def test_a_file_in_place_of_the_directory_is_an_error(tmp_path: Path) -> None:
         rows(tmp_path / "record")
 
 
-async def test_many_requests_at_once_read_the_disk_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("directory", ["", "record"])
+async def test_a_fresh_robot_has_an_empty_list_of_recordings(
+    tmp_path: Path, directory: str
 ) -> None:
-    """A viewer with very many requests must not delay the stops of other clients."""
-    looked: list[Path] = []
-
-    def look(place: Path) -> list[Recording]:
-        looked.append(place)
-        return []
-
-    monkeypatch.setattr(recordings, "rows", look)
-    robot: Any = None
-    box = BlackBox(robot)
-    monkeypatch.setattr(box, "_place", lambda: tmp_path)
-    assert await asyncio.gather(*(box.rows() for _ in range(40))) == [[]] * 40
-    assert looked == [tmp_path]
-    monkeypatch.setattr(recordings, "MIN_LIST_INTERVAL_NS", -1)
-    await box.rows()
-    assert len(looked) == 2
+    place = directory and str(tmp_path / directory)
+    robot: Any = SimpleNamespace(
+        endpoint="tcp/127.0.0.1:7447", about=SimpleNamespace(recordings=place)
+    )
+    assert await BlackBox(robot).rows() == []
+    with pytest.raises(RequestRefusedError, match="does not exist"):
+        await BlackBox(robot).find("000001-20261121T070027Z.rec.zst")

@@ -1,4 +1,4 @@
-"""Only a short, fixed list of paths needs no token or has no rate limit."""
+"""Only a short, fixed list of paths needs no token or has no limit."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 from acsard.core.messages.keys_and_roles import SERVICES, row_of
 from acsard.core.messages.permissions import SERVICE_ROLES
 from acsard.web.app import ROUTES
-from acsard.web.limits import REQUEST_RATE
 
 PAGE = (Path(__file__).parents[3] / "deploy/web/README.md").read_text()
 
@@ -23,10 +22,8 @@ def test_only_the_page_s_own_files_and_the_token_are_open_to_strangers() -> None
     assert is_open == {"/", "/favicon.ico", "/page/{name}", "/token"}
 
 
-def test_stops_reconnections_and_pictures_beyond_their_rate_wait_and_are_not_refused() -> None:
-    waiting = {"/api/srv/stop", "/api/whoami", "/ws", "/api/camera"}
-    assert {row.path for row in ROUTES if row.waits} == waiting
-    assert all(row.rate == REQUEST_RATE for row in ROUTES if row.path not in waiting)
+def test_only_a_stop_and_the_reason_for_a_refusal_are_served_beyond_the_limits_of_a_token() -> None:
+    assert {row.path for row in ROUTES if row.always} == {"/api/srv/stop", "/api/whoami"}
 
 
 def test_each_service_has_the_role_that_the_bus_asks_for() -> None:

@@ -1,6 +1,6 @@
-"""The page's server loads renewed certificates.
+"""The page's server reads tokens, files and certificates again each second, in one thread.
 
-While the disk hangs, it starts only one thread for this.
+A disk that hangs delays none of its requests.
 """
 
 from __future__ import annotations
@@ -8,44 +8,66 @@ from __future__ import annotations
 import asyncio
 import io
 import os
-import ssl
+from concurrent.futures import Future
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from acsard.bus import certificate_watch
-from acsard.bus.certificate_watch import CertificateFiles
-from acsard.bus.tls import KEY, files_in
+from acsard.bus.tls import KEY
 from acsard.core.config.settings import LogConfig
 from acsard.host.logs import Log
 from acsard.machine.authority import Authority
 from acsard.web import server
+from acsard.web.answers import Files
+from acsard.web.server import Certificate
+from acsard.web.tokens import ReadTokens, Vault
 from tests.unit.web.hanging_disk import ROUNDS_S, threads_named
 
 
-async def test_one_thread_waits_for_a_hanging_disk_and_then_the_new_certificate_is_loaded(
+async def test_one_thread_waits_for_a_hanging_disk_and_then_everything_is_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server, "TIDY_S", 0.01)
+    monkeypatch.setattr(server, "TICK_S", 0.01)
     monkeypatch.setattr(certificate_watch, "FILES_CHECK_PERIOD_NS", 0)
-    authority, key, names = Authority.make(tmp_path, "test", 10), tmp_path / KEY, set[str]()
+    authority, key = Authority.make(tmp_path, "test", 10), tmp_path / KEY
     authority.issue(tmp_path, "robot", ["192.168.0.1"], 10)
-    files, log = CertificateFiles(*files_in(str(tmp_path))), Log(LogConfig(), io.StringIO())
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    renewing = asyncio.create_task(server._renew(context, names, files, str(tmp_path), log))
+    log, vault = Log(LogConfig(), io.StringIO()), Vault(tmp_path / "state", "acsar")
+    text, _ = vault.invite("viewer", "tv", 1)
+    tokens, certificate = ReadTokens(vault), Certificate(str(tmp_path), log)
+    page: Any = SimpleNamespace(files=Files(tmp_path))
+    before = certificate.context
+    reading = asyncio.create_task(server._read_disk(tokens, page, certificate))
     try:
+        await tokens.next_reading()
+        assert tokens.owner([text]) is not None
         # A read of a named pipe blocks until another program has written to the pipe.
         key.unlink()
         os.mkfifo(key)
         await asyncio.sleep(ROUNDS_S)
-        assert threads_named("renewed") == 1
+        assert threads_named("read") == 1
+        assert tokens.owner([text]) is not None
+        vault.revoke("tv")
         hanging = os.open(key, os.O_WRONLY)
         key.unlink()
         authority.issue(tmp_path, "robot", ["192.168.0.2"], 10)
         os.close(hanging)
         async with asyncio.timeout(20.0):
-            while "192.168.0.2" not in names:
+            while "192.168.0.2" not in certificate.names or tokens.owner([text]):
                 await asyncio.sleep(0.01)
+        assert certificate.context is not before
     finally:
-        renewing.cancel()
+        reading.cancel()
         log.close()
+
+
+async def test_an_error_of_the_outbox_is_reported_even_after_its_future_was_waited_for() -> None:
+    """The end of the server must not cancel the future that reports the error."""
+    outbox: Any = SimpleNamespace(dead=Future())
+    await server.first_ended([asyncio.sleep(0)], outbox)
+    assert not outbox.dead.cancelled()
+    outbox.dead.set_exception(MemoryError("no room"))
+    with pytest.raises(MemoryError):
+        await server.first_ended([asyncio.sleep(60)], outbox)

@@ -17,12 +17,22 @@ from acsard.host import clock
 from acsard.host.errors import MendableError, NotPermittedError, UsageError
 from acsard.web import tokens
 from acsard.web.callers import AdmittedClient
-from acsard.web.tokens import Token, Vault, owner_in
+from acsard.web.tokens import ReadTokens, Token, Vault
 
 
 def owner(vault: Vault, text: str) -> AdmittedClient | None:
     """Return the owner of a token by the file as it is now."""
-    return owner_in(vault.all(), text, vault.now_s())
+    return read(vault).owner([text])
+
+
+def read(vault: Vault) -> ReadTokens:
+    tokens = ReadTokens(vault)
+    tokens.read()
+    return tokens
+
+
+def digests(vault: Vault) -> set[str]:
+    return {token.digest for token in vault.valid()}
 
 
 def test_a_token_is_valid_until_it_is_revoked(tmp_path: Path) -> None:
@@ -32,10 +42,10 @@ def test_a_token_is_valid_until_it_is_revoked(tmp_path: Path) -> None:
     found = owner(server, text)
     assert found is not None
     assert (found.role, found.name) == ("operator", "phone")
-    assert found.token in server.valid_digests()
+    assert found.token in digests(server)
     keeper.revoke("phone")
     assert owner(server, text) is None
-    assert found.token not in server.valid_digests()
+    assert found.token not in digests(server)
 
 
 def test_the_token_itself_is_not_stored_on_the_disk(tmp_path: Path) -> None:
@@ -53,7 +63,7 @@ def test_an_expired_token_is_not_valid(tmp_path: Path) -> None:
     ended = {"tokens": [replace(token, ends=token.made - 1)]}
     vault.path.write_bytes(msgspec.json.encode(ended))
     assert owner(vault, text) is None
-    assert token.digest not in vault.valid_digests()
+    assert token.digest not in digests(vault)
 
 
 @pytest.mark.parametrize("text", ["", "x", "x" * 10_000, "ü", "\0", "\udcff"])
@@ -70,7 +80,7 @@ def test_with_a_damaged_file_no_token_is_valid(tmp_path: Path) -> None:
     for damaged in (whole[:-3], whole.replace(b'"me"', '"mü"'.encode("latin-1")), b"[" * 100_000):
         vault.path.write_bytes(damaged)
         assert owner(vault, text) is None
-        assert vault.valid_digests() == frozenset()
+        assert digests(vault) == set()
         with pytest.raises(UsageError, match="is not a list of tokens"):
             vault.invite("viewer", "tv", 1)
 
@@ -83,9 +93,9 @@ def test_a_role_and_a_field_of_a_later_version_leave_the_other_tokens_valid(tmp_
     rows = content["tokens"]
     rows[0]["later"], rows[1]["role"], content["later"] = 1, "pilot", 2
     vault.path.write_text(json.dumps(content))
-    assert vault.valid_digests() == {token.digest, other.digest}
-    assert vault.find_owner(text) == AdmittedClient("operator", "phone", token.digest)
-    assert vault.find_owner(pilot) is None
+    assert digests(vault) == {token.digest, other.digest}
+    assert owner(vault, text) == AdmittedClient("operator", "phone", token.digest)
+    assert owner(vault, pilot) is None
     vault.revoke("pilot")
     content = json.loads(vault.path.read_bytes())
     (row,) = content["tokens"]
@@ -104,13 +114,13 @@ def test_an_expired_token_stays_expired_after_a_start_without_the_time(
     other, _ = Vault(tmp_path, "robot1").invite("viewer", "tv", 30)
     server = Vault(tmp_path, "robot1")
     for _ in range(DAY_S // 60 + 2):
-        assert (token.digest in server.valid_digests()) is (now_s < token.ends)
+        assert (token.digest in digests(server)) is (now_s < token.ends)
         now_s += 60.0
     now_s = 5.0  # a clock without a battery begins in 1970
     server = Vault(tmp_path, "robot1")
     assert owner(server, text) is None
-    assert token.digest not in server.valid_digests()
-    assert server.left_s(token.digest) == 0
+    assert token.digest not in digests(server)
+    assert read(server).left_s(token.digest) == 0
     # A robot without a network never learns the time, and its valid tokens still work.
     assert owner(server, other) is not None
     # A new token counts from the newest known time, so it is valid now.
@@ -128,7 +138,7 @@ def test_a_token_expires_on_a_robot_that_never_learns_the_time(
     for _ in range(2):  # starts, each of which runs for 13 hours
         wall_s, server = 5.0, Vault(tmp_path, "robot1")
         for _ in range(13):
-            valid = token.digest in server.valid_digests()
+            valid = token.digest in digests(server)
             wall_s += 3600.0
             steady_s += 3600.0
     assert not valid
@@ -142,13 +152,13 @@ def test_the_time_is_written_each_minute_at_most_and_only_beside_tokens(
     monkeypatch.setattr(time, "time", lambda: now_s)
     server = Vault(tmp_path, "robot1")
     for _ in range(100):
-        server.valid_digests()
+        digests(server)
         now_s += 1.0
     assert not server.path.exists()
     Vault(tmp_path, "robot1").invite("viewer", "tv", 1)
     contents = set[bytes]()
     for _ in range(600):
-        server.valid_digests()
+        digests(server)
         contents.add(server.path.read_bytes())
         now_s += 1.0
     assert len(contents) == 10
@@ -166,7 +176,7 @@ def test_a_disk_that_cannot_store_the_time_leaves_the_tokens_valid(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(tokens, "replace", full)
-    assert vault.valid_digests() == {token.digest}
+    assert digests(vault) == {token.digest}
 
 
 def test_a_damaged_file_is_not_written_over(tmp_path: Path) -> None:
@@ -194,9 +204,9 @@ def test_the_valid_tokens_are_reported_together(tmp_path: Path) -> None:
     vault = Vault(tmp_path, "robot1")
     _, first = vault.invite("viewer", "tv", 1)
     _, second = vault.invite("operator", "phone", 1)
-    assert vault.valid_digests() == {first.digest, second.digest}
+    assert digests(vault) == {first.digest, second.digest}
     vault.revoke("tv")
-    assert vault.valid_digests() == {second.digest}
+    assert digests(vault) == {second.digest}
 
 
 def test_a_name_is_given_once_and_an_unknown_one_cannot_be_revoked(tmp_path: Path) -> None:
@@ -223,12 +233,38 @@ def test_robots_that_share_the_file_know_their_own_tokens_alone(tmp_path: Path) 
     assert owner(second, ours) is None
     assert owner(first, theirs) is None
     assert [entry.robot for entry in second.all()] == ["robot2"]
-    assert second.valid_digests() == {token.digest}
-    assert first.left_s(token.digest) == 0
+    assert digests(second) == {token.digest}
+    assert read(first).left_s(token.digest) == 0
     first.revoke("phone")
     assert (first.all(), [entry.name for entry in second.all()]) == ([], ["phone"])
     with pytest.raises(UsageError, match="the robot's tokens: none"):
         first.revoke("phone")
+
+
+def test_a_record_that_is_not_a_token_is_kept_and_leaves_the_other_tokens_valid(
+    tmp_path: Path,
+) -> None:
+    vault = Vault(tmp_path, "robot1")
+    text, _ = vault.invite("viewer", "tv", 1)
+    content = json.loads(vault.path.read_bytes())
+    strange = {"name": "old", "role": "viewer", "digest": "d", "made": 1, "ends": 2}  # no robot
+    content["tokens"].append(strange)
+    vault.path.write_text(json.dumps(content))
+    assert owner(vault, text) is not None
+    vault.invite("viewer", "phone", 1)
+    assert [token.name for token in vault.all()] == ["tv", "phone"]
+    assert strange in json.loads(vault.path.read_bytes())["tokens"]
+
+
+def test_while_the_disk_hangs_tokens_stay_valid_until_they_expire(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vault = Vault(tmp_path, "robot1")
+    text, token = vault.invite("viewer", "tv", 1)
+    tokens = read(vault)  # and never again
+    assert tokens.owner(["", "x", text]) == AdmittedClient("viewer", "tv", token.digest)
+    monkeypatch.setattr(time, "time", lambda: float(token.ends))
+    assert tokens.owner([text]) is None
 
 
 @pytest.mark.slow

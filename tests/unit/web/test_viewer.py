@@ -16,11 +16,9 @@ from acsard.client import Client
 from acsard.client.commander import Commander, CommandSigner, Wish
 from acsard.core.messages.schema import Beat, ServiceReply
 from acsard.core.messages.signature import unpack
-from acsard.core.values import NS_PER_S, Role, Twist
-from acsard.host import clock
+from acsard.core.values import Role, Twist
 from acsard.web.callers import AdmittedClient
 from acsard.web.followed_robot import About, FollowedRobot
-from acsard.web.limits import COMMAND_RATE
 from acsard.web.metrics import Counts
 from acsard.web.viewer import Parts, Viewer, ViewerCommands
 from tests.unit.web.test_socket_messages import INVALID_STOPS
@@ -38,7 +36,7 @@ def test_a_command_that_cannot_be_sent_is_dropped_and_the_next_is_processed() ->
     commands = ViewerCommands(broken, counts)
     senders = {name: (Commander(), CommandSigner(name)) for name in "ab"}
     for name in "aba":
-        commands.give(name, "app", *senders[name], AHEAD)
+        commands.give("app", *senders[name], AHEAD)
         commands.outbox.flush(PATIENCE_S)
     assert counts.all() == {"commands_dropped": 3}
     assert not commands.outbox.dead.done()
@@ -58,7 +56,7 @@ def test_a_command_is_put_with_the_stamp_the_clock_and_the_echo_of_its_sender() 
     commander, sender = Commander(), CommandSigner("joe/aa")
     for stamp_ns, echo in ((1000, Beat(7, 5)), (2000, None)):
         wish = Wish(Twist(0.2, -0.5), stamp_ns, echo)
-        assert commands.give("joe", "teleop", commander, sender, wish)
+        commands.give("teleop", commander, sender, wish)
         commands.outbox.flush(PATIENCE_S)
     assert [(x, z) for x, z, _ in put] == [(0.2, -0.5)] * 2
     signed = [item for *_, item in put]
@@ -69,26 +67,6 @@ def test_a_command_is_put_with_the_stamp_the_clock_and_the_echo_of_its_sender() 
     assert counts.all() == {"commands": 2}
 
 
-def test_a_token_that_commands_without_end_is_refused_except_a_zero_after_a_speed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    commands, sender = ViewerCommands(lambda: None, Counts()), CommandSigner("joe/aa")
-    flooding, driving, other = Commander(), Commander(), Commander()
-    rest = Wish(Twist(0.0, 0.0), 1000)
-    assert commands.give("token", "teleop", driving, sender, AHEAD)
-    results = [commands.give("token", "app", flooding, sender, rest) for _ in range(1000)]
-    assert COMMAND_RATE.burst - 1 <= results.count(True) < COMMAND_RATE.burst + 100
-    assert not commands.give("token", "teleop", driving, sender, AHEAD)
-    # A source may have a timeout of 10 s, so a zero matters for that long.
-    later_ns = clock.mono_ns() + 9 * NS_PER_S
-    monkeypatch.setattr(clock, "mono_ns", lambda: later_ns)
-    while commands.give("token", "app", flooding, sender, rest):
-        pass
-    assert commands.give("token", "teleop", driving, sender, rest)
-    assert not commands.give("token", "teleop", driving, sender, rest)
-    assert commands.give("another", "teleop", other, sender, AHEAD)
-
-
 @pytest.mark.slow
 async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
     """A burst of messages, for example after a gap of the network, must not prevent the zero."""
@@ -96,9 +74,6 @@ async def test_a_zero_is_obeyed_beyond_the_limit_on_messages() -> None:
 
     class Fake:
         certificate, session = "", None
-
-        def sibling(self, *_: object) -> Fake:
-            return self
 
         def put(self, twist: Any, signature: Any, source: str) -> None:
             put.append((twist.linear.x, source))

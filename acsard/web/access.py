@@ -1,14 +1,14 @@
-"""Decides whether an HTTP request reaches its handler.
+"""Decides who may do what: finds the client of each HTTP request, and refuses it or serves it.
 
-The module checks, in this order: the client's address and the requested host (`callers.py`), the
-origin of the web page that sent the request, the token, the request rate, and the client's role.
-A path that does not exist requires a token too, so a client without a token does not learn which
-paths exist.
+The checks come in this order: the client's address and the requested host (`callers.py`), the
+origin of the web page that sent the request, the token, the token's connections and request rate,
+and the client's role. A path that does not exist requires a token too, so a client without a token
+does not learn which paths exist. No check waits for a disk: the tokens are those of the last
+reading of the file, which `server.py` repeats each second.
 """
 
 from __future__ import annotations
 
-import asyncio
 import re
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from collections.abc import Set as AbstractSet
@@ -20,9 +20,7 @@ from msgspec.structs import replace
 from acsard.core.config.settings import WebConfig
 from acsard.host import clock
 from acsard.host.rate_limits import Buckets, Rate
-from acsard.host.threads import in_thread
-from acsard.web.acceptor import Acceptor
-from acsard.web.answers import READ_TIMEOUT_S, STATUS_CODES, TroubleError, problem, secured
+from acsard.web.answers import STATUS_CODES, TroubleError, problem, secured
 from acsard.web.callers import (
     LOCAL_NAME,
     AdmittedClient,
@@ -30,19 +28,22 @@ from acsard.web.callers import (
     RequestFacts,
     RequestRefusedError,
     by_listed_page,
-    network_of,
     place,
     require_own_origin,
     tokens_in,
     tokens_offered,
     unmapped,
 )
-from acsard.web.limits import GUESSES, GUESSES_OF_ONE, REFUSAL_DELAY_S, REQUEST_RATE, STRANGER_RATE
-from acsard.web.metrics import Counts
+from acsard.web.connections import MAX_OF_TOKEN, Connection, Connections
 from acsard.web.routes import Route
 from acsard.web.socket_messages import MAX_MESSAGE_BYTES
-from acsard.web.tasks import shared
-from acsard.web.tokens import Token, Vault, owner_in
+from acsard.web.tokens import ReadTokens
+
+# Requests of one token, and messages of one WebSocket. A page asks for 20 pictures a second, and
+# sends 20 commands a second. The daemon takes 1000 commands a second from this server.
+REQUEST_RATE = Rate(100.0, 200.0)
+
+FLOOD_TEXT = f"more than {REQUEST_RATE.hz:g} a second: send fewer"
 
 # Strict, because the server copies the host into the content security policy of an answer.
 HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
@@ -58,63 +59,35 @@ STATUS_TEXTS = {
 # Not in a request for a path that is open to every client.
 IDENTITY_KEY: web.RequestKey[AdmittedClient] = web.RequestKey("who", AdmittedClient)
 
+# Why the connection of this request ends after the answer, or "".
+LAST_KEY: web.RequestKey[str] = web.RequestKey("last", str)
+
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
-# Each read starts a thread. Without this limit, a flood of requests delayed a stop by 200 ms.
-MIN_READ_INTERVAL_S = 0.005
 
-
-class Lookups:
-    """Reads the token file. All requests that arrive before a read starts share its result."""
-
-    def __init__(self, vault: Vault) -> None:
-        self._vault, self._lock = vault, asyncio.Lock()
-        self._next: asyncio.Task[Sequence[Token]] | None = None
-        self._read_s = -MIN_READ_INTERVAL_S
-
-    async def read(self) -> Sequence[Token]:
-        """Return the tokens, with all changes before this call.
-
-        Raises `TimeoutError` if the disk hangs.
-        """
-        if self._next is None:
-            self._next = shared(self._later())
-        return await asyncio.shield(self._next)
-
-    async def _later(self) -> Sequence[Token]:
-        loop = asyncio.get_running_loop()
-        async with self._lock:
-            await asyncio.sleep(self._read_s + MIN_READ_INTERVAL_S - loop.time())
-            self._next, self._read_s = None, loop.time()
-            return await in_thread(self._vault.all, READ_TIMEOUT_S)
-
-
-class Admission:
+class Access:
     """Checks each HTTP request, and refuses it or passes it to the handler of its route."""
 
     def __init__(
         self,
         robot: str,
         names: AbstractSet[str],
-        vault: Vault,
-        acceptor: Acceptor,
-        counts: Counts,
+        tokens: ReadTokens,
+        connections: Connections,
         rules: WebConfig,
     ) -> None:
         self._local = AdmittedClient(rules.local, LOCAL_NAME)
         self._origins = frozenset(rules.origins)
-        self._robot, self._names, self._vault = robot, names, vault
-        self._acceptor, self._counts = acceptor, counts
-        self._guesses, self._strangers = Buckets(GUESSES_OF_ONE, GUESSES), Buckets(STRANGER_RATE)
-        self._paces: dict[Rate, Buckets] = {}
-        self._lookups = Lookups(vault)
+        self._robot, self._names, self._tokens = robot, names, tokens
+        self._connections, self._counts = connections, connections.counts
+        self._rates = Buckets(REQUEST_RATE)
         self._rows: dict[web.AbstractRoute, Route] = {}
 
     def application(self, rows: Iterable[Route], page: object) -> web.Application:
         """Return the application that serves the routes; each handler gets `page` first."""
         app = web.Application(middlewares=[self._serve], client_max_size=MAX_MESSAGE_BYTES)
         app.on_response_prepare.append(secured)
-        app.on_response_prepare.append(self._shared)
+        app.on_response_prepare.append(self._share)
         for row in rows:
             for method in ("GET", "HEAD") if row.method == "GET" else (row.method,):
                 added = app.router.add_route(method, row.pattern, partial(row.handler, page))
@@ -122,56 +95,40 @@ class Admission:
         return app
 
     async def owner(self, peer: str, texts: Sequence[str]) -> AdmittedClient:
-        """Return the owner of the first valid token.
-
-        Raises `RequestRefusedError` if no token is valid, and `TimeoutError` if the disk hangs.
-        """
+        """Return the owner of the first valid token. Raises `RequestRefusedError` without one."""
         if not any(texts):
             raise RequestRefusedError(
                 "no_token", "a token is missing: run `acsard web --invite ROLE` on the robot"
             )
-        tokens = await self._lookups.read()
-        now_s = self._vault.now_s()
-        identity = next(filter(None, (owner_in(tokens, text, now_s) for text in texts)), None)
-        # A valid token is accepted even if too many wrong tokens have arrived. So the guesses of
-        # one client cannot lock out another client.
-        if identity is not None:
-            return replace(identity, address=peer)
-        if not self._guesses.take(network_of(peer), clock.mono_ns()):
-            raise RequestRefusedError("too_fast", "too many wrong tokens: wait a minute")
-        raise RequestRefusedError(
-            "bad_token",
-            "this token is not valid (expired, revoked, or for another robot): ask for a new one",
-        )
+        if (identity := self._tokens.owner(texts)) is None:
+            # The token may be newer than the last reading of the file.
+            await self._tokens.next_reading()
+            identity = self._tokens.owner(texts)
+        if identity is None:
+            raise RequestRefusedError(
+                "bad_token",
+                "this token is not valid (expired, revoked, or for another robot): ask for a new "
+                "one",
+            )
+        return replace(identity, address=peer)
 
     @web.middleware
     async def _serve(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        self._acceptor.spoke(request.transport, request.content)
+        with connection_of(request).serving(request.content):
+            answer = await self._answer(request, handler)
+        if request.get(LAST_KEY):
+            answer.force_close()
+        return answer
+
+    async def _answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         try:
-            if request.method == "OPTIONS" and self._listed(request):
-                await self._pace_stranger(request)
+            if request.method == "OPTIONS" and self._is_shared(request):
                 return self._preflight(request)
-            waits = await self._admit(request, self._rows.get(request.match_info.route))
-            # For a POST, delay only the answer, so that the server sends a stop immediately.
-            if waits and request.method != "POST":
-                await asyncio.sleep(REFUSAL_DELAY_S)
-            answer = await handler(request)
-            if waits and request.method == "POST":
-                await asyncio.sleep(REFUSAL_DELAY_S)
-            return answer
+            await self._admit(request, self._rows.get(request.match_info.route))
+            return await handler(request)
         except RequestRefusedError as error:
-            if error.reason == "too_fast":
-                await asyncio.sleep(REFUSAL_DELAY_S)
-            elif IDENTITY_KEY not in request:
-                await self._pace_stranger(request)
             self._counts.refuse(error.reason, _origin(request))
-            answer = problem(STATUS_CODES.get(error.reason, 403), str(error))
-            if error.reason == "too_many":
-                # Close the TCP connection too. A client that retries in a loop would keep it.
-                answer.force_close()
-            return answer
-        except TimeoutError:
-            return problem(503, "the disk of this page's server does not answer: try again")
+            return problem(STATUS_CODES.get(error.reason, 403), str(error))
         except TroubleError as trouble:
             return problem(trouble.status, str(trouble), trouble.detail)
         except web.HTTPException as error:
@@ -184,11 +141,7 @@ class Admission:
                 return answer
             return problem(error.status, STATUS_TEXTS.get(error.status, error.reason))
 
-    async def _pace_stranger(self, request: web.Request) -> None:
-        if not self._strangers.take(network_of(peer_of(request)), clock.mono_ns()):
-            await asyncio.sleep(REFUSAL_DELAY_S)
-
-    async def _admit(self, request: web.Request, row: Route | None) -> bool:
+    async def _admit(self, request: web.Request, row: Route | None) -> None:
         facts = request_facts(request)
         here = place(facts, self._names | {own_address(request)}) == "here"
         is_open = row is not None and row.least is None
@@ -196,15 +149,7 @@ class Admission:
         if request.method not in ("GET", "HEAD") if is_open else not listed:
             require_own_origin(facts)
         if is_open:
-            # A browser loads the files of the page over several connections before it requests a
-            # path that needs a token. If such a request already contains a valid token, record the
-            # client's identity, so that other clients cannot displace this connection.
-            tokens = [] if here else tokens_shown(request, self._robot)
-            if identity := next(filter(None, map(self._vault.find_owner, tokens)), None):
-                self._acceptor.admitted(request.transport, identity)
-            elif not here:
-                await self._pace_stranger(request)
-            return False
+            return
         identity = replace(self._local, address=facts.peer)
         if not here:
             # Accept cookies only from the robot's own page. A page in `web.origins` must send a
@@ -212,27 +157,28 @@ class Admission:
             tokens = tokens_sent(request) if listed else tokens_shown(request, self._robot)
             identity = await self.owner(facts.peer, tokens)
         request[IDENTITY_KEY] = identity
-        self._acceptor.admitted(request.transport, identity)
-        fast = self._too_fast(identity, row)
-        if fast and not (row and row.waits):
-            text = (
-                f"more than {REQUEST_RATE.hz:g} requests a second with one token: use the "
-                "WebSocket /ws, which sends each change"
-            )
-            raise RequestRefusedError("too_fast", text)
+        if not here:
+            self._limit(request, identity, row)
         if row is not None and row.least is not None:
             identity.require(row.least, f"{row.method} {row.path}")
-        return fast
 
-    def _too_fast(self, identity: AdmittedClient, row: Route | None) -> bool:
-        if not identity.token:
-            return False  # clients on the robot itself have no rate limit
-        rate, name = row.rate if row else REQUEST_RATE, identity.token
-        if row and row.waits:
-            name += f" {network_of(identity.address)}"
-        return not self._paces.setdefault(rate, Buckets(rate)).take(name, clock.mono_ns())
+    def _limit(self, request: web.Request, identity: AdmittedClient, row: Route | None) -> None:
+        connection, refusal = connection_of(request), None
+        if not self._connections.claim(connection, identity.token):
+            refusal = RequestRefusedError(
+                "too_many",
+                f"{MAX_OF_TOKEN} connections with this token are open already: close some pages, "
+                "or ask for a token of your own",
+            )
+        elif not self._rates.take(identity.token, clock.mono_ns()):
+            self._connections.end(identity.token, FLOOD_TEXT, but=connection)
+            refusal = RequestRefusedError("too_fast", f"requests with this token: {FLOOD_TEXT}")
+        if refusal is not None:
+            request[LAST_KEY] = str(refusal)
+            if row is None or not row.always:
+                raise refusal
 
-    def _listed(self, request: web.Request) -> bool:
+    def _is_shared(self, request: web.Request) -> bool:
         return by_listed_page(request_facts(request), self._origins)
 
     def _preflight(self, request: web.Request) -> web.Response:
@@ -246,13 +192,19 @@ class Admission:
             },
         )
 
-    async def _shared(self, request: web.Request, response: web.StreamResponse) -> None:
+    async def _share(self, request: web.Request, response: web.StreamResponse) -> None:
         if self._origins:
             vary = response.headers.get("Vary", "")
             response.headers["Vary"] = f"{vary}, Origin" if vary else "Origin"
-        if self._listed(request):
+        if self._is_shared(request):
             response.headers["Access-Control-Allow-Origin"] = request.headers["Origin"]
             response.headers["Access-Control-Expose-Headers"] = "ETag, Age-Ms, Waited-Ms"
+
+
+def connection_of(request: web.Request) -> Connection:
+    connection = request.protocol
+    assert isinstance(connection, Connection)
+    return connection
 
 
 def request_facts(request: web.Request) -> RequestFacts:
