@@ -234,12 +234,21 @@ def _write(files: Mapping[Path, tuple[bytes, int]]) -> None:
     # All or none: a key and its certificate belong together. Never with more permissions than the
     # mode. Raises `MendableError`.
     new = {path: path.with_name(f"{path.name}.new") for path in files}
+    owner, before, replaced = (os.geteuid(), os.getegid()), dict[Path, bytes](), list[Path]()
     try:
         for path, (data, mode) in files.items():
-            replace(new[path], data, mode=mode, owner=(os.geteuid(), os.getegid()))
+            if path.exists():
+                before[path] = path.read_bytes()
+            replace(new[path], data, mode=mode, owner=owner)
         for path, written in new.items():
             written.replace(path)
+            replaced.append(path)
     except OSError as error:
+        for earlier in replaced:
+            if earlier in before:
+                replace(earlier, before[earlier], mode=files[earlier][1], owner=owner)
+            else:
+                earlier.unlink()
         if isinstance(error, PermissionError):
             raise
         raise MendableError(f"cannot write {path}: {error.strerror}") from None

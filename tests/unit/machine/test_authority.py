@@ -168,6 +168,36 @@ def test_a_disk_that_refuses_a_file_leaves_the_earlier_key_and_certificate(
     assert {path: path.read_bytes() for path in (tmp_path / "robot").iterdir()} == before
 
 
+@pytest.mark.parametrize("blocked", ["certificate.pem", "key.pem"])
+def test_a_file_that_cannot_be_replaced_leaves_the_pair_that_belongs_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, blocked: str
+) -> None:
+    mine, own = Authority.make(tmp_path / "ca", "test", 1, OWN), tmp_path / "robot"
+    mine.issue(own, "robot", ["robot1"], 1)
+    before = {path: path.read_bytes() for path in own.iterdir()}
+    modes = {path: path.stat().st_mode for path in own.iterdir()}
+    rename = Path.replace
+
+    def immutable(path: Path, target: Path) -> Path:
+        if target.name == blocked and path.name.endswith(".new"):
+            raise OSError(errno.EROFS, "Read-only file system")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "replace", immutable)
+    with pytest.raises(MendableError, match=r"cannot write .*: Read-only file system"):
+        mine.issue(own, "robot", ["robot1"], 1)
+    assert {path: path.read_bytes() for path in own.iterdir()} == before
+    assert {path: path.stat().st_mode for path in own.iterdir()} == modes
+
+
+def test_a_directory_in_the_place_of_a_file_leaves_no_half_of_a_pair(tmp_path: Path) -> None:
+    mine, own = Authority.make(tmp_path / "ca", "test", 1, OWN), tmp_path / "robot"
+    (own / "key.pem").mkdir(parents=True)
+    with pytest.raises(MendableError, match=r"cannot write .*key.pem"):
+        mine.issue(own, "robot", ["robot1"], 1)
+    assert [path.name for path in own.iterdir()] == ["key.pem"]
+
+
 def test_an_authority_without_an_identifier_of_its_key_can_sign(tmp_path: Path) -> None:
     key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "other")])
