@@ -106,14 +106,17 @@ def report(
     withheld: str = "",
 ) -> CheckupReport:
     """Return the report. The check has passed if every step was run and judged, and none failed."""
-    judged = answered(findings) and not lateness.unjudged(findings)
-    passed = judged and not any(
-        finding.verdict == "FAIL" or finding.name == SKIPPED_STEPS for finding in findings
-    )
+    passed = _complete(findings) and not any(finding.verdict == "FAIL" for finding in findings)
     toml = "\n".join(excerpt(changes))
     return CheckupReport(
         port, passed, findings, changes, toml, written or None, error or None, withheld or None
     )
+
+
+def _complete(findings: Sequence[Finding]) -> bool:
+    # Whether every step was run and judged.
+    skipped = any(finding.name == SKIPPED_STEPS for finding in findings)
+    return answered(findings) and not skipped and not lateness.unjudged(findings)
 
 
 def summary(result: CheckupReport, where: str) -> str:
@@ -126,6 +129,9 @@ def summary(result: CheckupReport, where: str) -> str:
     if result.withheld:
         return f"\n{counts}\n{where} stays unchanged: {result.withheld}"
     if not result.toml:
-        return f"\n{counts}\nacsard.toml: nothing to change"
+        rest = "nothing to change"
+        if not _complete(result.findings):
+            rest = "no suggestion, because the check did not judge every step"
+        return f"\n{counts}\nacsard.toml: {rest}"
     head = f"{where}: written" if result.written else "for acsard.toml:"
     return f"\n{counts}\n\n{head}\n{result.toml}"

@@ -54,6 +54,13 @@ def test_the_summary_counts_the_verdicts_and_has_the_lines_of_toml() -> None:
     assert "nothing to change" in summary(report("sim", [RATE], {}, "", ""), "acsard.toml")
 
 
+def test_a_check_that_ended_early_does_not_say_that_nothing_has_to_change() -> None:
+    rest = Finding(SKIPPED_STEPS, "SKIPPED", "9 steps", "the board fell silent")
+    for findings in ([RATE, rest], [Finding("baud rate", "FAIL", "no answer", "look")]):
+        text = summary(report("sim", findings, {}, "", ""), "acsard.toml")
+        assert text.endswith(": no suggestion, because the check did not judge every step")
+
+
 def findings_for(**keys: object) -> list[Finding]:
     return [Finding(k, "PASS", keys={f"mcu.{k}": v}) for k, v in keys.items()]
 
