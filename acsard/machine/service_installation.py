@@ -247,12 +247,14 @@ REMOVE_COMMANDS = (*RELOAD_COMMANDS, Run(("systemctl", "reset-failed", *ALL_UNIT
 
 def files() -> list[File]:
     """Return all files that the installation of the service writes."""
-    defaults = reference(source()).read_text(encoding="utf-8")
+    defaults, simulator = reference(source()).read_text(encoding="utf-8"), '\nport = "sim"'
+    # Without this line, the installed service would run the simulator.
+    assert defaults.count(simulator) == 1
     return [
         *system_files(source()),
         File(
             CONFIG_DIRECTORY / "acsard.toml",
-            defaults.replace('port = "sim"', 'port = "/dev/acsar"').encode(),
+            defaults.replace(simulator, '\nport = "/dev/acsar"').encode(),
             kept=True,
         ),
     ]

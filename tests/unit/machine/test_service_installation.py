@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from acsard.host.errors import MendableError
+from acsard.machine import service_installation
 from acsard.machine.deploy_files import source
 from acsard.machine.service_installation import (
     GATEWAY,
@@ -196,6 +197,16 @@ def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
     assert (unit.path.name, gateway.path.name, page.path.name) == (UNIT, GATEWAY, PAGE)
     assert b'port = "/dev/acsar"' in configuration.content
     assert set(present([unit])) == {unit.path}
+
+
+def test_an_installation_never_selects_the_simulator(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    changed = tmp_path / "acsard.toml"
+    changed.write_text("[mcu]\nport='sim'\n")
+    monkeypatch.setattr(service_installation, "reference", lambda deploy: changed)
+    with pytest.raises(AssertionError):
+        files()
 
 
 def test_each_kept_path_is_reported_with_its_reason_and_how_to_remove_it() -> None:
