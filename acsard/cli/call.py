@@ -15,13 +15,15 @@ from acsard.cli.replies import of_each, print_each
 from acsard.client import Client
 from acsard.core.formatting import json_line, lines
 from acsard.core.messages.encodings import encode
-from acsard.core.messages.keys_and_roles import PLAIN_SERVICES, SERVICES
+from acsard.core.messages.keys_and_roles import SERVICES
 from acsard.core.messages.schema import MESSAGES
-from acsard.core.values import Verb
 from acsard.host.errors import UsageError
 
 # The service `set` is `acsard set`.
 CALLABLE_SERVICES = tuple(service for service in SERVICES if service != "set")
+
+
+RELEASES = tuple(service for service, row in SERVICES.items() if row.optional)
 
 
 class _Known(tuple[str, ...]):
@@ -31,8 +33,8 @@ class _Known(tuple[str, ...]):
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    fields = {service: " ".join(_fields(service)) for service in CALLABLE_SERVICES}
-    forms = [f"{service} {names.upper()}" for service, names in fields.items() if names]
+    needed = {service: " ".join(_needed(service)) for service in CALLABLE_SERVICES}
+    forms = [f"{service} {names.upper()}" for service, names in needed.items() if names]
     parser.add_argument(
         "service",
         # Accept `srv/stop` too, because the messages on `state` and the table of keys contain the
@@ -47,7 +49,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         type=float,
         metavar="NUMBER",
-        help=f"the numbers that the service needs: {'; '.join(forms)}",
+        help=f"the numbers that the service needs: {'; '.join(forms)}. For {' and '.join(RELEASES)}"
+        ": the causes to release, by `causes` in `acsard get state` (default: all that are older "
+        "than the call)",
     )
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
     add_bus(parser, SEVERAL_IDS + " (stop only)")
@@ -56,29 +60,44 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     if args.service == "set":
         raise UsageError("a setting is changed with `acsard set KEY VALUE`")
-    # The daemon refuses a service that it does not have. It may have one that is unknown here.
-    wanted = _fields(args.service) if args.service in SERVICES else ()
-    if len(args.values) != len(wanted):
-        form = " ".join(["acsard call", args.service, *(name.upper() for name in wanted)])
-        raise UsageError(f"wrong number of arguments; type: {form}")
-    for name, value in zip(wanted, args.values, strict=True):
-        if not math.isfinite(value):
-            raise UsageError(f"{name.upper()} = {value}: the number must be finite; correct it")
+    fields = _causes(args.values) if args.service in RELEASES else _fields(args)
     if args.service != "stop" and (ids := several_ids(args)):
         typed = (("--config", args.config), ("--connect", args.connect), ("--tls", args.tls))
         raise UsageError(one_robot_only_text(args.service, args.values, ids, options_text(typed)))
     with connected_to_many(args) as (robot, many):
         if many:
             return _stop_all(robot, many, as_json=args.json)
-        reply = robot.call(args.service, **dict(zip(wanted, args.values, strict=True)))
+        reply = robot.call(args.service, **fields)
     print(json_line(encode(reply, "json").decode()) if args.json else lines(reply.message))
     return 0 if reply.success else 1
 
 
-def _fields(service: Verb) -> tuple[str, ...]:
-    if service in PLAIN_SERVICES:
-        return ()
-    return MESSAGES[SERVICES[service].payload].__struct_fields__
+def _causes(values: Sequence[float]) -> dict[str, object]:
+    # Without numbers, the client names the causes that are older than the call.
+    for value in values:
+        if not (0 <= value < 1 << 53 and value.is_integer()):
+            raise UsageError(
+                f"{value:g} is not the number of a cause: `acsard get state` lists them in `causes`"
+            )
+    return {"numbers": [int(value) for value in values]} if values else {}
+
+
+def _needed(service: str) -> tuple[str, ...]:
+    # The daemon refuses a service that it does not have. It may have one that is unknown here.
+    row = SERVICES.get(service)  # type: ignore[call-overload]
+    needs = row is not None and row.payload and not row.optional
+    return MESSAGES[row.payload].__struct_fields__ if needs else ()
+
+
+def _fields(args: argparse.Namespace) -> dict[str, object]:
+    names, values = _needed(args.service), args.values
+    if len(values) != len(names):
+        form = " ".join(["acsard call", args.service, *map(str.upper, names)])
+        raise UsageError(f"wrong number of arguments; type: {form}")
+    for name, value in zip(names, values, strict=True):
+        if not math.isfinite(value):
+            raise UsageError(f"{name.upper()} = {value}: the number must be finite; correct it")
+    return dict(zip(names, values, strict=True))
 
 
 def one_robot_only_text(

@@ -46,13 +46,14 @@ def main(args: argparse.Namespace) -> int:
                 terminal.roster(fleet)
             return Exit.OK
         rows = fleet.gather()
+        if args.json:
+            print(json_line(msgspec.json.encode(rows).decode()), flush=True)
         if not rows:
             # Over TLS the client's certificate may not be permitted to see any of the named robots.
             named = robot.where.tls and ids != (ALL_ROBOTS,)
             silence = robot.sibling(ids[0]).whoami().silence if named else ""
             raise UnreachableError("; ".join(filter(None, (fleet.hint(), silence))))
         if args.json:
-            print(json_line(msgspec.json.encode(rows).decode()), flush=True)
             return Exit.OK
         width = output_size().columns
         # Flush now, so that a session that closes slowly does not hold back the table.

@@ -436,6 +436,25 @@ def test_call_prints_the_answer_and_ends_with_1_when_refused(shared: Daemon, bus
     assert (again.code, "nothing to clear" in again.out) == (0, True)
 
 
+def test_call_clear_with_numbers_releases_exactly_these_causes(shared: Daemon, bus: Bus) -> None:
+    first, second = (
+        json.loads(tool(shared, "call", "stop", "--json").out)["data"]["numbers"][0] for _ in "ab"
+    )
+    released = tool(shared, "call", "clear", str(first), "--json")
+    assert json.loads(released.out)["data"]["numbers"] == [first]
+    assert [cause["number"] for cause in bus.state()["causes"]] == [second]
+    assert tool(shared, "call", "clear", str(second)).code == 0
+    bus.comes_to("ready")
+    wrong = tool(shared, "call", "clear", "1.5")
+    assert (wrong.code, "`acsard get state` lists them" in wrong.err) == (Exit.USAGE, True)
+
+
+def test_fleet_prints_an_empty_list_of_json_if_no_robot_is_there(shared: Daemon) -> None:
+    nobody = tool(shared, "fleet", "--json", "--id", "nobody")
+    assert (nobody.code, nobody.out) == (Exit.UNREACHABLE, "[]")
+    assert "none of the robots" in nobody.err
+
+
 @pytest.mark.parametrize(
     "pose", [("1", "2", "0.5"), ("-1.5", "-2", "-0.5"), ("-1e-3", "0", "-.5E+0")]
 )
