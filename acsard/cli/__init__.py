@@ -14,7 +14,7 @@ import io
 import os
 import re
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from importlib import import_module
@@ -117,10 +117,12 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
-    """Return the parser of the subcommands in `called`, or if one is unknown, of all by name.
+def parser(
+    called: Collection[str] = VERBS, names: Iterable[str] = (*VERBS, *UNLISTED)
+) -> argparse.ArgumentParser:
+    """Return the parser of `names`, with the options of the subcommands in `called` only.
 
-    Only the modules in `called` are imported.
+    The modules of others are not imported.
     """
     whole = _Parser(
         prog="acsard",
@@ -132,8 +134,7 @@ def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
     )
     whole.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     verbs = whole.add_subparsers(title="subcommands", metavar="SUBCOMMAND", dest="verb")
-    names = (*VERBS, *UNLISTED)
-    for name in called if all(name in names for name in called) else names:
+    for name in names:
         # argparse lists only subcommands that have a help.
         verb = verbs.add_parser(name, help=VERBS[name]) if name in VERBS else verbs.add_parser(name)
         if name in called:
@@ -169,7 +170,8 @@ def main(argv: list[str] | None = None) -> int:
     code: int = Exit.FAILURE if must_finish else Exit.OK
     try:
         try:
-            args = parser(words[:1]).parse_args(words)
+            is_known = words[0] in VERBS or words[0] in UNLISTED
+            args = (parser(words[:1], words[:1]) if is_known else parser(())).parse_args(words)
             must_finish = must_finish or getattr(args, "must_finish", False)
             code = int(args.main(args))
         except AcsardError as error:

@@ -56,17 +56,17 @@ PROGRESS_RECORDS = 1024  # between two times on the terminal
 REPLAY_DESCRIPTION = """\
 Run the recorded inputs through the program again, without a robot, and compare the results with the
 recorded ones: each line to the board, and each pose, mode, reason and event. With --config, show
-what another configuration would have changed. A part that cannot be read because of damage is not
-compared. Exit codes: 0 everything is the same, 1 something differs, 65 a part was not compared and
-the rest is the same.
+what another configuration would have changed. A part that is damaged or missing is not compared. Exit
+codes: 0 everything is the same, 1 something differs, 65 a part was not compared and the rest is the
+same. With --config, a difference is no failure: 0, or 65 if a part was not compared.
 """
 
 EXPORT_DESCRIPTION = """\
 Write the messages of a recorded robot as a file for Foxglove, Lichtblick, PlotJuggler and `ros2 bag
 play`. The file is MCAP with odom, tf, tf_static, joint_states, cmd_vel_out, cmd_vel_in of each
 source, diagnostics, state and log as ROS 2 messages, and with their definitions. With --config,
-write the messages that the robot would have published with another configuration. A part that
-cannot be read because of damage is left out. Exit codes: 0 complete, 65 a part is left out.
+write the messages that the robot would have published with another configuration. Exit codes: 0
+all steps in the recording are written, 65 a damaged part, which cannot be read, is left out.
 """
 
 REPORT_DESCRIPTION = """\
