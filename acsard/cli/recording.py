@@ -56,9 +56,9 @@ PROGRESS_RECORDS = 1024  # between two times on the terminal
 REPLAY_DESCRIPTION = """\
 Run the recorded inputs through the program again, without a robot, and compare the results with the
 recorded ones: each line to the board, and each pose, mode, reason and event. With --config, show
-what another configuration would have changed. A part that is damaged or missing is not compared. Exit
-codes: 0 everything is the same, 1 something differs, 65 a part was not compared and the rest is the
-same. With --config, a difference is no failure: 0, or 65 if a part was not compared.
+what another configuration would have changed. A part that is damaged or missing is not compared.
+Exit codes: 0 everything is the same, 1 something differs, 65 a part was not compared and the rest
+is the same. With --config, a difference is no failure.
 """
 
 EXPORT_DESCRIPTION = """\
