@@ -295,7 +295,7 @@ def test_the_recipe_for_a_verb_names_every_file_that_lists_the_verbs() -> None:
 LISTS_KEYS = r"(?s)^(?=.*\bwheel_states\b)(?=.*\bcmd_vel_out\b)(?=.*\bdiagnostics\b)"
 """A file that contains three published keys."""
 
-READS_KEYS = {"web/page/main.js", "core/config/removed.py"}
+READS_KEYS = {"web/page/main.js"}
 """Files that name only some of the published keys."""
 
 

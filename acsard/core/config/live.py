@@ -15,7 +15,6 @@ from msgspec.structs import replace
 from acsard.core.config.contradictions import live_contradictions
 from acsard.core.config.nearest import hint
 from acsard.core.config.parsing import ConfigError, effective
-from acsard.core.config.removed import why_removed
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import build_value, keys_of, show
 from acsard.core.values import Plain
@@ -227,8 +226,6 @@ def _refusal(key: str, value: object, tables: Mapping[str, object]) -> str:
             "acsard.toml and restart acsard (`acsard set` lists the keys that can change "
             "without a restart)"
         )
-    if advice := why_removed(key):
-        return f"{key} = {show(value)}: {advice}"
     if key == "use_sim_time":  # each node of rclcpp and rclpy has this parameter
         return (
             "use_sim_time: the daemon does not support this ROS parameter, because it always uses "

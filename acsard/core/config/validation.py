@@ -14,7 +14,6 @@ from msgspec import inspect
 from msgspec.structs import FieldInfo, fields
 
 from acsard.core.config.nearest import nearest
-from acsard.core.config.removed import why_removed
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -60,9 +59,7 @@ def build_partly(
     known = keys_of(cls)
     prefix, complete = f"{path}." if path else "", True
     for key in table:
-        if key not in known and (advice := why_removed(prefix + key)):
-            problems.append(f"{prefix}{key} = {show(table[key])}: {advice}")
-        elif key not in known:
+        if key not in known:
             near = nearest(key, known)
             problems.append(_unknown(key, table[key], path, near, list(known)))
             # The user may have meant the similar key, so treat the value of that key as invalid.
