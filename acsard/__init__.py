@@ -24,7 +24,7 @@ Where to look: each package may import only the packages below it in this list.
     machine/         tools for the administrator of the computer: `acsard doctor`, certificates for
                      other machines, the serial ports, the system service
     client/          follows and drives a robot from Python, synchronously or with asyncio; its
-                     follower and commander have the rules and time limits that all tools use
+                     `Follower` and `Ride` have the rules and time limits that all tools use
     daemon/          the daemon's process: control loop, shutdown, and the file that keeps a stop
                      or a fault latched over a restart
     daemon/gateway/  `acsard gateway`: the process that terminates TLS connections

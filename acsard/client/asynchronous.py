@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from acsard.bus.address import address_by_environment
 from acsard.bus.subscription import encoded
 from acsard.bus.zenoh_sessions import client_session
-from acsard.client.driving import UnheardError, drive, repeat_zeros
+from acsard.client.driving import Driver, Steps, UnheardError, drive, move, turn
 from acsard.client.identity import ClientIdentity
 from acsard.client.synchronous import REPLY_TIMEOUT_S, Client, close, decoder, end_at_exit
 from acsard.core.messages import schema
@@ -95,18 +95,30 @@ class AsyncClient:
 
     async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
         """Drive for `seconds`, as `Client.drive` does. If the task is cancelled, send zeros."""
-        drove = False
+        await self._run(drive(linear, angular, seconds))
+
+    async def move(self, distance: float, *, speed: float = 0.3) -> None:
+        """Drive `distance` m straight ahead (back if negative), as `Client.move` does."""
+        await self._run(move(distance, speed))
+
+    async def turn(self, degrees: float, *, speed: float = 0.8) -> None:
+        """Turn on the spot by an angle (left is +), as `Client.turn` does."""
+        await self._run(turn(degrees, speed))
+
+    async def _run(self, steps: Steps) -> None:
+        driver = Driver(self._client)
         try:
-            with closing(drive(self._client, linear, angular, seconds)) as steps:
-                for pause in steps:
-                    drove = drove or self._client.commands_motion
-                    await asyncio.sleep(pause)
+            with closing(steps(driver)) as pauses:
+                for pause_s in pauses:
+                    await asyncio.sleep(pause_s)
         except BaseException as error:
-            for pause in repeat_zeros(self._client) if drove else ():
-                await asyncio.sleep(pause)
+            for pause_s in driver.zeros():
+                await asyncio.sleep(pause_s)
             if isinstance(error, UnheardError | NoAnswerError):
                 raise await _in_thread(partial(self._client.explain_error, error)) from None
             raise
+        finally:
+            driver.end()
 
     async def call(self, service: str, **fields: object) -> schema.ServiceReply:
         """Call a service and return its reply, as `Client.call` does."""

@@ -1,39 +1,48 @@
-"""Sends the commands of one drive of `acsard.client`, and checks that the robot follows them.
+"""Drives one robot: `Driver` connects a `Ride` to the bus, and three kinds of steps use it.
 
 The daemon does not answer commands, but says in `state` why the robot does not follow. Then the
-drive ends with an error with that reason, and also if this program has sent no command for some
-time, because the operator may no longer want the drive.
+steps raise an error with that reason. Each is a generator of the time to wait before it is resumed,
+s, so that a script can sleep and an asyncio program can await.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Generator
+from contextlib import closing, suppress
 from numbers import Real
 from typing import Protocol
 
 import zenoh
 
-from acsard.client.commander import (
+from acsard.bus.subscription import encoded
+from acsard.client.course import Course, Straight, Turn
+from acsard.client.follower import FIRST_STATE_TIMEOUT_S, Followed, Watch
+from acsard.client.ride import (
     GRACE_S,
-    OPEN_TIMEOUT_S,
-    OPENING_PERIOD_S,
-    OPENING_S,
     SEND_PERIOD_S,
+    SILENCE,
+    Ride,
     lacks_only_commands,
     objection,
     receives_commands,
     refuses_for_good,
 )
-from acsard.client.final_zeros import MAX_END_S, STANDSTILL, FinalZeros
-from acsard.client.follower import MAX_STATE_AGE_S, SETTLED_S, Followed, Watch
+from acsard.core.messages.encodings import DecodeError, Decoder
+from acsard.core.messages.schema import Odometry
+from acsard.core.values import REST, Seconds, Twist
 from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 
-# After a drive, the speed must fall below `SLOWER` times its lowest value, in each `SLOWS_S`.
-SLOWER, SLOWS_S = 0.97, 1.0
+# Longest repetition of zeros by a program that ends. The robot usually shows within 0.6 s that it
+# has stopped; the rest is for a hiccup of the network or a stall of the daemon.
+MAX_END_S = 2.0
 
+COURSE_PERIOD_S = 0.02  # between two looks at the odometry
+
+MAX_ODOM_AGE_S = 0.2  # of a speed on a course
+
+COURSE_TIMEOUT_S = 3.0  # without coming nearer to the end of a course
 
 CONNECTION_CLOSED = "the connection to the daemon was closed while the robot was driving"
 
@@ -47,7 +56,7 @@ class UnheardError(NotDrivenError):
 
 
 class CommandClient(Followed, Protocol):
-    """The part of a client that `drive` uses."""
+    """The part of a client that a `Driver` uses."""
 
     source: str
     sender: str  # public name of this client's sender
@@ -56,19 +65,91 @@ class CommandClient(Followed, Protocol):
         """Send one command: `linear` m/s, `angular` rad/s (left is +)."""
 
 
-def drive(
-    robot: CommandClient, linear: float, angular: float, seconds: float
-) -> Generator[float, None, None]:
-    """Drive for `seconds` at m/s and rad/s (left is +), then send zeros until the robot stands.
+class Driver:
+    """Sends the commands of a `Ride`, and receives the states of the robot."""
 
-    The generator yields the time to wait before resuming it, s. It begins with zeros until the
-    daemon accepts the commands.
+    def __init__(self, robot: CommandClient) -> None:
+        self.robot, self.watch = robot, Watch(robot, clock.steady_s())
+        # Read the clock again here, because the subscription above may take long.
+        self.ride = Ride(robot.source, robot.sender, self.watch, clock.steady_s())
 
-    Raises:
+    def step(self, wish: Twist | None) -> None:
+        """Pass a wish to the ride, send the command that is due, and process the states."""
+        now = clock.steady_s()
+        self.ride.wish(wish, now)
+        command = self.ride.due(now)
+        try:
+            if command is not None:
+                self.robot.send(command.linear, command.angular)
+            self.take()
+        except zenoh.ZError:
+            raise NoAnswerError(CONNECTION_CLOSED) from None
+
+    def take(self) -> None:
+        """Process the states that have arrived. If none has for some time, query it."""
+        now = clock.steady_s()
+        for state in self.watch.poll(now):
+            self.ride.state(state, now)
+
+    def require(self) -> None:
+        """Raise an error if the ride has ended, or if the daemon is silent.
+
+        It is an `UnheardError` if the daemon receives nothing from this source.
+        """
+        ride, state, source = self.ride, self.watch.state, self.robot.source
+        if self.watch.silent(clock.steady_s()):
+            raise NoAnswerError(
+                "the daemon's state cannot be read: does the daemon run another version of acsard "
+                "than this program? Use the same version for both"
+                if self.watch.unreadable
+                else SILENCE.format(self.watch.silence_timeout_s)
+            )
+        if not ride.ended:
+            return
+        if state is None or ride.ended != ride.objection or receives_commands(state, source):
+            raise NotDrivenError(ride.ended)
+        lacks = lacks_only_commands(state, source)
+        raise UnheardError(ride.ended, lacks_only_commands=lacks)
+
+    def stop(self) -> Generator[Seconds, None, None]:
+        """Send zeros until the robot stands. Raises the errors of `require`."""
+        self.step(REST)
+        while not self.ride.is_over(clock.steady_s()):
+            self.require()
+            yield SEND_PERIOD_S
+            self.step(None)
+        state, source = self.watch.state, self.robot.source
+        if state is not None and refuses_for_good(state, source):
+            raise NotDrivenError(objection(state, source, self.robot.sender))
+
+    def zeros(self) -> Generator[Seconds, None, None]:
+        """Send zeros until the robot stands, for at most `MAX_END_S`, when a drive ends early."""
+        begun = clock.steady_s()
+        if self.ride.is_over(begun):
+            return
+        with suppress(NoAnswerError):  # the connection is closed
+            self.step(REST)
+            while not self.ride.is_over(now := clock.steady_s()) and now - begun < MAX_END_S:
+                yield SEND_PERIOD_S
+                self.step(None)
+
+    def end(self) -> None:
+        """Unsubscribe from the states."""
+        self.watch.end()
+
+
+Steps = Callable[[Driver], Generator[Seconds, None, None]]
+
+
+def drive(linear: float, angular: float, seconds: float) -> Steps:
+    """Return the steps that drive for `seconds` at m/s and rad/s (left is +), and then stop.
+
+    The steps raise:
         NotDrivenError: the robot does not follow, with the daemon's reason; or this program paused
             for more than `GRACE_S` between two commands (not zeros at the end).
         NoAnswerError: the daemon is silent, or the connection was closed.
-        UsageError: an argument is not finite, or `seconds` is not above 0.
+
+    Raises `UsageError` if an argument is not finite, or `seconds` is not above 0.
     """
     _require(linear=linear, angular=angular, seconds=seconds)
     if seconds <= 0:
@@ -76,58 +157,115 @@ def drive(
             f"seconds = {seconds:g}: a drive needs a time above 0; to drive "
             "backwards, use linear < 0"
         )
-    checks = _Drive(robot)
-    try:
-        # Send zeros before each drive, not only before the first one. Since the previous drive, the
-        # robot may have been stopped and cleared, or the daemon may have restarted.
-        yield from _opening(checks)
-        end, grace = clock.steady_s() + seconds, min(GRACE_S, seconds / 2)
-        while (left := end - clock.steady_s()) > 0:
-            checks.send(linear, angular)
-            yield min(SEND_PERIOD_S, left)
-            checks.require_no_pause()
-            checks.require(grace)
-        yield from _stopping(checks)
-    finally:
-        # Send a zero at the end, even if an exception interrupts the drive. If the connection is
-        # closed, this fails, but the exception that ends the drive says so already.
-        with suppress(NoAnswerError):
-            checks.send(0.0, 0.0)
-        checks.watch.end()
+
+    def steps(driver: Driver) -> Generator[Seconds, None, None]:
+        ride = driver.ride
+        # A short drive that the robot hardly followed is not a success either.
+        ride.grace_s = min(GRACE_S, seconds / 2)
+        while True:
+            driver.step(Twist(linear, angular))
+            driver.require()
+            left = seconds
+            if ride.begun is not None:
+                left += ride.begun - clock.steady_s()
+            if left <= 0:
+                break
+            yield min(ride.period, left)
+        yield from driver.stop()
+
+    return steps
 
 
-def repeat_zeros(robot: CommandClient, idle_s: float = 0.0) -> Generator[float, None, None]:
-    """Send zeros until the `state` shows that the robot has stopped, when a drive ends early.
+def move(distance: float, speed: float) -> Steps:
+    """Return the steps that drive `distance` m straight ahead (back if negative), by `odom`."""
+    _require(distance=distance, speed=speed)
+    return _course(lambda odom: Straight(odom, distance, _positive(speed)))
 
-    The generator yields the time to wait, s, and ends after `MAX_END_S` or with the connection.
-    `idle_s` after the last command (over `GRACE_S`), the robot may follow another sender: if the
-    state shows that, no zero is sent, which would stop it.
+
+def turn(degrees: float, speed: float) -> Steps:
+    """Return the steps that turn by an angle (left is +), at `speed` rad/s, by `odom`."""
+    _require(degrees=degrees, speed=speed)
+    return _course(lambda odom: Turn(odom, math.radians(degrees), _positive(speed)))
+
+
+def _course(begin: Callable[[Odometry], Course]) -> Steps:
+    # The steps raise the errors of `drive`.
+    def steps(driver: Driver) -> Generator[Seconds, None, None]:
+        with closing(_Odometer(driver.robot)) as odometer:
+            while (odom := odometer.newest()) is None:
+                yield COURSE_PERIOD_S
+            course, nearest, nearer = begin(odom), math.inf, odometer.received
+            while not course.is_done:
+                now = clock.steady_s()
+                fresh = now - odometer.received < MAX_ODOM_AGE_S
+                driver.step(course.twist if fresh else None)
+                driver.require()
+                if driver.ride.begun is None or abs(course.left) < 0.99 * nearest:
+                    nearest, nearer = abs(course.left), now
+                elif now - nearer > COURSE_TIMEOUT_S:
+                    raise NotDrivenError(
+                        f"the robot came no nearer for {COURSE_TIMEOUT_S:g} s, and "
+                        f"{course.left_text} is left: is it blocked, or is a speed limit in force?"
+                    )
+                yield min(COURSE_PERIOD_S, driver.ride.period)
+                if (odom := odometer.newest()) is not None:
+                    course.odom(odom)
+        yield from driver.stop()
+
+    return steps
+
+
+class _Odometer:
+    def __init__(self, robot: CommandClient) -> None:
+        self._samples, self._decoder = robot.subscribe("odom"), Decoder(Odometry)
+        self.received = clock.steady_s()
+        self.close = self._samples.undeclare
+
+    def newest(self) -> Odometry | None:
+        """Return the newest message that has arrived since the last call. Raises `NoAnswerError`"""
+        now, odom = clock.steady_s(), None
+        while (sample := self._samples.try_recv()) is not None:
+            with suppress(DecodeError):
+                odom, self.received = self._decoder.decode(*encoded(sample)), now
+        if now - self.received > FIRST_STATE_TIMEOUT_S:
+            raise NoAnswerError(
+                "no odometry arrives, so the way cannot be measured: does the board send feedback "
+                "(`acsard doctor`), and is rates.odom above 10 Hz?"
+            )
+        return odom
+
+
+def repeat_zeros(
+    robot: CommandClient, moved_s: Seconds | None = None
+) -> Generator[Seconds, None, None]:
+    """Send zeros until the `state` shows that the robot has stopped, for at most `MAX_END_S`.
+
+    `moved_s` is the time of the last speed, or None for now. More than `GRACE_S` later, the robot
+    may follow another sender: if the state shows that, no zero is sent, which would stop it.
     """
-    # If the connection is closed, sending raises one of these errors, and subscribing the other.
-    with suppress(zenoh.ZError, NoAnswerError):
-        if idle_s <= GRACE_S:
-            robot.send(0.0, 0.0)
-        begun = now = clock.steady_s()
-        zeros, watch = FinalZeros(robot.source, robot.sender), Watch(robot, now)
-        zeros.drove(now)
+    with suppress(zenoh.ZError, NoAnswerError):  # the connection is closed
+        now = clock.steady_s()
+        idle_s = 0.0 if moved_s is None else now - moved_s
+        driver = Driver(robot)
+        driver.ride.moved(now - idle_s)
         try:
             if idle_s > GRACE_S:
-                while watch.state is None and now - begun < GRACE_S:
+                while driver.watch.state is None and clock.steady_s() - now < GRACE_S:
                     yield SEND_PERIOD_S
-                    now = clock.steady_s()
-                    list(watch.poll(now))
-                state = watch.state
+                    driver.watch.poll(clock.steady_s())
+                state = driver.watch.state
                 followed = (robot.source, robot.sender)
                 if state is not None and (state.source, state.sender) != followed:
                     return
-            while zeros.wanted(now) and now - begun < MAX_END_S:
-                yield SEND_PERIOD_S
-                robot.send(0.0, 0.0)
-                now = clock.steady_s()
-                for state in watch.poll(now):
-                    zeros.received(state, now)
+            yield from driver.zeros()
         finally:
-            watch.end()
+            driver.end()
+
+
+def _positive(speed: float) -> float:
+    if speed <= 0:
+        raise UsageError(f"speed = {speed:g}: it must be above 0; the way has the sign")
+    return speed
 
 
 def _require(**numbers: object) -> None:
@@ -138,109 +276,3 @@ def _require(**numbers: object) -> None:
             raise UsageError(f"{name}: this number is too large for a speed or a time") from None
         if not finite:
             raise UsageError(f"{name} = {value!r}: it must be a finite number")
-
-
-def _opening(checks: _Drive) -> Iterator[float]:
-    begun = clock.steady_s()
-    while (passed := clock.steady_s() - begun) < OPENING_S or checks.objection != "":
-        checks.send(0.0, 0.0)
-        yield OPENING_PERIOD_S
-        checks.require_no_pause()
-        checks.process_states()
-        if passed >= OPEN_TIMEOUT_S or (passed >= SETTLED_S and checks.refuses_for_good):
-            checks.require(0.0)
-
-
-def _stopping(checks: _Drive) -> Iterator[float]:
-    # Also ends after `SLOWS_S` without slowing down: something else moves the robot, or there is no
-    # feedback. Raises `NotDrivenError` and `NoAnswerError`.
-    begun = since = clock.steady_s()
-    watch, slowest = checks.watch, math.inf
-    while since + SLOWS_S > (now := clock.steady_s()) or watch.age(now) > MAX_STATE_AGE_S:
-        checks.send(0.0, 0.0)
-        yield SEND_PERIOD_S
-        checks.process_states()
-        if checks.refuses_for_good:
-            checks.require(0.0)
-        if watch.state is None or watch.last_seen < begun + SETTLED_S:
-            continue
-        linear, angular = watch.state.linear, watch.state.angular
-        if linear is None or angular is None:
-            # Without feedback from the board, it is unknown whether the robot stands.
-            continue
-        speed = max(abs(linear) / STANDSTILL[0], abs(angular) / STANDSTILL[1])
-        if speed < 1.0:
-            return
-        if speed < SLOWER * slowest:
-            slowest, since = speed, now
-
-
-class _Drive:
-    # Checks, from `state`, whether the robot follows the commands of this client.
-    def __init__(self, robot: CommandClient) -> None:
-        self._robot = robot
-        self.watch = Watch(robot, clock.steady_s())
-        # Read the clock again here, because the subscription above may take long.
-        self._followed_s = self._last_command_s = clock.steady_s()
-        # Why it does not; "" if it does, None before the first state.
-        self.objection: str | None = None
-
-    @property
-    def refuses_for_good(self) -> bool:
-        state = self.watch.state
-        return state is not None and refuses_for_good(state, self._robot.source)
-
-    def send(self, linear: float, angular: float) -> None:
-        try:
-            self._robot.send(linear, angular)
-        except zenoh.ZError:
-            raise NoAnswerError(CONNECTION_CLOSED) from None
-
-    def require_no_pause(self) -> None:
-        # The process may have been stopped, its computer may have been suspended, or the bus may
-        # not have accepted the command. The received states cannot reveal such a pause, because old
-        # states that waited in the queue seem to arrive now.
-        now = clock.steady_s()
-        paused, self._last_command_s = now - self._last_command_s, now
-        if paused > GRACE_S:
-            raise NotDrivenError(
-                f"this program sent no command for {paused:.1f} s, so the robot was stopped and "
-                "the drive was not finished: was the computer suspended, did something keep the "
-                "program from running, or did the network to the daemon fail?"
-            )
-
-    def process_states(self) -> None:
-        now, watch = clock.steady_s(), self.watch
-        try:
-            states = watch.poll(now)
-        except zenoh.ZError:
-            raise NoAnswerError(CONNECTION_CLOSED) from None
-        for state in states:
-            self.objection = objection(state, self._robot.source, self._robot.sender)
-            if not self.objection:
-                self._followed_s = now
-        if watch.silent(now):
-            raise NoAnswerError(
-                "the daemon's state cannot be read: does the daemon run another version of acsard "
-                "than this program? Use the same version for both"
-                if watch.unreadable
-                else f"nothing received from the daemon for {watch.silence_timeout_s:g} s: does "
-                "the daemon run, and does it have the robot.id that this program uses? `acsard "
-                "fleet` lists the robots"
-            )
-
-    def require(self, grace: float) -> None:
-        """Raise `NotDrivenError` if the robot has not followed for `grace` s, or never will.
-
-        It is an `UnheardError` if the daemon receives nothing from this source.
-        """
-        self.process_states()
-        if not self.objection:
-            return
-        if self.refuses_for_good or clock.steady_s() - self._followed_s >= grace:
-            state = self.watch.state
-            source = self._robot.source
-            if state is None or receives_commands(state, source):
-                raise NotDrivenError(self.objection)
-            lacks = lacks_only_commands(state, source)
-            raise UnheardError(self.objection, lacks_only_commands=lacks)

@@ -13,7 +13,6 @@ from typing import Protocol
 import zenoh
 
 from acsard.bus.subscription import MAX_QUEUED_SAMPLES, Subscription, encoded
-from acsard.client.commander import objection
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import RobotState
 from acsard.core.values import Seconds
@@ -160,15 +159,6 @@ class Watch(Follower):
         except DecodeError:
             self.unreadable += 1
             return None
-
-    def objection(self, source: str, sender: str, now: Seconds) -> str:
-        """Return why the robot does not follow a sender; "" if it does, or may not be known yet."""
-        if self.silent(now):
-            return (
-                "nothing received from the daemon: does the daemon run? `acsard doctor` on the "
-                "robot checks this"
-            )
-        return "" if self.state is None else objection(self.state, source, sender)
 
     def end(self) -> None:
         """Unsubscribe from `state`."""

@@ -23,14 +23,9 @@ from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.bus.tls import shown_at
 from acsard.bus.zenoh_sessions import client_session
 from acsard.client.beats import Beats
-from acsard.client.commander import (
-    MAX_SOURCE_TIMEOUT_S,
-    MIN_SPACING_S,
-    SEND_PERIOD_S,
-    CommandSigner,
-)
-from acsard.client.driving import UnheardError, drive, repeat_zeros
+from acsard.client.driving import Driver, Steps, UnheardError, drive, move, repeat_zeros, turn
 from acsard.client.identity import ClientIdentity, identity
+from acsard.client.ride import MAX_SOURCE_TIMEOUT_S, SEND_PERIOD_S
 from acsard.core.messages import schema
 from acsard.core.messages.encodings import (
     DecodeError,
@@ -59,7 +54,7 @@ from acsard.core.messages.refusals import (
     require_size,
 )
 from acsard.core.messages.signature import Signature, public_name
-from acsard.core.values import Plain, Pose
+from acsard.core.values import Ns, Plain, Pose
 from acsard.host import clock
 from acsard.host.errors import (
     MendableError,
@@ -72,6 +67,8 @@ from acsard.host.errors import (
 from acsard.host.own_identity import new_secret, own_name, sender_id
 
 REPLY_TIMEOUT_S = 3.0
+
+MIN_SPACING_S = 0.003  # on one connection: the daemon drops commands above 1000 per second
 
 # Zenoh's error reply to a query that reached the other side but was not answered in time.
 TIMED_OUT = "Timeout"
@@ -150,7 +147,7 @@ def _end(clients: Sequence[Client]) -> None:
             # After the longest timeout, the robot no longer follows the sender, so a zero would
             # only stop the next sender.
             if now - at_s < MAX_SOURCE_TIMEOUT_S:
-                ends.append(repeat_zeros(sender, idle_s=now - at_s))
+                ends.append(repeat_zeros(sender, at_s))
     try:
         while ends := [zeros for zeros in ends if next(zeros, None) is not None]:
             time.sleep(SEND_PERIOD_S)
@@ -198,6 +195,26 @@ class _CommandSpacing:
             yield
             self._last_s = time.monotonic()
             self._next_s = max(self._next_s, self._last_s + MIN_SPACING_S)
+
+
+class CommandSigner:
+    def __init__(self, sender_id: str) -> None:
+        self._id, self._sequence, self._newest_ns = sender_id, 0, 0
+
+    def sign(
+        self, stamp_ns: Ns | None, echo: schema.Beat | None, *, zero: bool = False
+    ) -> Signature:
+        """Return the signature of the next command, with its sequence number.
+
+        A zero gets a later stamp of this sender, so that it is not refused as older.
+        """
+        self._sequence += 1
+        # The daemon refuses a command whose stamp is older than that of an earlier command. If a
+        # sender uses two sources, its commands may be signed in another order than their stamps.
+        if stamp_ns is not None:
+            newest_ns = max(stamp_ns, self._newest_ns)
+            self._newest_ns, stamp_ns = newest_ns, newest_ns if zero else stamp_ns
+        return Signature(self._id, stamp_ns, self._sequence, echo)
 
 
 class Client:
@@ -284,11 +301,6 @@ class Client:
         """
         _end([self])
 
-    @property
-    def commands_motion(self) -> bool:
-        """Whether the last command of this client was not zero."""
-        return self in self._spacing.moving
-
     def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
         """Drive for `seconds` (above 0), then slow down, and return when the robot stands still.
 
@@ -304,18 +316,38 @@ class Client:
             NoAnswerError: The daemon is silent.
             UsageError: An argument is not valid.
         """
-        drove = False
+        self._run(drive(linear, angular, seconds))
+
+    def move(self, distance: float, *, speed: float = 0.3) -> None:
+        """Drive `distance` m straight ahead (back if negative), and return when the robot stands.
+
+        `odom` measures the way: in the simulator the robot stops within 5 mm. The errors are those
+        of `drive`, and `NotDrivenError` if the robot comes no nearer to the end for 3 s.
+        """
+        self._run(move(distance, speed))
+
+    def turn(self, degrees: float, *, speed: float = 0.8) -> None:
+        """Turn on the spot by an angle (left is +) at up to `speed` rad/s.
+
+        `odom` measures the angle: in the simulator the robot stops within 0.5 degrees. The errors
+        are those of `move`.
+        """
+        self._run(turn(degrees, speed))
+
+    def _run(self, steps: Steps) -> None:
+        driver = Driver(self)
         try:
-            with closing(drive(self, linear, angular, seconds)) as steps:
-                for pause in steps:
-                    drove = drove or self.commands_motion
-                    time.sleep(pause)
+            with closing(steps(driver)) as pauses:
+                for pause_s in pauses:
+                    time.sleep(pause_s)
         except BaseException as error:
-            for pause in repeat_zeros(self) if drove else ():
-                time.sleep(pause)
+            for pause_s in driver.zeros():
+                time.sleep(pause_s)
             if isinstance(error, UnheardError | NoAnswerError):
                 raise self.explain_error(error) from None
             raise
+        finally:
+            driver.end()
 
     def call(self, service: str, **fields: object) -> schema.ServiceReply:
         """Call a service, such as "stop", and return its reply.

@@ -21,7 +21,6 @@ from acsard.bus.certificate_watch import CertificateFiles
 from acsard.bus.tls import CERTIFICATE, KEY, files_in, names_in
 from acsard.bus.zenoh_sessions import client_session
 from acsard.client import Client
-from acsard.client.outbox import Outbox
 from acsard.core.config.settings import Config
 from acsard.core.values import Event
 from acsard.host.child import HEARTBEAT_S, Parent, end_signals, end_with_parent
@@ -33,6 +32,7 @@ from acsard.web.connections import Connections
 from acsard.web.followed_robot import About, FollowedRobot
 from acsard.web.listen import Listen, open_sockets, own_name, require_certificate
 from acsard.web.metrics import Counts
+from acsard.web.outbox import Outbox
 from acsard.web.socket_messages import DEFAULT_SOURCE
 from acsard.web.tokens import ReadTokens, Vault
 from acsard.web.viewer import Parts

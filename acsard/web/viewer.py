@@ -15,8 +15,8 @@ import aiohttp
 from aiohttp import web
 
 from acsard.client import Client
-from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, Commander, CommandSigner, Wish
-from acsard.client.outbox import Outbox
+from acsard.client.ride import MAX_SOURCE_TIMEOUT_S
+from acsard.client.synchronous import CommandSigner
 from acsard.core.messages import schema
 from acsard.core.messages.permissions import COMMAND_ROLE, SERVICE_ROLES
 from acsard.core.messages.signature import public_name
@@ -31,6 +31,7 @@ from acsard.web.callers import AdmittedClient, RequestRefusedError
 from acsard.web.calls import Calls
 from acsard.web.followed_robot import FollowedRobot
 from acsard.web.metrics import Counts
+from acsard.web.outbox import Outbox, Relay, Wish
 from acsard.web.routes import RECORDINGS_ROLE
 from acsard.web.socket_messages import (
     Call,
@@ -70,11 +71,11 @@ class ViewerCommands:
         # a viewer disconnects.
         self.outbox = Outbox(partial(counts.add, "commands_dropped"))
 
-    def give(self, source: str, commander: Commander, sender: CommandSigner, wish: Wish) -> None:
+    def give(self, source: str, relay: Relay, sender: CommandSigner, wish: Wish) -> None:
         """Queue a command, which replaces an unsent one."""
-        replaced = commander.replaced
-        self.outbox.take(commander, partial(self._publish, source, sender), wish)
-        if commander.replaced > replaced:
+        replaced = relay.replaced
+        self.outbox.take(relay, partial(self._publish, source, sender), wish)
+        if relay.replaced > replaced:
             self._counts.add("commands_superseded")
 
     def _publish(self, source: str, sender: CommandSigner, wish: Wish) -> None:
@@ -120,7 +121,7 @@ class Viewer:
         self._robot, self._commands, self._calls = parts.robot, parts.commands, parts.calls
         self._counts = parts.counts
         whole = sender_id(who.name)
-        self._sender, self._commanders = CommandSigner(whole), dict[str, Commander]()
+        self._sender, self._relays = CommandSigner(whole), dict[str, Relay]()
         # Public name, in `state.sender` while the client drives; the sender id stays secret.
         self.sender = public_name(whole, parts.robot.certificate)
         self._socket = socket
@@ -234,13 +235,13 @@ class Viewer:
             self._stamp_ns = stamp_ns
         twist = Twist(frame.cmd.linear_x, frame.cmd.angular_z)
         wish = Wish(twist, stamp_ns, frame.echo)
-        commander = self._commanders.setdefault(frame.source, Commander())
-        self._commands.give(frame.source, commander, self._sender, wish)
+        relay = self._relays.setdefault(frame.source, Relay())
+        self._commands.give(frame.source, relay, self._sender, wish)
 
     def _release(self) -> None:
         timeouts = self._robot.about.timeouts
-        for source, commander in self._commanders.items():
-            self._commands.outbox.release(commander, timeouts.get(source, MAX_SOURCE_TIMEOUT_S))
+        for source, relay in self._relays.items():
+            self._commands.outbox.release(relay, timeouts.get(source, MAX_SOURCE_TIMEOUT_S))
 
     def _call(self, frame: Call) -> None:
         if frame.call == "stop":

@@ -20,7 +20,7 @@ import zenoh
 
 from acsard.bus.subscription import Subscription
 from acsard.client import Client, asynchronous, connect, connect_async, synchronous
-from acsard.client.commander import GRACE_S
+from acsard.client.ride import GRACE_S
 from acsard.core.messages import schema
 from acsard.core.messages.refusals import BUSY_ENCODING
 from acsard.host.errors import (

@@ -11,8 +11,8 @@ from enum import StrEnum
 
 from acsard.calibration.guided.drive_plan import Leg
 from acsard.calibration.runs import STANDSTILL_SPEED
-from acsard.client.commander import NEVER_DRIVING_MODES, OPEN_TIMEOUT_S, OPENING_S, objection
 from acsard.client.follower import MAX_STATE_AGE_S
+from acsard.client.ride import NEVER_DRIVING_MODES, OPEN_TIMEOUT_S, objection
 from acsard.core.codes import HOST_CODES
 from acsard.core.config.settings import Config, DriveConfig, LimitsConfig
 from acsard.core.messages.schema import RobotState
@@ -24,6 +24,8 @@ STALL_REASON = (
     "this computer was suspended, or it was too busy for the calibration: end the other programs "
     "on it"
 )
+
+OPENING_S = 0.2  # of the zeros at the beginning of a leg
 
 RESPONSE_TIMEOUT_S = 1.5  # until the robot follows a changed command, including the ramp
 

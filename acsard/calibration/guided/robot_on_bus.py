@@ -17,13 +17,13 @@ from msgspec import Struct
 
 from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.calibration.guided.drive_plan import DisturbedError, GuideError, Leg
-from acsard.calibration.guided.leg_driver import LegDriver
+from acsard.calibration.guided.leg_driver import OPENING_S, LegDriver
 from acsard.calibration.log_rows import FOUR
 from acsard.calibration.log_table import APPLIED, Floats, Table
 from acsard.calibration.runs import NEW_RUN_AFTER_S, Log, Run, on_arrival_clock, runs
-from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S
 from acsard.client.driving import repeat_zeros
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S, Watch
+from acsard.client.ride import OPENING_PERIOD_S, SEND_PERIOD_S
 from acsard.client.synchronous import Client, decoder_of
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError, Decoder

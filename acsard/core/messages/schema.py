@@ -8,6 +8,7 @@ The daemon refuses unknown fields (`strict_types.py`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Annotated, get_args
 
@@ -158,6 +159,17 @@ class Odometry(Message, frozen=True):
     child_frame_id: str
     pose: PoseWithCovariance
     twist: TwistWithCovariance
+
+    @property
+    def yaw(self) -> float:
+        """Heading of the pose, rad, left is +, computed from its quaternion."""
+        turn = self.pose.pose.orientation
+        return math.remainder(2.0 * math.atan2(turn.z, turn.w), math.tau)
+
+    @property
+    def time(self) -> float:
+        """Time of the sample, `header.stamp`, s since 1970."""
+        return self.header.stamp.to_ns() / NS_PER_S
 
 
 class Transform(Message, frozen=True):

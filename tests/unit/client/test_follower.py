@@ -199,22 +199,6 @@ def test_a_flood_of_messages_does_not_block_the_caller() -> None:
     assert len(robot.queue) == 7
 
 
-def test_commands_have_no_effect_on_a_daemon_that_is_silent_or_objects() -> None:
-    robot = Robot()
-    watch = Watch(robot, 0.0)
-    assert watch.objection("app", STATE.sender, 0.0) == ""
-    robot.queue.append(sample_of(STATE))
-    watch.poll(0.0)
-    assert watch.objection("app", STATE.sender, 0.0) == ""
-    assert "nothing received from the daemon" in watch.objection(
-        "app", STATE.sender, ROBOT_SILENCE_TIMEOUT_S + 0.01
-    )
-    stopped = replace(STATE, mode="stopped", reason="stopped by request")
-    robot.queue.append(sample_of(stopped))
-    watch.poll(5.0)
-    assert watch.objection("app", STATE.sender, 5.0) == "stopped by request"
-
-
 def test_the_subscription_ends_with_the_watch() -> None:
     robot = Robot()
     Watch(robot, 0.0).end()

@@ -16,10 +16,10 @@ from msgspec import structs
 from acsard import client
 from acsard.client import AcsardError, Client, NoAnswerError, asynchronous, driving
 from acsard.client.asynchronous import AsyncClient
-from acsard.client.commander import MAX_SOURCE_TIMEOUT_S, MIN_SPACING_S
 from acsard.client.driving import UnheardError
 from acsard.client.identity import ClientIdentity
-from acsard.client.synchronous import decoder
+from acsard.client.ride import MAX_SOURCE_TIMEOUT_S
+from acsard.client.synchronous import MIN_SPACING_S, decoder
 from acsard.core.config.settings import Config, DriveConfig, JointsConfig
 from acsard.core.incoming.commands import Arrival, Receiver
 from acsard.core.incoming.imu import reading

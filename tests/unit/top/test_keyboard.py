@@ -1,9 +1,8 @@
-"""Tests of keyboard driving: a key press drives for a while, then zeros are sent, then nothing."""
+"""Tests of keyboard driving: a key press drives for a while, then zeros are sent until rest."""
 
 from __future__ import annotations
 
 import time
-from collections import deque
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,9 +12,9 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.bus.address import Address
-from acsard.client.commander import GRACE_S, MAX_SOURCE_TIMEOUT_S, RELEASE_TIMEOUT_NS, ZEROS
-from acsard.client.final_zeros import MAX_END_S
+from acsard.client.driving import MAX_END_S
 from acsard.client.follower import ROBOT_SILENCE_TIMEOUT_S
+from acsard.client.ride import GRACE_S, MAX_SOURCE_TIMEOUT_S, RELEASE_TIMEOUT_S
 from acsard.core.messages.schema import RobotState, SourceState
 from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.host import clock
@@ -45,25 +44,15 @@ SPEEDS = [
 ]  # fmt: skip
 
 
-def silent() -> Keyboard:
-    """Return a keyboard at 0.5 m/s and 2 rad/s that sent its first zeros and now sends nothing."""
-    keys = Keyboard(0.5, 2.0)
-    while keys.wish(0.0) is not None:
-        pass
-    return keys
-
-
 def pressed(key: str, now: float) -> Keyboard:
-    """Return a keyboard after a silence and this key."""
-    keys = silent()
+    """Return a keyboard at 0.5 m/s and 2 rad/s after this key."""
+    keys = Keyboard(0.5, 2.0)
     keys.press(key, now)
     return keys
 
 
-def test_the_keyboard_starts_with_three_zeros_and_then_sends_nothing() -> None:
-    keys = Keyboard(0.5, 2.0)
-    assert [keys.wish(n / 20) for n in range(6)] == [REST] * 3 + [None] * 3
-    assert ZEROS == 3
+def test_nothing_is_wished_before_the_first_key() -> None:
+    assert Keyboard(0.5, 2.0).wish(10.0) is None
 
 
 @each(("key", "linear", "angular"), MOVES)
@@ -72,10 +61,10 @@ def test_each_key_drives_in_its_direction(key: str, linear: int, angular: int) -
     assert keys.wish(10.0) == Twist(0.5 * linear, 2.0 * angular)
 
 
-def test_a_press_drives_for_its_hold_then_come_three_zeros_then_silence() -> None:
+def test_a_press_drives_for_its_hold() -> None:
     keys = pressed("i", 10.0)
     assert keys.wish(10.0 + KEY_HOLD_S - 0.001) == Twist(0.5, 0.0)
-    assert [keys.wish(10.0 + KEY_HOLD_S) for _ in range(5)] == [REST] * 3 + [None] * 2
+    assert keys.wish(10.0 + KEY_HOLD_S) is None
 
 
 def test_the_hold_is_longer_than_the_delay_of_a_keyboard_and_no_longer_than_a_second() -> None:
@@ -87,7 +76,7 @@ def test_a_repeated_press_extends_the_hold() -> None:
     for n in range(20):
         keys.press("i", 10.0 + n * 0.5)
         assert keys.wish(10.0 + n * 0.5 + 0.499) == Twist(0.5, 0.0)
-    assert keys.wish(19.5 + KEY_HOLD_S) == REST
+    assert keys.wish(19.5 + KEY_HOLD_S) is None
 
 
 @each(("delay", "hz"), [(0.25, 30.0), (0.5, 30.0), (0.5, 10.9), (0.25, 5.0)])
@@ -100,7 +89,7 @@ def test_a_held_key_drives_without_a_break_and_stops_soon_after_its_release(
         keys.press("i", at)
         last = at
     assert keys.wish(last + REPEAT_S - 0.001) == Twist(0.5, 0.0)
-    assert keys.wish(last + REPEAT_S) == REST
+    assert keys.wish(last + REPEAT_S) is None
 
 
 def test_two_taps_are_no_held_key() -> None:
@@ -120,21 +109,19 @@ def test_another_key_changes_the_direction_immediately() -> None:
 def test_any_other_key_stops_immediately(key: str) -> None:
     keys = pressed("i", 10.0)
     keys.press(key, 10.1)
-    assert [keys.wish(10.1) for _ in range(4)] == [REST] * 3 + [None]
+    assert [keys.wish(10.1) for _ in range(3)] == [REST, None, None]
 
 
-def test_a_stop_at_rest_sends_its_zeros_too() -> None:
-    keys = silent()
-    keys.press(" ", 10.0)
-    assert [keys.wish(10.0) for _ in range(4)] == [REST] * 3 + [None]
+def test_a_stop_at_rest_is_a_zero_too() -> None:
+    keys = pressed(" ", 10.0)
+    assert [keys.wish(10.0) for _ in range(2)] == [REST, None]
 
 
 @each(("key", "linear", "angular"), SPEEDS)
 def test_speed_keys_change_ten_percent_and_do_not_move(
     key: str, linear: float, angular: float
 ) -> None:
-    keys = silent()
-    keys.press(key, 10.0)
+    keys = pressed(key, 10.0)
     assert (keys.linear, keys.angular) == pytest.approx((0.5 * linear, 2.0 * angular))
     assert keys.wish(10.0) is None
 
@@ -143,7 +130,7 @@ def test_a_speed_key_while_driving_acts_immediately_and_does_not_extend_the_hold
     keys = pressed("u", 10.0)
     keys.press("w", 10.5)
     assert keys.wish(10.5) == Twist(0.5 * 1.1, 2.0)
-    assert keys.wish(10.0 + KEY_HOLD_S) == REST
+    assert keys.wish(10.0 + KEY_HOLD_S) is None
 
 
 @each(
@@ -180,21 +167,39 @@ def test_whole_keys_come_back_as_they_were(keys: list[str]) -> None:
 
 # the robot's published state
 
+FOLLOWED = replace(
+    STATE,
+    source="teleop",
+    sender="joe/1/aa",
+    sources=[SourceState("teleop", 100, 0.02, "", "nothing")],
+)
+RESTING = replace(FOLLOWED, linear=0.0, angular=0.0)
+STOPPED = replace(FOLLOWED, mode="stopped", reason="stopped by request", source="")
+ZERO_FIRST = replace(
+    FOLLOWED,
+    mode="ready",
+    reason="send a zero first: teleop must send a zero before it can drive",
+    sources=[SourceState("teleop", 10, 0.1, "send a zero first: teleop must send", "neutral")],
+)
+
 
 class Robot:
-    """A client whose robot has published these states."""
+    """A client whose robot publishes `shows` at each step, unless it is None."""
 
-    source, sender = "teleop", "joe/1/aa"
+    source, sender = "teleop", FOLLOWED.sender
     where = Address("tcp/127.0.0.1:7448", "acsar", "")
 
-    def __init__(self, *states: RobotState) -> None:
-        self.said = deque(map(sample_of, states))
+    def __init__(self, shows: RobotState | None = FOLLOWED) -> None:
+        self.shows = shows
+        self.is_fresh = False
         self.sent: list[float] = []
 
     def subscribe(self, name: str) -> Any:
-        return SimpleNamespace(
-            try_recv=lambda: self.said.popleft() if self.said else None, undeclare=lambda: None
-        )
+        return SimpleNamespace(try_recv=self.receive, undeclare=lambda: None)
+
+    def receive(self) -> Any:
+        fresh, self.is_fresh = self.is_fresh, False
+        return sample_of(self.shows) if fresh and self.shows else None
 
     def start_query(self, name: str, take: Any) -> None:
         """Do nothing: the query of the follower gets no answer."""
@@ -204,121 +209,92 @@ class Robot:
 
 
 class Drive:
-    """A keyboard drive with a clock that the test sets."""
+    """A keyboard drive with a clock that the test sets, and its robot."""
 
-    def __init__(self, robot: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now, self.asleep = 100.0, 0.0
+        robot: Any = Robot()
+        self.robot = robot
         monkeypatch.setattr(clock, "mono_ns", lambda: round((self.now - self.asleep) * NS_PER_S))
         monkeypatch.setattr(clock, "asleep_ns", lambda: round(self.asleep * NS_PER_S))
-        self.ride = KeyboardDrive(robot, Keyboard(0.5, 2.0))
+        self.ride = KeyboardDrive(self.robot, Keyboard(0.5, 2.0))
 
-    def step(self, typed: str = "", times: int = 1) -> None:
+    def step(self, typed: str = "", times: int = 1) -> list[float]:
+        """Type this text at each step of 0.05 s, and return the speeds that were sent."""
+        sent = len(self.robot.sent)
         for _ in range(times):
+            self.robot.is_fresh = True
             self.ride.step(typed)
             self.now += 0.05
+        return list(self.robot.sent[sent:])
 
 
-def test_only_a_drive_after_a_silence_is_led_by_a_zero(monkeypatch: pytest.MonkeyPatch) -> None:
-    robot = Robot()
-    drive = Drive(robot, monkeypatch)
-    drive.step(times=40)
-    assert robot.sent == [0.0] * ZEROS
-    robot.sent.clear()
-    drive.step("i", times=3)
-    assert robot.sent == [0.0, 0.5, 0.5]
-    drive.step("m")
-    assert robot.sent[-1] == -0.5
+@pytest.fixture
+def drive(monkeypatch: pytest.MonkeyPatch) -> Drive:
+    return Drive(monkeypatch)
 
 
-MOVING = replace(
-    STATE,
-    source="teleop",
-    sender=Robot.sender,
-    sources=[SourceState("teleop", 100, 0.02, "", "nothing")],
-)
-RESTING = replace(MOVING, linear=0.0, angular=0.0)
+def test_only_a_drive_after_a_silence_is_led_by_a_zero(drive: Drive) -> None:
+    assert drive.step(times=40) == []
+    assert drive.step("i", times=3) == [0.0, 0.5, 0.5]
+    assert drive.step("m") == [-0.5]
 
 
-def test_a_zero_is_repeated_until_the_state_shows_that_the_robot_rests(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    robot = Robot()
-    drive = Drive(robot, monkeypatch)
+def test_a_zero_is_repeated_until_the_state_shows_that_the_robot_rests(drive: Drive) -> None:
     drive.step("i", times=5)
-    for _ in range(40):
-        robot.said.append(sample_of(MOVING))
-        drive.step()
-    assert robot.sent[-20:] == [0.0] * 20
-    for _ in range(10):
-        robot.said.append(sample_of(RESTING))
-        drive.step()
-    sent = len(robot.sent)
-    drive.step(times=100)
-    assert len(robot.sent) == sent
+    assert drive.step("k", times=18) == [0.0] * 18
+    drive.robot.shows = RESTING
+    drive.step()
+    assert drive.step(times=100) == []
     drive.ride.end()
-    assert len(robot.sent) == sent
+    assert drive.step() == []
 
 
-def test_a_zero_is_not_repeated_for_longer_than_the_longest_timeout(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    robot = Robot()
-    drive = Drive(robot, monkeypatch)
-    drive.step("i", times=2)
-    drive.step(times=round(MAX_SOURCE_TIMEOUT_S / 0.05) - 20)
-    sent = len(robot.sent)
-    drive.step(times=10)
-    assert robot.sent[sent:] == [0.0] * 10
+def test_a_zero_is_not_repeated_for_longer_than_the_longest_timeout(drive: Drive) -> None:
+    drive.step("i", times=3)
+    drive.robot.shows = None
+    drive.step("k", times=round(MAX_SOURCE_TIMEOUT_S / 0.05) - 20)
+    assert drive.step(times=10) == [0.0] * 10
     drive.step(times=40)
-    sent = len(robot.sent)
-    drive.step(times=100)
-    assert len(robot.sent) == sent
+    assert drive.step(times=100) == []
 
 
-def test_a_key_drives_while_the_zero_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
-    robot = Robot()
-    drive = Drive(robot, monkeypatch)
-    drive.step("i", times=2)
-    drive.step(times=40)
-    drive.step("m", times=2)
-    assert robot.sent[-3:] == [0.0, -0.5, -0.5]
+def test_a_key_drives_while_the_zero_is_repeated(drive: Drive) -> None:
+    drive.step("i", times=3)
+    assert set(drive.step("k", times=10)) == {0.0}
+    assert drive.step("m", times=2) == [-0.5, -0.5]
 
 
 def test_a_drive_that_ends_repeats_its_zero_for_two_seconds_at_most(
-    monkeypatch: pytest.MonkeyPatch,
+    drive: Drive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    robot = Robot()
-    drive = Drive(robot, monkeypatch)
-
     def wait(seconds: float) -> None:
         drive.now += seconds
 
     monkeypatch.setattr(time, "sleep", wait)
-    drive.step("i", times=2)
-    sent, begun = len(robot.sent), drive.now
+    drive.step("i", times=3)
+    sent, begun = len(drive.robot.sent), drive.now
     drive.ride.end()
     assert drive.now - begun == pytest.approx(MAX_END_S, abs=0.06)
-    assert robot.sent[sent:] == [0.0] * len(robot.sent[sent:])
-    assert len(robot.sent[sent:]) == pytest.approx(41, abs=1)
+    assert drive.robot.sent[sent:] == [0.0] * len(drive.robot.sent[sent:])
+    assert len(drive.robot.sent[sent:]) == pytest.approx(41, abs=1)
 
 
 @each("key", ["i", UP])
 def test_keys_that_a_stalled_connection_held_back_do_not_drive(
     key: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    robot = Robot()
-    drive = Drive(robot, monkeypatch)
+    drive = Drive(monkeypatch)
     drive.step("i", times=5)
     waited = 151 * key
     reads = [waited[at : at + 64] for at in range(0, len(waited), 64)]  # as a terminal gives them
-    sent = len(robot.sent)
+    sent = len(drive.robot.sent)
     for read in reads:
         drive.ride.step(read)
         drive.now += 0.005
     drive.step(times=20)
-    assert set(robot.sent[sent:]) == {0.0}
-    drive.step(key, times=3)
-    assert robot.sent[-1] == 0.5
+    assert set(drive.robot.sent[sent:]) == {0.0}
+    assert drive.step(key, times=3)[-1] == 0.5
 
 
 @each("asleep", [60.0, 0.0])
@@ -327,59 +303,42 @@ def test_a_key_that_was_pressed_before_or_in_a_stall_does_not_drive_after_it(
     reads: list[str], asleep: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The computer is suspended for `asleep` s of the stall. Keys are typed during the stall."""
-    robot = Robot()
-    drive = Drive(robot, monkeypatch)
+    drive = Drive(monkeypatch)
     drive.step("i", times=5)
-    sent = len(robot.sent)
+    sent = len(drive.robot.sent)
     drive.now += 60.0
     drive.asleep += asleep
     for read in reads:
         drive.ride.step(read)
         drive.now += 0.005
     drive.step(times=10)
-    assert len(robot.sent) > sent
-    assert set(robot.sent[sent:]) == {0.0}
+    assert set(drive.robot.sent[sent:]) <= {0.0}
+    assert drive.step("i", times=4)[-1] == 0.5
+
+
+def test_a_press_does_not_drive_for_the_rest_of_its_hold_after_a_stall(drive: Drive) -> None:
     drive.step("i", times=3)
-    assert robot.sent[-1] == 0.5
-
-
-def test_a_press_does_not_drive_for_the_rest_of_its_hold_after_a_stall(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    robot = Robot()
-    drive = Drive(robot, monkeypatch)
-    drive.step(times=10)
-    drive.ride.step("i")
-    sent = len(robot.sent)
     drive.now += (GRACE_S + KEY_HOLD_S) / 2
-    drive.step(times=10)
-    assert robot.sent[sent:] == [0.0] * 10
+    assert drive.step(times=10) == [0.0] * 10
 
 
-def test_a_stall_without_a_key_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stall_without_a_key_sends_nothing(drive: Drive) -> None:
     """A zero would stop another program that drives as the same source."""
-    robot = Robot()
-    drive = Drive(robot, monkeypatch)
     drive.step(times=10)
-    sent = len(robot.sent)
     drive.now += 60.0
-    drive.step(times=10)
-    assert len(robot.sent) == sent
+    assert drive.step(times=10) == []
 
 
-def test_a_key_drives_after_a_short_stall(monkeypatch: pytest.MonkeyPatch) -> None:
-    robot = Robot()
-    drive = Drive(robot, monkeypatch)
+def test_a_key_drives_after_a_short_stall(drive: Drive) -> None:
     drive.step(times=10)
     drive.now += 0.8 * GRACE_S
-    drive.step("i", times=2)
-    assert robot.sent[-1] == 0.5
+    assert drive.step("i", times=2)[-1] == 0.5
 
 
 def test_the_first_key_drives_however_long_the_bus_took_to_subscribe(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    drive = Drive(Robot(), monkeypatch)
+    drive = Drive(monkeypatch)
 
     class Slow(Robot):
         def subscribe(self, name: str) -> Any:
@@ -387,28 +346,24 @@ def test_the_first_key_drives_however_long_the_bus_took_to_subscribe(
             return super().subscribe(name)
 
     robot: Any = Slow()
-    drive.ride = KeyboardDrive(robot, Keyboard(0.5, 2.0))
-    drive.step("i", times=2)
-    assert robot.sent == [0.0, 0.5]
+    drive.robot, drive.ride = robot, KeyboardDrive(robot, Keyboard(0.5, 2.0))
+    assert drive.step("i", times=2) == [0.0, 0.5]
 
 
-STOPPED = replace(STATE, mode="stopped", reason="stopped by request", source="")
-ZERO_FIRST = replace(
-    STATE,
-    mode="ready",
-    reason="send a zero first: teleop must send a zero before it can drive",
-    sources=[
-        SourceState(
-            "teleop", 10, 0.1, "send a zero first: teleop must send a zero before it can", "neutral"
-        )
-    ],
-)
-RESTARTED = replace(STATE, counters={"lines": 0})
+def test_a_key_drives_no_robot_that_does_not_publish_its_state(drive: Drive) -> None:
+    drive.robot.shows = None
+    assert set(drive.step("i", times=100)) == {0.0}
+
+
+def test_a_held_key_stops_the_robot_when_the_daemon_falls_silent(drive: Drive) -> None:
+    assert drive.step("i", times=20)[-1] == 0.5
+    drive.robot.shows = None
+    assert drive.step("i", times=round(ROBOT_SILENCE_TIMEOUT_S / 0.05) + 3)[-1] == 0.0
+
 
 NOT_FOLLOWING = [
-    *(replace(STOPPED, mode=mode) for mode in ("stopped", "fault", "inactive", "waiting")),
+    *(replace(STOPPED, mode=mode) for mode in ("stopped", "fault", "inactive")),
     ZERO_FIRST,
-    RESTARTED,
 ]
 
 
@@ -416,20 +371,15 @@ class HeldKeyDrive(Drive):
     """A keyboard drive with a held key. A state then shows why the robot does not obey it."""
 
     def __init__(self, why: RobotState, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.robot = Robot(replace(STATE, counters={"lines": 9}))
-        super().__init__(self.robot, monkeypatch)
+        super().__init__(monkeypatch)
         self.step(times=5)
-        self.step("i", times=20)
-        assert self.robot.sent[-1] == 0.5
-        self.robot.said.append(sample_of(why))
+        assert self.step("i", times=20)[-1] == 0.5
+        self.robot.shows = why
         self.step("i")
-        self.robot.sent.clear()
 
     def drives(self, typed: str, times: int = 20) -> bool:
         """Type this text at each step, and return whether the drive sends a speed."""
-        sent = len(self.robot.sent)
-        self.step(typed, times)
-        return any(self.robot.sent[sent:])
+        return any(self.step(typed, times))
 
 
 @each("why", NOT_FOLLOWING)
@@ -439,8 +389,23 @@ def test_a_key_that_is_held_while_the_robot_ceases_to_follow_does_not_drive_afte
 ) -> None:
     keyboard = HeldKeyDrive(why, monkeypatch)
     assert not keyboard.drives("i")
-    keyboard.robot.said.append(sample_of(STATE))
+    keyboard.robot.shows = FOLLOWED
     assert not keyboard.drives("", round(pause / 0.05))
+    assert not keyboard.drives("i")
+
+
+@each("mode", ["waiting", "ready"])
+def test_a_held_key_drives_on_after_a_short_time_without_effect_but_not_after_a_long_one(
+    mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The link to the board, or a source with a higher priority, comes and goes."""
+    keyboard = HeldKeyDrive(replace(FOLLOWED, mode=mode, source=""), monkeypatch)
+    assert keyboard.drives("i", round(GRACE_S / 0.05) - 4)
+    keyboard.robot.shows = FOLLOWED
+    assert keyboard.drives("i")
+    keyboard.robot.shows = replace(FOLLOWED, mode=mode, source="")
+    keyboard.step("i", round(GRACE_S / 0.05) + 2)
+    keyboard.robot.shows = FOLLOWED
     assert not keyboard.drives("i")
 
 
@@ -448,7 +413,7 @@ def test_delayed_keys_do_not_release_a_key_that_no_longer_drives(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     keyboard = HeldKeyDrive(STOPPED, monkeypatch)
-    keyboard.robot.said.append(sample_of(STATE))
+    keyboard.robot.shows = FOLLOWED
     keyboard.step(times=60)
     keyboard.step(45 * "i")
     assert not keyboard.drives("i", 40)
@@ -462,7 +427,7 @@ def test_a_delayed_space_does_not_release_a_key_that_no_longer_drives(
     Only a space that arrives in time releases the key.
     """
     keyboard = HeldKeyDrive(STOPPED, monkeypatch)
-    keyboard.robot.said.append(sample_of(STATE))
+    keyboard.robot.shows = FOLLOWED
     keyboard.step("i", times=10)
     keyboard.now += 1.2 * GRACE_S
     assert not keyboard.drives(" ", 1)
@@ -479,12 +444,12 @@ def test_delayed_keys_do_not_drive_if_the_robot_was_stopped_late_in_their_delay(
 
     After 2 s the robot is stopped and cleared.
     """
-    keyboard = HeldKeyDrive(STATE, monkeypatch)
+    keyboard = HeldKeyDrive(FOLLOWED, monkeypatch)
     keyboard.step("i", times=10)
     keyboard.step(times=40)
-    keyboard.robot.said.append(sample_of(STOPPED))
+    keyboard.robot.shows = STOPPED
     keyboard.step(times=2)
-    keyboard.robot.said.append(sample_of(STATE))
+    keyboard.robot.shows = FOLLOWED
     keyboard.step(times=18)
     keyboard.step(90 * "i")
     assert not keyboard.drives("i", 40)
@@ -496,10 +461,9 @@ def test_a_key_that_no_longer_drives_does_so_after_a_key_that_stops(
 ) -> None:
     keyboard = HeldKeyDrive(ZERO_FIRST, monkeypatch)
     keyboard.step("i", times=10)
-    keyboard.robot.sent.clear()
     keyboard.step(key)
-    keyboard.step("i", times=2)
-    assert keyboard.robot.sent == [0.0, 0.5, 0.5]
+    keyboard.robot.shows = FOLLOWED
+    assert keyboard.step("i", times=3)[-2:] == [0.5, 0.5]
 
 
 def test_a_key_that_no_longer_drives_does_so_after_its_release(
@@ -507,22 +471,17 @@ def test_a_key_that_no_longer_drives_does_so_after_its_release(
 ) -> None:
     keyboard = HeldKeyDrive(ZERO_FIRST, monkeypatch)
     keyboard.step("i", times=10)
-    keyboard.step(times=round(RELEASE_TIMEOUT_NS / NS_PER_S / 0.05) + 2)
-    keyboard.robot.sent.clear()
-    keyboard.step("i", times=3)
-    assert keyboard.robot.sent[-2:] == [0.5, 0.5]
+    keyboard.robot.shows = FOLLOWED
+    keyboard.step(times=round((REPEAT_S + RELEASE_TIMEOUT_S) / 0.05) + 2)
+    assert keyboard.step("i", times=4)[-2:] == [0.5, 0.5]
 
 
-def test_a_state_from_before_a_press_does_not_end_the_hold(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    robot = Robot()
-    drive = Drive(robot, monkeypatch)
+def test_a_state_from_before_a_press_does_not_end_the_hold(drive: Drive) -> None:
+    drive.robot.shows = STOPPED
     drive.step(times=50)
-    drive.step("i")
-    robot.said.append(sample_of(STOPPED))
-    drive.step("i", times=20)
-    assert robot.sent[-1] == 0.5
+    drive.step("i", times=2)
+    drive.robot.shows = FOLLOWED
+    assert drive.step("i", times=20)[-1] == 0.5
 
 
 def test_the_operator_is_informed_that_a_held_key_no_longer_drives(
@@ -531,45 +490,31 @@ def test_the_operator_is_informed_that_a_held_key_no_longer_drives(
     keyboard = HeldKeyDrive(STOPPED, monkeypatch)
     keyboard.step("i", times=12)
     assert keyboard.ride.screen_data().objection == "stopped by request"
-    keyboard.robot.said.append(sample_of(replace(STATE, mode="ready", source="")))
+    keyboard.robot.shows = replace(FOLLOWED, mode="ready", source="")
     keyboard.step("i", times=12)
     assert keyboard.ride.screen_data().objection == RELEASE_REASON
+    assert "press space, then press the key again" in RELEASE_REASON
     keyboard.step(" ")
     assert keyboard.ride.screen_data().objection == ""
 
 
-def test_a_space_stops_at_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    robot = Robot()
-    drive = Drive(robot, monkeypatch)
+def test_a_space_stops_at_the_next_step(drive: Drive) -> None:
     drive.step("i", times=5)
     drive.step(" ")
-    assert robot.sent[-2:] == [0.5, 0.0]
+    assert drive.robot.sent[-2:] == [0.5, 0.0]
 
 
-def test_the_operator_is_informed_that_a_robot_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
-    robot = Robot(STATE)
-    drive = Drive(robot, monkeypatch)
+def test_the_operator_is_informed_that_a_robot_is_silent(drive: Drive) -> None:
     drive.step("i")
     assert not drive.ride.screen_data().silent
     drive.now += ROBOT_SILENCE_TIMEOUT_S
     assert drive.ride.screen_data().silent
 
 
-def test_the_operator_is_informed_why_keys_have_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
-    stopped = replace(STATE, mode="stopped", reason="stopped by request", source="")
-    robot = Robot(stopped)
-    drive = Drive(robot, monkeypatch)
+def test_the_operator_is_informed_why_keys_have_no_effect(drive: Drive) -> None:
+    drive.robot.shows = STOPPED
     drive.step(times=10)
     drive.step("i", times=round(GRACE_S / 0.05) - 2)
     assert drive.ride.screen_data().objection == ""
     drive.step("i", times=4)
     assert drive.ride.screen_data().objection == "stopped by request"
-
-
-def test_a_held_key_that_must_be_released_is_explained_with_the_key_to_press(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    keyboard = HeldKeyDrive(ZERO_FIRST, monkeypatch)
-    keyboard.step("i", times=12)
-    assert keyboard.ride.screen_data().objection == RELEASE_REASON
-    assert "press space, then press the key again" in RELEASE_REASON

@@ -13,13 +13,14 @@ import pytest
 
 from acsard.bus.address import Address
 from acsard.client import Client
-from acsard.client.commander import Commander, CommandSigner, Wish
+from acsard.client.synchronous import CommandSigner
 from acsard.core.messages.schema import Beat, ServiceReply
 from acsard.core.messages.signature import unpack
 from acsard.core.values import Role, Twist
 from acsard.web.callers import AdmittedClient
 from acsard.web.followed_robot import About, FollowedRobot
 from acsard.web.metrics import Counts
+from acsard.web.outbox import Relay, Wish
 from acsard.web.viewer import Parts, Viewer, ViewerCommands
 from tests.unit.web.test_socket_messages import INVALID_STOPS
 
@@ -34,7 +35,7 @@ def test_a_command_that_cannot_be_sent_is_dropped_and_the_next_is_processed() ->
 
     counts = Counts()
     commands = ViewerCommands(broken, counts)
-    senders = {name: (Commander(), CommandSigner(name)) for name in "ab"}
+    senders = {name: (Relay(), CommandSigner(name)) for name in "ab"}
     for name in "aba":
         commands.give("app", *senders[name], AHEAD)
         commands.outbox.flush(PATIENCE_S)
@@ -53,10 +54,10 @@ def test_a_command_is_put_with_the_stamp_the_clock_and_the_echo_of_its_sender() 
     fake: Any = Fake()
     counts = Counts()
     commands = ViewerCommands(lambda: fake, counts)
-    commander, sender = Commander(), CommandSigner("joe/aa")
+    relay, sender = Relay(), CommandSigner("joe/aa")
     for stamp_ns, echo in ((1000, Beat(7, 5)), (2000, None)):
         wish = Wish(Twist(0.2, -0.5), stamp_ns, echo)
-        commands.give("teleop", commander, sender, wish)
+        commands.give("teleop", relay, sender, wish)
         commands.outbox.flush(PATIENCE_S)
     assert [(x, z) for x, z, _ in put] == [(0.2, -0.5)] * 2
     signed = [item for *_, item in put]

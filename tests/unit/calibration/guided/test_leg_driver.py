@@ -10,8 +10,8 @@ from msgspec.structs import replace
 
 from acsard.calibration.guided.drive_plan import Leg, Move
 from acsard.calibration.guided.leg_driver import STALL_REASON, LegDriver, Phase
-from acsard.client.commander import OPEN_TIMEOUT_S
 from acsard.client.follower import MAX_STATE_AGE_S
+from acsard.client.ride import OPEN_TIMEOUT_S
 from acsard.core.config.settings import Config, DriveConfig, LimitsConfig
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.motion.kinematics import Kinematics

@@ -7,10 +7,10 @@ from threading import Event
 
 import pytest
 
-from acsard.client.commander import STALE_NS, Commander, Wish
-from acsard.client.outbox import Outbox
+from acsard.client.ride import STALE_S
 from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.host import clock
+from acsard.web.outbox import Outbox, Relay, Wish
 from tests.system.harness import until
 
 PATIENCE_S = 20.0
@@ -45,29 +45,29 @@ def bus() -> Iterator[Bus]:
 
 
 def test_only_the_newest_wish_is_sent_after_the_bus_was_blocked(bus: Bus) -> None:
-    outbox, blocker, commander = Outbox(), Commander(), Commander()
+    outbox, blocker, relay = Outbox(), Relay(), Relay()
     bus.block()
     outbox.take(blocker, bus.put, ZERO)
     assert bus.entered.wait(PATIENCE_S)
     for wish in (AHEAD, AHEAD, ZERO):
-        outbox.take(commander, bus.put, wish)
+        outbox.take(relay, bus.put, wish)
     bus.free.set()
     outbox.flush(PATIENCE_S)
     assert bus.sent == [ZERO, ZERO]
-    assert commander.replaced == 2
+    assert relay.replaced == 2
 
 
 def test_an_outdated_speed_is_dropped_but_a_zero_is_sent_at_any_age(bus: Bus) -> None:
     dropped: list[bool] = []
     outbox = Outbox(lambda: dropped.append(True))
-    blocker, ahead, zero = Commander(), Commander(), Commander()
+    blocker, ahead, zero = Relay(), Relay(), Relay()
     bus.block()
     outbox.take(blocker, bus.put, ZERO)
     assert bus.entered.wait(PATIENCE_S)
     outbox.take(ahead, bus.put, AHEAD)
     outbox.take(zero, bus.put, ZERO)
     given_ns = clock.mono_ns()
-    until(lambda: clock.mono_ns() - given_ns > STALE_NS, PATIENCE_S, "that it is too old")
+    until(lambda: clock.mono_ns() - given_ns > STALE_S * NS_PER_S, PATIENCE_S, "that it is too old")
     bus.free.set()
     outbox.flush(PATIENCE_S)
     assert bus.sent == [ZERO, ZERO]
@@ -81,9 +81,9 @@ def test_a_speed_that_waited_during_a_suspend_is_dropped(
     asleep_ns = 0
     monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns)
     dropped: list[bool] = []
-    outbox, commander = Outbox(lambda: dropped.append(True)), Commander()
+    outbox, relay = Outbox(lambda: dropped.append(True)), Relay()
     with outbox._news:  # the thread cannot send the command before the suspend
-        outbox.take(commander, bus.put, AHEAD)
+        outbox.take(relay, bus.put, AHEAD)
         asleep_ns = 3600 * NS_PER_S
     outbox.flush(PATIENCE_S)
     assert bus.sent == []
@@ -95,22 +95,22 @@ def test_no_zero_is_sent_for_a_drive_that_ended_before_a_suspend(
 ) -> None:
     asleep_ns = 0
     monkeypatch.setattr(clock, "asleep_ns", lambda: asleep_ns)
-    outbox, commander = Outbox(), Commander()
-    outbox.take(commander, bus.put, AHEAD)
+    outbox, relay = Outbox(), Relay()
+    outbox.take(relay, bus.put, AHEAD)
     outbox.flush(PATIENCE_S)
     asleep_ns = 3600 * NS_PER_S
-    outbox.release(commander, 0.25)
+    outbox.release(relay, 0.25)
     outbox.flush(PATIENCE_S)
     assert bus.sent == [AHEAD]
 
 
 def test_the_zero_of_a_sender_that_leaves_while_the_bus_is_blocked_is_sent(bus: Bus) -> None:
-    outbox, commander = Outbox(), Commander()
+    outbox, relay = Outbox(), Relay()
     bus.block()
-    outbox.take(commander, bus.put, AHEAD)
+    outbox.take(relay, bus.put, AHEAD)
     assert bus.entered.wait(PATIENCE_S)
-    outbox.take(commander, bus.put, LEFT)
-    outbox.release(commander)
+    outbox.take(relay, bus.put, LEFT)
+    outbox.release(relay)
     bus.free.set()
     outbox.flush(PATIENCE_S)
     assert bus.sent == [AHEAD, ZERO]
@@ -121,5 +121,5 @@ def test_the_death_of_the_sending_thread_is_reported() -> None:
         raise SystemExit
 
     outbox = Outbox()
-    outbox.take(Commander(), deadly, AHEAD)
+    outbox.take(Relay(), deadly, AHEAD)
     assert isinstance(outbox.dead.exception(PATIENCE_S), SystemExit)
