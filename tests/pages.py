@@ -421,17 +421,16 @@ COMMANDS: dict[str, How] = {
         "tests/unit/cli/test_tls_verb.py",
         "test_init_makes_an_authority_the_robots_certificate_and_one_for_each_role",
     ),
-    f"acsard web {_AWAY} --invite operator --name phone --days 30": INVITED,
+    f"acsard web {_AWAY} invite operator --name phone --days 30": INVITED,
     "acsard web --tls tls --address https://0.0.0.0:8443": INVITED,
-    "acsard web --tokens": COOKIE,
-    "acsard web --revoke phone": COOKIE,
+    "acsard web tokens": COOKIE,
+    "acsard web revoke phone": COOKIE,
     "sudo acsard tls init": BY_THE_SERVICE,
     "sudo install -D -m 0644 -t /etc/systemd/system/acsard-web.service.d "
     "/opt/acsard/current/lib/acsard/deploy/systemd/lan.conf": BY_THE_SERVICE,
     'sudo sh -c "systemctl daemon-reload && systemctl restart acsard-web"': BY_THE_SERVICE,
-    "sudo acsard web --config /etc/acsard/acsard.toml "
-    "--invite operator --name phone": BY_THE_SERVICE,
-    "sudo acsard web --config /etc/acsard/acsard.toml --revoke phone": BY_THE_SERVICE,
+    "sudo acsard web invite operator --config /etc/acsard/acsard.toml --name phone": BY_THE_SERVICE,
+    "sudo acsard web revoke phone --config /etc/acsard/acsard.toml": BY_THE_SERVICE,
     'sudo sh -c "acsard tls renew && '
     'systemctl try-reload-or-restart acsard-web acsard-gateway"': Elsewhere(
         OPEN, "test_a_renewed_certificate_is_shown_after_the_reload_and_tokens_still_count"

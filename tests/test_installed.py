@@ -60,7 +60,7 @@ WORKS = {
 NEED_TOOLS = {
     "tls init --directory {}/tls": (0, "ca.pem"),
     "set limits.linear_speed 0.3 --keep": (0, "limits.linear_speed = 0.3"),
-    "web --tokens": (0, "no tokens"),
+    "web tokens": (0, "no tokens"),
 }
 
 # These subcommands run until a signal, and print this when they are ready. The gateway needs the

@@ -19,9 +19,10 @@ from acsard.host.config_file import find
 from acsard.host.errors import Exit, ExitError
 
 
-def add_config(parser: argparse.ArgumentParser) -> None:
+def add_config(parser: argparse.ArgumentParser, default: object = None) -> None:
     parser.add_argument(
         "--config",
+        default=default,
         metavar="FILE",
         help="configuration file (default: $ACSARD_CONFIG, ./acsard.toml, "
         "/etc/acsard/acsard.toml, or the built-in defaults)",

@@ -26,19 +26,23 @@ from acsard.host.errors import UsageError
 SEVERAL_IDS = "; several ids separated by commas, or '*' for all robots"
 
 
-def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
-    """Add the options that select a robot and its daemon's address; `more` help for `--id`."""
-    add_config(parser)
-    parser.add_argument(
-        "--connect", metavar="ENDPOINT", help="address of the daemon, e.g. tcp/127.0.0.1:7448"
-    )
-    parser.add_argument(
-        "--tls",
-        metavar="DIRECTORY",
-        help="directory with your certificate, for a tls/ endpoint (default: $ACSARD_TLS, or "
-        "bus.tls)",
-    )
-    parser.add_argument("--id", metavar="ID", help="the robot's id (default: robot.id)" + more)
+def add_bus(parser: argparse.ArgumentParser, more: str = "", default: object = None) -> None:
+    """Add the options that select a robot and its daemon's address; `more` help for `--id`.
+
+    With the `default` `argparse.SUPPRESS`, a subcommand keeps the value that stood before it.
+    """
+    add_config(parser, default)
+    for option, metavar, text in (
+        ("--connect", "ENDPOINT", "address of the daemon, e.g. tcp/127.0.0.1:7448"),
+        (
+            "--tls",
+            "DIRECTORY",
+            "directory with your certificate, for a tls/ endpoint (default: $ACSARD_TLS, or "
+            "bus.tls)",
+        ),
+        ("--id", "ID", "the robot's id (default: robot.id)" + more),
+    ):
+        parser.add_argument(option, metavar=metavar, default=default, help=text)
 
 
 @contextmanager

@@ -37,32 +37,51 @@ NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}\Z")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    add_bus(parser)
-    parser.add_argument(
-        "--address",
-        action="append",
-        metavar="URL",
-        help="address at which to serve the page, instead of web.address; repeat the option for "
-        "several; https://0.0.0.0:8443 lets browsers on other machines connect",
-    )
+    _add_place(parser, None)
     parser.add_argument(
         "--record",
         metavar="DIRECTORY",
         help="directory of the recordings that the page lists. If the robot reports its own "
         "directory, the page uses that one (default: record.directory)",
     )
-    doing = parser.add_mutually_exclusive_group()
-    doing.add_argument(
-        "--invite",
-        choices=ROLES,
-        help="print a link with a new token of this role, and its QR code",
+    parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
+    actions = parser.add_subparsers(title="subcommands", metavar="SUBCOMMAND")
+    invite = actions.add_parser(
+        "invite",
+        help="print a link with a new token, and its QR code",
+        description="Print a link with a new token, and its QR code, for a browser on another "
+        "machine.",
     )
-    doing.add_argument("--tokens", action="store_true", help="list the tokens")
-    doing.add_argument(
-        "--revoke",
-        metavar="NAME",
-        help="revoke a token; `acsard web` immediately disconnects the pages that use it",
+    tokens = actions.add_parser(
+        "tokens", help="list the tokens", description="List the tokens and how long each is valid."
     )
+    revoke = actions.add_parser(
+        "revoke",
+        help="revoke a token",
+        description="Revoke a token. The page's server disconnects the pages that use it within a "
+        "second.",
+    )
+    _add_token(invite)
+    revoke.add_argument("name", metavar="NAME", help="name of the token")
+    for action, run in ((invite, main_invite), (tokens, main_tokens), (revoke, main_revoke)):
+        action.set_defaults(main=run)
+        _add_place(action, argparse.SUPPRESS)
+
+
+def _add_place(parser: argparse.ArgumentParser, default: object) -> None:
+    parser.add_argument(
+        "--address",
+        action="append",
+        default=default,
+        metavar="URL",
+        help="address of the page, instead of web.address; repeat the option for several; "
+        "https://0.0.0.0:8443 lets browsers on other machines connect",
+    )
+    add_bus(parser, default=default)
+
+
+def _add_token(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("role", choices=ROLES, metavar="ROLE", help=", ".join(ROLES))
     parser.add_argument(
         "--name",
         type=_name,
@@ -80,18 +99,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--hours",
         type=whole("hours", MOST_HOURS, "; for more use --days"),
         metavar="N",
-        help=f"hours until the token expires, 1 to {MOST_HOURS}; use it instead of --days, for "
-        "example for a visitor",
+        help=f"hours until the token expires, 1 to {MOST_HOURS}, for example for a visitor",
     )
-    parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
 
 
-def main(args: argparse.Namespace) -> int:
-    for option in ("name", "days", "hours"):
-        if getattr(args, option) is not None and not args.invite:
-            raise UsageError(
-                f"--{option} is for a new token: add --invite ROLE, or leave --{option} out"
-            )
+def _loaded(args: argparse.Namespace) -> tuple[str, Config]:
     try:
         import aiohttp  # noqa: F401
         import prometheus_client  # noqa: F401
@@ -99,20 +111,12 @@ def main(args: argparse.Namespace) -> int:
     except ImportError:
         raise missing("aiohttp, prometheus-client or segno") from None
     options = {"record.directory": args.record or None, "bus.tls": args.tls or None}
-    where, loaded = load(args.config, options)
-    config = with_record_directory(loaded)
-    if args.invite:
-        return _invite(args, config, where)
-    if args.tokens:
-        return _list(_vault(args, config))
-    if args.revoke:
-        _vault(args, config).revoke(args.revoke)
-        print(f"{args.revoke} is revoked")
-        return Exit.OK
-    return _serve(args, config)
+    where, config = load(args.config, options)
+    return where, with_record_directory(config)
 
 
-def _serve(args: argparse.Namespace, config: Config) -> int:
+def main(args: argparse.Namespace) -> int:
+    _, config = _loaded(args)
     from acsard.web import server, tokens
     from acsard.web.listen import page_urls
 
@@ -152,7 +156,8 @@ def _listen(args: argparse.Namespace, config: Config) -> tuple[Listen, ...]:
     return tuple(parse_listen(text) for text in args.address or config.web.address)
 
 
-def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
+def main_invite(args: argparse.Namespace) -> int:
+    where, config = _loaded(args)
     import segno
 
     from acsard.web.listen import invitations, require_certificate
@@ -169,14 +174,14 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
         )
     vault = _vault(args, config)
     days = 0 if args.hours else args.days or DEFAULT_DAYS
-    text, token = vault.invite(args.invite, args.name or args.invite, days, args.hours or 0)
+    text, token = vault.invite(args.role, args.name or args.role, days, args.hours or 0)
     until = f"{_clock(token.ends)}, for {lasting(token.ends - token.made)}"
     print(f"{token.name} is {token.role} until {until}; the link is not shown again:\n")
     for url in urls:
         print(f"  {url}#token={text}")
     print()
     segno.make(f"{urls[0]}#token={text}", error="l").terminal(sys.stdout, compact=True)
-    print(f"\nto revoke the token before that: acsard web --revoke {token.name}")
+    print(f"\nto revoke the token before that: acsard web revoke {token.name}")
     if unknown := vault.unknown_to():
         print(unknown)
     return Exit.OK
@@ -188,11 +193,18 @@ def _vault(args: argparse.Namespace, config: Config) -> Vault:
     return Vault(place(), address_of(config, args.connect, args.id, args.tls).robot_id)
 
 
-def _list(vault: Vault) -> int:
+def main_revoke(args: argparse.Namespace) -> int:
+    _vault(args, _loaded(args)[1]).revoke(args.name)
+    print(f"{args.name} is revoked")
+    return Exit.OK
+
+
+def main_tokens(args: argparse.Namespace) -> int:
     # Do not import this at the top. The server of the page never prints a table, and the import
     # would use 5 MB of memory while the server runs.
     from acsard.terminal.output import show, table
 
+    vault = _vault(args, _loaded(args)[1])
     tokens, now_s = vault.all(), vault.now_s()
 
     def until(ends: int) -> str:
@@ -203,7 +215,7 @@ def _list(vault: Vault) -> int:
         show(table((token.name, token.role, until(token.ends)) for token in tokens))
     else:
         print(
-            f"no tokens for the robot {vault.robot} are in {vault.path}; `acsard web --invite "
+            f"no tokens for the robot {vault.robot} are in {vault.path}; `acsard web invite "
             "ROLE` makes one"
         )
     return Exit.OK

@@ -98,7 +98,7 @@ class Access:
         """Return the owner of the first valid token. Raises `RequestRefusedError` without one."""
         if not any(texts):
             raise RequestRefusedError(
-                "no_token", "a token is missing: run `acsard web --invite ROLE` on the robot"
+                "no_token", "a token is missing: run `acsard web invite ROLE` on the robot"
             )
         if (identity := self._tokens.owner(texts)) is None:
             # The token may be newer than the last reading of the file.

@@ -112,11 +112,12 @@ class Vault:
             if any(record.name == name for record in ours):
                 raise UsageError(
                     f"the token {name} exists already: either give another --name, or revoke the "
-                    f"old token with --revoke {name}"
+                    f"old token with `acsard web revoke {name}`"
                 )
             if len(ours) >= MAX_TOKENS:
                 raise UsageError(
-                    f"the robot already has {MAX_TOKENS} tokens: revoke some with --revoke NAME"
+                    f"the robot already has {MAX_TOKENS} tokens: revoke some with `acsard web "
+                    "revoke NAME`"
                 )
             text = secrets.token_urlsafe(32)
             ends = now_s + 3600 * (24 * days + hours)

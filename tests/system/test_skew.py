@@ -384,7 +384,7 @@ def test_the_older_version_reads_the_latches_the_tokens_and_the_recording_of_the
             "report": ("recording", "report", str(recording), str(out.with_suffix(".html"))),
             "export": ("recording", "export", str(recording), str(out.with_suffix(".mcap"))),
             "replay": ("recording", "replay", str(recording)),
-            "tokens": ("web", "--tokens", *config),
+            "tokens": ("web", "tokens", *config),
         }
         runs = {
             name: at_once.submit(finish, [older.acsard, *words], tmp_path, 40, env)

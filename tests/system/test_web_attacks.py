@@ -101,7 +101,7 @@ def table(page: Page, daemon: Daemon) -> Iterator[Table]:
 def tokens(page: Page) -> dict[str, str]:
     """Return tokens of five kinds: empty, wrong, expired, revoked, and a viewer's."""
     revoked = page.invite("maintainer", "revoked")
-    page.tokens("--revoke", "revoked")
+    page.tokens("revoke", "revoked")
     vault = page.vault
     return {
         "": "",

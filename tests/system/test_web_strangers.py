@@ -76,14 +76,14 @@ async def test_a_phone_drives_and_is_named_and_a_stop_of_a_viewer_s_latches(
 
 
 async def test_an_invitation_prints_a_link_and_a_qr_code_that_give_access(page: Page) -> None:
-    output = page.tokens("--invite", "operator", "--name", "guest", "--days", "30")
+    output = page.tokens("invite", "operator", "--name", "guest", "--days", "30")
     assert "guest is operator until" in output
     assert any(char in output for char in "▀▄█")  # the code
     (link,) = re.findall(r"https://\S+:\d+/#token=(\S+)", output)
     async with hands(page, link) as ours:
         hello = (await ours.find(lambda frame: "hello" in frame))["hello"]
         assert hello["role"] == "operator"
-    assert re.search(r"^guest +operator ", page.tokens("--tokens"), re.M)
+    assert re.search(r"^guest +operator ", page.tokens("tokens"), re.M)
 
 
 async def test_a_new_certificate_is_used_and_open_connections_stay(
@@ -122,13 +122,13 @@ async def test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revok
         async with session.get(f"{page.away}/api/whoami") as answer:
             assert await answer.json() == {"role": "operator", "name": "lent", "full": ""}
         async with session.ws_connect(f"{page.away}/ws") as ours:
-            page.tokens("--revoke", "lent")
+            page.tokens("revoke", "lent")
             async with asyncio.timeout(PATIENCE_S):
                 while (await ours.receive()).type == aiohttp.WSMsgType.TEXT:
                     pass
         async with session.get(f"{page.away}/api/state") as answer:
             assert answer.status == 401
-    assert "lent" not in page.tokens("--tokens")
+    assert "lent" not in page.tokens("tokens")
     assert token not in page.stdout + page.stderr
 
 

@@ -147,7 +147,7 @@ def test_the_page_runs_within_its_limits_and_its_end_does_not_end_the_daemon(
     assert bare.main_pid() == daemon
     Authority.make(bare.path(TLS), "test", 1).issue(bare.path(TLS), "robot", ["127.0.0.1"], 1)
     away = ("--address", "https://0.0.0.0:8443", "--tls", TLS)
-    result = bare.run(ACSARD, "web", "--invite", "viewer", *away)
+    result = bare.run(ACSARD, "web", "invite", "viewer", *away)
     assert result.code == 0, result.err
     attributes = bare.run(
         "stat", "-L", "-c", "%a %u", "/var/lib/acsard-web/tokens.json"

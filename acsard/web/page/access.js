@@ -16,7 +16,7 @@ export async function invited(waiting) {
     if (status === 409 && !replace && (replace = confirm(`${error}. Use the link anyway?`))) continue;
     if (status && status < 500 && status !== 429) history.replaceState(null, "", location.pathname);
     if (status === 409) return "";
-    if (status === 401) return "this invitation is not valid: it has expired, was revoked, or is incomplete. Ask for a new one (acsard web --invite)";
+    if (status === 401) return "this invitation is not valid: it has expired, was revoked, or is incomplete. Ask for a new one (acsard web invite)";
     if (status && status < 500) return error;
     waiting(`your invitation has no answer yet (${error}); this page sends it again`);
     await new Promise((done) => setTimeout(done, AGAIN));

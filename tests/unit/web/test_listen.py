@@ -130,7 +130,7 @@ def test_an_invitation_is_refused_if_the_server_could_not_start(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    words = ["web", *tls, "--address", "https://0.0.0.0:8443", "--invite", "viewer"]
+    words = ["web", *tls, "--address", "https://0.0.0.0:8443", "invite", "viewer"]
     with pytest.raises(CertificateError, match="tls init"):
-        web.main(parser(["web"]).parse_args(words))
+        web.main_invite(parser(["web"]).parse_args(words))
     assert list(tmp_path.iterdir()) == []

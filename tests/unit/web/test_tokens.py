@@ -212,7 +212,7 @@ def test_the_valid_tokens_are_reported_together(tmp_path: Path) -> None:
 def test_a_name_is_given_once_and_an_unknown_one_cannot_be_revoked(tmp_path: Path) -> None:
     vault = Vault(tmp_path, "robot1")
     vault.invite("viewer", "tv", 1)
-    with pytest.raises(UsageError, match="--revoke"):
+    with pytest.raises(UsageError, match="web revoke"):
         vault.invite("operator", "tv", 1)
     with pytest.raises(UsageError, match="the robot's tokens: tv"):
         vault.revoke("phone")
