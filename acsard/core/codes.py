@@ -88,7 +88,7 @@ limits_zero
     are 0;
     -> set a higher limit
 no_command
-    waiting for a command: no source has sent one within its timeout
+    waiting for a command: no source has sent a usable one within its timeout
 nothing
 command
     a command
@@ -132,7 +132,7 @@ stamps
 stalled
     the daemon stalled: waiting for the next command of {source}
 neutral
-    send a zero first: {source} must send a zero{alone} before it can drive{lasts}{ros}
+    send a zero first: {source} must send a zero{alone}{pause} before it can drive{lasts}{ros}
 zeros
     {source} commands zero speed: it has sent only zeros for over {lasts}{note}
 higher

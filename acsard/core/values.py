@@ -282,6 +282,7 @@ class Wait(Struct, frozen=True):
     kept: str = ""
     ros: bool = False  # the sender that must send a zero uses ROS
     shared: bool = False  # several programs may share its identity
+    pause: bool = False  # silence for `seconds` arms it too
 
 
 class SourceStatus(Struct, frozen=True):

@@ -163,7 +163,8 @@ def test_a_drive_is_reported_as_changes_of_mode_and_commander(world: World) -> N
     world.run(1.0)
     assert [event.text for event in events_named(world, "mode")] == [
         "ready -> driving: commanded by app",
-        "driving -> ready: waiting for a command: no source has sent one within its timeout",
+        "driving -> ready: waiting for a command: no source has sent a usable one within its "
+        "timeout",
     ]
     assert [event.text for event in events_named(world, "commander")] == [
         f"no sender -> app ({public_name('somebody')})"

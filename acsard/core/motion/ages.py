@@ -169,7 +169,7 @@ class Ages(Struct):
 
         `stalled`: the daemon stood still just now, so a command without a stamp may be old.
         """
-        if command.echo is not None or (last.beat_ns >= 0 and not command.shared):
+        if command.echo is not None or last.beat_ns >= 0:
             verdict = last.judge_echo(command, timeout_ns)
         elif command.stamp_ns is not None:
             clock = self._clock(command.clock, command.arrived_ns, command.stamp_ns)

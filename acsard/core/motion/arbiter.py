@@ -323,6 +323,7 @@ def _wait(sender: Sender, settings: Source, now_ns: Ns, lasting: bool) -> Wait:
         lasts=0.0 if since_ns is None else _reported_duration_s(now_ns - since_ns),
         ros=sender.ros,
         shared=sender.shared,
+        pause=settings.neutral_first == "pause",
     )
 
 

@@ -53,6 +53,7 @@ def waiting(wait: Wait) -> Reason:
                 "neutral",
                 source=wait.source,
                 alone=f", and then no speed for {wait.seconds:g} s," if wait.shared else "",
+                pause=f", or nothing for {wait.seconds:g} s," if wait.pause else "",
                 lasts=f"; it has sent speeds for over {lasting(wait.lasts)}" if wait.lasts else "",
                 ros=ROS_NEVER if wait.ros else "",
             )

@@ -25,6 +25,10 @@ SENTENCES = [
         "drive",
     ),
     (
+        Wait("neutral", "nav", 1.0, pause=True),
+        "send a zero first: nav must send a zero, or nothing for 1 s, before it can drive",
+    ),
+    (
         Wait("neutral", "nav", 1.0, lasts=3.0, ros=True),
         "send a zero first: nav must send a zero before it can drive; it has sent speeds for over "
         '3 s (`ros2 topic pub` with a speed never sends a zero; the section "After a clear" of '

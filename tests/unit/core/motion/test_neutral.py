@@ -179,6 +179,7 @@ def test_the_pause_must_begin_after_the_event_and_while_the_daemon_watches() -> 
     bench.wait(5000).arbiter.require_neutral(bench.now_ns)
     bench.wait(900).send(PAUSE)
     assert bench.driver() == ""
+    assert bench.choice().wait == Wait("neutral", "high", 1.0, pause=True)
     bench.wait(600)
     bench.arbiter.watched_ns = bench.now_ns
     bench.wait(600).send(PAUSE)
