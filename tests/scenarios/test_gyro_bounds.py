@@ -209,6 +209,32 @@ def test_the_heading_of_a_faulty_gyro_stays_within_its_covariance(fault: str, pe
         assert bench.hung < SMALL
 
 
+@pytest.mark.parametrize(
+    ("still", "noise", "period", "seed"),
+    [
+        (0.1, 0.1, 5, 2),
+        (0.004, 0.3, 10, 2),
+        *(
+            pytest.param(still, 0.3, period, seed, marks=MORE)
+            for still in (0.004, 0.3)
+            for period in (1, 5, 10)
+            for seed in range(2)
+        ),
+    ],
+)
+def test_the_noise_of_a_gyro_that_claims_none_is_in_the_covariance(
+    still: float, noise: float, period: int, seed: int
+) -> None:
+    """The noise at rest is `still`, and from the first turn on `noise`, rad/s."""
+    bench = Bench(period=period)
+    bench.dice.seed(seed)
+    bench.rate = lambda t, true: true + bench.dice.gauss(0.003, noise if t > 4.3 else still)
+    bench.course()
+    assert bench.worst < CLAIMED
+    if still > 0.2:
+        assert "used" not in bench.does
+
+
 @pytest.mark.parametrize("who", ["another frame", "first another frame", "the same frame"])
 def test_a_second_gyro_on_the_key_makes_no_wrong_and_certain_heading(who: str) -> None:
     bench = Bench()

@@ -35,11 +35,13 @@ from acsard.core.values import (
 REST_S = 0.2
 REST_COUNTS, REST_ANGLE = 2, 0.05
 
-LEARNING_TIME_S = 0.5  # at rest, until a bias is known
-MAX_BIAS = 0.2  # rad/s; a higher rate at rest is a person who turns the robot
+# At rest, until a bias is known: without a higher rate (rad/s), which is a person who turns the
+# robot, or a gyro whose noise makes it useless.
+LEARNING_TIME_S, LEARNING_SAMPLES, MAX_BIAS = 0.5, 20, 0.2
 BIAS_RANDOM_WALK = 1e-4  # of a cheap gyro with temperature, rad/s per square root of a second
 MIN_NOISE = 1e-5  # rad/s of a sample: a coarse gyro may repeat one value
 NOISE_GAIN = 0.02  # of the noise, about fifty samples
+SCATTER_GAIN = 0.1  # of the samples' own noise, in motion, too
 MAX_DEVIATIONS = 5.0  # standard deviations of a sample at rest from the bias
 VIBRATION = 0.01  # rad/s, in addition
 
@@ -78,7 +80,8 @@ MIN_DEGREES_RATIO, MAX_DEGREES_RATIO = 15.0, 150.0  # 57 without slip and errors
 STATUS_TEXTS: dict[GyroDoes, str] = {
     "off": "",
     "waiting for rest": "the gyro's bias is not known yet: the robot must stand for "
-    f"{REST_S + LEARNING_TIME_S:.1f} s",
+    f"{REST_S + LEARNING_TIME_S:.1f} s, in which the gyro reports {LEARNING_SAMPLES} rates of at "
+    f"most {MAX_BIAS} rad/s",
     "waiting for turn": "the heading comes from the wheels until the gyro has agreed with them in "
     "a turn",
     "used": "the heading comes from the gyro",
@@ -144,26 +147,29 @@ class Bias(Struct):
     noise: float = 0.0
     rested_s: Seconds = 0.0
     samples: int = 0
+    shared: float = 0.0  # covariance of the turns up to now with this error, rad2/s
 
     @property
     def is_known(self) -> bool:
-        return self.rested_s >= LEARNING_TIME_S
+        return self.rested_s >= LEARNING_TIME_S and self.samples >= LEARNING_SAMPLES
 
-    def follow(self, rate: RadPerS, variance: float, span: Seconds) -> bool:
+    def follow(self, rate: RadPerS, variance: float, scatter: float, span: Seconds) -> bool:
         """Learn from a sample at rest. Return False if it shows a turn."""
         if not self.is_known:
             return self._average(rate, variance, span)
         error, noise = rate - self.value, max(self.noise, variance, MIN_NOISE**2)
         if abs(error) > MAX_DEVIATIONS * math.sqrt(noise + self.variance) + VIBRATION:
             return False
-        gain = self.variance / (self.variance + noise)
+        gain = self.variance / (self.variance + max(noise, scatter))
         self.value += gain * error
         self.variance *= 1.0 - gain
+        self.shared *= 1.0 - gain
         self.noise += NOISE_GAIN * ((1.0 - gain) * error * error - self.noise)
         return True
 
     def _average(self, rate: RadPerS, variance: float, span: Seconds) -> bool:
         if abs(rate) > MAX_BIAS:
+            self.rested_s, self.samples = 0.0, 0
             return False
         self.rested_s += span
         self.samples += 1
@@ -182,6 +188,7 @@ class Compared(Struct):
     turned: Rad = 0.0  # by the wheels, to either side
     way: Metres = 0.0
     seconds: Seconds = 0.0
+    noise: float = 0.0  # of the gyro, rad2
 
     def add(self, block: Compared, share: float) -> None:
         self.wheels = share * self.wheels + block.wheels
@@ -189,6 +196,7 @@ class Compared(Struct):
         self.turned = share * self.turned + abs(block.wheels)
         self.way = share * self.way + block.way
         self.seconds = share * self.seconds + block.seconds
+        self.noise = share * self.noise + block.noise
 
 
 class Gyro(Struct):
@@ -211,6 +219,8 @@ class Gyro(Struct):
     late_ns: Ns = 0  # delay then
 
     rate: RadPerS = 0.0  # now
+    step: RadPerS = 0.0  # to the last sample from the one before
+    scatter: float = 0.0  # of the samples, rad2/s2
     turned: Rad = 0.0  # by all samples
     given: Rad = 0.0  # of `turned`, with the assumed turn since the last sample
     variance: float = 0.0  # of the rest of `turned`
@@ -324,12 +334,15 @@ class Gyro(Struct):
             self.turned, self.rate = self.given, rate
         if last is not None:
             self._follow_repetition(sample.rate == last.rate, span)
+        # Two steps one after the other have the covariance -n by white noise of the variance n.
+        step_before, self.step = self.step, 0.0 if last is None else sample.rate - last.rate
+        self.scatter -= SCATTER_GAIN * (self.step * step_before + self.scatter)
         bias.variance += BIAS_RANDOM_WALK * BIAS_RANDOM_WALK * span
         stands = self.rest_s > REST_S and not self.hangs
         was, is_known = bias.value, bias.is_known
         if stands and self.learn_again:
             bias.variance, self.learn_again = (MAX_BIAS / 4) ** 2, False
-        stands = stands and bias.follow(sample.rate, sample.variance, span)
+        stands = stands and bias.follow(sample.rate, sample.variance, self.scatter, span)
         if stands and is_known and abs(bias.value - was) > VIBRATION:
             # Nobody knows when the bias changed.
             self.doubt += (bias.value - was) * self.since_rest_s
@@ -338,9 +351,9 @@ class Gyro(Struct):
             self.hangs = True  # no person turns a robot so evenly
         if stands:
             self.since_rest_s = 0.0
-        step, noise = self.rate - before, max(bias.noise, sample.variance)
         self.turned += (before + self.rate) / 2 * span
-        self.variance += (noise + step * step / 12) * span * span
+        noise = max(bias.noise, sample.variance, self.scatter) + (self.rate - before) ** 2 / 12
+        self.variance += noise * span * span
         self.since_sample = 0.0
 
     def _follow_repetition(self, same: bool, span: Seconds) -> None:
@@ -379,6 +392,7 @@ class Gyro(Struct):
             block.gyro += angle
             block.way += abs(way)
             block.seconds += dt
+            block.noise += self.variance
             off = block.gyro - block.wheels
             if block.seconds >= BLOCK_S * 0.95 or abs(off) > MAX_BLOCK:
                 self.block = Compared()
@@ -399,9 +413,12 @@ class Gyro(Struct):
         if dt > 0.0:
             self.since_sample += angle - wheels
             self.since_change += angle - wheels
-        # The error of the bias is the same in each line.
-        variance = self.variance + 2.0 * self.bias.variance * self.since_rest_s * dt
-        rate_variance, disagrees = self.bias.noise + self.bias.variance, self.disagrees_s > 0.0
+        # The error of the bias is the same in each line, and nearly the same after a rest.
+        bias = self.bias
+        variance = self.variance + 2.0 * bias.shared * dt
+        if self.rate:
+            bias.shared += bias.variance * dt
+        rate_variance, disagrees = bias.noise + bias.variance, self.disagrees_s > 0.0
         if disagrees and dt > 0.0:
             rate_variance += ((angle - wheels) / dt) ** 2
         doubt, self.doubt, self.variance = self.doubt, 0.0, 0.0
@@ -505,6 +522,7 @@ class Gyro(Struct):
             + claims.per_radian * compared.turned
             + (claims.scale * compared.wheels) ** 2
             + self.bias.variance * compared.seconds**2
+            + compared.noise
         )
         return abs(compared.gyro - compared.wheels), math.sqrt(variance)
 
