@@ -300,7 +300,7 @@ class Wheels(Struct):
                 self.begins = False
             if not self.late:
                 self._obey(block, (due_left, due_right))
-                self._miss(patience)
+                self._miss(block.unit, patience)
         self._compare(block, kinematics)
 
     def _obey(self, block: Block, due: tuple[Rad, Rad]) -> None:
@@ -428,12 +428,12 @@ class Wheels(Struct):
             event = Event("wheel_fault", _text(wheel, i), "warning", kind=code, code=code)
         self.events = (*self.events, event)
 
-    def _miss(self, patience: Seconds) -> None:
+    def _miss(self, count: Rad, patience: Seconds) -> None:
         for side, (name, front, rear) in zip(self.sides, SIDES, strict=True):
             one, other = self.wheels[front], self.wheels[rear]
             # Quick motors stop before they are expected to.
             still = -COMMANDED < side.command < COMMANDED
-            if side.out >= 0 or still or not (one.missed and other.missed):
+            if side.out >= 0 or still or min(abs(one.missed), abs(other.missed)) <= count:
                 continue
             if one.apart_s >= patience and other.apart_s >= patience:
                 values = [0.0] * 4

@@ -272,6 +272,29 @@ def test_motors_that_stop_sooner_than_declared_missed_no_turn() -> None:
     assert doubts == []
 
 
+def test_slow_motors_missed_no_turn_within_a_count() -> None:
+    bench, doubts, angle, speed = Bench(counts=16), [], 0.0, 0.0
+    bench.run(STILL, STILL)
+    for _ in range(300):
+        speed += (1.5 - speed) * PERIOD / 0.35
+        before, angle = angle, angle + speed * PERIOD
+        counted = math.floor(16 * angle / math.tau) - math.floor(16 * before / math.tau)
+        reported = round(counted * math.tau / 16 / PERIOD, 2)
+        bench.run(all_at(reported), all_at(1.5), seconds=PERIOD)
+        doubts += bench.wheels.possible_motion((0.0, 0.0, 0.0, 0.0))
+    assert doubts == []
+
+
+def test_both_wheels_of_a_side_that_report_no_turn_may_have_turned() -> None:
+    bench, rolled = driven(), 0.0
+    for _ in range(100):
+        bench.run(WheelSpeeds(0.0, 10.0, 10.0, 0.0), TEN, seconds=PERIOD)
+        for side, angles in bench.wheels.possible_motion((0.0, 0.0, 0.0, 0.0)):
+            assert side == "right"
+            rolled += angles[0]
+    assert rolled == pytest.approx(10.0, rel=0.1)
+
+
 def test_stalls_hide_no_wheel_that_rolls_on() -> None:
     bench = driven()
     for step in range(200):
