@@ -216,7 +216,7 @@ EventName = Literal[
     "mode", "commander", "commands_without_effect", "new_sender", "command_refused", "fault",
 ]  # fmt: skip
 
-Level = Literal["info", "warning", "error"]
+Level = Literal["debug", "info", "warning", "error"]
 
 
 class Event(Struct, frozen=True, omit_defaults=True):

@@ -236,7 +236,7 @@ class Log:
             fields["by"] = event.by
         if event.count > 1:
             fields["count"] = event.count
-        self._logger.log(_LEVELS[event.level], event.name, **fields)
+        self._logger.log(_LEVELS[event.level.upper()], event.name, **fields)
 
     def info(self, name: EventName, **fields: object) -> None:
         """Log an event of the daemon itself."""
@@ -247,7 +247,7 @@ class Log:
         self._writer.close(CLOSE_TIMEOUT_S)
 
 
-_LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
+_LEVELS = logging.getLevelNamesMapping()
 
 
 def _in_order(logger: object, method: str, line: MutableMapping[str, Any]) -> dict[str, Any]:

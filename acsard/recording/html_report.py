@@ -47,7 +47,7 @@ BAD, WARN, GOOD, REST, NEUTRAL = "#d43d3d", "#e08600", "#159a6b", "#8fb8de", "#9
 COLOURS = {
     "driving": GOOD, "ready": REST, "waiting": WARN, "stopped": WARN, "fault": BAD,
     "up": REST, "booting": WARN, "stale": WARN, "down": BAD, "drives": GOOD, "waits": WARN,
-    "info": "#2f7ed8", "warning": WARN, "error": BAD,
+    "debug": NEUTRAL, "info": "#2f7ed8", "warning": WARN, "error": BAD,
     "limited": "#2f7ed8", "measured": GOOD,
 }  # fmt: skip
 PALETTE = ("#b04fc4", "#8f4f22", "#1ab2d2", "#8a8f00", "#e0588c", "#4a2f8f")

@@ -208,7 +208,7 @@ def test_state_reports_a_new_sender_and_counts_its_ignored_commands() -> None:
     assert not [name for name in world.state.counters if name.startswith("command_")]
     assert world.state.refused == ""
     (warning,) = [event for event in world.events if event.name == "new_sender"][:1]
-    assert warning.level == "info"
+    assert warning.level == "debug"
     client.hold(0.4, 0.3)
     assert world.state.mode == "driving"
 

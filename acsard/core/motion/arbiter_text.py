@@ -82,7 +82,7 @@ def refused(refusal: Refusal) -> Event:
     """Return the event `command_refused`, or `new_sender` if its clock is not proven yet."""
     by, kind = refusal.sender[:MAX_SENDER_LENGTH], refusal.reason
     if kind == "unproven":
-        return Event("new_sender", refusal.text, by=by, news=False, code=kind)
+        return Event("new_sender", refusal.text, "debug", by, news=False, code=kind)
     return Event("command_refused", refusal.text, "warning", by, kind, news=False, code=kind)
 
 

@@ -38,7 +38,7 @@ class Log(Struct, frozen=True):
     line: Natural = 0
 
 
-LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}  # in ROS
+LEVELS: dict[str, int] = {"debug": 10, "info": 20, "warning": 30, "error": 40}  # in ROS
 
 
 def log(event: Event | LogEvent, stamp: Time) -> Log:
