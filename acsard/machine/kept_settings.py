@@ -18,13 +18,17 @@ from acsard.host.errors import MendableError, UsageError
 from acsard.host.processes import is_daemon_here
 
 
+def can_be_kept(key: str) -> bool:
+    return not key.startswith("commands.sources.")
+
+
 def set_and_keep(robot: Client, config: str | None, settings: Mapping[str, Plain]) -> ServiceReply:
     """Change settings, write them into the configuration file, and return the reply.
 
     `config` is the path of the file; None means the usual places. Raises `UsageError` or
     `MendableError` if the file cannot be written.
     """
-    if any(key.startswith("commands.sources.") for key in settings):
+    if not all(map(can_be_kept, settings)):
         raise UsageError(
             "[[commands.sources]] cannot be kept: set the timeout without keeping it, and "
             "write it into the file yourself. If the file has no [[commands.sources]] yet, copy "

@@ -26,6 +26,7 @@ from acsard.core.ros.parameters import kind_of
 from acsard.core.values import Role
 from acsard.host import clock
 from acsard.host.errors import MendableError, NoAnswerError
+from acsard.machine.kept_settings import can_be_kept
 from acsard.web import metrics, openapi
 from acsard.web.access import IDENTITY_KEY, LAST_KEY, Access, connection_of, own_port, peer_of
 from acsard.web.answers import Files, TroubleError, file_answer, reply, sent_in_pieces
@@ -68,6 +69,8 @@ class Setting(Struct, frozen=True, omit_defaults=True):
     value: Any
     what: str
     when: str
+    unit: str = ""
+    keep: Annotated[bool, Meta(description="whether `keep` can write it into the file")] = True
     low: float | UnsetType = UNSET
     high: float | UnsetType = UNSET
     choices: list[str] | UnsetType = UNSET
@@ -256,20 +259,25 @@ class Page:
 def settings_in(config: Mapping[str, Any]) -> list[Setting]:
     """Return the settings that may change while the daemon runs."""
     return [
-        Setting(key, value, setting.what, WHEN_TEXTS[setting.when], **_allowed(key))
+        Setting(key, value, setting.what, WHEN_TEXTS[setting.when], **_described(key))
         for key, value in flat(config)
         if (setting := find_live_setting(key)) is not None
     ]
 
 
-def _allowed(key: str) -> dict[str, Any]:
+def _described(key: str) -> dict[str, Any]:
+    """Return the unit and the allowed values of a setting, and whether it can be kept."""
+    found: dict[str, Any] = {"keep": can_be_kept(key)}
     kind = kind_of(key)
-    match kind.type if isinstance(kind, inspect.Metadata) else kind:
+    if isinstance(kind, inspect.Metadata):
+        found["unit"] = (kind.extra or {}).get("unit", "")
+        kind = kind.type
+    match kind:
         case inspect.FloatType(ge=float(low), le=float(high)):
-            return {"low": low, "high": high}
+            return found | {"low": low, "high": high}
         case inspect.LiteralType(values=choices):
-            return {"choices": [str(choice) for choice in choices]}
-    return {}
+            return found | {"choices": [str(choice) for choice in choices]}
+    return found
 
 
 async def _body_of(request: web.Request) -> bytes:

@@ -280,7 +280,7 @@ class Browser:
 
         def look() -> bool:
             if not self.js("document.getElementById('stick').matches('.held')"):
-                texts.append(self.text("told"))
+                texts.append(self.text("hint"))
                 self.lift()
                 self.push(0, 0, "Start")
                 self.push(0, 90)

@@ -170,8 +170,8 @@ def test_space_stops_from_every_view_and_a_stick_that_is_held_drives_no_more(pag
     browser.tap("tab-drive")
     page.hold()
     bus.get("srv/stop")  # by another client
-    page.shows("told", "the reason is shown above")
-    assert browser.js("document.body.innerText").count("call srv/clear") == 1
+    page.shows("hint", "Stopped. Press Release STOP first.")
+    assert "srv/clear" not in browser.js("document.body.innerText")
     bus.get("srv/clear")
     page.shows("mode", "READY")
     # The finger is still down.
@@ -183,17 +183,22 @@ def test_space_stops_from_every_view_and_a_stick_that_is_held_drives_no_more(pag
     browser.touch("End")
 
 
-@pytest.mark.nightly
 @alone
-def test_a_button_s_failure_is_reported_once(page: Phone) -> None:
-    page.browser.tap("tab-set")
-    page.browser.js("document.getElementById('reset').click()")
+@pytest.mark.nightly
+def test_without_a_connection_stop_and_settings_are_grey_and_the_page_says_why(page: Phone) -> None:
+    browser = page.browser
+    browser.tap("tab-set")
+    browser.js("document.getElementById('reset').click()")
     page.shows("set-told", "pose is x 0")
+    until(lambda: browser.js(SETTINGS), 5.0, "the settings can be changed")
+    assert browser.js(RED)
     page.server.process.kill()
     page.shows("age", "no connection")
-    page.browser.js("document.getElementById('reset').click()")
-    page.shows("complaint", "no connection to the robot")
-    assert page.browser.js("document.body.innerText").count("no connection to the robot") == 1
+    page.shows("barred", "nothing can be changed now")
+    assert not browser.js(SETTINGS)
+    assert browser.js("document.getElementById('reset').disabled")
+    page.shows("doubt", "STOP may not reach the robot from here")
+    assert not browser.js(RED)
 
 
 def test_keys_drive_while_they_are_held(page: Phone) -> None:
@@ -264,7 +269,7 @@ def test_arrow_keys_set_the_slider_and_letter_keys_drive_without_a_mouse(page: P
 def test_a_second_finger_anywhere_releases_the_stick(page: Phone, where: str) -> None:
     page.hold()
     page.browser.tap(where)
-    page.shows("told", "use one finger to drive")
+    page.shows("hint", "use one finger to drive")
     page.bus.at_rest()
 
 
@@ -295,7 +300,7 @@ def test_releasing_the_left_mouse_button_while_another_is_held_releases_the_stic
         bus.at_rest()
     finally:
         mouse("Released", 90, "right", 0)
-    page.shows("told", "another button is down")
+    page.shows("hint", "another button is down")
 
 
 COARSE = """(() => {
@@ -369,7 +374,7 @@ def test_a_page_releases_the_stick_before_the_browser_leaves_it(page: Phone) -> 
 def viewers(page: Phone) -> int:
     """Return the number of open pages that the page's server counts."""
     _, text = asyncio.run(answer(f"{page.server.here}/metrics"))
-    return int(re.findall(r"^acsard_page_viewers\{.*\} (\d+)$", text, re.MULTILINE)[0])
+    return int(re.findall(r"^acsard_page_viewers\{.*\} (\d+)(?:\.0)?$", text, re.MULTILINE)[0])
 
 
 @pytest.mark.nightly
@@ -538,7 +543,7 @@ def test_a_gamepad_that_disconnects_releases_the_stick(page: Phone) -> None:
     until(lambda: (bus.state()["linear"] or 0.0) > 0.15, 10.0, "it drives")
     # The gamepad's last values stay pressed, as when its battery is empty.
     browser.js("dispatchEvent(new Event('gamepaddisconnected'))")
-    page.shows("told", "the gamepad is disconnected")
+    page.shows("hint", "the gamepad is disconnected")
     bus.at_rest()
 
 
@@ -546,7 +551,7 @@ def test_a_gamepad_that_the_browser_does_not_know_drives_nothing_and_says_so(pag
     pad = PAD.replace("AXES", "[0, -1, 0, 0]").replace("HELD", "true").replace("standard", "")
     commands = page.bus.count("commands")
     page.browser.js(pad + ";1")
-    page.shows("told", "this gamepad does not drive")
+    page.shows("hint", "This gamepad does not drive")
     assert page.bus.count("commands") == commands
     assert page.browser.js("document.getElementById('stick').matches('.held')") is False
 
@@ -606,7 +611,7 @@ def test_a_page_opened_while_the_daemon_is_silent_waits_and_shows_no_measurement
         page.shows("reason", "nothing is received from the daemon")
         browser.js("new Promise(done => setTimeout(done, 500))")  # more than one poll
         texts = [browser.text(name) for name in ("mode", "age", "speed", "turn", "who")]
-        assert texts == ["WAITING", "waiting", "–", "–", "–"]
+        assert texts == ["NO DATA", "waiting", "–", "–", "–"]
         assert not browser.js("document.body.classList.contains('stale')")
     finally:
         page.daemon.signal(signal.SIGCONT)
@@ -665,6 +670,10 @@ def row(page: Phone, source: str) -> str:
     rows = "[...document.querySelectorAll('#sources tr')].map(row => row.textContent)"
     return next((str(text) for text in page.browser.js(rows) if text.startswith(source)), "")
 
+
+RED = "getComputedStyle(document.getElementById('stop')).backgroundColor === 'rgb(196, 18, 10)'"
+
+SETTINGS = "[...document.querySelectorAll('#settings input')].some(one => one.matches(':enabled'))"
 
 SET = """(() => {
     const button = document.querySelector('[aria-label="Set limits.linear_speed"]');
@@ -1039,9 +1048,12 @@ def test_the_first_visit_loads_little_and_the_second_one_less(page: Phone, tmp_p
     assert second.ms < 15 * bare_ms + 500.0
 
 
-COMMANDER = """import('/page/commander.js').then(({Commander, ZERO, twist, objection}) => {
+COMMANDER = """import('/page/commander.js').then(({Commander, ZERO, twist}) => {
     const ours = {name: 'teleop', waits_for: '', wait: 'nothing'};
-    const driving = {mode: 'driving', source: 'teleop', sender: 'me', reason: '', sources: [ours]};
+    const driving = {
+        mode: 'driving', source: 'teleop', sender: 'me', reason: '', sources: [ours],
+        link: 'up', causes: [],
+    };
     const ready = {...driving, mode: 'ready', source: '', sender: '', reason: 'no commands'};
     const stopped = {...ready, mode: 'stopped', reason: 'stopped by request'};
     const out = [];
@@ -1076,8 +1088,7 @@ STOPPING = """(async () => {
 
 FAILS = [
     "sent",
-    "STOP is not confirmed. This page sends it again; the robot's own switch stops it too. "
-    "(no answer)",
+    "STOP is not confirmed. This page sends it again; the robot's own switch stops it too.",
 ]
 """The expected trace of a first attempt that gets no answer."""
 
@@ -1173,11 +1184,11 @@ def test_a_commander_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(pag
 @pytest.mark.parametrize(
     ("script", "why"),
     [
-        ("commander.press(0); look(0, ready); look(1100, ready)", "this page was suspended"),
-        ("commander.press(0); look(0, stopped)", "stopped by request"),
+        ("commander.press(0); look(0, ready); look(1100, ready)", "This page was suspended"),
+        ("commander.press(0); look(0, stopped)", "Stopped. Press Release STOP first."),
         (
             "commander.press(0); for (let now = 0; now <= 2100; now += 100) look(now, null)",
-            "nothing is received",
+            "Nothing is received",
         ),
         (
             "commander.press(-1); look(0, driving);"
@@ -1241,9 +1252,7 @@ def test_controls_that_a_viewer_may_not_use_are_disabled_and_say_why(tmp_path: P
             off = "one => [one.disabled || one.getAttribute('aria-disabled') === 'true', one.title]"
             controls = browser.js(f"[...document.querySelectorAll('[data-does]')].map({off})")
             assert len(controls) >= 6
-            assert {tuple(control) for control in controls} == {
-                (True, "for operators; your role is viewer")
-            }
+            assert all(off and "your role is viewer" in why for off, why in controls), controls
             described = browser.js(f"[...document.querySelectorAll('[data-does]')].map({WORDS})")
             assert all("for operators; your role is viewer" in control for control in described)
             page.shows("barred", "for operators; your role is viewer")
@@ -1292,7 +1301,7 @@ ABOVE = """(() => {
 
 @alone
 @pytest.mark.nightly
-def test_the_plots_begin_with_the_minute_before_and_say_which_data_is_missing(
+def test_the_plots_begin_with_the_minute_before(
     page: Phone,
 ) -> None:
     """A client drives the robot before a page is open, and again while one is open.
@@ -1312,14 +1321,13 @@ def test_the_plots_begin_with_the_minute_before_and_say_which_data_is_missing(
         browser.open(page.server.here)
         page.shows("mode", "READY")
         browser.tap("tab-status")
-        page.shows("unknown", "There is no data from before")
+        until(lambda: sum(browser.js(ABOVE)) > 0, 5.0, "the plots are drawn")
         measured, wished = browser.js(ABOVE)
         return measured, wished
 
     measured, wished = looked()
     assert measured > 20
     assert wished == 0
-    page.shows("unknown", "Commanded speeds from before")
     with bus.commanding(0.4, 0.0):
         until(lambda: (bus.state()["linear"] or 0.0) > 0.35, 10.0, "it drives")
     bus.at_rest()

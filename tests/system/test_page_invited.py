@@ -99,7 +99,7 @@ def test_an_invitation_outlives_a_network_that_fails(stranger: Stranger) -> None
     token = stranger.server.invite("operator", "flaky")
     with silent(browser, "token"):
         stranger.opens(token)
-        stranger.shows("reason", "your invitation has no answer yet")
+        stranger.shows("reason", "Your invitation has no answer yet")
         assert token in browser.js("location.hash")  # a reload shows it again
     stranger.shows("role", "operator")
     stranger.shows("mode", "READY")
@@ -112,7 +112,7 @@ def test_an_invalid_invitation_is_reported_and_the_page_stops_connecting(
     before = stranger.tries
     stranger.opens("x" * 43)
     stranger.knocks_no_more(before, 3)  # the invitation, the socket, and the reason
-    assert "this invitation is not valid" in stranger.browser.text("reason")
+    assert "This invitation is not valid" in stranger.browser.text("reason")
     assert stranger.browser.js("location.hash") == ""
 
 

@@ -124,7 +124,7 @@ class Field:
         try:
             until(self._is_live, 30.0, "the page is live")
         except AssertionError as error:
-            texts = [self.browser.text(name) for name in ("mode", "reason", "age", "told", "alarm")]
+            texts = [self.browser.text(name) for name in ("mode", "reason", "age", "hint", "alarm")]
             raise AssertionError(f"{error}; the page says {texts}") from None
 
     def open(self) -> None:

@@ -27,20 +27,22 @@ APPROVED = Path(__file__).with_name("page_states.txt")
 
 SAYS = """(() => {
     const red = one => getComputedStyle(one).color === 'rgb(179, 22, 11)' ? ' (red)' : '';
+    const stops = one => getComputedStyle(one).backgroundColor === 'rgb(196, 18, 10)';
+    const grey = one => one.disabled || (one.id === 'stop' && !stops(one)) ? ' (grey)' : '';
     const says = ['role', 'age', 'battery', 'mode', 'reason', 'doubt', 'speed', 'turn', 'who',
         'hint', 'stop', 'clear', 'alarm', 'complaint'].map(name => document.getElementById(name))
         .filter(one => one.checkVisibility() && one.innerText.trim() !== '')
-        .map(one => `${one.id}${red(one)}: ${one.innerText.trim()}`);
-    const grey = document.getElementById('stick').ariaDisabled === 'true';
-    return [`title: ${document.title}`, ...says, `stick: ${grey ? 'grey' : 'ready'}`];
+        .map(one => `${one.id}${red(one)}${grey(one)}: ${one.innerText.trim()}`);
+    const barred = document.getElementById('stick').ariaDisabled === 'true';
+    return [`title: ${document.title}`, ...says, `stick: ${barred ? 'grey' : 'ready'}`];
 })()"""
-"""The title, the visible texts that depend on the state and whether they are red, and the stick."""
+"""The title, the visible texts that depend on the state, which are red or grey, and the stick."""
 
 
 def says(browser: Browser) -> str:
     """Return the visible texts, without times, figures and paths."""
     text = re.sub(r"/tmp/\w+/", "", "\n".join(browser.js(SAYS)))
-    return re.sub(r"[+−-]?\d+(?:[.:-]\d+)*", "0", text)
+    return re.sub(r"[+−-]?\d+(?:[.:-]\d+)*(?:\s[AP]M)?", "0", text)
 
 
 def test_each_state_of_the_page_has_its_words(

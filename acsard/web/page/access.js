@@ -3,6 +3,7 @@
 
 const AGAIN = 1000; // ms before the next attempt, while the robot does not answer an invitation
 const SHUT = [401, 403, 429]; // HTTP statuses for which a repeated request is pointless
+const INVALID = "This invitation is not valid: it has expired, was revoked, or is incomplete. Ask for a new one.";
 
 /** Exchange the token of an invitation (behind the # of the URL) for a cookie. If the present cookie has more
  *  permissions, ask first. The token is removed from the URL once it was accepted or finally rejected. Returns
@@ -12,39 +13,37 @@ export async function invited(waiting) {
   const token = new URLSearchParams(location.hash.slice(1)).get("token");
   if (!token) return "";
   for (let replace = false; ; ) {
-    const { status, error } = await shown(token, replace);
+    const headers = { "Content-Type": "application/json" };
+    // The redirect leads to this page, which need not be fetched again.
+    const how = { method: "POST", headers, body: JSON.stringify({ token, replace }), redirect: "manual" };
+    const { status, error } = await request("token", how);
     if (status === 409 && !replace && (replace = confirm(`${error}. Use the link anyway?`))) continue;
-    if (status && status < 500 && status !== 429) history.replaceState(null, "", location.pathname);
-    if (status === 409) return "";
-    if (status === 401) return "this invitation is not valid: it has expired, was revoked, or is incomplete. Ask for a new one (acsard web invite)";
-    if (status && status < 500) return error;
-    waiting(`your invitation has no answer yet (${error}); this page sends it again`);
+    if (status && status < 500) {
+      if (status !== 429) history.replaceState(null, "", location.pathname);
+      return status === 401 ? INVALID : status === 409 ? "" : error;
+    }
+    waiting(`Your invitation has no answer yet: ${error}. This page sends it again.`);
     await new Promise((done) => setTimeout(done, AGAIN));
   }
-}
-
-async function shown(token, replace) {
-  const headers = { "Content-Type": "application/json" };
-  // The redirect leads to this page, which need not be fetched again.
-  const how = { method: "POST", headers, body: JSON.stringify({ token, replace }), redirect: "manual" };
-  return asked("token", how, 5000, (answer) => (answer.type === "opaqueredirect" ? { status: 303, error: "" } : null));
 }
 
 /** Return why a WebSocket is refused, as {why, shut, barred}, because no browser reports this. `shut` means that a
  *  repeated attempt is pointless. `barred` means that the robot refuses everything from this browser, also STOP. */
 export async function refusal() {
-  const { status, error, full } = await asked("api/whoami", {}, 2000);
-  return { why: error || full || "", shut: SHUT.includes(status), barred: BARRED.includes(status) };
+  const { status, error, body } = await request("api/whoami", {}, 2000);
+  return { why: error || body.full, shut: SHUT.includes(status), barred: BARRED.includes(status) };
 }
 
-/** Return the JSON answer with its status, or status 0 if there was no answer. */
-async function asked(path, how, within, special = () => null) {
+/** Return the answer to an HTTP request as {status, body, error}. `error` is "" if it succeeded, and `status` is 0 if
+ *  there was no answer within `within` ms. */
+export async function request(path, how = {}, within = 5000) {
   try {
     const answer = await fetch(path, { ...how, signal: expiring(within) });
-    const told = special(answer) ?? (await answer.json());
-    return { error: answer.ok ? "" : `${answer.status}`, status: answer.status, ...told };
+    if (answer.type === "opaqueredirect") return { status: 303, body: {}, error: "" };
+    const body = await answer.json();
+    return { status: answer.status, body, error: answer.ok ? "" : (body.error ?? `${answer.status}`) };
   } catch {
-    return { status: 0, error: "no answer from the robot" };
+    return { status: 0, body: {}, error: "no answer from the robot" };
   }
 }
 
@@ -53,18 +52,14 @@ export function barred(hello, what) {
   return hello ? (hello.barred[what] ?? "") : "no connection yet";
 }
 
-/** Return the hint at the stick while it is not held: how to drive, or why this user cannot. */
-export function hint(hello) {
-  return barred(hello, "drive") ? "You may watch and stop, but not drive." : "Hold and push to drive; release to stop.";
-}
-
-/** Disable the controls that this client may not use and explain why, on the control and in its description.
- *  `needless` maps each control that would change nothing now to the reason. `hello` is undefined while no robot has
- *  answered. */
-export function permit(hello, needless = {}) {
-  document.getElementById("barred").textContent = barred(hello, "drive");
+/** Disable the controls that this client may not use now and explain why, on the control and in its description.
+ *  `absent` says that the robot is not there, or is "". `needless` maps each control that would change nothing now to
+ *  the reason. `hello` is undefined while no robot has answered. */
+export function permit(hello, absent, needless = {}) {
+  const sets = barred(hello, "set");
+  document.getElementById("barred").textContent = barred(hello, "drive") || absent || (sets && `Settings are ${sets}.`);
   for (const one of document.querySelectorAll("[data-does]")) {
-    const why = barred(hello, one.dataset.does) || needless[one.dataset.does] || "";
+    const why = barred(hello, one.dataset.does) || absent || needless[one.dataset.does] || "";
     if ("disabled" in one) one.disabled = Boolean(why);
     else one.setAttribute("aria-disabled", String(Boolean(why)));
     one.title = why;

@@ -15,21 +15,33 @@ const GRACE = 500; // longest time for which the robot may cease to follow durin
 const HICCUP = 250; // after a longer gap between two calls of `look` the robot has braked, so zeros come first
 export const FROZEN = 1000; // after a longer gap between two calls of `look` the finger may be gone, so the hold ends
 
+export const ZERO = { linear_x: 0, angular_z: 0 };
+
+/** Modes that only a person or a restart ends. */
+const NEVER = ["inactive", "stopped", "fault", "shutdown"];
+
 /** Maps a mode to the reason why the robot does not drive in it, with the remedy. */
 const BARS = {
+  waiting: "Not ready: the reason is shown above.",
   inactive: "Switched off. Press Switch on first.",
   stopped: "Stopped. Press Release STOP first.",
   fault: "Fault. Press Release fault first.",
   shutdown: "The robot's daemon is ending.",
 };
-const NEVER = ["inactive", "stopped", "fault", "shutdown"];
-export const ZERO = { linear_x: 0, angular_z: 0 };
 
 /** Maps a state of the emergency stop at the robot that counts as pressed to the remedy. */
 const PRESSED = {
   pressed: "Emergency stop: release it at the robot first.",
   silent: "Emergency stop silent: check the board first.",
 };
+
+/** Return what must end at the robot before a stop can be released, in words, or undefined. */
+function held(state) {
+  if (PRESSED[state.emergency_stop]) return PRESSED[state.emergency_stop];
+  const caused = (code) => state.causes.some((cause) => cause.code === code);
+  if (caused("bumper") && state.bumpers?.some(Boolean)) return "Bumper pressed: free the robot first.";
+  return caused("battery_empty") && state.battery?.level === "stop" ? "Battery empty: charge it first." : undefined;
+}
 
 /** Return whether the link to the board is up. While it is down, nobody can stop the motors from here. */
 export function boarded(state) {
@@ -40,14 +52,15 @@ export function boarded(state) {
  *  source with a lower priority than `source`, but not from another sender with the same source. */
 export function still(state, source, sender) {
   if (!state) return "Nothing is received from the robot.";
-  if (state.mode === "stopped" && PRESSED[state.emergency_stop]) return PRESSED[state.emergency_stop];
-  if (BARS[state.mode]) return BARS[state.mode] + (boarded(state) ? "" : " The board is missing, too.");
-  if (!boarded(state)) return "No board: nothing can drive.";
-  const ours = state.sources.find((one) => one.name === source);
+  if (!boarded(state) && !NEVER.includes(state.mode)) return "No board: nothing can drive.";
+  const bar = (state.mode === "stopped" && held(state)) || BARS[state.mode];
+  if (bar) return boarded(state) ? bar : `${bar} The board is missing, too.`;
+  const ours = ranked(state, source);
   if (!ours) return `This robot takes no commands from a page: ${source} is not one of its sources.`;
   const driver = driving(state, source, sender);
-  if (state.source === source) return driver && `${driver} drives: you can drive when they stop.`;
-  const above = driver && state.sources.find((one) => one.name === state.source)?.priority >= ours.priority;
+  if (!driver) return "";
+  if (state.source === source) return `${driver} drives: you can drive when they stop.`;
+  const above = ranked(state, state.source)?.priority >= ours.priority;
   return above ? `${driver} drives and has priority: you can drive when it stops.` : "";
 }
 
@@ -58,16 +71,16 @@ export function driving(state, source, sender) {
   return state.sender ? `${person(state.sender, sender)} (${state.source})` : state.source;
 }
 
-/** Return why the robot does not follow `sender`, in words, or "" if it does. */
-export function objection(state, source, sender) {
-  if (!state) return "nothing is received from the robot";
-  const ours = state.sources.find((one) => one.name === source);
-  if (NEVER.includes(state.mode) || state.mode === "waiting") return state.reason;
-  if (!ours) return `${source} is not one of the robot's sources`;
-  if (state.source !== source) return ours.wait === "command" ? "the robot has not received a command yet" : ours.waits_for || state.reason || "the robot does not follow this source";
-  if (state.mode !== "driving") return state.reason;
-  if (state.sender && state.sender !== sender) return `${person(state.sender, sender)} drives`;
-  return "";
+/** Return why the robot does not follow the pushed stick of `sender`, in words, or "" if it does. */
+function objection(state, source, sender) {
+  const bar = still(state, source, sender);
+  if (bar || (state.mode === "driving" && state.source === source)) return bar;
+  const { wait, waits_for } = ranked(state, source);
+  return wait === "command" ? "The robot has not received a command yet." : waits_for || state.reason;
+}
+
+function ranked(state, source) {
+  return state.sources.find((one) => one.name === source);
 }
 
 export class Commander {
@@ -110,7 +123,7 @@ export class Commander {
    *  `heard` is the time at which `state` was true. */
   look(now, state, heard, source, sender) {
     if (!this.held) return {};
-    if (now - this.#looked > FROZEN) return { send: this.release(), ended: "this page was suspended: press again" };
+    if (now - this.#looked > FROZEN) return { send: this.release(), ended: "This page was suspended: press again." };
     if (now - this.#looked > HICCUP) this.#open(now);
     this.#looked = now;
     const why = objection(state, source, sender);
@@ -120,10 +133,9 @@ export class Commander {
       this.#fine = now;
       this.phase = "driving";
     }
-    const patience = this.phase === "opening" ? PATIENCE : GRACE;
-    const since = this.phase === "opening" ? this.#begun : this.#fine;
-    if (now - since > patience) return { send: this.release(), ended: why };
     const opening = this.phase === "opening";
+    const [since, patience] = opening ? [this.#begun, PATIENCE] : [this.#fine, GRACE];
+    if (now - since > patience) return { send: this.release(), ended: why };
     if (now - this.#sent < (opening ? OPENING : PERIOD)) return {};
     this.#sent = now;
     return { send: opening ? ZERO : this.#wish };

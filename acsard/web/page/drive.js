@@ -1,7 +1,6 @@
 // Connects stick, keys and gamepad to one commander. The robot stops when the operator's finger or view leaves the
 // control.
 
-import { awake } from "./awake.js";
 import { Commander, twist, ZERO } from "./commander.js";
 
 export const SOURCE = "teleop"; // the command source for persons; programs use "app", which has a lower priority
@@ -13,7 +12,7 @@ const KEYS = {
 };
 const SHOULDERS = [4, 5, 6, 7];
 const STRANGE =
-  "this gamepad does not drive, because the browser does not know its axes. Try the gamepad's mode switch (X, XInput) or another browser";
+  "This gamepad does not drive, because the browser does not know its axes. Try the gamepad's mode switch (X, XInput) or another browser.";
 
 export class Drive {
   #commander = new Commander();
@@ -28,6 +27,7 @@ export class Drive {
   #padFree = null; // index of the gamepad whose shoulder buttons were up at the last look, or null
   #padDrives = null; // index of the gamepad that drives
   #padStrange = false; // the hint about an unknown gamepad was shown
+  #awake = null; // the lock that keeps the screen on, as a promise; a locked screen hides the page, which releases
   state = null;
   heard = -Infinity; // time at which `state` was true, by performance.now()
   sender = "";
@@ -49,20 +49,18 @@ export class Drive {
     return this.#commander.held;
   }
 
-  /** Whether a gamepad is connected that does not drive. */
-  get strange() {
-    return this.#padStrange;
-  }
-
   /** Release the active input and send a zero command; `why` is shown to the operator. */
   release(why = "") {
+    const zero = this.#commander.release();
+    if (zero) this.#send(zero);
+    this.#rest();
+    if (zero) this.#end(why);
+  }
+
+  #rest() {
     this.#by = this.#pointer = null;
     this.#pressed.clear();
     this.#show(0, 0);
-    const zero = this.#commander.release();
-    if (!zero) return;
-    this.#send(zero);
-    this.#end(why);
   }
 
   #press(by) {
@@ -72,7 +70,8 @@ export class Drive {
     this.#told("");
     this.#commander.press(performance.now());
     this.stick.classList.add("held");
-    awake(true);
+    // Without HTTPS or with a low battery the browser refuses, and the screen locks as usual.
+    this.#awake = navigator.wakeLock?.request("screen").catch(() => null);
     this.#timer = setInterval(() => this.#look(), LOOK);
     this.#look();
   }
@@ -85,15 +84,12 @@ export class Drive {
     const { send, ended } = this.#commander.look(performance.now(), this.state, this.heard, SOURCE, this.sender);
     if (send) this.#send(send);
     if (ended === undefined) return;
-    this.#by = this.#pointer = null;
-    this.#pressed.clear();
-    this.#show(0, 0);
+    this.#rest();
     this.#end(ended);
   }
 
   #end(why) {
     clearInterval(this.#timer);
-    this.#timer = null;
     // A daemon that reads late drops a command that closely follows another one, so the zero is sent twice.
     // Then this page is silent, because a sender that repeats zeros keeps other senders from driving. A
     // hidden or stalled page runs its timers late. By then another person may drive, so the second zero is
@@ -102,7 +98,7 @@ export class Drive {
     const last = performance.now() + 3 * TWICE;
     this.#again = setTimeout(() => !document.hidden && performance.now() < last && this.#send(ZERO), TWICE);
     this.stick.classList.remove("held", "follows");
-    awake(false);
+    this.#awake?.then((lock) => lock?.release());
     this.#told(why);
   }
 
@@ -130,32 +126,32 @@ export class Drive {
     addEventListener("keydown", (event) => this.#key(event, true));
     addEventListener("keyup", (event) => this.#key(event, false));
     addEventListener("focusin", (event) => this.#by === "keys" && busy(event) && this.release());
-    addEventListener("blur", () => this.release("released: the window lost the focus"));
+    addEventListener("blur", () => this.release("Released: the window lost the focus"));
     // The browser waits for this handler before it navigates. The next event, pagehide, may come late on a
     // busy machine.
-    addEventListener("beforeunload", () => this.release("released: you left the page"));
+    addEventListener("beforeunload", () => this.release("Released: you left the page"));
     addEventListener("pagehide", () => this.release());
     document.addEventListener("freeze", () => this.release());
-    document.addEventListener("visibilitychange", () => document.hidden && this.release("released: the page was hidden"));
-    addEventListener("contextmenu", () => this.#by === "keys" && this.release("released: a menu is open"), true);
+    document.addEventListener("visibilitychange", () => document.hidden && this.release("Released: the page was hidden"));
+    addEventListener("contextmenu", () => this.#by === "keys" && this.release("Released: a menu is open"), true);
     // While something is dragged, no browser reports the release of a key.
-    addEventListener("dragstart", () => this.#by === "keys" && this.release("released: something is dragged"), true);
+    addEventListener("dragstart", () => this.#by === "keys" && this.release("Released: something is dragged"), true);
     addEventListener("gamepaddisconnected", () => {
       this.#padFree = null; // the gamepad may come back before the next look, with a button held
-      if (this.#by === "pad") this.release("released: the gamepad is disconnected");
+      if (this.#by === "pad") this.release("Released: the gamepad is disconnected");
     });
     setInterval(() => this.#pad(), 50);
   }
 
   /** A second finger on anything but STOP releases the stick. */
   #second(event) {
-    if (this.#pointer !== null && !event.target.closest?.("#stick, #stop")) this.release("released: use one finger to drive");
+    if (this.#pointer !== null && !event.target.closest?.("#stick, #stop")) this.release("Released: use one finger to drive");
   }
 
   #down(event) {
     if (event.button !== 0) return;
     event.preventDefault();
-    if (this.#pointer !== null) return this.release("released: use one finger to drive");
+    if (this.#pointer !== null) return this.release("Released: use one finger to drive");
     if (this.#by) return;
     this.#pointer = event.pointerId;
     this.stick.setPointerCapture(event.pointerId);
@@ -167,7 +163,7 @@ export class Drive {
   /** A mouse reports a change of a second button by a move event, so check the buttons on each move. */
   #moved(event) {
     if (event.buttons === 1) this.#move(event);
-    else this.release("released: another button is down");
+    else this.release("Released: another button is down");
   }
 
   #move(event) {
@@ -179,7 +175,7 @@ export class Drive {
   #key(event, down) {
     // With a modifier key down, some systems do not report the release of another key.
     if (down && this.#by === "keys" && (event.metaKey || event.ctrlKey || event.altKey))
-      return this.release("released: another key is down");
+      return this.release("Released: another key is down");
     if (!(event.code in KEYS)) return;
     // Handle a key release no matter where the focus is and which other keys are down.
     if (!down && !this.#pressed.delete(event.code)) return;
@@ -202,7 +198,6 @@ export class Drive {
     const pad = pads.find((one) => one.mapping === "standard");
     const strange = !pad && pads.length > 0;
     if (strange && !this.#padStrange && this.allowed) this.#told(STRANGE);
-    if (!strange && this.#padStrange) this.#told("");
     this.#padStrange = strange && this.allowed;
     const held = pad ? SHOULDERS.some((n) => pad.buttons[n]?.pressed) : false;
     if (this.#by === "pad") {

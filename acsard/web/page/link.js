@@ -5,7 +5,7 @@ const AGAIN = [300, 600, 1200, 2500, 5000];
 const BEAT = 1000; // ms between two pings
 const SILENT = 3000; // ms without any message after which the connection is cut, whatever the socket reports
 
-export class Link extends EventTarget {
+export class Link {
   #socket = null;
   #tries = 0;
   #wanted = new Map();
@@ -14,15 +14,18 @@ export class Link extends EventTarget {
   #heard = 0;
   #asked = null; // send time of the ping that has no answer yet
   #refused;
+  #takers;
   #shut = false; // closed for good
   open = false;
   way = null; // round trip, ms
   beat = null; // the newest beat of the daemon on this connection; each command echoes it
 
-  /** `refused()` is called when the robot rejects a connection. It resolves to true if another attempt is pointless. */
-  constructor(refused) {
-    super();
+  /** `refused()` is called when the robot rejects a connection. It resolves to true if another attempt is pointless.
+   *  `takers` maps a key, or another kind of message, to the function that takes it; `up()` and `down(reason)` report
+   *  the connection. */
+  constructor(refused, takers) {
     this.#refused = refused;
+    this.#takers = takers;
   }
 
   start() {
@@ -89,7 +92,7 @@ export class Link extends EventTarget {
       this.#heard = performance.now();
       this.#asked = null;
       for (const asked of this.#wanted.values()) this.send(asked);
-      this.#tell("up", {});
+      this.#takers.up();
       this.#ping();
     };
     socket.onmessage = (event) => this.#take(JSON.parse(event.data));
@@ -112,8 +115,8 @@ export class Link extends EventTarget {
       this.#asked = null;
     } else if ("answer" in message) this.#answer(message);
     else if (message.key === "beat") this.beat = message.value;
-    else if ("key" in message) this.#tell(`key:${message.key}`, message);
-    else for (const kind of ["hello", "path", "minute", "refused", "gone"]) if (kind in message) this.#tell(kind, message);
+    else if ("key" in message) this.#takers[message.key]?.(message);
+    else for (const kind of ["hello", "path", "minute", "refused", "gone"]) if (kind in message) this.#takers[kind](message);
   }
 
   #answer(message) {
@@ -151,10 +154,6 @@ export class Link extends EventTarget {
     this.open = false;
     this.way = null;
     for (const id of [...this.#answers.keys()]) this.#unanswered(id, "the connection was lost before an answer came");
-    this.#tell("down", { reason });
-  }
-
-  #tell(kind, detail) {
-    this.dispatchEvent(new CustomEvent(kind, { detail }));
+    this.#takers.down(reason);
   }
 }

@@ -1,9 +1,9 @@
 // The page: one link, one drive control, and the views.
 
-import { barred, hint, invited, permit, refusal } from "./access.js";
+import { barred, invited, permit, refusal, request } from "./access.js";
 import { Camera } from "./camera.js";
 import { Drive, SOURCE } from "./drive.js";
-import { boarded, driving, objection, still } from "./commander.js";
+import { boarded, driving, still } from "./commander.js";
 import { Link } from "./link.js";
 import { PathMap } from "./map.js";
 import { Minute } from "./plots.js";
@@ -15,13 +15,11 @@ import { RELEASE, figure, person, spot, yaw } from "./words.js";
 const $ = (id) => document.getElementById(id);
 const { stopping } = window; // of stop.js, which has run before
 if (!stopping) {
-  $("alarm").hidden = false;
   views.text("alarm", "STOP does not work here, because a part of this page did not run. Reload the page.");
   throw new Error("stop.js did not run, and a page without STOP does not drive");
 }
 const VIEWS = ["drive", "status", "events", "set"];
-const READ = 8000; // time that a person needs to read a message, ms
-const LATCHED = ["stopped", "fault"];
+const READ = 8000; // time after which a message disappears, ms
 const KINDS = { stopped: "stop", fault: "fault", inactive: "inactive" }; // of the causes, by the mode
 const ON = { activate: "the robot is already on" };
 /** Maps a mode to the button that would change nothing in it, with the reason. */
@@ -29,12 +27,34 @@ const NEEDLESS = { waiting: ON, driving: ON, ready: ON, inactive: { deactivate: 
 /** Time, ms, for which the release button must show the same text before a press of it counts. A double click may take
  *  900 ms, and a held Enter key may click again after 1000 ms. */
 const SETTLED = 1000;
-const HASTY = "this button has just appeared or changed, or was pressed twice: read it, wait a second, then press it once";
-const DATED = "nothing is received from the robot, so this press did nothing: press again when this button is not gray";
-const UNSHOWN = "nothing is received from the robot, so this page does not know what it would release";
+const HASTY = "This button has just appeared or changed, or was pressed twice: read it, wait a second, then press it once.";
+const ABSENT = "Nothing is received from the robot, so nothing can be changed now.";
 const SOON = 300; // ms within which a STOP is answered over the WebSocket, unless the connection is dead but still open
 
-const link = new Link(refused);
+const complain = notice((words) => {
+  views.text("complaint", ""); // a screen reader announces a repeated message only if the text changes
+  views.text("complaint", words);
+});
+const told = notice((words) => {
+  note = words;
+  readied();
+});
+const link = new Link(refused, {
+  hello: greeted,
+  state: stated,
+  odom: ({ value: { pose } }) => map.pose(pose.pose.position.x, pose.pose.position.y, yaw(pose.pose.orientation)),
+  "sim/pose": ({ value: { pose } }) => map.truth(pose.position.x, pose.position.y),
+  cmd_vel_out: commanded,
+  wheel_states: ({ value, age }) => plots.wheels.add(performance.now() - age, ...value.velocity),
+  diagnostics: ({ value }) => views.parts($("parts"), value),
+  events: ({ value }) => views.happened($("happened"), value),
+  path: ({ path }) => map.trail(path),
+  minute: ({ minute }) => plots.begin(performance.now(), minute),
+  refused: ({ reason }) => told(reason),
+  gone: ({ gone }) => (silent = gone),
+  up: connected,
+  down: disconnected,
+});
 const map = new PathMap($("map"));
 const drive = new Drive(link, $("stick"), $("knob"), told);
 const camera = new Camera($("camera"));
@@ -51,8 +71,8 @@ let seen = false; // a state was received at some time
 let silent = ""; // why the robot is silent, as reported by the page's server
 let uninvited = ""; // why the invitation was rejected
 let degrees = false; // turn rates are shown in degrees per second
-let note = { why: "", at: 0 }; // the message at the stick and its time, by performance.now()
-let complaint = { why: "", at: 0 }; // the message about a button and its time, by performance.now()
+let note = ""; // the message at the stick
+let absent = true; // nothing has been received from the robot for a while
 let offer = ""; // the mode and the numbers of the causes that the release button ends, "" while it is hidden
 let settling = 0; // time at which `offer` changed or the release button was last clicked, by performance.now()
 let down = null; // time at which a finger came down on the release button
@@ -75,7 +95,7 @@ function open(name) {
   else link.unsubscribe("diagnostics");
   if (view === "events") listed();
   if (view === "set") {
-    said({ ok: true, text: "" }); // the note of an earlier button is outdated
+    views.text("set-told", ""); // the note of an earlier button is outdated
     configured();
   }
   map.redraw();
@@ -85,68 +105,47 @@ async function asked(verb, payload) {
   return answered(await link.call(verb, payload));
 }
 
-/** Show the answer to a button, and return it. */
+/** Show the answer to a button, and return it: a failure in every view. */
 function answered(told) {
   complain(told.ok ? "" : told.text);
-  said(told.ok ? told : { ok: true, text: "" });
+  views.text("set-told", told.ok ? told.text : "");
   return told;
 }
 
-/** Show in every view why a button failed, until `why` is "". */
-function complain(why) {
-  complaint = { why, at: performance.now() };
-  views.complain(why);
+/** Return a function that shows a message by `show` until the person has had time to read it. */
+function notice(show) {
+  let timer;
+  return (words) => {
+    clearTimeout(timer);
+    show(words);
+    if (words) timer = setTimeout(show, READ, "");
+  };
 }
 
-/** Return the numbers of the causes that hold the robot in `mode` and that this page shows. */
+/** Return the numbers of the shown causes that hold the robot in `mode`. */
 function shown(mode) {
   return state.causes.filter(({ kind }) => kind === KINDS[mode]).map(({ number }) => number);
 }
 
-/** Call the service `verb` to release what holds the robot in `mode`. Without a state, the page shows no cause, and the
- *  call could release one that nobody has seen. */
 function released(verb, mode) {
-  if (state) return asked(verb, { numbers: shown(mode) });
-  return answered({ ok: false, text: UNSHOWN });
+  return asked(verb, { numbers: shown(mode) });
 }
 
 async function set(payload) {
-  said(await link.call("set", payload));
+  await asked("set", payload);
   configured();
 }
 
-/** Show the message `why` at the stick. A reason that the banner shows already is not repeated. */
-function told(why) {
-  note = { why, at: performance.now(), objects: Boolean(why) && why === objection(state, SOURCE, hello?.sender) };
-  views.text("told", why && why === state?.reason ? "not driving: the reason is shown above" : why);
-}
-
-function said(told) {
-  $("set-told").classList.toggle("error", !told.ok);
-  views.text("set-told", told.text);
-}
-
-async function got(path) {
-  try {
-    const answer = await fetch(path, { signal: expiring(5000) });
-    const told = await answer.json();
-    return answer.ok ? told : { error: told.error ?? `${answer.status}` };
-  } catch {
-    return { error: "no answer from the robot" };
-  }
-}
-
 async function listed() {
-  const files = await got("api/recordings");
-  recordings.show(files.error ? [] : files, barred(hello, "recordings"), files.error);
+  const { error, body } = await request("api/recordings");
+  recordings.show(error ? [] : body, barred(hello, "recordings"), error);
 }
 
 async function configured() {
-  const why = barred(hello, "set");
-  if (why) return views.text("set-told", `settings are ${why}`);
-  const rows = await got("api/settings");
-  if (rows.error) return views.text("set-told", rows.error);
-  settings.show(rows);
+  if (barred(hello, "set")) return;
+  const { error, body } = await request("api/settings");
+  if (error) complain(error);
+  else settings.show(body);
 }
 
 function limited() {
@@ -168,58 +167,50 @@ function looked() {
   const old = link.open ? Math.max(performance.now() - heard, link.lag) : Infinity;
   const none = link.open ? "waiting" : tried ? "no connection" : "connecting";
   views.freshness(old, lasts(), link.way, none, seen, Boolean(state) && !boarded(state));
-  if (dated()) views.unheard(silent);
+  if (link.open && (dated() || (silent && !state))) views.unheard(silent);
+  if (old > 2 * lasts()) drive.release("Released: nothing is received from the robot.");
+  offered();
+  camera.look(performance.now());
+  if (view === "status" && !document.hidden) plots.draw(performance.now());
+}
+
+/** Offer what would have an effect now, and say why the rest is gray. */
+function offered() {
+  permitted();
   releasable();
   readied();
-  camera.look(performance.now());
-  if (old > 2 * lasts()) drive.release("released: nothing is received from the robot");
-  if (view !== "status" || document.hidden) return;
-  plots.draw(performance.now());
-  views.text("unknown", plots.lacks(performance.now()));
 }
 
-/** Remove the messages about a button or the stick that belong to the previous mode. */
-function outdated() {
-  complain("");
-  if (note.why && (note.why === state.reason || LATCHED.includes(state.mode))) told("");
-}
-
-/** Remove the message about a button after the time `READ`. If it says that nothing is received, remove it as soon as
- *  the state is fresh. */
-function expired() {
-  if (!complaint.why) return;
-  const untrue = [DATED, UNSHOWN].includes(complaint.why) && !dated();
-  if (untrue || performance.now() - complaint.at > READ) complain("");
-}
-
-/** Remove the message at the stick after the time `READ`. If it says why the robot does not follow this page, remove it
- *  when this reason is gone instead. */
-function forgotten() {
-  if (!note.why || drive.held || drive.strange) return;
-  const why = objection(state, SOURCE, hello?.sender);
-  if (note.objects ? why !== note.why : performance.now() - note.at > READ) told("");
+/** Disable the controls that the robot would refuse to this client or that would change nothing, and all of them while
+ *  nothing is received from the robot. */
+function permitted() {
+  const before = absent;
+  absent = !state || performance.now() - heard > 2 * lasts();
+  permit(hello, absent ? ABSENT : "", NEEDLESS[state?.mode]);
+  if (before && !absent && view === "set") configured();
 }
 
 /** Disable the stick while a push would not move the robot, and show the reason beside it. */
 function readied() {
-  const fresh = link.beat && performance.now() - heard <= 2 * lasts(); // without a beat to echo, no command counts
-  drive.barred = link.open ? still(fresh ? state : null, SOURCE, hello?.sender) : "No connection.";
-  const off = !drive.allowed || Boolean(drive.barred);
-  $("stick").setAttribute("aria-disabled", String(off));
-  const driver = driving(state, SOURCE, hello?.sender);
+  const sender = hello?.sender;
+  const fresh = link.beat && !absent; // without a beat to echo, no command counts
+  drive.barred = link.open ? still(fresh ? state : null, SOURCE, sender) : "No connection.";
+  $("stick").setAttribute("aria-disabled", String(!drive.allowed || Boolean(drive.barred)));
+  const driver = driving(state, SOURCE, sender);
   const over = driver && `${driver} drives. Hold and push to take over. It drives on when you release: STOP ends that.`;
-  views.text("hint", ((drive.allowed || !link.open) && (drive.barred || over)) || hint(hello));
+  const why = drive.barred || over || "Hold and push to drive; release to stop.";
+  views.text("hint", note || (link.open && hello && !drive.allowed ? "You may watch and stop, but not drive." : why));
 }
 
-/** Show the button that ends the mode. While no new state confirms the mode, the button stays in place and does
- *  nothing. If the button disappeared, STOP would grow into its place under a finger. */
+/** Show the button that ends the mode. While no new state confirms the mode, the button stays in place, disabled. If
+ *  it disappeared, STOP would grow into its place under a finger. */
 function releasable() {
   const offers = state && state.mode in RELEASE;
   $("clear").hidden = !offers;
   const before = offer;
   offer = offers ? `${state.mode} ${shown(state.mode)}` : "";
   if (offer !== before) settling = performance.now();
-  $("clear").setAttribute("aria-disabled", String(dated()));
+  if (dated()) $("clear").disabled = true;
 }
 
 /** Release the mode that the button named when the person's finger touched the button. The text of the button changes
@@ -229,36 +220,32 @@ async function pressed(event) {
   // A click by a key has no pointerdown. If a finger slides off the button, its pointerdown stays in `down`.
   const since = ((event.detail && down) || event.timeStamp) - settling;
   down = null;
-  if (dated()) return answered({ ok: false, text: DATED });
+  if (!state || dated()) return;
   settling = performance.now();
   if (since < SETTLED) return answered({ ok: false, text: HASTY });
-  const ended = state?.mode;
+  const ended = state.mode;
   const press = stopping.over();
   const told = await released(ended === "inactive" ? "activate" : "clear", ended);
   if (ended === "stopped" && told.ok) stopping.released(press);
 }
 
-function stated({ detail }) {
+function stated({ value, age }) {
   // A state from long before this page opened says nothing about the present.
-  if (!state && detail.age > 2 * lasts()) return;
-  const other = state?.mode !== detail.value.mode;
-  if (state && other) outdated();
+  if (!state && age > 2 * lasts()) return;
+  if (state && state.mode !== value.mode) complain("");
+  if (state?.mode !== value.mode && value.mode in RELEASE) told("");
   seen = true;
-  state = drive.state = detail.value;
-  if (other) permitted();
-  heard = drive.heard = performance.now() - detail.age;
+  state = drive.state = value;
+  heard = drive.heard = performance.now() - age;
   silent = "";
   views.banner(state, Boolean(hello?.barred.clear), hello?.sender);
-  releasable();
-  readied();
+  offered();
   map.lose(!boarded(state));
   const who = state.sender ? person(state.sender, hello?.sender) : state.source;
-  views.text("who", !state.source || state.mode !== "driving" ? "nobody" : state.source === SOURCE ? who : `${who} (${state.source})`);
+  views.text("who", state.mode !== "driving" || !state.source ? "nobody" : state.source === SOURCE ? who : `${who} (${state.source})`);
   views.text("where", spot(state.x, state.y, state.yaw));
   const { linear, angular } = state; // null without feedback from the board
   dialled();
-  expired();
-  forgotten();
   const late = state.latencies.period_lateness?.last_minute;
   plots.late.add(heard, late ? late.p99 / 1000 : null, late ? late.max / 1000 : null);
   plots.volts.add(heard, state.battery?.volts);
@@ -286,8 +273,8 @@ function converted() {
   if (state) dialled();
 }
 
-function greeted({ detail }) {
-  hello = detail.hello;
+function greeted(message) {
+  hello = message.hello;
   $("robot").textContent = hello.robot;
   // A viewer may do nothing in the settings.
   $("tab-set").hidden = !settable();
@@ -299,18 +286,12 @@ function greeted({ detail }) {
   drive.limits = hello.limits;
   drive.allowed = !barred(hello, "drive");
   if (drive.allowed) link.subscribe("beat", 20);
-  permitted();
   $("limit").max = String(hello.limits.linear);
   limited();
-  readied();
-  if (uninvited) views.text("told", uninvited); // an earlier token still gave access
+  offered();
+  if (uninvited) told(uninvited); // an earlier token still gave access
   uninvited = "";
   if (hello.simulated) link.subscribe("sim/pose", 5);
-}
-
-/** Disable the controls that the robot would refuse to this client or that would change nothing. */
-function permitted() {
-  permit(hello, NEEDLESS[state?.mode]);
 }
 
 /** Show why the robot rejects the connection. Returns true if another attempt is pointless. */
@@ -333,46 +314,28 @@ async function hedged(called, post) {
   return Promise.any([answered(called), answered(posted)]).catch(() => posted);
 }
 
-link.addEventListener("hello", greeted);
-link.addEventListener("key:state", stated);
-link.addEventListener("key:odom", ({ detail: { value } }) => {
-  const { position, orientation } = value.pose.pose;
-  map.pose(position.x, position.y, yaw(orientation));
-});
-link.addEventListener("key:sim/pose", ({ detail: { value } }) => map.truth(value.pose.position.x, value.pose.position.y));
-link.addEventListener("key:cmd_vel_out", ({ detail: { value, age } }) => {
-  wished = { linear: value.twist.linear.x, angular: value.twist.angular.z };
+function commanded({ value: { twist }, age }) {
+  wished = { linear: twist.linear.x, angular: twist.angular.z };
   plots.speed.add(performance.now() - age, null, wished.linear);
   plots.turn.add(performance.now() - age, null, wished.angular);
-});
-link.addEventListener("key:wheel_states", ({ detail: { value, age } }) => plots.wheels.add(performance.now() - age, ...value.velocity));
-link.addEventListener("key:diagnostics", ({ detail }) => views.parts($("parts"), detail.value));
-link.addEventListener("key:events", ({ detail }) => views.happened($("happened"), detail.value));
-link.addEventListener("path", ({ detail }) => map.trail(detail.path));
-link.addEventListener("minute", ({ detail }) => plots.begin(performance.now(), detail.minute));
-link.addEventListener("refused", ({ detail }) => {
-  told((detail.refused === "cmd" && objection(state, SOURCE, hello?.sender)) || detail.reason);
-});
-link.addEventListener("gone", ({ detail }) => {
-  silent = detail.gone;
-  views.text("reason", silent);
-});
-link.addEventListener("up", () => {
+}
+
+function connected() {
   tried = camera.connected = true;
   complain("");
   views.waiting();
-});
-link.addEventListener("down", ({ detail }) => {
-  drive.release(`released: ${detail.reason || "the connection is lost"}`);
+}
+
+function disconnected(reason) {
+  drive.release(`Released: ${reason || "the connection is lost"}`);
   tried = true;
   camera.connected = false;
   heard = -Infinity;
-  views.lost(detail.reason || (state ? "this page connects again" : "")); // the text shown before is outdated
+  views.lost(reason || (state ? "This page connects again." : "")); // the text shown before is outdated
   state = drive.state = wished = null;
   for (const name of ["speed-command", "turn-command"]) views.text(name, "command –");
-  releasable();
-  readied();
-});
+  offered();
+}
 
 for (const name of VIEWS) $(`tab-${name}`).addEventListener("click", () => open(name));
 document.querySelector("nav").addEventListener("keydown", (event) => {
@@ -384,24 +347,26 @@ document.querySelector("nav").addEventListener("keydown", (event) => {
 });
 // The daemon refuses the release if a stop or a "deactivate" came after the state that this person sees.
 $("clear").addEventListener("pointerdown", (event) => (down = event.timeStamp));
-$("clear").addEventListener("click", pressed);
-$("activate").addEventListener("click", () => released("activate", "inactive"));
-$("deactivate").addEventListener("click", () => asked("deactivate"));
-$("reset").addEventListener("click", () => asked("reset_odometry"));
-$("nearer").addEventListener("click", () => map.zoom(1.4));
-$("farther").addEventListener("click", () => map.zoom(1 / 1.4));
-$("recentre").addEventListener("click", () => map.recentre());
-$("turns").addEventListener("click", () => $("turns").setAttribute("aria-pressed", String(map.turn())));
-$("erase").addEventListener("click", () => map.erase());
+const clicks = {
+  clear: pressed,
+  activate: () => released("activate", "inactive"),
+  deactivate: () => asked("deactivate"),
+  reset: () => asked("reset_odometry"),
+  nearer: () => map.zoom(1.4),
+  farther: () => map.zoom(1 / 1.4),
+  recentre: () => map.recentre(),
+  turns: () => $("turns").setAttribute("aria-pressed", String(map.turn())),
+  erase: () => map.erase(),
+  unit: converted,
+  again: () => location.reload(),
+};
+for (const [id, does] of Object.entries(clicks)) $(id).addEventListener("click", does);
 $("limit").addEventListener("input", limited);
-$("unit").addEventListener("click", converted);
 // After a mouse or a finger has set the slider, the arrow keys drive again. If the user reached the slider by Tab, the
 // arrow keys keep moving the slider.
 for (const name of ["pointerup", "click", "change"])
   $("limit").addEventListener(name, ({ target }) => target.matches(":focus-visible") || target.blur());
-$("again").addEventListener("click", () => location.reload());
 
-permit();
 limited();
 $("tab-set").hidden = !settable();
 open("drive");
@@ -412,8 +377,8 @@ setInterval(looked, 100);
 setInterval(() => view === "events" && !document.hidden && listed(), 5000);
 const post = stopping.send;
 stopping.send = () => (link.open ? hedged(link.call("stop"), post) : post());
-stopping.after = (told) => {
-  if (state?.mode === "fault") answered({ ok: false, text: "STOP is latched, too: when Release fault has ended the fault, the mode is STOPPED" });
+stopping.after = () => {
+  if (state?.mode === "fault") complain("STOP is latched, too: when Release fault has ended the fault, the mode is STOPPED.");
 };
 stopping.before = () => {
   complain("");

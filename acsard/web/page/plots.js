@@ -1,6 +1,6 @@
 // The plots of the last minute: lines over time, the scale at the left, the present at the right, and below each plot
-// a legend with the present values. The plots begin with the data that the page's server has kept, and the page says
-// which part is missing.
+// a legend with the present values. The plots begin with the data that the page's server has kept, and shade the time
+// before it.
 
 import { colours, sized } from "./map.js";
 import { made } from "./views.js";
@@ -19,9 +19,6 @@ const VOLTS = [{ name: "voltage", colour: "--accent" }];
 const LATE = [{ name: "99 %", colour: "--accent" }, { name: "maximum", colour: "--bad" }];
 
 export class Minute {
-  #before = performance.now(); // nothing is known from before this time
-  #wished = -Infinity; // the wished speeds have gaps before this time
-
   constructor() {
     const plot = (name, ...rest) => new Plot(document.getElementById(`plot-${name}`), ...rest);
     this.speed = plot("speed", COMPARED, { low: -0.1, high: 0.3 });
@@ -39,27 +36,10 @@ export class Minute {
     this.wheels.begin(times, ...kept.wheels);
     this.late.begin(times, kept.late_p99, kept.late_max);
     this.volts.begin(times, kept.volts);
-    const first = times[0] ?? now;
-    this.#before = Math.min(this.#before, first < now - SPAN + GAP ? -Infinity : first);
-    let known = first;
-    times.forEach((at, row) => {
-      if (kept.wished_linear[row] !== null) known = at;
-      else if (at - known > GAP) this.#wished = at;
-    });
   }
 
   draw(now) {
     for (const plot of [this.speed, this.turn, this.wheels, this.late, this.volts]) plot.draw(now);
-  }
-
-  /** Return which part of the last minute is missing, in words, or "". */
-  lacks(now) {
-    const recent = now - SPAN + GAP;
-    const clock = (at) => new Date(Date.now() - now + at).toLocaleTimeString();
-    const said = [];
-    if (this.#before > recent) said.push(`There is no data from before ${clock(this.#before)}.`);
-    if (this.#wished > recent) said.push(`Commanded speeds from before ${clock(this.#wished)} are known only for times at which this page was open in a browser.`);
-    return said.join(" ");
   }
 }
 
@@ -127,7 +107,7 @@ class Plot {
     const first = Math.min(now, ...this.#lines.flatMap((line) => line.points.slice(0, 1).map((point) => point[0])));
     paper.fillStyle = look("--ground"); // shade the time before the first value
     if (first > now - SPAN) paper.fillRect(ROOM, 8, x(first) - ROOM, height - 18);
-    paper.font = "11px system-ui, sans-serif";
+    paper.font = "12px system-ui, sans-serif";
     paper.fillStyle = look("--quiet");
     paper.strokeStyle = look("--line");
     paper.lineWidth = 1;

@@ -1,45 +1,45 @@
-// The settings that can be changed while the robot runs: one row each, with its range.
+// The settings that can be changed while the robot runs: one row each, with its unit and its range.
 
 import { made } from "./views.js";
 import { number } from "./words.js";
 
 export class Settings {
-  #form;
+  #place;
   #call;
 
   /** `call(payload)` changes a setting and shows the outcome. */
-  constructor(form, call) {
-    this.#form = form;
+  constructor(place, call) {
+    this.#place = place;
     this.#call = call;
-    form.addEventListener("submit", (event) => event.preventDefault());
   }
 
-  /** Show rows of {key, value, what, when, low, high, choices}. */
+  /** Show rows of {key, value, what, when, unit, keep, low, high, choices}. */
   show(rows) {
-    if (this.#form.contains(document.activeElement) && document.activeElement.tagName === "INPUT") return;
-    this.#form.replaceChildren(...rows.map((row, n) => this.#row(row, `set-${n}`)));
+    if (this.#place.contains(document.activeElement) && document.activeElement.tagName === "INPUT") return;
+    this.#place.replaceChildren(...rows.map((row, n) => this.#row(row, `set-${n}`)));
   }
 
-  #row(row, id) {
-    const range = row.low === undefined ? "" : ` (${row.low} to ${row.high})`;
+  #row({ key, value, what, when, unit = "", keep = true, low, high, choices }, id) {
+    unit = unit.replace("2", "²").replace("3", "³");
+    const range = low === undefined ? "" : `; ${low} to ${high} ${unit}`;
     // Allow a narrow screen to break a key at its dots and underscores.
-    const name = row.key.split(/(?<=[._])/).flatMap((part) => [part, made("wbr")]);
-    const label = made("label", "", ...name, made("small", "", `${row.what}${range}; ${row.when}`));
+    const name = key.split(/(?<=[._])/).flatMap((part) => [part, made("wbr")]);
+    const label = made("label", "", ...name, made("small", "", `${what}${range}; ${when}`));
     label.htmlFor = id;
-    const field = made(row.choices ? "select" : "input", "");
-    for (const one of row.choices ?? []) field.append(new Option(one, one));
+    const field = made(choices ? "select" : "input", "", ...(choices ?? []).map((one) => new Option(one, one)));
     field.id = id;
-    if (!row.choices) field.inputMode = typeof row.value === "number" ? "decimal" : "text";
-    field.value = row.value;
-    const send = (more) => this.#call({ settings: { [row.key]: read(field.value, row.value) }, ...more });
-    const buttons = [["Set", {}], ["Keep", { keep: true }]].map(([name, more]) => {
-      const button = made("button", "", name);
-      button.setAttribute("aria-label", `${name} ${row.key}`);
-      button.addEventListener("click", () => send(more));
-      return button;
-    });
+    if (!choices) field.inputMode = typeof value === "number" ? "decimal" : "text";
+    field.value = value;
+    const send = (more) => this.#call({ settings: { [key]: read(field.value, value) }, ...more });
     field.addEventListener("keydown", (event) => event.key === "Enter" && send({}));
-    return made("div", "", label, field, ...buttons);
+    const button = (name, more) => {
+      const one = made("button", "", name);
+      one.setAttribute("aria-label", `${name} ${key}`);
+      one.addEventListener("click", () => send(more));
+      return one;
+    };
+    const keeper = keep ? button("Keep", { keep: true }) : made("span");
+    return made("div", "", label, field, made("span", "quiet", unit.split(" ")[0]), button("Set", {}), keeper);
   }
 }
 

@@ -28,7 +28,7 @@ class Stopping {
   /** Called with the answer that confirms a stop. */
   after = () => {};
 
-  /** `send()` sends one request and resolves to {ok, text}. Only its answer confirms a stop: a robot that reports that
+  /** `send()` sends one request and resolves to {ok}. Only its answer confirms a stop: a robot that reports that
    *  it is stopped may have been stopped by another person, who will release it. `tell(words)` shows a message to the
    *  operator. */
   constructor(send, tell) {
@@ -50,7 +50,7 @@ class Stopping {
       const told = await this.send();
       if (press !== this.#press) return; // a newer press took over
       if (this.#ends(told) || press === this.#given) return;
-      this.#tell(`STOP is not confirmed. This page sends it again; the robot's own switch stops it too. (${told.text})`);
+      this.#tell("STOP is not confirmed. This page sends it again; the robot's own switch stops it too.");
       await new Promise((done) => setTimeout(done, PAUSE));
       if (press !== this.#press || press === this.#given) return;
       if (Date.now() > last || performance.now() > since + URGENT) return this.over();
@@ -121,10 +121,9 @@ function expiring(ms) {
 async function posted() {
   try {
     const answer = await fetch("api/srv/stop", { method: "POST", keepalive: true, signal: expiring(3000) });
-    const told = await answer.json();
-    return { ok: answer.ok, barred: BARRED.includes(answer.status), text: told.message ?? told.error ?? `${answer.status}` };
+    return { ok: answer.ok, barred: BARRED.includes(answer.status) };
   } catch {
-    return { ok: false, lost: true, text: "no connection to the robot" };
+    return { ok: false, lost: true };
   }
 }
 
@@ -132,9 +131,7 @@ async function posted() {
  *  (`main.js`), so that they do not hide this one. */
 function alarm(words) {
   const place = document.getElementById("alarm");
-  if (!place) return;
-  place.textContent = words;
-  place.hidden = !words;
+  if (place) place.textContent = words;
 }
 
 window.stopping = new Stopping(posted, alarm);

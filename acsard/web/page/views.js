@@ -75,16 +75,15 @@ export function banner(state, locked, own) {
   const words = state.mode.toUpperCase();
   if (alone && state.mode === "waiting") mode("noboard", "NO BOARD");
   else mode(state.mode, alone ? `${words} · NO BOARD` : words);
-  const why = state.mode === "driving" && state.sender ? `Driven by ${person(state.sender, own)}.` : reason(state);
-  const does = RELEASE[state.mode] && (state.mode === "inactive" ? "an operator switches it on" : "an operator releases it");
-  text("reason", locked && does ? `${why} (${does})` : why);
+  const others = state.mode === "inactive" ? "an operator switches it on" : "an operator releases it";
+  text("reason", reason(state, own) + (locked && RELEASE[state.mode] ? `; ${others}` : ""));
   const warned = [
     alone ? "Nobody can stop the motors from here: use the robot's own switch." : "",
     BATTERY[state.battery?.level] ?? "", pressed(state.bumpers),
     state.wheel_fault, state.recording_error, state.latch_file_error,
     ["valid", ""].includes(state.certificate) ? "" : `certificate ${state.certificate_expiry}`,
   ];
-  doubted(warned.filter(Boolean).join("; "));
+  text("doubt", warned.filter(Boolean).join("; "));
   powered(state.battery);
   document.getElementById("estop").hidden = !["pressed", "silent"].includes(state.emergency_stop);
   document.body.classList.toggle("boardless", alone);
@@ -108,20 +107,6 @@ function powered(battery) {
   text("battery", typeof percent === "number" ? `${Math.round(percent)} %` : typeof volts === "number" ? `${signed(volts, 1)} V` : "–");
 }
 
-/** Show a warning in the banner until `words` is "". */
-function doubted(words) {
-  document.getElementById("doubt").hidden = !words;
-  text("doubt", words);
-}
-
-/** Show in every view why a button failed, until `words` is "". A repeated message is set again, because a screen
- *  reader announces it only if the text changes. */
-export function complain(words) {
-  document.getElementById("complaint").hidden = !words;
-  text("complaint", "");
-  text("complaint", words);
-}
-
 /** Show a mode in the banner and in the title, which a background tab shows. Adapt STOP and the release button. */
 function mode(name, words) {
   document.body.dataset.mode = name;
@@ -135,22 +120,22 @@ function mode(name, words) {
 /** Show that the robot's computer answers but has reported nothing about the robot yet. */
 export function waiting() {
   mode("waiting", "WAITING");
-  text("reason", "for the robot: nothing is received from it yet");
-  doubted("");
+  text("reason", "Nothing is received from the robot yet.");
+  text("doubt", "");
 }
 
 /** Show that the data is old and that the robot may or may not be driving. */
 export function unheard(why) {
   mode("lost", "NO DATA");
-  text("reason", why || "nothing is received from the robot; the values below are old");
-  doubted(DOUBTFUL);
+  text("reason", why || "Nothing is received from the robot.");
+  text("doubt", DOUBTFUL);
 }
 
 /** Show that the connection is lost, and blank the values that are no longer known. */
 export function lost(why) {
   mode("lost", "NO CONNECTION");
   if (why) text("reason", why);
-  doubted(DOUBTFUL);
+  text("doubt", DOUBTFUL);
   for (const name of ["speed", "turn", "who"]) text(name, "–");
 }
 

@@ -73,7 +73,11 @@ export function person(sender, own = "") {
   return name || certificate || NAMELESS;
 }
 
-/** Return why the robot moves or does not move. */
-export function reason(state) {
-  return state.code === "no_command" ? "Nobody drives." : state.reason;
+/** Return why the robot moves or does not move, in the words of this page. `own` is the public name of this page. */
+export function reason(state, own) {
+  if (state.mode === "driving" && state.sender) return `Driven by ${person(state.sender, own)}.`;
+  if (state.code === "no_command") return "Nobody drives.";
+  if (!RELEASE[state.mode]) return state.reason;
+  const causes = state.causes.filter(({ kind }) => (kind === "inactive") === (state.mode === "inactive"));
+  return causes.map((one) => `${one.text} · ${clock(one.stamp, new Date())}`).join("; also ") || state.reason;
 }

@@ -136,14 +136,17 @@ def test_each_setting_that_may_change_has_a_row_and_no_other() -> None:
     assert set(ROWS) == (set(LIVE) - {"commands.sources.*.timeout"}) | sources
 
 
-def test_a_row_has_its_value_its_range_and_when_it_may_change() -> None:
+def test_a_row_has_its_value_its_unit_its_range_and_when_it_may_change() -> None:
     row = ROWS["limits.linear_speed"]
+    assert row.unit == "m/s"
     assert row.value == Config().limits.linear_speed
     assert isinstance(row.low, float)
     assert isinstance(row.high, float)
     assert row.low <= row.value <= row.high
     assert row.when == "at any time"
     assert "stands" in ROWS["limits.wheel_speed"].when
+    assert row.keep
+    assert not ROWS["commands.sources.app.timeout"].keep
 
 
 def test_a_setting_with_fixed_choices_lists_them() -> None:
