@@ -1,6 +1,4 @@
-"""Drive the robot with the keyboard of this terminal. The tool uses the full screen, or prints line
-by line if the terminal cannot do that (TERM=dumb).
-"""
+"""Drive the robot with the keyboard of this terminal. The tool uses the full screen."""
 
 from __future__ import annotations
 
@@ -14,6 +12,7 @@ from acsard.core.config.settings import AngularSpeed, LinearSpeed
 from acsard.core.messages.permissions import COMMAND_ROLE, has
 from acsard.host.errors import NoAnswerError, NotPermittedError, UsageError
 from acsard.host.logs import MAX_LAST_OUTPUT_S, output_in_threads
+from acsard.terminal.output import has_screen
 from acsard.top import terminal
 from acsard.top.drive_screen import HELP
 from acsard.top.keyboard import Keyboard, KeyboardDrive
@@ -43,10 +42,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     require_one(args)
-    if not sys.stdin.isatty():
+    if not sys.stdin.isatty() or not has_screen():
         raise UsageError(
-            "acsard drive reads single key presses, so run it in a terminal; a program must use "
-            "acsard.client instead"
+            "acsard drive reads single key presses and uses the full screen, so run it in a "
+            "terminal (with another TERM than dumb); a program must use acsard.client instead"
         )
     with output_in_threads(MAX_LAST_OUTPUT_S), connected(args, args.source) as robot:
         if robot.where.tls and not has((us := robot.whoami()).role, COMMAND_ROLE):

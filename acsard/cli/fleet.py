@@ -12,6 +12,7 @@ left out and long lines are cut; `acsard fleet | cat` prints everything.
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 
 import msgspec
@@ -21,10 +22,9 @@ from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many
 from acsard.core.formatting import json_line
 from acsard.host.errors import Exit, UnreachableError
 from acsard.host.logs import MAX_LAST_OUTPUT_S, output_in_threads
-from acsard.terminal.output import has_screen
+from acsard.terminal.output import UNLIMITED_WIDTH, has_screen, plain
 from acsard.top import terminal
 from acsard.top.fleet_table import Roster, table
-from acsard.top.terminal import output_size
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -55,9 +55,9 @@ def main(args: argparse.Namespace) -> int:
             raise UnreachableError("; ".join(filter(None, (fleet.hint(), silence))))
         if args.json:
             return Exit.OK
-        width = output_size().columns
+        width = shutil.get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED_WIDTH
         # Flush now, so that a session that closes slowly does not hold back the table.
-        print("\n".join(table(rows, width)), flush=True)
+        print(plain(table(rows, width), width=width), flush=True)
     for text in filter(None, (fleet.presence_text, fleet.left_out_text)):
         print(f"acsard: {text}", file=sys.stderr)
     return Exit.OK

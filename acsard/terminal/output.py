@@ -26,7 +26,7 @@ MAX_TEXT_WIDTH = 100
 
 def table(
     rows: Iterable[Sequence[str | Text]],
-    heads: Sequence[str] = (),
+    heads: Sequence[str | Text] = (),
     right: Collection[int] = (),
     gap: int = 2,
 ) -> Table:

@@ -10,7 +10,7 @@ from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState
 from acsard.host import clock
 from acsard.host.errors import MendableError, ReplyError
-from acsard.top.text import ScreenData
+from acsard.top.screen import ScreenData
 
 
 class Feed:

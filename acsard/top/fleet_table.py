@@ -1,10 +1,13 @@
-"""Collects the robots that `acsard fleet` shows, and formats them as a table of any width."""
+"""Collects the robots that `acsard fleet` shows, and formats them as a table."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Sequence
+
+from rich.table import Table
+from rich.text import Text
 
 from acsard.bus.robot_discovery import ALL_ROBOTS, count_text, no_robot_text
 from acsard.client.fleet import Fleet, Row
@@ -13,70 +16,45 @@ from acsard.core.messages.schema import RobotState
 from acsard.core.messages.state_warnings import SAME_AS_REASON, brief, charge, warnings
 from acsard.host.version import order
 
-COLUMN_HEADS = ("ROBOT", "MODE", "M/S", "LINK", "BATTERY", "PLACE", "VERSION", "SEEN", "WHY")
-
-# Maximum widths of all columns except the last, which gets the rest.
-COLUMN_WIDTHS = (32, 8, 6, 7, 7, 22, 33, 6)
-
-# Minimum widths. On a narrow terminal, ROBOT shrinks to its minimum first.
-NAME, WHY = 12, 32
-
-# The table has this column only if any robot reports a battery.
-BATTERY_COLUMN = COLUMN_HEADS.index("BATTERY")
+# On a narrower terminal, a column is left out; BATTERY also if no robot reports one.
+COLUMNS = {
+    "ROBOT": 0, "MODE": 0, "M/S": 60, "LINK": 90, "BATTERY": 70, "PLACE": 100, "VERSION": 120,
+    "SEEN": 50, "WHY": 0,
+}  # fmt: skip
 
 # Listed first, in this order; then robots with a warning.
 URGENT = ("fault", "stopped", "GONE", "SILENT")
 
 
-def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[str]:
-    """Return a header line, and a line for each robot, the urgent ones first.
-
-    If some do not fit into `height` lines, the last line says how many.
-    """
+def table(rows: Sequence[Row], width: int, most: int | None = None) -> Table:
+    """Return a table with a row for each robot, but at most `most`, the urgent ones first."""
     newest = max((order(row.state.version) for row in rows if row.state), default=())
-    cells = [COLUMN_HEADS, *(row_cells(row, newest) for row in sorted(rows, key=_order))]
-    widest = [max(len(row[n]) for row in cells) for n in range(len(COLUMN_HEADS))]
-    rooms = [min(room, most) for room, most in zip(widest, (*COLUMN_WIDTHS, WHY), strict=True)]
-    powered = any(row[BATTERY_COLUMN] for row in cells[1:])
-    columns = [n for n in range(len(COLUMN_HEADS)) if n != BATTERY_COLUMN or powered]
-    # If the terminal is too narrow, these columns are left out one by one, in this order.
-    for column in map(COLUMN_HEADS.index, ("VERSION", "PLACE", "LINK", "BATTERY")):
-        if column in columns and sum(rooms[n] + 2 for n in columns) - 2 > width:
-            columns.remove(column)
-    rest = sum(rooms[n] + 2 for n in columns[1:])
-    rooms[0] = min(rooms[0], max(NAME, width - rest))
-    lines = [
-        "  ".join(
-            [name.ljust(rooms[0])]
-            + [row[n][: rooms[n]].ljust(rooms[n]) for n in columns[1:-1]]
-            + [row[-1]]
-        ).rstrip()
-        for name, row in zip(shortened([row[0] for row in cells], rooms[0]), cells, strict=True)
-    ]
-    cut = [line if len(line) <= width else f"{line[: width - 1]}…" for line in lines]
-    if height is None or len(cut) <= height:
-        return cut
-    return [*cut[: max(1, height - 1)], f"and {len(cut) - height + 1} more"[:width]][:height]
+    powered = any(row.state and row.state.battery for row in rows)
+    shown = [name for name, least in COLUMNS.items() if width >= least]
+    if not powered and "BATTERY" in shown:
+        shown.remove("BATTERY")
+    made = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold cyan")
+    if most is not None and len(rows) > most:
+        made.caption, made.caption_justify = f"and {len(rows) - most} more", "left"
+    for name in shown:
+        folds = name in ("ROBOT", "WHY")
+        made.add_column(name, no_wrap=not folds, overflow="fold", max_width=None if folds else 33)
+    for row in sorted(rows, key=_order)[:most]:
+        cells = dict(zip(COLUMNS, row_cells(row, newest), strict=True))
+        texts = [Text(cells[name]) for name in shown]
+        texts[-1].no_wrap, texts[-1].overflow = True, "ellipsis"  # one line for each robot
+        made.add_row(*texts, style=_style(row))
+    return made
 
 
-def shortened(names: Sequence[str], room: int) -> list[str]:
-    """Return the names in at most `room` characters, with "…" where most of them stay distinct."""
-    if all(len(name) <= room for name in names):
-        return list(names)
-
-    def cut(head: int) -> list[str]:
-        tail = room - 1 - head
-        return [
-            name if len(name) <= room else f"{name[:head]}…{name[len(name) - tail :]}"
-            for name in names
-        ]
-
-    from_the_middle = sorted(range(room), key=lambda head: abs(2 * head - room + 1))
-    return max(map(cut, from_the_middle), key=lambda variant: len(set(variant)))
+def _style(row: Row) -> str:
+    if _urgency(row) in URGENT:
+        return "bold red"
+    return "bold yellow" if row.state is not None and warnings(row.state) else ""
 
 
 def row_cells(row: Row, newest: tuple[int, ...]) -> tuple[str, ...]:
-    """Return the texts of a robot's cells, in the order of `COLUMN_HEADS`.
+    """Return the texts of a robot's cells, in the order of `COLUMNS`.
 
     `newest` is the order of the newest version in the table.
     """
@@ -125,9 +103,12 @@ def _absence(row: Row) -> str:
     return "SILENT" if row.state is not None and row.silent else ""
 
 
+def _urgency(row: Row) -> str:
+    return _absence(row) or ("" if row.state is None else row.state.mode)
+
+
 def _order(row: Row) -> tuple[int, str]:
-    what = _absence(row) or ("" if row.state is None else row.state.mode)
-    if what in URGENT:
+    if (what := _urgency(row)) in URGENT:
         return URGENT.index(what), row.robot_id
     warned = row.state is not None and warnings(row.state)
     return len(URGENT) + (not warned), row.robot_id

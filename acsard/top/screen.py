@@ -1,112 +1,278 @@
-"""Builds one screen of `acsard top` from a robot's state, as lines of colored text.
+"""Builds the screen of `acsard top` from a robot's state, as tables of rich.
 
-This module is pure. It cuts all lines to the width of the terminal, so no message can break the
-layout. If the terminal has too few lines, the screen first leaves out the empty lines, and then
-some command sources.
+This module is pure. rich places the tables beside each other or below each other, as they fit the
+terminal's width; the least important ones come last, where a terminal with few lines cuts them off.
+Text from the bus reaches the terminal only through `clean`, and only inside rich's `Text`, which
+does not interpret markup.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 
-from msgspec.structs import replace
-from rich.console import Group
+from msgspec import Struct
+from rich.cells import cell_len
+from rich.columns import Columns
+from rich.console import Group, RenderableType
+from rich.constrain import Constrain
+from rich.styled import Styled
+from rich.table import Table
 from rich.text import Text
 
-from acsard.core.formatting import lasting, rough
-from acsard.core.messages.schema import RobotState
+from acsard.core.formatting import lasting, printable, rough, signed
+from acsard.core.messages.schema import Info, RobotState, SourceState
+from acsard.core.messages.short_texts import power
 from acsard.core.messages.state_warnings import WARNING, brief, warnings
-from acsard.top import narrow_screen
-from acsard.top import wide_screen as beside
-from acsard.top.text import MODE_STYLES, ScreenData, clean, ends
-from acsard.top.wide_screen import MAX_COLUMNS
+from acsard.core.motion.gyro import STATUS_TEXTS
+from acsard.core.values import NS_PER_S
+from acsard.daemon.latencies import NAMES
+from acsard.terminal.output import table
 
-MAX_SOURCES = 32
+# Styles in the notation of rich.
+MODE_STYLES = {
+    "driving": "bold white on green",
+    "ready": "bold white on blue",
+    "waiting": "bold black on yellow",
+    "shutdown": "bold black on yellow",
+    "inactive": "bold black on white",
+    "stopped": "bold white on red",
+    "fault": "bold white on red",
+}
 
+LINK_STYLES = {"up": "bold green", "booting": "bold yellow"}
 
-def screen(data: ScreenData, width: int, height: int | None = None) -> Group:
-    """Return the screen of `acsard top`, in lines of `width` cells (20 to `MAX_COLUMNS`)."""
-    width = max(20, min(MAX_COLUMNS, width))
-    head = [_header(data, width), *(_no_news(data, width) if data.silent else _mode(data, width))]
-    if data.state is not None:
-        head += _warnings(data.state, width)
-    sections: list[list[Text]] = []
-    if data.state is not None:
-        state = data.state
-        parts = narrow_screen if width < narrow_screen.MIN_WIDE_COLUMNS else beside
-        sections = [
-            parts.motion(state if state.link == "up" else _unmeasured(state), width),
-            parts.link(data, state, width),
-            parts.timing(state, width),
-        ]
-        used = len(head) + sum(map(len, sections)) + 1
-        room = MAX_SOURCES if height is None else max(1, min(MAX_SOURCES, height - used))
-        sections.insert(1, parts.sources(state, room, width))
-    used = len(head) + sum(map(len, sections))
-    airy = height is None or height - used >= len(sections) - 1
-    body = [line for part in sections for line in ([Text(), *part] if airy else part)]
-    body = body[1:] if airy else body  # no empty line between the head and the first section
-    if data.silent:
-        for line in body:
-            line.stylize("dim")
-    lines = [*head, *body][:height]
-    for line in lines:
-        line.no_wrap = True
-        line.truncate(width, overflow="ellipsis")
-    return Group(*lines)
+# Pose and wheels beside each other, link and timing below: a third column would tear the pairs.
+MAX_TABLES_WIDTH = 100
+
+# Of the lines that a hostile message could make.
+MAX_SOURCES, MAX_REASONS = 32, 16
 
 
-def _unmeasured(state: RobotState) -> RobotState:
-    return replace(state, linear=math.nan, angular=math.nan, wheels=[])
+class ScreenData(Struct, frozen=True):
+    """What the screen of `acsard top` shows. Rates compare `state` with the earlier `before`."""
+
+    robot_id: str
+    endpoint: str
+    state: RobotState | None
+    before: RobotState | None = None
+    age: float = 0.0  # since `state` arrived, or since the wait for the first one began
+    info: Info | None = None
+    undecodable: int = 0  # messages since the last readable state
+    hint: str = ""
+    silent: bool = False  # no state has arrived for too long
+    # s between `before` and `state` on this computer; other stamps: an adjusted clock
+    passed: float = 0.0
 
 
-def _header(data: ScreenData, width: int) -> Text:
-    left = Text.assemble((clean(data.robot_id), "bold"), "  ", clean(data.endpoint))
-    if data.info is not None:
-        left.append(f"  acsard {clean(data.info.version)}", "dim")
-    right = Text(f"seen {rough(data.age)} ago" if data.state is not None else "", "dim")
-    if data.hint:
-        right.append(f"   {data.hint}")
-    return ends(left, right, width)
-
-
-def _mode(data: ScreenData, width: int) -> list[Text]:
-    # On a wide screen, always return two lines. Otherwise, the lines below would move when the
-    # reason becomes long.
+def screen(data: ScreenData) -> Group:
     state = data.state
+    if data.silent:
+        head: list[RenderableType] = [_header(data), _silence(data)]
+    elif state is None:
+        words = "waiting for the first state message of the daemon"
+        head = [_header(data), Text(words, "yellow")]
+    else:
+        head = [_header(data), mode_line(state)]
     if state is None:
-        return [Text("waiting for the first state message of the daemon", "yellow")]
-    badge = Text(f" {clean(state.mode).upper()[:12]} ", MODE_STYLES.get(state.mode, "reverse"))
-    words = clean(state.why)
-    first, second = _split(words, width - badge.cell_len - 2)
-    if width < narrow_screen.MIN_WIDE_COLUMNS:
-        return [badge, *narrow_screen.folded(words, width, 2)]
-    gap = " " * (badge.cell_len + 2)
-    return [Text.assemble(badge, "  ", (first, "bold")), Text.assemble(gap, (second, "bold"))]
+        return Group(*head)
+    if problems := warnings(state):
+        words = f"{WARNING}: {problems[0]}" if len(problems) == 1 else brief(problems)
+        head.append(Text(clean(words), "yellow"))
+    parts = [_pose(state), _wheels(state), _link(data, state), _timing(state)]
+    tables = Constrain(Columns(parts, padding=(0, 3)), MAX_TABLES_WIDTH)
+    body = Group(tables, _sources(state), _facts(data, state))
+    return Group(*head, Styled(body, "dim" if data.silent else ""))
 
 
-def _warnings(state: RobotState, width: int) -> list[Text]:
-    problems = warnings(state)
-    words = clean(f"{WARNING}: {problems[0]}" if len(problems) == 1 else brief(problems))
-    wide = width >= narrow_screen.MIN_WIDE_COLUMNS
-    lines = [Text(words)] if wide and words else narrow_screen.folded(words, width, 2)
-    for line in lines:
-        line.stylize("yellow")
-    return lines
+def _header(data: ScreenData) -> Text:
+    head = Text.assemble((clean(data.robot_id), "bold"), "  ", clean(data.endpoint))
+    if data.info is not None:
+        head.append(f"  acsard {clean(data.info.version)}", "dim")
+    if data.state is not None:
+        head.append(f"  seen {rough(data.age)} ago", "dim")
+    return head.append(f"  {data.hint}")
 
 
-def _split(words: str, room: int) -> tuple[str, str]:
-    if len(words) <= room:
-        return words, ""
-    at = words.rfind(" ", 0, room + 1)
-    return (words[:at], words[at + 1 :]) if at > 0 else (words[:room], words[room:])
-
-
-def _no_news(data: ScreenData, width: int) -> list[Text]:
+def _silence(data: ScreenData) -> Text:
     since = lasting(int(min(data.age, 1e9)))
-    words = f"NOTHING RECEIVED FOR {since}: is the daemon running?"
+    words = f" NOTHING RECEIVED FOR {since}: is the daemon running? "
     if data.undecodable:
-        words = f"NOTHING READABLE FOR {since}: is the daemon a different version?"
-    banner = Text(words.center(width), "bold white on red")
-    blank = Text(" " * width, "on red")
-    return [blank, banner, blank.copy()]
+        words = f" NOTHING READABLE FOR {since}: is the daemon a different version? "
+    return Text(words, "bold white on red")
+
+
+def mode_line(state: RobotState) -> Text:
+    """Return the mode in its color, and the reason."""
+    badge = Text(f" {clean(state.mode).upper()[:12]} ", MODE_STYLES.get(state.mode, "reverse"))
+    return Text().append_text(badge).append(f"  {clean(state.why)}", "bold")
+
+
+def _table(
+    heads: Sequence[str | Text], rows: Iterable[Sequence[str | Text]], right: Sequence[int] = ()
+) -> Table:
+    made = table(rows, heads, right)
+    made.header_style = "cyan"
+    return made
+
+
+def _measured(state: RobotState, value: float | None, decimals: int, width: int) -> str:
+    """Return a measurement as text, "-" without a link: no old speed is shown."""
+    return signed(value if state.link == "up" else None, decimals, width)
+
+
+def _pose(state: RobotState) -> Table:
+    forward = _measured(state, state.linear, 3, 7)
+    turn = _measured(state, state.angular, 3, 7)
+    rows = [
+        (f"x   {signed(state.x, 3, 8)} m", f"forward {forward} m/s"),
+        (f"y   {signed(state.y, 3, 8)} m", f"turn    {turn} rad/s"),
+        (f"yaw {signed(math.degrees(state.yaw), 1, 8)}°", ""),
+    ]
+    return _table(("pose", "twist"), rows)
+
+
+def _wheels(state: RobotState) -> Table:
+    right, left, rear_left, rear_right = (*state.wheels[:4], *[math.nan] * 4)[:4]
+    rows = [
+        (axle, *(_measured(state, speed, 2, 7) for speed in speeds))
+        for axle, speeds in (("front", (left, right)), ("rear", (rear_left, rear_right)))
+    ]
+    return _table(("wheels, rad/s", "left", "right"), rows, (1, 2))
+
+
+def _link(data: ScreenData, state: RobotState) -> Table:
+    before = data.before or state
+    # The stamps give the exact time between the two states. If this time differs by more than 0.2 s
+    # (a network's delay) from the time between the arrivals of the states, the robot's clock was
+    # set. In this case, use the time between the arrivals.
+    seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
+    if abs(seconds - data.passed) > 0.2:
+        seconds = data.passed
+
+    def counted(label: str, name: str, rates: bool = False) -> tuple[str, str, Text]:
+        now, then = state.counters.get(name, 0), before.counters.get(name, 0)
+        style = "yellow" if now > then and not rates else ""
+        return label, rate(now, then, seconds) if rates else "", Text(count(now), style)
+
+    rows = [
+        counted("lines in", "lines", True),
+        counted("lines out", "lines_sent", True),
+        counted("commands", "commands", True),
+        counted("missed periods", "missed_periods"),
+        counted("superseded", "lines_superseded"),
+    ]
+    for label, name in (
+        ("bus overrun", "bus_overrun"), ("new senders", "commands_of_new_senders"),
+    ):  # fmt: skip
+        if state.counters.get(name, 0):
+            rows.append(counted(label, name))
+    up = Text.assemble("link ", (clean(state.link), LINK_STYLES.get(state.link, "bold red")))
+    return _table((up, "rate", "total"), rows, (1, 2))
+
+
+def _timing(state: RobotState) -> Table:
+    rows = []
+    for name in NAMES:
+        latency = state.latencies.get(name)
+        figures = latency.last_minute if latency else None
+        if figures is None or figures.count <= 0:
+            rows.append((name, *["-".rjust(6)] * 3))
+            continue
+        values = (figures.p50, figures.p99, figures.max)
+        rows.append((name, *(rough(1e-6 * us, 1e-6).rjust(6) for us in values)))
+    return _table(("last minute", "p50", "p99", "max"), rows, (1, 2, 3))
+
+
+def _sources(state: RobotState) -> Table:
+    rows = [
+        (
+            Text(f"{'▶ ' if _drives(source, state) else '  '}{clean(source.name)}", no_wrap=True),
+            count(source.priority),
+            # After a `clear` no command counts, although some have been seen.
+            "-" if source.age is None else rough(source.age),
+            _waits(source, state),
+        )
+        for source in state.sources[:MAX_SOURCES]
+    ]
+    return _table(("sources", "priority", "seen", "waits for"), rows, (1, 2))
+
+
+def _drives(source: SourceState, state: RobotState) -> bool:
+    return source.name == state.source and state.mode == "driving" and not source.waits_for
+
+
+def _waits(source: SourceState, state: RobotState) -> str:
+    if source.waits_for:
+        return clean(source.waits_for)
+    if _drives(source, state):
+        return "nothing: it drives"
+    return f"nothing, but the robot is {clean(state.mode)}"
+
+
+def _facts(data: ScreenData, state: RobotState) -> Table:
+    """Return a table of the values that are texts: port, gyro, board, rejected inputs."""
+    rows: list[tuple[str, str | Text]] = []
+    if data.info is not None:
+        where = "the built-in SIMULATOR" if data.info.simulated else clean(data.info.port)
+        rows.append(("port", where))
+    if state.gyro != "off":
+        words = {str(does): f"{does}: {text}" for does, text in STATUS_TEXTS.items()}
+        rows.append(("gyro", words.get(state.gyro, clean(state.gyro))))
+    if inputs := _board(state):
+        rows.append(("board", inputs))
+    if state.certificate_expiry:
+        rows.append(("certificate", clean(state.certificate_expiry)))
+    rows += [
+        ("rejected", _rejected(state, data.before or state)),
+        ("last one", clean(state.refused) or "-"),
+    ]
+    return _table(("", ""), rows)
+
+
+def _board(state: RobotState) -> str:
+    parts = [f"emergency stop {clean(state.emergency_stop)}"] if state.emergency_stop else []
+    if state.bumpers is not None:
+        parts.append(f"bumpers {''.join('X' if bumper else '.' for bumper in state.bumpers)}")
+    if state.battery is not None:
+        parts += ["battery", *power(state.battery)]
+    return "  ".join(parts)
+
+
+def _rejected(state: RobotState, before: RobotState) -> Text:
+    """Return the rejected inputs by kind and reason; yellow if more than `before`."""
+    kinds = []
+    for kind, prefix in (("lines", "line_"), ("commands", "command_"), ("gyro", "imu_")):
+        counters = [(n, c) for n, c in state.counters.items() if n.startswith(prefix) and c]
+        counters.sort(key=lambda item: -item[1])
+        parts = [
+            Text(
+                f"{clean(name.removeprefix(prefix)).replace('_', ' ')} {count(number)}",
+                "yellow" if number > before.counters.get(name, 0) else "",
+            )
+            for name, number in counters[:MAX_REASONS]
+        ]
+        if parts:
+            kinds.append(Text(f"{kind} ").append_text(Text(", ").join(parts)))
+    return Text(" · ").join(kinds) if kinds else Text("nothing")
+
+
+def clean(text: str) -> str:
+    """Return at most 256 characters of a text, with visible ones instead of control characters."""
+    return "".join(c if cell_len(c) else "\ufffd" for c in printable(text[:256]))
+
+
+def count(number: int) -> str:
+    """Format an integer with thousands separators, from 10^10 on with an exponent."""
+    if abs(number) < 10**10:
+        return f"{number:,}"
+    return f"{float(max(-(10**300), min(10**300, number))):.1e}"
+
+
+def rate(later: int, earlier: int, seconds: float) -> str:
+    """Return a counter's increase per second in at least 7 characters; "-/s" if not plausible."""
+    # After a clock change or a restart of the daemon, a wrong rate must not be shown.
+    if not 0.05 <= seconds <= 60.0 or not 0 <= later - earlier < 10**6:
+        return "-/s".rjust(7)
+    hz = (later - earlier) / seconds
+    return f"{hz:5.1f}/s" if hz < 999.95 else f"{hz:5.0f}/s"

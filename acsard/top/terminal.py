@@ -1,7 +1,7 @@
 """Shows the screens of the commands `acsard top`, `acsard fleet` and `acsard drive`.
 
 A signal or the end of the input ends each screen. The key `q` also ends the screens of `top` and
-`fleet`. If the terminal cannot show a screen, `acsard drive` prints reports instead.
+`fleet`.
 
 These commands run within `output_in_threads`. A terminal that does not read, for example over a
 connection that hangs, delays neither the keys nor the zero commands at the end of a drive.
@@ -13,7 +13,6 @@ import errno
 import io
 import os
 import select
-import shutil
 import signal
 import sys
 import time
@@ -25,21 +24,12 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from acsard.core.messages.state_warnings import WARNING
 from acsard.core.values import AcsardError
 from acsard.host import clock
 from acsard.host.logs import CLOSE_TIMEOUT_S, Writer
 from acsard.host.terminal_modes import single_key_mode
-from acsard.terminal.output import has_screen, plain
-from acsard.top.drive_screen import (
-    HELP,
-    Teleop,
-    last_report_lines,
-    lines,
-    moves,
-    released,
-    report_lines,
-)
+from acsard.terminal.output import MAX_TEXT_WIDTH, plain, show
+from acsard.top import drive_screen
 from acsard.top.feed import Feed
 from acsard.top.fleet_table import Roster, table
 from acsard.top.keyboard import KeyboardDrive
@@ -50,11 +40,6 @@ DRAW_PERIOD_S = 0.25
 # Longest wait for a key before `acsard drive` does its other work.
 KEY_POLL_S = 0.05
 
-# Least time between two printed reports: of other content, while the robot moves, and at rest.
-CHANGED_REPORT_S, MOVING_REPORT_S, RESTING_REPORT_S = 0.5, 1.0, 10.0
-
-NO_END = 10**9
-
 SCREEN_END_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
@@ -63,8 +48,7 @@ def one_screen(feed: Feed) -> str:
     time.sleep(0.5)  # rates are averaged over this time
     feed.query_state()
     _be_lenient()
-    width = Console().width
-    return plain(screen(feed.screen_data(), width), width=width)
+    return plain(screen(feed.screen_data()), width=Console().width)
 
 
 def show_live(feed: Feed) -> None:
@@ -75,17 +59,14 @@ def show_live(feed: Feed) -> None:
 
     def draw(width: int, height: int) -> RenderableType:
         feed.poll()
-        return screen(feed.screen_data("q quits"), width, height)
+        return screen(feed.screen_data("q quits"))
 
     _run_suspendable(partial(_watch, draw))
 
 
 def drive(ride: KeyboardDrive) -> None:
     """Drive the robot with the typed keys, until the input ends or a signal arrives."""
-    if has_screen():
-        _run_suspendable(partial(_steer, ride))
-    else:
-        _drive_in_lines(ride)
+    _run_suspendable(partial(_steer, ride))
 
 
 def print_last_report(ride: KeyboardDrive) -> None:
@@ -96,10 +77,10 @@ def print_last_report(ride: KeyboardDrive) -> None:
     while os.isatty(0) and os.isatty(1):
         ride.take()
         teleop, took = ride.screen_data(), clock.steady_s() - left
-        rests = teleop.age < took and released(teleop)
+        rests = teleop.age < took and drive_screen.released(teleop)
         # A robot usually stops within 2 s, by its own deceleration ramp.
         if rests or took > 2.0:
-            print("\n".join(last_report_lines(teleop, output_size().columns)), flush=True)
+            show(drive_screen.last_report(teleop), most=MAX_TEXT_WIDTH)
             return
         time.sleep(KEY_POLL_S)
 
@@ -109,16 +90,9 @@ def roster(fleet: Roster) -> None:
 
     def draw(width: int, height: int) -> RenderableType:
         rows = fleet.rows()
-        texts = [Text(line, no_wrap=True) for line in table(rows, width, max(1, height - 2))]
-        texts[0].stylize("bold cyan")
-        for line in texts[1:]:
-            if "GONE" in line.plain or "SILENT" in line.plain:
-                line.stylize("bold red")
-            elif WARNING in line.plain:
-                line.stylize("bold yellow")
         below = f"q quits   {fleet.left_out_text or fleet.presence_text}" if rows else fleet.hint()
         last = Text(below.rstrip(), "dim", no_wrap=bool(rows), overflow="ellipsis")
-        return Group(*texts, Text(), last)
+        return Group(table(rows, width, max(1, height - 4)), Text(), last)
 
     _run_suspendable(partial(_watch, draw))
 
@@ -171,8 +145,7 @@ def _steer(ride: KeyboardDrive, suspend: list[bool]) -> bool:
             ride.step(typed)
             if (typed or time.monotonic() >= due) and _terminal_reads():
                 due = time.monotonic() + DRAW_PERIOD_S
-                size = display.console.size
-                display.update(Group(*lines(ride.screen_data(), *size)), refresh=True)
+                display.update(drive_screen.screen(ride.screen_data()), refresh=True)
     for letter in ("k", "", ""):
         ride.step(letter)  # stop the robot, because a suspended program sends no commands
     ride.end()
@@ -237,60 +210,3 @@ def keys() -> Iterator[Callable[[float], str | None]]:
         return
     with single_key_mode():
         yield read
-
-
-# Without a screen
-
-
-def _drive_in_lines(ride: KeyboardDrive) -> None:
-    due, page = ReportThrottle(), Page()
-    with until_signal(), keys() as read:
-        while (typed := read(KEY_POLL_S)) is not None:
-            ride.step(typed)
-            teleop = ride.screen_data()
-            if _terminal_reads() and due.should_print(teleop, time.monotonic()):
-                width, height = output_size()
-                print("\n".join(page.with_help(report_lines(teleop, width), height)), flush=True)
-
-
-def output_size() -> os.terminal_size:
-    """Return columns and lines of the terminal; a file or pipe has practically no limit."""
-    unlimited = os.terminal_size((NO_END, NO_END))
-    return shutil.get_terminal_size() if sys.stdout.isatty() else unlimited
-
-
-class ReportThrottle:
-    """Decides when `acsard drive` prints a report on a terminal that cannot show a screen."""
-
-    def __init__(self) -> None:
-        self._shown: tuple[object, ...] = ()
-        self._at = -RESTING_REPORT_S
-
-    def should_print(self, teleop: Teleop, now: float) -> bool:
-        """Return whether to print a report now, and count it as printed."""
-        state = teleop.state
-        words = ("", "") if state is None else (state.mode, state.why)
-        what = (*words, teleop.objection, teleop.linear, teleop.angular, teleop.silent)
-        moving = state is not None and moves(state)
-        wait = MOVING_REPORT_S if moving else RESTING_REPORT_S
-        if what != self._shown:
-            wait = CHANGED_REPORT_S
-        if now - self._at < wait:
-            return False
-        self._shown, self._at = what, now
-        return True
-
-
-class Page:
-    """Repeats the help about the keys between printed reports, so that it stays in sight."""
-
-    def __init__(self) -> None:
-        self._shown = NO_END  # lines since the help began; `NO_END` before
-
-    def with_help(self, report: list[str], height: int) -> list[str]:
-        """Return a report, below the help if it would scroll the last one out of sight."""
-        self._shown += len(report)
-        if self._shown < height:
-            return report
-        self._shown = len(HELP) + len(report)
-        return [*HELP, *report]

@@ -635,25 +635,13 @@ def test_get_of_a_service_does_not_call_it(shared: Daemon, bus: Bus) -> None:
 
 
 @contextmanager
-def without_a_screen(
+def driving(
     shared: Daemon, *words: str, how: str = ON_TERMINAL, columns: int = 80
 ) -> Iterator[tuple[Terminal, Program]]:
-    """Run `acsard drive` at a terminal that cannot draw a full screen."""
+    """Run `acsard drive` at a terminal of this width."""
     drive = ("drive", "--config", str(shared.config), *words)
-    with at_terminal(shared.config.parent, *drive, how=how, columns=columns, piped="stderr") as (
-        terminal,
-        program,
-    ):
-        until(lambda: WAITS in terminal.screen, 10.0, "the robot's state")
-        yield terminal, program
-
-
-@contextmanager
-def screened(shared: Daemon, columns: int) -> Iterator[tuple[Terminal, Program]]:
-    """Run `acsard drive` at a terminal of this width that can draw a full screen."""
-    drive = ("drive", "--config", str(shared.config))
     with at_terminal(
-        shared.config.parent, *drive, term=SCREEN, columns=columns, piped="stderr"
+        shared.config.parent, *drive, how=how, term=SCREEN, columns=columns, piped="stderr"
     ) as (terminal, program):
         until(lambda: [screen for screen in screens(terminal) if WAITS in screen], 10.0, "it")
         yield terminal, program
@@ -664,7 +652,7 @@ def screened(shared: Daemon, columns: int) -> Iterator[tuple[Terminal, Program]]
 def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
     shared: Daemon, bus: Bus, columns: int
 ) -> None:
-    with screened(shared, columns) as (terminal, _):
+    with driving(shared, columns=columns) as (terminal, _):
         with key_held(terminal, "i"):
             until(lambda: "DRIVING" in screens(terminal)[-1], 5.0, "driving")
         frames = screens(terminal)
@@ -685,7 +673,7 @@ def test_a_drive_that_is_suspended_stops_gives_the_terminal_back_and_goes_on(
 ) -> None:
     with Terminal() as fresh:
         usual = fresh.settings
-    with screened(shared, 80) as (terminal, program), bus.follow("cmd/teleop") as commands:
+    with driving(shared) as (terminal, program), bus.follow("cmd/teleop") as commands:
         during = terminal.settings
         assert during != usual
         with key_held(terminal, "i"):
@@ -702,26 +690,8 @@ def test_a_drive_that_is_suspended_stops_gives_the_terminal_back_and_goes_on(
 
 
 @pytest.mark.slow
-def test_drive_without_a_screen_prints_the_help_and_a_line_a_second_that_fits(
-    shared: Daemon, bus: Bus
-) -> None:
-    with without_a_screen(shared, columns=50) as (terminal, _):
-        begun = time.monotonic()
-        with key_held(terminal, "i"):
-            until(lambda: terminal.screen.count("driving: ") >= 3, 10.0, "some news")
-        took = time.monotonic() - begun
-    lines = terminal.screen.splitlines()
-    assert any("u  i  o" in line for line in lines)
-    assert terminal.screen.count("driving: ") <= 2 * took + 2
-    assert max(map(len, lines)) <= 50
-    bus.at_rest()
-
-
-@pytest.mark.slow
-def test_drive_without_a_screen_ends_with_a_line_that_the_robot_is_at_rest(
-    shared: Daemon, bus: Bus
-) -> None:
-    with without_a_screen(shared) as (terminal, program):
+def test_a_drive_ends_with_a_line_that_the_robot_is_at_rest(shared: Daemon, bus: Bus) -> None:
+    with driving(shared) as (terminal, program):
         with key_held(terminal, "i"):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.2, 5.0, "moving")
         terminal.press("\x03")
@@ -739,7 +709,7 @@ def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silenc
     # its zeros.
     with (
         bus.follow("cmd/teleop") as commands,
-        without_a_screen(shared, how=UNDER_A_SHELL) as (terminal, _),
+        driving(shared, how=UNDER_A_SHELL) as (terminal, _),
     ):
         with key_held(terminal, "i"):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.2, 5.0, "moving")
@@ -751,7 +721,7 @@ def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silenc
 
 @pytest.mark.slow
 def test_a_held_key_drives_and_its_release_stops_the_robot(shared: Daemon, bus: Bus) -> None:
-    with without_a_screen(shared) as (terminal, program):
+    with driving(shared) as (terminal, program):
         with key_held(terminal, "i"):
             until(lambda: bus.state()["linear"] == pytest.approx(0.5, abs=0.01), 5.0, "0.5 m/s")
             assert bus.state()["source"] == "teleop"
@@ -766,7 +736,7 @@ def test_a_held_key_drives_and_its_release_stops_the_robot(shared: Daemon, bus: 
 
 @pytest.mark.slow
 def test_space_stops_the_robot_within_the_ramp(shared: Daemon, bus: Bus) -> None:
-    with without_a_screen(shared) as (terminal, _):
+    with driving(shared) as (terminal, _):
         with key_held(terminal, "i"):
             until(lambda: bus.state()["linear"] == pytest.approx(0.5, abs=0.01), 5.0, "0.5 m/s")
         pressed = time.monotonic()
@@ -783,7 +753,7 @@ ARROWS = {"A": (1, 0), "B": (-1, 0), "D": (0, 1), "C": (0, -1)}
 
 @pytest.mark.slow
 def test_arrows_drive_forward_back_left_and_right(shared: Daemon, bus: Bus) -> None:
-    with without_a_screen(shared) as (terminal, _):
+    with driving(shared) as (terminal, _):
         for letter, (ahead, left) in ARROWS.items():
             with key_held(terminal, f"\x1b[{letter}"):
 
@@ -799,7 +769,7 @@ def test_arrows_drive_forward_back_left_and_right(shared: Daemon, bus: Bus) -> N
 
 @pytest.mark.slow
 def test_speed_keys_change_the_speed_of_the_next_key(shared: Daemon, bus: Bus) -> None:
-    with without_a_screen(shared, "--linear", "0.2") as (terminal, _):
+    with driving(shared, "--linear", "0.2") as (terminal, _):
         terminal.press("w")
         until(lambda: "0.22 m/s" in terminal.screen, 3.0, "the new speed on the screen")
         with key_held(terminal, "i"):
@@ -811,7 +781,7 @@ def test_speed_keys_change_the_speed_of_the_next_key(shared: Daemon, bus: Bus) -
 def test_ctrl_c_while_driving_stops_and_leaves_with_0_and_the_terminal_as_it_was(
     shared: Daemon, bus: Bus
 ) -> None:
-    with without_a_screen(shared) as (terminal, program):
+    with driving(shared) as (terminal, program):
         during = terminal.settings
         with key_held(terminal, "i"):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.3, 5.0, "moving")
@@ -833,7 +803,7 @@ def test_ctrl_c_while_driving_stops_and_leaves_with_0_and_the_terminal_as_it_was
 def test_a_drive_that_is_ended_from_outside_leaves_the_terminal_as_it_was(
     shared: Daemon, bus: Bus, number: signal.Signals
 ) -> None:
-    with without_a_screen(shared) as (terminal, program):
+    with driving(shared) as (terminal, program):
         program.signal(number)
         program.ended(3.0)
         after = terminal.settings
@@ -845,7 +815,7 @@ def test_a_drive_that_is_ended_from_outside_leaves_the_terminal_as_it_was(
 def test_a_stranger_s_put_on_the_robot_s_topics_does_not_end_a_drive(
     shared: Daemon, bus: Bus
 ) -> None:
-    with without_a_screen(shared) as (terminal, program):
+    with driving(shared) as (terminal, program):
         for payload in (b"\xff", b"{}", b""):
             for name in ("state", "odom", "cmd_vel_out", "events", "beat"):
                 bus.session.put(f"acsard/*/{name}", payload)
@@ -863,6 +833,13 @@ def test_drive_without_a_terminal_ends_with_2(shared: Daemon) -> None:
     ended = tool(shared, "drive")
     assert (ended.code, ended.out) == (2, "")
     assert "terminal" in ended.err
+
+
+def test_drive_at_a_terminal_without_a_screen_ends_with_2(shared: Daemon) -> None:
+    words = ("drive", "--config", str(shared.config))
+    with at_terminal(shared.config.parent, *words, piped="stderr") as (_, program):
+        assert program.ended(10.0) == 2
+    assert "TERM" in program.stderr
 
 
 @each("words", [["mcu", "check", "--port", "sim", "--yes"]])

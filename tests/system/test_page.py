@@ -1281,6 +1281,8 @@ def test_curves_that_overlap_are_distinguishable_and_show_their_values(page: Pho
     until(lambda: browser.js(SEEN) == 4, 20.0, "four colours")
 
 
+LEGEND = "document.querySelector('#plot-speed + .legend').textContent"
+
 ABOVE = """(() => {
     const canvas = document.getElementById('plot-speed'), paper = canvas.getContext('2d');
     const {width, height} = canvas, look = getComputedStyle(document.documentElement);
@@ -1321,7 +1323,7 @@ def test_the_plots_begin_with_the_minute_before(
         browser.open(page.server.here)
         page.shows("mode", "READY")
         browser.tap("tab-status")
-        until(lambda: sum(browser.js(ABOVE)) > 0, 5.0, "the plots are drawn")
+        until(lambda: "0.00" in browser.js(LEGEND), 5.0, "the plots are drawn")
         measured, wished = browser.js(ABOVE)
         return measured, wished
 

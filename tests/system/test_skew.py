@@ -27,7 +27,7 @@ from acsard.core.messages.keys_and_roles import PUBLISHED, SERVICES
 from acsard.core.messages.schema import Message
 from acsard.web.callers import PROTOCOL
 from tests.system.harness import Bus, Daemon, Finished, Peer, Program, finish, free_endpoint, until
-from tests.system.terminals import at_terminal
+from tests.system.terminals import SCREEN, at_terminal
 from tests.system.versions import (
     CODE,
     LATCH_CODE,
@@ -251,7 +251,10 @@ fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 os.execv({pair.client.acsard!r}, ["acsard", *sys.argv[1:]])
 """
     words = ("drive", "--config", str(pair.daemon.config))
-    with Bus(pair.daemon.endpoint) as bus, at_terminal(pair.where, *words, how=how) as (at, tool):
+    with (
+        Bus(pair.daemon.endpoint) as bus,
+        at_terminal(pair.where, *words, how=how, term=SCREEN) as (at, tool),
+    ):
 
         def drives() -> bool | None:
             at.press("i")

@@ -24,7 +24,7 @@ from tests.system.harness import (
     until,
 )
 from tests.system.identities import Certificates, Identity, free_tls_endpoint
-from tests.system.terminals import at_terminal
+from tests.system.terminals import SCREEN, at_terminal
 from tests.system.viewer import Viewer
 
 pytestmark = pytest.mark.network
@@ -254,7 +254,7 @@ def test_the_drive_verb_refuses_a_client_without_permission_before_a_key_is_pres
 ) -> None:
     link = ["--connect", robot.tls, "--tls", robot.own(identity)]
     where = robot.daemon.config.parent
-    with at_terminal(where, "drive", *link, piped="stderr") as (_, program):
+    with at_terminal(where, "drive", *link, term=SCREEN, piped="stderr") as (_, program):
         assert program.ended(10.0) == code
     assert text in program.stderr
 

@@ -24,7 +24,7 @@ export function sources(body, state, own) {
     ...state.sources.map((one) => {
       const drives = one.name === state.source;
       const who = drives && state.sender ? `${one.name} (${person(state.sender, own)})` : one.name;
-      const cells = [who, String(one.priority), one.age === null ? "none" : ago(one.age)];
+      const cells = [who, String(one.priority), one.age === null ? "–" : ago(one.age)];
       const waits = drives ? "drives" : one.waits_for;
       return made("tr", drives ? "drives" : "", ...[...cells, waits].map((text) => made("td", "", text)));
     }),

@@ -32,7 +32,6 @@ function milliseconds(stamp) {
 }
 
 export function ago(seconds) {
-  if (seconds === null || seconds === undefined) return "never";
   if (seconds < 1) return "now";
   if (seconds < 120) return `${Math.round(seconds)} s ago`;
   return seconds < 7200 ? `${Math.round(seconds / 60)} min ago` : `${Math.round(seconds / 3600)} h ago`;

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from msgspec.structs import replace
-from rich.console import Console
+from rich.console import Console, RenderableType
 
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import (
@@ -20,8 +20,7 @@ from acsard.core.messages.schema import (
     Time,
 )
 from acsard.daemon.latencies import NAMES
-from acsard.top.screen import screen
-from acsard.top.text import ScreenData
+from acsard.top.screen import ScreenData, screen
 
 MEASURED = Latency(Spread(9000, 56.2, 112.2, 8000.0), Spread(6000, 63.1, 891.0, 9700.0))
 UNMEASURED = Latency(Spread(0, 0.0, 0.0, 0.0), Spread(0, 0.0, 0.0, 0.0))
@@ -60,22 +59,25 @@ SEEN = ScreenData(
 )
 
 
-def lines_of(data: ScreenData, width: int = 80, height: int | None = 24) -> list[str]:
-    """Return the lines of the screen as a person reads them."""
-    console = Console(width=width, file=io.StringIO(), color_system=None)
-    with console.capture() as captured:
-        console.print(screen(data, width, height))
-    return captured.get().rstrip("\n").split("\n")
-
-
-def painted(data: ScreenData, width: int = 80, height: int | None = 24) -> str:
-    """Return the screen as it is sent to a terminal."""
+def drawn(shown: RenderableType, width: int = 80, *, colour: bool = False) -> str:
+    """Return the text that a terminal of this width receives."""
     console = Console(
-        width=width, file=io.StringIO(), force_terminal=True, color_system="256", _environ={}
-    )
+        width=width, file=io.StringIO(), force_terminal=colour, _environ={},
+        color_system="256" if colour else None,
+    )  # fmt: skip
     with console.capture() as captured:
-        console.print(screen(data, width, height))
+        console.print(shown)
     return captured.get()
+
+
+def lines_of(data: ScreenData, width: int = 80) -> list[str]:
+    """Return the lines of the screen as a person reads them."""
+    return drawn(screen(data), width).rstrip("\n").split("\n")
+
+
+def painted(data: ScreenData, width: int = 80) -> str:
+    """Return the screen as it is sent to a terminal."""
+    return drawn(screen(data), width, colour=True)
 
 
 def line_with(text: str, data: ScreenData = SEEN, width: int = 80) -> str:

@@ -19,8 +19,8 @@ from acsard.core.messages.short_texts import short
 from acsard.top import drive_screen
 from acsard.top.drive_screen import Teleop
 from acsard.top.fleet_table import table
-from acsard.top.text import ScreenData
-from tests.unit.top.screens import INFO, SEEN, STATE, UNMEASURED, lines_of, of
+from acsard.top.screen import ScreenData
+from tests.unit.top.screens import INFO, SEEN, STATE, UNMEASURED, drawn, lines_of, of
 
 REASON = "the microcontroller's lines come 0.50 s apart; set mcu.reply_period = 0.50 in acsard.toml"
 MANY = [SourceState(f"source{n}", n, None, "a command", "command") for n in range(40)]
@@ -105,13 +105,10 @@ FLEET = [
 def screens(width: int) -> dict[str, list[str]]:
     """Return the lines of all screens of this width, by the verb and the situation."""
     found = {f"top: {name}": lines_of(data, width) for name, data in TOP.items()}
-    for name, data in DRIVE.items():
-        found[f"drive: {name}"] = [line.plain for line in drive_screen.lines(data, width)]
-    for name, data in DRIVE.items():
-        found[f"drive without a screen: {name}"] = drive_screen.report_lines(data, width)
-    for name, data in ENDS.items():
-        found[f"drive has ended: {name}"] = drive_screen.last_report_lines(data, width)
-    found["fleet"] = table(FLEET, width)
+    shown = {f"drive: {name}": drive_screen.screen(data) for name, data in DRIVE.items()}
+    ends = {f"drive has ended: {name}": drive_screen.last_report(d) for name, d in ENDS.items()}
+    for name, what in (shown | ends | {"fleet": table(FLEET, width)}).items():
+        found[name] = drawn(what, width).splitlines()
     return found
 
 

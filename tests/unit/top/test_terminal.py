@@ -1,4 +1,4 @@
-"""Tests of the lines that keyboard driving prints, and of the table of robots on a terminal."""
+"""Tests of the last report of keyboard driving, and of the table of robots on a terminal."""
 
 from __future__ import annotations
 
@@ -11,54 +11,13 @@ from rich.console import Console
 
 from acsard.core.messages.schema import RobotState
 from acsard.top import terminal
-from acsard.top.drive_screen import HELP, Teleop
+from acsard.top.drive_screen import Teleop
 from acsard.top.fleet_table import Roster
 from acsard.top.keyboard import KeyboardDrive
-from acsard.top.terminal import NO_END, Page, ReportThrottle, print_last_report
+from acsard.top.terminal import print_last_report
 from tests.unit.top.screens import STATE
 from tests.unit.top.test_drive_screen import SEEN
 from tests.unit.top.test_fleet_table import ROW
-
-
-def printed_states(states: list[tuple[float, RobotState]]) -> list[RobotState]:
-    """Return the states that are printed when these states arrive at these times, s."""
-    throttle = ReportThrottle()
-    return [
-        state for now, state in states if throttle.should_print(replace(SEEN, state=state), now)
-    ]
-
-
-def test_a_robot_that_moves_is_a_line_a_second_and_one_at_rest_one_in_ten() -> None:
-    moving = [(n / 20, replace(STATE, x=n / 40, linear=0.5)) for n in range(200)]
-    assert len(printed_states(moving)) == 10
-    sliding = [(n / 20, replace(STATE, linear=0.0, angular=0.0)) for n in range(200)]
-    assert len(printed_states(sliding)) == 10  # its wheels turn
-    resting = [(now, replace(state, wheels=[0.0] * 4)) for now, state in sliding]
-    assert len(printed_states(resting)) == 1
-
-
-def test_another_reason_is_reported_immediately_up_to_two_lines_a_second() -> None:
-    stopped = replace(STATE, mode="stopped", reason="stopped by request")
-    states = printed_states([(0.0, STATE), (0.5, stopped), (0.6, STATE), (1.0, STATE)])
-    assert [state.mode for state in states] == ["driving", "stopped", "driving"]
-    flickering = [(n / 20, replace(STATE, reason=f"because {n}")) for n in range(200)]
-    assert len(printed_states(flickering)) <= 20
-
-
-def test_the_help_is_repeated_before_reports_scroll_it_off_the_terminal() -> None:
-    page, lines = Page(), list[str]()
-    for number in range(100):
-        lines += page.with_help([f"news {number}", *["more of it"] * (number % 4)], 24)
-        # The last line of a terminal stays empty, because the cursor is there.
-        assert list(HELP) == [line for line in lines[-23:] if line in HELP]
-    assert lines.count(HELP[0]) < 30
-    assert lines[-4:-3] == ["news 99"]
-
-
-def test_output_to_a_file_has_the_help_once() -> None:
-    page = Page()
-    assert page.with_help(["news"], NO_END) == [*HELP, "news"]
-    assert page.with_help(["news"] * 1000, NO_END) == ["news"] * 1000
 
 
 class Ended:
@@ -109,7 +68,7 @@ def test_a_terminal_of_any_height_shows_the_heading_of_the_table_of_robots(
     monkeypatch.setattr(terminal, "_run_suspendable", lambda shows: shows([]))
     fleet = SimpleNamespace(rows=lambda: [ROW], left_out_text="", presence_text="1 robot")
     terminal.roster(cast(Roster, fleet))
-    head, *others = capsys.readouterr().out.splitlines()
+    head, *others = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
     assert head.startswith("ROBOT")
     assert others[-1] == "q quits   1 robot"
-    assert any("robot1" in line for line in others) == (height == 24)
+    assert any("robot1" in line for line in others)

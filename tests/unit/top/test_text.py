@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rich.cells import cell_len
 
-from acsard.top.text import bar, clean, count, ends, rate, rule
-from acsard.top.text import row as labelled
+from acsard.top.screen import clean, count, rate
 from tests.each import each
 
 
@@ -59,21 +55,3 @@ def test_an_unknown_rate_is_not_invented(
     later: int, earlier: int, seconds: float, text: str
 ) -> None:
     assert rate(later, earlier, seconds) == text
-
-
-@each(
-    ("value", "drawn"),
-    [(0.0, ""), (20.0, "██████"), (-20.0, "██████"), (10.0, "███"), (99.0, "██████"),
-     (0.5, "▏"), (math.nan, "")],
-)  # fmt: skip
-def test_a_bar_is_as_long_as_the_value_and_never_longer_than_its_place(
-    value: float, drawn: str
-) -> None:
-    assert bar(value, 20.0, 6) == drawn
-
-
-def test_columns_are_joined_to_lines_of_the_full_width() -> None:
-    line = rule(30, ((0, "pose"), (15, "wheels")))
-    assert line.plain == "pose ───────── wheels ────────"
-    assert cell_len(ends(labelled("a", "b"), labelled("c", "d"), 40).plain) == 40
-    assert ends(labelled("a", "much too long"), labelled("c", "d"), 20).plain.endswith("d")
