@@ -117,7 +117,7 @@ def _table(
 
 
 def _measured(state: RobotState, value: float | None, decimals: int, width: int) -> str:
-    """Return a measurement as text, "-" without a link: no old speed is shown."""
+    # Without a link no old speed is shown.
     return signed(value if state.link == "up" else None, decimals, width)
 
 
@@ -211,7 +211,6 @@ def _waits(source: SourceState, state: RobotState) -> str:
 
 
 def _facts(data: ScreenData, state: RobotState) -> Table:
-    """Return a table of the values that are texts: port, gyro, board, rejected inputs."""
     rows: list[tuple[str, str | Text]] = []
     if data.info is not None:
         where = "the built-in SIMULATOR" if data.info.simulated else clean(data.info.port)
@@ -240,7 +239,6 @@ def _board(state: RobotState) -> str:
 
 
 def _rejected(state: RobotState, before: RobotState) -> Text:
-    """Return the rejected inputs by kind and reason; yellow if more than `before`."""
     kinds = []
     for kind, prefix in (("lines", "line_"), ("commands", "command_"), ("gyro", "imu_")):
         counters = [(n, c) for n, c in state.counters.items() if n.startswith(prefix) and c]

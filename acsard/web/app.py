@@ -266,7 +266,6 @@ def settings_in(config: Mapping[str, Any]) -> list[Setting]:
 
 
 def _described(key: str) -> dict[str, Any]:
-    """Return the unit and the allowed values of a setting, and whether it can be kept."""
     found: dict[str, Any] = {"keep": can_be_kept(key)}
     kind = kind_of(key)
     if isinstance(kind, inspect.Metadata):
