@@ -151,6 +151,7 @@ class Robot:
             gyro=checks.gyro_status(self.config.odometry),
             doubt=checks.wheels_status(self.config.feedback),
             check=session.check(self.link_setup),
+            unanswered=self._answered.told,
             encoders=session.count_recovery.counts(self.config.mcu.encoder_counts),
             pose_doubt=session.doubt.code,
             sender=self._choice.sender,

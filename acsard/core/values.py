@@ -497,6 +497,7 @@ class Snapshot(Struct, frozen=True):
     check: str = "plain"  # form of the serial lines, such as "plain"
     # Counts per turn, by `WHEELS`; 0 if not configured, or contradicted by the speeds.
     encoders: tuple[int, ...] = ()
+    unanswered: bool = False  # more than 2 % of the lines
     sender: str = ""  # selected by the arbiter
     routers: RoutersStatus = RoutersStatus()
     recording: Recording = Recording()

@@ -22,6 +22,7 @@ from acsard.bus.zenoh_sessions import answers
 from acsard.client.synchronous import connect
 from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.config.settings import Config
+from acsard.core.messages.diagnostics import MAX_MISSED_FRACTION
 from acsard.core.messages.schema import RobotState
 from acsard.core.values import AcsardError, Seconds
 from acsard.host.child import how_it_ended
@@ -30,7 +31,6 @@ from acsard.host.errors import MendableError
 from acsard.host.processes import run_command
 from acsard.machine import service_installation as service
 from acsard.machine import versions
-from acsard.machine.daemon_findings import MAX_MISSED_FRACTION
 from acsard.machine.service_installation import ALL_UNITS, RELOAD_COMMANDS, UNIT, Run, Write
 
 WATCH_S = 30.0

@@ -1,21 +1,22 @@
-"""Makes the rows of the message `diagnostics`, which rqt_robot_monitor shows.
+"""Makes the rows of the message `diagnostics`, which rqt_robot_monitor and `acsard doctor` show.
 
-OK needs no attention, WARN a person should know, ERROR keeps the robot from driving. Each message
-has the same rows, because a missing one is shown as stale. Only those of the board's inputs and
-battery appear with the first report, or from the start if they are required, until a board without
-them.
+OK needs no attention, WARN a person should know, ERROR keeps the robot from driving. A row that is
+not OK has the value `advice`: what a person can do. Each message has the same rows, because a
+missing one is shown as stale. Only those of the board's inputs and battery appear with the first
+report, or from the start if they are required, until a board without them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from msgspec import Struct
 
-from acsard.core.codes import sentence
+from acsard.core.codes import GUARD_CODES, HOST_CODES, sentence
 from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_use
 from acsard.core.formatting import many
+from acsard.core.link.link_diagnosis import BUSY_ADVICE, MAX_UNANSWERED_FRACTION
 from acsard.core.messages.certificate_expiry import CERTIFICATE_LEVELS
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus, Header, KeyValue, Time
 from acsard.core.motion import battery
@@ -30,13 +31,13 @@ from acsard.core.motion.emergency_stop import (
 from acsard.core.motion.gyro import STATUS_TEXTS
 from acsard.core.values import (
     WHEELS,
-    GyroStatus,
+    GyroDoes,
     Instant,
     Measured,
     Recording,
     RoutersStatus,
     Snapshot,
-    WheelsStatus,
+    Status,
 )
 
 OK, WARN, ERROR = 0, 1, 2
@@ -45,10 +46,10 @@ MODE_LEVELS = {"stopped": WARN, "fault": ERROR}  # of modes; others are OK
 
 # Rows by the state of the emergency-stop input.
 BOARD = {
-    "": (OK, "no emergency-stop input"),
-    "released": (OK, "emergency stop released"),
-    "pressed": (WARN, PRESSED_REASON.text),
-    "silent": (ERROR, SILENT_REASON.text),
+    "": (OK, "no emergency-stop input", ""),
+    "released": (OK, "emergency stop released", ""),
+    "pressed": (WARN, PRESSED_REASON.text, PRESSED_REASON.advice),
+    "silent": (ERROR, SILENT_REASON.text, SILENT_REASON.advice),
 }
 
 BATTERY_LEVELS = {"ok": OK, "warning": WARN, "stop": ERROR, "unknown": WARN}
@@ -59,6 +60,37 @@ MAX_MISSED_FRACTION = 0.01  # of the last minute's periods, above which this war
 
 NO_ROUTER, NOT_YET = "a peer, not a router", "not connected yet"
 
+SIMULATOR_ADVICE = (
+    "to drive a robot, set mcu.port to the board's serial port; `acsard ports` lists the ports"
+)
+
+CLEAR = "then look at the robot, and type `acsard call clear`"
+
+DEFECT = (
+    "this is a defect of acsard: report it with the newest recording (`acsard recording` lists the "
+    f"recordings), {CLEAR}"
+)
+
+# Advice by the status of the gyro.
+GYRO_ADVICE: dict[GyroDoes, str] = {
+    "silent": "check that the gyro's driver runs, and that it publishes on the Zenoh key `imu` "
+    "(the ROS topic imu/data)",
+    "hangs": "check the gyro's cable and its driver: angular_velocity.z must change in its last "
+    "digits even at rest",
+    "disagrees": "if the wheels do not slip, measure the track with `acsard calibrate`, let the "
+    "robot stand so that it learns the gyro's bias, and check the gyro's scale",
+    "reversed": "check with `acsard mcu check` that the wheels turn the right way; if they do, "
+    "mount the gyro with its z axis up, or let its driver negate angular_velocity.z",
+    "in degrees": "let the gyro's driver send rad/s: divide the degrees per second by 57.3",
+    "dead": "check the gyro's cable and its driver: angular_velocity.z must change when the robot "
+    "turns",
+    "not believed": "check that the gyro's z axis points up and that its driver sends rad/s; then "
+    "measure the track width with `acsard calibrate`",
+}
+
+# Level, text, and advice for a level that is not OK.
+Finding = tuple[int, str, str]
+
 
 class Row(Struct, frozen=True):
     """A row about one part of the robot, with details as text in `values`."""
@@ -67,6 +99,7 @@ class Row(Struct, frozen=True):
     level: int
     message: str
     values: dict[str, str]
+    advice: str = ""
 
 
 def diagnostics(
@@ -79,21 +112,20 @@ def diagnostics(
 
     `certificate` is the result of `expiry`, or two "" for no such row.
     """
-    status = snapshot.status
-    mode = {"mode": status.mode, "source": status.source}
     rows = [
-        Row("mode", MODE_LEVELS.get(status.mode, OK), status.reason, mode),
+        _mode(snapshot.status),
         _serial_link(config, snapshot),
         _control_loop(snapshot),
         _commands(snapshot),
-        _wheels(snapshot.doubt, snapshot.counters),
+        _wheels(config, snapshot),
         *_board(config, snapshot),
         *_battery(config, snapshot),
-        *_gyro(snapshot.gyro),
+        *_gyro(snapshot),
         *_routers(config.bus.connect, snapshot.routers),
         *_recording(snapshot.recording),
         *_latch_file(snapshot.latch_file),
         *_certificate(*certificate),
+        _settings(snapshot.settings_differ),
     ]
     return DiagnosticArray(
         Header(Time.from_ns(now.wall_ns)),
@@ -103,10 +135,34 @@ def diagnostics(
                 f"acsard: {row.name}",
                 row.message,
                 config.robot.id,
-                [KeyValue(key, value) for key, value in row.values.items()],
+                [KeyValue(key, value) for key, value in row.values.items()]
+                + ([KeyValue("advice", row.advice)] if row.advice else []),
             )
             for row in rows
         ],
+    )
+
+
+def _row(name: str, findings: Sequence[Finding], values: dict[str, str]) -> Row:
+    level = max(level for level, _, _ in findings)
+    advice = dict.fromkeys(advice for level, _, advice in findings if level and advice)
+    return Row(name, level, "; ".join(text for _, text, _ in findings), values, "; ".join(advice))
+
+
+def _mode(status: Status) -> Row:
+    advice = ""
+    if status.mode == "stopped":
+        advice = f"remove the cause, {CLEAR}"
+    elif status.mode == "fault":
+        advice = DEFECT if status.code in GUARD_CODES else f"correct the cause, {CLEAR}"
+    values = {"mode": status.mode, "source": status.source}
+    return Row("mode", MODE_LEVELS.get(status.mode, OK), status.reason, values, advice)
+
+
+def _check(config: Config) -> str:
+    return (
+        "lift the wheels off the ground, stop the daemon, and type `acsard mcu check --port "
+        f"{config.mcu.port}`, which finds the cause"
     )
 
 
@@ -118,13 +174,38 @@ def _serial_link(config: Config, snapshot: Snapshot) -> Row:
     if snapshot.feedback_age_s is not None:
         values["feedback_age_s"] = f"{snapshot.feedback_age_s:.2f}"
     values |= {f"counts_{name}": str(counts) for name, counts in named if counts}
-    link = snapshot.status.link
-    level, message = OK if link == "up" else ERROR, link
+    values |= _counted(snapshot.counters, "line") | _counted(snapshot.counters, "link")
+    return _row("serial link", [*_link(config, snapshot)], values)
+
+
+def _link(config: Config, snapshot: Snapshot) -> Iterator[Finding]:
+    status, counters, simulated = snapshot.status, snapshot.counters, config.mcu.simulated
+    by_host = simulated or status.code in HOST_CODES
+    advice = BUSY_ADVICE if by_host else _check(config)
+    if status.link == "up":
+        yield OK, "up", ""
+    else:
+        why = f": {status.reason}" if status.mode == "waiting" else ""
+        yield ERROR, f"{status.link}{why}", advice
     if snapshot.pose_doubt:
-        level, message = max(level, WARN), f"{message}; {sentence(snapshot.pose_doubt).text}"
-    if mcu.simulated:
-        level, message = max(level, WARN), f"{message}: this is the simulator, no real wheel turns"
-    return Row("serial link", level, message, values | _counted(snapshot.counters, "line"))
+        yield WARN, sentence(snapshot.pose_doubt).text, ""
+    if simulated:
+        yield WARN, "this is the simulator, no real wheel turns", SIMULATOR_ADVICE
+    if snapshot.unanswered:
+        yield WARN, "the board does not answer each line", advice
+    refused = {name: n for name, n in counters.items() if name.startswith("line_") and n}
+    if sum(refused.values()) > MAX_UNANSWERED_FRACTION * max(1, counters.get("lines", 0)):
+        kinds = ", ".join(f"{n} {name[5:].replace('_', ' ')}" for name, n in refused.items())
+        yield WARN, f"lines of the board were rejected: {kinds}", advice
+    # More than once a day on average.
+    days = counters.get("lines_sent", 0) / config.rate_hz / 86400
+    late = counters.get(f"link_lost{'' if simulated else '_host_stall'}", 0)
+    if late > days:
+        times = many(late, "time")
+        yield WARN, f"lost {times}, because this computer did not run the daemon", BUSY_ADVICE
+    lost = counters.get("link_lost", 0) - late
+    if lost > days:
+        yield WARN, f"lost {many(lost, 'time')} since the start", advice
 
 
 def _control_loop(snapshot: Snapshot) -> Row:
@@ -136,11 +217,13 @@ def _control_loop(snapshot: Snapshot) -> Row:
         for when, spread in (("", figure.since_start), ("_minute", figure.last_minute))
         for share in ("p50", "p99", "max")
     }
+    level = WARN if missed > MAX_MISSED_FRACTION * (run_count + missed) else OK
     return Row(
         "control loop",
-        WARN if missed > MAX_MISSED_FRACTION * (run_count + missed) else OK,
+        level,
         f"{missed} of {run_count + missed} periods missed in the last minute",
         values | _counted(snapshot.counters, "missed") | _counted(snapshot.counters, "bus"),
+        BUSY_ADVICE if level else "",
     )
 
 
@@ -148,31 +231,36 @@ def _commands(snapshot: Snapshot) -> Row:
     values = {s.name: waiting(s.waits_for).text or "driving" for s in snapshot.sources}
     values |= _counted(snapshot.counters, "command")
     driver = snapshot.status.source
-    message = f"commanded by {driver}" if driver else "waiting for a command"
+    findings = [(OK, f"commanded by {driver}" if driver else "waiting for a command", "")]
     if snapshot.speed_limit:
-        message = f"{message}; speed limit: {snapshot.speed_limit}"
-    crowded = [s for s in snapshot.sources if s.waits_for.what == "senders"]
-    for source in crowded:
-        message = (
-            f"{message}; {source.waits_for.senders + 1} programs send as {source.name}, and the "
-            "robot follows one of them: end the other programs, or give each program its own source"
-        )
+        findings.append((OK, f"speed limit: {snapshot.speed_limit}", ""))
+    for source in snapshot.sources:
+        if source.waits_for.what == "senders":
+            text = (
+                f"{source.waits_for.senders + 1} programs send as {source.name}, and the robot "
+                "follows one of them"
+            )
+            advice = "end the other programs, or give each program its own source"
+            findings.append((WARN, text, advice))
     age_s = snapshot.refused_age_s
-    refused = age_s is not None and age_s < SHOW_REFUSAL_S
-    if refused:
-        message = f"{message}; refused: {snapshot.refused}"
-    return Row("commands", WARN if refused or crowded else OK, message, values)
+    if age_s is not None and age_s < SHOW_REFUSAL_S:
+        findings.append((WARN, f"refused: {snapshot.refused}", ""))
+    return _row("commands", findings, values)
 
 
-def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
+def _wheels(config: Config, snapshot: Snapshot) -> Row:
+    doubt, counters = snapshot.doubt, snapshot.counters
+    advice = _check(config)
+    if not config.feedback.encoders:
+        advice = "if the robot has encoders, set feedback.encoders = true"
     values = {
         "left_out": ", ".join(doubt.left_out),
         "slipping": ", ".join(doubt.slipping),
     }
-    level = WARN if doubt.text else OK
-    message = doubt.text or "every wheel obeys its command"
     values |= _counted(counters, "wheel_fault") | _counted(counters, "uncommanded_motion")
-    return Row("wheels", level, message, values)
+    if not doubt.text:
+        return Row("wheels", OK, "every wheel obeys its command", values)
+    return Row("wheels", WARN, doubt.text, values, advice)
 
 
 def _board(config: Config, snapshot: Snapshot) -> list[Row]:
@@ -182,27 +270,27 @@ def _board(config: Config, snapshot: Snapshot) -> list[Row]:
         return []
     findings = [BOARD[snapshot.estop]]
     if required and not snapshot.estop:
-        findings = [(ERROR, MISSING_REASON.text)]
+        findings = [(ERROR, MISSING_REASON.text, _check(config))]
     if snapshot.bumper is not None:
         level = ERROR if snapshot.bumper.code == "bumpers_silent" else WARN
-        findings.append((level, snapshot.bumper.text))
+        findings.append((level, snapshot.bumper.text, snapshot.bumper.advice))
     elif bumpers is not None:
-        findings.append((OK, f"{many(len(bumpers), 'bumper')} released"))
+        findings.append((OK, f"{many(len(bumpers), 'bumper')} released", ""))
     elif safety.needs_bumpers:
-        findings.append((ERROR, missing_reason(safety).text))
+        findings.append((ERROR, missing_reason(safety).text, _check(config)))
     if snapshot.board.get("motor_driver") == "fault":
-        findings.append((ERROR, DRIVER_FAULT_REASON.text))
+        findings.append((ERROR, DRIVER_FAULT_REASON.text, DRIVER_FAULT_REASON.advice))
     counted: dict[str, str] = {}
     for kind in ("line_status", "emergency", "bumper"):
         counted |= _counted(snapshot.counters, kind)
-    level, message = max(level for level, _ in findings), "; ".join(text for _, text in findings)
-    return [Row("board", level, message, snapshot.board | counted)]
+    return [_row("board", findings, snapshot.board | counted)]
 
 
 def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
     status, bounds = snapshot.battery, config.battery.bounds
     if status is None:
-        return [Row("battery", WARN, battery.MISSING_REASON, {})] if bounds else []
+        missing = Row("battery", WARN, battery.MISSING_REASON, {}, _check(config))
+        return [missing] if bounds else []
     values: dict[str, str] = {"level": status.level}
     numbers = {
         "volts": status.volts,
@@ -212,22 +300,24 @@ def _battery(config: Config, snapshot: Snapshot) -> list[Row]:
     }
     values |= {name: f"{value:.2f}" for name, value in numbers.items() if value is not None}
     values |= {f"{level}_below": f"{below:g}" for level, below in bounds.items()}
-    return [
-        Row(
-            "battery",
-            BATTERY_LEVELS[status.level],
-            battery.status_text(config.battery, status),
-            values,
-        )
-    ]
+    advice = {
+        "ok": "",
+        "warning": "charge the battery",
+        "stop": f"{battery.empty_reason(config.battery).advice}, {CLEAR}",
+        "unknown": _check(config),
+    }
+    text, level = battery.status_text(config.battery, status), status.level
+    return [Row("battery", BATTERY_LEVELS[level], text, values, advice[level])]
 
 
-def _gyro(gyro: GyroStatus) -> list[Row]:
+def _gyro(snapshot: Snapshot) -> list[Row]:
+    gyro = snapshot.gyro
     if gyro.does == "off":
         return []
     values = {} if gyro.bias is None else {"bias_rad_s": f"{gyro.bias:.5f}"}
-    level = OK if gyro.does in ("used", "waiting for rest", "waiting for turn") else WARN
-    return [Row("gyro", level, STATUS_TEXTS[gyro.does], values)]
+    values |= _counted(snapshot.counters, "imu_")
+    advice = GYRO_ADVICE.get(gyro.does, "")
+    return [Row("gyro", WARN if advice else OK, STATUS_TEXTS[gyro.does], values, advice)]
 
 
 def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:
@@ -235,32 +325,58 @@ def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:
     values = dict.fromkeys(endpoints, NOT_YET) | dict.fromkeys(routers.connected, "connected")
     values |= dict.fromkeys(missing, "not connected") | dict.fromkeys(peers, NO_ROUTER)
     words = NOT_YET if NOT_YET in values.values() else "connected"
+    advice = ""
     if missing:
         words = f"not connected to {', '.join(missing)}"
+        advice = (
+            "start the Zenoh router at that address (rmw_zenohd, zenohd or `acsard router`): the "
+            "daemon then connects by itself"
+        )
     if peers:
+        advice = "connect all robots to a Zenoh router (deploy/zenoh/README.md)"
         words += (
             f"; {', '.join(peers)} is not a router: clients that connect to this daemon see only "
             "this robot"
         )
-    return [Row("router", WARN if missing or peers else OK, words, values)] if values else []
+    level = WARN if missing or peers else OK
+    return [Row("router", level, words, values, advice)] if values else []
 
 
 def _recording(recording: Recording) -> list[Row]:
     if not recording.where:
         return []
     missing = {"steps_missing": str(recording.missing)}
-    level, message = WARN if recording.trouble else OK, recording.trouble or "on"
-    return [Row("recording", level, message, missing)]
+    if not recording.trouble:
+        return [Row("recording", OK, "on", missing)]
+    advice = "free disk space, or set record.directory to a writable directory"
+    return [Row("recording", WARN, recording.trouble, missing, advice)]
 
 
 def _certificate(code: str, text: str) -> list[Row]:
-    return [Row("certificate", CERTIFICATE_LEVELS[code], text, {})] if code else []
+    if not code:
+        return []
+    level = CERTIFICATE_LEVELS[code]
+    advice = "run `acsard doctor` on the daemon's machine, where it examines the certificate files"
+    return [Row("certificate", level, text, {}, advice if level else "")]
 
 
 def _latch_file(trouble: str | None) -> list[Row]:
     if trouble is None:
         return []
-    return [Row("latch file", WARN if trouble else OK, trouble or "written", {})]
+    if not trouble:
+        return [Row("latch file", OK, "written", {})]
+    advice = "free disk space, or set control.state_directory to a writable directory"
+    return [Row("latch file", WARN, trouble, {}, advice)]
+
+
+def _settings(differ: str) -> Row:
+    if not differ:
+        return Row("settings", OK, "those of the start", {})
+    advice = (
+        "the next start of the daemon uses the values of the file; `acsard set KEY VALUE --keep` "
+        "on the robot writes a value into the file"
+    )
+    return Row("settings", WARN, f"changed since the daemon's start: {differ}", {}, advice)
 
 
 def _counted(counters: dict[str, int], kind: str) -> dict[str, str]:

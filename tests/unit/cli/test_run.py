@@ -10,7 +10,7 @@ from acsard.cli import parser, run
 from acsard.cli.common import overrides
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, McuConfig, WebConfig
-from acsard.machine.daemon_findings import OPTION_KEYS
+from acsard.machine.doctor import OPTION_KEYS
 from tests.each import each
 
 

@@ -1,41 +1,37 @@
-"""Runs all examinations of `acsard doctor` in order.
-
-The doctor opens no serial port, and sends only queries. Of a daemon that runs, it examines the
-configuration in force, not the file, which may have changed. On another machine, it examines the
-daemon's reports and this machine's certificates, because port, files and gateway are there.
-"""
+"""What only a program on the robot's computer sees: the serial port, and the computer itself."""
 
 from __future__ import annotations
 
 import os
 import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
-from acsard.bus.address import Address, address_of
-from acsard.core.config.contradictions import warnings
-from acsard.core.config.parsing import ConfigError, parse
-from acsard.core.config.settings import Config
+from acsard.core.config.settings import SIMULATOR
+from acsard.core.messages.diagnostics import SIMULATOR_ADVICE
 from acsard.core.values import NS_PER_S, Ns
 from acsard.host import clock, real_time
 from acsard.host.kernel_counters import Kernel, Reading
-from acsard.host.processes import holders, is_running
+from acsard.host.processes import holders, is_running, master_of
 from acsard.machine import versions
-from acsard.machine.certificate_findings import certificates, router_certificates
-from acsard.machine.daemon_findings import (
-    Running,
-    compared,
-    daemon,
-    gateway,
-    query_or_finding,
-    routers,
-)
 from acsard.machine.finding import Finding, Level
 from acsard.machine.serial_ports import BOARDS, serial_devices
 
 # Of `service install`, and of the Debian package.
 UDEV_RULES = ("/etc/udev/rules.d/70-acsar.rules", "/usr/lib/udev/rules.d/70-acsar.rules")
+
+
+def computer(real_time: bool, pid: int | None) -> Iterator[Finding]:
+    """Yield findings about this computer, with the daemon's process id `pid` if it runs.
+
+    `real_time` is `control.real_time`.
+    """
+    yield from port_grabbers()
+    yield from unused_version()
+    yield from clock_year()
+    yield from scheduling(real_time, pid)
+    yield from slowness()
 
 
 def port_grabbers() -> Iterator[Finding]:
@@ -148,17 +144,15 @@ def slowdowns(before: Reading, after: Reading, within_ns: Ns) -> list[tuple[str,
     return causes
 
 
-def serial_port(config: Config) -> Iterator[Finding]:
-    """Yield findings about `mcu.port`: whether it exists, who may open and uses it, its USB."""
-    path = config.mcu.port
-    if config.mcu.simulated:
-        mend = (
-            "to drive a robot, set mcu.port to the board's serial port, for example "
-            '"/dev/acsar"; `acsard ports` lists the ports'
-        )
-        yield Finding(
-            "port", "warning", "mcu.port selects the built-in simulator: no robot will move", mend
-        )
+def serial_port(path: str, simulated: bool) -> Iterator[Finding]:
+    """Yield findings about `mcu.port`: whether it exists, who may open and uses it, its USB.
+
+    `simulated` is true if a daemon that does not run yet would simulate its robot.
+    """
+    if simulated:
+        text = "mcu.port selects the built-in simulator: no robot will move"
+        yield Finding("port", "warning", text, SIMULATOR_ADVICE)
+    if path == SIMULATOR:
         return
     if not os.path.exists(path):
         ports = ", ".join(port.device for port in serial_devices()) or "none"
@@ -173,15 +167,17 @@ def serial_port(config: Config) -> Iterator[Finding]:
         yield Finding("port", "failure", f"{path} is not a serial device", mend)
         return
     yield _permission(path)
+    # The other end of a pty is a simulator of the board, which may hold this end open, too.
+    board = master_of(path)
     for holder in holders(path):
-        level: Level = "ok" if holder.name == "acsard" else "failure"
-        mend = (
-            ""
-            if level == "ok"
-            else f"end that program (`kill {holder.pid}`), or let it use another port"
-        )
         text = f"{path} is in use by {holder.name} (pid {holder.pid})"
-        yield Finding("port", level, text, mend)
+        if holder == board:
+            yield Finding("port", "ok", f"{text}, which simulates the board")
+        elif holder.name == "acsard":
+            yield Finding("port", "ok", text)
+        else:
+            mend = f"end that program (`kill {holder.pid}`), or let it use another port"
+            yield Finding("port", "failure", text, mend)
     yield from _hardware(Path(os.path.realpath(path)).name)
 
 
@@ -221,59 +217,3 @@ def _permission(path: str) -> Finding:
     return Finding(
         "port", "failure", f"{path} belongs to group {group}, but you are not in it", mend
     )
-
-
-def examine(
-    where: str,
-    text: bytes,
-    overrides: dict[str, dict[str, object]],
-    find_address: Callable[[Config], Address] = address_of,
-) -> Iterator[Finding]:
-    """Yield all findings of the doctor. Raises `UsageError` for an invalid endpoint.
-
-    `overrides` replace values of the file by table and key. `where` is its path.
-    """
-    try:
-        config = parse(text, overrides)
-    except ConfigError as error:
-        for problem in error.problems:
-            yield Finding("configuration", "failure", f"{where}: {problem}", "see acsard.toml")
-        return
-    yield Finding("configuration", "ok", where)
-    address, written = find_address(config), ""
-    running = query_or_finding(config, address)
-    if isinstance(running, Running) and not running.is_local:
-        elsewhere = (
-            "the daemon runs on another machine (on this machine, no process of acsard has its pid "
-            f"{running.info.pid})"
-        )
-        yield Finding(
-            "daemon", "ok", f"{elsewhere}: check its serial port, files and TLS gateway there"
-        )
-        yield from certificates(address.tls)
-        yield from daemon(running)
-        return
-    if isinstance(running, Running):
-        yield from compared(running, config)
-        config, written = running.config, config.bus.tls
-    for warning in warnings(config):
-        yield Finding("configuration", "warning", warning, "see acsard.toml")
-    yield from serial_port(config)
-    yield from port_grabbers()
-    yield from unused_version()
-    yield from clock_year()
-    yield from scheduling(
-        config.control.real_time, running.info.pid if isinstance(running, Running) else None
-    )
-    yield from slowness()
-    # systemd gives the daemon copies of the certificates at its start. Examine the directories with
-    # the copies and with the original files.
-    for directory in dict.fromkeys((config.bus.tls, address.tls, written)):
-        yield from certificates(directory)
-    yield from routers(config)
-    yield from router_certificates(config)
-    if isinstance(running, Running):
-        yield from daemon(running)
-    else:
-        yield running
-    yield from gateway(config)

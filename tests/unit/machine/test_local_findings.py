@@ -1,9 +1,12 @@
-"""The doctor's findings about this computer: real-time scheduling, and causes of lateness."""
+"""The doctor's findings about this computer: the port, real time, and causes of lateness."""
 
 from __future__ import annotations
 
 import os
+import pty
 import resource
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,7 +14,7 @@ import pytest
 from acsard.host import real_time
 from acsard.host.kernel_counters import Kernel
 from acsard.machine import versions
-from acsard.machine.examination import scheduling, slowness, unused_version
+from acsard.machine.local_findings import scheduling, serial_port, slowness, unused_version
 from tests.unit.host.kernel_files import HWMON, POLICY, QUIET, write
 
 WANTED = True
@@ -43,6 +46,47 @@ def test_the_scheduling_policy_of_a_running_daemon_is_reported(
     monkeypatch.setattr(os, "sched_getscheduler", lambda _: policy)
     (finding,) = scheduling(WANTED, 77)
     assert (finding.level, "pid 77" in finding.text) == (level, True)
+
+
+# A person's own simulator of their board often keeps both ends of its pty open.
+OWN_BOARD = """
+import os, pty, sys
+board, port = pty.openpty()
+print(os.ttyname(port), flush=True)
+sys.stdin.read()
+"""
+
+
+def test_the_simulator_of_a_person_s_own_board_is_not_to_be_killed() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", OWN_BOARD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as board:
+        assert board.stdout is not None
+        findings = list(serial_port(board.stdout.readline().strip(), simulated=False))
+        assert board.stdin is not None
+        board.stdin.close()
+    (used,) = [finding for finding in findings if f"(pid {board.pid})" in finding.text]
+    assert (used.level, used.mend) == ("ok", "")
+    assert "simulates the board" in used.text
+
+
+def test_a_program_that_uses_the_port_in_place_of_the_daemon_is_a_failure() -> None:
+    board, port = pty.openpty()
+    path = os.ttyname(port)
+    opened = f"os.open({path!r}, os.O_RDWR | os.O_NOCTTY)"
+    code = f"import os, sys; {opened}; print(flush=True); sys.stdin.read()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        findings = list(serial_port(path, simulated=False))
+        assert other.stdin is not None
+        other.stdin.close()
+    for end in (board, port):
+        os.close(end)
+    (used,) = [finding for finding in findings if f"(pid {other.pid})" in finding.text]
+    assert (used.level, f"kill {other.pid}" in used.mend) == ("failure", True)
 
 
 def test_without_real_time_in_the_configuration_no_warning_is_given() -> None:

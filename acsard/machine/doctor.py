@@ -1,0 +1,265 @@
+"""The findings of `acsard doctor`.
+
+A daemon that runs reports about itself and its robot: each row of its `diagnostics` is one finding,
+with the row's advice. The doctor adds what only a program beside it sees: the file and its
+certificates, the port, the computer, and whether programs listen where they should. It opens no
+serial port, and sends only queries. For a daemon on another machine it examines only the reports
+and this machine's certificates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import msgspec
+from msgspec import Struct
+from msgspec.structs import replace
+
+from acsard.bus.address import Address, address_of
+from acsard.bus.zenoh_sessions import answers, reachable
+from acsard.client import Client, connect
+from acsard.core.config.contradictions import warnings
+from acsard.core.config.live import differences
+from acsard.core.config.parsing import ConfigError, from_builtins, parse
+from acsard.core.config.settings import SIMULATOR, Config, is_tls
+from acsard.core.config.validation import write
+from acsard.core.formatting import listed
+from acsard.core.messages.diagnostics import OK
+from acsard.core.messages.schema import DiagnosticStatus, Info
+from acsard.core.values import NS_PER_S, AcsardError, Seconds
+from acsard.host import clock
+from acsard.host.errors import MendableError, NoAnswerError
+from acsard.host.processes import is_daemon_here
+from acsard.machine.certificate_findings import certificates, router_certificates
+from acsard.machine.finding import LEVELS, Finding
+from acsard.machine.local_findings import computer, serial_port
+
+MAX_KEYS = 6  # in one finding of `compared`
+
+# Set by options of `acsard run`, so a difference to the file is probably intended.
+OPTION_KEYS = (
+    "mcu.port", "mcu.baud_rate", "robot.id", "bus.listen", "bus.connect", "record.directory",
+    "ros.namespace",
+)  # fmt: skip
+
+# Zenoh replaces time stamps from 0.5 s on.
+MAX_APART_S = 0.4
+
+OTHER_VERSION_ADVICE = (
+    "if the daemon has another version of acsard, run this tool from the same version"
+)
+
+
+class Running(Struct, frozen=True):
+    """The answers of a running daemon."""
+
+    info: Info
+    config: Config
+    rows: tuple[DiagnosticStatus, ...]
+    role: str  # this client's role, certificate and name at the daemon
+    is_local: bool = True  # it runs on this machine
+    ahead_s: Seconds = 0.0  # its clock
+    round_trip_s: Seconds = 0.0  # of the query of its clock
+
+
+def examine(
+    where: str,
+    text: bytes,
+    overrides: dict[str, dict[str, object]],
+    find_address: Callable[[Config], Address] = address_of,
+) -> Iterator[Finding]:
+    """Yield all findings of the doctor. Raises `UsageError` for an invalid endpoint.
+
+    `overrides` replace values of the file by table and key. `where` is its path.
+    """
+    try:
+        config = parse(text, overrides)
+    except ConfigError as error:
+        for problem in error.problems:
+            yield Finding("configuration", "failure", f"{where}: {problem}", "see acsard.toml")
+        return
+    yield Finding("configuration", "ok", where)
+    address = find_address(config)
+    running = query_or_finding(config, address)
+    if isinstance(running, Finding):
+        yield running
+        yield from local(config, address, config.bus.tls, None)
+        return
+    yield Finding("daemon", "ok", f"acsard {running.info.version}, pid {running.info.pid}")
+    yield Finding("role", "ok", running.role)
+    yield from reported(running.rows)
+    if running.is_local:
+        yield from compared(running, config)
+        yield from local(running.config, address, config.bus.tls, running.info.pid)
+    else:
+        text_ = "the daemon runs on another machine: check its port, files and TLS gateway there"
+        yield Finding("daemon", "ok", text_)
+        yield from clocks(running)
+        yield from certificates(address.tls)
+
+
+def local(config: Config, address: Address, written: str, pid: int | None) -> Iterator[Finding]:
+    """Yield what only a program on the daemon's machine sees; `pid` is the daemon's, if it runs.
+
+    `config` is in force; `written` is the certificate directory in the file. systemd gives the
+    daemon copies of the certificates at its start, so all directories are examined.
+    """
+    for warning in warnings(config):
+        yield Finding("configuration", "warning", warning, "see acsard.toml")
+    yield from serial_port(config.mcu.port, config.mcu.simulated and pid is None)
+    yield from computer(config.control.real_time, pid)
+    for directory in dict.fromkeys((config.bus.tls, address.tls, written)):
+        yield from certificates(directory)
+    yield from routers(config, running=pid is not None)
+    yield from router_certificates(config)
+    yield from gateway(config)
+
+
+def reported(rows: tuple[DiagnosticStatus, ...]) -> Iterator[Finding]:
+    """Yield a finding for each row of the daemon's diagnostics, and each text once."""
+    for row in rows:
+        others = [other.message for other in rows if other is not row]
+        if row.level == OK and any(row.message in message for message in others):
+            continue
+        mend = "".join(pair.value for pair in row.values if pair.key == "advice")
+        subject = row.name.removeprefix("acsard: ")
+        yield Finding(subject, LEVELS[min(row.level, 2)], row.message, mend)
+
+
+def query_or_finding(config: Config, address: Address) -> Running | Finding:
+    """Return the daemon's answers, or a finding. Raises `UsageError` for an invalid endpoint."""
+    endpoint = address.endpoint
+    if not answers(endpoint):
+        if config.bus.mode == "client" and endpoint in map(reachable, config.bus.connect):
+            text = (
+                f"this tool reaches the daemon only through the Zenoh router at {endpoint}, and no "
+                "program listens there"
+            )
+            mend = (
+                "start that router (rmw_zenohd, zenohd or `acsard router`), then run `acsard "
+                "doctor` again; until then, `systemctl status acsard` shows the state of the daemon"
+            )
+            return Finding("daemon", "warning", text, mend)
+        mend = (
+            "if the daemon is a systemd service, `systemctl status acsard` shows why it does not "
+            "run; otherwise start it with `acsard run`. If the daemon was started with --listen "
+            "ADDRESS, give this command the same address with --connect"
+        )
+        return Finding("daemon", "warning", f"no program listens at {endpoint}", mend)
+    try:
+        return query(config, address)
+    except NoAnswerError as error:
+        mend = (
+            "if the daemon has another robot id, name that id with --id (`acsard fleet` lists the "
+            "robots); otherwise check whether another program listens at that address"
+        )
+        return Finding("daemon", "failure", str(error), mend)
+    except MendableError as error:
+        # The text of such an error contains the advice.
+        return Finding("daemon", "failure", str(error))
+    except AcsardError as error:
+        return Finding("daemon", "failure", str(error), OTHER_VERSION_ADVICE)
+
+
+def query(config: Config, address: Address) -> Running:
+    """Query the daemon. Raises an `AcsardError` without an answer.
+
+    The local `config`, with the values of `info`, stands in for one that is not returned.
+    """
+    endpoint, robot_id, tls = address
+    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+        info = robot.get("info")
+        runs, rows = _configuration(robot, info, config), tuple(robot.get("diagnostics").status)
+        sent, stamp, answered = clock.now(), robot.get("state").stamp, clock.now()
+        trip_s = (answered.mono_ns - sent.mono_ns) / NS_PER_S
+        ahead_s = (stamp.to_ns() - sent.wall_ns) / NS_PER_S - trip_s / 2
+        us = robot.whoami()
+        role = f"{us.describe()}; your sender id is {us.sender}"
+        return Running(info, runs, rows, role, is_daemon_here(info.pid), ahead_s, trip_s)
+
+
+def _configuration(robot: Client, info: Info, file: Config) -> Config:
+    # Otherwise `file`, with the values of `info`.
+    try:
+        return from_builtins(robot.get("config"))
+    except (AcsardError, msgspec.ValidationError):  # not permitted, or a daemon of another version
+        mcu = replace(file.mcu, port=SIMULATOR if info.simulated else info.port)
+        bus = replace(file.bus, listen=tuple(info.listen), connect=tuple(info.connect))
+        return replace(file, robot=replace(file.robot, id=info.id), mcu=mcu, bus=bus)
+
+
+def compared(running: Running, file: Config) -> Iterator[Finding]:
+    """Yield a finding about the values of the daemon that differ from those of the file."""
+    others = differences(running.config, file)
+    typed = {key: difference for key, difference in others.items() if key in OPTION_KEYS}
+    changed = {key: difference for key, difference in others.items() if key not in OPTION_KEYS}
+    if not others:
+        yield Finding("configuration", "ok", "the running daemon uses the file's values")
+    if typed:
+        keys = [(key.rpartition("."), write(value.its)) for key, value in typed.items()]
+        lines = "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in keys)
+        texts = [value.describe(key) for key, value in typed.items()]
+        yield Finding(
+            "configuration",
+            "ok",
+            "the running daemon has other values than the file, for example by options of `acsard "
+            f"run`: {listed(texts, MAX_KEYS, '; ')}",
+            f"to keep them after a restart, write them into the file: {lines}",
+        )
+    if changed:
+        texts = [value.describe(key) for key, value in changed.items()]
+        yield Finding(
+            "configuration",
+            "warning",
+            "the running daemon has other values than the file, by `acsard set`, by another file, "
+            "or because the file has changed since the daemon's start: "
+            f"{listed(texts, MAX_KEYS, '; ')}",
+            "restart the daemon with this file, name the daemon's file with --config, or keep a "
+            "value with `acsard set KEY VALUE --keep`",
+        )
+
+
+def clocks(running: Running) -> Iterator[Finding]:
+    """Yield a warning if the clock of a daemon on another machine differs from this machine's."""
+    # The daemon has read its clock at an unknown moment between the query and the answer.
+    if abs(running.ahead_s) > MAX_APART_S + running.round_trip_s / 2:
+        way = "ahead of" if running.ahead_s > 0 else "behind"
+        yield Finding(
+            "clock",
+            "warning",
+            f"the daemon's clock is {abs(running.ahead_s):.1f} s {way} this machine's",
+            "let NTP set the clocks of both machines (timedatectl), or let the clients echo the "
+            "key beat (deploy/clients/README.md): commands with an echo do not need a common clock",
+        )
+
+
+def routers(config: Config, running: bool) -> Iterator[Finding]:
+    """Yield warnings about endpoints in `bus.connect` without TLS, or without a program.
+
+    A running daemon reports the latter itself.
+    """
+    for endpoint in config.bus.connect:
+        if not running and not answers(endpoint):
+            mend = "start the Zenoh router there (rmw_zenohd, zenohd or `acsard router`)"
+            yield Finding("router", "warning", f"no program listens at {endpoint}", mend)
+        if not is_tls(endpoint):
+            yield Finding(
+                "bus",
+                "warning",
+                f"the daemon connects to the router at {endpoint} without TLS: every program that "
+                "is connected to that router has the rights of this machine",
+                "let the router listen only on loopback, or let the daemon connect to it over TLS",
+            )
+
+
+def gateway(config: Config) -> Iterator[Finding]:
+    """Yield a finding for each endpoint of the TLS gateway: does a program listen there?"""
+    for endpoint in config.bus.outside:
+        if answers(endpoint):
+            yield Finding("gateway", "ok", f"open at {endpoint}")
+        else:
+            mend = (
+                "`systemctl status acsard-gateway` shows why the TLS gateway does not run; without "
+                "the systemd service, `acsard run` starts a gateway by itself"
+            )
+            yield Finding("gateway", "warning", f"no program listens at {endpoint}", mend)
