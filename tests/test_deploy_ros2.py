@@ -475,7 +475,7 @@ def row_names() -> list[str]:
 def test_each_row_of_diagnostics_falls_into_exactly_one_group_of_the_aggregator() -> None:
     """The aggregator puts a row into a group if its name begins with an entry of `startswith`."""
     names = row_names()
-    assert len(set(names)) == 12
+    assert len(set(names)) == 13
     for name in names:
         matches = [
             group
