@@ -38,6 +38,7 @@ VERBS = {
     "fleet": "show one line per robot, live",
     "foxglove": "show the robot live in Foxglove or Lichtblick",
     "drive": "drive the robot with the keyboard",
+    "move": "drive the robot a distance, or turn it by an angle, by its odometry",
     "web": "serve the robot's page: see, stop and drive the robot in a browser",
     "call": "call a service of the robot, such as stop or clear",
     "set": "change a setting of the running robot, or list the changeable settings",
@@ -56,7 +57,7 @@ UNLISTED = ("gateway",)  # started only by systemd and `acsard run`
 # Their exit code says whether something was done or judged, so they fail if the reader of their
 # output ends early. An action such as `recording replay` sets `must_finish` instead.
 MUST_FINISH = {
-    "call", "set", "doctor", "mcu", "calibrate", "tls", "service",
+    "move", "call", "set", "doctor", "mcu", "calibrate", "tls", "service",
 }  # fmt: skip
 
 MAX_ARGUMENT_LENGTH = 4096  # characters; Zenoh fails on keys above 65,535 bytes

@@ -52,7 +52,7 @@ from acsard.calibration.recorded_drive import calibrated
 from acsard.calibration.solve import Calibration
 from acsard.cli.common import add_outcome, load
 from acsard.cli.connection import add_bus, require_one
-from acsard.client import connect
+from acsard.client.connection import open_connection
 from acsard.core.config.settings import Config
 from acsard.core.messages.keys_and_roles import full_key
 from acsard.host.config_file import change, writable
@@ -192,10 +192,10 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
 
 def _guided(args: argparse.Namespace, file: str, file_config: Config) -> tuple[Calibration, Config]:
     require_one(args)
-    endpoint, robot_id, tls = address_of(file_config, args.connect, args.id, args.tls)
-    _usable(args, full_key(robot_id, "odom"))
+    where = address_of(file_config, args.connect, args.id, args.tls)
+    _usable(args, full_key(where.robot_id, "odom"))
     options = DriveOptions(args.method, args.positions, args.positions_at, args.imu, args.yes)
-    with connect(endpoint, robot_id=robot_id, source=SOURCE, tls=tls) as client:
+    with open_connection(where, SOURCE) as client:
         return guided_drive(
             client, options, file, file_config, _prompt(args), must_write=args.write
         )

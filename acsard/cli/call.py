@@ -12,7 +12,7 @@ from acsard.bus import robot_discovery
 from acsard.cli.common import options_text
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, several_ids
 from acsard.cli.replies import of_each, print_each
-from acsard.client import Client
+from acsard.client.connection import Connection
 from acsard.core.formatting import json_line, lines
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.keys_and_roles import SERVICES
@@ -117,7 +117,7 @@ def one_robot_only_text(
     )
 
 
-def _stop_all(robot: Client, ids: tuple[str, ...], *, as_json: bool) -> int:
+def _stop_all(robot: Connection, ids: tuple[str, ...], *, as_json: bool) -> int:
     # First stop every named robot without waiting for answers. `of_each` may first look up which
     # robots are present, which would delay the stop.
     robot_discovery.stop(robot.session, ids, robot.caller)

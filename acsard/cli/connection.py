@@ -16,7 +16,7 @@ from acsard.bus.address import Address, address_of
 from acsard.bus.robot_discovery import Presence, explain_silence, parse_ids, presence
 from acsard.bus.tls import trouble
 from acsard.cli.common import add_config, load
-from acsard.client import Client, connect
+from acsard.client.connection import Connection, open_connection
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S
 from acsard.core.config.settings import TLS_PREFIX
 from acsard.core.formatting import printable
@@ -46,10 +46,9 @@ def add_bus(parser: argparse.ArgumentParser, more: str = "", default: object = N
 
 
 @contextmanager
-def connected(args: argparse.Namespace, source: str = "app") -> Iterator[Client]:
+def connected(args: argparse.Namespace, source: str = "app") -> Iterator[Connection]:
     """Yield a client of the one robot that the options name. Raises `UsageError` for several."""
-    endpoint, robot_id, tls = robot_address(args)
-    with connect(endpoint, robot_id=robot_id, source=source, tls=tls) as robot:
+    with open_connection(robot_address(args), source) as robot:
         yield robot
 
 
@@ -75,26 +74,25 @@ def require_one(args: argparse.Namespace) -> None:
 
 
 @contextmanager
-def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[str, ...]]]:
-    """Yield a client, and the ids of the robots to use by `Client.sibling`.
+def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Connection, tuple[str, ...]]]:
+    """Yield a client, and the ids of the robots to use by `Connection.sibling`.
 
     These are () for one robot, which is the client's, and only "*" for `--id '*'`.
     """
     many = several_ids(args)
     _, config = load(args.config)
     where = address_of(config, args.connect, None if many else args.id, args.tls)
-    with connect(where.endpoint, robot_id=where.robot_id, tls=where.tls) as robot:
+    with open_connection(where) as robot:
         yield robot, many
 
 
 def require_followed(key: str) -> None:
-    """Raise `UsageError`, with the right command, if nothing is published on a known key.
+    """Raise `UsageError` for a key that does not exist, or on which nothing is published.
 
-    Print a warning for an unknown one: a misspelt key would look like a silent robot.
+    A misspelt key would look like a silent robot. A key may contain wildcards.
     """
-    if unknown(key):
-        words = f"{key} is not in the topic table ({key_hint(key)}); waiting for messages anyway"
-        print(f"acsard: {printable(words)}", file=sys.stderr)
+    if unknown(key) and not set(key) & set("*$"):
+        raise UsageError(f"{key} is not a key of the robot: {key_hint(key)}")
     row = row_of(key)
     if row is None:
         return
@@ -182,7 +180,7 @@ def explained(
 
 
 def silence_explained(
-    robot: Client, key: str, timeout_s: float | None = None
+    robot: Connection, key: str, timeout_s: float | None = None
 ) -> AbstractContextManager[Callable[[], None]]:
     """Return `explained` for a key, or if it is "", only for a lost connection.
 
@@ -195,7 +193,7 @@ def silence_explained(
     )
 
 
-def _none_yet(robot: Client, key: str) -> str:
+def _none_yet(robot: Connection, key: str) -> str:
     where = robot.where
     status = presence(robot.session, where.robot_id, where.endpoint)
     if status is None:
@@ -205,7 +203,7 @@ def _none_yet(robot: Client, key: str) -> str:
     return f"waiting for messages on {robot.key(key)}: {reason}"
 
 
-def _ceased(robot: Client) -> str:
+def _ceased(robot: Connection) -> str:
     try:
         if robot.session.info.links():
             return ""

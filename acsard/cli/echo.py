@@ -34,8 +34,8 @@ from acsard.cli.connection import (
     silence_explained,
 )
 from acsard.cli.replies import json_line, of_robot
-from acsard.client import Client
-from acsard.client.synchronous import decoder
+from acsard.client.connection import Connection
+from acsard.client.reads import decoder
 from acsard.core import formatting
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import TOPICS, by_key
@@ -168,7 +168,7 @@ def _print(
 
 
 def _print_rates(
-    robot: Client, topic: str, most: int | None, on_message: Callable[[], None]
+    robot: Connection, topic: str, most: int | None, on_message: Callable[[], None]
 ) -> int:
     # Python receives fewer than a million messages in `RATE_SPAN_S`. So the limit takes effect only
     # while the output is blocked.
@@ -228,7 +228,7 @@ def _message_text(decoder: Decoder[Any] | None, encoding: str, payload: bytes, w
 
 
 def _record(
-    robot: Client,
+    robot: Connection,
     keys: list[str],
     most: int | None,
     timeout: float | None,
@@ -269,7 +269,7 @@ def _report_left_out(full_key: str, key: str, error: Exception) -> None:
     )
 
 
-def _expected(robot: Client, ids: tuple[str, ...]) -> Collection[str]:
+def _expected(robot: Connection, ids: tuple[str, ...]) -> Collection[str]:
     # Also prints which robots are present.
     # Without the printed text, the operator could not distinguish a silent robot from an absent
     # robot.

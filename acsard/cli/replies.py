@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 import msgspec
 
 from acsard.bus.robot_discovery import ALL_ROBOTS, count_text, running_robots
-from acsard.client import Client
+from acsard.client.connection import Connection
 from acsard.core import formatting
 from acsard.core.formatting import printable
 from acsard.core.messages.encodings import DecodeError, detect, encode
@@ -39,7 +39,7 @@ def json_line(encoding: str, payload: bytes) -> str:
 Replies = Mapping[str, ServiceReply | AcsardError]
 
 
-def present_ids(robot: Client, ids: Sequence[str]) -> Sequence[str]:
+def present_ids(robot: Connection, ids: Sequence[str]) -> Sequence[str]:
     """Return `ids`, or for "*" all present robots. Raises `NoAnswerError` if there are none."""
     if ALL_ROBOTS in ids:
         return running_robots(robot.session, ids, robot.where.endpoint)
@@ -47,7 +47,7 @@ def present_ids(robot: Client, ids: Sequence[str]) -> Sequence[str]:
 
 
 def of_each(
-    robot: Client, ids: Sequence[str], call: Callable[[Client], ServiceReply]
+    robot: Connection, ids: Sequence[str], call: Callable[[Connection], ServiceReply]
 ) -> dict[str, ServiceReply | AcsardError]:
     """Call a service of several robots at once, and return replies or errors by robot id."""
     from concurrent.futures import ThreadPoolExecutor  # slow, and one robot does not need it
@@ -65,7 +65,7 @@ def of_each(
 
 
 def print_each(
-    replies: Replies, robot: Client, ids: Sequence[str], silence: str, *, as_json: bool
+    replies: Replies, robot: Connection, ids: Sequence[str], silence: str, *, as_json: bool
 ) -> int:
     """Print a line for each reply, and return the exit code.
 

@@ -19,7 +19,7 @@ import msgspec
 
 from acsard.cli.connection import SEVERAL_IDS, add_bus, connected_to_many, several_ids
 from acsard.cli.replies import of_each, print_each
-from acsard.client import Client
+from acsard.client.connection import Connection
 from acsard.core.config.live import find_live_setting, flat
 from acsard.core.config.validation import finite, show
 from acsard.core.formatting import json_line, lines
@@ -114,9 +114,9 @@ def _with_duration(reply: ServiceReply) -> ServiceReply:
 
 
 def _set_all(
-    robot: Client, ids: tuple[str, ...], settings: dict[str, Plain], *, as_json: bool
+    robot: Connection, ids: tuple[str, ...], settings: dict[str, Plain], *, as_json: bool
 ) -> int:
-    def change_one(client: Client) -> ServiceReply:
+    def change_one(client: Connection) -> ServiceReply:
         reply = client.set(settings)
         return reply if as_json else _with_duration(reply)
 

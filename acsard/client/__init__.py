@@ -3,17 +3,20 @@
     from acsard.client import connect
 
     with connect() as robot:
-        robot.drive(0.5, 0.0, seconds=2.0)
-        print(robot.pose())
+        robot.move(1.0)
+        robot.turn(90)
+        for odom in robot.messages("odom", timeout=1.0):
+            print(odom.time, odom.yaw)
 
 `connect` is for scripts and `connect_async` for asyncio programs. Both offer the same methods and
-typed messages (`acsard.core.messages.schema`). The daemon refuses late commands, and requires a
-zero (a command with the speed 0) from each sender before that sender may move the robot. The client
-follows these rules: each command has its sender, a number and the newest beat of the daemon, and
-zeros come before each drive.
+typed messages (`acsard.core.messages.schema`): `mypy --strict` finds a wrong key or field. The
+daemon refuses late commands, and requires a zero (a command with the speed 0) from each sender
+before that sender may move the robot. The client follows these rules: each command has its sender,
+a number and the newest beat of the daemon, and zeros come before each drive.
 When the `with` block ends, even with an exception, the client sends zeros until the robot stands,
-for up to 2 s, if its last command was not zero. `drive` raises an error if the robot does not
-follow the commands. When `drive` returns, the robot stands still, unless something else moves it.
+for up to 2 s, if its last command was not zero. `drive`, `move` and `turn` raise an error if the
+robot does not follow the commands. When they return, the robot stands still, unless something else
+moves it.
 
 If you leave out an argument, its value comes from the configuration file that the environment
 variable ACSARD_CONFIG names (`bus.listen`, `robot.id`, `bus.tls`). Without that variable, the
@@ -24,7 +27,8 @@ All errors are `AcsardError`s, and most are also the built-in exception in the s
 text of an error says what to do:
 
     UnreachableError   ConnectionError  no daemon listens at the endpoint
-    NoAnswerError      TimeoutError     the robot or the key does not exist, or you may not query it
+    NoAnswerError      TimeoutError     the robot does not exist or is stuck, or you may not query
+                                        the key
     ReplyError         RuntimeError     the daemon reports a failure; a service that refuses says so
                                         in its reply instead
     NotDrivenError     RuntimeError     the robot does not follow your commands: it is stopped or in
@@ -34,14 +38,14 @@ text of an error says what to do:
     NotPermittedError  PermissionError  your certificate does not allow this, or you may not read
                                         its files
     CertificateError   ValueError       the certificates do not exist or cannot be used
-    UsageError         ValueError       an endpoint, id, key or number is not valid, or the
+    UsageError         ValueError       an endpoint, id or number is not valid, a key does not
+                                        exist (the text has the near name), or the
                                         file that ACSARD_CONFIG names is not valid
     DecodeError                         a payload is not a message of acsard
 """
 
 from typing import TYPE_CHECKING
 
-from acsard.bus.subscription import Subscription
 from acsard.client.identity import ClientIdentity
 from acsard.client.synchronous import Client, connect
 from acsard.core.messages.encodings import DecodeError
@@ -71,7 +75,6 @@ __all__ = (
     "NotPermittedError",
     "Pose",
     "ReplyError",
-    "Subscription",
     "UnreachableError",
     "UsageError",
     "connect",

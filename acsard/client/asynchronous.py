@@ -7,17 +7,17 @@ for up to 3 ms (`MIN_SPACING_S`) directly after another.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import aclosing, asynccontextmanager, closing, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import asynccontextmanager, closing, suppress
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from acsard.bus.address import address_by_environment
-from acsard.bus.subscription import encoded
 from acsard.bus.zenoh_sessions import client_session
+from acsard.client.connection import REPLY_TIMEOUT_S, Connection, close, end_at_exit
 from acsard.client.driving import Driver, Steps, UnheardError, drive, move, turn
 from acsard.client.identity import ClientIdentity
-from acsard.client.synchronous import REPLY_TIMEOUT_S, Client, close, decoder, end_at_exit
+from acsard.client.reads import AsyncReads
 from acsard.core.messages import schema
 from acsard.core.values import AcsardError, Plain, Pose
 from acsard.host.errors import NoAnswerError
@@ -46,7 +46,7 @@ async def connect_async(
     """
     where = await _in_thread(lambda: address_by_environment(endpoint, robot_id, tls), 5.0)
     session = await _in_thread(lambda: client_session(where.endpoint, where.tls), 10.0, late=close)
-    robot = Client(session, where.robot_id, source, where.tls, where.endpoint)
+    robot = Connection(session, where.robot_id, source, where.tls, where.endpoint)
     end_at_exit(robot)
     try:
         yield AsyncClient(robot)
@@ -83,15 +83,27 @@ async def _in_thread(
         ) from None
 
 
-class AsyncClient:
-    """A client for asyncio, with methods like those of `Client`. Create it with `connect_async`."""
+class AsyncClient(AsyncReads):
+    """A client for asyncio, with the methods of `Client`. Create it with `connect_async`."""
 
-    def __init__(self, client: Client) -> None:
-        self._client = client
+    def __init__(self, connection: Connection) -> None:
+        self._reads = self._connection = connection
+
+    @property
+    def name(self) -> str:
+        """The name of this program in the robot's log of service calls. You may change it."""
+        return self._connection.name
+
+    @name.setter
+    def name(self, name: str) -> None:
+        self._connection.name = name
+
+    def _call(self, function: Callable[[], T]) -> Awaitable[T]:
+        return _in_thread(function)
 
     def send(self, linear: float, angular: float = 0.0) -> None:
         """Send one command: `linear` m/s, `angular` rad/s (left is +). Repeat it to keep moving."""
-        self._client.send(linear, angular)
+        self._connection.send(linear, angular)
 
     async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
         """Drive for `seconds`, as `Client.drive` does. If the task is cancelled, send zeros."""
@@ -106,7 +118,7 @@ class AsyncClient:
         await self._run(turn(degrees, speed))
 
     async def _run(self, steps: Steps) -> None:
-        driver = Driver(self._client)
+        driver = Driver(self._connection)
         try:
             with closing(steps(driver)) as pauses:
                 for pause_s in pauses:
@@ -115,34 +127,31 @@ class AsyncClient:
             for pause_s in driver.zeros():
                 await asyncio.sleep(pause_s)
             if isinstance(error, UnheardError | NoAnswerError):
-                raise await _in_thread(partial(self._client.explain_error, error)) from None
+                raise await _in_thread(partial(self._connection.explain_error, error)) from None
             raise
         finally:
             driver.end()
 
+    async def stop(self) -> schema.ServiceReply:
+        """Stop the robot, and return its reply. It stays stopped until `clear`."""
+        return await self.call("stop")
+
+    async def clear(self) -> schema.ServiceReply:
+        """Release the faults and stops that are older than this call, and return the reply."""
+        return await self.call("clear")
+
     async def call(self, service: str, **fields: object) -> schema.ServiceReply:
         """Call a service and return its reply, as `Client.call` does."""
-        return await _in_thread(lambda: self._client.call(service, **fields))
+        return await _in_thread(lambda: self._connection.call(service, **fields))
 
     async def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
         """Change settings of the daemon and return the reply, as `Client.set` does."""
-        return await _in_thread(lambda: self._client.set(settings))
-
-    async def get(self, name: str) -> Any:
-        """Return the last message on a key, decoded to its type, as `Client.get` does."""
-        return await _in_thread(lambda: self._client.get(name))
+        return await _in_thread(lambda: self._connection.set(settings))
 
     async def whoami(self) -> ClientIdentity:
         """Return this client's role and name at the robot, as `Client.whoami` does."""
-        return await _in_thread(self._client.whoami)
+        return await _in_thread(self._connection.whoami)
 
     async def pose(self) -> Pose:
         """Return the present pose of the robot in the odom frame, m and rad."""
-        return await _in_thread(self._client.pose)
-
-    async def messages(self, name: str) -> AsyncIterator[Any]:
-        """Yield the messages of a published key as they arrive, decoded to their types."""
-        reader = decoder(name)
-        async with aclosing(self._client.subscribe(name).arriving()) as samples:
-            async for sample in samples:
-                yield reader.decode(*encoded(sample))
+        return await _in_thread(self._connection.pose)

@@ -17,8 +17,8 @@ from msgspec import Struct
 
 from acsard.bus.robot_discovery import ALL_ROBOTS, robot_of
 from acsard.bus.subscription import encoded
+from acsard.client.connection import Connection
 from acsard.client.follower import FLEET_QUERY_PERIOD_S, Follower
-from acsard.client.synchronous import Client
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import full_key
 from acsard.core.messages.schema import RobotState
@@ -51,7 +51,7 @@ class _TrackedRobot:
 class Fleet:
     """Follows several robots, or all robots on the bus, and returns a row for each."""
 
-    def __init__(self, robot: Client, ids: Sequence[str], most: int = MAX_ROBOTS) -> None:
+    def __init__(self, robot: Connection, ids: Sequence[str], most: int = MAX_ROBOTS) -> None:
         # Raises `ZError`. "*" in `ids` is all robots. Beyond `most`, a new robot replaces an absent
         # one that `ids` does not name, or is left out.
         self._robot, self._ids, self._most = robot, ids, most

@@ -12,7 +12,7 @@ import msgspec
 import zenoh
 from foxglove import StatusLevel
 
-from acsard.client import Client
+from acsard.client.connection import Connection
 from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import Config
 from acsard.core.messages.permissions import has, least_role
@@ -38,7 +38,7 @@ class Bridge:
     """
 
     def __init__(
-        self, robot: Client, address: tuple[str, int], tell: Callable[[str], None]
+        self, robot: Connection, address: tuple[str, int], tell: Callable[[str], None]
     ) -> None:
         self._robot, self._id, self._tell = robot, robot.where.robot_id, tell
         robot.name += " foxglove"
@@ -120,10 +120,10 @@ class Bridge:
         self._server.publish_status(self._problem, StatusLevel.Error, STATUS_ID)
 
 
-def configuration(robot: Client) -> Config:
+def configuration(robot: Connection) -> Config:
     """Return the robot's configuration, or the default one if this program may not read it.
 
-    Raises the errors of `Client.get`, and `ReplyError` if a reply is not readable.
+    Raises the errors of `Connection.get`, and `ReplyError` if a reply is not readable.
     """
     if robot.where.tls and not has(robot.whoami().role, least_role("config")):
         return Config()

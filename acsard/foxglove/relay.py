@@ -14,8 +14,8 @@ import msgspec
 import zenoh
 
 from acsard.bus.subscription import Subscription, encoded, queue_on
-from acsard.client import Client
-from acsard.client.synchronous import decoder
+from acsard.client.connection import Connection
+from acsard.client.reads import decoder
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.keys_and_roles import by_key
@@ -77,7 +77,9 @@ class _Out:
 class Relay:
     """Forwards all topics of a robot to the viewers. Only one thread may use this class."""
 
-    def __init__(self, robot: Client, context: foxglove.Context, wake: Callable[[], None]) -> None:
+    def __init__(
+        self, robot: Connection, context: foxglove.Context, wake: Callable[[], None]
+    ) -> None:
         self._robot, self._context, self._wake = robot, context, wake
         self._outs: dict[str, _Out] = {}
         self._followed: dict[str, Subscription] = {}

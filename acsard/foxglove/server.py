@@ -17,7 +17,7 @@ import foxglove
 import msgspec
 from foxglove.websocket import Capability, ChannelView, Client, WebSocketServer
 
-from acsard.client import Client as Robot
+from acsard.client.connection import Connection as Robot
 from acsard.core.config.settings import RosConfig
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.json_schema import SCHEMAS

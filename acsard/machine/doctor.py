@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from acsard.bus.address import Address, address_of
 from acsard.bus.zenoh_sessions import answers, reachable
-from acsard.client import Client, connect
+from acsard.client.connection import Connection, open_connection
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.live import differences
 from acsard.core.config.parsing import ConfigError, from_builtins, parse
@@ -166,8 +166,7 @@ def query(config: Config, address: Address) -> Running:
 
     The local `config`, with the values of `info`, stands in for one that is not returned.
     """
-    endpoint, robot_id, tls = address
-    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+    with open_connection(address) as robot:
         info = robot.get("info")
         runs, rows = _configuration(robot, info, config), tuple(robot.get("diagnostics").status)
         sent, stamp, answered = clock.now(), robot.get("state").stamp, clock.now()
@@ -178,7 +177,7 @@ def query(config: Config, address: Address) -> Running:
         return Running(info, runs, rows, role, is_daemon_here(info.pid), ahead_s, trip_s)
 
 
-def _configuration(robot: Client, info: Info, file: Config) -> Config:
+def _configuration(robot: Connection, info: Info, file: Config) -> Config:
     # Otherwise `file`, with the values of `info`.
     try:
         return from_builtins(robot.get("config"))

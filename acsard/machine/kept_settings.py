@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 from msgspec.structs import replace
 
-from acsard.client import Client
+from acsard.client.connection import Connection
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.values import Plain
 from acsard.host.config_file import change, writable
@@ -22,7 +22,9 @@ def can_be_kept(key: str) -> bool:
     return not key.startswith("commands.sources.")
 
 
-def set_and_keep(robot: Client, config: str | None, settings: Mapping[str, Plain]) -> ServiceReply:
+def set_and_keep(
+    robot: Connection, config: str | None, settings: Mapping[str, Plain]
+) -> ServiceReply:
     """Change settings, write them into the configuration file, and return the reply.
 
     `config` is the path of the file; None means the usual places. Raises `UsageError` or

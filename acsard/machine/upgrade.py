@@ -19,7 +19,7 @@ from msgspec import Struct, field
 
 from acsard.bus.address import Address, address_of
 from acsard.bus.zenoh_sessions import answers
-from acsard.client.synchronous import connect
+from acsard.client.connection import open_connection
 from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.config.settings import Config
 from acsard.core.messages.diagnostics import MAX_MISSED_FRACTION
@@ -126,8 +126,7 @@ def look(address: Address) -> Look | None:
     if not answers(address.endpoint):
         return None
     try:
-        endpoint, robot_id, tls = address
-        with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+        with open_connection(address) as robot:
             sent = robot.get("cmd_vel_out").twist
             return Look(robot.get("state"), bool(sent.linear.x or sent.angular.z))
     except AcsardError:

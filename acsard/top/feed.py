@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from acsard.client import Client
+from acsard.client.connection import Connection
 from acsard.client.follower import Watch, restarted
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState
@@ -16,7 +16,7 @@ from acsard.top.screen import ScreenData
 class Feed:
     """Receives the states of a robot, and keeps those of about the last second."""
 
-    def __init__(self, robot: Client) -> None:
+    def __init__(self, robot: Connection) -> None:
         self._robot = robot
         # Query `info` first: if no daemon answers, this query raises an error with a clear message.
         self._info = self._ask_info()
@@ -24,7 +24,7 @@ class Feed:
         self._past: deque[tuple[float, RobotState]] = deque()
 
     def query_state(self) -> None:
-        """Query the present state. Raises `ReplyError`, and the errors of `Client.get`."""
+        """Query the present state. Raises `ReplyError`, and the errors of `Connection.get`."""
         try:
             state: RobotState = self._robot.get("state")
         except DecodeError as error:

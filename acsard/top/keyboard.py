@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 
-from acsard.client import Client
+from acsard.client.connection import Connection
 from acsard.client.driving import Driver
 from acsard.client.ride import GRACE_S, can_drive
 from acsard.core.values import REST, Twist
@@ -103,7 +103,7 @@ class Keyboard:
 class KeyboardDrive:
     """Sends the commands of the typed keys to the robot, and receives the robot's state."""
 
-    def __init__(self, robot: Client, keyboard: Keyboard) -> None:
+    def __init__(self, robot: Connection, keyboard: Keyboard) -> None:
         self._robot, self._keyboard = robot, keyboard
         self._driver = Driver(robot)
         # Subscribing may take long. The terminal discards the keys that are typed until it is done.

@@ -11,7 +11,7 @@ import asyncio
 from collections.abc import Mapping
 from typing import Any
 
-from acsard.client import Client
+from acsard.client.connection import Connection
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.keys_and_roles import SERVICE_NAME, service_key
 from acsard.core.messages.permissions import least_role
@@ -67,7 +67,7 @@ class Calls:
             raise MendableError(self._robot.gone)
         return await in_thread(lambda: client.reply(f"{name}?fmt=json"), ANSWER_TIMEOUT_S)
 
-    def _request(self, client: Client, verb: str, payload: Mapping[str, Any]) -> ServiceReply:
+    def _request(self, client: Connection, verb: str, payload: Mapping[str, Any]) -> ServiceReply:
         if verb != "set" or "keep" not in payload:
             return client.request(verb, payload)
         arguments = dict(payload)
@@ -82,14 +82,14 @@ class _Stops:
         self._under_way = asyncio.Lock()
         self._next: asyncio.Task[ServiceReply] | None = None
 
-    async def send(self, client: Client) -> ServiceReply:
+    async def send(self, client: Connection) -> ServiceReply:
         if self._next is None:
             self._next = asyncio.create_task(self._send(client))
             # Its error counts as retrieved even if all callers have gone.
             self._next.add_done_callback(lambda done: done.cancelled() or done.exception())
         return await asyncio.shield(self._next)
 
-    async def _send(self, client: Client) -> ServiceReply:
+    async def _send(self, client: Connection) -> ServiceReply:
         async with self._under_way:
             self._next = None  # a later press needs a later stop
             return await in_thread(lambda: client.request("stop", {}), ANSWER_TIMEOUT_S)

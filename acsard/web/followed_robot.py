@@ -15,7 +15,7 @@ from msgspec import Struct
 
 from acsard.bus.address import Address
 from acsard.bus.tls import shown_at
-from acsard.client import Client
+from acsard.client.connection import Connection
 from acsard.client.follower import Watch, restarted
 from acsard.core.config.settings import RatesConfig
 from acsard.core.messages.encodings import DecodeError, Decoder
@@ -45,7 +45,7 @@ PATH_JUMP_M = 1.0
 T = TypeVar("T")
 
 # Blocks until the daemon is connected. Raises `UnreachableError`.
-Connect = Callable[[], Client]
+Connect = Callable[[], Connection]
 
 
 class About(Struct, frozen=True):
@@ -85,7 +85,7 @@ class PathHistory:
 
 
 class _TaskQueries:
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: Connection) -> None:
         self.subscribe, self._client = client.subscribe, client
         self._asked: asyncio.Task[None] | None = None
 
@@ -109,7 +109,7 @@ class FollowedRobot:
         # Common name of this server's TLS certificate, a part of the public names of all viewers.
         self.certificate = shown_at(address.endpoint, address.tls)
         self.about = about
-        self.client: Client | None = None
+        self.client: Connection | None = None
         self.streams = Streams()
         # why the robot is not reachable, or ""
         self.gone = f"no daemon answers at {address.endpoint} yet"
@@ -157,7 +157,7 @@ class FollowedRobot:
     def minute(self) -> Plotted:
         return self._minute.plotted(clock.steady_ns())
 
-    async def _reached(self) -> Client:
+    async def _reached(self) -> Connection:
         while True:
             try:
                 return await in_thread(self._connect, None)

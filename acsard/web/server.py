@@ -20,7 +20,7 @@ from acsard.bus.address import Address
 from acsard.bus.certificate_watch import CertificateFiles
 from acsard.bus.tls import CERTIFICATE, KEY, files_in, names_in
 from acsard.bus.zenoh_sessions import client_session
-from acsard.client import Client
+from acsard.client.connection import Connection
 from acsard.core.config.settings import Config
 from acsard.core.values import Event
 from acsard.host.child import HEARTBEAT_S, Parent, end_signals, end_with_parent
@@ -161,9 +161,9 @@ async def _watch_parent(leaving: asyncio.Event) -> None:
         loop.remove_reader(parent.fd)
 
 
-def _connected(address: Address) -> Client:
+def _connected(address: Address) -> Connection:
     session = client_session(address.endpoint, address.tls)
-    return Client(session, address.robot_id, DEFAULT_SOURCE, address.tls, address.endpoint)
+    return Connection(session, address.robot_id, DEFAULT_SOURCE, address.tls, address.endpoint)
 
 
 def _about(options: ServerOptions) -> About:

@@ -16,7 +16,7 @@ import msgspec
 import zenoh
 
 from acsard.bus.subscription import encoded, has_exact_key
-from acsard.client import Client
+from acsard.client.connection import Connection
 from acsard.core.messages.encodings import DecodeError, detect
 from acsard.core.messages.keys_and_roles import FOLLOWED
 from acsard.host import clock
@@ -88,7 +88,7 @@ class Streams:
         self._streams: dict[str, Stream] = {}
         self._ending: set[asyncio.Task[None]] = set()
 
-    async def follow(self, client: Client, key: str) -> Stream:
+    async def follow(self, client: Connection, key: str) -> Stream:
         """Return the stream of a key, for which the caller must call `leave` later.
 
         Raises one of `NOT_READY_ERRORS`.
@@ -122,7 +122,7 @@ class Streams:
         if stream.declared is not None:
             start(attempt(stream.declared.undeclare), self._ending)
 
-    async def _declare(self, client: Client, key: str, stream: Stream) -> Any:
+    async def _declare(self, client: Connection, key: str, stream: Stream) -> Any:
         def of_it(take: Take) -> Take:
             return lambda sample: take(sample) if has_exact_key(client.key(key), sample) else None
 

@@ -14,9 +14,8 @@ from typing import Any
 import aiohttp
 from aiohttp import web
 
-from acsard.client import Client
+from acsard.client.connection import CommandSigner, Connection
 from acsard.client.ride import MAX_SOURCE_TIMEOUT_S
-from acsard.client.synchronous import CommandSigner
 from acsard.core.messages import schema
 from acsard.core.messages.permissions import COMMAND_ROLE, SERVICE_ROLES
 from acsard.core.messages.signature import public_name
@@ -65,7 +64,7 @@ class ViewerCommands:
     The server itself creates only zeros, for a viewer that was driving and has disconnected.
     """
 
-    def __init__(self, client: Callable[[], Client | None], counts: Counts) -> None:
+    def __init__(self, client: Callable[[], Connection | None], counts: Counts) -> None:
         self._client, self._counts = client, counts
         # If an error ends its thread, the server must exit: it cannot stop the robot any more when
         # a viewer disconnects.

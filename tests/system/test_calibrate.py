@@ -27,7 +27,7 @@ from acsard.calibration.guided.robot_on_bus import (
     Sample,
     Sensor,
 )
-from acsard.client import Client
+from acsard.client.connection import Connection
 from acsard.core.codes import CODES
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, JointsConfig
@@ -427,7 +427,7 @@ def test_positions_that_are_missing_or_of_another_type_are_reported(
 @pytest.mark.slow
 def test_an_unreadable_state_ends_the_leg_with_the_reason(free: str) -> None:
     with router(free) as sender, client_session(free, "") as receiver:
-        client = Client(receiver, "acsar", "app")
+        client = Connection(receiver, "acsar", "app")
         ended = threading.Event()
 
         def publish() -> None:

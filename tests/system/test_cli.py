@@ -276,7 +276,8 @@ def test_a_tool_that_waits_for_a_message_prints_the_reason_once_and_goes_on_wait
 
 @pytest.mark.slow
 def test_a_waiting_client_notices_that_the_daemon_has_ended(tmp_path: Path) -> None:
-    with Daemon(tmp_path) as daemon, connect(daemon.endpoint) as robot:
+    with Daemon(tmp_path) as daemon, connect(daemon.endpoint) as client:
+        robot = client._connection
 
         def seen() -> Presence | None:
             return presence(robot.session, "acsar", daemon.endpoint)

@@ -8,10 +8,12 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
+from acsard.client import connect
 from tests.system.harness import Bus, Daemon, Program, until
 from tests.system.test_faults_bus import port_of
 
@@ -26,7 +28,7 @@ from pathlib import Path
 from acsard.client import connect
 
 with connect(sys.argv[1]) as robot:
-    while robot._beats.newest() is None:
+    while robot._connection._beats.newest() is None:
         time.sleep(0.01)
     print("connected", flush=True)
     while not Path("begin").exists():
@@ -134,6 +136,28 @@ def test_a_new_client_drives_within_0_3_s_of_its_zero(
     print(f"drives {moved - began:.3f} s after its zero")
     assert moved - began < 0.3
     bus.at_rest()
+
+
+def test_a_clear_does_not_release_a_stop_that_came_after_it(
+    shared: Daemon, bus: Bus, delay: Delay
+) -> None:
+    """The client's calls need 2.8 s to the daemon. Meanwhile another person stops the robot."""
+    with connect(shared.endpoint) as other, connect(delay.endpoint) as robot:
+        other.name = "first"
+        other.stop()
+        time.sleep(0.2)  # the state shows it
+        delay.seconds = 2.8
+        with ThreadPoolExecutor(1) as thread:
+            clearing = thread.submit(robot.clear)
+            time.sleep(0.5)
+            later = bus.get("srv/stop")["data"]["numbers"]
+            reply = clearing.result()
+        delay.seconds = 0.0
+        time.sleep(2.8)
+    assert reply.success, reply
+    state = bus.state()
+    assert (state["mode"], [cause["number"] for cause in state["causes"]]) == ("stopped", later)
+    bus.get("srv/clear")
 
 
 def test_a_joystick_behind_a_queue_of_3_s_from_its_first_command_on_moves_nothing(

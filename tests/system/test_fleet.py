@@ -513,8 +513,8 @@ def test_the_python_client_drives_through_the_router_under_its_certificate_s_nam
         driven = {
             entry.value["sender"] for entry in states.seen if (entry.value["linear"] or 0.0) > 0.1
         }
-        assert driven == {robot.sender}
-        assert robot.sender.endswith(f" [{name}]")
+        assert driven == {robot._connection.sender}
+        assert robot._connection.sender.endswith(f" [{name}]")
 
 
 def test_all_robots_are_seen_each_by_its_own_keys(fleet: Fleet) -> None:

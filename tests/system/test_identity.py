@@ -115,21 +115,25 @@ def test_the_published_sender_does_not_take_the_robot_from_another_program(robot
     assert len(states) > 10
     turned = [state for state in states if abs(state["angular"] or 0.0) > 0.05]
     assert not turned, f"turned in {len(turned)} of {len(states)} states"
-    assert {state["sender"] for state in states if state["mode"] == "driving"} == {victim.sender}
+    assert {state["sender"] for state in states if state["mode"] == "driving"} == {
+        victim._connection.sender
+    }
 
 
 def test_a_stolen_secret_does_not_take_the_robot_under_another_certificate(robot: Robot) -> None:
     with connect(robot.plain, source="teleop") as victim, Bus(robot.plain) as bus:
         refused = bus.count("command_other_certificate")
-        states = attacked(robot, victim, victim._sender._id)
+        states = attacked(robot, victim, victim._connection._sender._id)
         assert bus.count("command_other_certificate") > refused
         assert (
             "this sender id is already in use on the robot's own machine" in bus.state()["refused"]
         )
     assert not [state for state in states if abs(state["angular"] or 0.0) > 0.05]
-    assert {state["sender"] for state in states if state["mode"] == "driving"} == {victim.sender}
+    assert {state["sender"] for state in states if state["mode"] == "driving"} == {
+        victim._connection.sender
+    }
     events = robot.daemon.events("command_refused")
-    assert any(event["by"] == f"{victim.sender} [operator]" for event in events)
+    assert any(event["by"] == f"{victim._connection.sender} [operator]" for event in events)
 
 
 def test_the_sender_of_a_client_over_tls_has_the_name_of_its_certificate(robot: Robot) -> None:
@@ -140,8 +144,8 @@ def test_the_sender_of_a_client_over_tls_has_the_name_of_its_certificate(robot: 
         senders = {
             entry.value["sender"] for entry in states.seen if (entry.value["linear"] or 0.0) > 0.1
         }
-    assert senders == {client.sender}
-    assert client.sender.endswith(" [operator]")
+    assert senders == {client._connection.sender}
+    assert client._connection.sender.endswith(" [operator]")
 
 
 def test_a_page_server_connected_over_tls_drives_under_its_certificate_s_name(

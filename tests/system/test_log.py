@@ -15,7 +15,9 @@ from typing import Any
 import pytest
 
 from acsard.bus import robot_discovery
+from acsard.bus.address import Address
 from acsard.client import connect
+from acsard.client.connection import open_connection
 from acsard.core.messages.signature import public_name
 from acsard.host.own_identity import own_name
 from acsard.host.version import version
@@ -49,7 +51,7 @@ def test_a_put_on_stop_is_reported_with_its_sender_id_or_the_session_that_stampe
     named: bool, shared: Daemon, bus: Bus
 ) -> None:
     stops = len(shared.events("stop"))
-    with connect(shared.endpoint) as robot:
+    with open_connection(Address(shared.endpoint, "acsar", "")) as robot:
         key, stamp = robot.key("stop"), robot.session.new_timestamp()
         attachment = b'{"sender": "ann/s3cret"}' if named else b""
         robot.session.put(key, b"", timestamp=stamp, attachment=attachment)
@@ -61,7 +63,7 @@ def test_a_put_on_stop_is_reported_with_its_sender_id_or_the_session_that_stampe
 
 def test_one_program_that_puts_on_stop_and_calls_it_has_one_name(shared: Daemon, bus: Bus) -> None:
     stops = len(shared.events("stop"))
-    with connect(shared.endpoint) as robot:
+    with open_connection(Address(shared.endpoint, "acsar", "")) as robot:
         robot_discovery.stop(robot.session, ["acsar"], robot.caller)
         robot.call("stop")
         until(lambda: len(shared.events("stop")) == stops + 2, 5.0, "both stops are in the log")

@@ -18,7 +18,7 @@ import zenoh
 
 from acsard.bus.robot_discovery import ALL_ROBOTS, stop
 from acsard.cli import main
-from acsard.client import synchronous
+from acsard.client import connection
 from acsard.host.version import version
 from acsard.machine.authority import Authority
 from tests.pages import blocks
@@ -181,14 +181,14 @@ def test_a_table_for_a_pipe_does_not_wait_for_the_connection_to_be_closed(
     near, far = os.pipe()
     os.set_blocking(near, False)
     chunks = [b""]
-    really = synchronous.close
+    really = connection.close
 
     def close(session: zenoh.Session) -> None:
         with suppress(BlockingIOError):
             chunks.append(os.read(near, 65536))
         really(session)
 
-    monkeypatch.setattr(synchronous, "close", close)
+    monkeypatch.setattr(connection, "close", close)
     with os.fdopen(near, "rb"), os.fdopen(far, "w") as pipe, redirect_stdout(pipe):
         main(robots.command_line("fleet", "--once", who=f"{ONE},{TWO}")[3:])
     assert b"ready" in chunks[-1]

@@ -16,7 +16,7 @@ from yarl import URL
 
 from acsard.bus.address import Address
 from acsard.bus.zenoh_sessions import client_session
-from acsard.client import Client
+from acsard.client.connection import Connection
 from acsard.core.config.settings import WebConfig
 from acsard.core.messages.signature import MAX_INT64
 from acsard.host.errors import UnreachableError
@@ -48,7 +48,7 @@ class Inside:
     def __init__(self, where: Path, rules: WebConfig = DEFAULT_CONFIG) -> None:
         self.counts = Counts()
 
-        def connect() -> Client:
+        def connect() -> Connection:
             raise UnreachableError("nobody is there")
 
         self.robot = FollowedRobot(
@@ -123,7 +123,7 @@ async def test_a_client_that_stops_reading_later_gets_only_the_newest_message(
         return inside.counts.all().get("frames_left_out", 0)
 
     with Daemon(tmp_path) as daemon, client_session(daemon.endpoint, "") as session:
-        inside.robot.client = Client(session, "acsar", "teleop")
+        inside.robot.client = Connection(session, "acsar", "teleop")
         async with inside.hands() as ours:
             await ours.say(subscribe="odom", rate=50)
             await ours.find(lambda frame: "key" in frame)
@@ -175,7 +175,7 @@ async def test_a_key_that_is_unsubscribed_and_immediately_subscribed_again_is_fo
     inside: Inside, tmp_path: Path
 ) -> None:
     with Daemon(tmp_path) as daemon, client_session(daemon.endpoint, "") as session:
-        inside.robot.client = Client(session, "acsar", "teleop")
+        inside.robot.client = Connection(session, "acsar", "teleop")
         async with inside.hands() as ours:
             await ours.say(subscribe="state", rate=10)
             await ours.state(lambda state: state["mode"])
@@ -193,7 +193,7 @@ async def test_a_client_that_unsubscribes_and_disconnects_leaves_no_subscription
     inside: Inside, tmp_path: Path
 ) -> None:
     with Daemon(tmp_path) as daemon, client_session(daemon.endpoint, "") as session:
-        inside.robot.client = Client(session, "acsar", "teleop")
+        inside.robot.client = Connection(session, "acsar", "teleop")
         async with inside.hands() as ours:
             await ours.say(subscribe="odom", rate=50)
             await ours.find(lambda frame: "key" in frame)
@@ -233,13 +233,13 @@ async def test_a_bus_that_is_gone_is_reported_and_the_key_comes_when_it_is_back(
     with Daemon(tmp_path) as daemon:
         closed = client_session(daemon.endpoint, "")
         closed.close()
-        inside.robot.client = Client(closed, "acsar", "teleop")
+        inside.robot.client = Connection(closed, "acsar", "teleop")
         async with inside.hands() as ours:
             await ours.say(subscribe="state", rate=10)
             refused = await ours.find(lambda frame: frame.get("refused") == "subscribe")
             assert "again" in refused["reason"]
             with client_session(daemon.endpoint, "") as session:
-                inside.robot.client = Client(session, "acsar", "teleop")
+                inside.robot.client = Connection(session, "acsar", "teleop")
                 await ours.state(lambda state: state["mode"])
 
 
@@ -249,7 +249,7 @@ async def test_a_robot_with_a_closed_session_is_reported_as_gone_and_the_server_
     with Daemon(tmp_path) as daemon:
         closed = client_session(daemon.endpoint, "")
         closed.close()
-        way = Client(closed, "acsar", "teleop")
+        way = Connection(closed, "acsar", "teleop")
         robot = FollowedRobot(
             Address(daemon.endpoint, "acsar", ""), lambda: way, ABOUT, inside.counts
         )

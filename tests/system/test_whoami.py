@@ -68,7 +68,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
 def test_whoami_returns_the_role_and_name_of_each_certificate(robot: Robot, role: Identity) -> None:
     with connect(robot.tls, tls=robot.own(role)) as client:
         us = client.whoami()
-        assert (us.role, us.certificate, us.sender) == (role, role, client.sender)
+        assert (us.role, us.certificate, us.sender) == (role, role, client._connection.sender)
 
 
 def test_a_local_client_without_a_certificate_is_a_maintainer(robot: Robot) -> None:

@@ -13,7 +13,7 @@ from acsard.calibration.guided.robot_on_bus import RobotOnBus
 from acsard.calibration.guided.runner import guide
 from acsard.calibration.runs import Run
 from acsard.calibration.solve import Calibration
-from acsard.client.synchronous import Client
+from acsard.client.connection import Connection
 from acsard.core.config.settings import Config
 from acsard.core.messages.keys_and_roles import IMU, full_key
 from acsard.core.messages.schema import Info
@@ -34,7 +34,7 @@ class DriveOptions(Struct, frozen=True):
 
 
 def guided_drive(
-    client: Client,
+    client: Connection,
     options: DriveOptions,
     file: str,
     file_config: Config,
@@ -97,7 +97,7 @@ def guided_drive(
         return calibration, config
 
 
-def require_same_robot(client: Client, info: Info, settings: object) -> None:
+def require_same_robot(client: Connection, info: Info, settings: object) -> None:
     """Raise `GuideError` if another robot or other settings answer than before the first leg.
 
     A restarted daemon may drive a real robot instead of the simulator.

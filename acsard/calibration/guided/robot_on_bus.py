@@ -21,10 +21,11 @@ from acsard.calibration.guided.leg_driver import OPENING_S, LegDriver
 from acsard.calibration.log_rows import FOUR
 from acsard.calibration.log_table import APPLIED, Floats, Table
 from acsard.calibration.runs import NEW_RUN_AFTER_S, Log, Run, on_arrival_clock, runs
+from acsard.client.connection import Connection
 from acsard.client.driving import repeat_zeros
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S, Watch
+from acsard.client.reads import decoder_of
 from acsard.client.ride import OPENING_PERIOD_S, SEND_PERIOD_S
-from acsard.client.synchronous import Client, decoder_of
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.keys_and_roles import by_key
@@ -182,7 +183,7 @@ def times(samples: Sequence[Sample]) -> Floats:
 class RobotOnBus:
     """Drives the robot one leg at a time, and records its sensors during each leg."""
 
-    def __init__(self, client: Client, config: Config, prompt: Prompt) -> None:
+    def __init__(self, client: Connection, config: Config, prompt: Prompt) -> None:
         self._client, self._prompt = client, prompt
         self._joints, self._config = config.joints.as_tuple(), config
         commands = Sensor(client.session, client.key("cmd_vel_out"), (TwistStamped,))

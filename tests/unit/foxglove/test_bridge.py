@@ -11,7 +11,8 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from acsard.client import Client, synchronous
+from acsard.client import connection
+from acsard.client.connection import Connection
 from acsard.core.config.settings import Config, RosConfig
 from acsard.core.messages.signature import public_name
 from acsard.core.ros.names import full_name
@@ -53,13 +54,13 @@ class World:
         monkeypatch.setattr(module, "configuration", self._configuration)
         monkeypatch.setattr(module, "start", lambda *_, **__: self.server)
         session: Any = SimpleNamespace(liveliness=lambda: self, zid=lambda: "0123456789abcdef")
-        self.bridge = Bridge(Client(session, "acsar", "app"), ("", 0), self.printed.append)
+        self.bridge = Bridge(Connection(session, "acsar", "app"), ("", 0), self.printed.append)
         self.queries = 0
 
     def declare_subscriber(self, key: str, take: Callable[[Any], None], *, history: bool) -> None:
         self._take = take
 
-    def _configuration(self, robot: Client) -> Config:
+    def _configuration(self, robot: Connection) -> Config:
         config, self.queries = self.config, self.queries + 1
         self.during_query()
         return config
@@ -103,7 +104,7 @@ def test_the_daemon_logs_a_call_of_a_viewer_under_a_readable_name(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The daemon replaces each comma in a name by a question mark."""
-    monkeypatch.setattr(synchronous, "own_name", lambda: "alice@laptop acsard")
+    monkeypatch.setattr(connection, "own_name", lambda: "alice@laptop acsard")
     robot = World(monkeypatch).bridge._robot
     name, _, _ = public_name(robot.caller).rpartition("/")
     assert name == "alice@laptop acsard foxglove"
@@ -167,7 +168,7 @@ class StartingWorld(World):
 
     restarted = False
 
-    def _configuration(self, robot: Client) -> Config:
+    def _configuration(self, robot: Connection) -> Config:
         config = super()._configuration(robot)
         if not self.restarted:
             self.restarted = True

@@ -10,7 +10,8 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.bus.address import Address
-from acsard.client import Client, Subscription
+from acsard.bus.subscription import Subscription
+from acsard.client.connection import Connection
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S, ROBOT_SILENCE_TIMEOUT_S
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState, Time
@@ -64,7 +65,7 @@ def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
 
 
 def feed_of(robot: Robot) -> Feed:
-    return Feed(cast(Client, robot))
+    return Feed(cast(Connection, robot))
 
 
 def at(sec: int, lines: int = 1300) -> RobotState:

@@ -13,7 +13,7 @@ from aiohttp.test_utils import make_mocked_request
 from msgspec.structs import replace
 
 from acsard.bus.address import Address
-from acsard.client import Client
+from acsard.client.connection import Connection
 from acsard.core.config.live import LIVE
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config, WebConfig
@@ -36,13 +36,13 @@ from tests.unit.web.test_callers import MAINTAINER
 ABOUT = About("1", True, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 
 
-def followed(client: Client | None) -> FollowedRobot:
+def followed(client: Connection | None) -> FollowedRobot:
     result = FollowedRobot(Address("tcp/127.0.0.1:1", "acsar", ""), Mock(), ABOUT, Counts())
     result.client = client
     return result
 
 
-def page_of(directory: Path, client: Client | None = None) -> Page:
+def page_of(directory: Path, client: Connection | None = None) -> Page:
     counts = Counts()
     tokens = ReadTokens(Vault(directory, "acsar"))
     return Page(
@@ -91,7 +91,7 @@ class Daemon:
 def page_with_daemon(directory: Path) -> tuple[Page, list[str]]:
     """Return a page, and the list of the calls that reach the robot."""
     calls = list[str]()
-    return page_of(directory, cast(Client, Daemon(calls))), calls
+    return page_of(directory, cast(Connection, Daemon(calls))), calls
 
 
 def posted(verb: str, *body: bytes, end: bool = True, role: Role = "viewer") -> web.Request:

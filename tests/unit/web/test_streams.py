@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from acsard.client import Client
+from acsard.client.connection import Connection
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.web.streams import Stream, Streams
@@ -81,7 +81,7 @@ def test_an_age_is_never_negative(
 
 async def test_a_put_on_a_wildcard_is_not_a_message_of_the_key(session: zenoh.Session) -> None:
     streams = Streams()
-    stream = await streams.follow(Client(session, "acsar", "app"), "events")
+    stream = await streams.follow(Connection(session, "acsar", "app"), "events")
     for key, payload in ((KEY, b"1"), ("acsard/**", b"666"), ("acsard/*/*", b"667"), (KEY, b"2")):
         session.put(key, payload, encoding="application/json")
     async with asyncio.timeout(10.0):

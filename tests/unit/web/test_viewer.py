@@ -12,8 +12,7 @@ import aiohttp
 import pytest
 
 from acsard.bus.address import Address
-from acsard.client import Client
-from acsard.client.synchronous import CommandSigner
+from acsard.client.connection import CommandSigner, Connection
 from acsard.core.messages.schema import Beat, ServiceReply
 from acsard.core.messages.signature import unpack
 from acsard.core.values import Role, Twist
@@ -30,7 +29,7 @@ AHEAD = Wish(Twist(0.2, 0.0), 1000)
 
 
 def test_a_command_that_cannot_be_sent_is_dropped_and_the_next_is_processed() -> None:
-    def broken() -> Client | None:
+    def broken() -> Connection | None:
         raise OverflowError("no room in 64 bits")
 
     counts = Counts()

@@ -1,4 +1,4 @@
-"""Tests of the synchronous client without a bus: sent commands and decoded messages."""
+"""Tests of a connection and its clients without a bus: sent commands, calls and errors."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from msgspec import structs
 from acsard import client
 from acsard.client import AcsardError, Client, NoAnswerError, asynchronous, driving
 from acsard.client.asynchronous import AsyncClient
+from acsard.client.connection import MIN_SPACING_S, Connection
 from acsard.client.driving import UnheardError
 from acsard.client.identity import ClientIdentity
+from acsard.client.reads import decoder
 from acsard.client.ride import MAX_SOURCE_TIMEOUT_S
-from acsard.client.synchronous import MIN_SPACING_S, decoder
 from acsard.core.config.settings import Config, DriveConfig, JointsConfig
 from acsard.core.incoming.commands import Arrival, Receiver
 from acsard.core.incoming.imu import reading
@@ -95,9 +96,9 @@ def session() -> Session:
     return Session("0123456789abcdef")
 
 
-def client_of(session: Session) -> Client:
+def client_of(session: Session) -> Connection:
     fake: Any = session
-    return Client(fake, "acsar", "app")
+    return Connection(fake, "acsar", "app")
 
 
 def test_each_command_has_its_sender_and_its_sequence_number(session: Session) -> None:
@@ -248,7 +249,7 @@ def test_each_method_reports_a_closed_connection(session: Session) -> None:
         robot.pose,
         robot.whoami,
         lambda: robot.call("stop"),
-        lambda: robot.drive(0.1, seconds=1.0),
+        lambda: Client(robot).drive(0.1, seconds=1.0),
         lambda: next(robot.messages("odom")),
         lambda: robot.listen("odom", print),
     ):
@@ -256,7 +257,7 @@ def test_each_method_reports_a_closed_connection(session: Session) -> None:
             method()
 
 
-def without_states(robot: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+def without_states(robot: Connection, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the client subscribe to `state`, on which nothing arrives."""
     silence = SimpleNamespace(try_recv=lambda: None, undeclare=lambda: None)
     monkeypatch.setattr(robot, "subscribe", lambda _: silence)
@@ -274,7 +275,7 @@ def test_ctrl_c_ends_a_drive_whose_connection_is_closed_with_a_keyboard_interrup
     without_states(robot, monkeypatch)
     monkeypatch.setattr(time, "sleep", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        robot.drive(0.1, seconds=1.0)
+        Client(robot).drive(0.1, seconds=1.0)
 
 
 async def test_a_cancelled_async_drive_whose_connection_is_closed_is_cancelled(
@@ -307,8 +308,9 @@ async def test_an_async_call_that_takes_too_long_raises_a_documented_error(
 
 
 async def test_an_async_call_raises_the_error_of_the_call_itself(session: Session) -> None:
-    with pytest.raises(NoAnswerError, match="no answer on the Zenoh key"):
-        await AsyncClient(client_of(session)).get("odm")
+    session.close()
+    with pytest.raises(NoAnswerError, match="connection of this client is closed"):
+        await AsyncClient(client_of(session)).get("odom")
 
 
 async def test_an_async_call_without_a_new_thread_raises_a_documented_error(
@@ -475,7 +477,7 @@ def test_an_imu_message_that_the_daemon_refuses_is_not_decoded(payload: bytes) -
 
 
 def test_a_wrong_argument_of_drive_sends_nothing(session: Session) -> None:
-    robot = client_of(session)
+    robot = Client(client_of(session))
     with pytest.raises(client.UsageError):
         robot.drive(0.3, seconds=0.0)
     assert session.heard == []

@@ -1,0 +1,71 @@
+"""Drive the robot straight ahead or turn it on the spot, by its odometry, and print its pose. For
+example: acsard move forward 1 left 90. Ctrl-C stops the robot. The exit code is 1 if the robot does
+not follow, or comes no nearer to the end for 3 s.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import get_args
+
+from acsard.cli.common import between
+from acsard.cli.connection import add_bus, connected
+from acsard.client import Client
+from acsard.core.config.settings import AngularSpeed, LinearSpeed
+from acsard.core.messages.short_texts import place
+from acsard.host.errors import UsageError
+
+# By the typed word: whether it is a turn, and the sign.
+_WAYS = {"forward": (False, 1), "back": (False, -1), "left": (True, 1), "right": (True, -1)}
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "way",
+        nargs="+",
+        metavar="WAY",
+        help="forward METRES, back METRES, left DEGREES or right DEGREES; several are driven one "
+        "after the other",
+    )
+    for name, speed, setting in (("--linear", 0.3, LinearSpeed), ("--angular", 0.8, AngularSpeed)):
+        _, meta = get_args(setting)
+        unit = meta.extra["unit"]
+        parser.add_argument(
+            name,
+            type=between(0.02, meta.le, unit),
+            default=speed,
+            metavar=unit.upper(),
+            help=f"highest speed, up to {meta.le:g} {unit} (default: %(default)s)",
+        )
+    parser.add_argument(
+        "--source", default="app", help="send the commands as this command source (default: app)"
+    )
+    add_bus(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    ways = _parsed(args.way)
+    with connected(args, args.source) as connection:
+        robot = Client(connection)
+        for is_turn, amount in ways:
+            if is_turn:
+                robot.turn(amount, speed=args.angular)
+            else:
+                robot.move(amount, speed=args.linear)
+        pose = robot.pose()
+    print("  ".join(place(pose.x, pose.y, pose.yaw)))
+    return 0
+
+
+def _parsed(words: list[str]) -> list[tuple[bool, float]]:
+    ways, amount = [], between(0.0, 1e4, "metres or degrees")
+    for word, number in zip(words[::2], [*words[1::2], ""], strict=False):
+        try:
+            is_turn, sign = _WAYS[word]
+            ways.append((is_turn, sign * amount(number)))
+        except (KeyError, ValueError, argparse.ArgumentTypeError):
+            raise UsageError(
+                f"'{f'{word} {number}'.strip()}' is not a way; type for example `acsard move "
+                "forward 1 left 90`, in metres and degrees"
+            ) from None
+    return ways

@@ -1,0 +1,99 @@
+"""`get` and `messages` are typed for each key of the table, so a type checker finds mistakes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_args, get_overloads, get_type_hints
+
+import pytest
+
+from acsard.client.reads import FOLLOWED_KEYS, QUERIED_KEYS, AsyncReads, Reads
+from acsard.core.messages.keys_and_roles import by_key
+from acsard.core.messages.schema import MESSAGES
+from tests.each import each
+from tests.system.harness import ROOT
+
+
+def types(method: Callable[..., object]) -> dict[str, object]:
+    """Return the type that each overload gives, by key."""
+    found: dict[str, object] = {}
+    for overload in get_overloads(method):
+        hints = get_type_hints(overload)
+        # The type of a message is also the argument of the iterator over it.
+        kind = next(iter(get_args(hints["return"])), hints["return"])
+        found |= dict.fromkeys(get_args(hints["name"]), kind)
+    return found
+
+
+@each(
+    ("method", "keys"),
+    [
+        (Reads.get, QUERIED_KEYS),
+        (AsyncReads.get, QUERIED_KEYS),
+        (Reads.messages, FOLLOWED_KEYS),
+        (AsyncReads.messages, FOLLOWED_KEYS),
+    ],
+)
+def test_each_key_of_the_table_gives_its_own_type(
+    method: Callable[..., object], keys: set[str]
+) -> None:
+    def wanted(key: str) -> object:
+        topic = by_key(key)
+        assert topic is not None
+        return MESSAGES.get(topic.type, str)  # a dictionary with keys that are strings
+
+    assert types(method) == {key: wanted(key) for key in keys}
+
+
+STUDENT = """\
+import asyncio
+
+from acsard.client import connect, connect_async
+
+with connect() as robot:
+    for odom in robot.messages("odom", timeout=1.0):
+        print(odom.time, odom.yaw, odom.pose.pose.position.x)
+        print(odom.speed)
+        break
+    robot.get("odmo")
+    robot.move(robot.get("state").mode)
+    robot.turn(90)
+    robot.stop().success
+
+
+async def main() -> None:
+    async with connect_async() as robot:
+        async for state in robot.messages("state"):
+            print(state.mod)
+        await robot.get("odmo")
+        await robot.drive("fast", seconds=1.0)
+
+
+asyncio.run(main())
+"""
+
+
+@pytest.mark.slow
+def test_mypy_names_the_mistakes_of_a_program(tmp_path: Path) -> None:
+    """A wrong field, a wrong key and a wrong type, in a script and in an asyncio program."""
+    program = tmp_path / "student.py"
+    program.write_text(STUDENT)
+    done: Any = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "--no-error-summary", str(program)],
+        cwd=ROOT, capture_output=True, text=True, timeout=110, check=False,
+    )  # fmt: skip
+    errors = [line for line in done.stdout.splitlines() if ": error: " in line]
+    lines = [int(line.split(":")[1]) for line in errors]
+    text = STUDENT.splitlines()
+    assert [text[number - 1].strip() for number in lines] == [
+        "print(odom.speed)",
+        'robot.get("odmo")',
+        'robot.move(robot.get("state").mode)',
+        "print(state.mod)",
+        'await robot.get("odmo")',
+        'await robot.drive("fast", seconds=1.0)',
+    ], done.stdout + done.stderr
+    assert '"Odometry" has no attribute "speed"' in errors[0]
