@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import fcntl
 import json
+import math
 import os
 import pty
+import re
 import signal
 import struct
 import subprocess
@@ -63,6 +65,7 @@ VERBS = (
     "fleet",
     "foxglove",
     "drive",
+    "move",
     "web",
     "call",
     "set",
@@ -630,6 +633,28 @@ def test_get_of_a_service_does_not_call_it(shared: Daemon, bus: Bus) -> None:
     assert (ended.code, ended.out) == (2, "")
     assert "acsard call stop" in ended.err
     assert bus.state()["mode"] != "stopped"
+
+
+# move
+
+
+def test_move_drives_the_ways_one_after_the_other_and_prints_the_pose(
+    shared: Daemon, bus: Bus
+) -> None:
+    bus.at_rest()
+    bus.get("srv/reset_odometry")
+    ended = tool(shared, "move", "forward", "0.1", "left", "20", "back", "0")
+    assert ended.code == 0, ended
+    assert re.fullmatch(r"x +\+0\.(09|10)\d m  y +[+-]0\.00\d m  yaw +\+(19|20)\.\d°", ended.out)
+    assert bus.state()["yaw"] == pytest.approx(math.radians(20), abs=math.radians(1.0))
+
+
+def test_move_of_a_stopped_robot_fails_with_the_reason(shared: Daemon, bus: Bus) -> None:
+    bus.get("srv/stop")
+    ended = tool(shared, "move", "forward", "1")
+    bus.get("srv/clear")
+    assert (ended.code, ended.out) == (1, "")
+    assert "stopped" in ended.err
 
 
 # drive
