@@ -18,6 +18,7 @@ from acsard.core.config.contradictions import warnings
 from acsard.core.config.settings import Config
 from acsard.core.values import ROOT_KEY, Event
 from acsard.daemon import daemon
+from acsard.host.event_loop import EventLoop
 from acsard.host.logs import Log, Writer
 from acsard.host.version import version
 
@@ -122,15 +123,16 @@ def main(args: argparse.Namespace) -> int:
     if sys.stderr is not None:
         faulthandler.enable()
     try:
-        asyncio.run(
-            daemon.run(
-                config,
-                log,
-                announce,
-                None if args.no_gateway else gateway,
-                served,
+        with asyncio.Runner(loop_factory=EventLoop) as runner:
+            runner.run(
+                daemon.run(
+                    config,
+                    log,
+                    announce,
+                    None if args.no_gateway else gateway,
+                    served,
+                )
             )
-        )
     finally:
         log.close()
         screen.close(0.2)
