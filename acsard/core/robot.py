@@ -74,6 +74,9 @@ MAX_DT = 0.05
 # stopped the motors. The margin is for a board whose clock is slightly fast.
 WRITE_PAUSE_S = WATCHDOG_S - 0.05
 
+# After a longer time between two steps, the second may be late: at least `LinkSetup.late_step_ns`.
+STEADY_STEP_NS = NS_PER_S // 20
+
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)  # modes with the stop deceleration
 
 UNLATCHED = (Mode.DRIVING, Mode.READY)  # their reason depends only on the choice and the settings
@@ -122,6 +125,10 @@ class Robot:
         self._asked: tuple[str, str, int | None] = ("", "", None)
         self._told = CommandEvents(self._life.mode)
         self._linked_once = False
+        # The last `hear` holds until then, if only bytes arrive; 0: it may not.
+        self._until_ns: Ns = 0
+        self._silence = Heard(True)  # what `hear` gets if nothing arrives
+        self._is_watched = True  # the reports of the board may change the mode at any time
         self._arbiter.require_neutral()
 
     def snapshot(self, now_ns: Ns) -> Snapshot:
@@ -199,7 +206,12 @@ class Robot:
 
     def hear(self, now: Instant, heard: Heard) -> News:
         """Process what arrived since the last call, and return what is to be published."""
-        now_ns, life, arbiter = now.mono_ns, self._life, self._arbiter
+        now_ns, life, arbiter, session = now.mono_ns, self._life, self._arbiter, self.session
+        steady = now_ns - arbiter.begun_ns < STEADY_STEP_NS
+        holds = steady and now_ns < self._until_ns
+        if holds and heard == self._silence:
+            arbiter.begun_ns = session.lateness.looked_ns = now_ns
+            return QUIET
         events: list[Event] = []
         if heard.events or self._announced:
             events += heard.events + self._announced
@@ -211,6 +223,13 @@ class Robot:
             self.counters["missed_periods"] += heard.missed
             events.append(missed(heard.missed, self.config.period_ns))
         estimates = self._fold(now, heard, events)
+        until_ns = min(arbiter.until_ns, session.until_ns)
+        if holds and now_ns < until_ns and not (
+            events or self._is_watched or heard.commands or heard.refusals or heard.requests
+            or heard.speed_cap is not None or heard.shutting_down
+        ):  # fmt: skip
+            self._until_ns = until_ns
+            return News(estimates) if estimates else QUIET
         answers: tuple[Answer, ...] = ()
         if heard.requests or self._last.trip or heard.shutting_down:
             answers = self._serve(now, heard, events)
@@ -234,6 +253,10 @@ class Robot:
         logged: tuple[Event, ...] = ()
         if events or self._tally.held:
             logged = self._tally.lines(events, now_ns)
+        waits = urgent or self._tally.held or life.unshown or self._is_watched or not steady
+        self._until_ns = 0
+        if not waits and mode in UNLATCHED:
+            self._until_ns = min(arbiter.until_ns, session.until_ns)
         if not (estimates or answers or logged or urgent or changed):
             return QUIET
         return News(estimates, answers, logged, urgent, changed)
@@ -280,6 +303,8 @@ class Robot:
         `trip` says why the guard replaced it with the stop line.
         """
         left = line is not None
+        if trip or not left:
+            self._until_ns = 0
         self._last.sent(left, trip)
         # The board must not be expected to answer a line that the guard has replaced.
         self.session.sent(self.link_setup, left_ns, was_written=left and not trip)
@@ -296,7 +321,7 @@ class Robot:
             self.link_setup, now, heard.port_open, heard.opened, heard.received
         )
         link, inputs = session.link, self._inputs
-        if feedback or link != "up":
+        if (feedback and self.counters["lines_sent"] >= self._answered.due) or link != "up":
             warning = self._answered.check(
                 self.counters["lines_sent"],
                 session.good_lines,
@@ -319,7 +344,9 @@ class Robot:
             events += session.events
         if session.reopened:
             inputs.reopen()
+            self._silence = Heard(True, heard.opened)
         is_watched, safety = inputs.expects_reports(session), self.config.safety
+        self._is_watched = is_watched
         if is_watched:
             self._watch_inputs(now, events)
         if link != "up":

@@ -55,8 +55,12 @@ PARTS: dict[str, Any] = {
     "_tally": EventThrottle,
 }
 
-# Not stored: they follow from the configuration, and no line is pending between two steps.
-DERIVED = ("config", "link_setup", "_kinematics", "_errors", "_steady")
+# Not stored: they follow from the configuration or from the next step, and no line is pending
+# between two steps.
+DERIVED = (
+    "config", "link_setup", "_kinematics", "_errors", "_steady",
+    "_until_ns", "_silence", "_is_watched",
+)  # fmt: skip
 
 MAX_BYTES = 1 << 20  # usually 8 000 to 30 000, more with many senders
 

@@ -32,6 +32,7 @@ class PoseDoubt(Struct):
     lines: int = 0
     gaps: int = 0
     coarse: int = 0
+    due: int = WINDOW_LINES  # good lines at the next comparison
 
     def judge(self, setup: LinkSetup, timeline: Timeline, lines: int, coarse_lines: int) -> bool:
         """Judge the last `WINDOW_LINES`, and return whether the code has changed.
@@ -49,6 +50,7 @@ class PoseDoubt(Struct):
         # A free-running board has no delay that matters: its lines are a period apart.
         vague = timeline.prompted.lateness.deviation > NARROW_DEVIATION and not setup.period_ns
         self.lines, self.gaps, self.coarse = lines, timeline.gaps, coarse_lines
+        self.due = lines + WINDOW_LINES
         doubtful = coarse and (lossy or vague) and not setup.mcu.checked
         before, self.code = self.code, "coarse_encoder" if doubtful else ""
         return before != self.code

@@ -90,6 +90,7 @@ class McuSession(Struct):
     # Of the last `update`.
     restarted: bool = False  # it began a new session
     reopened: bool = False
+    until_ns: Ns = 0  # without bytes, `update` has nothing to do until then; 0: it may have
     events: list[Event] = []  # for the log
     _rejected: dict[str, tuple[int, bytes]] = {}  # by reason: their number, and the last line
     _starting_over: bool = False
@@ -130,7 +131,7 @@ class McuSession(Struct):
             self.events = []
         if self.status.new or self.status.forgot:
             self.status.begin_update()
-        now_ns, link, echo, is_settled = now.mono_ns, self._link, self._echo, False
+        now_ns, link, echo, until_ns = now.mono_ns, self._link, self._echo, 0
         feedback: list[Feedback] = []
         if not port_open or opened != self._opened:
             self._begin(setup, port_open, opened, now_ns)
@@ -154,23 +155,22 @@ class McuSession(Struct):
                 # motors, a stop without a ramp would only shake the robot. `Robot` makes such a
                 # stop anyway after `WRITE_PAUSE_S`.
                 link.wait(now_ns, setup.quiet_ns)
-            # A link that is up stays up until one of these is false.
-            is_settled = (
+            if (
                 link.state == "up"
-                and now_ns <= link.silent_ns
-                and now_ns - echo.since_ns < WINDOW_NS
                 and not (self._held_up or self.blocked or echo.trouble)
                 and self.status.up_ns is None
-            )
-            if not is_settled:
+            ):
+                until_ns = min(link.silent_ns + 1, echo.since_ns + WINDOW_NS)
+            if now_ns >= until_ns:
                 self._judge(setup, now_ns)
-        if feedback and self.doubt.judge(
-            setup, self._timeline, self.good_lines, self.count_recovery.coarse_lines
+        self.until_ns = until_ns
+        if feedback and (
+            self.good_lines >= self.doubt.due or self._timeline.counts_check.differing
         ):
-            self._announce_doubt()
+            self._judge_doubt(setup)
         if self._rejected:
             self._announce_rejects()
-        if not is_settled and (link.state, self._trouble, self.blocked) != self._announced:
+        if now_ns >= until_ns and (link.state, self._trouble, self.blocked) != self._announced:
             self._announce(setup)
         return feedback
 
@@ -332,8 +332,10 @@ class McuSession(Struct):
             )
         self._rejected.clear()
 
-    def _announce_doubt(self) -> None:
-        if self.doubt.code:
+    def _judge_doubt(self, setup: LinkSetup) -> None:
+        coarse_lines = self.count_recovery.coarse_lines
+        changed = self.doubt.judge(setup, self._timeline, self.good_lines, coarse_lines)
+        if changed and self.doubt.code:
             why = sentence(self.doubt.code)
             self.events.append(Event("pose_doubtful", why.text, "warning", code=why.code))
 
@@ -415,32 +417,52 @@ class McuSession(Struct):
             self._reject(self._echo.trouble)
             self._link.reset_good_lines()
             return None
-        reading, asked_ns = None, None
+        reading, asked_ns, at_ns, timeline = None, None, read_at.mono_ns, self._timeline
         try:
             if setup.checked:
                 reply = unseal(line)
                 speeds, reading = setup.codec.decode(reply.plain), reply.reading
-                asked_ns = self._open_lines.answered(reply, read_at.mono_ns)
+                asked_ns = self._open_lines.answered(reply, at_ns)
             else:
                 speeds = setup.codec.decode(line)
         except FrameError as error:
-            if error.reason == "repeated":
-                self.rejects["repeated"] = self.rejects.get("repeated", 0) + 1
-            elif (
-                error.reason != "without_crc"
-                or self._link.state == "up"
-                or not self._plain(setup, line)
-            ):
-                self._reject(error.reason, line)
-                self._link.bad(setup.checked)
+            self._refuse(setup, line, error)
             return None
+        self.good_lines += 1
+        before_ns, self._heard_ns = self._heard_ns, at_ns
+        if before_ns is not None and at_ns - before_ns >= LONG_GAP_NS:
+            self.restarted = True  # even if an earlier update has already reported a restart
+        since_ns = self._link.good(at_ns, setup.quiet_ns)
+        silent = since_ns is None or since_ns > setup.quiet_ns
+        length = len(line) + 2
+        feedback = timeline.place(setup, speeds, reading, following, length, silent, asked_ns)
         if setup.checked:
-            self._plain_lines, self._unchecked = 0, False
-            self._sampled = reading is not None
-            if self._says_samples and not self._sampled:
-                self._says_samples = False
-                self.events.append(Event("link_check", NO_SAMPLES, "warning"))
-        return self._good(setup, speeds, reading, read_at, following, len(line) + 2, asked_ns)
+            self._check_samples(reading)
+        return self.count_recovery.recover_counts(feedback, setup.count)
+
+    def _refuse(self, setup: LinkSetup, line: bytes, error: FrameError) -> None:
+        if error.reason == "repeated":
+            self.rejects["repeated"] = self.rejects.get("repeated", 0) + 1
+        elif (
+            error.reason != "without_crc"
+            or self._link.state == "up"
+            or not self._plain(setup, line)
+        ):
+            self._reject(error.reason, line)
+            self._link.bad(setup.checked)
+
+    def _check_samples(self, reading: Reading | None) -> None:
+        # Of a good line on a checked link.
+        self._plain_lines, self._unchecked = 0, False
+        self._sampled = reading is not None
+        if self._says_samples and not self._sampled:
+            self._says_samples = False
+            self.events.append(Event("link_check", NO_SAMPLES, "warning"))
+        if reading is not None:
+            if more := self._timeline.leaps - self.rejects.get("count_leap", 0):
+                self._reject("count_leap", more=more)
+            if self._timeline.restarted:
+                self._restart("has restarted: its clock went back")
 
     def _plain(self, setup: LinkSetup, line: bytes) -> bool:
         # On a checked link that is not up. The first one answers the stop after the opening.
@@ -451,27 +473,3 @@ class McuSession(Struct):
         self._plain_lines += 1
         self._unchecked = self._unchecked or self._plain_lines >= GOOD_LINES
         return True
-
-    def _good(
-        self,
-        setup: LinkSetup,
-        speeds: WheelSpeeds,
-        reading: Reading | None,
-        read_at: Instant,
-        following: int,
-        length: int,
-        asked_ns: Ns | None,
-    ) -> Feedback:
-        self.good_lines += 1
-        before_ns, self._heard_ns = self._heard_ns, read_at.mono_ns
-        if before_ns is not None and read_at.mono_ns - before_ns >= LONG_GAP_NS:
-            self.restarted = True  # even if an earlier update has already reported a restart
-        since_ns = self._link.good(read_at.mono_ns, setup.quiet_ns)
-        silent = since_ns is None or since_ns > setup.quiet_ns
-        feedback = self._timeline.place(setup, speeds, reading, following, length, silent, asked_ns)
-        if reading is not None:
-            if more := self._timeline.leaps - self.rejects.get("count_leap", 0):
-                self._reject("count_leap", more=more)
-            if self._timeline.restarted:
-                self._restart("has restarted: its clock went back")
-        return self.count_recovery.recover_counts(feedback, setup.count)
