@@ -32,6 +32,8 @@ from acsard.recording.recorded_steps import StepRecorder
 # Least delay of a line; less is reported as 0, as the estimated sample times are less exact.
 MIN_WRITE_DELAY_NS = 1_000_000
 
+KEEPER_PERIOD_NS = NS_PER_S // 10
+
 # The line on the port, why the guard replaced the robot's, and how late it was written.
 Left = tuple[bytes | None, Trip, Ns]
 
@@ -64,6 +66,7 @@ class ControlLoop:
         mcu = robot.config.mcu
         self.pace = Pace(wire_ns(mcu.line_bytes, mcu.baud_rate), robot.config.period_ns)
         self._start_ns, self._mono_ns = start.mono_ns, mono_ns
+        self._keeper_ns = start.mono_ns  # when to look for events of the keeper
         if recorder is not None and robot.latches != Latches():
             # Without this record, a replay would start with a robot that has no latches.
             recorder.begins(robot, self._guard)
@@ -87,15 +90,15 @@ class ControlLoop:
         robot, publication, pace = self.robot, self.publication, self.pace
         port, keeper, recorder = self._port, self._keeper, self._recorder
         heard: Heard | None = None
-        tick = due = False
-        line: bytes | None = None
-        left = NOTHING_LEFT
+        tick, line, left = False, None, NOTHING_LEFT
         publication.now = now
         try:
             heard = self._heard(now, period)
-            tick = period is not NO_PERIOD and pace.period_ended(heard.missed)
+            if period is not NO_PERIOD:
+                tick = pace.period_ended(heard.missed)
             news = robot.hear(now, heard)
-            if robot.latches is not keeper.latches:
+            # The latches do not change without news.
+            if news is not QUIET and robot.latches is not keeper.latches:
                 keeper.keep(robot.latches)
             due = tick or (news.urgent and pace.at_once(now.mono_ns, port.sent_ns))
             if due:
@@ -109,9 +112,9 @@ class ControlLoop:
             if recorder is not None and heard is not None:
                 recorder.died(now, heard)
             raise
-        had_input = bool(heard.commands or heard.refusals or heard.requests)
-        if period is not NO_PERIOD or due or had_input or news.urgent or pace.waiting:
-            pace.record_step(tick, due, left[0] is not None, news.urgent, had_input, port.sent_ns)
+        urgent, had_input = news.urgent, bool(heard.commands or heard.refusals or heard.requests)
+        if due or urgent or had_input or period is not NO_PERIOD or pace.waiting:
+            pace.record_step(tick, due, left[0] is not None, urgent, had_input, port.sent_ns)
         if recorder is not None:
             step = now, heard, due, line, *left, news, robot.status
             recorder.step(step, robot, self._guard)
@@ -129,8 +132,9 @@ class ControlLoop:
         if period is not NO_PERIOD:
             missed = period.expired - 1
             publication.stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns, missed)
-            if told := self._keeper.take_events():
-                intake.events += told
+            if now.mono_ns >= self._keeper_ns:
+                self._keeper_ns = now.mono_ns + KEEPER_PERIOD_NS
+                intake.events += self._keeper.take_events()
         # Call `take` before reading `is_open`: in a late wake-up it may find the port lost.
         taken, received = intake.take(publication.serve), port.take(now if missed else None)
         events: tuple[Event, ...] = ()
