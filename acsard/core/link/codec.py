@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import re
-from functools import lru_cache
 from typing import Literal
 
 from acsard.core.config.settings import WheelMap
@@ -91,31 +90,23 @@ class Codec:
 
     def decode(self, line: bytes) -> WheelSpeeds:
         """Return the wheel speeds in a plain line without its end. Raises `FrameError`."""
-        words = _parse_tokens(line)
-        if words is None:
+        match = _LINE.fullmatch(line)
+        if match is None:
             raise FrameError("malformed", line)
-        wheel: list[float | None] = [None] * 4
-        places = self._by_word
-        for word, speed in words:
-            index, sign = places[word]
-            if speed > MAX_SPEED:
-                raise FrameError("over_range", line)
-            wheel[index] = speed * sign
+        a, of_a, b, of_b, c, of_c, d, of_d = match.groups()
+        places, wheel = self._by_word, [math.inf] * 4
+        index, sign = places[a]
+        wheel[index] = sign * float(of_a)
+        index, sign = places[b]
+        wheel[index] = sign * float(of_b)
+        index, sign = places[c]
+        wheel[index] = sign * float(of_c)
+        index, sign = places[d]
+        wheel[index] = sign * float(of_d)
+        if max(wheel) > MAX_SPEED or min(wheel) < -MAX_SPEED:
+            raise FrameError("duplicate_wheel" if math.inf in wheel else "over_range", line)
         front_right, front_left, rear_left, rear_right = wheel
-        if front_right is None or front_left is None or rear_left is None or rear_right is None:
-            raise FrameError("duplicate_wheel", line)
         return WheelSpeeds(front_right, front_left, rear_left, rear_right)
-
-
-# A robot at rest repeats the same line, so the last lines are cached.
-@lru_cache(16)
-def _parse_tokens(line: bytes) -> tuple[tuple[bytes, float], ...] | None:
-    # Pairs such as `(b"ap", 12.5)`; None if `line` is malformed.
-    match = _LINE.fullmatch(line)
-    if match is None:
-        return None
-    a, of_a, b, of_b, c, of_c, d, of_d = match.groups()
-    return (a, float(of_a)), (b, float(of_b)), (c, float(of_c)), (d, float(of_d))
 
 
 def _token(letter: str, speed: float) -> str:

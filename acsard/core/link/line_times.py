@@ -177,6 +177,9 @@ class Prompted(Struct):
         """Process a read of replies that do not name their commands, which are `apart`."""
         left, given_up, lateness, last = self.left, self.given_up, self.lateness, lines - 1
         self.own = 0.0
+        if lines == 1 and len(left) == 1 and self.least and not given_up:
+            self.measure(end_ns - left[0], 1, apart)  # it answers the only command that waits
+            return
         while given_up and len(left) < lines:
             left.insert(0, given_up.pop())
         if len(left) < lines:
@@ -200,13 +203,13 @@ class Prompted(Struct):
 
     def measure(self, delay: Ns, lines: int, apart: Ns) -> None:
         """Measure the delay of the last reply of a read."""
-        lateness = self.lateness
-        self.least = self.least or float(delay)
-        late = (delay - self.least) / apart
-        if delay < self.least:
+        lateness, least = self.lateness, self.least or float(delay)
+        longer = delay - least
+        late = longer / apart
+        if longer < 0.0:
             self.least = float(delay)
         else:
-            self.least += LEAST_DELAY_GAIN * (min(delay - self.least, apart))
+            self.least = least + LEAST_DELAY_GAIN * (longer if longer < apart else apart)
         off, deviation = late - lateness.usual, lateness.deviation
         lateness.follow(late)
         jitter = deviation * apart
@@ -232,11 +235,11 @@ class Prompted(Struct):
             command = end_ns - int(usual)
             if self.newest:
                 command = min(command, self.newest + apart)
-        lost = self.given_up[-1] if self.given_up else 0
-        bridged_ns = lost - before if before and lost > self.answered else 0
-        self.answered = command
-        sample_ns = self.sample_ns = max(before, command + int(self.own))
-        self.own = 0.0
-        dt_ns = sample_ns - before if before else 0
-        bridged_ns = min(max(bridged_ns, 0), dt_ns)
+        sample_ns = command + int(self.own)
+        if sample_ns < before:
+            sample_ns = before
+        dt_ns, bridged_ns = sample_ns - before if before else 0, 0
+        if self.given_up and before and self.given_up[-1] > self.answered:
+            bridged_ns = min(max(self.given_up[-1] - before, 0), dt_ns)
+        self.answered, self.sample_ns, self.own = command, sample_ns, 0.0
         return Placed(sample_ns + int(usual), dt_ns, bridged_ns, int(self.jitter))

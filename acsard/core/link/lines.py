@@ -27,20 +27,18 @@ class LineReader(Struct):
         From this number the caller computes when the line was complete on the wire.
         """
         lines = []
-        ends = data.split(b"\n")
-        rest = ends.pop()
+        *ends, rest = data.split(b"\n")
         following = len(data)
         for piece in ends:
             following -= len(piece) + 1
-            line = self.held + piece
-            self.held = b""
+            line, self.held = self.held + piece, b""
             if self.discarding:
                 self.discarding = False
             elif len(line) >= MAX_LINE_BYTES:
                 self.too_long += 1
             elif line not in (b"", b"\r"):
                 lines.append((line.removesuffix(b"\r"), following))
-        if not self.discarding:
+        if rest and not self.discarding:
             self.held += rest
             if len(self.held) >= MAX_LINE_BYTES:
                 self.too_long += 1

@@ -69,13 +69,13 @@ class FeedbackTopic:
         self._frames: dict[Format, Frame] = {}  # of the encodings that had a subscriber
 
     def encode(self, estimate: Estimate, form: Format) -> bytes:
-        order, numbers = _ORDERS.get(form), self._numbers(estimate)
-        if order is None or not (
-            _MIN_UINT32 <= numbers[0] <= _MAX_SEC and numbers[1] >= _MIN_UINT32
-        ):
+        numbers, frame = self._numbers(estimate), self._frames.get(form)
+        if not (_MIN_UINT32 <= numbers[0] <= _MAX_SEC and numbers[1] >= _MIN_UINT32):
             return encode(self.build(estimate), form)
-        frame = self._frames.get(form)
         if frame is None:
+            order = _ORDERS.get(form)
+            if order is None:
+                return encode(self.build(estimate), form)
             example = encode(self.build(EXAMPLE), form)
             frame = self._frames[form] = Frame(example, self._numbers(EXAMPLE), order)
         return frame.fill(numbers)

@@ -112,9 +112,16 @@ class Sanity(Struct):
                     why = "" if agrees else why
         else:
             self.fast = NOT_FAST
-        self._count(why)
+        self.lines += 1
+        self.warning = None
         if why:
+            self.dropped += 1
             self.count += 1
+            if self.dropped == int(WARNING_FRACTION * WINDOW_LINES) + 1:
+                self.warning = Event("lines_implausible", self._warning_text(why), "warning")
+        if self.lines == WINDOW_LINES:
+            self.lines = self.dropped = 0
+        if why:
             return why
         # If this line is damaged, the speeds change back by `change` in the next line. Every next
         # line may at least change by as much as a wheel can in half of `_longest`.
@@ -135,16 +142,6 @@ class Sanity(Struct):
             not self._jump(line, speeds, self._most(self.since - since, longest))
             for speeds, since in self.rejected
         )
-
-    def _count(self, why: str) -> None:
-        self.lines += 1
-        self.warning = None
-        if why:
-            self.dropped += 1
-            if self.dropped == int(WARNING_FRACTION * WINDOW_LINES) + 1:
-                self.warning = Event("lines_implausible", self._warning_text(why), "warning")
-        if self.lines == WINDOW_LINES:
-            self.lines = self.dropped = 0
 
     def _warning_text(self, why: str) -> str:
         setting = why.rpartition(" over ")[2]
