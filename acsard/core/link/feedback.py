@@ -115,7 +115,7 @@ class Timeline(Struct):
         """Skip a line that is not used, and the command that it may answer, or its period."""
         self.rest -= 1
         if setup.period_ns:
-            self.free_running.lost += 1
+            self.free_running.skip()
         elif not setup.mcu.checked:  # else the next reply names its command
             self.prompted.give_up()
 

@@ -43,6 +43,10 @@ LAG_GAIN = 0.03
 
 WINDOW_NS = NS_PER_S // 2  # of the least delay of a free-running board
 
+# Missing lines among the last ones, above which a free-running board behind an adapter that holds
+# lines back is lossy: nobody knows between which lines they are missing.
+LOSSY, LOSSY_LINES = 2.0, 1000
+
 MAX_OPEN_COMMANDS = 64  # replies to them may still come
 
 LEAST_DELAY_GAIN = 0.002  # rise of the least delay per reply: an old one is forgotten after 500
@@ -110,7 +114,12 @@ class FreeRunning(Struct):
     # Least lateness in a window, and its beginning: by as much our clock is ahead of the board's.
     least: float = math.inf
     window_ns: Ns = 0
-    lost: int = 0  # periods before the next line; negative: lines that were counted before
+    lost: float = 0.0  # periods before the next line; negative: lines that were counted before
+    missing: float = 0.0  # among the last lines
+    # Periods that each line of the last read takes longer, and the lateness that such lines took in
+    # all: those of a lossy link take the times of arrival.
+    longer: float = 0.0
+    taken: float = 0.0
 
     def process_read(self, end_ns: Ns, since_ns: Ns, lines: int, drained: bool, period: Ns) -> None:
         """Process a read; `drained`: the kernel has no more data."""
@@ -118,7 +127,7 @@ class FreeRunning(Struct):
             self.begun, self.window_ns = True, end_ns
             return
         passed = since_ns / period
-        late = self.late + passed - lines
+        late, before = self.late + passed - lines, self.lost
         if late < 0.0:  # the board's clock may be the faster one
             late = min(0.0, late + MAX_CLOCK_ERROR * passed)
         if late < -EARLY_SLOTS:
@@ -135,17 +144,32 @@ class FreeRunning(Struct):
                 late -= 1.0
             self.lateness.follow(late)
         self.late, self.least = late, min(self.least, late)
+        self.missing += self.lost - before - self.missing * min(1.0, lines / LOSSY_LINES)
+        taken, lateness, lost = self.taken, self.lateness, self.lost
+        lossy = self.missing > LOSSY and lateness.deviation >= NARROW_DEVIATION
+        self.taken, self.longer = late - lateness.usual if lossy else 0.0, 0.0
+        if taken or lossy:
+            self.longer, self.lost = (lost + self.taken - taken) / lines, 0.0
+            if self.longer < -1.0:
+                self.longer, self.taken = -1.0, taken - lines - lost
         if end_ns - self.window_ns > WINDOW_NS:
             most = MAX_CLOCK_ERROR * (end_ns - self.window_ns) / period
             if 0.0 < self.least < EARLY_SLOTS:  # else a line may be missing
-                self.late -= min(self.least, most)
+                shift = min(self.least, most)
+                self.late -= shift
+                if self.taken:
+                    self.taken -= shift
             self.window_ns, self.least = end_ns, math.inf
 
     def place(self, end_ns: Ns, behind: int, period: Ns) -> Placed:
         """Return the time of the next line of the last read, `behind` lines before its end."""
-        lost, self.lost = self.lost, min(0, self.lost + 1)
-        due_ns = end_ns - int((self.late + behind) * period)
-        return Placed(due_ns, max(0, 1 + lost) * period, max(0, lost) * period)
+        lost, self.lost = self.lost + self.longer, min(0.0, self.lost + 1.0)
+        due_ns = end_ns - int((self.late - self.taken + behind) * period)
+        return Placed(due_ns, int(max(0.0, 1.0 + lost) * period), int(max(0.0, lost) * period))
+
+    def skip(self) -> None:
+        """Skip a line that is not used."""
+        self.lost += 1.0 + self.longer
 
 
 class Prompted(Struct):
