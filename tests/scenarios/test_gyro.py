@@ -22,10 +22,14 @@ def world(
     gyro: bool = True,
     recorder: StepRecorder | None = None,
     skid: float = CALIBRATED,
+    track_std: float = 0.0,
 ) -> World:
     """Return a world whose robot has been at rest for 1.5 s."""
     made = World(
-        Config(odometry=OdometryConfig(gyro=True), sim=SimConfig(track_multiplier=skid)),
+        Config(
+            odometry=OdometryConfig(gyro=True, wheel_separation_multiplier_std=track_std),
+            sim=SimConfig(track_multiplier=skid),
+        ),
         recorder=recorder,
         gyro=imperfect or ImperfectGyro(bias=0.01, noise=0.005),
     )
@@ -95,6 +99,22 @@ def test_with_a_gyro_a_long_rotation_in_one_direction_has_a_small_heading_error(
     print(f"turning on: gyro {with_gyro.error:.2%}, wheels {without.error:.0%}")
     assert with_gyro.error < 0.01
     assert without.error > 0.55  # the track is 1.6 times as wide as configured
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("track_std", "does", "least", "most"), [(0.0, "disagrees", 3.0, 30.0), (0.3, "used", 0.0, 0.2)]
+)
+def test_the_heading_is_sure_only_if_the_settings_say_that_the_track_may_be_wrong(
+    track_std: float, does: str, least: float, most: float
+) -> None:
+    """If they do not, the gyro or the track is wrong, and nobody knows which one."""
+    drive = Drive(world(skid=SKIDDING, track_std=track_std))
+    drive.world.drive(0.0, 0.0, 0.2)
+    drive.hold(0.2, 1.0, 20.0)
+    assert drive.world.state.gyro == does
+    assert least < math.sqrt(drive.world.odom.pose.covariance[35]) < most
+    assert drive.error < 0.01
 
 
 @pytest.mark.slow

@@ -87,9 +87,10 @@ STATUS_TEXTS: dict[GyroDoes, str] = {
     "used": "the heading comes from the gyro",
     "silent": "the gyro is silent: the heading comes from the wheels",
     "hangs": "the gyro repeats one rate exactly, so it hangs: the heading comes from the wheels",
-    "disagrees": "gyro and wheels measure different turns, and the heading's uncertainty includes "
-    "the difference: do the wheels slip, is the track calibrated, has the gyro's scale or bias "
-    "changed?",
+    "disagrees": "gyro and wheels measure different turns: the heading is the gyro's, and its "
+    "uncertainty includes the difference. Do the wheels slip, has the gyro's scale or bias "
+    "changed? If the track is not calibrated, run acsard calibrate, or set "
+    "odometry.wheel_separation_multiplier_std to how wrong it may be",
     "reversed": "the gyro is not used, because it reports a left turn of the robot as a right "
     "turn: check how the gyro is mounted",
     "in degrees": "the gyro is not used, because its rate is 57 times too high: it sends degrees "
@@ -115,10 +116,11 @@ class Claims(Struct, frozen=True, gc=False):
 
 def claims(odometry: OdometryConfig, kinematics: Kinematics, counts: int) -> Claims:
     rest = REST_COUNTS * math.tau / counts if counts else REST_ANGLE
+    track = odometry.wheel_separation_multiplier_std / kinematics.multipliers[2]
     return Claims(
         odometry.yaw_variance_per_metre,
         odometry.yaw_variance_per_radian,
-        math.hypot(odometry.gyro_scale_std, odometry.wheel_separation_multiplier_std),
+        math.hypot(odometry.gyro_scale_std, track),
         rest * kinematics.radius,
         kinematics.track / 2,
     )

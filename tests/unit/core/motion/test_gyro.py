@@ -571,3 +571,9 @@ def test_the_variance_of_the_turn_is_that_of_its_errors() -> None:
 
 def test_every_state_of_the_gyro_has_a_text() -> None:
     assert set(STATUS_TEXTS) == set(GyroDoes.__args__)  # type: ignore[attr-defined]
+
+
+def test_the_declared_error_of_the_track_is_a_fraction_of_its_multiplier() -> None:
+    odometry = OdometryConfig(gyro_scale_std=0.0, wheel_separation_multiplier_std=0.2)
+    kinematics = Kinematics(DriveConfig(wheel_separation_multiplier=2.0))
+    assert claims(odometry, kinematics, 3200).scale == pytest.approx(0.1)
