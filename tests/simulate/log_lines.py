@@ -15,7 +15,7 @@ BURST = 5
 LATE_NS = 6 * NS
 """A change may be logged this late: after a burst, repetitions wait until it is paid for."""
 
-LEVELS = {"info", "warning", "error"}
+LEVELS = {"debug", "info", "warning", "error"}
 
 
 class LogLines:

@@ -54,7 +54,9 @@ class Spread:
         coarse = counts == 96 and not mcu_counts
         self._rough = counts == 400 and not mcu_counts
         """Whether lines that follow each other sooner than `SHORTEST_NS` look like slip."""
-        self._judged = not config.get("odometry") and usual and not coarse
+        # A wrong number of counts, once it is known, makes the pose doubtful.
+        miscounts = mcu_counts and mcu_counts != (counts or 3200)
+        self._judged = not (config.get("odometry") or coarse or miscounts) and usual
         self._track = 2 * witness.half
         every_s = max(witness.period_ns / NS, config["mcu"].get("reply_period", 0.0))
         self._longest_ns = 2 * max(int(every_s * NS), LEAST_NS)
