@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any, TypeVar
 
@@ -26,12 +26,15 @@ from acsard.host.errors import MendableError, UnreachableError
 from acsard.host.threads import NoThreadError, in_thread
 from acsard.web.last_minute import Minute, Plotted
 from acsard.web.metrics import Counts
-from acsard.web.streams import DECLARE_TIMEOUT_S, NOT_READY_ERRORS, Stream, Streams
+from acsard.web.streams import (
+    DECLARE_TIMEOUT_S,
+    NOT_READY_ERRORS,
+    RETRY_DELAY_S,
+    Stream,
+    Streams,
+)
 
 PROCESS_PERIOD_S = 0.1
-
-# After a daemon did not answer.
-RETRY_DELAY_S = 1.0
 
 # Between two queries of `About`: after an answer, and after none.
 ABOUT_PERIOD_S, ABOUT_RETRY_S = 10.0, 1.0
@@ -110,7 +113,7 @@ class FollowedRobot:
         self.certificate = shown_at(address.endpoint, address.tls)
         self.about = about
         self.client: Connection | None = None
-        self.streams = Streams()
+        self.streams = Streams(lambda: self.client)
         # why the robot is not reachable, or ""
         self.gone = f"no daemon answers at {address.endpoint} yet"
         self._connect, self._counts = connect, counts
@@ -127,14 +130,8 @@ class FollowedRobot:
         """
         client = self.client = await self._reached()
         asking = asyncio.create_task(self._ask_again_and_again())
-
-        def watch() -> Watch:
-            return Watch(_TaskQueries(client), clock.steady_s())
-
         try:
-            await self._follow(
-                await self._retried(lambda: in_thread(watch, DECLARE_TIMEOUT_S, Watch.end))
-            )
+            await self._follow(await self._watch_state(client))
         finally:
             asking.cancel()
 
@@ -167,10 +164,13 @@ class FollowedRobot:
                 self.gone = f"{error}; the page tries again by itself"
             await asyncio.sleep(RETRY_DELAY_S)
 
-    async def _retried(self, call: Callable[[], Awaitable[T]]) -> T:
+    async def _watch_state(self, client: Connection) -> Watch:
+        def watch() -> Watch:
+            return Watch(_TaskQueries(client), clock.steady_s())
+
         while True:
             try:
-                return await call()
+                return await in_thread(watch, DECLARE_TIMEOUT_S, Watch.end)
             except NOT_READY_ERRORS as error:
                 why = str(error) if isinstance(error, NoThreadError) else "the Zenoh bus is stuck"
                 self.gone = f"{why}; the page tries again by itself"
@@ -202,7 +202,7 @@ class FollowedRobot:
                 self.gone = ""
                 self.refresh_about()
             if self.about.simulated and truth is None:
-                truth = await self._retried(self._truth)
+                truth = self.streams.follow("sim/pose")
             if truth is not None:
                 self._take_truth(truth, now_ns)
             await asyncio.sleep(PROCESS_PERIOD_S)
@@ -224,10 +224,6 @@ class FollowedRobot:
             return self._wishes.decode(*raw).twist
         except DecodeError:
             return None
-
-    async def _truth(self) -> Stream:
-        assert self.client is not None
-        return await self.streams.follow(self.client, "sim/pose")
 
     def _take_truth(self, truth: Stream, now_ns: Ns) -> None:
         raw = truth.raw()

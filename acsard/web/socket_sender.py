@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
 
 import aiohttp
 import msgspec
@@ -22,14 +21,16 @@ from acsard.host import clock
 from acsard.host.rate_limits import Buckets, Rate
 from acsard.web.answers import cut
 from acsard.web.callers import Reason
-from acsard.web.followed_robot import RETRY_DELAY_S, FollowedRobot
 from acsard.web.metrics import Counts
-from acsard.web.socket_messages import Refused, Subscribe, Unsubscribe
-from acsard.web.streams import NOT_READY_ERRORS, VIEWER_KEYS, Stream
+from acsard.web.socket_messages import Refused
+from acsard.web.streams import VIEWER_KEYS, Stream, Streams
 
 # Above this, the client gets no new values. It is less than `connections.WRITE_BYTES`, so that a
 # client that does not read delays no task.
 MAX_UNREAD_BYTES = 32768
+
+# Sum of all keys of a WebSocket. More would take processor time from the commands.
+MAX_FRAMES_HZ = 300.0
 
 # Of reports about refused messages, for each kind of message and each reason.
 REPORT_RATE = Rate(1.0)
@@ -38,16 +39,15 @@ REPORT_RATE = Rate(1.0)
 class Following:
     """A key to which the client is subscribed, and the time at which to send its next value."""
 
-    def __init__(self, name: str, period: float) -> None:
-        self.name, self.period = name, period
+    def __init__(self, name: str, period: float, stream: Stream) -> None:
+        self.name, self.period, self.stream = name, period, stream
         self.head = msgspec.json.encode({"key": name})[:-1] + b',"value":'
-        self.stream: Stream | None = None
         self.sent = 0
         self.due = 0.0
 
-    def next(self, stream: Stream) -> bytes:
+    def next(self) -> bytes:
         """Return the message with the newest value."""
-        self.sent, value, age = stream.value()
+        self.sent, value, age = self.stream.value()
         return b'%b%b,"age":%.1f}' % (self.head, value, age)
 
 
@@ -55,10 +55,15 @@ class Outgoing:
     """Sends the messages and the values of subscribed keys to the client of one WebSocket."""
 
     def __init__(
-        self, socket: web.WebSocketResponse, request: web.Request, counts: Counts, origin: str
+        self,
+        socket: web.WebSocketResponse,
+        request: web.Request,
+        streams: Streams,
+        counts: Counts,
+        origin: str,
     ) -> None:
         self._socket, self._transport, self._counts = socket, request.transport, counts
-        self._origin = origin
+        self._streams, self._origin = streams, origin
         self.following: dict[str, Following] = {}  # by key
         # The queue is limited, because the client may have stopped reading.
         self._out: deque[bytes] = deque(maxlen=200)
@@ -72,10 +77,7 @@ class Outgoing:
         self._out.append(msgspec.json.encode(message))
         self._news.set()
 
-    def wake(self) -> None:
-        self._news.set()
-
-    def wake_from_thread(self) -> None:
+    def _wake_from_thread(self) -> None:
         with suppress(RuntimeError):  # the event loop may have ended
             self._loop.call_soon_threadsafe(self._news.set)
 
@@ -84,6 +86,39 @@ class Outgoing:
         self._counts.refuse(reason, self._origin)
         if self._reports.take(f"{what} {reason}", clock.mono_ns()):
             self.enqueue(Refused(what, text))
+
+    def subscribe(self, key: str, rate: float) -> None:
+        """Subscribe to a key or change its rate, or report to the client why not."""
+        known = self.following.get(key)
+        others = sum(1.0 / other.period for other in self.following.values() if other is not known)
+        if key not in VIEWER_KEYS:
+            keys = ", ".join(sorted(VIEWER_KEYS))
+            text = f"{key!r} is not a key to follow; choose one of {keys}"
+            self.refuse("subscribe", "malformed", text)
+        elif others + rate > MAX_FRAMES_HZ:
+            text = (
+                f"the rates of your keys add up to more than {MAX_FRAMES_HZ:g} messages a second: "
+                "lower some of them"
+            )
+            self.refuse("subscribe", "too_many", text)
+        elif known is not None:
+            known.period, known.due = 1.0 / rate, 0.0
+        else:
+            stream = self._streams.follow(key)
+            self.following[key] = Following(key, 1.0 / rate, stream)
+            if key == BEAT:
+                stream.wakes.add(self._wake_from_thread)
+        self._news.set()
+
+    def unsubscribe(self, key: str) -> None:
+        subscription = self.following.pop(key, None)
+        if subscription is not None:
+            subscription.stream.wakes.discard(self._wake_from_thread)
+            self._streams.leave(key)
+
+    def unsubscribe_all(self) -> None:
+        for key in list(self.following):
+            self.unsubscribe(key)
 
     async def pump(self, look_around: Callable[[float], float]) -> None:
         """Send messages until the task is cancelled or the connection closes.
@@ -148,8 +183,8 @@ class Outgoing:
 
     async def _send_beat(self) -> None:
         beats = self.following.get(BEAT)
-        if beats is not None and beats.stream is not None and beats.stream.number != beats.sent:
-            await self._send_frame(beats.next(beats.stream), aiohttp.WSMsgType.TEXT)
+        if beats is not None and beats.stream.number != beats.sent:
+            await self._send_frame(beats.next(), aiohttp.WSMsgType.TEXT)
 
     async def _send_what_waits(self) -> None:
         if self._pong is not None:
@@ -159,109 +194,18 @@ class Outgoing:
             await self._send(self._out.popleft())
 
     async def _send_due(self, subscription: Following, now: float) -> float:
-        stream = subscription.stream
-        if stream is None or subscription.name == BEAT:
-            return now + subscription.period  # `Keys._join` wakes the task when the stream exists
+        if subscription.name == BEAT:
+            return now + subscription.period  # each beat wakes the task
         if subscription.due > now:
             return subscription.due
         # All keys share one time grid, so they wake the task together.
         subscription.due = (now // subscription.period + 1) * subscription.period
-        if stream.number != subscription.sent:
+        if subscription.stream.number != subscription.sent:
             if self._unread() > MAX_UNREAD_BYTES:
                 self._counts.add("frames_left_out")
             else:
-                await self._send(subscription.next(stream))
+                await self._send(subscription.next())
         return subscription.due
 
     def _unread(self) -> int:
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
-
-
-# Sum of all keys of a WebSocket. More would take processor time from the commands.
-MAX_FRAMES_HZ = 300.0
-
-
-class Keys:
-    """The subscriptions of one WebSocket. `start` starts a task that ends with it."""
-
-    def __init__(
-        self,
-        out: Outgoing,
-        robot: FollowedRobot,
-        start: Callable[[Coroutine[Any, Any, None]], None],
-    ) -> None:
-        self._out, self._robot, self._start = out, robot, start
-
-    def subscribe(self, frame: Subscribe) -> None:
-        """Subscribe to a key or change its rate, or report to the client why not."""
-        key = frame.subscribe
-        known = self._out.following.get(key)
-        if (refusal := self._refusal(key, frame.rate, known)) is not None:
-            self._out.refuse("subscribe", *refusal)
-        elif known is not None:
-            known.period, known.due = 1.0 / frame.rate, 0.0
-            self._out.wake()
-        else:
-            subscription = Following(key, 1.0 / frame.rate)
-            self._out.following[key] = subscription
-            self._start(self._join(subscription))
-
-    def _refusal(self, key: str, rate: float, known: Following | None) -> tuple[Reason, str] | None:
-        if key not in VIEWER_KEYS:
-            keys = ", ".join(sorted(VIEWER_KEYS))
-            return "malformed", f"{key!r} is not a key to follow; choose one of {keys}"
-        following = self._out.following
-        others = sum(1.0 / other.period for other in following.values() if other is not known)
-        if others + rate > MAX_FRAMES_HZ:
-            return "too_many", (
-                f"the rates of your keys add up to more than {MAX_FRAMES_HZ:g} messages a second: "
-                "lower some of them"
-            )
-        return None
-
-    def unsubscribe(self, frame: Unsubscribe) -> None:
-        # Remove the key immediately, because the client's next message may subscribe to it again.
-        subscription = self._out.following.pop(frame.unsubscribe, None)
-        if subscription is not None:
-            self._leave(subscription)
-
-    def leave_all(self) -> None:
-        followed, self._out.following = self._out.following, {}
-        for subscription in followed.values():
-            self._leave(subscription)
-
-    def _leave(self, subscription: Following) -> None:
-        if subscription.stream is not None:
-            subscription.stream.wakes.discard(self._out.wake_from_thread)
-            self._robot.streams.leave(subscription.name)
-
-    async def _join(self, subscription: Following) -> None:
-        stream = None
-        while stream is None and self._is_followed(subscription):
-            stream = await self._follow(subscription)
-        if stream is None:
-            return
-        if not self._is_followed(subscription):  # the viewer unsubscribed during the wait
-            self._robot.streams.leave(subscription.name)
-            return
-        subscription.stream = stream
-        if subscription.name == BEAT:
-            stream.wakes.add(self._out.wake_from_thread)
-        self._out.wake()
-
-    async def _follow(self, subscription: Following) -> Stream | None:
-        client = self._robot.client
-        if client is None:
-            await asyncio.sleep(0.2)
-            return None
-        try:
-            return await self._robot.streams.follow(client, subscription.name)
-        except NOT_READY_ERRORS:
-            self._out.refuse(
-                "subscribe", "stuck", "the Zenoh bus is stuck; the page tries again by itself"
-            )
-            await asyncio.sleep(RETRY_DELAY_S)
-            return None
-
-    def _is_followed(self, subscription: Following) -> bool:
-        return self._out.following.get(subscription.name) is subscription

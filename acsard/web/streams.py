@@ -30,6 +30,9 @@ VIEWER_KEYS = frozenset(topic.key for topic in FOLLOWED)
 
 DECLARE_TIMEOUT_S = 3.0
 
+# After a failed attempt.
+RETRY_DELAY_S = 1.0
+
 # The bus is stuck or the session is closed. A later attempt may succeed.
 NOT_READY_ERRORS = (TimeoutError, zenoh.ZError, UsageError)
 
@@ -41,10 +44,8 @@ class Stream:
         self._taking = threading.Lock()
         self._newest: tuple[int, zenoh.Sample | None, int] = (0, None, 0)
         self._text: tuple[int, bytes] = (0, b"null")
-        self.declared: Any = None
-        self.users = 0
+        self.users, self.unused = 0, asyncio.Event()
         self.wakes: set[Callable[[], object]] = set()  # called for each message, in any thread
-        self.lock = asyncio.Lock()
 
     @property
     def number(self) -> int:
@@ -84,26 +85,21 @@ class Stream:
 class Streams:
     """Subscriptions to keys of the robot, each shared by all its users."""
 
-    def __init__(self) -> None:
+    def __init__(self, client: Callable[[], Connection | None]) -> None:
+        self._client = client  # None before the daemon is connected
         self._streams: dict[str, Stream] = {}
-        self._ending: set[asyncio.Task[None]] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
 
-    async def follow(self, client: Connection, key: str) -> Stream:
+    def follow(self, key: str) -> Stream:
         """Return the stream of a key, for which the caller must call `leave` later.
 
-        Raises one of `NOT_READY_ERRORS`.
+        The subscription begins in the background, as soon as the bus is ready.
         """
         stream = self._streams.get(key)
         if stream is None:
             stream = self._streams[key] = Stream()
+            start(self._serve(key, stream), self._tasks)
         stream.users += 1
-        try:
-            async with stream.lock:
-                if stream.declared is None:
-                    stream.declared = await self._declare(client, key, stream)
-        except BaseException:
-            self.leave(key)
-            raise
         return stream
 
     def followed(self, key: str) -> Stream | None:
@@ -111,38 +107,45 @@ class Streams:
         return self._streams.get(key)
 
     def leave(self, key: str) -> None:
-        """Remove one user of a key; after the last one, the subscription ends in the background."""
-        stream = self._streams.get(key)
-        if stream is None:
-            return
+        """Remove one user of a key; the subscription ends with the last one."""
+        stream = self._streams[key]
         stream.users -= 1
-        if stream.users:
-            return
-        del self._streams[key]
-        if stream.declared is not None:
-            start(attempt(stream.declared.undeclare), self._ending)
+        if not stream.users:
+            del self._streams[key]
+            stream.unused.set()
 
-    async def _declare(self, client: Connection, key: str, stream: Stream) -> Any:
-        def of_it(take: Take) -> Take:
-            return lambda sample: take(sample) if has_exact_key(client.key(key), sample) else None
-
-        def declare() -> Any:
-            subscription = client.listen(key, of_it(stream.take))
+    async def _serve(self, key: str, stream: Stream) -> None:
+        subscription = None
+        while subscription is None and stream.users:
+            client = self._client()
             try:
-                # The query gives a first value soon, even if the key is published rarely.
-                client.start_query(key, of_it(stream.answered))
-            except zenoh.ZError:
-                subscription.undeclare()
-                raise
-            return subscription
+                if client is not None:
+                    subscription = await _declare(client, key, stream)
+            except NOT_READY_ERRORS:
+                await asyncio.sleep(RETRY_DELAY_S)
+            if client is None:
+                await asyncio.sleep(0.2)
+        await stream.unused.wait()
+        if subscription is not None:
+            with suppress(*NOT_READY_ERRORS):
+                await in_thread(subscription.undeclare, DECLARE_TIMEOUT_S)
 
-        return await in_thread(declare, DECLARE_TIMEOUT_S, lambda late: late.undeclare())
 
+async def _declare(client: Connection, key: str, stream: Stream) -> Any:
+    def of_it(take: Take) -> Take:
+        return lambda sample: take(sample) if has_exact_key(client.key(key), sample) else None
 
-async def attempt(call: Callable[[], object]) -> None:
-    """Make a call that waits for the bus, in a thread, even if the bus is stuck or closed."""
-    with suppress(*NOT_READY_ERRORS):
-        await in_thread(call, DECLARE_TIMEOUT_S)
+    def declare() -> Any:
+        subscription = client.listen(key, of_it(stream.take))
+        try:
+            # The query gives a first value soon, even if the key is published rarely.
+            client.start_query(key, of_it(stream.answered))
+        except zenoh.ZError:
+            subscription.undeclare()
+            raise
+        return subscription
+
+    return await in_thread(declare, DECLARE_TIMEOUT_S, lambda late: late.undeclare())
 
 
 def as_json(encoding: str, payload: bytes) -> bytes:

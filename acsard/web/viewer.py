@@ -43,7 +43,7 @@ from acsard.web.socket_messages import (
     asks_to_stop,
     decode,
 )
-from acsard.web.socket_sender import Keys, Outgoing
+from acsard.web.socket_sender import Outgoing
 from acsard.web.tasks import start
 
 # The page disables the controls of the actions that its user's role does not allow.
@@ -125,8 +125,7 @@ class Viewer:
         self.sender = public_name(whole, parts.robot.certificate)
         self._socket = socket
         self._bucket = Bucket(REQUEST_RATE)
-        self._out = Outgoing(socket, request, parts.counts, who.origin)
-        self._keys = Keys(self._out, parts.robot, self._start)
+        self._out = Outgoing(socket, request, parts.robot.streams, parts.counts, who.origin)
         self._tasks: set[asyncio.Task[None]] = set()
         self._stops: set[asyncio.Task[None]] = set()
         self._ended = self._is_calling = False
@@ -147,7 +146,7 @@ class Viewer:
             pump.cancel()
             for task in list(self._tasks):
                 task.cancel()
-            self._keys.leave_all()
+            self._out.unsubscribe_all()
 
     def end(self, why: str) -> None:
         """Stop the robot if this viewer may still drive it, and close the connection.
@@ -209,9 +208,9 @@ class Viewer:
                 now = clock.now().wall_ns / 1e6
                 self._out.enqueue(socket_messages.Pong(frame.ping, now))
             case Subscribe():
-                self._keys.subscribe(frame)
+                self._out.subscribe(frame.subscribe, frame.rate)
             case Unsubscribe():
-                self._keys.unsubscribe(frame)
+                self._out.unsubscribe(frame.unsubscribe)
 
     def _command(self, frame: Command) -> None:
         if frame.source not in self._robot.about.timeouts:

@@ -227,17 +227,14 @@ async def test_a_client_that_pings_without_reading_gets_one_answer_to_all_pings(
         assert message.data == b"%0125d" % 99
 
 
-async def test_a_bus_that_is_gone_is_reported_and_the_key_comes_when_it_is_back(
-    inside: Inside, tmp_path: Path
-) -> None:
+async def test_a_key_comes_when_a_bus_that_was_gone_is_back(inside: Inside, tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon:
         closed = client_session(daemon.endpoint, "")
         closed.close()
         inside.robot.client = Connection(closed, "acsar", "teleop")
         async with inside.hands() as ours:
             await ours.say(subscribe="state", rate=10)
-            refused = await ours.find(lambda frame: frame.get("refused") == "subscribe")
-            assert "again" in refused["reason"]
+            await asyncio.sleep(0.2)
             with client_session(daemon.endpoint, "") as session:
                 inside.robot.client = Connection(session, "acsar", "teleop")
                 await ours.state(lambda state: state["mode"])

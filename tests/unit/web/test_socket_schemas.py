@@ -17,6 +17,7 @@ from acsard.web.last_minute import Minute
 from acsard.web.openapi import KEYS, SENT_MESSAGES, VALUE_PREFIX
 from acsard.web.socket_sender import Following
 from acsard.web.streams import VIEWER_KEYS as FOLLOWED
+from acsard.web.streams import Stream
 from tests.described import FRAMES, SCHEMAS, is_described_frame, kinds, spoilt
 from tests.each import each
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START, due
@@ -71,7 +72,7 @@ def test_a_message_of_a_key_has_its_type_by_reference() -> None:
     list(due(report, OUTPUTS, {"odom"}, lambda: SNAPSHOT))
     odom = report.current("odom", lambda: SNAPSHOT)
     assert odom is not None
-    head = Following("odom", 0.1).head
+    head = Following("odom", 0.1, Stream()).head
     frame = as_sent(msgspec.Raw(b'%b%b,"age":1.5}' % (head, encode(odom, "json"))))
     assert kinds([frame, frame | {"value": None}]) == {"Value.odom"}
     assert [variant for variant in spoilt(frame) if is_described_frame(variant)] == []

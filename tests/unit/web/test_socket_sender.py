@@ -14,13 +14,15 @@ from aiohttp.test_utils import make_mocked_request
 
 from acsard.web.metrics import Counts
 from acsard.web.socket_sender import Following, Outgoing
-from acsard.web.streams import Stream
+from acsard.web.streams import Stream, Streams
+
+REQUEST = make_mocked_request("GET", "/ws")
+STREAMS = Streams(lambda: None)
 
 
 async def test_earlier_messages_do_not_delay_a_key_that_is_due_soon() -> None:
-    out = Outgoing(web.WebSocketResponse(), make_mocked_request("GET", "/ws"), Counts(), "")
-    subscription = Following("state", 0.1)
-    subscription.stream = Stream()
+    out = Outgoing(web.WebSocketResponse(), REQUEST, STREAMS, Counts(), "")
+    subscription = Following("state", 0.1, Stream())
     due = await out._send_due(subscription, 100.03)
     assert abs(due - 100.1) < 1e-6
     woken = [await out._send_due(subscription, now) for now in (100.04, 100.07, 100.099)]
@@ -31,7 +33,7 @@ async def test_earlier_messages_do_not_delay_a_key_that_is_due_soon() -> None:
 @pytest.mark.slow
 async def test_a_refusal_is_reported_once_a_second_for_each_kind_of_message_and_reason() -> None:
     counts = Counts()
-    out = Outgoing(web.WebSocketResponse(), make_mocked_request("GET", "/ws"), counts, "")
+    out = Outgoing(web.WebSocketResponse(), REQUEST, STREAMS, counts, "")
     for _ in range(3):
         out.refuse("subscribe", "malformed", "no such key")
         out.refuse("cmd", "malformed", "not a number")
@@ -55,10 +57,9 @@ class Socket:
 
 async def test_a_beat_is_sent_as_it_arrives_and_ahead_of_everything_that_waits() -> None:
     socket: Any = Socket()
-    out = Outgoing(socket, make_mocked_request("GET", "/ws"), Counts(), "")
-    following = out.following["beat"] = Following("beat", 0.05)
-    stream = following.stream = Stream()
-    stream.wakes.add(out.wake_from_thread)
+    out = Outgoing(socket, REQUEST, STREAMS, Counts(), "")
+    out.subscribe("beat", 20.0)
+    stream = out.following["beat"].stream
 
     def arrive(number: int) -> None:
         payload = SimpleNamespace(to_bytes=lambda: b'{"run":7,"boot_us":%d}' % number)
