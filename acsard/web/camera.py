@@ -10,7 +10,7 @@ count as new.
 from __future__ import annotations
 
 import asyncio
-import re
+from collections.abc import AsyncIterator
 from contextlib import suppress
 from email.message import Message
 
@@ -27,13 +27,11 @@ PICTURE_TIMEOUT_S = 1.0
 # For connecting to the camera's server, and for each wait for its data.
 CONNECT_S, SILENT_S = 3.0, 3.0
 
-# Bytes of a picture and of the lines before it. A full HD picture has a few hundred kB.
-MAX_PICTURE, MAX_HEAD = 1_000_000, 4096
+# A full HD picture has a few hundred kB.
+MAX_PICTURE, READ_BYTES = 1_000_000, 65536
 
 # The page in the browser waits no longer.
 SEND_TIMEOUT_S = 5.0
-
-_LENGTH = re.compile(rb"(?im)^content-length:[ \t]*(\d{1,8})[ \t]*\r?$")
 
 
 class Picture(Struct, frozen=True):
@@ -44,47 +42,24 @@ class Picture(Struct, frozen=True):
     at_ns: Ns
 
 
-class Parts:
-    """Splits a `multipart/x-mixed-replace` stream into pictures.
-
-    Dashes before the boundary in the content type are ignored.
-    """
-
-    def __init__(self, boundary: str) -> None:
-        self._end = b"\r\n--" + boundary.strip('"').removeprefix("--").encode()
-        self._buffer = bytearray()
-
-    def feed(self, data: bytes) -> bytes | None:
-        """Return the newest picture that the bytes complete.
-
-        Raises `ValueError` if one is too long.
-        """
-        self._buffer += data
-        newest = None
-        while (part := self._part()) is not None:
-            newest = part
-        return newest
-
-    def _part(self) -> bytes | None:
-        head = self._buffer.find(b"\r\n\r\n", 0, MAX_HEAD)
-        if head < 0:
-            if len(self._buffer) >= MAX_HEAD:
-                raise ValueError(
-                    f"the header of a picture is missing, or has {MAX_HEAD} bytes or more"
-                )
-            return None
-        begin = head + 4
-        if match := _LENGTH.search(self._buffer, 0, head):
-            end = begin + int(match[1])
-        else:
-            end = self._buffer.find(self._end, begin)
-        if max(end, len(self._buffer) if end < 0 else 0) - begin > MAX_PICTURE:
-            raise ValueError(f"a picture has more than {MAX_PICTURE} bytes")
-        if end < 0 or end > len(self._buffer):
-            return None
-        part = bytes(self._buffer[begin:end])
-        del self._buffer[:end]
-        return part
+async def pictures(content_type: str, stream: aiohttp.StreamReader) -> AsyncIterator[bytes]:
+    """Yield the pictures of an MJPEG stream. Raises `ValueError` if it is not one."""
+    kind = Message()
+    kind["Content-Type"] = content_type
+    # Some programs write the dashes before a boundary into the content type, too.
+    boundary = (kind.get_boundary() or "").removeprefix("--")
+    if not boundary:
+        raise ValueError(f"the camera sends {content_type!r}, not an MJPEG stream")
+    parts = aiohttp.MultipartReader(
+        {"Content-Type": f'multipart/x-mixed-replace; boundary="{boundary}"'}, stream
+    )
+    while isinstance(part := await parts.next(), aiohttp.BodyPartReader):
+        picture = bytearray()
+        while chunk := await part.read_chunk(READ_BYTES):
+            picture += chunk
+            if len(picture) > MAX_PICTURE:
+                raise ValueError(f"a picture has more than {MAX_PICTURE} bytes")
+        yield bytes(picture)
 
 
 class Camera:
@@ -133,7 +108,7 @@ class Camera:
             while not self._idle():
                 try:
                     await self._read(session)
-                except (aiohttp.ClientError, TimeoutError, OSError, ValueError) as error:
+                except Exception as error:  # noqa: BLE001 - whatever the camera sends
                     detail = str(error) or "no answer"
                     self._trouble = ("the camera's stream cannot be read", detail)
                     self.newest = None  # clients get the reason instead of an old picture
@@ -142,22 +117,16 @@ class Camera:
 
     async def _read(self, session: aiohttp.ClientSession) -> None:
         async with session.get(self._url, allow_redirects=False) as answer:
-            kind = Message()
-            kind["Content-Type"] = answer.headers.get("Content-Type", "")
-            boundary = kind.get_boundary()
-            if answer.status != 200 or boundary is None:
-                raise ValueError(
-                    f"the camera answered {answer.status} {answer.content_type}, not an MJPEG "
-                    "stream: correct web.camera"
-                )
-            parts = Parts(boundary)
-            async for data in answer.content.iter_any():
+            if answer.status != 200:
+                raise ValueError(f"the camera answered {answer.status}: correct web.camera")
+            content_type = answer.headers.get("Content-Type", "")
+            async for picture in pictures(content_type, answer.content):
                 if self._idle():
                     return
-                self._take(parts.feed(data))
+                self._take(picture)
 
-    def _take(self, body: bytes | None) -> None:
-        if body is None or (self.newest is not None and body == self.newest.body):
+    def _take(self, body: bytes) -> None:
+        if self.newest is not None and body == self.newest.body:
             return
         self._number += 1
         self.newest = Picture(body, self._number, clock.steady_ns())

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Callable
+from unittest.mock import Mock
+
 import pytest
+from aiohttp import StreamReader
+from aiohttp.http import HttpProcessingError
 
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
-from acsard.web.camera import MAX_HEAD, MAX_PICTURE, Camera, Parts
+from acsard.web.camera import Camera, pictures
 from tests.each import each
 
 PICTURES = [bytes([0xFF, 0xD8, n]) * (n + 1) + b"\r\n--\r\n\r\n" for n in range(5)]
@@ -22,33 +28,51 @@ def bare(picture: bytes) -> bytes:
     return b"--frame\r\nContent-Type: image/jpeg\r\n\r\n" + picture + b"\r\n"
 
 
+async def read(boundary: str, stream: bytes, size: int = 1000) -> list[bytes]:
+    """Return the pictures of a stream that arrives in pieces of this size."""
+    reader = StreamReader(Mock(_reading_paused=False), 2**16)
+
+    async def arrive() -> None:
+        for n in range(0, len(stream), size):
+            reader.feed_data(stream[n : n + size])
+            await asyncio.sleep(0)
+        reader.feed_eof()
+
+    arriving = asyncio.create_task(arrive())
+    kind = f"multipart/x-mixed-replace; boundary={boundary}"
+    try:
+        return [picture async for picture in pictures(kind, reader)]
+    finally:
+        arriving.cancel()
+
+
 @each("boundary", ["frame", '"frame"', "--frame"])
 @each("form", [measured, bare])
 @each("size", [1, 7, 1000])
-def test_every_picture_is_found_in_pieces_of_any_size(boundary, form, size) -> None:  # type: ignore[no-untyped-def]
-    stream = b"".join(map(form, [*PICTURES, b"last"]))
-    parts = Parts(boundary)
-    pieces = [stream[n : n + size] for n in range(0, len(stream), size)]
-    pictures = [part for piece in pieces if (part := parts.feed(piece)) is not None]
-    wanted = [*PICTURES, b"last"] if form is measured else PICTURES
-    if size == 1:
-        assert pictures == wanted
-    else:
-        assert pictures[-1] == wanted[-1]  # of several at once only the newest counts
-        assert all(picture in wanted for picture in pictures)
+async def test_every_picture_is_found_in_pieces_of_any_size(
+    boundary: str, form: Callable[[bytes], bytes], size: int
+) -> None:
+    stream = b"".join(map(form, PICTURES)) + b"--frame--\r\n"
+    assert await read(boundary, stream, size) == PICTURES
 
 
 @each(
-    "stream",
+    ("stream", "why"),
     [
-        b"x" * MAX_HEAD,
-        b"--frame\r\nContent-Length: 99999999\r\n\r\n",
-        b"--frame\r\n\r\n" + b"x" * (MAX_PICTURE + 1),
+        (b"x" * 300_000, "more than"),
+        (b"--frame\r\nContent-Length: 99999999\r\n\r\n" + b"x" * 2_000_000, "more than"),
+        (b"--frame\r\n\r\n" + b"x" * 2_000_000, "more than"),
     ],
 )
-def test_a_stream_that_would_fill_the_memory_is_an_error(stream: bytes) -> None:
-    with pytest.raises(ValueError, match=r"header of a picture|more than"):
-        Parts("frame").feed(stream)
+async def test_a_stream_that_would_fill_the_memory_is_an_error(stream: bytes, why: str) -> None:
+    with pytest.raises((ValueError, HttpProcessingError), match=why):
+        await read("frame", stream, 65536)
+
+
+async def test_an_answer_that_is_not_a_stream_is_an_error() -> None:
+    reader = StreamReader(Mock(_reading_paused=False), 2**16)
+    with pytest.raises(ValueError, match="'text/html', not an MJPEG stream"):
+        await anext(pictures("text/html", reader))
 
 
 async def test_a_camera_that_no_client_asked_for_in_a_suspend_is_idle(
