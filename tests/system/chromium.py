@@ -58,6 +58,15 @@ _PRESSED = """[...document.querySelectorAll('button, a, input, select, #stick')]
     .map(([name, box]) => [name, box.width, box.height])"""
 
 
+READABLE_PX = 12
+"""Minimum size of a visible text."""
+
+_TINY = """[...document.querySelectorAll('body *')]
+    .filter(one => [...one.childNodes].some(node => node.nodeType === 3 && node.data.trim()))
+    .filter(one => one.checkVisibility() && parseFloat(getComputedStyle(one).fontSize) < LEAST)
+    .map(one => [one.id || one.textContent, getComputedStyle(one).fontSize])"""
+
+
 class Browser:
     """A browser in a separate process. The test's thread calls its methods."""
 
@@ -215,6 +224,10 @@ class Browser:
     def too_small(self) -> list[Any]:
         """Return the visible controls that are too small for a finger: name, width, height."""
         return list(self.js(_PRESSED.replace("LEAST", str(FINGER_PX - 0.5))))
+
+    def too_tiny(self) -> list[Any]:
+        """Return the visible texts that are too small to read: element, size."""
+        return list(self.js(_TINY.replace("LEAST", str(READABLE_PX))))
 
     def obstacles(self, only: str = "") -> list[Any]:
         """Return the accessibility problems that axe finds: severity, rule, element.

@@ -918,13 +918,14 @@ def test_stick_stop_speed_mode_and_path_fit_on_the_screen_beside_each_other(
 
 
 @pytest.mark.nightly
-def test_every_control_is_large_enough_for_a_finger(page: Phone) -> None:
+def test_every_control_is_large_enough_for_a_finger_and_every_text_to_read(page: Phone) -> None:
     page.bus.get("srv/stop")
     page.shows("mode", "STOPPED")  # together with Release
     for size, view in itertools.product((PHONE, SIDEWAYS, SMALL_SIDEWAYS), VIEWS):
         page.browser.size(*size)
         pictures.show(page.browser, view)
         assert page.browser.too_small() == [], (size, view)
+        assert page.browser.too_tiny() == [], (size, view)
 
 
 @pytest.mark.nightly
