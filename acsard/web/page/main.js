@@ -7,12 +7,11 @@ import { boarded, driving, still } from "./commander.js";
 import { Link } from "./link.js";
 import { PathMap } from "./map.js";
 import { Minute } from "./plots.js";
-import { Recordings } from "./recordings.js";
-import { Settings } from "./settings.js";
+import * as settings from "./settings.js";
 import * as views from "./views.js";
 import { RELEASE, figure, person, spot, yaw } from "./words.js";
 
-const $ = (id) => document.getElementById(id);
+const { $ } = views;
 const { stopping } = window; // of stop.js, which has run before
 if (!stopping) {
   views.text("alarm", "STOP does not work here, because a part of this page did not run. Reload the page.");
@@ -58,8 +57,6 @@ const link = new Link(refused, {
 const map = new PathMap($("map"));
 const drive = new Drive(link, $("stick"), $("knob"), told);
 const camera = new Camera($("camera"));
-const settings = new Settings($("settings"), set);
-const recordings = new Recordings($("recordings"), $("no-recordings"));
 const plots = new Minute();
 let view = "drive";
 let state = null;
@@ -138,14 +135,14 @@ async function set(payload) {
 
 async function listed() {
   const { error, body } = await request("api/recordings");
-  recordings.show(error ? [] : body, barred(hello, "recordings"), error);
+  views.recordings($("recordings"), error ? [] : body, barred(hello, "recordings"), error);
 }
 
 async function configured() {
   if (barred(hello, "set")) return;
   const { error, body } = await request("api/settings");
   if (error) complain(error);
-  else settings.show(body);
+  else settings.show($("settings"), body, set);
 }
 
 function limited() {

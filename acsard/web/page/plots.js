@@ -3,7 +3,7 @@
 // before it.
 
 import { colours, sized } from "./map.js";
-import { made } from "./views.js";
+import { $, made } from "./views.js";
 import { signed } from "./words.js";
 
 const SPAN = 60000;
@@ -20,7 +20,7 @@ const LATE = [{ name: "99 %", colour: "--accent" }, { name: "maximum", colour: "
 
 export class Minute {
   constructor() {
-    const plot = (name, ...rest) => new Plot(document.getElementById(`plot-${name}`), ...rest);
+    const plot = (name, ...rest) => new Plot($(`plot-${name}`), ...rest);
     this.speed = plot("speed", COMPARED, { low: -0.1, high: 0.3 });
     this.turn = plot("turn", COMPARED, { low: -0.3, high: 0.3 });
     this.wheels = plot("wheels", WHEELS, { low: -1, high: 3 });

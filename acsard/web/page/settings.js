@@ -3,44 +3,34 @@
 import { made } from "./views.js";
 import { number } from "./words.js";
 
-export class Settings {
-  #place;
-  #call;
+/** Show `rows` of {key, value, what, when, unit, keep, low, high, choices} in `place`. `call(payload)` changes a setting
+ *  and shows the outcome. */
+export function show(place, rows, call) {
+  if (place.contains(document.activeElement) && document.activeElement.tagName === "INPUT") return;
+  place.replaceChildren(...rows.map((row, n) => shown(row, `set-${n}`, call)));
+}
 
-  /** `call(payload)` changes a setting and shows the outcome. */
-  constructor(place, call) {
-    this.#place = place;
-    this.#call = call;
-  }
-
-  /** Show rows of {key, value, what, when, unit, keep, low, high, choices}. */
-  show(rows) {
-    if (this.#place.contains(document.activeElement) && document.activeElement.tagName === "INPUT") return;
-    this.#place.replaceChildren(...rows.map((row, n) => this.#row(row, `set-${n}`)));
-  }
-
-  #row({ key, value, what, when, unit = "", keep = true, low, high, choices }, id) {
-    unit = unit.replace("2", "²").replace("3", "³");
-    const range = low === undefined ? "" : `; ${low} to ${high} ${unit}`;
-    // Allow a narrow screen to break a key at its dots and underscores.
-    const name = key.split(/(?<=[._])/).flatMap((part) => [part, made("wbr")]);
-    const label = made("label", "", ...name, made("small", "", `${what}${range}; ${when}`));
-    label.htmlFor = id;
-    const field = made(choices ? "select" : "input", "", ...(choices ?? []).map((one) => new Option(one, one)));
-    field.id = id;
-    if (!choices) field.inputMode = typeof value === "number" ? "decimal" : "text";
-    field.value = value;
-    const send = (more) => this.#call({ settings: { [key]: read(field.value, value) }, ...more });
-    field.addEventListener("keydown", (event) => event.key === "Enter" && send({}));
-    const button = (name, more) => {
-      const one = made("button", "", name);
-      one.setAttribute("aria-label", `${name} ${key}`);
-      one.addEventListener("click", () => send(more));
-      return one;
-    };
-    const keeper = keep ? button("Keep", { keep: true }) : made("span");
-    return made("div", "", label, field, made("span", "quiet", unit.split(" ")[0]), button("Set", {}), keeper);
-  }
+function shown({ key, value, what, when, unit = "", keep = true, low, high, choices }, id, call) {
+  unit = unit.replace("2", "²").replace("3", "³");
+  const range = low === undefined ? "" : `; ${low} to ${high} ${unit}`;
+  // Allow a narrow screen to break a key at its dots and underscores.
+  const name = key.split(/(?<=[._])/).flatMap((part) => [part, made("wbr")]);
+  const label = made("label", "", ...name, made("small", "", `${what}${range}; ${when}`));
+  label.htmlFor = id;
+  const field = made(choices ? "select" : "input", "", ...(choices ?? []).map((one) => new Option(one, one)));
+  field.id = id;
+  if (!choices) field.inputMode = typeof value === "number" ? "decimal" : "text";
+  field.value = value;
+  const send = (more) => call({ settings: { [key]: read(field.value, value) }, ...more });
+  field.addEventListener("keydown", (event) => event.key === "Enter" && send({}));
+  const button = (words, more) => {
+    const one = made("button", "", words);
+    one.setAttribute("aria-label", `${words} ${key}`);
+    one.addEventListener("click", () => send(more));
+    return one;
+  };
+  const keeper = keep ? button("Keep", { keep: true }) : made("span");
+  return made("div", "", label, field, made("span", "quiet", unit.split(" ")[0]), button("Set", {}), keeper);
 }
 
 /** Convert the typed text to the type of the present value `before`. A text that does not fit is returned unchanged,

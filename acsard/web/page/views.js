@@ -1,7 +1,7 @@
 // Fills the views from the messages of the bus. Text is inserted as text, never as HTML.
 
 import { boarded } from "./commander.js";
-import { RELEASE, age, ago, clock, person, reason, signed } from "./words.js";
+import { RELEASE, age, ago, began, clock, lasted, person, reason, signed } from "./words.js";
 
 const DOUBTFUL = "STOP may not reach the robot from here: use its own switch.";
 const BATTERY = {
@@ -10,6 +10,8 @@ const BATTERY = {
   unknown: "The level of the battery is unknown.",
 };
 const LEVELS = ["", "warning", "error", "warning"];
+
+export const $ = (id) => document.getElementById(id);
 
 /** Return an element with its children; strings become text nodes. */
 export function made(name, look, ...children) {
@@ -68,6 +70,22 @@ export function happened(list, told) {
   list.replaceChildren(...rows);
 }
 
+/** Show the recordings, each with its download. `barred` says why this user may not download, or is ""; `trouble` says
+ *  why the list is empty. */
+export function recordings(list, files, barred, trouble) {
+  const all = JSON.stringify([files, barred, trouble]);
+  if (list.dataset.shown === all) return; // do not rebuild an unchanged list, so the focus stays
+  list.dataset.shown = all;
+  text("no-recordings", trouble || (files.length ? "" : "There are no recordings."));
+  const rows = files.map((one) => {
+    const parts = [began(one.begin), lasted(one.seconds), one.being_recorded && "being recorded", barred && `the download is ${barred}`];
+    const link = made(barred ? "span" : "a", "", one.name);
+    if (!barred) Object.assign(link, { href: `api/recordings/${encodeURIComponent(one.name)}`, download: one.name });
+    return made("li", "", link, made("div", "quiet", parts.filter(Boolean).join(" · ")));
+  });
+  list.replaceChildren(...rows);
+}
+
 /** Show the mode, its reason and the warnings. `locked` is true for a client that may not release a stop. `own` is the
  *  public name of this page. */
 export function banner(state, locked, own) {
@@ -85,7 +103,7 @@ export function banner(state, locked, own) {
   ];
   text("doubt", warned.filter(Boolean).join("; "));
   powered(state.battery);
-  document.getElementById("estop").hidden = !["pressed", "silent"].includes(state.emergency_stop);
+  $("estop").hidden = !["pressed", "silent"].includes(state.emergency_stop);
   document.body.classList.toggle("boardless", alone);
 }
 
@@ -97,9 +115,9 @@ function pressed(bumpers) {
 
 /** Show the state of charge or, if it is unknown, the voltage. The icon is filled by the state of charge. */
 function powered(battery) {
-  const shown = document.getElementById("battery");
+  const shown = $("battery");
   shown.hidden = !battery;
-  document.getElementById("volts").hidden = typeof battery?.volts !== "number";
+  $("volts").hidden = typeof battery?.volts !== "number";
   if (!battery) return;
   const { percent, volts, level } = battery;
   shown.dataset.level = level;
@@ -111,10 +129,10 @@ function powered(battery) {
 function mode(name, words) {
   document.body.dataset.mode = name;
   text("mode", words);
-  document.getElementById("stop").setAttribute("aria-pressed", String(name === "stopped"));
+  $("stop").setAttribute("aria-pressed", String(name === "stopped"));
   text("stop-words", name === "stopped" ? "STOPPED" : "STOP");
   if (RELEASE[name]) text("clear", RELEASE[name]);
-  document.title = `${words} · ${document.getElementById("robot").textContent}`;
+  document.title = `${words} · ${$("robot").textContent}`;
 }
 
 /** Show that the robot's computer answers but has reported nothing about the robot yet. */
@@ -148,6 +166,6 @@ export function freshness(old, fresh, way, none, seen, alone) {
 }
 
 export function text(id, words) {
-  const element = document.getElementById(id);
+  const element = $(id);
   if (element.textContent !== words) element.textContent = words;
 }
