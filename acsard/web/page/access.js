@@ -1,6 +1,8 @@
 // Access to the page: exchanges an invitation for a cookie, explains why access is refused, and disables each
 // control that the robot would refuse to this client.
 
+import { text } from "./views.js";
+
 const AGAIN = 1000; // ms before the next attempt, while the robot does not answer an invitation
 const SHUT = [401, 403, 429]; // HTTP statuses for which a repeated request is pointless
 const INVALID = "This invitation is not valid: it has expired, was revoked, or is incomplete. Ask for a new one.";
@@ -57,11 +59,11 @@ export function barred(hello, what) {
  *  the reason. `hello` is undefined while no robot has answered. */
 export function permit(hello, absent, needless = {}) {
   const sets = barred(hello, "set");
-  document.getElementById("barred").textContent = barred(hello, "drive") || absent || (sets && `Settings are ${sets}.`);
+  text("barred", barred(hello, "drive") || absent || (sets && `Settings are ${sets}.`));
   for (const one of document.querySelectorAll("[data-does]")) {
     const why = barred(hello, one.dataset.does) || absent || needless[one.dataset.does] || "";
     if ("disabled" in one) one.disabled = Boolean(why);
     else one.setAttribute("aria-disabled", String(Boolean(why)));
-    one.title = why;
+    if (one.title !== why) one.title = why;
   }
 }
