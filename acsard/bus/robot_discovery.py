@@ -47,16 +47,16 @@ def parse_ids(text: str) -> tuple[str, ...]:
 def running_robots(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[str]:
     """Return the sorted ids of those robots in `ids` ("*" for all) whose daemon is running.
 
-    Raises `NoAnswerError`, which names `endpoint`, if `ids` contains "*" and no robot is visible.
+    Raises `NoAnswerError`, which names `endpoint`, if `ids` is only "*" and no robot is visible.
     """
-    running_ids = set()
+    running_ids = set[str]()
     for robot_id in ids:
         replies = session.liveliness().get(full_key(robot_id, "alive"), timeout=DISCOVERY_S)
         running_ids |= {
             robot_of(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None
         }
     running_ids.discard("")
-    if not running_ids and ALL_ROBOTS in ids:
+    if not running_ids and tuple(ids) == (ALL_ROBOTS,):
         raise NoAnswerError(no_robot_text(endpoint))
     return sorted(running_ids)
 
@@ -106,6 +106,8 @@ def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscriptio
 
     `robot_of` returns the robot's id of a sample's key. Raises `UsageError` if `name` is not a key.
     """
+    if ALL_ROBOTS in ids:
+        ids = (ALL_ROBOTS,)  # each sample once, also of the robots that are named besides
     topic = by_key(name)
     latched = topic is not None and topic.latched
     keys = [full_key(robot_id, name) for robot_id in ids]

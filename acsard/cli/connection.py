@@ -13,7 +13,7 @@ from threading import Event, Thread
 import zenoh
 
 from acsard.bus.address import Address, address_of
-from acsard.bus.robot_discovery import Presence, explain_silence, parse_ids, presence
+from acsard.bus.robot_discovery import ALL_ROBOTS, Presence, explain_silence, parse_ids, presence
 from acsard.bus.tls import trouble
 from acsard.cli.common import add_config, load
 from acsard.client.connection import Connection, open_connection
@@ -77,10 +77,13 @@ def require_one(args: argparse.Namespace) -> None:
 def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Connection, tuple[str, ...]]]:
     """Yield a client, and the ids of the robots to use by `Connection.sibling`.
 
-    These are () for one robot, which is the client's, and only "*" for `--id '*'`.
+    These are () for one robot, which is the client's. For `--id '*'` they are "*" and the robots of
+    `[fleet] robots`, which must answer.
     """
     many = several_ids(args)
     _, config = load(args.config)
+    if ALL_ROBOTS in many:
+        many += config.fleet.robots
     where = address_of(config, args.connect, None if many else args.id, args.tls)
     with open_connection(where) as robot:
         yield robot, many

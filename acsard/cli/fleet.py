@@ -5,8 +5,9 @@ and y in m and the heading. VERSION marks a number as older if another robot in 
 higher one. SEEN gives the age of the last report. WHY gives the warnings, then the
 reason why the robot moves or does not move, then the details of the warnings. A robot that is ready
 can have warnings too: a certificate that expires soon, a recording or a latch file that fails, a
-wheel fault, settings that differ from the configuration file. On a narrow terminal some columns are
-left out and long lines are cut; `acsard fleet | cat` prints everything.
+wheel fault, settings that differ from the configuration file. A robot that --id or `[fleet] robots`
+names is always listed, and the exit code is 69 if it is gone or does not answer. On a narrow
+terminal some columns are left out and long lines are cut; `acsard fleet | cat` prints everything.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from acsard.host.errors import Exit, UnreachableError
 from acsard.host.logs import MAX_LAST_OUTPUT_S, output_in_threads
 from acsard.terminal.output import UNLIMITED_WIDTH, has_screen, plain
 from acsard.top import terminal
-from acsard.top.fleet_table import Roster, table
+from acsard.top.fleet_table import Roster, absence, table
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -38,8 +39,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
+    args.id = args.id or ALL_ROBOTS
     with connected_to_many(args) as (robot, many):
-        ids = (many or (robot.where.robot_id,)) if args.id else (ALL_ROBOTS,)
+        ids = many or (robot.where.robot_id,)
         fleet = Roster(robot, ids)
         if not (args.once or args.json) and has_screen():
             with output_in_threads(MAX_LAST_OUTPUT_S):
@@ -50,14 +52,17 @@ def main(args: argparse.Namespace) -> int:
             print(json_line(msgspec.json.encode(rows).decode()), flush=True)
         if not rows:
             # Over TLS the client's certificate may not be permitted to see any of the named robots.
-            named = robot.where.tls and ids != (ALL_ROBOTS,)
-            silence = robot.sibling(ids[0]).whoami().silence if named else ""
+            named = [robot_id for robot_id in ids if robot_id != ALL_ROBOTS]
+            silence = robot.sibling(named[0]).whoami().silence if robot.where.tls and named else ""
             raise UnreachableError("; ".join(filter(None, (fleet.hint(), silence))))
+        lost = [row.robot_id for row in rows if row.robot_id in ids and absence(row)]
+        code = Exit.UNREACHABLE if lost else Exit.OK
         if args.json:
-            return Exit.OK
+            return code
         width = shutil.get_terminal_size().columns if sys.stdout.isatty() else UNLIMITED_WIDTH
         # Flush now, so that a session that closes slowly does not hold back the table.
         print(plain(table(rows, width), width=width), flush=True)
-    for text in filter(None, (fleet.presence_text, fleet.left_out_text)):
+    lost_text = f"gone or silent: {', '.join(lost)}" if lost else ""
+    for text in filter(None, (fleet.presence_text, lost_text, fleet.left_out_text)):
         print(f"acsard: {text}", file=sys.stderr)
-    return Exit.OK
+    return code

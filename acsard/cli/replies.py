@@ -40,10 +40,11 @@ Replies = Mapping[str, ServiceReply | AcsardError]
 
 
 def present_ids(robot: Connection, ids: Sequence[str]) -> Sequence[str]:
-    """Return `ids`, or for "*" all present robots. Raises `NoAnswerError` if there are none."""
-    if ALL_ROBOTS in ids:
-        return running_robots(robot.session, ids, robot.where.endpoint)
-    return ids
+    """Return the named robots, for "*" also the present ones. Raises `NoAnswerError` if none is."""
+    if ALL_ROBOTS not in ids:
+        return ids
+    present = running_robots(robot.session, ids, robot.where.endpoint)
+    return sorted({*present, *ids} - {ALL_ROBOTS})
 
 
 def of_each(
@@ -77,9 +78,12 @@ def print_each(
             reply = ServiceReply(False, silence.format(error=reply))
         line = encode(reply, "json").decode()
         print(of_robot(robot_id, line) if as_json else printable(f"{robot_id}: {reply.message}"))
+    silent = [name for name, reply in replies.items() if isinstance(reply, AcsardError)]
     if ALL_ROBOTS in ids:
-        print(f"acsard: {count_text(robot.where.endpoint, len(replies))}", file=sys.stderr)
-    if any(isinstance(reply, AcsardError) for reply in replies.values()):
+        answered = count_text(robot.where.endpoint, len(replies) - len(silent))
+        without = f"; without an answer: {', '.join(silent)}" if silent else ""
+        print(f"acsard: {printable(answered + without)}", file=sys.stderr)
+    if silent:
         return Exit.UNREACHABLE
     done = [isinstance(reply, ServiceReply) and reply.success for reply in replies.values()]
     return Exit.OK if all(done) else Exit.FAILURE

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 
+from msgspec.structs import replace
 from rich.table import Table
 from rich.text import Text
 
@@ -60,9 +61,11 @@ def row_cells(row: Row, newest: tuple[int, ...]) -> tuple[str, ...]:
     """
     name = printable(row.robot_id)
     if row.state is None:
-        why = "waiting for its state" if row.here else "not there"
+        why = "not there" if not row.here else "waiting for its state"
+        if absence(row) == "SILENT":
+            why = "SILENT: its daemon is there and does not answer"
         return (name, "-", "-", "-", "", "-", "-", "never", why)
-    state, absence = row.state, _absence(row)
+    state, lost = row.state, absence(row)
     return (
         name,
         printable(state.mode),
@@ -72,7 +75,7 @@ def row_cells(row: Row, newest: tuple[int, ...]) -> tuple[str, ...]:
         _place(state),
         _version(state, newest),
         rough(row.age),
-        f"{absence}, was: {_why(state)}" if absence else _why(state),
+        f"{lost}, was: {_why(state)}" if lost else _why(state),
     )
 
 
@@ -97,14 +100,15 @@ def _place(state: RobotState) -> str:
     return " ".join(signed(value, decimals, 7).strip() for value, decimals in figures) + "°"
 
 
-def _absence(row: Row) -> str:
+def absence(row: Row) -> str:
+    """Return "GONE" for a robot without a daemon, "SILENT" for one that hangs, or ""."""
     if not row.here:
         return "GONE"
-    return "SILENT" if row.state is not None and row.silent else ""
+    return "SILENT" if row.silent else ""
 
 
 def _urgency(row: Row) -> str:
-    return _absence(row) or ("" if row.state is None else row.state.mode)
+    return absence(row) or ("" if row.state is None else row.state.mode)
 
 
 def _order(row: Row) -> tuple[int, str]:
@@ -124,25 +128,29 @@ class Roster(Fleet):
     def gather(self) -> list[Row]:
         """Wait for the first reports, and return one row per robot.
 
-        The wait ends when all named robots have reported, or after 1.5 s; without any robot after 3
-        s, because the first answer can be late on a busy computer.
+        The wait ends when all named robots have reported; for "*" it takes 1.5 s. Without any
+        robot, or if a named one is missing, it takes 3 s, because the first answer can be late on a
+        busy computer. A robot that has not reported then is silent.
         """
         began, rows = time.monotonic(), self.rows()
-        while not self.all_reported:
+        while (passed := time.monotonic() - began) < 3.0:
             present = any(row.here or row.state for row in rows)
-            if time.monotonic() - began >= (1.5 if present else 3.0):
-                return self.rows() if present else []
+            if present and self.all_reported and (passed >= 1.5 or ALL_ROBOTS not in self._ids):
+                break
             time.sleep(0.05)
             rows = self.rows()
-        return self.rows()
+        if not any(row.here or row.state for row in rows):
+            return []
+        return [replace(row, silent=True) if math.isinf(row.age) else row for row in rows]
 
     @property
     def all_reported(self) -> bool:
         """Whether all robots that the user named have reported."""
         with self._lock:
-            known = list(self._known.values())
-        named = ALL_ROBOTS not in self._ids
-        return named and all(robot.here and robot.follower.is_confirmed for robot in known)
+            named = [self._known.get(name) for name in self._ids if name != ALL_ROBOTS]
+        return all(
+            robot is not None and robot.here and robot.follower.is_confirmed for robot in named
+        )
 
     @property
     def presence_text(self) -> str:

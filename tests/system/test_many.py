@@ -10,6 +10,7 @@ import tomllib
 import urllib.request
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -305,7 +306,46 @@ def test_fleet_warns_of_the_robot_whose_settings_differ_from_its_file(robots: Ro
 def test_a_named_robot_that_is_absent_is_reported(robots: Robots) -> None:
     ended = robots.tool("fleet", "--once", who=f"{ONE},robot9")
     assert re.search(r"^robot9 +- .* not there$", ended.out, re.M)
+    assert (ended.code, ended.err) == (69, "acsard: gone or silent: robot9")
     assert robots.tool("fleet", "--once", who="robot8,robot9").code == 69
+
+
+def stopped_state(bus: Bus) -> bool:
+    return bool(bus.state()["mode"] == "stopped")
+
+
+@pytest.mark.slow
+def test_an_expected_robot_that_hangs_or_is_gone_is_shown_and_ends_with_69(
+    robots: Robots, tmp_path: Path
+) -> None:
+    config = tmp_path / "fleet.toml"
+    config.write_text('[fleet]\nrobots = ["robot1", "robot2", "robot9"]\n')
+
+    def tool(*words: str) -> Finished:
+        return typed(*words, "--connect", robots.endpoint, "--config", str(config))
+
+    robots.daemons[TWO].signal(signal.SIGSTOP)
+    try:
+        ended = tool("fleet", "--once")
+        rows = {line.split()[0]: line for line in ended.out.splitlines()}
+        assert " ready " in rows[ONE]
+        assert rows[TWO].endswith("SILENT: its daemon is there and does not answer")
+        assert rows["robot9"].endswith("not there")
+        assert ended.code == 69
+        assert "acsard: gone or silent: robot2, robot9" in ended.err
+        assert json.loads(tool("fleet", "--json").out)[0]["robot_id"] == ONE
+        stopped = tool("call", "stop", "--id", "*")
+    finally:
+        robots.daemons[TWO].signal(signal.SIGCONT)
+    assert stopped.code == 69
+    assert re.search(rf"^{ONE}: stopped", stopped.out, re.M)
+    assert re.search(rf"^{TWO}: NO ANSWER", stopped.out, re.M)
+    assert re.search(r"^robot9: NO ANSWER", stopped.out, re.M)
+    assert stopped.err.endswith("1 robot; without an answer: robot2, robot9")
+    for name in (ONE, TWO):
+        with Bus(robots.endpoint, robot_id=name) as bus:
+            until(partial(stopped_state, bus), 10.0, "the stop has arrived")
+        assert robots.tool("call", "clear", who=name).code == 0
 
 
 def test_stop_of_all_stops_each_robot_and_names_those_that_answered(robots: Robots) -> None:

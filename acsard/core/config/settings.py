@@ -416,6 +416,10 @@ class SimConfig(Struct, frozen=True):
     faults: tuple[FaultName, ...] = ()
 
 
+class FleetConfig(Struct, frozen=True):
+    robots: tuple[Name, ...] = ()
+
+
 class Config(Struct, frozen=True):
     robot: RobotConfig = RobotConfig()
     mcu: McuConfig = McuConfig()
@@ -436,6 +440,7 @@ class Config(Struct, frozen=True):
     log: LogConfig = LogConfig()
     record: RecordConfig = RecordConfig()
     web: WebConfig = WebConfig()
+    fleet: FleetConfig = FleetConfig()
     sim: SimConfig = SimConfig()
 
     @property

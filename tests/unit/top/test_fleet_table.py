@@ -240,7 +240,8 @@ def test_a_state_from_before_a_suspend_is_old(
         (("robot1", "robot2"), ("robot1", "robot2"), ("robot1", "robot2"), True),
         (("robot1", "robot2"), ("robot1",), ("robot1", "robot2"), False),
         (("robot1", "robot2"), ("robot1", "robot2"), ("robot1",), False),
-        (("*",), ("robot1",), ("robot1",), False),  # another robot may still appear
+        (("*", "robot1"), ("robot1",), ("robot1",), True),
+        (("*", "robot2"), ("robot1",), ("robot1",), False),
     ],
 )
 def test_the_fleet_is_complete_once_each_named_robot_is_present_and_has_answered(
