@@ -335,7 +335,8 @@ class Robot:
                 self.counters["link_lost"] += 1
                 if session.lateness.late_s:
                     self.counters["link_lost_host_stall"] += 1
-            self._forget()
+            self._sanity.forget()
+            self._checks.wheels.pause()
         if session.restarted:
             # No sender drives before the link is up for the first time, so accept a zero that was
             # sent during the start.
@@ -369,10 +370,6 @@ class Robot:
             if self._is_plausible(line, now, events):
                 estimates.append(self._check_and_integrate(line, now, events))
         return tuple(estimates)
-
-    def _forget(self) -> None:
-        self._sanity.forget()
-        self._checks.wheels.forget()
 
     def _watch_inputs(self, now: Instant, events: list[Event]) -> None:
         # A press stops the robot even if it began and ended between two wake-ups.
@@ -507,7 +504,8 @@ class Robot:
             case "clear":
                 message, numbers = life.clear(request.numbers, asked_ns)
                 if numbers:
-                    self._forget()
+                    self._sanity.forget()
+                    self._checks.wheels.forget()
                     if not life.latches.of("stop"):
                         self._inputs.estop.powered()
                     self._arbiter.require_neutral(asked_ns)

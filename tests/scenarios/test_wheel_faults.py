@@ -129,6 +129,20 @@ def test_a_dead_encoder_is_left_out_and_named_at_any_speed_and_the_robot_drives_
     assert made.state.wheel_fault.startswith("front_right wheel is left out of the pose")
 
 
+@pytest.mark.parametrize("up", [0.3, pytest.param(0.5, marks=SLOW)])
+def test_a_reversed_motor_on_a_bad_cable_is_found(up: float) -> None:
+    """The link is lost again and again, before the evidence of one time is enough."""
+    made = world()
+    made.drive(0.0, seconds=0.2)
+    with made.mcu.reversed_motor(0):
+        for _ in range(5):
+            made.hold(0.3, seconds=up)
+            with made.mcu.mute():
+                made.hold(0.3, seconds=0.15)
+    assert made.state.mode == "fault"
+    assert made.state.reason.startswith("front_right wheel does not obey its command")
+
+
 @SLOW
 def test_an_encoder_that_works_again_is_used_again() -> None:
     made = world()

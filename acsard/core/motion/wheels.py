@@ -221,8 +221,13 @@ class Wheels(Struct):
             self._judge(turned, speeds.as_tuple(), feedback.response_time, kinematics, count)
         self._begin()
 
+    def pause(self) -> None:
+        """Expect the speeds that the next lines report: there is no link."""
+        self.begins = True
+        self._begin()
+
     def forget(self) -> None:
-        """Drop the evidence of faults: the link was lost, or a fault was cleared."""
+        """Drop the evidence of faults: one was cleared."""
         self._drop()
         self._begin()
 
