@@ -34,7 +34,7 @@ from acsard.web.callers import (
     tokens_offered,
     unmapped,
 )
-from acsard.web.connections import MAX_OF_TOKEN, Connection, Connections
+from acsard.web.connections import MAX_OF_TOKEN, Connections, HttpConnection
 from acsard.web.routes import Route
 from acsard.web.socket_messages import MAX_MESSAGE_BYTES
 from acsard.web.tokens import ReadTokens
@@ -201,9 +201,9 @@ class Access:
             response.headers["Access-Control-Expose-Headers"] = "ETag, Age-Ms, Waited-Ms"
 
 
-def connection_of(request: web.Request) -> Connection:
+def connection_of(request: web.Request) -> HttpConnection:
     connection = request.protocol
-    assert isinstance(connection, Connection)
+    assert isinstance(connection, HttpConnection)
     return connection
 
 

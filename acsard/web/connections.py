@@ -58,8 +58,8 @@ class Connections:
         self.counts = counts
         self._away = Places(MAX_CONNECTIONS, MAX_OF_NETWORK)
         self._here = Places(MAX_LOCAL, MAX_LOCAL)
-        self._all, self._opening = set[Connection](), set[asyncio.Task[None]]()
-        self._of_token: dict[str, list[Connection]] = {}
+        self._all, self._opening = set[HttpConnection](), set[asyncio.Task[None]]()
+        self._of_token: dict[str, list[HttpConnection]] = {}
 
     async def accept(
         self,
@@ -80,7 +80,7 @@ class Connections:
             peer = unmapped(str(place[0]))
             places = self._here if is_loopback(peer) else self._away
             if places.enter(network_of(peer)):
-                connection = Connection(self, server, peer, places)
+                connection = HttpConnection(self, server, peer, places)
                 self._all.add(connection)
                 start(self._open(connection, accepted, certificate), self._opening)
             else:
@@ -92,7 +92,7 @@ class Connections:
         for task in self._opening:
             task.cancel()
 
-    def claim(self, connection: Connection, token: str) -> bool:
+    def claim(self, connection: HttpConnection, token: str) -> bool:
         """Count a connection for the token of its request.
 
         If the token has `MAX_OF_TOKEN` other connections, an idle one of them is closed. Returns
@@ -116,20 +116,20 @@ class Connections:
         """Return the digests of the tokens of all connections."""
         return list(self._of_token)
 
-    def end(self, token: str, why: str, but: Connection | None = None) -> None:
+    def end(self, token: str, why: str, but: HttpConnection | None = None) -> None:
         """End the connections of a token; WebSockets get the reason (120 characters at most)."""
         for connection in list(self._of_token.get(token, ())):
             if connection is not but:
                 connection.end(why)
 
-    def left(self, connection: Connection) -> None:
+    def left(self, connection: HttpConnection) -> None:
         """Note that a connection has ended, or could not be opened."""
         if connection in self._all:
             self._all.remove(connection)
             connection.places.leave(network_of(connection.peer))
             self._disown(connection)
 
-    def _disown(self, connection: Connection) -> None:
+    def _disown(self, connection: HttpConnection) -> None:
         its = self._of_token.get(connection.token, [])
         if connection in its:
             its.remove(connection)
@@ -139,7 +139,7 @@ class Connections:
 
     async def _open(
         self,
-        connection: Connection,
+        connection: HttpConnection,
         accepted: socket.socket,
         certificate: HasContext | None,
     ) -> None:
@@ -164,7 +164,7 @@ class Connections:
                 self.left(connection)
 
 
-class Connection(web.RequestHandler):
+class HttpConnection(web.RequestHandler):
     """aiohttp's handler of one connection, which serves one request at a time."""
 
     def __init__(

@@ -25,8 +25,8 @@ from acsard.web.connections import (
     MAX_OF_TOKEN,
     MAX_WAITING_BYTES,
     UNREAD_S,
-    Connection,
     Connections,
+    HttpConnection,
 )
 from acsard.web.metrics import Counts
 
@@ -83,13 +83,13 @@ class Owned:
         for connection in self.made:
             assert self.all.claim(connection, "phone")
 
-    def new(self) -> Connection:
+    def new(self) -> HttpConnection:
         server, places = web.Server(_not_found), Places(MAX_CONNECTIONS, MAX_OF_NETWORK)
-        connection = Connection(self.all, server, "192.168.1.9", places)
+        connection = HttpConnection(self.all, server, "192.168.1.9", places)
         connection.transport = Mock(get_write_buffer_size=lambda: 0)
         return connection
 
-    def aborted(self) -> list[Connection]:
+    def aborted(self) -> list[HttpConnection]:
         return [one for one in self.made if cast(Mock, one.transport).abort.called]
 
 
