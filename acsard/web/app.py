@@ -249,7 +249,8 @@ class Page:
         try:
             return as_json(*await self._parts.calls.get(key))
         except NoAnswerError as error:
-            raise TroubleError(504, str(error)) from None
+            # Without a daemon, the reason why in a plain sentence.
+            raise TroubleError(504, self._robot.gone or str(error)) from None
         except (MendableError, DecodeError, TimeoutError) as error:
             raise TroubleError(
                 503, str(error) or "the robot did not answer in time: try again"

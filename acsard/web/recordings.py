@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import calendar
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -13,12 +13,14 @@ from msgspec import Meta, Struct
 
 from acsard.host.threads import in_thread
 from acsard.recording.directory import NAME_TIME_FORMAT, is_being_recorded
-from acsard.recording.file import listed
+from acsard.recording.file import first_head, listed
 from acsard.web.answers import READ_TIMEOUT_S, TroubleError
 from acsard.web.callers import RequestRefusedError, is_loopback
 from acsard.web.followed_robot import FollowedRobot
 
 T = TypeVar("T")
+
+ELSEWHERE = "open the page that the robot serves"
 
 
 class Recording(Struct, frozen=True):
@@ -43,55 +45,55 @@ class BlackBox:
 
     async def rows(self) -> list[Recording]:
         """Return all recordings, oldest first."""
-        directory = self._directory()
-        return [] if directory is None else await _read(directory, rows)
+        return await self._read(rows)
 
     async def find(self, name: str) -> Path:
         """Return the path of a recording. Raises `RequestRefusedError` if it does not exist."""
-        directory = self._directory()
-        paths = [] if directory is None else await _read(directory, _files)
+        paths = await self._read(list)
         path = next((path for path in paths if path.name == name), None)
         if path is None:
             text = "this recording does not exist; GET /api/recordings lists them"
             raise RequestRefusedError("path", text)
         return path
 
-    def _directory(self) -> Path | None:
-        host = self._robot.endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+    async def _read(self, read: Callable[[Sequence[Path]], list[T]]) -> list[T]:
+        robot, directory = self._robot, Path(self._robot.about.recordings)
+        host = robot.endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
         if not (is_loopback(host) or host == "localhost"):
-            raise TroubleError(
-                404,
-                "the recordings are on the robot, but this page's server runs on another machine: "
-                "open the page that the robot serves",
-            )
-        # A daemon whose record.directory is not set records nothing.
-        directory = self._robot.about.recordings
-        return Path(directory) if directory else None
+            raise TroubleError(404, f"the recordings are on another machine: {ELSEWHERE}")
+        if not robot.about.recordings:
+            return []  # the daemon records nothing
+        try:
+            return await in_thread(lambda: read(files(directory, robot.id)), READ_TIMEOUT_S)
+        except (OSError, TimeoutError) as error:
+            words = getattr(error, "strerror", None) or "the disk does not answer; try again"
+            raise TroubleError(503, f"cannot read {directory}: {words}") from None
 
 
-async def _read(directory: Path, read: Callable[[Path], T]) -> T:
+def files(directory: Path, robot: str) -> list[Path]:
+    """Return the recordings of a robot in a directory, oldest first.
+
+    Raises `TroubleError` if another robot has recorded there, and `OSError`.
+    """
     try:
-        return await in_thread(lambda: read(directory), READ_TIMEOUT_S)
-    except (OSError, TimeoutError) as error:
-        words = getattr(error, "strerror", None) or "the disk does not answer; try again"
-        raise TroubleError(503, f"cannot read {directory}: {words}") from None
+        paths = listed(directory)
+    except FileNotFoundError:
+        return []
+    head = first_head(paths[-1]) if paths else None
+    # A daemon behind a router on this machine may record on a machine of its own.
+    if head is not None and head.robot != robot:
+        raise TroubleError(404, f"{directory} has the recordings of {head.robot}: {ELSEWHERE}")
+    return paths
 
 
-def rows(directory: Path) -> list[Recording]:
-    """Return all recordings in a directory, oldest first. Raises `OSError`."""
+def rows(paths: Iterable[Path]) -> list[Recording]:
+    """Return what is known of each recording. Raises `OSError`."""
     recordings = []
-    for path in _files(directory):
+    for path in paths:
         # The daemon may delete a file meanwhile.
         with suppress(FileNotFoundError):
             recordings.append(_row(path))
     return recordings
-
-
-def _files(directory: Path) -> list[Path]:
-    try:
-        return listed(directory)
-    except FileNotFoundError:
-        return []
 
 
 def _row(path: Path) -> Recording:
