@@ -292,9 +292,9 @@ FAULTS = (
         "neutral nothing",
         "a clear that finds nothing to release asks each sender for a zero",
         ROBOT,
-        "                if numbers:\n                    self._forget()\n",
+        "                if numbers:\n                    self._sanity.forget()\n",
         "                self._arbiter.require_neutral(asked_ns)\n"
-        "                if numbers:\n                    self._forget()\n",
+        "                if numbers:\n                    self._sanity.forget()\n",
     ),
     fault(
         "neutral overtaken",
