@@ -7,8 +7,6 @@ clock: the caller passes the time.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import NamedTuple
 
 from acsard.core.values import NS_PER_S, Ns
@@ -45,29 +43,21 @@ class Bucket:
 
 
 class Buckets:
-    """A token bucket for each name, and optionally one that all names share."""
+    """A token bucket for each name."""
 
-    def __init__(self, per_name: Rate, shared: Rate | None = None) -> None:
+    def __init__(self, per_name: Rate) -> None:
         self._per_name = per_name
-        self._shared = None if shared is None else Bucket(shared)
         self._buckets: dict[str, Bucket] = {}
 
-    def room(self, name: str, now_ns: Ns) -> bool:
-        return name not in self._buckets or self._buckets[name].room(now_ns)
-
     def take(self, name: str, now_ns: Ns) -> bool:
-        """Take a unit from the bucket of `name` and from the shared one, or return False."""
+        """Take a unit from the bucket of `name`; return False if there is none."""
         if name not in self._buckets:
             # Drop the full buckets, which equal new ones, so that many names do not fill the
             # memory.
             self._buckets = {
                 k: bucket for k, bucket in self._buckets.items() if not bucket.full(now_ns)
             }
-        own = self._buckets.setdefault(name, Bucket(self._per_name))
-        if self._shared is None:
-            return own.take(now_ns)
-        # A name whose bucket is empty must not consume units of the shared bucket.
-        return own.room(now_ns) and self._shared.take(now_ns) and own.take(now_ns)
+        return self._buckets.setdefault(name, Bucket(self._per_name)).take(now_ns)
 
 
 class Places:
@@ -95,13 +85,3 @@ class Places:
         self._counts[name] -= 1
         if not self._counts[name]:
             del self._counts[name]
-
-    @contextmanager
-    def place(self, name: str = "") -> Iterator[bool]:
-        """Take a place during a `with` block; yield False if none is free."""
-        free = self.enter(name)
-        try:
-            yield free
-        finally:
-            if free:
-                self.leave(name)
