@@ -1,7 +1,7 @@
 """Builds the screen of `acsard top` from a robot's state, as tables of rich.
 
-This module is pure. rich places the tables beside each other or below each other, as they fit the
-terminal's width; the least important ones come last, where a terminal with few lines cuts them off.
+This module is pure. The least important tables come last, where a terminal with few lines cuts them
+off.
 Text from the bus reaches the terminal only through `clean`, and only inside rich's `Text`, which
 does not interpret markup.
 """
@@ -13,9 +13,7 @@ from collections.abc import Iterable, Sequence
 
 from msgspec import Struct
 from rich.cells import cell_len
-from rich.columns import Columns
 from rich.console import Group, RenderableType
-from rich.constrain import Constrain
 from rich.styled import Styled
 from rich.table import Table
 from rich.text import Text
@@ -42,8 +40,8 @@ MODE_STYLES = {
 
 LINK_STYLES = {"up": "bold green", "booting": "bold yellow"}
 
-# Pose and wheels beside each other, link and timing below: a third column would tear the pairs.
-MAX_TABLES_WIDTH = 100
+# Cells of the tables on the left and on the right.
+PAIR_WIDTHS = 38, 40
 
 # Of the lines that a hostile message could make.
 MAX_SOURCES, MAX_REASONS = 32, 16
@@ -65,7 +63,7 @@ class ScreenData(Struct, frozen=True):
     passed: float = 0.0
 
 
-def screen(data: ScreenData) -> Group:
+def screen(data: ScreenData, width: int) -> Group:
     state = data.state
     if data.silent:
         head: list[RenderableType] = [_header(data), _silence(data)]
@@ -80,9 +78,21 @@ def screen(data: ScreenData) -> Group:
         words = f"{WARNING}: {problems[0]}" if len(problems) == 1 else brief(problems)
         head.append(Text(clean(words), "yellow"))
     parts = [_pose(state), _wheels(state), _link(data, state), _timing(state)]
-    tables = Constrain(Columns(parts, padding=(0, 3)), MAX_TABLES_WIDTH)
-    body = Group(tables, _sources(state), _facts(data, state))
+    body = Group(*_in_pairs(parts, width), _sources(state), _facts(data, state))
     return Group(*head, Styled(body, "dim" if data.silent else ""))
+
+
+def _in_pairs(parts: Sequence[Table], width: int) -> Sequence[Table]:
+    """Return the tables in pairs beside each other, or below each other on a narrow terminal."""
+    if width < sum(PAIR_WIDTHS) + 2:
+        return parts
+    # `rich.columns` would find the widths by itself, but takes twice as long.
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    for column_width in PAIR_WIDTHS:
+        grid.add_column(width=column_width)
+    for left, right in zip(parts[::2], parts[1::2], strict=True):
+        grid.add_row(left, right)
+    return [grid]
 
 
 def _header(data: ScreenData) -> Text:

@@ -35,7 +35,10 @@ from acsard.top.fleet_table import Roster, table
 from acsard.top.keyboard import KeyboardDrive
 from acsard.top.screen import screen
 
-DRAW_PERIOD_S = 0.25
+DRAW_PERIOD_S = 0.25  # of the small screen of `drive`
+
+# A screen of tables takes 8 ms of processor time on a PC, and several times that on a small board.
+TABLES_PERIOD_S = 0.5
 
 # Longest wait for a key before `acsard drive` does its other work.
 KEY_POLL_S = 0.05
@@ -48,7 +51,8 @@ def one_screen(feed: Feed) -> str:
     time.sleep(0.5)  # rates are averaged over this time
     feed.query_state()
     _be_lenient()
-    return plain(screen(feed.screen_data()), width=Console().width)
+    width = Console().width
+    return plain(screen(feed.screen_data(), width), width=width)
 
 
 def show_live(feed: Feed) -> None:
@@ -59,7 +63,7 @@ def show_live(feed: Feed) -> None:
 
     def draw(width: int, height: int) -> RenderableType:
         feed.poll()
-        return screen(feed.screen_data("q quits"))
+        return screen(feed.screen_data("q quits"), width)
 
     _run_suspendable(partial(_watch, draw))
 
@@ -102,7 +106,7 @@ def _watch(draw: Callable[[int, int], RenderableType], suspend: list[bool]) -> b
         while not suspend:
             if _terminal_reads():
                 display.update(draw(*display.console.size), refresh=True)
-            typed = read(DRAW_PERIOD_S)
+            typed = read(TABLES_PERIOD_S)
             if typed is None or "q" in typed.lower():
                 return False
     return True

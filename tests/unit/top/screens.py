@@ -72,12 +72,12 @@ def drawn(shown: RenderableType, width: int = 80, *, colour: bool = False) -> st
 
 def lines_of(data: ScreenData, width: int = 80) -> list[str]:
     """Return the lines of the screen as a person reads them."""
-    return drawn(screen(data), width).rstrip("\n").split("\n")
+    return drawn(screen(data, width), width).rstrip("\n").split("\n")
 
 
 def painted(data: ScreenData, width: int = 80) -> str:
     """Return the screen as it is sent to a terminal."""
-    return drawn(screen(data), width, colour=True)
+    return drawn(screen(data, width), width, colour=True)
 
 
 def line_with(text: str, data: ScreenData = SEEN, width: int = 80) -> str:
