@@ -83,7 +83,7 @@ def screen(data: ScreenData, width: int) -> Group:
 
 
 def _in_pairs(parts: Sequence[Table], width: int) -> Sequence[Table]:
-    """Return the tables in pairs beside each other, or below each other on a narrow terminal."""
+    # Below each other on a narrow terminal.
     if width < sum(PAIR_WIDTHS) + 2:
         return parts
     # `rich.columns` would find the widths by itself, but takes twice as long.
