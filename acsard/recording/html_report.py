@@ -43,14 +43,14 @@ GAP_S = 1.0
 
 JUMP_M = 1.0  # no robot drives so far between two messages: its pose was set
 
+# Plotly's own, so that a curve has one colour in both diagrams of the speeds.
+PALETTE = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b")
 BAD, WARN, GOOD, REST, NEUTRAL = "#d43d3d", "#e08600", "#159a6b", "#8fb8de", "#9a9a9a"
 COLOURS = {
     "driving": GOOD, "ready": REST, "waiting": WARN, "stopped": WARN, "fault": BAD,
     "up": REST, "booting": WARN, "stale": WARN, "down": BAD, "drives": GOOD, "waits": WARN,
-    "debug": NEUTRAL, "info": "#2f7ed8", "warning": WARN, "error": BAD,
-    "limited": "#2f7ed8", "measured": GOOD,
+    "debug": NEUTRAL, "info": REST, "warning": WARN, "error": BAD,
 }  # fmt: skip
-PALETTE = ("#b04fc4", "#8f4f22", "#1ab2d2", "#8a8f00", "#e0588c", "#4a2f8f")
 
 LEVEL_NAMES = {number: name for name, number in LEVELS.items()}
 
@@ -86,7 +86,7 @@ Row = tuple[float, ...]  # s since 1970, and the values of the curves
 
 Trace = dict[str, Any]  # curves, marks or bars, as plotly describes them
 
-LEGEND_PX = 40  # above each diagram
+HEIGHT_PX, GAP = 200, 0.3  # of each diagram over time, and the part of it that its legend has
 
 
 class Figure(Struct, frozen=True):
@@ -97,7 +97,6 @@ class Figure(Struct, frozen=True):
 
 class Diagram(NamedTuple):
     title: str  # of its y axis
-    height: int  # px, with its legend
     traces: list[Trace]
     axis: dict[str, Any]
 
@@ -341,10 +340,9 @@ def _marks(level: str, events: Sequence[Log], x: Iterable[float], y: Iterable[ob
 
 def _path(drawing: Drawing) -> Figure:
     rows = list(drawing.path.rows())
-    data = [_curve("path", *_columns(rows)[1:], line={"color": COLOURS["limited"]})]
-    for name, row, colour in (("start", rows[:1], GOOD), ("end", rows[-1:], "#8668b8")):
-        marker = {"size": 12, "color": colour}
-        data.append(_curve(name, *_columns(row)[1:], mode="markers", marker=marker))
+    data = [_curve("path", *_columns(rows)[1:])]
+    for name, row in (("start", rows[:1]), ("end", rows[-1:])):
+        data.append(_curve(name, *_columns(row)[1:], mode="markers", marker={"size": 12}))
     for level in ("warning", "error"):
         placed = [(log, at) for _, log, at in drawing.events if at and log.level == LEVELS[level]]
         if placed:
@@ -365,12 +363,12 @@ def _diagrams(drawing: Drawing) -> Figure:
     bands = {name: spans for name, spans in drawing.bands.items() if any(s.kind for s in spans)}
     return _stacked(
         [
-            Diagram("forward, m/s", 190, _speeds(drawing, 1), _range(drawing, 1)),
-            Diagram("turning, rad/s", 190, _speeds(drawing, 2), _range(drawing, 2)),
-            Diagram("wheels, rad/s", 190, _over_time(drawing.wheels, WHEELS), {}),
-            Diagram("per second", 160, _over_time(drawing.counters, COUNTERS), {}),
-            Diagram("", 60 + 34 * len(bands), _bars(bands), _categories(bands)),
-            Diagram("", 150, _events(drawing), _categories(LEVELS)),
+            Diagram("forward, m/s", _speeds(drawing, 1), _range(drawing, 1)),
+            Diagram("turning, rad/s", _speeds(drawing, 2), _range(drawing, 2)),
+            Diagram("wheels, rad/s", _over_time(drawing.wheels, WHEELS), {}),
+            Diagram("per second", _over_time(drawing.counters, COUNTERS), {}),
+            Diagram("", _bars(bands), _categories(bands)),
+            Diagram("", _events(drawing), _categories(LEVELS)),
         ]
     )
 
@@ -378,21 +376,17 @@ def _diagrams(drawing: Drawing) -> Figure:
 def _over_time(rows: Rows, names: Sequence[str]) -> list[Trace]:
     times, *columns = _columns(rows.rows())
     x = [*map(_ms, times)]
-    return [
-        _curve(name.replace("_", " "), x, column, line={"width": 1.6, "color": colour})
-        for name, colour, column in zip(names, PALETTE, columns, strict=False)
-    ]
+    pairs = zip(names, columns, strict=False)
+    return [_curve(name.replace("_", " "), x, column) for name, column in pairs]
 
 
 def _speeds(drawing: Drawing, axis: int) -> list[Trace]:
     traces = []
     for number, (name, rows) in enumerate(sorted(drawing.speeds.items())):
         times, *columns = _columns(rows.rows())
-        line: dict[str, object] = {"width": 1.6, "color": COLOURS.get(name)}
-        if name not in COLOURS:
-            line |= {"dash": "dot", "color": PALETTE[number % len(PALETTE)]}
-        if name != "measured":
-            line["shape"] = "hv"
+        # A commanded speed lasts until the next one.
+        shape = "linear" if name == "measured" else "hv"
+        line = {"shape": shape, "color": PALETTE[number % len(PALETTE)]}
         traces.append(_curve(name, map(_ms, times), columns[axis - 1], line=line))
     return traces
 
@@ -447,19 +441,15 @@ def _categories(names: Iterable[str]) -> dict[str, Any]:
 
 def _stacked(diagrams: Sequence[Diagram]) -> Figure:
     # Each diagram has its own y axis and legend, and all share the x axis.
-    total, top = sum(diagram.height for diagram in diagrams), 0
-    layout = _layout(
-        total + 60, barmode="overlay", xaxis={"type": "date", "anchor": f"y{len(diagrams)}"}
-    )
-    data: list[Trace] = []
+    count, data = len(diagrams), list[Trace]()
+    grid = {"rows": count, "columns": 1, "pattern": "coupled", "ygap": GAP}
+    layout = _layout(count * HEIGHT_PX, barmode="overlay", grid=grid, xaxis={"type": "date"})
     for n, diagram in enumerate(diagrams, 1):
-        low, high = 1 - (top + diagram.height) / total, 1 - (top + LEGEND_PX) / total
-        top += diagram.height
-        number = "" if n == 1 else n
+        number, top = "" if n == 1 else n, 1 - (n - 1) / (count - GAP)
         layout[f"yaxis{number}"] = {
-            "title": {"text": diagram.title}, "domain": [low, high], "automargin": True,
+            "title": {"text": diagram.title}, "automargin": True,
         } | diagram.axis  # fmt: skip
-        layout[f"legend{number}"] = {"orientation": "h", "y": high, "yanchor": "bottom", "x": 0}
+        layout[f"legend{number}"] = {"orientation": "h", "y": top, "yanchor": "bottom", "x": 0}
         data += [
             trace | {"yaxis": f"y{number}", "legend": f"legend{number}", "showlegend": True}
             for trace in diagram.traces
