@@ -266,8 +266,16 @@ class Browser:
 
     def release(self) -> None:
         """Wait until the page accepts a press of its button `clear`, and tap it."""
-        time.sleep(SETTLED_S)
+        self.settle()
         self.tap("clear")
+
+    def settle(self) -> None:
+        """Wait until the page accepts a press of its button `clear`.
+
+        On a busy machine, a gap between two states makes the button gray for a moment.
+        """
+        time.sleep(SETTLED_S)
+        until(lambda: self.js("!document.getElementById('clear').disabled"), 5.0, "it is offered")
 
     def lift(self) -> None:
         """Lift all fingers that are down. Do nothing if the page has gone."""

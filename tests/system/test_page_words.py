@@ -283,6 +283,9 @@ def test_switch_on_is_beside_stop_and_only_offered_while_the_robot_is_off(
     browser.release()
     shows(browser, "mode", "READY")
     until(lambda: off("activate"), 5.0, "the robot is on")
+    robot[1].get("srv/stop")
+    shows(browser, "mode", "STOPPED")
+    assert (off("activate"), off("deactivate")) == (True, True)
 
 
 def stopped_while_off(bus: Bus, browser: Browser) -> None:
@@ -290,7 +293,7 @@ def stopped_while_off(bus: Bus, browser: Browser) -> None:
     bus.get("srv/deactivate")
     bus.get("srv/stop")
     shows(browser, "clear", "Release STOP")
-    time.sleep(SETTLED_S)
+    browser.settle()
 
 
 def twice(browser: Browser, name: str, pause_s: float) -> None:

@@ -21,8 +21,12 @@ const VIEWS = ["drive", "status", "events", "set"];
 const READ = 8000; // time after which a message disappears, ms
 const KINDS = { stopped: "stop", fault: "fault", inactive: "inactive" }; // of the causes, by the mode
 const ON = { activate: "the robot is already on" };
-/** Maps a mode to the button that would change nothing in it, with the reason. */
-const NEEDLESS = { waiting: ON, driving: ON, ready: ON, inactive: { deactivate: "the robot is already off" } };
+const both = (why) => ({ activate: why, deactivate: why });
+/** Maps a mode to the buttons that would change nothing in it, with the reason. */
+const NEEDLESS = {
+  waiting: ON, driving: ON, ready: ON, inactive: { deactivate: "the robot is already off" },
+  stopped: both("press Release STOP first"), fault: both("press Release fault first"),
+};
 /** Time, ms, for which the release button must show the same text before a press of it counts. A double click may take
  *  900 ms, and a held Enter key may click again after 1000 ms. */
 const SETTLED = 1000;
