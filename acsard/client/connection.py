@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
+from functools import cached_property
 from typing import Any
 
 import msgspec
@@ -218,11 +219,14 @@ class Connection(Reads):
         # share it, although they may send commands under another name.
         self._secret = new_secret()
         whole = sender_id(f"{platform.node()[:32]}/{os.getpid()}")
-        self._sender = CommandSigner(whole)
+        self._sender, self._sender_id = CommandSigner(whole), whole
         self._beats = Beats(session, self.key(BEAT))
-        # `state.sender` while this client drives.
-        self.sender = public_name(whole, self.certificate)
         self._own_causes: set[int] = set()  # that calls of this client have latched
+
+    @cached_property
+    def sender(self) -> str:
+        """The public name of this client as a sender: `state.sender` while it drives."""
+        return public_name(self._sender_id, self.certificate)
 
     @property
     def caller(self) -> str:

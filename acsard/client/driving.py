@@ -59,7 +59,10 @@ class CommandClient(Followed, Protocol):
     """The part of a client that a `Driver` uses."""
 
     source: str
-    sender: str  # public name of this client's sender
+
+    @property
+    def sender(self) -> str:
+        """The public name of this client's sender."""
 
     def send(self, linear: float, angular: float = 0.0) -> None:
         """Send one command: `linear` m/s, `angular` rad/s (left is +)."""

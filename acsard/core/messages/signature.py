@@ -12,7 +12,6 @@ of any other form is ignored, but a command with a wrong `echo` is refused.
 from __future__ import annotations
 
 from functools import lru_cache
-from hashlib import sha256
 from typing import Annotated
 
 import msgspec
@@ -79,6 +78,8 @@ def public_name(sender: str, certificate: str = "") -> str:
     That is the id before its last "/", the first 16 digits of the SHA-256 of all of it, and the
     certificate's common name. Without an id, pass that of the Zenoh session of the timestamp.
     """
+    from hashlib import sha256  # it loads OpenSSL for 2 ms, and `acsard call stop` hashes nothing
+
     digits = sha256(sender.encode("utf-8", "surrogatepass")).hexdigest()[:HASH_DIGITS]
     name = _cleaned(sender.rpartition("/")[0][:MAX_NAME_LENGTH]).strip()
     label = f"{name}/{digits}" if name else digits

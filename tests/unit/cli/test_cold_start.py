@@ -8,8 +8,8 @@ import sys
 # Each takes 1 to 20 ms of processor time to load.
 SLOW = {
     "acsard.bus.access", "acsard.core.incoming.queries", "acsard.core.messages.json_schema",
-    "asyncio", "concurrent.futures", "cryptography", "difflib", "logging", "numpy", "rich",
-    "socket", "ssl", "structlog", "subprocess", "tempfile", "tomllib",
+    "asyncio", "concurrent.futures", "cryptography", "difflib", "hashlib", "logging", "numpy",
+    "rich", "socket", "ssl", "structlog", "subprocess", "tempfile", "tomllib",
 }  # fmt: skip
 
 
