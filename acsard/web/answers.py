@@ -10,6 +10,7 @@ import asyncio
 import base64
 import gzip
 import hashlib
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -180,27 +181,27 @@ class Files:
         return self._files.get(name)
 
     def read(self) -> None:
-        """Read the files that have changed on the disk."""
+        """Read the files that have changed on the disk. Symbolic links are not followed."""
         try:
-            names = [path.name for path in self._directory.iterdir()]
+            with os.scandir(self._directory) as entries:
+                files = [entry for entry in entries if entry.is_file(follow_symlinks=False)]
+                stats = {entry.name: entry.stat() for entry in files}
         except OSError:
-            names = []
-        files = {name: self._read(name) for name in names}
-        self._files = {name: file for name, file in files.items() if file is not None}
+            stats = {}
+        stamps = {name: (stat.st_mtime_ns, stat.st_size) for name, stat in stats.items()}
+        read = {name: self._read(name, stamps) for name in stamps}
+        self._files = {name: file for name, file in read.items() if file is not None}
 
-    def _read(self, name: str) -> File | None:
-        kind = CONTENT_TYPES.get(Path(name).suffix)
-        if kind is None or name.startswith("."):
+    def _read(self, name: str, stamps: Mapping[str, tuple[int, int]]) -> File | None:
+        kind, parts = CONTENT_TYPES.get(Path(name).suffix), (name, *INLINED.get(name, ()))
+        if kind is None or name.startswith(".") or not all(part in stamps for part in parts):
             return None
-        paths = [self._directory / entry for entry in (name, *INLINED.get(name, ()))]
+        known, stamp = self._files.get(name), tuple(stamps[part] for part in parts)
+        if known is not None and known.stamp == stamp:
+            return known
         try:
-            if any(path.is_symlink() or not path.is_file() for path in paths):
-                return None
-            stats = [path.stat() for path in paths]
-            stamp = tuple((entry.st_mtime_ns, entry.st_size) for entry in stats)
-            known = self._files.get(name)
-            return known if known and known.stamp == stamp else _load_file(paths, kind, stamp)
-        except (OSError, ValueError):
+            return _load_file([self._directory / part for part in parts], kind, stamp)
+        except OSError:
             return None
 
 
