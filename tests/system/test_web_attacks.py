@@ -212,6 +212,8 @@ async def test_a_flood_of_a_viewer_ends_its_connections_and_delays_no_stop_of_an
                         async with flooding.get(f"{url}/api/state") as answer:
                             statuses[answer.status] += 1
 
+            async with phone.get(f"{url}/api/whoami") as answer:
+                assert answer.status == 200  # the server knows the token
             ending = asyncio.create_task(_drained(theirs))
             floods = [asyncio.create_task(asks()) for _ in range(7)]
             took = list[float]()

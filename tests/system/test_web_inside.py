@@ -34,7 +34,7 @@ from tests.system.harness import PATIENCE_S, Daemon, seconds
 
 pytestmark = pytest.mark.network
 
-MISSED = 50
+MISSED = 20
 """Messages at 50 a second that one client does not read."""
 
 ABOUT = About("1", True, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
@@ -132,7 +132,8 @@ async def test_a_client_that_stops_reading_later_gets_only_the_newest_message(
             wire.pause_reading()
             (viewer,) = inside.page._viewers
             while viewer._out._unread() <= MAX_UNREAD_BYTES:  # more than the kernels hold
-                viewer._out.enqueue("x" * 4096)
+                if not viewer._out._out:  # more would let the server wait for the client
+                    viewer._out.enqueue("x" * 16384)
                 await asyncio.sleep(0)
             await eventually(lambda: left_out() >= MISSED)
             wire.resume_reading()
