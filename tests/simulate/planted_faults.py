@@ -555,8 +555,8 @@ FAULTS = (
         "times commands",
         "the time between two replies is twice that between their commands",
         "core/link/line_times.py",
-        "dt_ns = sample_ns - before if before else 0",
-        "dt_ns = 2 * (sample_ns - before) if before else 0",
+        "= sample_ns - before if before else 0, 0",
+        "= 2 * (sample_ns - before) if before else 0, 0",
     ),
     fault(
         "session stale",
@@ -613,9 +613,8 @@ FAULTS = (
         "        if self._echo.trouble:\n            self._reject",
         Edit(
             SESSION,
-            "self._link.bad(setup.checked)\n            return None\n        if",
-            "self._link.bad(setup.checked)\n            self._deaf = 6\n"
-            "            return None\n        if",
+            "self._link.bad(setup.checked)\n\n    def _check",
+            "self._link.bad(setup.checked)\n            self._deaf = 6\n\n    def _check",
         ),
         Edit(SESSION, LINK_FIELD, f"{LINK_FIELD}    _deaf: int = 0\n"),
     ),
