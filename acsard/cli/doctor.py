@@ -1,8 +1,8 @@
-"""Check the configuration, the serial port and the process that uses it, permissions, the clock,
-real-time limits, reasons why programs on this computer run late, certificates, and the daemon if it
-runs. The tool looks for the daemon at the address in the options. Without such an option, it uses
-the address in the configuration. Each problem is printed with its fix. The exit code is 1 if a
-check fails, else 0.
+"""Print the diagnostics of the running daemon, each problem with its fix, and what only a program on
+this computer sees: the configuration file, the serial port and the program that uses it,
+permissions, the clock, real-time limits, reasons why programs run late, and certificates. The tool
+looks for the daemon at the address in the options, else in the configuration. The exit code is 1 if
+a check fails, else 0.
 """
 
 from __future__ import annotations

@@ -118,8 +118,8 @@ def local(config: Config, address: Address, written: str, pid: int | None) -> It
 def reported(rows: tuple[DiagnosticStatus, ...]) -> Iterator[Finding]:
     """Yield a finding for each row of the daemon's diagnostics, and each text once."""
     for row in rows:
-        others = [other.message for other in rows if other is not row]
-        if row.level == OK and any(row.message in message for message in others):
+        # The row of the link ends with the reason for which the robot waits.
+        if row.level == OK and any(other.message.endswith(f": {row.message}") for other in rows):
             continue
         mend = "".join(pair.value for pair in row.values if pair.key == "advice")
         subject = row.name.removeprefix("acsard: ")

@@ -58,14 +58,13 @@ def test_a_peer_says_that_its_router_is_missing_and_that_it_came_and_went(tmp_pa
         toml = f'[bus]\nlisten = ["{daemon.endpoint}"]\nconnect = ["{meeting}"]\n'
         _, findings = examined(tmp_path, toml)
         rows = [(finding["level"], finding["text"]) for finding in findings["router"]]
-        assert ("warning", f"no program listens at {meeting}") in rows
-        assert ("warning", f"the daemon is not connected to {meeting}") in rows
+        assert rows == [("warning", f"not connected to {meeting}")]
         with router(tmp_path, meeting) as there:
             assert wait_for_event(daemon, "router_found", 1) == f"connected to {meeting}"
             until(lambda: row(bus)["level"] == 0, 2.0, "diagnostics say it")
             _, findings = examined(tmp_path, toml)
             rows = [(finding["level"], finding["text"]) for finding in findings["router"]]
-            assert rows == [("ok", "the daemon is connected")]
+            assert rows == [("ok", "connected")]
             there.signal(signal.SIGKILL)
             wait_for_event(daemon, "router_missing", 2)
         assert bus.count("router_missing") == 2

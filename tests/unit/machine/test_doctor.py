@@ -41,9 +41,11 @@ def test_each_report_of_the_daemon_is_a_finding_with_its_advice() -> None:
 
 
 def test_a_text_of_two_reports_is_printed_once_where_it_is_not_ok() -> None:
-    rows = (row("mode", 0, "nothing came"), row("serial link", 2, "down: nothing came", "check"))
-    assert list(reported(rows)) == [
-        Finding("serial link", "failure", "down: nothing came", "check")
+    waits = row("mode", 0, "nothing came")
+    link = row("serial link", 2, "down: nothing came", "check")
+    assert list(reported((waits, link, row("recording", 0, "on")))) == [
+        Finding("serial link", "failure", "down: nothing came", "check"),
+        Finding("recording", "ok", "on"),
     ]
 
 
