@@ -1,5 +1,5 @@
-"""Print the diagnostics of the running daemon, each problem with its fix, and what only a program on
-this computer sees: the configuration file, the serial port and the program that uses it,
+"""Print the diagnostics of the running daemon, each problem with its fix. Print also what only a
+program on this computer sees: the configuration file, the serial port and the program that uses it,
 permissions, the clock, real-time limits, reasons why programs run late, and certificates. The tool
 looks for the daemon at the address in the options, else in the configuration. The exit code is 1 if
 a check fails, else 0.
