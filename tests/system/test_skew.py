@@ -186,11 +186,13 @@ from acsard.client import connect, connect_async
 from acsard.core.messages.keys_and_roles import SERVICES
 
 NAMES = {[topic.key for topic in PUBLISHED if topic.key != "battery"]!r}
-FIXED = ["info", "config", "interfaces", "topics", "schema/Twist", "whoami/viewer"]
+FIXED = ["info", "config", "interfaces", "topics"]
 
 def used(robot):
     for name in NAMES + FIXED:
         robot.get(name)
+    for name in ("schema/Twist", "whoami/viewer"):
+        robot._connection.reply(name)
     for name in NAMES:
         if name not in ("tf_static", "events", "diagnostics"):
             assert next(robot.messages(name, timeout=5), None) is not None, name
@@ -201,11 +203,13 @@ def used(robot):
         assert reply.success, (verb, reply)
         done[verb] = reply.data.numbers
     robot.drive(0.3, seconds=0.5)
+    robot.move(0.02)
+    robot.turn(2)
     done["x"] = robot.pose().x
     reply = robot.call("set_pose", x=1.0, y=2.0, yaw=0.5)
     assert reply.success
     done["{VERB}"] = [(reply := robot.call("{VERB}")).success, reply.message]
-    refused = robot.request("set_pose", {{"x": 1, "y": 2, "yaw": 0, "zaw": 1}})
+    refused = robot._connection.request("set_pose", {{"x": 1, "y": 2, "yaw": 0, "zaw": 1}})
     done["strict"] = [refused.success, refused.message]
     return done
 

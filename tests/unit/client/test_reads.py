@@ -10,6 +10,7 @@ from typing import Any, get_args, get_overloads, get_type_hints
 
 import pytest
 
+from acsard.client import AsyncClient, Client
 from acsard.client.reads import FOLLOWED_KEYS, QUERIED_KEYS, AsyncReads, Reads
 from acsard.core.messages.keys_and_roles import by_key
 from acsard.core.messages.schema import MESSAGES
@@ -46,6 +47,14 @@ def test_each_key_of_the_table_gives_its_own_type(
         return MESSAGES.get(topic.type, str)  # a dictionary with keys that are strings
 
     assert types(method) == {key: wanted(key) for key in keys}
+
+
+def test_both_clients_show_the_same_few_names() -> None:
+    for client in (Client, AsyncClient):
+        assert {name for name in dir(client) if not name.startswith("_")} == {
+            "call", "clear", "drive", "get", "messages", "move", "name", "pose", "send", "set",
+            "stop", "turn", "whoami",
+        }, client  # fmt: skip
 
 
 STUDENT = """\
