@@ -187,7 +187,7 @@ class Followed:
             # A zero of a shared identity counts only behind its pause.
             since_ns = max(witness.armed_since_ns, witness.disarmed_ns)
             armed = wish.armed_ns > since_ns and command.who[0] not in witness.pausing
-            waited = witness.may_have_waited(wish)
+            waited = witness.may_have_waited(wish, surely=False)
             return wish.certain and not waited and (armed or not sample.shared)
         if sample.clock in witness.shared_clocks or not stable(sender):
             return False

@@ -86,6 +86,7 @@ CLEARLY = 4.0
 
 DIALECTS = {
     "unpadded", "spaces", "trailing_comma", "no_sample", "no_check", "constant_answers",
+    "replies_twice",
 }  # fmt: skip
 """Forms of the protocol, and habits of the board, that give the daemon no trouble."""
 
@@ -339,11 +340,15 @@ class Witness:
                 wish.fresh = self.ages.fresh(*arguments) and not self.may_have_waited(wish)
                 self._unread[place] = key, None, ()
 
-    def may_have_waited(self, wish: Wish) -> bool:
-        """Return whether a speed without a stamp arrived in a stall of the daemon or behind it."""
+    def may_have_waited(self, wish: Wish, surely: bool = True) -> bool:
+        """Return whether a speed without a stamp arrived in a stall of the daemon or behind it.
+
+        The daemon refuses it `surely`, or perhaps: it notes a stall at its next step.
+        """
         begun_ns, ended_ns = self._stalled
-        stalled = ended_ns - begun_ns > LATE_NS + MARGIN_NS + self.period_ns
-        behind = begun_ns < wish.arrived_ns < ended_ns + WAITED_NS
+        room_ns = 0 if surely else 2 * MARGIN_NS + self.period_ns
+        stalled = ended_ns - begun_ns > LATE_NS + MARGIN_NS + self.period_ns - room_ns
+        behind = begun_ns < wish.arrived_ns < ended_ns + WAITED_NS + room_ns
         return wish.certain and bool(wish.v or wish.w) and stalled and behind
 
     def _cancel_zeros(self, source: str, now_ns: int, sender: Sender) -> None:
