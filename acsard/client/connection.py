@@ -25,11 +25,11 @@ from acsard.bus.robot_discovery import NO_BATTERY, explain_silence, presence
 from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.bus.tls import shown_at
 from acsard.bus.zenoh_sessions import client_session
-from acsard.client.beats import Beats
 from acsard.client.driving import UnheardError, repeat_zeros
 from acsard.client.identity import ClientIdentity, identity
 from acsard.client.reads import Reads
 from acsard.client.ride import MAX_SOURCE_TIMEOUT_S, SEND_PERIOD_S
+from acsard.client.signing import Beats, CommandSigner
 from acsard.core.messages import schema
 from acsard.core.messages.encodings import (
     DecodeError,
@@ -56,7 +56,7 @@ from acsard.core.messages.refusals import (
     require_size,
 )
 from acsard.core.messages.signature import Signature, public_name
-from acsard.core.values import Ns, Plain, Pose
+from acsard.core.values import Plain, Pose
 from acsard.host import clock
 from acsard.host.errors import (
     MendableError,
@@ -176,26 +176,6 @@ class _CommandSpacing:
             yield
             self._last_s = time.monotonic()
             self._next_s = max(self._next_s, self._last_s + MIN_SPACING_S)
-
-
-class CommandSigner:
-    def __init__(self, sender_id: str) -> None:
-        self._id, self._sequence, self._newest_ns = sender_id, 0, 0
-
-    def sign(
-        self, stamp_ns: Ns | None, echo: schema.Beat | None, *, zero: bool = False
-    ) -> Signature:
-        """Return the signature of the next command, with its sequence number.
-
-        A zero gets a later stamp of this sender, so that it is not refused as older.
-        """
-        self._sequence += 1
-        # The daemon refuses a command whose stamp is older than that of an earlier command. If a
-        # sender uses two sources, its commands may be signed in another order than their stamps.
-        if stamp_ns is not None:
-            newest_ns = max(stamp_ns, self._newest_ns)
-            self._newest_ns, stamp_ns = newest_ns, newest_ns if zero else stamp_ns
-        return Signature(self._id, stamp_ns, self._sequence, echo)
 
 
 class Connection(Reads):

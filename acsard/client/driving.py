@@ -181,14 +181,14 @@ def drive(linear: float, angular: float, seconds: float) -> Steps:
 
 def move(distance: float, speed: float) -> Steps:
     """Return the steps that drive `distance` m straight ahead (back if negative), by `odom`."""
-    _require(distance=distance, speed=speed)
-    return _course(lambda odom: Straight(odom, distance, _positive(speed)))
+    _require_course(distance=distance, speed=speed)
+    return _course(lambda odom: Straight(odom, distance, speed))
 
 
 def turn(degrees: float, speed: float) -> Steps:
     """Return the steps that turn by an angle (left is +), at `speed` rad/s, by `odom`."""
-    _require(degrees=degrees, speed=speed)
-    return _course(lambda odom: Turn(odom, math.radians(degrees), _positive(speed)))
+    _require_course(degrees=degrees, speed=speed)
+    return _course(lambda odom: Turn(odom, math.radians(degrees), speed))
 
 
 def _course(begin: Callable[[Odometry], Course]) -> Steps:
@@ -265,10 +265,10 @@ def repeat_zeros(
             driver.end()
 
 
-def _positive(speed: float) -> float:
+def _require_course(*, speed: float, **way: float) -> None:
+    _require(speed=speed, **way)
     if speed <= 0:
         raise UsageError(f"speed = {speed:g}: it must be above 0; the way has the sign")
-    return speed
 
 
 def _require(**numbers: object) -> None:

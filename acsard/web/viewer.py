@@ -14,8 +14,9 @@ from typing import Any
 import aiohttp
 from aiohttp import web
 
-from acsard.client.connection import CommandSigner, Connection
+from acsard.client.connection import Connection
 from acsard.client.ride import MAX_SOURCE_TIMEOUT_S
+from acsard.client.signing import CommandSigner
 from acsard.core.messages import schema
 from acsard.core.messages.permissions import COMMAND_ROLE, SERVICE_ROLES
 from acsard.core.messages.signature import public_name

@@ -12,7 +12,7 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from acsard.client.driving import MAX_END_S, Driver, UnheardError, drive, repeat_zeros
+from acsard.client.driving import MAX_END_S, Driver, UnheardError, drive, move, repeat_zeros
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S, ROBOT_SILENCE_TIMEOUT_S, SETTLED_S
 from acsard.client.ride import GRACE_S, OPEN_TIMEOUT_S, objection
 from acsard.core.messages.schema import RobotState, SourceState, Time
@@ -20,6 +20,7 @@ from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 from tests.each import each
+from tests.unit.client.test_course import Robot as StandingRobot
 from tests.unit.top.screens import raw_sample, sample_of
 
 US, OTHER = "joe/1/aa", "ann/2/bb"
@@ -537,3 +538,64 @@ def test_a_sender_that_was_idle_sends_zeros_if_the_robot_follows_it_or_is_silent
     for pause in repeat_zeros(robot, world.now - 2 * GRACE_S):
         world.now += pause
     assert set(world.sent) == {0.0}
+
+
+# courses by the odometry
+
+
+class WithOdometry(World):
+    """A robot that publishes its odometry for some time, and does not move."""
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__(followed)
+        self._odometry_s = seconds
+
+    def subscribe(self, name: str) -> Any:
+        if name == "state":
+            return super().subscribe(name)
+        queue: list[Any] = []
+
+        def receive() -> Any:
+            if not queue and self.now - 100.0 < self._odometry_s:
+                queue.extend([sample_of(StandingRobot(0.0).odom(), "acsard/acsar/odom"), None])
+            return queue.pop(0) if queue else None
+
+        return SimpleNamespace(try_recv=receive, undeclare=lambda: None)
+
+    def move(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.set_clock(monkeypatch)
+        robot: Any = self
+        for pause in move(1.0, 0.3)(Driver(robot)):
+            self.now += pause
+
+
+def test_a_move_without_odometry_ends_before_it_began(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = WithOdometry(0.0)
+    with pytest.raises(NoAnswerError, match="no odometry arrives"):
+        world.move(monkeypatch)
+    assert world.sent == []
+
+
+def test_a_move_stops_when_the_odometry_falls_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = WithOdometry(1.0)
+    with pytest.raises(NoAnswerError, match="no odometry arrives"):
+        world.move(monkeypatch)
+    zeros = next(n for n, speed in enumerate(reversed(world.sent)) if speed)
+    assert 0.3 in world.sent
+    # The error comes 2 s after the last message, and zeros from 0.2 s after it until rest.
+    assert zeros >= 10
+
+
+def test_a_move_of_a_robot_that_does_not_move_ends_after_three_seconds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = WithOdometry(60.0)
+    with pytest.raises(NotDrivenError, match=r"no nearer for 3 s, and 1\.000 m is left"):
+        world.move(monkeypatch)
+    assert 3.0 < world.now - 100.0 < 4.0
+
+
+@pytest.mark.parametrize("speed", [0.0, -0.3])
+def test_a_move_needs_a_speed_above_zero(speed: float) -> None:
+    with pytest.raises(UsageError, match=f"speed = {speed:g}: it must be above 0"):
+        move(-1.0, speed)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.client.connection import CommandSigner
 from acsard.client.ride import MAX_SOURCE_TIMEOUT_S, STALE_S
+from acsard.client.signing import CommandSigner
 from acsard.core.messages.schema import Beat
 from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.web.outbox import Relay, Wish

@@ -12,7 +12,8 @@ import aiohttp
 import pytest
 
 from acsard.bus.address import Address
-from acsard.client.connection import CommandSigner, Connection
+from acsard.client.connection import Connection
+from acsard.client.signing import CommandSigner
 from acsard.core.messages.schema import Beat, ServiceReply
 from acsard.core.messages.signature import unpack
 from acsard.core.values import Role, Twist

@@ -1,6 +1,6 @@
-"""The beats of a robot's daemon, of which each command of this program echoes the newest.
+"""Signs the commands of one sender: each has its number and the newest beat of the robot's daemon.
 
-The daemon computes the age of a command from the echo, so a command that a network holds back is
+The daemon computes the age of a command from this echo, so a command that a network holds back is
 refused, however constant the delay is.
 """
 
@@ -13,6 +13,8 @@ import zenoh
 from acsard.bus.subscription import direct, encoded, has_exact_key
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import Beat
+from acsard.core.messages.signature import Signature
+from acsard.core.values import Ns
 
 _decoder = Decoder(Beat)
 
@@ -38,3 +40,21 @@ class Beats:
             self._newest = _decoder.decode(*encoded(sample))
         except DecodeError:
             pass  # of another version: the daemon would refuse its echo
+
+
+class CommandSigner:
+    def __init__(self, sender_id: str) -> None:
+        self._id, self._sequence, self._newest_ns = sender_id, 0, 0
+
+    def sign(self, stamp_ns: Ns | None, echo: Beat | None, *, zero: bool = False) -> Signature:
+        """Return the signature of the next command, with its sequence number.
+
+        A zero gets a later stamp of this sender, so that it is not refused as older.
+        """
+        self._sequence += 1
+        # The daemon refuses a command whose stamp is older than that of an earlier command. If a
+        # sender uses two sources, its commands may be signed in another order than their stamps.
+        if stamp_ns is not None:
+            newest_ns = max(stamp_ns, self._newest_ns)
+            self._newest_ns, stamp_ns = newest_ns, newest_ns if zero else stamp_ns
+        return Signature(self._id, stamp_ns, self._sequence, echo)
