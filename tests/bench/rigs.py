@@ -101,7 +101,7 @@ def chosen(settings: Config) -> dict[str, Any]:
     """Return the settings that are not the defaults: another checkout may not know the others."""
     usual: dict[str, Any] = effective(Config())
     tables: dict[str, Any] = effective(settings)
-    return {
+    changed = {
         name: {
             key: value
             for key, value in table.items()
@@ -109,6 +109,7 @@ def chosen(settings: Config) -> dict[str, Any]:
         }
         for name, table in tables.items()
     }
+    return {name: table for name, table in changed.items() if table}
 
 
 @contextmanager
