@@ -90,7 +90,7 @@ async def serve(
         await runner.setup()
         assert runner.server is not None
         stack.push_async_callback(runner.cleanup)
-        work = [leaving.wait(), robot.run(), _tick(page, counts, log)]
+        work = [leaving.wait(), robot.run(), _tick(page, tokens, counts, log)]
         work.append(_read_disk(tokens, page, certificate))
         if options.supervised:
             work.append(_watch_parent(leaving))
@@ -121,9 +121,10 @@ async def first_ended(work: Iterable[Coroutine[Any, Any, object]], outbox: Outbo
             task.cancel()
 
 
-async def _tick(page: Page, counts: Counts, log: Log) -> None:
+async def _tick(page: Page, tokens: ReadTokens, counts: Counts, log: Log) -> None:
     while True:
-        await asyncio.sleep(TICK_S)
+        # A revoked token ends as soon as it is read; an expired one also while a disk hangs.
+        await tokens.next_reading()
         page.tidy()
         if (refusals := counts.new_refusals()) is not None:
             log.event(refusals)

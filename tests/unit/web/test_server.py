@@ -22,6 +22,7 @@ from acsard.host.logs import Log
 from acsard.machine.authority import Authority
 from acsard.web import server
 from acsard.web.answers import Files
+from acsard.web.metrics import Counts
 from acsard.web.server import Certificate
 from acsard.web.tokens import ReadTokens, Vault
 from tests.unit.web.hanging_disk import ROUNDS_S, threads_named
@@ -60,6 +61,28 @@ async def test_one_thread_waits_for_a_hanging_disk_and_then_everything_is_read_a
         assert certificate.context is not before
     finally:
         reading.cancel()
+        log.close()
+
+
+async def test_the_connections_of_a_revoked_token_end_with_the_reading_that_misses_it(
+    tmp_path: Path,
+) -> None:
+    log, vault = Log(LogConfig(), io.StringIO()), Vault(tmp_path, "acsar")
+    text, _ = vault.invite("viewer", "tv", 1)
+    tokens, valid = ReadTokens(vault), list[bool]()
+    page: Any = SimpleNamespace(tidy=lambda: valid.append(tokens.owner([text]) is not None))
+    ticking = asyncio.create_task(server._tick(page, tokens, Counts(), log))
+    try:
+        await asyncio.sleep(0)
+        for revokes in (False, True):
+            if revokes:
+                vault.revoke("tv")
+            tokens.read()
+            tokens.announce()
+            await asyncio.sleep(0.01)
+        assert valid == [True, False]
+    finally:
+        ticking.cancel()
         log.close()
 
 
