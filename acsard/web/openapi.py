@@ -72,7 +72,7 @@ ERRORS = {
         "The role of the token is too low, or the request came through a proxy or from another "
         "web page."
     ),
-    "429": "Too many requests, or too many wrong tokens.",
+    "429": "Too many requests with this token.",
     "default": "Any other failure.",
 }
 

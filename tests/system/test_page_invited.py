@@ -6,12 +6,14 @@ import asyncio
 import json
 import urllib.request
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, contextmanager
+from contextlib import AsyncExitStack, contextmanager, suppress
 from typing import Any
 
+import aiohttp
 import pytest
 
 from acsard.machine.authority import Authority
+from acsard.web.access import FLOOD_TEXT
 from acsard.web.connections import MAX_OF_TOKEN
 from tests.system.browser import NAME, TRUSTING, Page, hands
 from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
@@ -43,7 +45,7 @@ class Stranger:
     def tries(self) -> float:
         """The number of requests that the page has refused because they had no valid token."""
         counted = self.server.refused()
-        return sum(counted.get(reason, 0) for reason in ("no_token", "bad_token", "too_fast"))
+        return sum(counted.get(reason, 0) for reason in ("no_token", "bad_token"))
 
     def knocks_no_more(self, since: float, times: int) -> None:
         """Wait for `times` refusals since `since`, and check that the page then stops trying."""
@@ -161,8 +163,30 @@ async def test_a_page_beyond_the_connections_of_its_token_says_why_and_can_still
         for _ in range(MAX_OF_TOKEN):
             await stack.enter_async_context(hands(server, token))
         await asyncio.to_thread(look)
+    await asyncio.to_thread(stranger.shows, "mode", "STOPPED")  # it connects by itself
     numbers = [cause["number"] for cause in ask(server, "state")["causes"]]
     assert ask(server, "srv/clear", {"numbers": numbers})["success"]
+
+
+async def test_a_page_whose_token_floods_says_why_and_connects_by_itself_afterwards(
+    stranger: Stranger, server: Page
+) -> None:
+    token = server.invite("operator", "flooded")
+    stranger.opens(token)
+    stranger.shows("mode", "READY")
+
+    async def floods(client: aiohttp.ClientSession) -> None:
+        while True:
+            with suppress(aiohttp.ClientError):
+                await (await client.get(f"{server.away}/api/state")).read()
+
+    async with server.client(token) as client:
+        flood = [asyncio.create_task(floods(client)) for _ in range(4)]
+        await asyncio.to_thread(stranger.shows, "reason", FLOOD_TEXT)
+        await asyncio.sleep(2.0)  # the page tries again and is refused
+        for task in flood:
+            task.cancel()
+    await asyncio.to_thread(stranger.shows, "mode", "READY")
 
 
 @pytest.mark.parametrize(("agrees", "role"), [(False, "operator"), (True, "viewer")])

@@ -4,7 +4,6 @@
 import { text } from "./views.js";
 
 const AGAIN = 1000; // ms before the next attempt, while the robot does not answer an invitation
-const SHUT = [401, 403, 429]; // HTTP statuses for which a repeated request is pointless
 const INVALID = "This invitation is not valid: it has expired, was revoked, or is incomplete. Ask for a new one.";
 
 /** Exchange the token of an invitation (behind the # of the URL) for a cookie. If the present cookie has more
@@ -21,7 +20,7 @@ export async function invited(waiting) {
     const { status, error } = await request("token", how);
     if (status === 409 && !replace && (replace = confirm(`${error}. Use the link anyway?`))) continue;
     if (status && status < 500) {
-      if (status !== 429) history.replaceState(null, "", location.pathname);
+      history.replaceState(null, "", location.pathname);
       return status === 401 ? INVALID : status === 409 ? "" : error;
     }
     waiting(`Your invitation has no answer yet: ${error}. This page sends it again.`);
@@ -29,11 +28,11 @@ export async function invited(waiting) {
   }
 }
 
-/** Return why a WebSocket is refused, as {why, shut, barred}, because no browser reports this. `shut` means that a
- *  repeated attempt is pointless. `barred` means that the robot refuses everything from this browser, also STOP. */
+/** Return why a WebSocket is refused, as {why, barred}, because no browser reports this. `barred` means that the robot
+ *  refuses everything from this browser, also STOP, so a repeated attempt is pointless. */
 export async function refusal() {
   const { status, error, body } = await request("api/whoami", {}, 2000);
-  return { why: error || body.full, shut: SHUT.includes(status), barred: BARRED.includes(status) };
+  return { why: error || body.full, barred: BARRED.includes(status) };
 }
 
 /** Return the answer to an HTTP request as {status, body, error}. `error` is "" if it succeeded, and `status` is 0 if

@@ -16,8 +16,7 @@ export class Camera {
   #trouble = "";
   #shows = false;
   #runs = false;
-  /** Whether the page has a connection. Without a connection, the token may have expired, and each request with it
-   *  would count as a guess. */
+  /** Whether the page has a connection. Without one, the token may have expired, and each request would be refused. */
   connected = false;
 
   constructor(figure) {

@@ -297,12 +297,12 @@ function greeted(message) {
 
 /** Show why the robot rejects the connection. Returns true if another attempt is pointless. */
 async function refused() {
-  const { why, shut, barred: uninvites } = await refusal();
+  const { why, barred: uninvites } = await refusal();
   if (link.open) return false;
   if (uninvites) stopping.uninvited();
-  if (why) views.lost(shut && uninvited ? uninvited : why);
-  $("again").hidden = !shut;
-  return shut;
+  if (why) views.lost(uninvites && uninvited ? uninvited : why);
+  $("again").hidden = !uninvites;
+  return uninvites;
 }
 
 /** Resolve to the answer to a STOP. `called` is its call over the WebSocket. If this call is not answered within
