@@ -41,7 +41,7 @@ from acsard.web.tokens import ReadTokens
 
 # Requests of one token, and messages of one WebSocket. A page asks for 20 pictures a second, and
 # sends 20 commands a second. The daemon takes 1000 commands a second from this server.
-REQUEST_RATE = Rate(100.0, 200.0)
+REQUEST_RATE = Rate(100.0, 100.0)
 
 FLOOD_TEXT = f"more than {REQUEST_RATE.hz:g} a second: send fewer"
 

@@ -129,7 +129,8 @@ class Viewer:
         self._out = Outgoing(socket, request, parts.robot.streams, parts.counts, who.origin)
         self._tasks: set[asyncio.Task[None]] = set()
         self._stops: set[asyncio.Task[None]] = set()
-        self._ended = self._is_calling = False
+        self._stop_ids: list[int | str] = []
+        self._ended = self._is_calling = self._is_stopping = False
         self._stamp_ns = -1  # of the last command
         self._unreachable_reason, self._about = "", parts.robot.about
 
@@ -164,7 +165,8 @@ class Viewer:
 
     def _take(self, message: aiohttp.WSMessage) -> None:
         if self._ended:  # after the close frame, only a stop counts
-            if message.type == aiohttp.WSMsgType.TEXT and asks_to_stop(message.data):
+            is_text = message.type == aiohttp.WSMsgType.TEXT
+            if is_text and not self._stop_ids and asks_to_stop(message.data):
                 self._obey(Call("stop"))
             return
         if message.type == aiohttp.WSMsgType.ERROR:  # aiohttp closes the connection after this
@@ -244,8 +246,11 @@ class Viewer:
 
     def _call(self, frame: Call) -> None:
         if frame.call == "stop":
-            # Keep stops in a separate set of tasks, which continue when the connection ends.
-            start(self._answer(frame), self._stops)
+            self._stop_ids.append(frame.id)
+            if not self._is_stopping:
+                self._is_stopping = True
+                # Keep it in a separate set of tasks, which continue when the connection ends.
+                start(self._stop(), self._stops)
         elif self._is_calling:
             self._counts.refuse("too_fast", self.who.origin)
             text = "another call of this WebSocket is under way: wait for its answer"
@@ -254,17 +259,30 @@ class Viewer:
             self._is_calling = True
             self._start(self._answer(frame))
 
+    async def _stop(self) -> None:
+        try:
+            while self._stop_ids:  # all that arrived during one stop share the next
+                ids, self._stop_ids = self._stop_ids, []
+                ok, text = await self._reply(Call("stop"))
+                for number in ids:
+                    self._out.enqueue(socket_messages.Answer(number, ok, text))
+        finally:
+            self._is_stopping = False
+
     async def _answer(self, frame: Call) -> None:
         try:
+            ok, text = await self._reply(frame)
+        finally:
+            self._is_calling = False
+        self._out.enqueue(socket_messages.Answer(frame.id, ok, text))
+
+    async def _reply(self, frame: Call) -> tuple[bool, str]:
+        try:
             reply = await self._calls.call(self.who, frame.call, frame.payload)
-            ok, text = reply.success, reply.message
         except RequestRefusedError as error:
             self._counts.refuse(error.reason, self.who.origin)
-            ok, text = False, str(error)
-        finally:
-            if frame.call != "stop":
-                self._is_calling = False
-        self._out.enqueue(socket_messages.Answer(frame.id, ok, text))
+            return False, str(error)
+        return reply.success, reply.message
 
     # Outgoing messages.
 

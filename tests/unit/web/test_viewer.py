@@ -152,3 +152,31 @@ async def test_an_invalid_message_without_a_stop_is_only_refused() -> None:
     await page.take('{"call": "clear", "id": null}')
     assert page.stops == []
     assert page.counts.refused() == {"malformed": 1}
+
+
+async def test_every_press_is_answered_by_a_stop_that_was_sent_after_it() -> None:
+    """Each further press comes just as the stop before it ends."""
+    page, loop, sent, pressed = Page("viewer"), asyncio.get_running_loop(), list[int](), 0
+
+    def press() -> None:
+        nonlocal pressed
+        data = json.dumps({"call": "stop", "id": pressed})
+        pressed += 1
+        page.viewer._take(cast(Any, SimpleNamespace(type=aiohttp.WSMsgType.TEXT, data=data)))
+
+    async def call(who: object, verb: str, payload: object) -> ServiceReply:
+        sent.append(pressed)
+        if pressed < 9:
+            for _ in range(3):
+                loop.call_soon(press)
+        return ServiceReply(True, str(len(sent)))
+
+    page.viewer._calls.call = call  # type: ignore[method-assign, assignment]
+    press()
+    async with asyncio.timeout(PATIENCE_S):
+        while len(page.viewer._out._out) < 10:
+            await asyncio.sleep(0)
+    answers = [json.loads(text) for text in page.viewer._out._out]
+    assert [answer["answer"] for answer in answers] == list(range(10))
+    assert all(sent[int(answer["text"]) - 1] > answer["answer"] for answer in answers)
+    assert len(sent) == 4  # three presses share a stop
