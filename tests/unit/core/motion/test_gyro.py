@@ -577,3 +577,25 @@ def test_the_declared_error_of_the_track_is_a_fraction_of_its_multiplier() -> No
     odometry = OdometryConfig(gyro_scale_std=0.0, wheel_separation_multiplier_std=0.2)
     kinematics = Kinematics(DriveConfig(wheel_separation_multiplier=2.0))
     assert claims(odometry, kinematics, 3200).scale == pytest.approx(0.1)
+
+
+def test_a_bias_that_was_wrong_since_the_last_rest_becomes_doubt() -> None:
+    """Its step is too small to contradict wheels that turn all the time."""
+    bench = proved(noise=0.002)
+    bench.bias = 0.03
+    for _ in range(10):
+        bench.run(2.0, 0.8)
+        bench.run(2.0, -0.8)
+    assert bench.says() == "used"
+    bench.run(2.0)
+    assert abs(bench.told - bench.true) == pytest.approx(1.2, abs=0.1)
+    assert abs(bench.told - bench.true) < 2.0 * abs(bench.doubt)
+
+
+def test_the_rate_of_a_gyro_that_disagrees_is_as_uncertain_as_the_difference() -> None:
+    bench = proved(noise=0.002)
+    bench.run(3.0, 0.1, skid=10.0)
+    assert bench.says() == "disagrees"
+    turn = bench.gyro.turn(bench.now_ns + LINE_NS, DT, DT, 0.0, False, CLAIMS)
+    assert turn is not None
+    assert turn.rate_variance == pytest.approx(0.81, rel=0.1)
