@@ -66,7 +66,7 @@ AGREES = 0.5  # deviations, below which a short comparison restarts: a new fault
 MARGIN = 0.02  # rad, standard deviation of the wheels' turn by encoder counts and vibration
 MAX_DELAY_S = 0.05  # a gyro with this delay does not contradict the wheels
 DEVIATIONS = 3.0  # of what both claim; more is a contradiction
-DISAGREES_S = 5.0  # of driving after a contradiction
+DISAGREES_S = 5.0  # after a contradiction
 
 # True turn divided by the turn of the wheels, on any floor.
 MIN_RATIO, MAX_RATIO = 0.25, 2.5
@@ -402,8 +402,7 @@ class Gyro(Struct):
                     self._compare(block, claims)
                 else:
                     self._try(block, known)
-        if self.disagrees_s > 0.0 and self.rest_s <= REST_S:
-            self.disagrees_s = max(0.0, self.disagrees_s - dt)
+        self.disagrees_s = max(0.0, self.disagrees_s - dt)
         self._judge(silent, known)
         if self.does not in ("used", "disagrees"):
             return self._wheels(dt, wheels, claims)

@@ -214,9 +214,10 @@ def test_wheels_that_roll_on_with_whole_counts_in_each_line_are_a_fault(speed: f
     assert bench.faults[0] == "wheel_runaway"
 
 
-def test_wheels_that_speed_up_after_a_stop_to_one_speed_are_a_fault() -> None:
+@pytest.mark.parametrize("before", [0.0, 0.1])
+def test_wheels_that_speed_up_after_a_stop_to_one_speed_are_a_fault(before: float) -> None:
     bench = driven(all_at(1.0))
-    bench.run(all_at(1.0), STILL, seconds=0.1)
+    bench.run(all_at(1.0), STILL, seconds=before)
     bench.run(all_at(3.0), STILL, seconds=2.0)
     assert bench.faults[0] == "wheel_runaway"
 
