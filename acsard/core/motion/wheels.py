@@ -376,9 +376,7 @@ class Wheels(Struct):
         speed, off, command = wheel.speed, wheel.off, wheel.command
         if self._are_swapped(i):
             return
-        # The smoothed speed of a coarse encoder lasts longer than the motion.
-        rolled = abs(wheel.apart_angle) >= AGREEMENT * abs(speed) * wheel.apart_s
-        goes_on = angle * off > 0.0 and speed * off > 0.0 and rolled
+        goes_on = angle * off > 0.0 and speed * off > 0.0
         if goes_on and abs(command) < COMMANDED:
             # A firmware that waits for the next count keeps the last speed of a wheel that stops:
             # it followed the command until the last two counts, and never changes after them.
