@@ -592,6 +592,7 @@ MOMENTS: dict[str, tuple[float, Callable[[Plan], bool], Callable[[Plan, random.R
     "slow wheels": (0.15, _is_plain, _driven(moments_of_wheels.slow_wheels)),
     "wrong counts": (0.03, _any, _driven(moments_of_wheels.wrong_counts)),
     "set points": (0.05, _is_plain, _driven(moments_of_wheels.set_points)),
+    "stuck encoder": (0.03, _is_plain, _driven(moments_of_wheels.stuck_encoder)),
 }
 """The share of the plans that have each moment, of those that can have it, whether a plan can have
 it, and what makes it."""

@@ -87,6 +87,34 @@ def _motors(config: dict[str, Any], which: str, dice: random.Random) -> list[int
     return sorted(MOTORS.index(wheels[name][1]) for name in names)
 
 
+def stuck_encoder(plan: Plan, dice: random.Random, driver: Sender) -> None:
+    """Drive steadily, while one encoder after the other is stuck."""
+    plan["config"].get("odometry", {}).pop("gyro", None)
+    events: list[dict[str, Any]] = []
+    phases: list[list[Any]] = []
+    at = 0.0
+    while at < plan["seconds"]:
+        phases += [
+            [round(at, 3), 0.0, 0.0],
+            [round(at + 1.3, 3), *slow_speeds(dice, plan["config"])],
+        ]
+        begin, lasts = at + 1.3 + dice.uniform(1.0, 4.0), dice.uniform(6.0, 10.0)
+        at = begin + lasts
+        events.append({
+            "at": round(begin, 3), "do": "board", "for": round(lasts, 3),
+            "fault": ["stuck_encoder", dice.randrange(4)],
+        })  # fmt: skip
+        phases.append([round(at, 3), 0.0, 0.0])
+        at += dice.uniform(3.0, 4.0)
+        events.append({
+            "at": round(at, 4), "do": "call", "verb": "clear", "named": True, "late": 0.01,
+            "lost": False, "twice": False, "by": "op9", "via": "native",
+        })  # fmt: skip
+        at += 0.5
+    driver |= {"phases": phases}
+    plan["events"] = events
+
+
 def wrong_counts(plan: Plan, dice: random.Random, driver: Sender) -> None:
     """Let the configuration name a wrong number of counts on a link with a check."""
     config = plan["config"]

@@ -28,6 +28,7 @@ PLANS_OF_FAULT = {
     "replay": "recorded", "lines endless": "endless", "wheel reversed": "reversed_motor",
     "wheel runaway": "slow wheels", "wheel fast": "gain",
     "wheel blocked": "dead_motor",
+    "wheel stuck": "stuck encoder", "counts wrong": "wrong counts",
     "session gap": "mute", "session stale": "mute", "odometry silent": "mute",
     "odometry gap": "mute",
     "loop end": "restart", "robot end": "restart", "gate late": "stall in step",
@@ -882,6 +883,26 @@ FAULTS = (
         '[replace(cause, kept=True) for cause in latches.causes if cause.kind != "fault"]',
     ),
     # gyro
+    fault(
+        "wheel stuck",
+        "a wheel that seems not to turn is neither left out nor named",
+        WHEELS_LAW,
+        "OUT_BLOCKS = 2\n",
+        "OUT_BLOCKS = 1_000_000\n",
+        Edit(WHEELS_LAW, 'self._warn(i, wheel, "wheel_blocked")', "pass"),
+        Edit(
+            WHEELS_LAW,
+            'self._warn(i, wheel, wheel.warning or ("wheel_fast" if fast else "wheel_slow"))',
+            "pass",
+        ),
+    ),
+    fault(
+        "counts wrong",
+        "counts that contradict the speeds of their lines are believed",
+        "core/link/counts_check.py",
+        "MAX_DIFFERENCE = 0.2 ",
+        "MAX_DIFFERENCE = 20.0 ",
+    ),
     fault(
         "gyro hangs",
         "a gyro that repeats one rate is believed",

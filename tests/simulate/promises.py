@@ -86,7 +86,6 @@ CLEARLY = 4.0
 
 DIALECTS = {
     "unpadded", "spaces", "trailing_comma", "no_sample", "no_check", "constant_answers",
-    "replies_twice",
 }  # fmt: skip
 """Forms of the protocol, and habits of the board, that give the daemon no trouble."""
 

@@ -107,3 +107,19 @@ def test_state_names_a_wheel_that_does_not_turn(seconds: float, text: str, findi
     with pytest.raises(BrokenError, match="is named") if finding else nullcontext():
         for n in range(200, 200 + round(seconds * 100)):
             judge.see(n * NS // 100, [1.0, 0.0, 1.0, 1.0], frozenset(), {"dead_motor"}, 0)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text", "finding"),
+    [(3.8, "", False), (5.8, "", True), (9.0, "front_left wheel reports that", False)],
+)
+def test_state_names_a_wheel_whose_encoder_is_stuck(
+    seconds: float, text: str, finding: bool
+) -> None:
+    witness = Witness(CONFIG)
+    judge = Wheels(witness, lambda: {"wheel_fault": text})
+    witness.lies = [("stuck_encoder", (witness.motors[1][0],))]
+    witness.last = (1.0,) * 4
+    with pytest.raises(BrokenError, match="is named") if finding else nullcontext():
+        for n in range(200, 200 + round(seconds * 100)):
+            judge.see(n * NS // 100, [1.0] * 4, frozenset(), {"stuck_encoder"}, 0)

@@ -140,6 +140,7 @@ class Wheels:
             del self._recent[0]
         self._recent.append((at_ns, fastest))
         motors = bool(lies) and lies <= MOTORS | {"gain", "dead_motor"}
+        motors |= lies == {"stuck_encoder"}
         found = not causes.isdisjoint(FAULTS)
         unseen = passed_ns > NS // 5
         if not motors or found or unseen or calm_ns > at_ns - NS or not witness.linked:
@@ -166,8 +167,12 @@ class Wheels:
             self._swapped(at_ns, passed_ns / NS, commands[0], commands[1])
 
     def _named(self, at_ns: int, place: int, seconds: float, speed: float) -> None:
-        """Check that `state` names a wheel that does not turn."""
-        if at_ns - self._since_ns[place] < self._response_ns or abs(speed) > TURNS:
+        """Check that `state` names a wheel that does not turn, or seems not to."""
+        if at_ns - self._since_ns[place] < self._response_ns:
+            return
+        if self._witness.lies == [("stuck_encoder", (self._witness.motors[place][0],))]:
+            self._stuck(at_ns, place, seconds, abs(speed))
+        if abs(speed) > TURNS:
             return
         command, motor = abs(self._commands[place]), self._witness.motors[place][0]
         faults = [name for name, values in self._witness.lies if values[:1] == (motor,)]
@@ -181,6 +186,17 @@ class Wheels:
         text = self._state()["wheel_fault"]
         if f"{WHEELS[place]} wheel is blocked" not in text:
             raise BrokenError("a wheel that does not turn is named", at_ns, f"{place}: {text!r}")
+
+    def _stuck(self, at_ns: int, place: int, seconds: float, speed: float) -> None:
+        """Check that `state` names a wheel that turns, and whose encoder shows nothing of it."""
+        self._missed[place] += speed * seconds
+        if self._missed[place] <= 2 * self._roll + ROOM_RAD + speed * NAMED_S:
+            return
+        self._missed[place] = 0.0
+        self._witness.counts["wheels stuck"] += 1
+        text = self._state()["wheel_fault"]
+        if f"{WHEELS[place]} wheel" not in text:
+            raise BrokenError("a stuck encoder is named", at_ns, f"{WHEELS[place]}: {text!r}")
 
     def _too_fast(self, at_ns: int, slowest: float) -> None:
         """Check that a robot all of whose wheels are too fast is stopped."""
