@@ -121,6 +121,18 @@ def cut(transport: asyncio.BaseTransport | None) -> None:
             raise
 
 
+def unsent_bytes(transport: asyncio.BaseTransport | None) -> int:
+    """Return how many bytes wait for the client; 0 for a TLS connection that was closed twice."""
+    if transport is None:
+        return 0
+    try:
+        return int(transport.get_write_buffer_size())  # type: ignore[attr-defined]
+    except AttributeError:  # as in `cut`, on all versions of Python
+        if not transport.is_closing():
+            raise
+        return 0
+
+
 async def secured(request: web.Request, response: web.StreamResponse) -> None:
     """Add the security headers to an answer; a file keeps its own content security policy."""
     response.headers.update(HEADERS)

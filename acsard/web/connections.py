@@ -19,7 +19,7 @@ from typing import Never, Protocol
 from aiohttp import StreamReader, web
 
 from acsard.host.rate_limits import Places
-from acsard.web.answers import HEADERS, cut, problem
+from acsard.web.answers import HEADERS, cut, problem, unsent_bytes
 from acsard.web.callers import is_loopback, network_of, unmapped
 from acsard.web.metrics import Counts
 from acsard.web.tasks import start
@@ -196,7 +196,7 @@ class HttpConnection(web.RequestHandler):
     @property
     def is_busy(self) -> bool:
         """Whether a request is being answered, or a WebSocket is open."""
-        return self._serves or bool(self.transport and self.transport.get_write_buffer_size())
+        return self._serves or unsent_bytes(self.transport) > 0
 
     @contextmanager
     def serving(self, body: StreamReader) -> Iterator[None]:

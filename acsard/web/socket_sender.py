@@ -19,7 +19,7 @@ from aiohttp import web
 from acsard.core.messages.keys_and_roles import BEAT
 from acsard.host import clock
 from acsard.host.rate_limits import Buckets, Rate
-from acsard.web.answers import cut
+from acsard.web.answers import cut, unsent_bytes
 from acsard.web.callers import Reason
 from acsard.web.metrics import Counts
 from acsard.web.socket_messages import Refused
@@ -201,11 +201,8 @@ class Outgoing:
         # All keys share one time grid, so they wake the task together.
         subscription.due = (now // subscription.period + 1) * subscription.period
         if subscription.stream.number != subscription.sent:
-            if self._unread() > MAX_UNREAD_BYTES:
+            if unsent_bytes(self._transport) > MAX_UNREAD_BYTES:
                 self._counts.add("frames_left_out")
             else:
                 await self._send(subscription.next())
         return subscription.due
-
-    def _unread(self) -> int:
-        return 0 if self._transport is None else self._transport.get_write_buffer_size()

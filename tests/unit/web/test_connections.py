@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from asyncio import sslproto
 from collections.abc import AsyncIterator
 from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path
@@ -111,6 +112,16 @@ async def test_a_token_whose_connections_are_all_busy_gets_no_further_one() -> N
         assert not owned.all.claim(owned.new(), "phone")
         assert owned.all.claim(owned.new(), "tv")  # another token has its own
     assert owned.aborted() == []
+
+
+async def test_a_tls_connection_that_was_closed_twice_gives_its_place_to_a_new_one() -> None:
+    """A WebSocket's end closes it twice. Until it is gone, it must not fail a stop of its token."""
+    owned = Owned(MAX_OF_TOKEN)
+    closed = sslproto._SSLProtocolTransport(asyncio.get_running_loop(), Mock())
+    closed.close()
+    closed.close()
+    owned.made[0].transport = closed
+    assert owned.all.claim(owned.new(), "phone")
 
 
 async def test_all_connections_of_a_token_end_and_a_socket_gets_the_reason() -> None:
