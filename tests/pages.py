@@ -390,27 +390,27 @@ COMMANDS: dict[str, How] = {
     "acsard echo wheel_states imu --csv > drive.csv": Elsewhere(
         SIMULATED, "test_calibrate_reads_a_drive_that_echo_recorded_as_csv"
     ),
-    "acsard calibrate": Elsewhere(
+    "acsard calibrate drive": Elsewhere(
         GUIDED, "test_a_person_with_a_gyro_is_guided_from_the_start_to_the_written_file"
     ),
-    "acsard calibrate --method tape --write": Elsewhere(
+    "acsard calibrate drive --method tape --write": Elsewhere(
         GUIDED, "test_a_person_with_a_tape_alone_is_guided_to_the_written_file"
     ),
-    "acsard calibrate --positions sim/pose --yes": Elsewhere(
+    "acsard calibrate drive --poses sim/pose --yes": Elsewhere(
         GUIDED, "test_the_simulator_is_calibrated_by_its_true_pose_without_a_person"
     ),
-    "acsard calibrate --log drive.csv": PRINTED,
+    "acsard calibrate log drive.csv": PRINTED,
     # deploy/calibration
-    "acsard calibrate --log drive.csv --config acsard.toml": PRINTED,
-    "acsard calibrate --log drive.csv --config acsard.toml --write": Elsewhere(
+    "acsard calibrate log drive.csv --config acsard.toml": PRINTED,
+    "acsard calibrate log drive.csv --config acsard.toml --write": Elsewhere(
         CALIBRATE, "test_write_keeps_the_comments_and_a_second_time_finds_nothing_to_improve"
     ),
     "pip install rosbags": UntestedCommand("a library of PyPI that the tests have"),
     "python3 bag_to_csv.py drive drive.csv --wheels /joint_states --left left_wheel "
     "--right right_wheel --imu /imu/data": Elsewhere(
-        CALIBRATE, "test_a_script_converts_a_bag_to_a_log"
+        "tests/unit/calibration/test_cases.py", "test_one_message_with_the_stamp_0_is_left_out"
     ),
-    "acsard calibrate --log drive.csv --distance 4.03 --write": Elsewhere(
+    "acsard calibrate log drive.csv --distance 4.03 --write": Elsewhere(
         CALIBRATE, "test_a_distance_measures_the_wheels"
     ),
     "sudo apt install gcc libsimavr-dev libelf-dev": InCi("libsimavr-dev"),

@@ -20,7 +20,7 @@ from acsard.cli import UNLISTED, VERBS
 from acsard.host.version import commit_of
 from deploy.release import contents
 from tests.pages import ROOT
-from tests.unit.calibration.cut import usual
+from tests.unit.calibration.logs import usual
 
 pytestmark = [
     pytest.mark.slow,
@@ -53,7 +53,7 @@ WORKS = {
     "recording": (0, "[being recorded]"),
     "recording show": (0, "link up"),
     "recording export 1 {}/export.csv --csv": (0, "rows in"),
-    "calibrate --log {}/drive.csv": (0, "wheel_separation_multiplier"),
+    "calibrate log {}/drive.csv": (0, "wheel_separation_multiplier"),
     "drive": (2, "reads single key presses"),
     "mcu check": (2, "`acsard mcu check --port DEVICE`"),
 }

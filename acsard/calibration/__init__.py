@@ -1,1 +1,1 @@
-"""`acsard calibrate`: computes wheel radii, effective track and their uncertainty from drives."""
+"""`acsard calibrate`: geometry and noise from a recorded drive, or from a guided one."""

@@ -1,308 +1,445 @@
-"""Fits the parameters of the calibration to the measurements of all sensors, by Gauss-Newton.
+"""Fits the geometry of a robot to its runs: one Gauss-Newton with one prior.
 
-Each sensor contributes its evidence to the normal equations, separately for each block (a few
-seconds of driving). The standard deviations come from a jackknife over the blocks (Quenouille and
-Tukey), so they are right even if the errors within a block are correlated.
+The parameters are the logarithms of the factors of the configured radii and track, and what the
+sensors need beside them. There are no case distinctions: what a log does not show stays as
+configured, with the standard deviation of its prior. Each run is left out in turn (long ones are
+cut). The errors on the runs that were left out decide whether the new values are better.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from enum import IntEnum
+import math
+from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.log_table import Floats
-from acsard.calibration.runs import Complexes, Mask
-from acsard.core.config.settings import DriveConfig
+from acsard.calibration.log import Complexes, Floats, LogError, Mask, Run
+from acsard.core.config.settings import Config, DriveConfig
+from acsard.core.values import Metres
 
+LEFT, RIGHT, TRACK, BIAS, SCALE, GYRO_DELAY, POSE_DELAY, AHEAD, ASIDE = range(9)
+GEOMETRY = slice(LEFT, TRACK + 1)
 
-class Parameter(IntEnum):
-    """Indices of the fitted parameters in an array of `PARAMETER_COUNT` numbers."""
+# Standard deviations before a log is known: tyres and load change the radii by 2 %, and skidding
+# may double the track. The scale of a gyro has that of `odometry.gyro_scale_std`.
+RADIUS_STD, TRACK_STD, DELAY_STD_S, LEVER_STD_M = 0.02, 1.0, 0.3, 0.2
+BIAS_STD, REST_BIAS_STD = 0.05, 1e-3  # rad/s, of a gyro without and with a rest
 
-    LEFT = 0  # radius of the left wheels / configured wheel radius
-    RIGHT = 1  # radius of the right wheels / configured wheel radius
-    INVERSE_TRACK = 2  # configured wheel separation / effective track
-    TRACK_GROWTH = 3  # fraction by which the effective track grows for each rad/s of turn rate
-    DELAY = 4  # of the positions' recorded times after those of the wheels, s
-    SENSOR_X = 5  # position sensor ahead of the robot's middle, m
-    SENSOR_Y = 6  # position sensor to the left of the robot's middle, m
-    BIAS_ERROR = 7  # gyro bias that the measurement at rest leaves, rad/s
-    SCALE_ERROR = 8  # of the gyro, relative: with 0.01, it shows turns 1 % too large
+HUBER = 1.5  # robust standard deviations of a sensor, beyond which a residual counts linearly
+STEP_S = 1.0  # over which the turns of gyro and wheels are compared
+HEADING_STEP_S = 3.0  # the same of headings, for the report: an error is below half a turn
+GRID_S = 0.02  # of the wheels' path
+MIN_ROLL = 0.02  # rad, in a step; at rest there is nothing to compare
+HOLE_S, HOLE_PERIODS = 0.3, 8.0  # a hole in the samples of a gyro is longer than both
 
+TRACKS = np.linspace(math.log(0.4), math.log(4.0), 60)  # starting values
+DELAYS_S = np.linspace(-1.0, 1.0, 41)
+FINEST = 1e-4  # rad or m, of any sensor
+STEPS, CONVERGED = 15, 1e-4
+PIECES = 12  # at least
 
-PARAMETER_COUNT = len(Parameter)
-RADII = [Parameter.LEFT, Parameter.RIGHT]
-# Radii, inverse track and track growth.
-WHEEL_PARAMETERS = list(Parameter)[: Parameter.DELAY]
+SURE = 2.0  # standard deviations by which the new values must be better, or else by half
+CAP = 10.0  # robust standard deviations: a residual of a run that was left out counts as at most
+WORSE = 0.02  # by which the error of one sensor may grow, as a fraction
 
-HUBER_LIMIT = 2.0  # standard deviations of a residual, above which its weight is less than 1
+SENSORS = "gyro", "positions", "headings", "tape"
 
 
 class Base(Struct, frozen=True):
-    """The configured geometry, to which the fitted parameters are relative. Lengths are in m."""
+    """The configured geometry, m: radii and track with their multipliers."""
 
-    radius: float
-    separation: float
-    left: float  # configured multiplier of the left wheels' radius
-    right: float  # configured multiplier of the right wheels' radius
-    track: float  # configured multiplier of the wheel separation
+    left: Metres
+    right: Metres
+    track: Metres
 
     @classmethod
     def of(cls, drive: DriveConfig) -> Base:
         return cls(
-            drive.wheel_radius, drive.wheel_separation, drive.left_wheel_radius_multiplier,
-            drive.right_wheel_radius_multiplier, drive.wheel_separation_multiplier,
-        )  # fmt: skip
+            drive.wheel_radius * drive.left_wheel_radius_multiplier,
+            drive.wheel_radius * drive.right_wheel_radius_multiplier,
+            drive.wheel_separation * drive.wheel_separation_multiplier,
+        )
 
-    def start(self) -> Floats:
-        """Return the parameters that describe the configured robot; those of sensors are 0."""
-        parameters = np.zeros(PARAMETER_COUNT)
-        parameters[: Parameter.TRACK_GROWTH] = self.left, self.right, 1 / self.track
-        return parameters
+    def motion(self, p: Floats, left: Floats, right: Floats) -> tuple[Floats, Floats]:
+        """Return distances, m, and turns, rad, for the rolled angles of the sides."""
+        a, b = self.left * math.exp(p[LEFT]) * left, self.right * math.exp(p[RIGHT]) * right
+        return (a + b) / 2, (b - a) / (self.track * math.exp(p[TRACK]))
 
-    def configured(self, parameters: Floats) -> Floats:
-        """Return `parameters` with the configured geometry, and with a track growth of 0."""
-        return np.concatenate((self.start()[: Parameter.DELAY], parameters[Parameter.DELAY :]))
-
-    @property
-    def radius_per_separation(self) -> float:
-        """Turn of the robot, rad, if the right wheels roll 1 rad further than the left ones."""
-        return self.radius / self.separation
+    def path(self, p: Floats, left: Floats, right: Floats) -> tuple[Complexes, Floats]:
+        """Return positions, m, and headings, rad, for rolled angles, from zero."""
+        distance, turn = self.motion(p, np.diff(left), np.diff(right))
+        heading = np.concatenate(([0.0], np.cumsum(turn)))
+        step = distance * np.sinc(turn / 2 / np.pi) * np.exp(1j * (heading[:-1] + turn / 2))
+        return np.concatenate(([0j], np.cumsum(step))), heading
 
 
-class Evidence(Struct, frozen=True):
-    """The contribution of one sensor to the normal equations of the fit, block by block.
+class Piece:
+    """A run, or a part of one, prepared for many evaluations of its residuals."""
 
-    J is the Jacobian of the predictions, r the residuals and W their weights. `fit()` divides J^T W
-    J and J^T W r by the noise variance of the sensor.
+    def __init__(self, run: Run, base: Base, sensors: Sequence[str] = SENSORS) -> None:
+        self.run, self.base = run, base
+        step = max(1, round(GRID_S / float(np.median(np.diff(run.t)))))
+        picked = np.append(np.arange(0, len(run.t) - 1, step), len(run.t) - 1)
+        self.t, self.left, self.right = run.t[picked], run.left[picked], run.right[picked]
+        edges = np.linspace(self.t[0], self.t[-1], max(1, round(run.seconds / STEP_S)) + 1)
+        self.begin, self.end = edges[:-1], edges[1:]
+        self.rolls = [np.diff(np.interp(edges, run.t, side)) for side in (run.left, run.right)]
+        self.rolling = np.abs(self.rolls[0]) + np.abs(self.rolls[1]) > MIN_ROLL
+        steps = np.diff(run.gyro_t)
+        self.gyro = len(steps) > 1 and "gyro" in sensors
+        if self.gyro:
+            wide = steps > max(HOLE_S, HOLE_PERIODS * float(np.median(steps)))
+            self.hole_begins = np.append(run.gyro_t[:-1][wide], run.gyro_t[-1])
+            self.hole_ends = np.append(run.gyro_t[0], run.gyro_t[1:][wide])
+
+    def residuals(self, p: Floats) -> dict[str, Floats]:
+        """Return the residuals of each sensor: rad of a gyro or heading, m, or deviations."""
+        run, made = self.run, dict[str, Floats]()
+        if self.gyro:
+            begin, end = self.begin + p[GYRO_DELAY], self.end + p[GYRO_DELAY]
+            ends, begins = (np.interp(at, run.gyro_t, run.turned) for at in (end, begin))
+            whole = self.rolling & (
+                np.searchsorted(self.hole_ends, begin, side="right")
+                == np.searchsorted(self.hole_begins, end) + 1
+            )
+            turned = (ends - begins - p[BIAS] * (end - begin)) * math.exp(p[SCALE])
+            made["gyro"] = np.where(whole, turned - self.base.motion(p, *self.rolls)[1], np.nan)
+        if not (len(run.place_t) or len(run.yaw_t) or run.tape):
+            return made
+        place, heading = self.base.path(p, self.left, self.right)
+        if len(run.yaw_t):
+            at = run.yaw_t - p[POSE_DELAY]
+            off = run.yaw - np.interp(at, self.t, heading)
+            off = np.angle(np.exp(1j * (off - np.angle(np.exp(1j * off).sum()))))
+            made["headings"] = self._inside(at, off - np.median(off))
+        if len(run.place_t) > 2:
+            at = run.place_t - p[POSE_DELAY]
+            model = np.interp(at, self.t, place.real) + 1j * np.interp(at, self.t, place.imag)
+            lever = (p[AHEAD] + 1j * p[ASIDE]) * np.exp(1j * np.interp(at, self.t, heading))
+            off = aligned(run.place, model + lever)
+            made["positions"] = self._inside(
+                np.concatenate((at, at)), np.concatenate((off.real, off.imag))
+            )
+        if run.tape:
+            seen = {"distance": abs(place[-1]), "turn": heading[-1]}
+            made["tape"] = np.array([(r.value - seen[r.quantity]) / r.std for r in run.tape])
+        return made
+
+    def _inside(self, at: Floats, values: Floats) -> Floats:
+        return np.where((at >= self.t[0]) & (at <= self.t[-1]), values, np.nan)
+
+
+def aligned(seen: Complexes, model: Complexes) -> Complexes:
+    """Return what remains of `seen` after `model` was turned and moved onto it, in its axes.
+
+    Three rounds of weights keep single wrong positions from turning the rest.
     """
-
-    normal: Floats  # left-hand sides J^T W J, shape (blocks, PARAMETER_COUNT, PARAMETER_COUNT)
-    score: Floats  # right-hand sides J^T W r, shape (blocks, PARAMETER_COUNT)
-    squares: Floats  # sum of weighted squared residuals per block
-    counts: Floats  # number of independent residuals per block
-
-
-def evidence_from_measurements(
-    jacobian: Floats, residual: Floats, weight: Floats, block: npt.NDArray[np.int64], blocks: int
-) -> Evidence:
-    """Return the evidence of one sensor from its measurements, summed by block.
-
-    The shape of `jacobian` is (measurements, PARAMETER_COUNT).
-    """
-    normal = np.zeros((blocks, PARAMETER_COUNT, PARAMETER_COUNT))
-    score = np.zeros((blocks, PARAMETER_COUNT))
-    weighted = jacobian * weight[:, None]
-    np.add.at(normal, block, weighted[:, :, None] * jacobian[:, None, :])
-    np.add.at(score, block, weighted * residual[:, None])
-    squares = np.bincount(block, weight * residual**2, blocks).astype(np.float64)
-    counts = np.bincount(block, minlength=blocks).astype(np.float64)
-    return Evidence(normal, score, squares, counts)
+    weight = np.ones(len(seen))
+    for _ in range(3):
+        share = weight / weight.sum()
+        a, b = seen - share @ seen, model - share @ model
+        turn = complex(np.vdot(b, weight * a))
+        off = a * np.conj(turn / abs(turn) if turn else 1.0) - b
+        size = np.abs(off)
+        weight = np.minimum(1.0, HUBER * np.median(size) / np.maximum(size, 1e-12))
+    return np.asarray(off)
 
 
-def condition(normal: Floats) -> float:
-    """Return the condition number of `normal` after scaling its diagonal to 1.
+class Problem:
+    """The pieces of a log, the prior, and the robust size of each sensor's residuals."""
 
-    It is infinite if a parameter does not influence the predictions.
-    """
-    size = np.sqrt(np.diag(normal))
-    if not np.all(size > 0.0):
-        return np.inf
-    return float(np.linalg.cond(normal / np.outer(size, size)))
+    def __init__(self, pieces: Sequence[Piece], bias: float, stds: Floats) -> None:
+        self.pieces, self.stds = pieces, stds
+        self.mean = np.zeros(len(stds))
+        self.mean[BIAS] = bias
+        self.sensors = [s for s in SENSORS if any(s in p.residuals(self.mean) for p in pieces)]
+        free = [LEFT, RIGHT, TRACK]
+        free += [BIAS, SCALE, GYRO_DELAY] if "gyro" in self.sensors else []
+        free += [POSE_DELAY] if {"positions", "headings"} & set(self.sensors) else []
+        free += [AHEAD, ASIDE] if "positions" in self.sensors else []
+        self.free = np.array(free)
+
+    def sizes(self, p: Floats) -> dict[str, float]:
+        """Return the robust standard deviation of each sensor's residuals."""
+        found = [piece.residuals(p) for piece in self.pieces]
+        sizes = {s: _robust([r[s] for r in found if s in r]) for s in self.sensors}
+        return sizes | {"tape": 1.0}  # readings are few, and come with their deviations
+
+    def normal(self, p: Floats) -> tuple[Floats, Floats, Floats, dict[str, float]]:
+        """Return normal matrix, curvature and score of each piece, and the size of each sensor.
+
+        Their units are deviations of the prior. The normal matrices lead to the minimum. Only
+        residuals that are no outliers bend it, and the deviations follow from its curvature. Each
+        sensor is weighted by the scatter of its pieces' scores, so residuals that repeat each
+        other count once.
+        """
+        sizes, count = self.sizes(p), len(self.free)
+        normal = np.zeros((len(self.pieces), len(self.sensors), count, count))
+        curvature, score = np.zeros(normal.shape), np.zeros(normal.shape[:-1])
+        squares = np.zeros((len(self.sensors), 2))
+        for n, piece in enumerate(self.pieces):
+            center = piece.residuals(p)
+            moved = []
+            for index in self.free:
+                q, step = p.copy(), 1e-3 * self.stds[index]
+                q[index] += step
+                moved.append(piece.residuals(q))
+            for k, sensor in enumerate(self.sensors):
+                if sensor not in center:
+                    continue
+                e = center[sensor]
+                jacobian = np.array([(m[sensor] - e) * 1e3 for m in moved])
+                sound = np.isfinite(e) & np.isfinite(jacobian).all(axis=0)
+                e, jacobian = e[sound], jacobian[:, sound]
+                weight = np.minimum(1.0, HUBER * sizes[sensor] / np.maximum(np.abs(e), 1e-12))
+                normal[n, k] = (jacobian * weight) @ jacobian.T
+                curvature[n, k] = (jacobian * (weight == 1.0)) @ jacobian.T
+                score[n, k] = -(jacobian * weight) @ e
+                squares[k] += (weight * e * e).sum(), len(e)
+        for k, sensor in enumerate(self.sensors):
+            inner = np.linalg.pinv(normal[:, k].sum(axis=0), rcond=1e-9, hermitian=True)
+            apart = score[:, k] - score[:, k].mean(axis=0)
+            rank = max(1, int(np.linalg.matrix_rank(inner, hermitian=True)))
+            scatter = float(np.einsum("bi,ij,bj->", apart, inner, apart)) / rank
+            variance = max(scatter, squares[k, 0] / max(1.0, squares[k, 1]), FINEST**2)
+            if sensor == "tape":
+                variance = 1.0
+            for each in (normal, curvature, score):
+                each[:, k] /= variance
+        return normal.sum(axis=1), curvature.sum(axis=1), score.sum(axis=1), sizes
+
+    def solve(self, start: Floats) -> Solution:
+        p, prior = start.copy(), np.eye(len(self.free))
+        scale = self.stds[self.free]
+        for _ in range(STEPS):
+            normal, curvature, score, sizes = self.normal(p)
+            off = (p - self.mean)[self.free] / scale
+            step = np.linalg.solve(normal.sum(axis=0) + prior, score.sum(axis=0) - off)
+            step *= min(
+                1.0, 0.3 / max(1e-12, float(np.abs(step[: TRACK + 1] * scale[: TRACK + 1]).max()))
+            )
+            p[self.free] += step * scale
+            if float(np.abs(step).max()) < CONVERGED:
+                break
+        whole = curvature.sum(axis=0) + prior
+        left_out = np.repeat(p[None], len(self.pieces), axis=0)
+        for n in range(len(self.pieces)):
+            left_out[n, self.free] -= np.linalg.solve(whole - curvature[n], score[n]) * scale
+        return Solution(p, left_out, self._covariance(whole, left_out), sizes)
+
+    def _covariance(self, whole: Floats, left_out: Floats) -> Floats:
+        # The sum of two, each of which misses what the other one sees: the jackknife misses what a
+        # single piece shows, and the inverse information that a robot skids for a whole piece. The
+        # prior is in the second one.
+        scale = np.diag(self.stds[self.free])
+        # A reading by tape has its deviation, and may be the only one of its kind.
+        sensed = left_out[[not piece.run.tape for piece in self.pieces]][:, self.free]
+        apart, n = sensed - sensed.sum(axis=0) / max(1, len(sensed)), max(1, len(sensed))
+        jackknife = apart.T @ apart * (n - 1) / n
+        return np.asarray((jackknife + scale @ np.linalg.inv(whole) @ scale)[GEOMETRY, GEOMETRY])
 
 
-def huber(residuals: Floats | Complexes, least: float) -> Floats:
-    """Return Huber's weight of each residual, by which outliers have less influence on a fit.
-
-    The standard deviation is 1.4826 times the median absolute residual, but at least `least`.
-    """
-    size = np.abs(residuals)
-    scale = max(least, 1.4826 * float(np.median(size)) if len(size) else 0.0)
-    return np.asarray(np.minimum(1.0, HUBER_LIMIT * scale / np.maximum(size, 1e-300)))
+class Solution(Struct, frozen=True):
+    p: Floats
+    left_out: Floats  # parameters without each piece
+    covariance: Floats  # of the logarithms of left radius, right radius and track
+    sizes: dict[str, float]
 
 
-Source = Callable[[Floats], Evidence]  # the evidence of a sensor, for given parameters
-
-MAX_STEPS = 30
-# The fit ends after a step below `SMALL`, and has converged if its last step is below `SETTLED`. A
-# step is the largest change of a wheel parameter: 0.01 is 1 % of a radius.
-SMALL, SETTLED = 1e-5, 0.02
-
-# Prior standard deviations of parameters that some logs do not determine.
-PRIOR_STD = {
-    Parameter.TRACK_GROWTH: 0.06,
-    Parameter.DELAY: 1.0,
-    Parameter.SENSOR_X: 0.5,
-    Parameter.SENSOR_Y: 0.5,
-}
-
-GYRO_SCALE_STD = 0.005  # relative, of a MEMS gyro; only positions can show its scale
-
-CONSTRAINT_WEIGHT = 1e9  # of a `Held` in the normal equations, large enough to enforce it
-
-# Constraint: weights of the parameters, shape (PARAMETER_COUNT,), and the value of their sum.
-Held = tuple[Floats, float]
-
-MIN_PAIR_BLOCKS = 16  # for a jackknife that also leaves out pairs of neighboring blocks
-
-MIN_BLOCKS = 5  # in a log; and least runs for a jackknife that leaves out whole runs
+def _robust(residuals: Sequence[Floats]) -> float:
+    joined = np.concatenate(residuals)
+    joined = joined[np.isfinite(joined)]
+    return 1.4826 * float(np.median(np.abs(joined))) + 1e-9 if len(joined) else 1.0
 
 
-def student_factor(free: Floats | float) -> Floats:
-    """Return the variance of Student's t with max(`free`, 3) degrees of freedom.
+def gyro_bias(runs: Sequence[Run]) -> tuple[float, float]:
+    """Return the rate that the gyro shows while the wheels rest, and its deviation, rad/s."""
+    rates = []
+    for run in runs:
+        if len(run.gyro_t) > 1:
+            t = (run.gyro_t[1:] + run.gyro_t[:-1]) / 2
+            rates.append((np.diff(run.turned) / np.diff(run.gyro_t))[run.rests(t)])
+    rest = np.concatenate(rates) if rates else np.zeros(0)
+    return (float(np.median(rest)), REST_BIAS_STD) if len(rest) > 20 else (0.0, BIAS_STD)
 
-    It is the factor by which to increase a variance that was estimated from few values.
-    """
-    free = np.maximum(3.0, free)
-    return np.asarray(free / (free - 2))
+
+def cut(runs: Sequence[Run], least: int = PIECES) -> list[Run]:
+    """Return the runs, the longest of them cut so that there are at least `least` of them."""
+    shortest = max(3.0, sum(run.seconds for run in runs) / least)
+    made = []
+    for run in runs:
+        count = max(1, round(run.seconds / shortest)) if len(runs) < least and not run.tape else 1
+        edges = np.linspace(run.t[0], run.t[-1], count + 1)
+        made += [run.part(a, b) for a, b in pairwise(edges)]
+    return [run for run in made if len(run.t) > 3 and moves(run)]
+
+
+def moves(run: Run) -> bool:
+    return max(float(np.ptp(run.left)), float(np.ptp(run.right))) > 0.2
+
+
+class Errors(Struct, frozen=True):
+    """Errors on runs that the fit did not use: as configured, and with the new values."""
+
+    now: float
+    new: float
 
 
 class Fit(Struct, frozen=True):
-    """The result of a fit: the fitted parameters, and the normal equations at these parameters."""
+    """The geometry that fits a log, and what it is worth on runs that were left out."""
 
-    parameters: Floats
-    normal: Floats  # left-hand sides, shape (blocks, PARAMETER_COUNT, PARAMETER_COUNT)
-    score: Floats  # right-hand sides, shape (blocks, PARAMETER_COUNT)
-    # Added to the left-hand side by constraints and priors, shape (PARAMETER_COUNT,
-    # PARAMETER_COUNT).
-    prior_normal: Floats
-    active: tuple[Parameter, ...]  # indices of the parameters that were fitted
-    converged: bool
-    prior_std: Mapping[Parameter, float]  # prior standard deviation of each parameter that has one
+    base: Base
+    p: Floats
+    covariance: Floats  # of the logarithms of left radius, right radius and track
+    sensors: tuple[str, ...]
+    pieces: tuple[Piece, ...]
+    left_out: Floats
+    gain: float  # logarithm of the ratio of the errors, now to new, of all sensors
+    gain_std: float
+    worst: float  # the same of the sensor that gains least
+    turn: Errors | None  # heading after a turn of 360 deg, rad
+    place: Errors | None  # rms of the positions, m
+    readings: Errors | None  # rms of a person's readings, in their deviations
+    sized: bool  # the log shows the size of the wheels, not only their ratio
+    unexplained: dict[str, float]  # share of each sensor's motion that differs from the wheels
 
-    def without(self, blocks: Mask) -> Floats:
-        """Return approximate parameters of a fit without the blocks in the mask."""
-        rest = self.normal[~blocks].sum(axis=0) + self.prior_normal
-        parameters = self.parameters.copy()
-        parameters[list(self.active)] -= _solved(rest, self.score[blocks].sum(axis=0), self.active)
-        return parameters
+    @property
+    def better(self) -> bool:
+        sure = self.gain > min(SURE * self.gain_std, math.log(2.0))
+        return sure and self.gain > 0.0 and self.worst > -WORSE
 
-    def marginal(self) -> Floats:
-        """Return the matrix of the normal equations, reduced to the wheel parameters.
+    @property
+    def shares(self) -> Floats:
+        """Relative deviations of track / mean radius, right / left radius, and mean radius."""
+        rows = np.array([[-0.5, -0.5, 1.0], [-1.0, 1.0, 0.0], [0.5, 0.5, 0.0]])
+        return np.asarray(np.sqrt(np.einsum("ri,ij,rj->r", rows, self.covariance, rows)))
 
-        Its condition number shows how well the log separates the radii from the track. The unknowns
-        are left radius, right radius and inverse track; without positions, the difference of the
-        radii and the inverse track.
-        """
-        total = self.normal.sum(axis=0) + self.prior_normal
-        rest = [index for index in self.active if index > Parameter.INVERSE_TRACK]
-        inner, cross = total[np.ix_(rest, rest)], total[:3, rest]
-        three = np.asarray(total[:3, :3] - cross @ np.linalg.solve(inner, cross.T))
-        sized = Parameter.DELAY in self.active
-        free = np.eye(3) if sized else np.array([[-0.5, 0.5, 0.0], [0.0, 0.0, 1.0]])
-        return np.asarray(free @ three @ free.T)
 
-    def covariance(self, runs: Sequence[int] = ()) -> Floats:
-        """Return the covariance of the parameters, from the jackknife and the prior information.
-
-        `runs` has the run of each block. The jackknife also leaves out whole runs if there are at
-        least `MIN_BLOCKS`.
-        """
-        alone = np.arange(len(self.score))
-        change, size = self._changes(alone)
-        # Leaving out neighboring blocks or whole runs shows errors that last longer than a block.
-        if len(alone) >= MIN_PAIR_BLOCKS:
-            size = np.maximum(size, self._changes(alone // 2)[1])
-        if len(set(runs)) >= MIN_BLOCKS:
-            size = np.maximum(size, self._changes(np.array(runs))[1])
-        wider = np.sqrt(size / np.maximum(change**2, 1e-150).sum(axis=0))
-        chance = change.T @ change * np.outer(wider, wider)
-        information = np.zeros(PARAMETER_COUNT)
-        information[list(self.prior_std)] = np.array(list(self.prior_std.values())) ** -2
-        total = self.normal.sum(axis=0) + self.prior_normal
-        pull = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT))
-        pull[list(self.active)] = _solved(total, np.diag(information), self.active)
-        return np.asarray(
-            chance + pull @ np.diag(1 / np.where(information, information, np.inf)) @ pull.T
+def fit(runs: Sequence[Run], config: Config) -> Fit:
+    """Fit the geometry. Raises `LogError` if the wheels never move beside a sensor."""
+    base, (bias, bias_std) = Base.of(config.drive), gyro_bias(runs)
+    pieces = [Piece(run, base) for run in cut(runs)]
+    stds = np.array([
+        RADIUS_STD, RADIUS_STD, TRACK_STD, bias_std, max(1e-6, config.odometry.gyro_scale_std),
+        DELAY_STD_S, DELAY_STD_S, LEVER_STD_M, LEVER_STD_M,
+    ])  # fmt: skip
+    problem = Problem(pieces, bias, stds)
+    if not problem.sensors:
+        raise LogError(
+            "no gyro and no positions while the wheels turn: record one of them at the same time "
+            "as the wheels, with times from the same clock"
         )
-
-    def _changes(self, group: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
-        change = np.array(
-            [self.without(group == number) - self.parameters for number in np.unique(group)]
-        )
-        squares = np.maximum(change**2, 1e-150)
-        free = 3 * squares.sum(axis=0) ** 2 / (squares**2).sum(axis=0) - 2
-        free = np.minimum(free, len(change) - 1)
-        return change, (1 - 1 / len(change)) * student_factor(free) * squares.sum(axis=0)
+    start = _start(problem)
+    solution = problem.solve(start)
+    return _judged(problem, solution, base)
 
 
-def fit(
-    sources: Sequence[Source], start: Floats, *, places: bool, gyro: bool = False,
-    bias_std: float = 0.0, held: Sequence[Held] = (),
-) -> Fit:  # fmt: skip
-    """Fit the parameters to the evidence of all sensors, starting from nearly right ones.
+def _start(problem: Problem) -> Floats:
+    p = problem.mean.copy()
+    for index, values in (
+        (TRACK, TRACKS),
+        (GYRO_DELAY, DELAYS_S),
+        (POSE_DELAY, DELAYS_S),
+        (TRACK, TRACKS),
+    ):
+        if index in problem.free:
+            tried = []
+            for value in values:
+                q = p.copy()
+                q[index] = value
+                tried.append((_cost(problem, q), abs(float(value)), float(value)))
+            p[index] = min(tried)[2]
+            if index != TRACK:
+                problem.mean[index] = p[index]
+    return p
 
-    Without positions, the mean of the two wheel radii stays as in `start`. A `bias_std` of 0 keeps
-    the gyro bias.
-    """
-    active = tuple(Parameter)[: Parameter.BIAS_ERROR if places else Parameter.DELAY]
-    usual = dict(PRIOR_STD)
-    if gyro:
-        active, usual[Parameter.SCALE_ERROR] = (*active, Parameter.SCALE_ERROR), GYRO_SCALE_STD
-    if bias_std:
-        active, usual[Parameter.BIAS_ERROR] = (*active, Parameter.BIAS_ERROR), bias_std
-    if not places:
-        both = np.zeros(PARAMETER_COUNT)
-        both[RADII] = 1.0
-        held = (*held, (both, float(both @ start)))
-    parameters, size = start.copy(), np.inf
-    for at in range(MAX_STEPS):
-        normal, score = _sum([source(parameters) for source in sources])
-        known, prior = _prior_terms(parameters, held, usual)
-        step = np.zeros(PARAMETER_COUNT)
-        step[list(active)] = _solved(normal.sum(axis=0) + known, score.sum(axis=0) + prior, active)
-        # Far from the solution, take only a part of the step, because the linearization holds only
-        # nearby. Later, halve each step: otherwise a residual could become an outlier in every
-        # second step.
-        size = float(np.max(np.abs(step[: Parameter.DELAY])))
-        whole = 1.0 if at < MAX_STEPS // 3 else 0.5
-        parameters = parameters + step * min(whole, 0.3 / size if size else 1.0)
-        if size < SMALL:
+
+def _cost(problem: Problem, p: Floats) -> float:
+    found = [piece.residuals(p) for piece in problem.pieces]
+    cost = 0.0
+    for sensor in problem.sensors:
+        e = np.abs(np.concatenate([r[sensor] for r in found if sensor in r]))
+        e = e[np.isfinite(e)]
+        cost += math.log(float(np.minimum(e, 1.0).mean()) + 1e-9) if len(e) else 0.0
+    return cost
+
+
+def _judged(problem: Problem, solution: Solution, base: Base) -> Fit:
+    squares = np.zeros((2, len(problem.pieces), len(problem.sensors)))
+    sums = np.zeros((2, len(problem.pieces), len(problem.sensors), 2))
+    for n, piece in enumerate(problem.pieces):
+        new = solution.left_out[n]
+        now = new.copy()
+        now[GEOMETRY] = 0.0
+        for k, p in enumerate((now, new)):
+            for s, e in piece.residuals(p).items():
+                at, e = problem.sensors.index(s), e[np.isfinite(e)]
+                squares[k, n, at] = (np.minimum(np.abs(e), CAP * solution.sizes[s]) ** 2).sum()
+                sums[k, n, at] = abs(e.sum()), len(e)
+
+    def gains(kept: Mask) -> Floats:
+        now, new = squares[:, kept].sum(axis=1)
+        return np.asarray(np.log((now + 1e-18) / (new + 1e-18)) / 2)
+
+    every = np.ones(len(problem.pieces), dtype=bool)
+    gain = gains(every)
+    others = [float(gains(np.arange(len(every)) != n).sum()) for n in range(len(every))]
+    spread = math.sqrt(len(every) - 1) * float(np.std(others))
+    rms = np.sqrt(squares.sum(axis=1) / np.maximum(1.0, sums[0, :, :, 1].sum(axis=0)))
+    errors = {s: Errors(*rms[:, k].tolist()) for k, s in enumerate(problem.sensors)}
+    turn = None
+    for s in ("gyro", "headings"):
+        if s in problem.sensors:
+            turn = _turn_errors(problem, solution)
             break
-    normal, score = _sum([source(parameters) for source in sources])
-    known, _ = _prior_terms(parameters, held, usual)
-    return Fit(parameters, normal, score, known, active, size < SETTLED, usual)
+    return Fit(
+        base, solution.p, solution.covariance, tuple(problem.sensors), tuple(problem.pieces),
+        solution.left_out,
+        float(gain.sum()), spread, float(gain.min()), turn, errors.get("positions"),
+        errors.get("tape"), bool({"positions", "tape"} & set(problem.sensors)),
+        _unexplained(problem, solution.p),
+    )  # fmt: skip
 
 
-def _sum(evidence: Sequence[Evidence]) -> tuple[Floats, Floats]:
-    normal, score = np.zeros_like(evidence[0].normal), np.zeros_like(evidence[0].score)
-    for part in evidence:
-        weight = _weight(part)
-        normal, score = normal + weight * part.normal, score + weight * part.score
-    return normal, score
+def _unexplained(problem: Problem, p: Floats) -> dict[str, float]:
+    off, moved = dict[str, float](), dict[str, float]()
+    for piece in problem.pieces:
+        place, heading = piece.base.path(p, piece.left, piece.right)
+        turns, ways = (
+            float(np.abs(np.diff(heading)).sum()),
+            float(np.abs(place - place.mean()).mean()),
+        )
+        for sensor, e in piece.residuals(p).items():
+            e = np.abs(e[np.isfinite(e)])
+            if sensor != "tape" and len(e):
+                moves = {"gyro": turns, "headings": turns / 4, "positions": ways}[sensor]
+                wrong = float(e.sum()) if sensor == "gyro" else float(np.median(e))
+                off[sensor] = off.get(sensor, 0.0) + wrong
+                moved[sensor] = moved.get(sensor, 0.0) + moves
+    return {sensor: off[sensor] / max(moved[sensor], 1e-3) for sensor in off}
 
 
-def _weight(part: Evidence) -> float:
-    # From the differences between blocks, which unlike residuals grow if residuals are correlated.
-    total = part.normal.sum(axis=0)
-    used = np.flatnonzero(np.diag(total) > 0.0)
-    if not len(used):
-        return 0.0
-    inner = np.linalg.pinv(total[np.ix_(used, used)], rcond=1e-10, hermitian=True)
-    rank = int(np.linalg.matrix_rank(inner, hermitian=True))
-    # The mean is not noise until the fit has converged.
-    apart = part.score[:, used] - part.score[:, used].mean(axis=0)
-    noise = float(np.einsum("bi,ij,bj->", apart, inner, apart))
-    white = float(part.squares.sum() / max(1.0, part.counts.sum()))
-    return 1.0 / max(noise / max(1, rank), white, 1e-18)
+def _heading_error(piece: Piece, p: Floats) -> float:
+    # Return the sum of the errors of the turns between headings some seconds apart, rad.
+    yaw_t, yaw = piece.run.yaw_t, piece.run.yaw
+    at = np.unique(np.searchsorted(yaw_t, np.arange(yaw_t[0], yaw_t[-1], HEADING_STEP_S)))
+    heading = piece.base.path(p, piece.left, piece.right)[1]
+    off = np.diff(yaw[at] - np.interp(yaw_t[at] - p[POSE_DELAY], piece.t, heading))
+    return float(np.abs(np.angle(np.exp(1j * off))).sum())
 
 
-def _prior_terms(
-    parameters: Floats, targets: Sequence[Held], usual: Mapping[Parameter, float]
-) -> tuple[Floats, Floats]:
-    normal, score = np.zeros((PARAMETER_COUNT, PARAMETER_COUNT)), np.zeros(PARAMETER_COUNT)
-    for index, deviation in usual.items():
-        normal[index, index] = deviation**-2
-        score[index] = -parameters[index] * deviation**-2
-    for weights, value in targets:
-        normal += CONSTRAINT_WEIGHT * np.outer(weights, weights)
-        score += CONSTRAINT_WEIGHT * weights * (value - weights @ parameters)
-    return normal, score
-
-
-def _solved(normal: Floats, score: Floats, active: Sequence[int]) -> Floats:
-    part = normal[np.ix_(active, active)]
-    return np.asarray(np.linalg.lstsq(part, score[list(active)], rcond=1e-15)[0])
+def _turn_errors(problem: Problem, solution: Solution) -> Errors:
+    off, turned = np.zeros(2), 0.0
+    for n, piece in enumerate(problem.pieces):
+        new = solution.left_out[n]
+        now = new.copy()
+        now[GEOMETRY] = 0.0
+        turned += float(np.abs(piece.base.motion(new, *piece.rolls)[1]).sum())
+        for k, p in enumerate((now, new)):
+            if piece.gyro:
+                off[k] += float(np.nansum(np.abs(piece.residuals(p)["gyro"])))
+            elif len(piece.run.yaw_t) > 1:
+                off[k] += _heading_error(piece, p)
+    return Errors(*(off * math.tau / max(turned, 1e-9)).tolist())

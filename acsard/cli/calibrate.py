@@ -1,15 +1,44 @@
-"""Measure the wheel radii and the effective track width, each with its standard
-deviation, and say how much they improve the odometry. If the tool has data of a
-gyro or positions, it also estimates the noise settings of [odometry].
+"""Measure the wheel radii and the effective track width, each with its standard deviation, and the
+noise of the odometry. A value is written only if it is better on runs that its fit did not use.
+"""
 
-Without --log the tool drives the robot and guides a person at this terminal
-through the drive. The person stands near the robot on a free floor of 3 m x 3 m,
-starts each leg with Enter, stops it with any key, and types the tape measurements
-that the tool asks for. The robot drives for at most 90 s.
+from __future__ import annotations
 
-With --log the tool uses a recorded drive: a black-box recording of a robot with a
-gyro, or a CSV file with commas and decimal points, whose first line names the
-columns, in any order:
+import argparse
+import math
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+from msgspec.structs import replace
+
+from acsard.bus.address import address_of
+from acsard.calibration.guide import MIN_TAPE_M, SOURCE, Options, drive
+from acsard.calibration.log import Log, LogError, read_file, with_distance
+from acsard.calibration.plan import METHODS
+from acsard.calibration.result import Refusal, calibrate, text
+from acsard.cli.common import add_config, add_outcome, load
+from acsard.cli.connection import add_bus, require_one
+from acsard.client.connection import open_connection
+from acsard.core.config.settings import Config
+from acsard.core.messages.keys_and_roles import full_key
+from acsard.host.config_file import change, writable
+from acsard.host.errors import Exit, MendableError, NotDrivenError, UsageError
+from acsard.host.terminal_modes import single_key_mode
+from acsard.terminal.output import MAX_TEXT_WIDTH, show
+from acsard.terminal.prompt import NobodyError, Prompt, TerminalPrompt, ended_by_signals
+
+DRIVE = """\
+Drive the robot, and guide a person at this terminal. The person stands near the robot on a free
+floor of 3 m x 3 m, starts each leg with Enter, stops it with any key, and types the distances that
+the tool asks for. The robot drives for at most 90 s.
+"""
+
+LOG = """\
+Use a recorded drive: a recording of a robot with a gyro, or a CSV file with commas and decimal
+points, whose first line names the columns, in any order:
 
     t                     time, s
     fr,fl,rl,rr           speed of each wheel, rad/s; or the mean of each side:
@@ -20,213 +49,151 @@ columns, in any order:
     applied_linear,applied_angular   commands, m/s and rad/s; may be missing
     run                   name of the drive of this row; may be missing
 
-The file needs t, the wheels, and yaw_rate or x and y. A cell is empty if its sensor
-has no value at that time. deploy/calibration/bag_to_csv.py converts a ROS bag.
+The file needs t, the wheels, and yaw_rate or x and y. A cell is empty if its sensor has no value at
+that time. deploy/calibration/bag_to_csv.py converts a ROS bag.
 
-A good log begins with 3 s of standing still. Then it contains 60 s or more of
-straight drives, slow and fast turns to both sides, and curves.
-
-The exit code is 0 if the tool found the values. Otherwise it is 1, and a message
-says what to do instead.
+A good log begins with 3 s of standing still. Then it contains 60 s or more of straight drives, slow
+and fast turns to both sides, and curves. The exit code is 1 if no value is better.
 """
-
-from __future__ import annotations
-
-import argparse
-import math
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-
-import msgspec
-
-from acsard.bus.address import address_of
-from acsard.calibration.calibration_report import CalibrationRefusal, keys, parts, report
-from acsard.calibration.guided.drive_plan import NEEDS, GuideError
-from acsard.calibration.guided.guided_drive import DriveOptions, guided_drive
-from acsard.calibration.guided.robot_on_bus import SOURCE
-from acsard.calibration.log_table import LogError, NoCalibrationError
-from acsard.calibration.multipliers import Tape
-from acsard.calibration.recorded_drive import calibrated
-from acsard.calibration.solve import Calibration
-from acsard.cli.common import add_outcome, load
-from acsard.cli.connection import add_bus, require_one
-from acsard.client.connection import open_connection
-from acsard.core.config.settings import Config
-from acsard.core.messages.keys_and_roles import full_key
-from acsard.host.config_file import change, writable
-from acsard.host.errors import Exit, MendableError, UsageError
-from acsard.host.terminal_modes import single_key_mode
-from acsard.terminal.output import MAX_TEXT_WIDTH, show
-from acsard.terminal.prompt import NobodyError, Prompt, TerminalPrompt, ended_by_signals
-
-# Options of a guided drive, not with `--log`.
-DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    add_bus(parser)
-    _add_drive_options(parser)
-    parser.add_argument(
-        "--log",
-        type=Path,
-        metavar="FILE",
-        help="calibrate from a recorded drive, without driving: FILE is a CSV file or a recording "
-        "of `acsard recording`",
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    guided = actions.add_parser(
+        "drive", help="drive the robot, guided by this terminal", description=DRIVE
     )
-    parser.add_argument(
+    add_bus(guided)
+    guided.add_argument(
+        "--method",
+        choices=tuple(METHODS),
+        help="with what the wheels are compared (default: the gyro if odometry.gyro is true, else "
+        "a tape measure)",
+    )
+    guided.add_argument(
+        "--poses",
+        metavar="KEY",
+        help="for --method poses: the Zenoh key on which the robot's poses are published "
+        "(PoseStamped or Odometry in JSON, msgpack or CDR), as `acsard topics` lists it, for "
+        "example sim/pose, or a full key",
+    )
+    guided.add_argument(
+        "--poses-at",
+        metavar="ENDPOINT",
+        help="address of the bus with the poses, if they are not on the daemon's own bus",
+    )
+    guided.add_argument(
+        "--yes",
+        action="store_true",
+        help="start every leg without Enter (only with the built-in simulator)",
+    )
+    add_outcome(guided, "the result")
+    guided.set_defaults(main=main_drive)
+    recorded = actions.add_parser(
+        "log",
+        help="use a recorded drive",
+        description=LOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    recorded.add_argument("file", type=Path, metavar="FILE", help="the recorded drive")
+    add_config(recorded)
+    recorded.add_argument(
         "--distance",
         type=_distance,
         metavar="[RUN=]METERS",
-        help="with --log: the straight-line distance from the start to the end of the run RUN, "
-        "by tape measure. acsard computes the size of the wheels from this distance. Without RUN, "
-        "METERS is the distance of the straightest run",
+        help="the straight distance from the start to the end of the run RUN, by tape measure, "
+        "which shows the size of the wheels. Without RUN, it is that of the straightest run",
     )
-    add_outcome(parser, "the result")
+    add_outcome(recorded, "the result")
+    recorded.set_defaults(main=main_log)
 
 
-def main(args: argparse.Namespace) -> int:
-    _require_fitting(args)
-    where, local_config = load(args.config)
-    if args.write:
-        writable(args.config)
-    # Messages and reports name a recorded drive by the path of its file.
-    source = str(args.log) if args.log else "the drive"
-    try:
-        if args.log:
-            calibration = calibrated(args.log, local_config, args.distance)
-            config = local_config
-        else:
-            calibration, config = _guided(args, where, local_config)
-    except (LogError, NoCalibrationError, GuideError, NobodyError) as error:
-        notes = tuple(getattr(error, "__notes__", ()))
-        if args.json:
-            print(
-                msgspec.json.encode(CalibrationRefusal(source, str(error), notes)).decode(),
-                flush=True,
-            )
-        notes_text = "".join(f"\nnote: {note}" for note in notes)
-        raise MendableError(f"{source}: {error}{notes_text}") from None
-    written, trouble = "", None
-    if args.write:
-        try:
-            change(Path(where), keys(calibration))
-            written = where
-        except MendableError as error:
-            # Print the result of the long drive before the error.
-            trouble = error
-    result = report(source, calibration, config.drive, written)
-    if args.json:
-        print(msgspec.json.encode(result).decode())
-    else:
-        show(*parts(result, calibration, where, guided=not args.log), most=MAX_TEXT_WIDTH)
-    if trouble is not None:
-        raise trouble
-    if written and not args.log:
-        print(
-            "restart the daemon: it uses the new calibration only after a restart", file=sys.stderr
-        )
-    return Exit.OK
-
-
-def _require_fitting(args: argparse.Namespace) -> None:
-    if not args.log and args.distance:
-        raise UsageError(
-            "--distance needs --log: without --log, acsard asks for the distances that it needs"
-        )
-    for name in DRIVE_OPTIONS if args.log else ():
-        if getattr(args, name):
-            option = "--" + name.replace("_", "-")
-            raise UsageError(
-                f"{option} is for a guided drive, but --log reads a recorded drive: leave one of "
-                "the two options out"
-            )
-
-
-def _distance(text: str) -> Tape:
-    run, _, metres = text.rpartition("=")
+def _distance(typed: str) -> tuple[str, float]:
+    run, _, metres = typed.rpartition("=")
     try:
         value = float(metres)
     except ValueError:
         value = math.nan
-    if not 0.1 <= value <= 1e4:
-        raise argparse.ArgumentTypeError(f"{text} is not a distance in m from 0.1 to 10000")
-    return Tape(value, run)
+    if not MIN_TAPE_M <= value <= 1e4:
+        raise argparse.ArgumentTypeError(
+            f"{typed} is not a distance in m from {MIN_TAPE_M} to 10000"
+        )
+    return run, value
 
 
-def _add_drive_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--method",
-        choices=tuple(NEEDS),
-        help="reference with which the wheels are compared (default: the gyro if odometry.gyro is "
-        "true, else a tape measure)",
-    )
-    parser.add_argument(
-        "--positions",
-        metavar="KEY",
-        help="for --method positions: the Zenoh key on which the robot's positions are published "
-        "(PoseStamped or Odometry in JSON, msgpack or CDR). Give a key as `acsard topics` lists "
-        "it, for example sim/pose, or a full key",
-    )
-    parser.add_argument(
-        "--positions-at",
-        metavar="ENDPOINT",
-        help="address of the bus on which the positions are published, for example of a router; "
-        "needed only if they are not on the daemon's own bus",
-    )
-    parser.add_argument(
-        "--imu",
-        metavar="KEY",
-        help="for --method gyro: the Zenoh key of the gyro (default: imu), as `acsard topics` "
-        "lists it, or a full key",
-    )
-    parser.add_argument(
-        "--yes",
-        action="store_true",
-        help="start every leg of the drive without waiting for Enter (only with the built-in "
-        "simulator)",
-    )
+def main_log(args: argparse.Namespace) -> int:
+    where, config = load(args.config)
+    if args.write:
+        writable(args.config)
+
+    def log() -> tuple[Log, Config]:
+        made = read_file(args.file)
+        return with_distance(made, *args.distance) if args.distance else made, config
+
+    return _finished(args, where, str(args.file), log)
 
 
-def _guided(args: argparse.Namespace, file: str, file_config: Config) -> tuple[Calibration, Config]:
+def main_drive(args: argparse.Namespace) -> int:
+    where, config = load(args.config)
+    if args.write:
+        writable(args.config)
     require_one(args)
-    where = address_of(file_config, args.connect, args.id, args.tls)
-    _usable(args, full_key(where.robot_id, "odom"))
-    options = DriveOptions(args.method, args.positions, args.positions_at, args.imu, args.yes)
-    with open_connection(where, SOURCE) as client:
-        return guided_drive(
-            client, options, file, file_config, _prompt(args), must_write=args.write
-        )
-
-
-def _usable(args: argparse.Namespace, odometry: str) -> None:
-    if args.method == "positions" and not args.positions:
+    address = address_of(config, args.connect, args.id, args.tls)
+    if (args.method == "poses") != bool(args.poses) and args.method:
+        raise UsageError("--method poses and --poses KEY belong together: add the other one")
+    if args.poses_at and not args.poses:
+        raise UsageError("--poses-at is the bus of the key of --poses: give --poses KEY as well")
+    if args.poses in ("odom", full_key(address.robot_id, "odom")):
         raise UsageError(
-            "--method positions needs the Zenoh key of the positions: add --positions KEY"
-        )
-    if args.positions and args.method not in (None, "positions"):
-        raise UsageError(f"--positions is not for --method {args.method}: leave one of them out")
-    if args.positions in ("odom", odometry):
-        raise UsageError(
-            "the daemon computes odom from the wheels, so odom cannot show the errors of the "
-            "wheels: give --positions the Zenoh key of another source"
-        )
-    if args.imu and (args.positions or args.method not in (None, "gyro")):
-        other = "--positions" if args.positions else f"--method {args.method}"
-        raise UsageError(f"--imu is for --method gyro, not for {other}: leave one of them out")
-    if args.positions_at and not args.positions:
-        raise UsageError(
-            "--positions-at names the bus address of the key of --positions: give --positions KEY "
-            "as well"
+            "the daemon computes odom from the wheels, so odom cannot show their errors: give "
+            "--poses the Zenoh key of another source"
         )
     if not (args.yes or sys.stdin.isatty()):
         raise UsageError(
-            "`acsard calibrate` drives the robot, and a person at the terminal starts and stops "
-            "each leg: run `acsard calibrate` in a terminal. Without a terminal, use --yes (only "
-            "with the built-in simulator), or --log with a recorded drive"
+            "a person at the terminal starts and stops each leg: run `acsard calibrate drive` in a "
+            "terminal. Without one, use --yes (only with the built-in simulator) or `acsard "
+            "calibrate log`"
         )
+    options = Options(args.method, args.poses, args.poses_at, args.yes)
+
+    def driven() -> tuple[Log, Config]:
+        with (
+            open_connection(address, SOURCE) as client,
+            _prompt(args) as prompt,
+        ):
+            return drive(client, options, prompt, where if args.write else "", config)
+
+    code = _finished(args, where, "the drive", driven)
+    if args.write:
+        print("restart the daemon: it uses the new calibration after a restart", file=sys.stderr)
+    return code
+
+
+def _finished(
+    args: argparse.Namespace, where: str, source: str, get: Callable[[], tuple[Log, Config]]
+) -> int:
+    try:
+        log, config = get()
+        result = calibrate(log, config, source)
+    except (LogError, NotDrivenError, NobodyError) as error:
+        notes = tuple(getattr(error, "__notes__", ()))
+        if args.json:
+            print(msgspec.json.encode(Refusal(source, str(error), notes)).decode(), flush=True)
+        notes_text = "".join(f"\nnote: {note}" for note in notes)
+        raise MendableError(f"{source}: {error}{notes_text}") from None
+    trouble = None
+    if args.write:
+        try:
+            change(Path(where), dict(result.settings))
+            result = replace(result, written=where)
+        except MendableError as error:
+            trouble = error  # print the result of the long drive before the error
+    if args.json:
+        print(msgspec.json.encode(result).decode())
+    else:
+        show(*text(result, config, where), most=MAX_TEXT_WIDTH)
+    if trouble is not None:
+        raise trouble
+    return Exit.OK
 
 
 @contextmanager

@@ -1,6 +1,6 @@
 """Print each message on a key as one line of JSON, until Ctrl-C. Every key below the robot's id
 works, for example `cmd/teleop`. --csv prints wheel speeds, gyro and position as one table for
-`acsard calibrate --log`, for example: acsard echo wheel_states imu --csv > drive.csv. --short
+`acsard calibrate log`, for example: acsard echo wheel_states imu --csv > drive.csv. --short
 prints pose, speeds and warnings as text, for example: acsard echo odom -n 1 --short. --rate prints
 each second the message rate, and the times from one message to the next. If --id names several
 robots, each line names its robot, and -n N prints N messages of each robot.
@@ -60,7 +60,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     form.add_argument(
         "--csv",
         action="store_true",
-        help="print a CSV log for `acsard calibrate --log` (for one or more of the keys "
+        help="print a CSV log for `acsard calibrate log` (for one or more of the keys "
         "wheel_states, imu and sim/pose)",
     )
     form.add_argument(

@@ -158,7 +158,7 @@ def _export_forms(parser: argparse.ArgumentParser) -> None:
         const="csv",
         default="mcap",
         help="write a CSV table with one row per feedback line; its first columns are those that "
-        "`acsard calibrate --log` reads",
+        "`acsard calibrate log` reads",
     )
     form.add_argument(
         "--rosbag2",

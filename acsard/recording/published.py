@@ -14,16 +14,28 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config
 from acsard.core.messages.report import Report
-from acsard.core.messages.schema import DiagnosticArray, RobotState, Time
+from acsard.core.messages.schema import (
+    DiagnosticArray,
+    Header,
+    Imu,
+    Quaternion,
+    RobotState,
+    Time,
+    Vector3,
+)
 from acsard.core.robot import Robot
-from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG_CHANNEL, Channel
+from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, IMU_CHANNEL, LOG_CHANNEL, Channel
 from acsard.core.ros.shapes import LEVELS, Log, command_message
 from acsard.core.ros.transports import left_out
-from acsard.core.values import Command, Instant, News, WallNs
+from acsard.core.values import Command, GyroSample, Instant, News, WallNs
 from acsard.recording.file import Recording
 from acsard.recording.recorded_steps import RecordedStep
 from acsard.recording.replay import Playback
 from acsard.recording.timeline import Timeline, TimelineEntry
+
+EXPORTED = (*BY_KEY, IMU_CHANNEL.native)
+
+UNMEASURED = [-1.0] + [0.0] * 8  # covariance of a quantity that is not measured
 
 # Rows of `diagnostics` that are not recorded.
 MEASURED_ROWS = frozenset({"acsard: control loop", "acsard: certificate"})
@@ -39,7 +51,7 @@ class Published(NamedTuple):
 
 
 def published(
-    recording: Recording, other: Config | None = None, keys: Collection[str] = BY_KEY.keys()
+    recording: Recording, other: Config | None = None, keys: Collection[str] = EXPORTED
 ) -> Iterator[Published]:
     """Replay a recording, and yield its commands, its log, and the messages on these keys.
 
@@ -93,11 +105,24 @@ class Publisher:
         self._report.config = robot.config
         for command in step.heard.commands:
             yield self._received(command, now)
+        for sample in step.heard.gyro if IMU_CHANNEL.native in self._keys else ():
+            yield self._gyro(sample, now)
         applied = robot.applied if step.driven else None
         for key, message in self._report.due(
             now, news, applied, self._keys, lambda: robot.snapshot(now.mono_ns)
         ):
             yield Published(BY_KEY[key], "", now.wall_ns, _without_measurements(message))
+
+    def _gyro(self, sample: GyroSample, now: Instant) -> Published:
+        arrived_ns = sample.at_ns + now.wall_ns - now.mono_ns
+        stamp_ns = arrived_ns if sample.stamp_ns is None else sample.stamp_ns
+        header = Header(Time.from_ns(stamp_ns), self._config.odometry.base_frame)
+        variances = [*[0.0] * 8, sample.variance]
+        message = Imu(
+            header, Quaternion(), UNMEASURED, Vector3(z=sample.rate), variances, Vector3(),
+            UNMEASURED,
+        )  # fmt: skip
+        return Published(IMU_CHANNEL, "", arrived_ns, message)
 
     def _received(self, command: Command, now: Instant) -> Published:
         arrived_ns = command.arrived_ns + now.wall_ns - now.mono_ns

@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from acsard.calibration.log_table import read
-from acsard.calibration.runs import runs
+from acsard.calibration.log import read
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Header, Imu, Quaternion, Vector3
 from acsard.core.ros.attachments import Attachment
@@ -104,11 +103,11 @@ def test_calibrate_reads_a_drive_that_echo_recorded_as_csv(tmp_path: Path) -> No
         words = ("echo", "wheel_states", "imu", "--csv", "-n", "300")
         ended = finish(acsard(*words, "--config", str(daemon.config)), tmp_path)
         assert ended.code == 0, ended
-        (run,) = runs(read(ended.out.encode())).runs
-        assert min(len(run.t), len(run.gyro)) > 100
+        (run,) = read(ended.out.encode()).runs
+        assert min(len(run.t), len(run.turned)) > 100
         # A robot that stood all the time gives no result; the calibration says so in its own words.
         (tmp_path / "drive.csv").write_text(ended.out)
-        result = finish(acsard("calibrate", "--log", "drive.csv"), tmp_path)
+        result = finish(acsard("calibrate", "log", "drive.csv"), tmp_path)
         assert (result.code, "drive.csv: " in result.err) == (1, True)
 
 

@@ -270,7 +270,15 @@ os.execv({pair.client.acsard!r}, ["acsard", *sys.argv[1:]])
 
 
 def test_a_guided_calibration_begins_with_the_other_version(pair: Pair) -> None:
-    words = ["calibrate", "--positions", "sim/pose", "--yes", "--config", str(pair.daemon.config)]
+    words = [
+        "calibrate",
+        "drive",
+        "--poses",
+        "sim/pose",
+        "--yes",
+        "--config",
+        str(pair.daemon.config),
+    ]
     program = [pair.client.acsard, *words]
     with (
         Bus(pair.daemon.endpoint) as bus,

@@ -10,11 +10,6 @@ from __future__ import annotations
 
 MESSAGES = """
 nav2_msgs/msg/SpeedLimit: std_msgs/msg/Header header, bool percentage, float64 speed_limit
-sensor_msgs/msg/Imu: \
-    std_msgs/msg/Header header, \
-    geometry_msgs/msg/Quaternion orientation, float64[9] orientation_covariance, \
-    geometry_msgs/msg/Vector3 angular_velocity, float64[9] angular_velocity_covariance, \
-    geometry_msgs/msg/Vector3 linear_acceleration, float64[9] linear_acceleration_covariance
 service_msgs/msg/ServiceEventInfo: \
     uint8 event_type, builtin_interfaces/msg/Time stamp, char[16] client_gid, int64 sequence_number
 rcl_interfaces/msg/FloatingPointRange: float64 from_value, float64 to_value, float64 step

@@ -14,10 +14,10 @@ from msgspec import Struct
 
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.keys_and_roles import by_key
-from acsard.core.messages.schema import MESSAGES, RobotState, TwistStamped
+from acsard.core.messages.schema import MESSAGES, Imu, RobotState, TwistStamped
 from acsard.core.ros.names import Qos, full_name
 from acsard.core.ros.shapes import Log, State, state
-from acsard.core.ros.transports import PUBLISHED
+from acsard.core.ros.transports import GYRO_TOPIC, PUBLISHED
 
 ACSARD_PREFIX = "acsard/msg/"  # of types that ROS does not have
 
@@ -47,6 +47,11 @@ tf2_msgs/msg/TFMessage: geometry_msgs/msg/TransformStamped[] transforms
 sensor_msgs/msg/JointState: \
     std_msgs/msg/Header header, string[] name, \
     float64[] position, float64[] velocity, float64[] effort
+sensor_msgs/msg/Imu: \
+    std_msgs/msg/Header header, \
+    geometry_msgs/msg/Quaternion orientation, float64[9] orientation_covariance, \
+    geometry_msgs/msg/Vector3 angular_velocity, float64[9] angular_velocity_covariance, \
+    geometry_msgs/msg/Vector3 linear_acceleration, float64[9] linear_acceleration_covariance
 sensor_msgs/msg/BatteryState: \
     uint8 POWER_SUPPLY_STATUS_UNKNOWN=0, uint8 POWER_SUPPLY_STATUS_CHARGING=1, \
     uint8 POWER_SUPPLY_STATUS_DISCHARGING=2, uint8 POWER_SUPPLY_STATUS_NOT_CHARGING=3, \
@@ -190,6 +195,9 @@ CMD_VEL_IN = Channel(
     "geometry_msgs/msg/TwistStamped",
     TwistStamped,
 )
+
+# In exports only: the samples that the daemon received.
+IMU_CHANNEL = Channel(GYRO_TOPIC.name, GYRO_TOPIC.native, GYRO_TOPIC.type, Imu, GYRO_TOPIC.qos)
 
 # Channels by key, for all messages that `Report` builds.
 BY_KEY: dict[str, Channel] = {**_published(), STATE_CHANNEL.native: STATE_CHANNEL}

@@ -1,4 +1,4 @@
-"""Tests of `acsard recording export`, and of `acsard calibrate --log` with a recording."""
+"""Tests of `acsard recording export`, and of `acsard calibrate log` with a recording."""
 
 from __future__ import annotations
 
@@ -136,10 +136,10 @@ def test_calibrate_takes_a_recording_of_a_robot_with_a_gyro_as_it_is(
     # calibrate recognizes the format by its content, not by its name
     tape.save(here / "drive.log", config)
     (here / "acsard.toml").write_text("")
-    assert main(["calibrate", "--log", "drive.log", "--json"]) == 0
+    assert main(["calibrate", "log", "drive.log", "--json"]) == 0
     by_recording = capsys.readouterr().out
     assert main(["recording", "export", "drive.log", "drive.csv", "--csv"]) == 0
     capsys.readouterr()
-    assert main(["calibrate", "--log", "drive.csv", "--json"]) == 0
+    assert main(["calibrate", "log", "drive.csv", "--json"]) == 0
     by_table = capsys.readouterr().out.replace("drive.csv", "drive.log")
     assert by_recording.partition('"notes"')[0] == by_table.partition('"notes"')[0]

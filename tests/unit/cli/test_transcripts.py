@@ -27,9 +27,7 @@ from acsard.machine.authority import Authority
 from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import World
 from tests.system.typed import typed
-from tests.unit.calibration.bags import write_bag
-from tests.unit.calibration.cut import usual
-from tests.unit.calibration.robots import GUIDED
+from tests.unit.calibration.logs import usual
 
 PLACE = Path(__file__).with_name("transcripts")
 
@@ -66,9 +64,9 @@ def recordings(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def logs(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make a log, a bag, and one part of a bag."""
+    """Make a log, and the directory of a bag."""
     (where / "drive.csv").write_text(usual().csv(places=False))
-    write_bag(where / "bag", usual(plan=GUIDED[:2]))
+    (where / "bag").mkdir()
 
 
 def authorities(where: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
-from acsard.calibration.log_table import read
+from acsard.calibration.log import read
 from acsard.core.config.settings import Config, SimConfig
 from acsard.core.ros.channels import BY_KEY, CHANNELS, CMD_VEL_IN
 from acsard.core.ros.names import Qos
@@ -41,6 +41,7 @@ from acsard.recording.export import (
 from acsard.recording.file import Recording
 from tests.scenarios.taped import BATCH, Tape, recorded_world
 from tests.scenarios.world import START
+from tests.unit.calibration.bags import converted
 
 SECONDS = 2.0
 
@@ -237,7 +238,7 @@ GYRO = replace(Config(), odometry=replace(Config().odometry, gyro=True))
 @pytest.fixture(scope="module")
 def tape() -> Tape:
     tape, world = recorded_world(GYRO)
-    world.drive(0.5, 0.4, 1.0)
+    world.drive(0.5, 0.4, 3.0)
     return tape
 
 
@@ -271,14 +272,22 @@ def test_calibration_reads_the_same_from_the_table_and_from_the_recording(
     tape: Tape, drive: Recording
 ) -> None:
     whole = "\n".join(map(",".join, table(drive))).encode()
-    tables = [read(whole), read(calibration_csv(drive))]
-    commands = ["applied_linear", "applied_angular"]
-    assert list(tables[0].columns) == ["t", "fr", "fl", "rl", "rr", "yaw_rate", *commands]
-    for name, values in tables[0].columns.items():
-        np.testing.assert_array_equal(values, tables[1].columns[name])
-    speeds = [e.speeds.front_right for t in tape.taken for e in t.news.estimates]
-    fr = tables[0].columns["fr"]
-    np.testing.assert_allclose(fr[~np.isnan(fr)], speeds, rtol=1e-5)
+    runs = [read(text).runs[0] for text in (whole, calibration_csv(drive))]
+    for name in ("t", "left", "right", "gyro_t", "turned", "commands_t", "commands"):
+        column = getattr(runs[0], name)
+        assert len(column) > 100
+        np.testing.assert_array_equal(column, getattr(runs[1], name))
+    lines = [e for t in tape.taken for e in t.news.estimates]
+    assert len(runs[0].t) == len(lines)
+
+
+def test_a_bag_has_the_same_gyro_samples_as_the_table(drive: Recording, tmp_path: Path) -> None:
+    export(drive, tmp_path / "drive.mcap", "mcap")
+    right, left = (joint for joint in GYRO.joints.as_tuple()[:2])
+    bag = converted(tmp_path / "drive.mcap", "--imu", "/imu/data", left=[left], right=[right])
+    runs = [read(text).runs[0] for text in (bag, calibration_csv(drive))]
+    assert len(runs[0].gyro_t) == len(runs[1].gyro_t) > 100
+    np.testing.assert_allclose(runs[0].turned, runs[1].turned, atol=1e-4)
 
 
 def test_the_times_in_the_table_are_those_of_the_samples(tape: Tape) -> None:

@@ -1,0 +1,224 @@
+"""Computes the result of `acsard calibrate`: the settings to write, and a sentence per decision.
+
+A value is written only if it is better on runs that its fit did not use.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from msgspec import Struct
+from rich.console import RenderableType
+
+from acsard.calibration.checks import DRIVE, require_agreement, require_motion
+from acsard.calibration.fit import LEFT, RIGHT, TRACK, Errors, Fit, fit
+from acsard.calibration.log import Log, LogError
+from acsard.calibration.noise import Noise, noise
+from acsard.calibration.response import response_time
+from acsard.core.config.settings import Config
+from acsard.core.config.toml_text import excerpt
+from acsard.core.formatting import many
+from acsard.core.values import Seconds
+from acsard.terminal.output import table
+
+DIGITS = 5
+MULTIPLIERS = {
+    "wheel_separation_multiplier": TRACK, "left_wheel_radius_multiplier": LEFT,
+    "right_wheel_radius_multiplier": RIGHT,
+}  # fmt: skip
+TRACK_NAME = "wheel_separation_multiplier"
+SHORT = 1.5  # times the configured response time, from which a longer one is written
+REPORT_M = 10.0  # of driving, for the sentence about noise
+
+
+class Refusal(Struct, frozen=True):
+    """The object that `--json` prints if a log gives no better value."""
+
+    log: str
+    refused: str  # why, and what to do
+    notes: Sequence[str] = ()
+
+
+class Result(Struct, frozen=True):
+    """The object that `--json` prints for a calibration."""
+
+    log: str
+    reference: str  # the sensors with which the wheels were compared
+    runs: int
+    seconds: Seconds
+    distance: float  # m
+    turns: float  # of 360 deg
+    found: dict[str, float]  # multipliers that fit best, by setting
+    deviations: dict[str, float]  # their standard deviations
+    better: bool  # the found multipliers are better on the runs that were left out
+    turn_error: Errors | None  # of the heading after a turn of 360 deg, deg
+    position_error: Errors | None  # m
+    decisions: Sequence[str]  # a sentence each
+    settings: dict[str, float]  # that `--write` writes, by dotted key
+    notes: Sequence[str]
+    written: str | None = None  # the file
+    refused: None = None
+
+
+def calibrate(log: Log, config: Config, source: str) -> Result:
+    """Return the calibration of a log. Raises `LogError`, with the notes of the log attached."""
+    try:
+        require_motion(log.runs)
+        found = fit(log.runs, config)
+        notes = require_agreement(found, config.drive.wheel_separation)
+        return _result(log, config, source, found, notes)
+    except LogError as error:
+        for note in log.notes:
+            error.add_note(note)
+        raise
+
+
+def _result(log: Log, config: Config, source: str, found: Fit, notes: list[str]) -> Result:
+    base, p = found.base, found.p
+    motion = [base.motion(p, *piece.rolls) for piece in found.pieces]
+    configured = np.array([getattr(config.drive, name) for name in MULTIPLIERS])
+    factors = np.exp(p[list(MULTIPLIERS.values())])
+    # A track without the size of the wheels is one beside their mean radius.
+    stds = np.sqrt(np.diag(found.covariance))[list(MULTIPLIERS.values())]
+    stds = np.where([name == TRACK_NAME for name in MULTIPLIERS], found.shares[0], stds)
+    stds = stds * configured * factors
+    shown = noise(log.runs, found, config.odometry)
+    settings: dict[str, float] = {}
+    decisions = [*_geometry(found, config, settings, shown)]
+    decisions += _noise(found, config, settings, shown)
+    decisions += _response(log, config, settings)
+    if not settings:
+        raise LogError(" ".join(decisions) + " Nothing is written. On a robot that is calibrated "
+                       f"this is right; on another one record a longer drive: {DRIVE}")  # fmt: skip
+    return Result(
+        source, " and ".join(found.sensors), len(log.runs), sum(r.seconds for r in log.runs),
+        sum(float(np.abs(d).sum()) for d, _ in motion),
+        sum(float(np.abs(t).sum()) for _, t in motion) / math.tau,
+        dict(zip(MULTIPLIERS, (configured * factors).tolist(), strict=True)),
+        dict(zip(MULTIPLIERS, stds.tolist(), strict=True)), found.better,
+        found.turn and Errors(math.degrees(found.turn.now), math.degrees(found.turn.new)),
+        found.place, decisions,
+        {key: float(f"{value:.{DIGITS}g}") for key, value in settings.items()},
+        (*notes, *log.notes),
+    )  # fmt: skip
+
+
+def _geometry(
+    found: Fit, config: Config, settings: dict[str, float], shown: Noise
+) -> Iterator[str]:
+    errors = [
+        f"{words} {_two(e.new * factor)} {unit} instead of {_two(e.now * factor)} {unit}"
+        for e, words, factor, unit in (
+            (found.turn, "a turn of 360 deg errs by", 180 / math.pi, "deg"),
+            (found.place, "positions err by", 100.0, "cm"),
+            (found.readings, "your readings are missed by", 1.0, "of their deviations"),
+        ) if e is not None
+    ]  # fmt: skip
+    if not found.better:
+        yield (
+            "Track and radii stay as configured, because new values are not clearly better on runs "
+            f"that the fit did not use: {', '.join(errors)}."
+        )
+        return
+    yield f"New track and radii are better on runs that the fit did not use: {', '.join(errors)}."
+    for name, index in MULTIPLIERS.items():
+        settings[f"drive.{name}"] = getattr(config.drive, name) * math.exp(found.p[index])
+    track, ratio, scale = found.shares
+    if shown.heading_better:
+        width = found.base.track * math.exp(found.p[TRACK])
+        track = math.hypot(track, math.sqrt(shown.track))
+        ratio = math.hypot(ratio, width * math.sqrt(shown.ratio))
+    if shown.distance_better:
+        scale = math.hypot(scale, math.sqrt(shown.scale))
+    settings["odometry.wheel_separation_multiplier_std"] = (
+        track * settings["drive.wheel_separation_multiplier"]
+    )
+    settings["odometry.wheel_radius_ratio_std"] = ratio
+    settings["odometry.distance_scale_std"] = scale
+    yield (
+        "The log shows the size of the wheels: distances are right to "
+        f"{scale:.2%} (standard deviation)."
+        if found.sized
+        else "A gyro does not show the size of the wheels, so distances are as right as "
+        "drive.wheel_radius: measure a straight run with a tape (--distance)."
+    )
+
+
+def _noise(found: Fit, config: Config, settings: dict[str, float], shown: Noise) -> Iterator[str]:
+    present = config.odometry
+    now = _after(present.yaw_variance_per_metre, present.yaw_variance_per_radian)
+    if shown.heading_better and shown.yaw_per_metre and shown.yaw_per_radian:
+        settings["odometry.yaw_variance_per_metre"] = shown.yaw_per_metre
+        settings["odometry.yaw_variance_per_radian"] = shown.yaw_per_radian
+        new = _after(shown.yaw_per_metre, shown.yaw_per_radian)
+        yield (
+            f"The stated uncertainty of the heading becomes {_two(new)} deg after "
+            f"{REPORT_M:g} m and one turn, where it is {_two(now)} deg, because that describes "
+            "the runs better."
+        )
+    else:
+        yield "The noise of the heading stays as configured: this log describes it no better."
+    if shown.distance_better and shown.distance_per_metre:
+        settings["odometry.distance_variance_per_metre"] = shown.distance_per_metre
+        new, now = (
+            100 * math.sqrt(v * REPORT_M)
+            for v in (shown.distance_per_metre, present.distance_variance_per_metre)
+        )
+        yield (
+            f"The stated uncertainty of the distance becomes {_two(new)} cm after {REPORT_M:g} m, "
+            f"where it is {_two(now)} cm."
+        )
+    else:
+        yield (
+            "The noise of the distance stays as configured: only positions on straight ways "
+            "show it."
+        )
+
+
+def _after(per_metre: float, per_radian: float) -> float:
+    return math.degrees(math.sqrt(REPORT_M * per_metre + math.tau * per_radian))
+
+
+def _response(log: Log, config: Config, settings: dict[str, float]) -> Iterator[str]:
+    present = config.feedback.response_time
+    seconds = response_time(log.runs, config.drive)
+    if seconds is None:
+        return
+    if seconds > SHORT * present:
+        settings["feedback.response_time"] = float(f"{seconds:.2g}")
+        yield (
+            f"The wheels follow their commands with a response time of {seconds:.2g} s, so the "
+            f"configured {present:g} s would call healthy wheels faulty."
+        )
+    else:
+        yield (
+            f"The wheels follow their commands with a response time of {seconds:.2g} s, so "
+            f"feedback.response_time = {present:g} s is long enough."
+        )
+
+
+def _two(value: float) -> str:
+    return f"{value:.0f}" if value >= 10 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
+
+
+def text(result: Result, config: Config, where: str) -> Iterator[RenderableType]:
+    """Yield the parts of the printed result. `where` is the configuration file."""
+    yield (
+        f"{result.log}: {many(result.runs, 'run')}, {result.seconds:.0f} s, {result.distance:.1f} "
+        f"m, {result.turns:.1f} turns, compared with {result.reference}"
+    )
+    rows = [
+        (name, f"{getattr(config.drive, name):.4f}", f"{value:.4f}",
+         f"{result.deviations[name]:.4f}")
+        for name, value in result.found.items()
+    ]  # fmt: skip
+    yield from ("", table(rows, ("", "now", "found", "standard deviation"), right={1, 2}), "")
+    yield from result.decisions
+    written = f"{where}: written"
+    offered = "settings for acsard.toml (--write writes them):"
+    yield from ("", written if result.written else offered, *excerpt(result.settings))
+    if result.notes:
+        yield ""
+    yield from (f"note: {note}" for note in result.notes)

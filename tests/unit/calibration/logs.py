@@ -1,0 +1,51 @@
+"""Converts simulated drives to the runs of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from acsard.calibration.fit import TRACK, Fit, fit
+from acsard.calibration.log import Notes, Run, run_of
+from acsard.core.config.settings import Config
+from tests.unit.calibration.robots import GUIDED, Drive, Floats, Plan, Robot, drive
+
+IDEAL = {
+    "rate": 0.0, "slip": 0.0, "late": 0.0, "bias": 0.0, "gyro_noise": 0.0, "place_noise": 0.0,
+    "outliers": 0.0, "lever": 0j, "decimals": 6,
+}  # fmt: skip
+"""Overrides for a robot that moves exactly as the model says and has perfect sensors."""
+
+
+def ideal(plan: Plan = GUIDED) -> Drive:
+    return drive(replace(Robot(), **IDEAL), plan)  # type: ignore[arg-type]
+
+
+def usual(seed: int = 3, plan: Plan = GUIDED) -> Drive:
+    return drive(Robot(rng=np.random.default_rng(seed)), plan)
+
+
+def run(trip: Drive, *, gyro: bool = True, places: bool = True, name: str = "1") -> Run:
+    streams: dict[str, tuple[Floats, ...]] = {"left right": (trip.t, trip.left, trip.right)}
+    if gyro:
+        streams["yaw_rate"] = trip.gyro_t, trip.gyro
+    if places:
+        streams["x y"] = trip.place_t, trip.place.real, trip.place.imag
+    return run_of(name, streams, Notes())
+
+
+def runs(drives: Iterable[Drive], *, gyro: bool = True, places: bool = True) -> list[Run]:
+    return [run(trip, gyro=gyro, places=places, name=str(at)) for at, trip in enumerate(drives, 1)]
+
+
+def fitted(
+    *drives: Drive, gyro: bool = True, places: bool = True, config: Config | None = None
+) -> Fit:
+    return fit(runs(drives, gyro=gyro, places=places), config or Config())
+
+
+def multipliers(found: Fit) -> Floats:
+    """Return track, left and right as factors of the configured ones."""
+    return np.asarray(np.exp(found.p[[TRACK, 0, 1]]))

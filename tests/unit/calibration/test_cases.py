@@ -1,0 +1,289 @@
+"""Situations of real logs, each with its right value or with the cause that must be named."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acsard.calibration.log import LogError, read
+from acsard.calibration.result import Result, calibrate
+from acsard.core.config.settings import Config
+from tests.unit.calibration import bags
+from tests.unit.calibration.bags import END, RADIUS, START, WHEELS, Bag, at, bag, converted, motion
+
+pytestmark = pytest.mark.slow
+
+BY_GYRO, BY_POSES = (1.4925, 0.9950, 1.0050), (1.500, 1.000, 1.010)
+GYRO, POSES = ("--imu", "/imu/data"), ("--positions", "/pose", "--yaw")
+
+
+def found(data: bytes) -> Result:
+    return calibrate(read(data), Config(), "drive.csv")
+
+
+def require(result: Result, truth: Sequence[float], within: float = 0.008) -> None:
+    values = list(result.found.values())
+    print(dict(zip(result.found, values, strict=True)), list(result.deviations.values()))
+    assert result.better
+    assert values == pytest.approx(truth, abs=within)
+    # The noise never states more than a few degrees for a sound log.
+    noise = result.settings.get("odometry.yaw_variance_per_radian", 0.0)
+    assert noise <= Config().odometry.yaw_variance_per_radian
+
+
+def rows(header: str, lines: Sequence[str]) -> bytes:
+    return "\n".join([header, *lines, ""]).encode()
+
+
+def test_one_straight_part_and_then_turns_give_the_track() -> None:
+    """The part that holds all straight driving is left out once, too."""
+    turn = 6 * np.pi / 0.8
+    made = motion([(3, 0, 0), (5, 0.4, 0), (1, 0, 0), (turn, 0, 0.8), (1, 0, 0), (turn, 0, -0.8),
+                   (1, 0, 0)])  # fmt: skip
+    rng, every = np.random.default_rng(4), slice(None, None, 10)
+    columns = (made[name][every] for name in ("t", "left", "right", "w"))
+    lines = [
+        f"{t:.3f},{a:.4f},{b:.4f},{w + 0.01 + rng.normal(0, 0.004):.5f}"
+        for t, a, b, w in zip(*columns, strict=True)
+    ]
+    result = found(rows("t,left,right,yaw_rate", lines))
+    require(result, BY_GYRO)
+
+
+@pytest.mark.parametrize("first", ["driver", "publisher"])
+def test_zeros_of_a_second_publisher_are_refused_with_the_cause(tmp_path: Path, first: str) -> None:
+    def joint(made: Bag, number: int, t: float, left: float, right: float) -> None:
+        late = 0.012 if first == "driver" else 0.001
+        made.joints(START + t + 0.002, START + t, WHEELS, [left, right] * 2)
+        made.joints(START + t + late, START + t + late - 0.002, WHEELS, [0.0] * 4)
+
+    directory = bag(joint).write(tmp_path / "drive")
+    with pytest.raises(SystemExit, match=r"two series of angles alternate.*joint_state_publisher"):
+        converted(directory, *GYRO)
+
+
+def test_speeds_with_zeros_of_a_second_program_are_refused_with_the_cause() -> None:
+    t = np.arange(0, END, 0.02)
+    speeds = np.where(np.arange(len(t)) % 2, 0.0, at("left", t))
+    lines = [f"{a:.3f},{b:.4f},{b:.4f},{at('w', a):.4f}" for a, b in zip(t, speeds, strict=True)]
+    with pytest.raises(LogError, match="in column left, every other value is 0: two programs"):
+        found(rows("t,left,right,yaw_rate", lines))
+
+
+@pytest.mark.parametrize("gyro", [True, False])
+def test_positions_at_1_hz_give_all_three_values(tmp_path: Path, gyro: bool) -> None:
+    made = bag(gyro=bags.usual_gyro if gyro else None, pose_hz=1.0)
+    data = converted(made.write(tmp_path / "drive"), *(GYRO if gyro else ()), *POSES)
+    result = found(data)
+    require(result, BY_POSES)
+    assert result.position_error is not None
+    assert result.position_error.new < result.position_error.now
+
+
+def test_one_message_with_the_stamp_0_is_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The network delivers the messages in bursts of 0.2 s, so the stamps are needed."""
+
+    def joint(made: Bag, number: int, t: float, left: float, right: float) -> None:
+        recorded = START + float(np.ceil(t / 0.2)) * 0.2 + 0.001 * (number % 10)
+        made.joints(recorded, START + t if number else 0.0, WHEELS, [left, right] * 2)
+
+    data = converted(bag(joint).write(tmp_path / "drive"), *GYRO)
+    assert "/joint_states: 1 messages with a wrong stamp are left out" in capsys.readouterr().err
+    require(found(data), BY_GYRO)
+
+
+@pytest.mark.parametrize("column", ["left (in/s)", "left_ips", "left [rpm]"])
+def test_a_unit_in_the_header_is_an_error_with_the_right_unit(column: str) -> None:
+    with pytest.raises(LogError, match=r"name it left, and write its values in rad/s"):
+        found(rows(f"t,{column},right,yaw_rate", ["0.0,1.0,1.0,0.0"]))
+
+
+def set_back(t: float) -> float:
+    return START + t - (3.0 if t > 40 else 0.0)
+
+
+def test_a_clock_that_is_set_back_begins_a_new_run_of_a_csv_file() -> None:
+    lines = [
+        f"{set_back(t):.3f},{at('left', t):.4f},{at('right', t):.4f},{at('w', t) + 0.01:.5f}"
+        for t in np.arange(0, END, 0.02)
+    ]
+    result = found(rows("t,left,right,yaw_rate", lines))
+    require(result, BY_GYRO)
+    assert result.runs == 2
+
+
+def test_a_clock_that_is_set_back_in_a_bag_is_a_cause_that_is_named(tmp_path: Path) -> None:
+    """The reader of bags sorts by the time of recording, so the two parts are mixed."""
+
+    def joint(made: Bag, number: int, t: float, left: float, right: float) -> None:
+        made.joints(set_back(t) + 0.002, set_back(t), WHEELS, [left, right] * 2)
+
+    directory = bag(joint, lambda made, t, w: made.imu(set_back(t) + 0.002, set_back(t), w))
+    with pytest.raises(SystemExit, match="clock was set back"):
+        converted(directory.write(tmp_path / "drive"), *GYRO)
+
+
+def test_poses_with_a_covariance_are_read(tmp_path: Path) -> None:
+    made = bag(gyro=None, pose_hz=10.0, pose=lambda b, t, x, y, yaw: b.pose(
+        START + t, START + t, (x, y, 0.0), yaw, kind="PoseWithCovarianceStamped"))  # fmt: skip
+    require(found(converted(made.write(tmp_path / "drive"), *POSES)), BY_POSES)
+
+
+def test_a_gyro_that_hangs_is_used_up_to_there(tmp_path: Path) -> None:
+    last = [0.0]
+
+    def gyro(made: Bag, t: float, rate: float) -> None:
+        last[0] = rate if t < 45 else last[0]
+        made.imu(START + t + 0.002, START + t, last[0])
+
+    result = found(converted(bag(gyro=gyro).write(tmp_path / "drive"), *GYRO))
+    require(result, BY_GYRO)
+    assert any("yaw_rate repeats" in note and "from 45 s" in note for note in result.notes)
+
+
+def test_angles_of_one_side_that_are_copied_to_the_other_give_way_to_the_speeds(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def joint(made: Bag, number: int, t: float, left: float, right: float) -> None:
+        speeds = [at("left", t), at("right", t)] * 2
+        made.joints(START + t + 0.002, START + t, WHEELS, [right] * 4, speeds)
+
+    data = converted(bag(joint).write(tmp_path / "drive"), *GYRO)
+    assert "the driver copies one side" in capsys.readouterr().err
+    require(found(data), BY_GYRO)
+
+
+def test_sides_that_are_copied_in_a_csv_file_are_refused_with_the_cause() -> None:
+    lines = [
+        f"{t:.3f},{at('right', t):.4f},{at('right', t):.4f},{at('w', t):.5f}"
+        for t in np.arange(0, END, 0.02)
+    ]
+    with pytest.raises(LogError, match="left and right are the same in every row"):
+        found(rows("t,left,right,yaw_rate", lines))
+
+
+def test_encoders_without_direction_are_named_as_the_cause(tmp_path: Path) -> None:
+    t, step = bags.DRIVE["t"], bags.STEP
+    up = {name: np.cumsum(np.abs(bags.DRIVE[name])) * step for name in ("left", "right")}
+
+    def joint(made: Bag, number: int, time: float, left: float, right: float) -> None:
+        angles = [float(np.interp(time, t, up[name])) for name in ("left", "right")] * 2
+        made.joints(START + time + 0.002, START + time, WHEELS, angles)
+
+    data = converted(bag(joint).write(tmp_path / "drive"), *GYRO)
+    with pytest.raises(LogError, match=r"never turn backwards.*encoders with one channel"):
+        found(data)
+
+
+def test_messages_with_one_joint_each_are_joined(tmp_path: Path) -> None:
+    def joint(made: Bag, number: int, t: float, left: float, right: float) -> None:
+        for at_s, name, angle in zip((0, 1, 2, 3), WHEELS, [left, right] * 2, strict=True):
+            made.joints(START + t + 0.002 + at_s * 1e-4, START + t, (name,), [angle])
+
+    require(found(converted(bag(joint).write(tmp_path / "drive"), *GYRO)), BY_GYRO)
+
+
+def test_poses_whose_y_axis_points_up_need_the_option_that_the_error_names(tmp_path: Path) -> None:
+    made = bag(gyro=None, pose_hz=20.0, pose=lambda b, t, x, y, yaw: b.pose(
+        START + t, START + t, (x, 0.02, -y), yaw, axis=1))  # fmt: skip
+    directory = made.write(tmp_path / "drive")
+    with pytest.raises(SystemExit, match=r"turn about their y axis.*add --up y"):
+        converted(directory, *POSES)
+    require(found(converted(directory, *POSES, "--up", "y")), BY_POSES)
+
+
+def test_a_body_that_is_taken_for_the_robot_for_three_seconds_changes_nothing(
+    tmp_path: Path,
+) -> None:
+    def pose(made: Bag, t: float, x: float, y: float, yaw: float) -> None:
+        if any(begin < t < begin + 1 for begin in (20, 40, 60)):
+            x, y, yaw = 2.5, -1.0, 1.3
+        made.pose(START + t, START + t, (x, y, 0.0), yaw)
+
+    made = bag(gyro=None, pose_hz=20.0, pose=pose).write(tmp_path / "drive")
+    require(found(converted(made, *POSES)), BY_POSES, 0.006)
+
+
+# What held before, and must go on holding.
+
+
+def odd_joints(kind: str) -> bags.Joint:
+    def joint(made: Bag, number: int, t: float, left: float, right: float) -> None:
+        angles, stamp, names = [left, right] * 2, START + t, WHEELS
+        match kind:
+            case "arm":
+                names, angles = (*WHEELS, "arm"), [*angles, 0.3]
+                if number % 3 == 0:
+                    made.joints(START + t + 0.001, stamp, ("arm",), [0.3])
+            case "jumps" if number in (900, 2000, 2001, 2002, 2003, 2004):
+                angles = [angle + 21.0 for angle in angles]
+            case "restart" if t > 45:
+                zero = [at("left_angle", 45.0), at("right_angle", 45.0)] * 2
+                angles = [a - b for a, b in zip(angles, zero, strict=True)]
+            case "NaN" if t < 2 or number % 97 == 0:
+                angles = [float("nan")] * 4
+            case "turn":
+                angles = [float(angle % (2 * np.pi)) for angle in angles]
+            case "old" if number == 0:
+                stamp -= 3000.0
+        made.joints(START + t + 0.002, stamp, names, angles)
+
+    return joint
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("kind", ["arm", "jumps", "restart", "NaN", "turn", "old"])
+def test_odd_joints_give_the_same_values(tmp_path: Path, kind: str) -> None:
+    made = bag(odd_joints(kind)).write(tmp_path / "drive")
+    require(found(converted(made, *GYRO)), BY_GYRO)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("kind", ["milliseconds", "50 years", "fast", "since the boot"])
+def test_odd_clocks_of_the_gyro_give_the_same_values(tmp_path: Path, kind: str) -> None:
+    def gyro(made: Bag, t: float, rate: float) -> None:
+        stamp = {"milliseconds": 1000 * t, "50 years": START + t - 1.577e9,
+                 "fast": START + 1.005 * t, "since the boot": 12.0 + t}[kind]  # fmt: skip
+        made.imu(START + t + 0.002, stamp, rate)
+
+    made = bag(gyro=gyro).write(tmp_path / "drive")
+    require(found(converted(made, *GYRO)), BY_GYRO)
+
+
+def test_a_clock_that_jumps_ahead_makes_two_runs(tmp_path: Path) -> None:
+    def late(t: float) -> float:
+        return START + t + (7.0 if t > 40 else 0.0)
+
+    def joint(made: Bag, number: int, t: float, left: float, right: float) -> None:
+        made.joints(late(t) + 0.002, late(t), WHEELS, [left, right] * 2)
+
+    made = bag(joint, lambda b, t, w: b.imu(late(t) + 0.002, late(t), w)).write(tmp_path / "drive")
+    result = found(converted(made, *GYRO))
+    require(result, BY_GYRO)
+    assert result.runs == 2
+
+
+def test_two_frames_on_a_topic_are_refused_with_the_cause(tmp_path: Path) -> None:
+    def gyro(made: Bag, t: float, rate: float) -> None:
+        made.imu(START + t, START + t, rate)
+        made.imu(START + t + 0.001, START + t, 0.0, "lidar_imu")
+
+    made = bag(gyro=gyro).write(tmp_path / "drive")
+    with pytest.raises(SystemExit, match="imu_link and lidar_imu, so two programs"):
+        converted(made, *GYRO)
+
+
+def test_a_topic_or_joint_that_is_missing_is_named(tmp_path: Path) -> None:
+    directory = bag(gyro=None).write(tmp_path / "drive", sqlite=True)
+    with pytest.raises(SystemExit, match=r"no topic /imu/data; its topics are /joint_states"):
+        converted(directory, *GYRO)
+    words = [str(directory), "unused", "--wheels", "/joint_states", "--left", "wheel", "--right"]
+    args = bags.script["parser"].parse_args([*words, WHEELS[1]])
+    with pytest.raises(SystemExit, match="no joint wheel; the joints are front_left_wheel_joint"):
+        bags.script["convert"](args)
+    assert Config().drive.wheel_radius == RADIUS

@@ -1,0 +1,156 @@
+"""Guided drives of simulated robots, with a person who measures what the truth is."""
+
+from __future__ import annotations
+
+import cmath
+import math
+
+import numpy as np
+import pytest
+
+from acsard.calibration.drive import require_path
+from acsard.calibration.fit import Base
+from acsard.calibration.guide import guided, line_angle
+from acsard.calibration.log import Floats, Log, LogError, Notes, Run, run_of
+from acsard.calibration.plan import FLOOR_M, METHODS, Leg, Move, Setup, legs
+from acsard.calibration.result import calibrate
+from acsard.core.config.parsing import parse
+from acsard.core.config.settings import Config
+from acsard.host.errors import NotDrivenError
+from acsard.terminal.prompt import NumberQuestion, Prompt
+
+STEP_S, LINE_M, WHEELBASE_M, WIDTH_M = 0.02, 0.45, 0.25, 0.30
+SETUP = Setup.of(Config())
+
+
+class Robot(Prompt):
+    """A robot that skids, whose wheels follow exactly, and the person beside it."""
+
+    def __init__(self, track: float, radius: float = 0.0505) -> None:
+        super().__init__()
+        self.track, self.radius = track, radius
+        self.place, self.yaw = complex(SETUP.from_edge, FLOOR_M / 2), 0.0
+        self.mark = self.place
+        self.way: list[complex] = []
+        self.disturbed = 0
+        self.rng = np.random.default_rng(1)
+
+    def ride(self, leg: Leg) -> Run:
+        if self.disturbed:
+            self.disturbed -= 1
+            raise NotDrivenError("a chair is in the way")
+        begun, sides, rates = self.yaw, [], []
+        for number, move in enumerate(leg.moves):
+            rolled = move.angular * Config().drive.wheel_separation / 2
+            for _ in range(max(1, round(move.seconds / STEP_S))):
+                ends = leg.by_key and number == len(leg.moves) - 1
+                if ends and self.yaw - begun > 2 * math.pi + 0.1:
+                    break
+                wheels = [(move.linear + side * rolled) / 0.05 for side in (-1, 1)]
+                left, right = (wheel * self.radius for wheel in wheels)
+                turn = (right - left) / (Config().drive.wheel_separation * self.track) * STEP_S
+                self.place += (left + right) / 2 * STEP_S * cmath.exp(1j * (self.yaw + turn / 2))
+                self.yaw += turn
+                self.way.append(self.place)
+                sides.append(wheels)
+                rates.append(turn / STEP_S + self.rng.normal(0, 0.002))
+        t: Floats = STEP_S * np.arange(len(sides), dtype=np.float64)
+        left_speeds, right_speeds = np.array(sides, dtype=np.float64).T
+        streams: dict[str, tuple[Floats, ...]] = {"left right": (t, left_speeds, right_speeds)}
+        if self.method == "gyro":
+            streams["yaw_rate"] = t, np.array(rates, dtype=np.float64)
+        return run_of(leg.name, streams, Notes())
+
+    method = "tape"
+
+    def number(self, ask: NumberQuestion) -> float:
+        ahead = {"front": WHEELBASE_M / 2, "rear": -WHEELBASE_M / 2}.get(ask.name, 0.0)
+        corner = self.place + (ahead + 1j * WIDTH_M / 2) * cmath.exp(1j * self.yaw)
+        answer = {
+            "wheelbase": 1000 * WHEELBASE_M, "distance": abs(self.place - self.mark),
+        }.get(ask.name, 1000 * (FLOOR_M / 2 + LINE_M - corner.imag))  # fmt: skip
+        return float(np.round(answer, 3 if ask.unit == "m" else 0))
+
+
+@pytest.mark.parametrize("track", [1.0, 1.6, 2.4])
+@pytest.mark.parametrize("method", ["gyro", "tape"])
+def test_a_guided_drive_finds_track_and_size_and_stays_on_the_floor(
+    method: str, track: float
+) -> None:
+    robot = Robot(track)
+    robot.method = method
+    log = guided(method, SETUP, robot, robot.ride)
+    result = calibrate(log, Config(), "the drive")
+    print(result.found, result.deviations)
+    found = result.found["wheel_separation_multiplier"]
+    assert found == pytest.approx(track, rel=0.025)
+    assert abs(found - track) < 3 * result.deviations["wheel_separation_multiplier"] + 0.01
+    assert result.found["left_wheel_radius_multiplier"] == pytest.approx(1.01, abs=0.004)
+    edges = [x for place in robot.way for x in (place.real, place.imag)]
+    assert SETUP.reach <= min(edges)
+    assert max(edges) <= FLOOR_M - SETUP.reach
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_guided_drive_lasts_90_s_at_most(method: str) -> None:
+    for track in np.arange(1.0, 2.51, 0.1):
+        assert sum(leg.seconds for leg in legs(method, SETUP, track)) <= 90.0
+
+
+def test_a_leg_that_is_disturbed_is_repeated_twice() -> None:
+    robot = Robot(1.5)
+    robot.disturbed = 2
+    assert len(guided("tape", SETUP, robot, robot.ride).runs) == 4
+    robot = Robot(1.5)
+    robot.disturbed = 3
+    with pytest.raises(NotDrivenError, match="a chair"):
+        guided("tape", SETUP, robot, robot.ride)
+
+
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [(1.0, ""), (0.95, ""), (0.8, "moved 0.96 m, although 1.20 m"), (0.0, "0.00 m")],
+)
+def test_wheels_that_do_not_roll_the_commanded_path_disturb_the_leg(
+    share: float, words: str
+) -> None:
+    move, base = Move(4.0, 0.3), Base.of(Config().drive)
+    rows = [(0.02 * n, 0.0, share * 6.0, share * 6.0) for n in range(201)]
+    if words:
+        with pytest.raises(NotDrivenError, match=words):
+            require_path(move, rows, base)
+    else:
+        require_path(move, rows, base)
+    with pytest.raises(NotDrivenError, match="hardly any wheel speeds"):
+        require_path(move, rows[:5], base)
+    require_path(Move(1.0), [], base)
+
+
+def test_two_turns_instead_of_one_are_noticed() -> None:
+    robot = Robot(1.0, radius=0.0165)
+    with pytest.raises(LogError, match=r"should have made one full turn, but by its wheels"):
+        guided("tape", SETUP, robot, robot.ride)
+
+
+def test_impossible_distances_to_the_line_are_refused() -> None:
+    assert line_angle(0.30, 0.35, 0.25) == pytest.approx(0.2014, abs=1e-4)
+    with pytest.raises(LogError, match="250 mm apart cannot be 100 mm and 400 mm"):
+        line_angle(0.1, 0.4, 0.25)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[limits]\nangular_speed = 0.1\n", "raise limits.linear_speed"),
+        ("[drive]\nwheel_separation = 1.6\n", "too large for a floor of 3 m x 3 m"),
+    ],
+)
+def test_a_robot_that_cannot_be_guided_is_refused(text: str, words: str) -> None:
+    with pytest.raises(LogError, match=words):
+        Setup.of(parse(text.encode()))
+
+
+def test_a_log_of_nothing_but_readings_is_a_log() -> None:
+    robot = Robot(1.5)
+    log: Log = guided("tape", SETUP, robot, robot.ride)
+    assert [len(run.tape) for run in log.runs] == [2, 1, 1, 1]

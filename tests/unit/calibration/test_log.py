@@ -1,0 +1,129 @@
+"""Tests of the one CSV format of a log, and of the runs that are made of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from acsard.calibration.log import LogError, read, with_distance
+from tests.unit.calibration.logs import run, usual
+from tests.unit.calibration.robots import Robot, drive
+
+HEADER = "t,left,right,yaw_rate"
+
+
+def lines(count: int = 200, start: float = 0.0, speed: float = 2.0) -> list[str]:
+    t = start + 0.05 * np.arange(count)
+    return [f"{a:.3f},{speed + 0.01 * n},{speed},{0.001 * n}" for n, a in enumerate(t)]
+
+
+def text(rows: list[str], header: str = HEADER) -> bytes:
+    return "\n".join([header, *rows, ""]).encode()
+
+
+def test_a_csv_file_gives_the_same_run_as_its_samples() -> None:
+    trip = usual()
+    (made,) = read(trip.csv().encode()).runs
+    direct = run(trip)
+    for name in ("t", "left", "right", "turned", "place_t", "place"):
+        assert np.asarray(getattr(made, name)) == pytest.approx(
+            np.asarray(getattr(direct, name)), abs=2e-3
+        )
+
+
+def test_columns_may_be_in_any_order_and_others_are_named_in_a_note() -> None:
+    rows = [",".join([*reversed(line.split(",")), "7"]) for line in lines()]
+    log = read(text(rows, "yaw_rate,right,left,t,battery"))
+    assert log.runs[0].left[-1] > log.runs[0].right[-1]
+    assert log.notes == ("columns not used: battery",)
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"\xff\xfe", "is not text"),
+        (b"", "does not name t, left, right, yaw_rate"),
+        (b"a,b\n1,2\n", "does not name t, left, right"),
+        (b"t,left,right,yaw_rate,t\n1,2,3,4,5\n", "a column twice"),
+        (b"t,left,right,yaw_rate\n", "no rows below the header"),
+        (b"t;left;right\n1;2;3\n", "does not name"),
+        (text(["0,1,1,1", "0.1,one,1,1", "0.2,1,1,1"]), 'line 3 is "0.1,one,1,1"'),
+        (text(["0,1,1", "0.1,1,1,1"]), "line 2"),
+        (text(lines(5)), "no run has 8 rows"),
+        (text([f"{n // 10},1,1,1" for n in range(300)]), "only 30 different times"),
+    ],
+)
+def test_a_file_in_another_form_is_refused_with_the_place(data: bytes, words: str) -> None:
+    with pytest.raises(LogError) as refused:
+        read(data)
+    assert words in str(refused.value)
+
+
+def test_a_last_line_that_was_cut_off_is_left_out() -> None:
+    log = read(text([*lines(), "10.000,2.0,2"]).rstrip())
+    assert len(log.runs[0].t) == 200
+    assert log.notes == ("the last line is cut off and left out",)
+
+
+def test_a_new_run_begins_after_a_jump_back_and_after_a_gap() -> None:
+    log = read(text([*lines(), *lines(start=-50.0), *lines(start=1000.0)]))
+    assert [run.name for run in log.runs] == ["1", "2", "3"]
+    assert [run.seconds for run in log.runs] == pytest.approx([9.95] * 3)
+    assert len(log.notes) == 2
+
+
+def test_the_column_run_names_the_runs() -> None:
+    rows = [f"{line},square" for line in lines()] + [f"{line},turns" for line in lines(start=99.0)]
+    rows += [f"{line},turns" for line in lines(start=500.0)]
+    log = read(text(rows, f"{HEADER},run"))
+    assert [run.name for run in log.runs] == ["square", "turns", "turns.2"]
+
+
+def test_a_log_of_one_row_a_second_is_one_run() -> None:
+    rows = [f"{0.79 * n:.3f},2,2,0.01" for n in range(60)]
+    assert len(read(text(rows)).runs) == 1
+
+
+def test_single_wrong_cells_are_left_out_with_a_note() -> None:
+    rows = lines()
+    rows[50] = "2.5,5000,2,0.05"
+    log = read(text(rows))
+    assert len(log.runs[0].t) == 199
+    assert log.notes == ("cells of left left out, far above others, such as 5000: 1",)
+
+
+def test_a_coarse_encoder_that_alternates_with_zero_is_read() -> None:
+    rows = [f"{0.01 * n:.3f},{15.7 * (n % 2)},{15.7 * (n % 3 == 0)},0.1" for n in range(900)]
+    assert len(read(text(rows)).runs) == 1
+
+
+def test_a_dead_wheel_is_refused_and_named() -> None:
+    rows = [f"{0.05 * n:.3f},2,2,0,2,0.1" for n in range(200)]
+    with pytest.raises(LogError, match="rl rolls otherwise than fl"):
+        read(text(rows, "t,fr,fl,rl,rr,yaw_rate"))
+
+
+def test_positions_that_are_repeated_in_later_rows_count_once() -> None:
+    rows = [f"{0.05 * n:.3f},2,2,{0.1 * (n // 4)},0" for n in range(200)]
+    log = read(text(rows, "t,left,right,x,y"))
+    assert len(log.runs[0].place) == 50
+    assert log.notes == ("rows of x y and yaw left out, because they repeat the row before: 150",)
+
+
+def test_a_gyro_that_repeats_its_value_in_a_steady_turn_is_read() -> None:
+    rows = [f"{0.05 * n:.3f},1,3,0.5" for n in range(200)]
+    assert len(read(text(rows)).runs[0].gyro_t) == 200
+
+
+def test_a_distance_is_that_of_the_straightest_run_or_of_the_named_one() -> None:
+    ahead = drive(Robot(), [(1, 0, 0), (8, 0.4, 0), (1, 0, 0)])
+    data = usual().csv(run="turns") + ahead.csv(run="straight").partition("\n")[2]
+    log = read(data.encode())
+    for name in ("", "straight"):
+        measured = with_distance(log, name, 3.2).runs[-1]
+        assert (measured.name, measured.tape[0].value) == ("straight", 3.2)
+        assert not len(measured.gyro_t)
+    with pytest.raises(LogError, match="run turns do not roll alike"):
+        with_distance(log, "turns", 3.2)
+    with pytest.raises(LogError, match='no run "square"; there are turns, straight'):
+        with_distance(log, "square", 3.2)
