@@ -1,6 +1,6 @@
 """Drive the robot straight ahead or turn it on the spot, by its odometry, and print its pose. For
 example: acsard move forward 1 left 90. Ctrl-C stops the robot. The exit code is 1 if the robot does
-not follow, or comes no nearer to the end for 3 s.
+not follow, comes no nearer to the end for 3 s, or gets a new pose.
 """
 
 from __future__ import annotations

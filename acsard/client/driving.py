@@ -16,7 +16,7 @@ from typing import Protocol
 import zenoh
 
 from acsard.bus.subscription import encoded
-from acsard.client.course import Course, Straight, Turn
+from acsard.client.course import Course, Straight, Turn, leaps
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S, Followed, Watch
 from acsard.client.ride import (
     GRACE_S,
@@ -43,6 +43,11 @@ COURSE_PERIOD_S = 0.02  # between two looks at the odometry
 MAX_ODOM_AGE_S = 0.2  # of a speed on a course
 
 COURSE_TIMEOUT_S = 3.0  # without coming nearer to the end of a course
+
+# What counts as nearer: this fraction of the rest, or on a long way this many m or rad.
+NEARER, MOST_NEARER = 0.01, 0.01
+
+POSE_SET = "the pose was set during the drive, when {} was left: drive the rest of the way anew"
 
 CONNECTION_CLOSED = "the connection to the daemon was closed while the robot was driving"
 
@@ -203,15 +208,19 @@ def _course(begin: Callable[[Odometry], Course]) -> Steps:
                 fresh = now - odometer.received < MAX_ODOM_AGE_S
                 driver.step(course.twist if fresh else None)
                 driver.require()
-                if driver.ride.begun is None or abs(course.left) < 0.99 * nearest:
-                    nearest, nearer = abs(course.left), now
+                left = abs(course.left)
+                if driver.ride.begun is None or left < nearest - min(NEARER * nearest, MOST_NEARER):
+                    nearest, nearer = left, now
                 elif now - nearer > COURSE_TIMEOUT_S:
                     raise NotDrivenError(
                         f"the robot came no nearer for {COURSE_TIMEOUT_S:g} s, and "
                         f"{course.left_text} is left: is it blocked, or is a speed limit in force?"
                     )
                 yield min(COURSE_PERIOD_S, driver.ride.period)
-                if (odom := odometer.newest()) is not None:
+                if (newest := odometer.newest()) is not None:
+                    if leaps(odom, newest):
+                        raise NotDrivenError(POSE_SET.format(course.left_text))
+                    odom = newest
                     course.odom(odom)
         yield from driver.stop()
 

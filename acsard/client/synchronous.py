@@ -89,7 +89,8 @@ class Client(Reads):
         """Drive `distance` m straight ahead (back if negative), and return when the robot stands.
 
         `odom` measures the way: in the simulator the robot stops within 5 mm. The errors are those
-        of `drive`, and `NotDrivenError` if the robot comes no nearer to the end for 3 s.
+        of `drive`, and `NotDrivenError` if the robot comes no nearer to the end for 3 s, or if the
+        pose is set meanwhile.
         """
         self._run(move(distance, speed))
 

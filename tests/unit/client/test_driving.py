@@ -12,7 +12,16 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from acsard.client.driving import MAX_END_S, Driver, UnheardError, drive, move, repeat_zeros
+from acsard.client.driving import (
+    MAX_END_S,
+    Driver,
+    Steps,
+    UnheardError,
+    drive,
+    move,
+    repeat_zeros,
+    turn,
+)
 from acsard.client.follower import FIRST_STATE_TIMEOUT_S, ROBOT_SILENCE_TIMEOUT_S, SETTLED_S
 from acsard.client.ride import GRACE_S, OPEN_TIMEOUT_S, objection
 from acsard.core.messages.schema import RobotState, SourceState, Time
@@ -548,6 +557,7 @@ class WithOdometry(World):
 
     def __init__(self, seconds: float) -> None:
         super().__init__(followed)
+        self.body = StandingRobot(0.0)
         self._odometry_s = seconds
 
     def subscribe(self, name: str) -> Any:
@@ -557,7 +567,7 @@ class WithOdometry(World):
 
         def receive() -> Any:
             if not queue and self.now - 100.0 < self._odometry_s:
-                queue.extend([sample_of(StandingRobot(0.0).odom(), "acsard/acsar/odom"), None])
+                queue.extend([sample_of(self.body.odom(), "acsard/acsar/odom"), None])
             return queue.pop(0) if queue else None
 
         return SimpleNamespace(try_recv=receive, undeclare=lambda: None)
@@ -593,6 +603,58 @@ def test_a_move_of_a_robot_that_does_not_move_ends_after_three_seconds(
     with pytest.raises(NotDrivenError, match=r"no nearer for 3 s, and 1\.000 m is left"):
         world.move(monkeypatch)
     assert 3.0 < world.now - 100.0 < 4.0
+
+
+class Rolling(WithOdometry):
+    """A robot that follows each command at once."""
+
+    def __init__(self) -> None:
+        super().__init__(math.inf)
+        self.linear = self.angular = self.way = self.turned = 0.0
+
+    def send(self, linear: float, angular: float = 0.0) -> None:
+        super().send(linear, angular)
+        self.linear, self.angular = linear, angular
+
+    def follow(
+        self, monkeypatch: pytest.MonkeyPatch, steps: Steps, is_set: float = math.inf
+    ) -> None:
+        """Drive a course, for at most 1000 s. After `is_set` s, the odometry is reset."""
+        self.set_clock(monkeypatch)
+        robot: Any = self
+        body = self.body
+        for pause in steps(Driver(robot)):
+            self.now += pause
+            assert self.now < 1100.0
+            self.way += self.linear * pause
+            self.turned += self.angular * pause
+            body.x += self.linear * math.cos(body.yaw) * pause
+            body.y += self.linear * math.sin(body.yaw) * pause
+            body.yaw += self.angular * pause
+            if self.now - 100.0 >= is_set:
+                body.x, body.y, body.yaw, is_set = 0.0, 0.0, 0.0, math.inf
+
+
+def test_a_long_way_at_a_low_speed_is_driven_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = Rolling()
+    world.follow(monkeypatch, move(20.0, 0.05))
+    assert world.way == pytest.approx(20.0, abs=0.01)
+    world = Rolling()
+    world.follow(monkeypatch, turn(3600.0, 0.2))
+    assert world.turned == pytest.approx(20 * math.pi, abs=0.02)
+
+
+def test_a_course_ends_if_the_pose_is_set_on_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    # From (3, -2) to (0, 0): the robot would drive 4.5 m in place of 1 m.
+    world = Rolling()
+    with pytest.raises(NotDrivenError, match="the pose was set"):
+        world.follow(monkeypatch, move(1.0, 0.3), is_set=2.0)
+    assert world.way < 0.7
+    world = Rolling()
+    world.body.x, world.body.y, world.body.yaw = 0.0, 0.0, 2.0
+    with pytest.raises(NotDrivenError, match="the pose was set"):
+        world.follow(monkeypatch, turn(90.0, 0.8), is_set=1.0)
+    assert world.turned < 1.0
 
 
 @pytest.mark.parametrize("speed", [0.0, -0.3])
