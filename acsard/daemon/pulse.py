@@ -105,7 +105,7 @@ class Pulse:
                 over.set_result(None)
                 return
         except BaseException as error:  # noqa: BLE001
-            # The event loop would only log the exception, but a bug in a step must end the process.
+            # A bug in a step must end the process: as an error of `run`, which the daemon reports.
             over.set_exception(error)
             return
         self._step = step

@@ -53,7 +53,12 @@ class _Selector(DefaultSelector):
                 if read is None:
                     self.scheduled = True
                 else:
-                    read()
+                    try:
+                        read()
+                    except BaseException:
+                        # It would fail again, in the tasks that clean up.
+                        self.remove(fd)
+                        raise
             if end_ns is not None:
                 timeout = (end_ns - timer_ns()) / NS_PER_S if ready else -1.0
         return super().select(0)

@@ -96,11 +96,23 @@ def test_a_reader_that_was_removed_is_not_called_any_more() -> None:
         run(main())
 
 
-def test_an_exception_of_a_reader_ends_the_program() -> None:
-    async def main() -> None:
-        asyncio.get_running_loop().add_reader(fd, reading(fd, lambda: 1 / 0))
-        os.write(other, b"x")
-        await asyncio.sleep(4.0)
+def test_an_exception_of_a_reader_ends_the_program_after_its_cleanup() -> None:
+    ended: list[str] = []
 
-    with pipe() as (fd, other), pytest.raises(ZeroDivisionError):
-        run(main())
+    async def main() -> None:
+        # It does not read, so the descriptor stays ready.
+        asyncio.get_running_loop().add_reader(fd, lambda: 1 / 0)
+        os.write(other, b"x")
+        try:
+            await asyncio.sleep(4.0)
+        finally:
+            await asyncio.sleep(0.02)
+            ended.append("stopped")
+
+    with (
+        pipe() as (fd, other),
+        pytest.raises(ZeroDivisionError),
+        asyncio.Runner(loop_factory=EventLoop) as runner,
+    ):
+        runner.run(main())
+    assert ended == ["stopped"]
