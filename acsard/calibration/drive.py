@@ -34,7 +34,7 @@ from acsard.host.errors import NotDrivenError
 from acsard.terminal.prompt import Prompt
 
 POLL_S = 0.005  # a key takes effect within this time
-DISPLAY_S = 0.2
+DISPLAY_S = 0.2  # between two views of the progress
 STANDS_S = 0.7  # that is recorded after a leg: the sensors may be late
 MAX_JITTER_S = 5.0  # of the delay from stamp to arrival; above it, stamps are not used
 MIN_SAMPLES = 20
@@ -187,13 +187,15 @@ class Recorder:
         self._receive()
         for sensor in (self._wheels, *self._others):
             sensor.rows.clear()
-        done = 0.0
+        done, shown = 0.0, -DISPLAY_S
         for number, move in enumerate(leg.moves):
             by_key = leg.by_key and number == len(leg.moves) - 1
             first = len(self._wheels.rows)
             with closing(self._steps(move)) as steps:
                 for passed in steps:
-                    self._prompt.progress(min(0.99, (done + passed) / leg.seconds))
+                    if done + passed - shown >= DISPLAY_S:
+                        shown = done + passed
+                        self._prompt.progress(min(0.99, shown / leg.seconds))
                     if self._prompt.keys(POLL_S):
                         if by_key:
                             break

@@ -49,7 +49,6 @@ REST_ROLL = 0.03  # rad
 
 # A cell that is `SPIKE` times as large as all but 2 % of the moving cells is a wrong sample.
 SPIKE, SPIKE_QUANTILE = 10.0, 0.98
-MAX_SPIKES = 0.05  # share of a column: with more, the column is not one sensor
 
 STUCK_S, STUCK_TURN = 1.0, 0.3  # a gyro that repeats one value while the wheels' turn changes, rad
 

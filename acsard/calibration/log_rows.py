@@ -1,4 +1,4 @@
-"""Writes messages of a robot as rows of the log that `log_table` reads.
+"""Writes messages of a robot as rows of the log that `log.py` reads.
 
 It does not import numpy, because `acsard echo --csv` must work without it.
 """

@@ -22,8 +22,6 @@ QUERY_PERIOD_S = 0.3  # without a new state: the robot may be configured to publ
 
 SETTLED_S = 0.2  # for a message on `state` to arrive: a later one shows the robot after an action
 
-MAX_STATE_AGE_S = 0.5  # for an action that a program bases on it
-
 ROBOT_SILENCE_TIMEOUT_S = 1.0  # a drive ends then, too
 
 FIRST_STATE_TIMEOUT_S = 2.0  # of a key, from a robot that works normally
