@@ -22,7 +22,7 @@ import zenoh
 from acsard.bus.subscription import Subscription
 from acsard.client import asynchronous, connect, connect_async, connection
 from acsard.client.connection import Connection
-from acsard.client.ride import GRACE_S
+from acsard.client.ride import GRACE_S, OPEN_TIMEOUT_S
 from acsard.core.messages import schema
 from acsard.core.messages.refusals import BUSY_ENCODING
 from acsard.host.errors import (
@@ -496,7 +496,8 @@ def test_a_drive_raises_and_names_the_sender_while_another_commander_drives(
         connect(shared.endpoint) as robot,
         ThreadPoolExecutor(1) as other,
     ):
-        driving = other.submit(lambda: first.drive(0.1, seconds=4.0))
+        # The second would drive if the first ended within this time.
+        driving = other.submit(lambda: first.drive(0.1, seconds=OPEN_TIMEOUT_S + 3.0))
         until(lambda: (fresh.state()["linear"] or 0.0) > 0.05, 5.0, "the first drives")
         with pytest.raises(NotDrivenError, match=re.escape(first._connection.sender)):
             robot.drive(0.5, seconds=0.2)

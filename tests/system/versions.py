@@ -135,6 +135,13 @@ def _say_more(newer: Version) -> None:
         },
     )
     newer.swap(
+        "core/messages/diagnostics.py",
+        {
+            "OK), status.reason, values": f'OK), "{REASON}" if status.code == "no_command" '
+            "else status.reason, values"
+        },
+    )
+    newer.swap(
         "core/messages/recent_events.py",
         {
             "event.level, event.text, event.by, event.count, event.code": f'"{LEVEL}", event.text, '
