@@ -408,7 +408,7 @@ COMMANDS: dict[str, How] = {
     "pip install rosbags": UntestedCommand("a library of PyPI that the tests have"),
     "python3 bag_to_csv.py drive drive.csv --wheels /joint_states --left left_wheel "
     "--right right_wheel --imu /imu/data": Elsewhere(
-        "tests/unit/calibration/test_cases.py", "test_one_message_with_the_stamp_0_is_left_out"
+        "tests/unit/calibration/test_cases.py", "test_the_command_of_the_page_converts_a_bag"
     ),
     "acsard calibrate log drive.csv --distance 4.03 --write": Elsewhere(
         CALIBRATE, "test_a_distance_measures_the_wheels"

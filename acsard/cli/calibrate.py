@@ -23,6 +23,7 @@ from acsard.cli.common import add_config, add_outcome, load
 from acsard.cli.connection import add_bus, require_one
 from acsard.client.connection import open_connection
 from acsard.core.config.settings import Config
+from acsard.core.formatting import many
 from acsard.core.messages.keys_and_roles import full_key
 from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, NotDrivenError, UsageError
@@ -126,7 +127,9 @@ def main_log(args: argparse.Namespace) -> int:
         writable(args.config)
 
     def log() -> tuple[Log, Config]:
-        made = read_file(args.file)
+        with Prompt(args.json) as prompt:
+            prompt.doing(f"reading {args.file}")
+            made = read_file(args.file)
         return with_distance(made, *args.distance) if args.distance else made, config
 
     return _finished(args, where, str(args.file), log)
@@ -173,7 +176,9 @@ def _finished(
 ) -> int:
     try:
         log, config = get()
-        result = calibrate(log, config, source)
+        with Prompt(args.json) as prompt:
+            prompt.doing(f"fitting {many(len(log.runs), 'run')}")
+            result = calibrate(log, config, source)
     except (LogError, NotDrivenError, NobodyError) as error:
         notes = tuple(getattr(error, "__notes__", ()))
         if args.json:

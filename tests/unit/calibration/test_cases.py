@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +15,18 @@ from acsard.calibration.log import LogError, read
 from acsard.calibration.result import Result, calibrate
 from acsard.core.config.settings import Config
 from tests.unit.calibration import bags
-from tests.unit.calibration.bags import END, RADIUS, START, WHEELS, Bag, at, bag, converted, motion
+from tests.unit.calibration.bags import (
+    END,
+    RADIUS,
+    SCRIPT,
+    START,
+    WHEELS,
+    Bag,
+    at,
+    bag,
+    converted,
+    motion,
+)  # fmt: skip
 
 pytestmark = pytest.mark.slow
 
@@ -95,6 +109,22 @@ def test_one_message_with_the_stamp_0_is_left_out(
     data = converted(bag(joint).write(tmp_path / "drive"), *GYRO)
     assert "/joint_states: 1 messages with a wrong stamp are left out" in capsys.readouterr().err
     require(found(data), BY_GYRO)
+
+
+def test_the_command_of_the_page_converts_a_bag(tmp_path: Path) -> None:
+    page = (SCRIPT.parent / "README.md").read_text()
+    name = f"$ python3 {SCRIPT.name} "
+    (command,) = (line for line in page.splitlines() if line.startswith(name))
+
+    def joint(made: Bag, number: int, t: float, left: float, right: float) -> None:
+        names = ("left_wheel", "right_wheel")
+        made.joints(START + t + 0.002, START + t, names, [left, right])
+
+    bag(joint).write(tmp_path / "drive")
+    words = [sys.executable, str(SCRIPT), *shlex.split(command.removeprefix(name))]
+    ended = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")
+    require(found((tmp_path / "drive.csv").read_bytes()), BY_GYRO)
 
 
 @pytest.mark.parametrize("column", ["left (in/s)", "left_ips", "left [rpm]"])

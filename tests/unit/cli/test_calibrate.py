@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from acsard.cli import parser
 from acsard.core.config.parsing import parse
 from acsard.host.errors import Exit, MendableError, UnreachableError
+from acsard.terminal import prompt
 from tests.unit.calibration.logs import usual
 
 GOOD = usual().csv(places=False)
@@ -40,6 +42,18 @@ def test_the_result_is_printed_as_text_and_the_file_stays(
     assert "wheel_separation_multiplier" in out
     assert "a turn of 360 deg errs by" in out
     assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
+
+
+def test_a_terminal_shows_what_a_long_fit_does_and_clears_the_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(prompt, "has_room", lambda _: True)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert called(tmp_path, GOOD) == 0
+    shown = capsys.readouterr().err
+    reads, fits = shown.index("... reading "), shown.index("... fitting 1 run")
+    assert reads < fits
+    assert shown.endswith("\r\033[K")
 
 
 def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
