@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 
 import msgspec
 import numpy as np
@@ -101,8 +101,9 @@ def drive(
             try:
                 return recorder.ride(leg)
             except NotDrivenError as error:
-                if client.get("state").mode in NEVER_DRIVING_MODES:
-                    raise LogError(str(error)) from None
+                with suppress(NoAnswerError):  # the reason is known, also if a query is late
+                    if client.get("state").mode in NEVER_DRIVING_MODES:
+                        raise LogError(str(error)) from None
                 raise
             except NoAnswerError as error:
                 client.get("info")  # raises if the daemon is still silent
