@@ -174,7 +174,7 @@ def _repeated(leg: Leg, words: str, prompt: Prompt, ride: Ride) -> Run:
             if not left:
                 raise
             prompt.show_text(
-                f"This leg was disturbed: {error}. Put the robot back where and how the leg began. "
+                f"This leg was disturbed: {error}\nPut the robot back where and how the leg began. "
                 "Then start it again."
             )
     raise AssertionError
