@@ -247,7 +247,7 @@ COMMANDS: dict[str, How] = {
     "acsard echo odom -n 1 --short": Run(r"^x +[+-]\d.* m  y .* m  yaw .*°  forward .* m/s  turn"),
     "acsard echo odom -n 1": Run('"child_frame_id":"base_link"'),
     "acsard echo state -n 1 --short": Run(r"^x .*°  forward .* m/s  turn .* rad/s  [a-z]+: "),
-    "acsard top": Run("pose and twist"),
+    "acsard top": Run("wheels, rad/s"),
     "acsard call stop": Run("^stopped and latched; srv/clear releases it$"),
     "acsard call clear": Run("^cleared; each sender must send a zero before it drives$"),
     "acsard ports": Run(codes=(0, 1)),

@@ -43,7 +43,7 @@ WORKS = {
     "get info": (0, '"version":"'),
     "echo state -n 1 --short": (0, "m/s"),
     "echo odom -n 1": (0, '"child_frame_id"'),
-    "top --once": (0, "pose and twist"),
+    "top --once": (0, "wheels, rad/s"),
     "fleet --once": (0, "1 robot"),
     "doctor": (0, "the running daemon"),
     "call stop": (0, "stopped and latched"),

@@ -100,7 +100,7 @@ def test_the_simulated_gyro_corrects_the_odometry_and_is_published_as_imu(tmp_pa
 def test_calibrate_reads_a_drive_that_echo_recorded_as_csv(tmp_path: Path) -> None:
     tables: dict[str, dict[str, object]] = {"odometry": {"gyro": True}}
     with running(tmp_path, config=tables) as (daemon, _):
-        words = ("echo", "wheel_states", "imu", "--csv", "-n", "300")
+        words = ("echo", "wheel_states", "imu", "--csv", "-n", "600")
         ended = finish(acsard(*words, "--config", str(daemon.config)), tmp_path)
         assert ended.code == 0, ended
         (run,) = read(ended.out.encode()).runs

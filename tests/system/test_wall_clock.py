@@ -56,7 +56,7 @@ def test_top_says_how_long_ago_the_robot_was_seen_and_how_often_lines_come(place
     def rates() -> list[float]:
         output = place.tool("top", "--once").out
         assert re.search(r"seen \d+\.\d s ago", output), output
-        return [float(rate) for rate in re.findall(r"(\d+\.\d)/s of", output)]
+        return [float(rate) for rate in re.findall(r"(\d+\.\d)/s +\d", output)]
 
     values = until(rates, 20.0, "how often lines come")
     assert 1 < max(values) < 1000
