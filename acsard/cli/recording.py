@@ -352,7 +352,13 @@ def _nothing(args: argparse.Namespace) -> RecordingError:
 def _new(args: argparse.Namespace, recording: Recording, ending: str) -> Path:
     # By default, write into the working directory, because the directory of the recordings may
     # belong to the service.
-    return Path(args.new or recording.paths[0].name.partition(".")[0] + ending)
+    new = Path(args.new or recording.paths[0].name.partition(".")[0] + ending)
+    if new.suffix not in ("", ending):
+        raise UsageError(
+            f"{new} does not end with {ending}: a report ends with .html, and an export with "
+            ".mcap, with --csv with .csv, with --rosbag2 with .rosbag2"
+        )
+    return new
 
 
 @contextmanager

@@ -118,7 +118,10 @@ def test_an_hour_needs_hardly_more_memory_than_a_minute(
 ) -> None:
     options = [] if kind == "mcap" else [f"--{kind}"]
     little, much = (
-        cost("recording", "export", str(path), str(tmp_path / path.stem), *options) for path in both
+        cost(
+            "recording", "export", str(path), str(tmp_path / path.name.partition(".")[0]), *options
+        )
+        for path in both
     )
     new = tmp_path / "hour"
     written = sum(p.stat().st_size for p in [new, *new.rglob("*")] if p.is_file()) / 1e6
@@ -137,7 +140,8 @@ def test_a_report_of_an_hour_has_room_beside_the_page_in_its_service(
     unit = (ROOT / "deploy/systemd/acsard-web.service").read_text()
     room = int(unit.partition("MemoryMax=")[2].partition("M")[0])
     little, much = (
-        cost("recording", "report", str(path), str(tmp_path / path.stem)) for path in both
+        cost("recording", "report", str(path), str(tmp_path / path.name.partition(".")[0]))
+        for path in both
     )
     print(
         f"\na report of an hour: {much.seconds:.0f} s ({much.processor:.0f} s of a processor), "

@@ -11,6 +11,7 @@ from msgspec.structs import replace
 
 from acsard.cli import main
 from acsard.core.config.settings import Config
+from tests.each import each
 from tests.scenarios.taped import Tape, recorded_world
 from tests.scenarios.world import START, World
 
@@ -56,11 +57,11 @@ def test_the_newest_recording_is_exported_to_a_named_file_in_the_working_directo
 
 
 @pytest.mark.slow
-def test_a_name_without_a_known_suffix_is_taken(where: Path, here: Path) -> None:
+def test_a_name_without_an_ending_is_taken(where: Path, here: Path) -> None:
     assert export(where, "7", "drive") == 0
-    assert export(where, "7", "drive.txt", "--csv") == 0
-    assert export(where, "7", "drive.d", "--rosbag2") == 0
-    assert {path.name for path in here.iterdir()} == {"drive", "drive.txt", "drive.d"}
+    assert export(where, "7", "table", "--csv") == 0
+    assert export(where, "7", "bag", "--rosbag2") == 0
+    assert {path.name for path in here.iterdir()} == {"drive", "table", "bag"}
 
 
 @pytest.mark.slow
@@ -143,3 +144,12 @@ def test_calibrate_takes_a_recording_of_a_robot_with_a_gyro_as_it_is(
     assert main(["calibrate", "log", "drive.csv", "--json"]) == 0
     by_table = capsys.readouterr().out.replace("drive.csv", "drive.log")
     assert by_recording.partition('"notes"')[0] == by_table.partition('"notes"')[0]
+
+
+@each("words", ["y.pdf", "y.csv", "y.mcap --csv", "y.mcap --rosbag2"])
+def test_a_name_with_the_ending_of_another_kind_is_refused(
+    words: str, where: Path, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert export(where, "7", *words.split()) == 2
+    assert "with --csv with .csv" in capsys.readouterr().err
+    assert not list(here.iterdir())
