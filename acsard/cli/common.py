@@ -40,14 +40,6 @@ def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
     )
 
 
-def count(text: str) -> int:
-    """Parse a whole number from 1 to 999999999, as an argparse type."""
-    if not text.isascii() or not text.isdecimal() or len(text) > 9 or int(text) < 1:
-        words = f"{text[:40]} is not a whole number from 1 to 999999999"
-        raise argparse.ArgumentTypeError(words)
-    return int(text)
-
-
 def between(least: float, most: float, units: str) -> Callable[[str], float]:
     """Return an argparse type for a number from `least` to `most`, in `units`."""
 
@@ -68,8 +60,9 @@ def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
     """Return an argparse type for a whole number from 1 to `most`; `hint` ends the error."""
 
     def number(text: str) -> int:
-        if not text.isascii() or not text.isdecimal() or not 0 < int(text) <= most:
-            words = f"{text} is not a whole number of {units} from 1 to {most}{hint}"
+        digits = text.isascii() and text.isdecimal() and len(text) <= 9
+        if not digits or not 0 < int(text) <= most:
+            words = f"{text[:40]} is not a whole number of {units} from 1 to {most}{hint}"
             raise argparse.ArgumentTypeError(words)
         return int(text)
 

@@ -23,7 +23,7 @@ import zenoh
 from acsard.bus.robot_discovery import ALL_ROBOTS, follow, robot_of, running_robots
 from acsard.bus.subscription import encoded
 from acsard.calibration.log_rows import HEADER, KEYS, row
-from acsard.cli.common import between, count
+from acsard.cli.common import between, whole
 from acsard.cli.connection import (
     SEVERAL_IDS,
     add_bus,
@@ -71,7 +71,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "-n",
-        type=count,
+        type=whole("messages", 999_999_999),
         metavar="N",
         help="end after N messages of each robot; with --rate, after N lines",
     )
