@@ -47,7 +47,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "values",
         nargs="*",
-        type=float,
+        type=_number,
         metavar="NUMBER",
         help=f"the numbers that the service needs: {'; '.join(forms)}. For {' and '.join(RELEASES)}"
         ": the causes to release, by `causes` in `acsard get state` (default: all that are older "
@@ -55,6 +55,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
     add_bus(parser, SEVERAL_IDS + " (stop only)")
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        words = f"{text} is not a number; `acsard call --help` lists what each service needs"
+        raise argparse.ArgumentTypeError(words) from None
 
 
 def main(args: argparse.Namespace) -> int:
