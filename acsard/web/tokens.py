@@ -178,8 +178,8 @@ class Vault:
             raise MendableError(f"cannot write {self.path}: {error.strerror}") from None
         except MSGSPEC_ERRORS as error:
             raise UsageError(
-                f"{self.path} is not a list of tokens ({error}): correct it, or move it away "
-                "and invite all users again"
+                f"{self.path} does not hold tokens as this version writes them ({error}): "
+                "correct it, or move it away and invite all users again"
             ) from None
 
     def _write(self, content: dict[str, Any]) -> None:

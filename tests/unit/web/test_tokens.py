@@ -81,7 +81,7 @@ def test_with_a_damaged_file_no_token_is_valid(tmp_path: Path) -> None:
         vault.path.write_bytes(damaged)
         assert owner(vault, text) is None
         assert digests(vault) == set()
-        with pytest.raises(UsageError, match="is not a list of tokens"):
+        with pytest.raises(UsageError, match="does not hold tokens"):
             vault.invite("viewer", "tv", 1)
 
 
@@ -185,7 +185,7 @@ def test_a_damaged_file_is_not_written_over(tmp_path: Path) -> None:
     damaged = vault.path.read_bytes()[:-3]
     vault.path.write_bytes(damaged)
     for change in (lambda: vault.invite("viewer", "tv", 1), lambda: vault.revoke("me")):
-        with pytest.raises(UsageError, match="is not a list of tokens"):
+        with pytest.raises(UsageError, match="does not hold tokens"):
             change()
     assert vault.path.read_bytes() == damaged
 
