@@ -1,6 +1,6 @@
 """Drive the robot straight ahead or turn it on the spot, by its odometry, and print its pose. For
-example: acsard move forward 1 left 90. Ctrl-C stops the robot. The exit code is 1 if the robot does
-not follow, comes no nearer to the end for 3 s, or gets a new pose.
+example: acsard move forward 1 left 90. Ctrl-C stops the robot, and its pose is printed, too. The
+exit code is 1 if the robot does not follow, comes no nearer to the end for 3 s, or gets a new pose.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from acsard.cli.connection import add_bus, connected
 from acsard.client import Client
 from acsard.core.config.settings import AngularSpeed, LinearSpeed
 from acsard.core.messages.short_texts import place
-from acsard.host.errors import UsageError
+from acsard.host.errors import NotDrivenError, UsageError
 
 # By the typed word: whether it is a turn, and the sign.
 _WAYS = {"forward": (False, 1), "back": (False, -1), "left": (True, 1), "right": (True, -1)}
@@ -47,14 +47,22 @@ def main(args: argparse.Namespace) -> int:
     ways = _parsed(args.way)
     with connected(args, args.source) as connection:
         robot = Client(connection)
-        for is_turn, amount in ways:
-            if is_turn:
-                robot.turn(amount, speed=args.angular)
-            else:
-                robot.move(amount, speed=args.linear)
-        pose = robot.pose()
-    print("  ".join(place(pose.x, pose.y, pose.yaw)))
+        try:
+            for is_turn, amount in ways:
+                if is_turn:
+                    robot.turn(amount, speed=args.angular)
+                else:
+                    robot.move(amount, speed=args.linear)
+        except (KeyboardInterrupt, NotDrivenError):
+            _print_pose(robot)
+            raise
+        _print_pose(robot)
     return 0
+
+
+def _print_pose(robot: Client) -> None:
+    pose = robot.pose()
+    print("  ".join(place(pose.x, pose.y, pose.yaw)), flush=True)
 
 
 def _parsed(words: list[str]) -> list[tuple[bool, float]]:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+from types import SimpleNamespace
+
 import pytest
 
+from acsard.cli import main, move
 from acsard.cli.move import _parsed
-from acsard.host.errors import UsageError
+from acsard.core.values import Pose
+from acsard.host.errors import NotDrivenError, UsageError
 from tests.each import each
 
 
@@ -18,3 +23,17 @@ def test_ways_are_metres_and_degrees_in_their_directions() -> None:
 def test_other_words_are_refused_with_an_example(words: str) -> None:
     with pytest.raises(UsageError, match="acsard move forward 1 left 90"):
         _parsed(words.split())
+
+
+@each("error", [KeyboardInterrupt(), NotDrivenError("stopped by joe")])
+def test_a_drive_that_ends_early_prints_how_far_it_came(
+    error: BaseException, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def driven(_: float, *, speed: float) -> None:
+        raise error
+
+    robot = SimpleNamespace(move=driven, pose=lambda: Pose(0.53, 0.0, 0.0))
+    monkeypatch.setattr(move, "connected", lambda *_: nullcontext())
+    monkeypatch.setattr(move, "Client", lambda _: robot)
+    assert main(["move", "forward", "1"]) == (130 if isinstance(error, KeyboardInterrupt) else 1)
+    assert "+0.530 m" in capsys.readouterr().out
