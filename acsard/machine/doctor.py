@@ -9,6 +9,7 @@ and this machine's certificates.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 
 import msgspec
@@ -116,14 +117,15 @@ def local(config: Config, address: Address, written: str, pid: int | None) -> It
 
 
 def reported(rows: tuple[DiagnosticStatus, ...]) -> Iterator[Finding]:
-    """Yield a finding for each row of the daemon's diagnostics, and each text once."""
-    for row in rows:
-        # The row of the link ends with the reason for which the robot waits.
-        if row.level == OK and any(other.message.endswith(f": {row.message}") for other in rows):
+    """Yield a finding for each row of the daemon's diagnostics, and each reason once."""
+    details = [{pair.key: pair.value for pair in row.values} for row in rows]
+    codes = Counter(values.get("code") for values in details)
+    for row, values in zip(rows, details, strict=True):
+        # The row of the link has the reason for which the robot waits, too.
+        if row.level == OK and "code" in values and codes[values["code"]] > 1:
             continue
-        mend = "".join(pair.value for pair in row.values if pair.key == "advice")
-        subject = row.name.removeprefix("acsard: ")
-        yield Finding(subject, LEVELS[min(row.level, 2)], row.message, mend)
+        subject, level = row.name.removeprefix("acsard: "), LEVELS[min(row.level, 2)]
+        yield Finding(subject, level, row.message, values.get("advice", ""))
 
 
 def query_or_finding(config: Config, address: Address) -> Running | Finding:

@@ -155,7 +155,7 @@ def _mode(status: Status) -> Row:
         advice = f"remove the cause, {CLEAR}"
     elif status.mode == "fault":
         advice = DEFECT if status.code in GUARD_CODES else f"correct the cause, {CLEAR}"
-    values = {"mode": status.mode, "source": status.source}
+    values = {"mode": status.mode, "code": status.code, "source": status.source}
     return Row("mode", MODE_LEVELS.get(status.mode, OK), status.reason, values, advice)
 
 
@@ -171,11 +171,18 @@ def _serial_link(config: Config, snapshot: Snapshot) -> Row:
     use = wire_use(config.rate_hz, mcu.baud_rate, mcu.line_bytes)
     named = zip(WHEELS, snapshot.encoders, strict=False)
     values = {"port": mcu.port, "wire_use": f"{use:.2f}", "check": snapshot.check}
+    if _is_reason(snapshot.status):
+        values["code"] = snapshot.status.code
     if snapshot.feedback_age_s is not None:
         values["feedback_age_s"] = f"{snapshot.feedback_age_s:.2f}"
     values |= {f"counts_{name}": str(counts) for name, counts in named if counts}
     values |= _counted(snapshot.counters, "line") | _counted(snapshot.counters, "link")
     return _row("serial link", [*_link(config, snapshot)], values)
+
+
+def _is_reason(status: Status) -> bool:
+    # The robot waits because of the link.
+    return status.mode == "waiting" and status.link != "up"
 
 
 def _link(config: Config, snapshot: Snapshot) -> Iterator[Finding]:
@@ -185,7 +192,7 @@ def _link(config: Config, snapshot: Snapshot) -> Iterator[Finding]:
     if status.link == "up":
         yield OK, "up", ""
     else:
-        why = f": {status.reason}" if status.mode == "waiting" else ""
+        why = f": {status.reason}" if _is_reason(status) else ""
         yield ERROR, f"{status.link}{why}", advice
     if snapshot.pose_doubt:
         yield WARN, sentence(snapshot.pose_doubt).text, ""

@@ -26,8 +26,9 @@ def running(config: Config = FILE, **more: float) -> Running:
     return Running(INFO, config, (), "", **more)  # type: ignore[arg-type]
 
 
-def row(name: str, level: int, message: str, *advice: str) -> DiagnosticStatus:
-    values = [KeyValue("a", "b"), *(KeyValue("advice", text) for text in advice)]
+def row(name: str, level: int, message: str, advice: str = "", code: str = "") -> DiagnosticStatus:
+    pairs = {"a": "b", "advice": advice, "code": code}
+    values = [KeyValue(key, value) for key, value in pairs.items() if value]
     return DiagnosticStatus(level, f"acsard: {name}", message, "acsar", values)
 
 
@@ -40,9 +41,9 @@ def test_each_report_of_the_daemon_is_a_finding_with_its_advice() -> None:
     ]
 
 
-def test_a_text_of_two_reports_is_printed_once_where_it_is_not_ok() -> None:
-    waits = row("mode", 0, "nothing came")
-    link = row("serial link", 2, "down: nothing came", "check")
+def test_a_reason_of_two_reports_is_printed_once_where_it_is_not_ok() -> None:
+    waits = row("mode", 0, "nothing came", code="silent")
+    link = row("serial link", 2, "down: nothing came", "check", code="silent")
     assert list(reported((waits, link, row("recording", 0, "on")))) == [
         Finding("serial link", "failure", "down: nothing came", "check"),
         Finding("recording", "ok", "on"),

@@ -272,7 +272,7 @@ def test_a_link_that_was_lost_less_than_once_a_day_is_ok() -> None:
 def test_a_latched_mode_is_not_ok_and_its_reason_is_the_message(mode: str, level: int) -> None:
     status = row("mode", outputs=replace(OUTPUTS, mode=mode, reason="words"))
     assert (status.level, status.message) == (level, "words")
-    assert values(status) == {"mode": mode, "source": "app"}
+    assert values(status) == {"mode": mode, "code": "commanded", "source": "app"}
 
 
 # link
