@@ -53,6 +53,11 @@ def json_line(text: str) -> str:
     )
 
 
+def after_mode(mode: str, reason: str) -> str:
+    """Return "mode: reason", without the mode if the reason begins with it ("stopped by ...")."""
+    return reason if reason.startswith(mode) else f"{mode}: {reason}"
+
+
 def many(count: int, singular: str, more: str = "") -> str:
     """Return a count with its noun, such as `no lines`, `1 line` or `2 changes of mode`.
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Mapping
 
+from acsard.core.formatting import after_mode
 from acsard.core.values import NS_PER_S, Ns, Status, Twist
 
 FEEDS_PER_WATCHDOG = 4  # within the watchdog's timeout
@@ -92,4 +93,4 @@ def status_text(status: Status, applied: Twist) -> str:
     if status.mode == "driving":
         turn = f", {applied.angular:.1f} rad/s" if abs(applied.angular) >= 0.05 else ""
         return f"driving at {applied.linear:.1f} m/s{turn}, commanded by {status.source}"
-    return f"{status.mode}: {status.reason}"
+    return after_mode(status.mode, status.reason)

@@ -9,7 +9,7 @@ from rich.text import Text
 
 from acsard.core.formatting import printable
 from acsard.core.messages.schema import RobotState
-from acsard.core.messages.short_texts import place, speeds
+from acsard.core.messages.short_texts import mode_and_reason, place, speeds
 from acsard.core.motion.modes import Mode
 from acsard.top.screen import mode_line
 
@@ -59,7 +59,7 @@ def last_report(teleop: Teleop) -> Group:
     what = "still moves" if moves(state) else "stands still"
     if state.linear is None:
         what = "reports no speed"
-    why = f"{printable(state.mode)}: {printable(state.why)}"
+    why = printable(mode_and_reason(state))
     return Group(Text(f"drive ended: the robot {what}; {why}"), _measured(state))
 
 

@@ -20,7 +20,7 @@ from rich.text import Text
 
 from acsard.core.formatting import lasting, printable, rough, signed
 from acsard.core.messages.schema import Info, RobotState, SourceState
-from acsard.core.messages.short_texts import power
+from acsard.core.messages.short_texts import cause_numbers, power
 from acsard.core.messages.state_warnings import WARNING, brief, warnings
 from acsard.core.motion.gyro import STATUS_TEXTS
 from acsard.core.values import NS_PER_S
@@ -113,9 +113,10 @@ def _silence(data: ScreenData) -> Text:
 
 
 def mode_line(state: RobotState) -> Text:
-    """Return the mode in its color, and the reason."""
+    """Return the mode in its color, the reason, and the numbers of the causes."""
     badge = Text(f" {clean(state.mode).upper()[:12]} ", MODE_STYLES.get(state.mode, "reverse"))
-    return Text().append_text(badge).append(f"  {clean(state.why)}", "bold")
+    why = clean(state.why) + clean(cause_numbers(state))
+    return Text().append_text(badge).append(f"  {why}", "bold")
 
 
 def _table(

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from acsard.core.formatting import printable, signed
+from acsard.core.formatting import after_mode, printable, signed
 from acsard.core.messages.schema import (
     Battery,
     BatterySummary,
@@ -34,6 +34,17 @@ def speeds(linear: float | None, angular: float | None) -> list[str]:
     return [f"forward {signed(linear, 2, 5)} m/s", f"turn {signed(angular, 2, 5)} rad/s"]
 
 
+def mode_and_reason(state: RobotState) -> str:
+    """Return the mode, the reason, and the numbers of the causes, such as "(causes 7, 12)"."""
+    return after_mode(state.mode, state.why) + cause_numbers(state)
+
+
+def cause_numbers(state: RobotState) -> str:
+    """Return the numbers that `acsard call clear` and `activate` take, or "" without a cause."""
+    numbers = ", ".join([str(cause.number) for cause in state.causes])
+    return f" (cause{'s' * (len(state.causes) > 1)} {numbers})" if numbers else ""
+
+
 def short(message: object) -> str:
     """Format a message, of a type in `SHORT_TEXTS`, as one line."""
     return "  ".join(SHORT_TEXTS[type(message)](message))
@@ -44,8 +55,8 @@ def _odometry(odom: Odometry) -> list[str]:
 
 
 def _state(state: RobotState) -> list[str]:
-    mode = printable(f"{state.mode}: {state.why}")
-    parts = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular), mode]
+    why = printable(mode_and_reason(state))
+    parts = [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular), why]
     left = charge(state.battery)
     return [*parts, *filter(None, (left and f"battery {left}", brief(warnings(state))))]
 

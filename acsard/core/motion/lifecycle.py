@@ -188,10 +188,11 @@ class Lifecycle(Struct):
     ) -> tuple[int, ...]:
         done = tuple([cause.number for cause in causes if cause.number in numbers])
         if not done:
+            present = ", ".join([str(cause.number) for cause in causes])
             raise RefusedError(
                 f"this call names no cause that srv/{verb} would release now; the robot is still "
                 f"{in_force(causes)}: look at the robot, then call srv/{verb} again with the "
-                "numbers of the present `causes` in `state`"
+                f"numbers of the present `causes` in `state` ({present})"
             )
         self._use(released(self.latches, done))
         return done

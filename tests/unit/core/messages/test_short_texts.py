@@ -6,8 +6,10 @@ import math
 import re
 
 import pytest
+from msgspec.structs import replace
 
 from acsard.core.messages.schema import (
+    Cause,
     Header,
     Odometry,
     Pose,
@@ -21,6 +23,7 @@ from acsard.core.messages.schema import (
 )
 from acsard.core.messages.short_texts import place, short, speeds
 from tests.each import each
+from tests.unit.top.screens import STATE
 
 HEADER = Header(Time(), "odom")
 
@@ -59,3 +62,13 @@ def test_lines_of_odometry_have_the_same_width() -> None:
 @each("value", [1e300, -1e12, math.inf, math.nan])
 def test_no_number_makes_the_line_longer_than_80_characters(value: float) -> None:
     assert len("".join(place(value, value, 0.0) + speeds(value, value))) < 80
+
+
+def test_a_stopped_robot_says_why_once_and_with_the_numbers_that_clear_takes() -> None:
+    causes = [Cause(n, "stop", "stopped", "", "", Time(), False, None) for n in (7, 12)]
+    state = replace(STATE, mode="stopped", reason="stopped by ann", code="stopped")
+    assert short(state).endswith("  stopped by ann")
+    assert short(replace(state, causes=causes)).endswith("  stopped by ann (causes 7, 12)")
+    assert short(replace(state, causes=causes[:1])).endswith("  stopped by ann (cause 7)")
+    low = replace(state, reason="battery low")
+    assert short(low).endswith("  stopped: battery low")

@@ -184,7 +184,7 @@ def test_a_clear_that_names_nothing_in_force_is_refused_and_says_what_holds_the_
 ) -> None:
     number = timed.stop("ann")
     timed.run(5.0)
-    with pytest.raises(RefusedError, match=r"still stopped by ann.*present `causes`"):
+    with pytest.raises(RefusedError, match=rf"still stopped by ann.*\({number}\)"):
         timed.clear(number + 1)
     with pytest.raises(RefusedError, match="names no cause"):
         timed.life.clear((), ns(timed.now_s))
