@@ -50,6 +50,39 @@ PAUSE = (
 )
 
 
+class _Stopping:
+    # Finds out whether the robot has stopped following the last speed of a sender.
+
+    def __init__(self, source: str, sender: str, moved: Seconds = -math.inf) -> None:
+        self._source, self._sender = source, sender
+        self._moved = self._slower_at = moved
+        self._slowest = math.inf  # in units of `STANDSTILL`
+
+    def is_over(self, now: Seconds) -> bool:
+        return now - self._moved >= MAX_SOURCE_TIMEOUT_S
+
+    def state(self, state: RobotState, now: Seconds) -> None:
+        if now - self._moved >= SETTLED_S and self._shows_the_end(state, now):
+            self._moved = -math.inf
+
+    def _shows_the_end(self, state: RobotState, now: Seconds) -> bool:
+        if state.mode in NEVER_DRIVING_MODES:
+            return True
+        # While the network holds the commands, the robot may rest because the last speed has not
+        # arrived yet. So the daemon must have accepted a zero.
+        ours = _entry(state, self._source)
+        if ours is None or ours.age is None or now - ours.age - self._moved < SETTLED_S:
+            return False
+        if state.source != self._source or state.sender not in ("", self._sender):
+            return True
+        speed = math.inf  # unknown without feedback
+        if state.linear is not None and state.angular is not None:
+            speed = max(abs(state.linear) / STANDSTILL[0], abs(state.angular) / STANDSTILL[1])
+        if speed < SLOWER * self._slowest:
+            self._slowest, self._slower_at = speed, now
+        return speed < 1.0 or now - self._slower_at >= SLOWS_S
+
+
 class Ride:
     """Decides the commands of one sender. Times are on a clock that a suspend does not stop, s.
 
@@ -72,12 +105,11 @@ class Ride:
         self._asked = now  # last call of `due`
         self._last, self._sent = REST, -math.inf  # last command, and its time
         self._zero_is_due = False
-        self.moved(-math.inf)
+        self._stopping = _Stopping(source, sender)
 
     def moved(self, at: Seconds) -> None:
         """Record that the sender last sent a speed at this time."""
-        self._moved = self._slower_at = at
-        self._slowest = math.inf
+        self._stopping = _Stopping(self._source, self._sender, at)
 
     def wish(self, twist: Twist | None, now: Seconds) -> None:
         """Want a speed until the next call, for at most `STALE_S`.
@@ -104,8 +136,7 @@ class Ride:
     def state(self, state: RobotState, now: Seconds) -> None:
         """Process a state, which the follower has processed already."""
         self.objection = objection(state, self._source, self._sender)
-        if now - self._moved >= SETTLED_S and self._shows_the_end(state, now):
-            self._moved = -math.inf
+        self._stopping.state(state, now)
         if not self.objection:
             self.followed = now
             self._is_open = self._is_open or self._opened is not None
@@ -165,28 +196,11 @@ class Ride:
         enough: after a stall of the network, all commands arrive within 1 ms, and the daemon
         accepts the oldest, maybe a speed, and drops the others as too fast.
         """
-        return self._wish is None and now - self._moved >= MAX_SOURCE_TIMEOUT_S
+        return self._wish is None and self._stopping.is_over(now)
 
     def _begin(self, ended: str) -> None:
         self.ended, self._wish = ended, None
         self._opened, self._is_open = None, False
-
-    def _shows_the_end(self, state: RobotState, now: Seconds) -> bool:
-        if state.mode in NEVER_DRIVING_MODES:
-            return True
-        # While the network holds the commands, the robot may rest because the last speed has not
-        # arrived yet. So the daemon must have accepted a zero.
-        age = next((entry.age for entry in state.sources if entry.name == self._source), None)
-        if age is None or now - age - self._moved < SETTLED_S:
-            return False
-        if state.source != self._source or state.sender not in ("", self._sender):
-            return True
-        speed = math.inf  # unknown without feedback
-        if state.linear is not None and state.angular is not None:
-            speed = max(abs(state.linear) / STANDSTILL[0], abs(state.angular) / STANDSTILL[1])
-        if speed < SLOWER * self._slowest:
-            self._slowest, self._slower_at = speed, now
-        return speed < 1.0 or now - self._slower_at >= SLOWS_S
 
 
 def objection(state: RobotState, source: str, sender: str) -> str:
