@@ -13,7 +13,7 @@ from acsard.cli.connection import add_bus, connected
 from acsard.client import Client
 from acsard.core.config.settings import AngularSpeed, LinearSpeed
 from acsard.core.messages.short_texts import place
-from acsard.host.errors import NotDrivenError, UsageError
+from acsard.host.errors import UsageError
 
 # By the typed word: whether it is a turn, and the sign.
 _WAYS = {"forward": (False, 1), "back": (False, -1), "left": (True, 1), "right": (True, -1)}
@@ -53,7 +53,7 @@ def main(args: argparse.Namespace) -> int:
                     robot.turn(amount, speed=args.angular)
                 else:
                     robot.move(amount, speed=args.linear)
-        except (KeyboardInterrupt, NotDrivenError):
+        except KeyboardInterrupt:
             _print_pose(robot)
             raise
         _print_pose(robot)
