@@ -25,7 +25,7 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.link.link_diagnosis import UnansweredLines
 from acsard.core.link.link_setup import LinkSetup
 from acsard.core.link.link_state import WATCHDOG_S
-from acsard.core.link.session import McuSession
+from acsard.core.link.session import QUESTION_LINE, McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import CommandEvents, missed, refused, waiting
 from acsard.core.motion.battery import empty_reason
@@ -305,7 +305,8 @@ class Robot:
         left = line is not None
         if trip or not left:
             self._until_ns = 0
-        self._last.sent(left, trip)
+        # The question moves nothing: a ramp continues from the line before it.
+        self._last.sent(left and line != QUESTION_LINE, trip)
         # The board must not be expected to answer a line that the guard has replaced.
         self.session.sent(self.link_setup, left_ns, was_written=left and not trip)
         if left:

@@ -1463,6 +1463,25 @@ def test_at_a_slow_rate_a_stall_adds_at_most_1_5_periods_of_acceleration() -> No
     assert bench.step(ms=240).applied.linear == pytest.approx(0.25)
 
 
+def test_the_question_that_takes_the_place_of_a_line_is_no_step_of_the_ramp() -> None:
+    slow = Config(
+        control=ControlConfig(rate=10.0),
+        limits=LimitsConfig(linear_acceleration=0.2),
+        commands=CommandsConfig(sources=(Source("app", 50, 1.0),)),
+    )
+    bench = Bench(slow).linked()
+    bench.step(REST)
+    for _ in range(20):
+        before = bench.out.applied.linear
+        bench.reply = bench.out.line  # a board that repeats its commands is asked
+        if bench.step(GO).line == b"?\r\n":
+            break
+    assert bench.out.line == b"?\r\n"
+    assert 0.0 < before < 0.4
+    # The last line that moved the motors is two periods old: the speed grows by 1.5.
+    assert bench.step(GO).applied.linear == pytest.approx(before + 0.03)
+
+
 def test_after_a_stall_the_robot_brakes_for_the_whole_elapsed_time() -> None:
     bench = Bench().driving()
     bench.reply = bench.codec.stop
