@@ -8,6 +8,7 @@ made, and is never stricter than that law.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from tests.simulate.roads import NS, Message, Sample
@@ -70,12 +71,14 @@ class Clock:
         """The least delay, behind the time at which it was measured."""
         self._lower: list[tuple[int, int]] = []
         """Times and delays of all commands since the first one below the least, if all are."""
+        self._confirmed_ns = math.inf
+        """The lowest value that such commands may have given to the robot's least delay."""
 
     def take(self, at_ns: int, delay_ns: int, timeout_ns: int) -> bool:
         """Return whether a command with this delay may count."""
         self.last_ns = at_ns
         if self.least is None:  # the robot slept
-            self.least = at_ns, delay_ns
+            self.least, self._confirmed_ns = (at_ns, delay_ns), math.inf
             return True
         since_ns, least_ns = self.least
         if not self.counted:
@@ -94,12 +97,14 @@ class Clock:
             return bool(delay_ns <= least_ns + rises_ns + timeout_ns + MARGIN_NS)
         self._lower.append((at_ns, delay_ns))
         confirms_ns = at_ns - self._lower[0][0]
+        if confirms_ns > timeout_ns - MARGIN_NS:
+            self._confirmed_ns = min(self._confirmed_ns, *(delay for _, delay in self._lower))
         if confirms_ns > 2 * timeout_ns + NS // 5:
             # Now the robot surely knows the lower delays of the time before the last timeout.
             known = [delay for then, delay in self._lower if at_ns - then > timeout_ns]
             self.least = at_ns, min(known)
             self._lower.clear()
-        return confirms_ns > timeout_ns - MARGIN_NS or delay_ns >= least_ns - SURELY_LOWER_NS
+        return delay_ns >= min(least_ns, self._confirmed_ns) - SURELY_LOWER_NS
 
 
 class Ages:

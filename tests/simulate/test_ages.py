@@ -87,6 +87,15 @@ def test_a_delay_is_late_by_a_lower_one_only_if_that_has_stayed(
     assert fresh(ages, at_s, 1.1) is obeyed
 
 
+@pytest.mark.parametrize("lower_s", [0.05, 0.4])
+def test_a_lower_delay_that_may_count_stays_allowed_behind_a_higher_one(lower_s: float) -> None:
+    ages = known(4.0, 1.0)
+    lower = [fresh(ages, 4.0 + n / 20, 0.1) for n in range(int(lower_s * 20) + 1)]
+    assert fresh(ages, 4.5, 1.1)
+    assert fresh(ages, 4.55, 0.1) is lower[-1]
+    assert not fresh(ages, 4.6, 0.02)
+
+
 def test_a_robot_that_slept_knows_no_least_delay() -> None:
     ages = known(4.0, 0.01)
     ages.forget_least(5 * NS)
