@@ -142,7 +142,7 @@ class Timeline(Struct):
         came_ns = self.heard_ns = came_ns if came_ns > before_ns else before_ns
         since = (came_ns - before_ns) / NS_PER_S
         if setup.period_ns:
-            placed = self.free_running.place(self.end_ns, self.rest, setup.period_ns)
+            placed = self.free_running.place(self.rest, setup.period_ns)
         else:
             if asked_ns is not None and not self.rest:
                 self.prompted.measure(self.end_ns - asked_ns, self.read_lines, setup.apart_ns)

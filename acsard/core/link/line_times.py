@@ -5,8 +5,8 @@ clock (`FreeRunning`). Any other makes one for each command (`Prompted`): its ti
 command, and the part of the reply's delay that is the board's own. Both count whole slots, a period
 or a command, so that an error of one line is undone by the next.
 
-A line is late by so many slots over the least delay. One that is later than usual follows missing
-lines, and one that is too early shows that fewer are missing (`Lateness`).
+The lateness of a line is its delay above the least one, in slots. A line that is later than usual
+follows missing lines, and one that is too early shows that fewer are missing (`Lateness`).
 """
 
 from __future__ import annotations
@@ -34,17 +34,16 @@ MAX_MISSING = 1000
 
 MAX_ADAPTER_DELAY_NS = 25_000_000  # an FTDI chip holds a line for 16 ms
 
-EARLY_SLOTS = 0.5  # a line that comes so much too early: a loss that was none
-
-# The same for a command that seemed to have no reply.
-EARLY_REPLY = 0.1
+# A line that is earlier than this shows that a line was counted as missing, but came; and a reply,
+# that a command was given up too soon.
+EARLY_SLOTS, EARLY_REPLY = 0.5, 0.1
 
 LAG_GAIN = 0.03
 
 WINDOW_NS = NS_PER_S // 2  # of the least delay of a free-running board
 
-# Missing lines among the last ones, above which a free-running board behind an adapter that holds
-# lines back is lossy: nobody knows between which lines they are missing.
+# Missing lines among the last `LOSSY_LINES`. Above it, the link of a free-running board behind an
+# adapter that holds lines back is lossy: nobody knows between which lines they are missing.
 LOSSY, LOSSY_LINES = 2.0, 1000
 
 MAX_OPEN_COMMANDS = 64  # replies to them may still come
@@ -106,7 +105,11 @@ class Placed(Struct, frozen=True, gc=False):
 
 
 class FreeRunning(Struct):
-    """The lines of a board with its own clock, whose period is declared."""
+    """The lines of a board with its own clock, whose period is declared.
+
+    A line takes one period, and one more for each line that is missing before it. On a lossy link,
+    the lines of a read share the time since the line before them, by the times of arrival.
+    """
 
     begun: bool = False
     late: float = 0.0  # of the last line, in periods
@@ -114,62 +117,57 @@ class FreeRunning(Struct):
     # Least lateness in a window, and its beginning: by as much our clock is ahead of the board's.
     least: float = math.inf
     window_ns: Ns = 0
-    lost: float = 0.0  # periods before the next line; negative: lines that were counted before
-    missing: float = 0.0  # among the last lines
-    # Periods that each line of the last read takes longer, and the lateness that such lines took in
-    # all: those of a lossy link take the times of arrival.
-    longer: float = 0.0
-    taken: float = 0.0
+    missing: float = 0.0  # among the last `LOSSY_LINES`
+    lossy: bool = False
+    due_ns: Ns = 0  # time of the last line of the last read
+    line_ns: Ns = 0  # that each line of the last read takes
+    lost_ns: Ns = 0  # more for the next line; negative: lines before it have taken its time
 
     def process_read(self, end_ns: Ns, since_ns: Ns, lines: int, drained: bool, period: Ns) -> None:
         """Process a read; `drained`: the kernel has no more data."""
         if not self.begun:
-            self.begun, self.window_ns = True, end_ns
+            self.begun, self.window_ns, self.due_ns, self.line_ns = True, end_ns, end_ns, period
             return
         passed = since_ns / period
-        late, before = self.late + passed - lines, self.lost
+        late, lost = self.late + passed - lines, 0
         if late < 0.0:  # the board's clock may be the faster one
             late = min(0.0, late + MAX_CLOCK_ERROR * passed)
         if late < -EARLY_SLOTS:
-            early = round(-late)
-            self.lost -= early
-            late += early
+            lost = round(late)
         elif drained:
-            if (missing := int(late) - MAX_MISSING) > 0:
-                self.lost += missing
-                late -= missing
+            if (lost := max(0, int(late) - MAX_MISSING)) > 0:
                 self.lateness.recent = []
-            while self.lateness.missing(late, lines, period):
-                self.lost += 1
-                late -= 1.0
-            self.lateness.follow(late)
-        self.late, self.least = late, min(self.least, late)
-        self.missing += self.lost - before - self.missing * min(1.0, lines / LOSSY_LINES)
-        taken, lateness, lost = self.taken, self.lateness, self.lost
-        lossy = self.missing > LOSSY and lateness.deviation >= NARROW_DEVIATION
-        self.taken, self.longer = late - lateness.usual if lossy else 0.0, 0.0
-        if taken or lossy:
-            self.longer, self.lost = (lost + self.taken - taken) / lines, 0.0
-            if self.longer < -1.0:
-                self.longer, self.taken = -1.0, taken - lines - lost
+            while self.lateness.missing(late - lost, lines, period):
+                lost += 1
+            self.lateness.follow(late - lost)
+        late -= lost
+        self.least = min(self.least, late)
         if end_ns - self.window_ns > WINDOW_NS:
             most = MAX_CLOCK_ERROR * (end_ns - self.window_ns) / period
             if 0.0 < self.least < EARLY_SLOTS:  # else a line may be missing
-                shift = min(self.least, most)
-                self.late -= shift
-                if self.taken:
-                    self.taken -= shift
+                late -= min(self.least, most)
             self.window_ns, self.least = end_ns, math.inf
+        self.late = late
+        self.missing += lost - self.missing * min(1.0, lines / LOSSY_LINES)
+        lossy, usual = self.lossy, self.lateness.usual
+        self.lossy = self.missing > LOSSY and self.lateness.deviation >= NARROW_DEVIATION
+        before_ns = self.due_ns - self.lost_ns  # time of the last line that was used
+        self.due_ns = end_ns - int((usual if self.lossy else late) * period)
+        if lossy or self.lossy:
+            took_ns = self.due_ns - before_ns
+            self.line_ns, self.lost_ns = max(0, took_ns) // lines, min(0, took_ns)
+        else:
+            self.line_ns, self.lost_ns = period, self.lost_ns + lost * period
 
-    def place(self, end_ns: Ns, behind: int, period: Ns) -> Placed:
+    def place(self, behind: int, period: Ns) -> Placed:
         """Return the time of the next line of the last read, `behind` lines before its end."""
-        lost, self.lost = self.lost + self.longer, min(0.0, self.lost + 1.0)
-        due_ns = end_ns - int((self.late - self.taken + behind) * period)
-        return Placed(due_ns, int(max(0.0, 1.0 + lost) * period), int(max(0.0, lost) * period))
+        took_ns = self.line_ns + self.lost_ns
+        dt_ns, self.lost_ns = max(0, took_ns), min(0, took_ns)
+        return Placed(self.due_ns - behind * period, dt_ns, max(0, dt_ns - period))
 
     def skip(self) -> None:
         """Skip a line that is not used."""
-        self.lost += 1.0 + self.longer
+        self.lost_ns += self.line_ns
 
 
 class Prompted(Struct):

@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from acsard.core.link.line_times import FreeRunning
 from acsard.core.values import Instant
 from tests.unit.core.link.drives import PERIOD, Case, drive
 from tests.unit.core.link.table import print_row
@@ -144,6 +145,24 @@ def test_a_free_running_board_on_a_lossy_batched_link_gets_the_times_of_arrival(
     """Whole periods, of which some are missed, would give 0.049 m and 0.086 m."""
     case = Case("ftdi", lost=lost, stall=0.15, stall_every=60.0)
     assert np.mean([drive(case, seed, 60.0).errors()[FOUND, 0] for seed in range(3)]) < most
+
+
+def test_the_times_on_a_lossy_link_add_up_to_those_of_arrival() -> None:
+    """The board's clock is 0.4 % fast, and an adapter reads every 16 ms."""
+    period, batch = 10_000_000, 16_000_000
+    lines, chance = FreeRunning(), np.random.default_rng(1)
+    came = np.flatnonzero(chance.random(6000) > 0.05) * period * 0.996
+    reads = (came // batch + 1).astype(int) * batch
+    before, passed, times = 0, 0, []
+    for end in np.unique(reads):
+        count = int(np.sum(reads == end))
+        lines.process_read(int(end), int(end) - before, count, True, period)
+        before = int(end)
+        placed = [lines.place(behind, period) for behind in reversed(range(count))]
+        passed += sum(line.dt_ns for line in placed)
+        times.append(placed[-1].due_ns - passed)
+    late = times[len(times) // 2 :]
+    assert max(late) - min(late) < period / 10
 
 
 @pytest.mark.slow
