@@ -1,7 +1,7 @@
 """Opens the Zenoh sessions of the daemon, of the TLS gateway and of the client tools.
 
-All settings of these sessions are here, each with its reason. What only the daemon or a check needs
-is imported there: `acsard call stop` starts in half of the time without it.
+All settings of these sessions are here, each with its reason. Functions import modules that only
+they need: `acsard call stop` starts in half of the time without those of the daemon.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ FaultCode = Literal[
     "wheel_too_fast", "wheels_swapped",
 ]  # fmt: skip
 
-# What a wheel does that is no reason to stop.
+# Trouble of a wheel that does not stop the robot.
 WheelCode = Literal["wheel_blocked", "wheel_slow", "wheel_fast", "wheel_stuck"]
 
 StateCode = Literal[

@@ -125,7 +125,7 @@ class Robot:
         self._asked: tuple[str, str, int | None] = ("", "", None)
         self._told = CommandEvents(self._life.mode)
         self._linked_once = False
-        # The last `hear` holds until then, if only bytes arrive; 0: it may not.
+        # The result of the last `hear` holds until then if only bytes arrive; 0: not even now.
         self._until_ns: Ns = 0
         self._silence = Heard(True)  # what `hear` gets if nothing arrives
         self._is_watched = True  # the reports of the board may change the mode at any time
@@ -223,6 +223,8 @@ class Robot:
             self.counters["missed_periods"] += heard.missed
             events.append(missed(heard.missed, self.config.period_ns))
         estimates = self._fold(now, heard, events)
+        # Nothing below has anything to do if `_fold` only integrated lines. It makes an event for
+        # each fault, and one of both `until_ns` is 0 if the link is lost or a sender was disarmed.
         until_ns = min(arbiter.until_ns, session.until_ns)
         if holds and now_ns < until_ns and not (
             events or self._is_watched or heard.commands or heard.refusals or heard.requests

@@ -32,6 +32,7 @@ from acsard.recording.recorded_steps import StepRecorder
 # Least delay of a line; less is reported as 0, as the estimated sample times are less exact.
 MIN_WRITE_DELAY_NS = 1_000_000
 
+# Asking the keeper for events takes 8 us, too long for each period.
 KEEPER_PERIOD_NS = NS_PER_S // 10
 
 # The line on the port, why the guard replaced the robot's, and how late it was written.

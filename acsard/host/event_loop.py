@@ -69,7 +69,10 @@ class _Selector(DefaultSelector):
 
 
 class EventLoop(asyncio.SelectorEventLoop):
-    """The event loop of the daemon. An exception of a reader ends it."""
+    """The event loop of the daemon. An exception of a reader ends it.
+
+    A reader's descriptor is a number, and the reader must be removed before it is closed.
+    """
 
     def __init__(self) -> None:
         self._direct = _Selector()

@@ -11,7 +11,7 @@ MAX_CALL_INTERVAL_NS = NS_PER_S // 4
 class WaitTimer:
     """Measures how long the present operation of another thread has taken so far.
 
-    That thread calls `begin` and `end`, and the control loop `wait_ns` in each period.
+    That thread calls `begin` and `end`, and the control loop `wait_ns`, at least every 0.1 s.
     """
 
     def __init__(self) -> None:

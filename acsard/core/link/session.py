@@ -87,10 +87,10 @@ class McuSession(Struct):
     _timeline: Timeline = field(default_factory=Timeline)
     _hearing: SilenceDiagnosis = field(default_factory=SilenceDiagnosis)
 
-    # Of the last `update`.
+    # Results of the last `update`.
     restarted: bool = False  # it began a new session
     reopened: bool = False
-    until_ns: Ns = 0  # without bytes, `update` has nothing to do until then; 0: it may have
+    until_ns: Ns = 0  # without bytes, `update` has nothing to do before then
     events: list[Event] = []  # for the log
     _rejected: dict[str, tuple[int, bytes]] = {}  # by reason: their number, and the last line
     _starting_over: bool = False

@@ -276,7 +276,7 @@ class Gyro(Struct):
     # Samples.
 
     def add_samples(self, samples: tuple[GyroSample, ...]) -> None:
-        """Use samples in the order of arrival; one with `anew` (another gyro) begins anew."""
+        """Use samples in the order of arrival. One with `anew` is the first of another gyro."""
         for sample in samples:
             if sample.anew:
                 self._begin()
